@@ -1,0 +1,72 @@
+# Two commands for a fresh checkout: `make demo` and `make test`. They need python3 (3.10 or newer, with venv) and a
+# package index; PYTHON=... picks another interpreter.
+PYTHON ?= python3
+JOBS ?= 2
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+.NOTPARALLEL:
+.DEFAULT_GOAL := help
+
+BIN := .venv/bin
+TEST := .venv-test/bin
+MINIMAL := .venv-minimal/bin
+
+.PHONY: help demo test check test-full test-wheel test-minimal clean
+
+help:
+	@echo "make demo          perceive the bundled scene: a table, and a picture in demo/"
+	@echo "make test          everything below"
+	@echo "make check         ruff, mypy"
+	@echo "make test-full     pytest with every extra"
+	@echo "make test-wheel    build the wheel, run the demo from it outside the checkout"
+	@echo "make test-minimal  pytest with nothing but the runtime: no torch, no onnx, no matplotlib"
+	@echo "make clean         remove the environments and whatever else is made here"
+
+demo: .venv/installed
+	$(BIN)/edgeperc demo --out demo
+
+test: check test-full test-wheel test-minimal
+
+check: .venv-test/installed
+	$(TEST)/ruff check .
+	$(TEST)/ruff format --check .
+	$(TEST)/mypy
+
+test-full: .venv-test/installed
+	$(TEST)/pytest -n $(JOBS)
+
+test-wheel: .venv-test/installed
+	PYTHON=$(TEST)/python tests/wheel_demo.sh
+
+test-minimal: .venv-minimal/installed
+	$(MINIMAL)/python -c "import importlib.util as u; assert not any(map(u.find_spec, ['torch', 'onnx', 'matplotlib']))"
+	$(MINIMAL)/pytest -n $(JOBS)
+
+# The stamp inside each environment is as new as what it was installed from, so a second `make` installs nothing.
+.venv/installed: pyproject.toml
+	$(call environment,.venv)
+	$(BIN)/pip install --quiet --editable '.[cpu,view]'
+	@touch $@
+
+.venv-test/installed: pyproject.toml constraints.txt
+	$(call environment,.venv-test)
+	$(TEST)/pip install --quiet --constraint constraints.txt --editable '.[cpu,openvino,view,export,test]'
+	@touch $@
+
+.venv-minimal/installed: pyproject.toml constraints.txt
+	$(call environment,.venv-minimal)
+	$(MINIMAL)/pip install --quiet --constraint constraints.txt --editable '.[cpu]' \
+		filelock hypothesis pytest pytest-xdist shapely
+	@touch $@
+
+define environment
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and \
+		f"edgeperc needs Python 3.10 or newer and $(PYTHON) is {sys.version.split()[0]}. Run: make PYTHON=python3.12 $(MAKECMDGOALS)")'
+	rm -rf $(1)
+	$(PYTHON) -m venv $(1)
+endef
+
+clean:
+	rm -rf .venv .venv-test .venv-minimal build dist demo *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find bench edgeperc export models tests -name __pycache__ -type d -exec rm -rf {} +

@@ -1,0 +1,1 @@
+"""Measure edgeperc's latency on the hardware at hand."""

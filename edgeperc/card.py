@@ -1,0 +1,331 @@
+"""ModelCard: what an .onnx says about itself. The only reader and writer of the card's JSON.
+
+A card lives in the model file, under one ``metadata_props`` key, so that geometry, normalisation and classes can
+never be separated from the weights they belong to.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from .errors import CardError
+
+__all__ = ["CARD_KEY", "Golden", "InputSpec", "ModelCard", "OutputSpec", "RangeImageGeometry", "TopViewGeometry"]
+
+CARD_KEY = "edgeperc.card"
+SCHEMA = 1
+OUTPUT_KINDS = ("class_logits", "class_probabilities", "box_slots", "box_dense")
+CHANNELS = {
+    "top_view": ("distance", "remission", "height"),
+    "range_image": ("x", "y", "z", "remission", "range"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class TopViewGeometry:
+    """The ground ahead as an image (SSADNet 2.1.2). Row 0 is farthest ahead, column 0 leftmost.
+
+    Attributes
+    ----------
+    x_range_m, y_range_m, z_range_m : tuple of 2 float
+        Bounds of the view [m] in the sensor frame, lower first.
+    cell_m : float
+        Edge of a cell [m].
+    """
+
+    x_range_m: tuple[float, float] = (6.0, 46.0)
+    y_range_m: tuple[float, float] = (-10.0, 10.0)
+    z_range_m: tuple[float, float] = (-2.5, 2.5)
+    cell_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("x_range_m", "y_range_m", "z_range_m"):
+            low, high = getattr(self, name)
+            if not (math.isfinite(low) and math.isfinite(high) and low < high):
+                raise CardError(f"view.{name} is {(low, high)}; expected two finite numbers, the lower first")
+        if not (math.isfinite(self.cell_m) and self.cell_m > 0.0):
+            raise CardError(f"view.cell_m is {self.cell_m}; expected a positive number of metres")
+
+    @property
+    def kind(self) -> str:
+        return "top_view"
+
+    @property
+    def height(self) -> int:
+        """Rows, along x."""
+        return round((self.x_range_m[1] - self.x_range_m[0]) / self.cell_m)
+
+    @property
+    def width(self) -> int:
+        """Columns, along y."""
+        return round((self.y_range_m[1] - self.y_range_m[0]) / self.cell_m)
+
+
+@dataclass(frozen=True, slots=True)
+class RangeImageGeometry:
+    """The scan as seen from the sensor (PointSeg 3.1). Row 0 is the top beam, column 0 leftmost.
+
+    Attributes
+    ----------
+    row_elevations_deg : tuple of float
+        Elevation of every row [deg], top to bottom, strictly decreasing. Uneven beams are welcome.
+    width : int
+        Columns, evenly spread over the azimuths.
+    azimuth_left_deg, azimuth_right_deg : float
+        Azimuths of the image's left and right edges [deg], counter-clockwise from +x; 180 and -180 for a full turn.
+    """
+
+    row_elevations_deg: tuple[float, ...]
+    width: int = 512
+    azimuth_left_deg: float = 45.0
+    azimuth_right_deg: float = -45.0
+
+    def __post_init__(self) -> None:
+        rows = self.row_elevations_deg
+        falling = all(a > b for a, b in zip(rows, rows[1:], strict=False))
+        if len(rows) < 2 or not falling or not all(-90.0 < e < 90.0 for e in rows):
+            raise CardError(
+                f"view.row_elevations_deg holds {len(rows)} values; expected two or more, strictly decreasing, "
+                "between -90 and 90 degrees"
+            )
+        if self.width < 1:
+            raise CardError(f"view.width is {self.width}; expected at least one column")
+        if not -180.0 <= self.azimuth_right_deg < self.azimuth_left_deg <= 180.0:
+            raise CardError(
+                f"view azimuths are left {self.azimuth_left_deg}, right {self.azimuth_right_deg}; "
+                "expected -180 <= right < left <= 180"
+            )
+
+    @property
+    def kind(self) -> str:
+        return "range_image"
+
+    @property
+    def height(self) -> int:
+        """Rows, one a beam."""
+        return len(self.row_elevations_deg)
+
+
+@dataclass(frozen=True, slots=True)
+class InputSpec:
+    """The network's input: ``(raw - mean) / std`` per channel, 0 in every channel where nothing returned."""
+
+    name: str
+    channels: tuple[str, ...]
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if not len(self.channels) == len(self.mean) == len(self.std) or not self.channels:
+            raise CardError(
+                f"input has {len(self.channels)} channels, {len(self.mean)} means and {len(self.std)} standard "
+                "deviations; expected as many of each, at least one"
+            )
+        if not all(math.isfinite(v) for v in self.mean) or not all(math.isfinite(v) and v > 0 for v in self.std):
+            raise CardError(f"input mean {self.mean}, std {self.std}; expected finite means and positive deviations")
+
+
+@dataclass(frozen=True, slots=True)
+class OutputSpec:
+    """One output of the graph; ``kind`` picks the function in ``decode.py`` that reads it."""
+
+    name: str
+    kind: str
+
+    def __post_init__(self) -> None:
+        if self.kind not in OUTPUT_KINDS:
+            raise CardError(f"output {self.name!r} is of kind {self.kind!r}; expected one of {', '.join(OUTPUT_KINDS)}")
+
+
+@dataclass(frozen=True, slots=True)
+class Golden:
+    """A known input and what the exporting computer answered to it.
+
+    The input is uniform noise in -1..1 from ``numpy.random.PCG64(seed)``. At samples of every output
+    (flat positions) the answers are kept, so that any runtime can be held against the exporter's.
+
+    Attributes
+    ----------
+    seed : int
+    input_sha256 : str
+        Of the input's bytes, float32, C order.
+    outputs : mapping
+        Output name to ``{"sha256": str, "std": float, "positions": [int], "values": [float]}``.
+    """
+
+    seed: int
+    input_sha256: str
+    outputs: Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class ModelCard:
+    """What a model is, how its input is made and what its outputs mean.
+
+    Attributes
+    ----------
+    name, version : str
+    view : TopViewGeometry or RangeImageGeometry
+    input : InputSpec
+    outputs : tuple of OutputSpec
+    classes : tuple of str
+        Index 0 is the background.
+    box_classes : tuple of str
+        Classes that boxes may have; a subset of ``classes``.
+    box_size_priors : mapping
+        Class to usual (length, width, height) [m], for heads that do not measure all three.
+    score_threshold, nms_iou : float
+        Defaults for boxes.
+    mount_height_m : float
+        Height of the training sensor above the road [m].
+    fitness : mapping or None
+        What the training scans looked like (`edgeperc.sensors.FitnessProfile`), or None where nobody measured.
+    training : mapping
+        Data, licence, recipe, seed, frames' hashes: whatever whoever trained it says of it.
+    metrics : mapping
+        Measured figures.
+    parity : mapping
+        How far the exported graph was from the network it was made of.
+    golden : Golden or None
+    """
+
+    name: str
+    version: str
+    view: TopViewGeometry | RangeImageGeometry
+    input: InputSpec
+    outputs: tuple[OutputSpec, ...]
+    classes: tuple[str, ...]
+    box_classes: tuple[str, ...] = ()
+    box_size_priors: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    score_threshold: float = 0.3
+    nms_iou: float = 0.2
+    mount_height_m: float = 1.73
+    fitness: Mapping[str, Any] | None = None
+    training: Mapping[str, Any] = field(default_factory=dict)
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+    parity: Mapping[str, Any] = field(default_factory=dict)
+    golden: Golden | None = None
+
+    def __post_init__(self) -> None:
+        if not self.name or not self.version:
+            raise CardError(f"name {self.name!r}, version {self.version!r}; expected both to be non-empty strings")
+        if not 2 <= len(self.classes) <= 255 or len(set(self.classes)) != len(self.classes):
+            raise CardError(f"classes {self.classes}; expected 2 to 255 different names, the background first")
+        unknown = [c for c in self.input.channels if c not in CHANNELS[self.view.kind]]
+        if unknown:
+            raise CardError(
+                f"input channels {unknown} are unknown to a {self.view.kind}; "
+                f"expected some of {', '.join(CHANNELS[self.view.kind])}"
+            )
+        kinds = [o.kind for o in self.outputs]
+        if sum(k.startswith("class_") for k in kinds) != 1 or len(kinds) != len(set(kinds)):
+            raise CardError(f"output kinds {kinds}; expected one class output and at most one of each box kind")
+        if any(k.startswith("box_") for k in kinds):
+            if self.view.kind != "top_view":
+                raise CardError(f"output kinds {kinds} in a {self.view.kind}; boxes need a top_view")
+            if not self.box_classes:
+                raise CardError("a box output without box_classes; expected the classes that boxes may have")
+        strange = [c for c in (*self.box_classes, *self.box_size_priors) if c not in self.classes]
+        if strange:
+            raise CardError(f"box classes {strange} are not among the classes {self.classes}")
+        for name in ("score_threshold", "nms_iou"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise CardError(f"{name} is {getattr(self, name)}; expected a number in 0..1")
+
+    def to_json(self) -> str:
+        """Canonical JSON: sorted keys, no blanks, no NaN."""
+        view: dict[str, Any] = {"kind": self.view.kind}
+        view |= {name: getattr(self.view, name) for name in type(self.view).__dataclass_fields__}
+        document = {name: getattr(self, name) for name in type(self).__dataclass_fields__}
+        document |= {
+            "schema": SCHEMA,
+            "view": view,
+            "input": {name: getattr(self.input, name) for name in InputSpec.__dataclass_fields__},
+            "outputs": [{"name": o.name, "kind": o.kind} for o in self.outputs],
+            "golden": self.golden and {n: getattr(self.golden, n) for n in Golden.__dataclass_fields__},
+        }
+        return json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> ModelCard:
+        """Read a card.
+
+        Raises
+        ------
+        CardError
+            No JSON, no schema, a newer schema, or a key missing or malformed. Unknown keys are ignored.
+        """
+        try:
+            document = json.loads(text)
+        except ValueError as exc:
+            raise CardError(f"the card is no JSON ({exc}); export the model again") from exc
+        if not isinstance(document, dict) or not isinstance(document.get("schema"), int):
+            raise CardError("the card has no schema number; export the model again")
+        if document["schema"] != SCHEMA:
+            raise CardError(
+                f"the card has schema {document['schema']}, this edgeperc reads {SCHEMA}; "
+                + ("upgrade edgeperc" if document["schema"] > SCHEMA else "export the model again")
+            )
+        try:
+            return _card(document)
+        except (KeyError, TypeError, ValueError, AttributeError) as exc:
+            raise CardError(f"the card is malformed: {type(exc).__name__} {exc}; export the model again") from exc
+
+
+def _card(document: dict[str, Any]) -> ModelCard:
+    view = dict(document["view"])
+    kind = view.pop("kind")
+    geometry: TopViewGeometry | RangeImageGeometry
+    if kind == "top_view":
+        geometry = TopViewGeometry(
+            x_range_m=_pair(view["x_range_m"]),
+            y_range_m=_pair(view["y_range_m"]),
+            z_range_m=_pair(view["z_range_m"]),
+            cell_m=float(view["cell_m"]),
+        )
+    elif kind == "range_image":
+        geometry = RangeImageGeometry(
+            row_elevations_deg=tuple(float(e) for e in view["row_elevations_deg"]),
+            width=int(view["width"]),
+            azimuth_left_deg=float(view["azimuth_left_deg"]),
+            azimuth_right_deg=float(view["azimuth_right_deg"]),
+        )
+    else:
+        raise CardError(f"view.kind is {kind!r}; expected top_view or range_image")
+    fitness, golden = document["fitness"], document["golden"]
+    return ModelCard(
+        name=str(document["name"]),
+        version=str(document["version"]),
+        view=geometry,
+        input=InputSpec(
+            name=str(document["input"]["name"]),
+            channels=tuple(str(c) for c in document["input"]["channels"]),
+            mean=tuple(float(v) for v in document["input"]["mean"]),
+            std=tuple(float(v) for v in document["input"]["std"]),
+        ),
+        outputs=tuple(OutputSpec(name=str(o["name"]), kind=str(o["kind"])) for o in document["outputs"]),
+        classes=tuple(str(c) for c in document["classes"]),
+        box_classes=tuple(str(c) for c in document["box_classes"]),
+        box_size_priors={
+            str(c): (float(s[0]), float(s[1]), float(s[2])) for c, s in document["box_size_priors"].items()
+        },
+        score_threshold=float(document["score_threshold"]),
+        nms_iou=float(document["nms_iou"]),
+        mount_height_m=float(document["mount_height_m"]),
+        fitness=None if fitness is None else dict(fitness),
+        training=dict(document["training"]),
+        metrics=dict(document["metrics"]),
+        parity=dict(document["parity"]),
+        golden=None
+        if golden is None
+        else Golden(int(golden["seed"]), str(golden["input_sha256"]), dict(golden["outputs"])),
+    )
+
+
+def _pair(values: Any) -> tuple[float, float]:
+    low, high = values
+    return float(low), float(high)

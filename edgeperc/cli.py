@@ -1,0 +1,347 @@
+"""The ``edgeperc`` command: ``demo``, ``run`` and ``info``.
+
+Exit codes: 0 all is well, 1 some scans failed (each is reported, the others are done), 2 nothing could be done
+(usage, model, provider, a missing extra), 130 interrupted, 141 the reader of the output went away.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import sys
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from . import __version__
+from .errors import EdgepercError, MissingExtraError, ModelError, PointsError
+
+# What takes long to import (numba's kernels, onnxruntime, matplotlib) is imported where a command needs it.
+if TYPE_CHECKING:
+    from .perceiver import Perceiver
+    from .perception import Perception
+
+__all__ = ["main"]
+
+SHIPPED = ("ssadnet", "pointseg")
+SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
+DEMO_SEED = 7
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments without the program's name; by default those of this process.
+
+    Returns
+    -------
+    code : int
+        The exit code; wrong usage leaves by argparse's ``SystemExit(2)``.
+    """
+    arguments = _parser().parse_args(argv)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            code: int = arguments.command(arguments)
+            sys.stdout.flush()
+            return code
+    except EdgepercError as exc:
+        _complain(exc)
+        return 2
+    except BrokenPipeError:
+        # Python flushes stdout once more on its way out, and would complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except OSError as exc:
+        _complain(exc)
+        return 2
+    except KeyboardInterrupt:
+        _complain("interrupted")
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="edgeperc", description="A LiDAR scan in, perception out: drivable area, boxes, a class for every point."
+    )
+    parser.add_argument("--version", action="version", version=f"edgeperc {__version__}")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    sensing = argparse.ArgumentParser(add_help=False)
+    sensing.add_argument("--sensor", default="hdl-64e", metavar="NAME", help="what took the scans (default: hdl-64e)")
+    running = argparse.ArgumentParser(add_help=False)
+    running.add_argument(
+        "--model",
+        action="append",
+        metavar="NAME",
+        help=f"a shipped model or an .onnx with a card; may be repeated (default: {' and '.join(SHIPPED)})",
+    )
+    running.add_argument("--provider", default="auto", metavar="P", help="cpu, openvino, cuda, ... (default: auto)")
+    running.add_argument("--threads", type=_positive, metavar="N", help="threads inside a model (default: its choice)")
+
+    demo = commands.add_parser("demo", parents=[running], help="perceive the bundled scene: a table and a picture")
+    demo.add_argument("--out", type=Path, default=Path("edgeperc-demo"), metavar="DIR", help="default: edgeperc-demo")
+    demo.set_defaults(command=_demo)
+
+    run = commands.add_parser(
+        "run",
+        parents=[sensing, running],
+        help="perceive scans",
+        description="Perceive scans: a line each on the terminal, and the files asked for in DIR.",
+    )
+    run.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="scans, or folders of scans")
+    run.add_argument("--out", type=Path, metavar="DIR", help="where files go; NAME.png and so on")
+    run.add_argument("--json", action="store_true", help="one JSON object a scan on the output, and nothing else there")
+    run.add_argument("--png", action="store_true", help="a picture of each scan (needs the extra 'view')")
+    run.add_argument("--html", action="store_true", help="a page with the labelled points in 3-D, for a browser")
+    run.add_argument("--labels", action="store_true", help="NAME.label: a uint32 a point, SemanticKITTI's layout")
+    run.add_argument("--ply", action="store_true", help="the points with their labels and colours")
+    run.add_argument(
+        "--on-mismatch",
+        choices=("warn", "raise", "ignore"),
+        default="warn",
+        help="a scan unlike those a model was trained on: warn, fail that scan, or say nothing (default: warn)",
+    )
+    run.set_defaults(command=_run, usage_error=run.error)
+
+    info = commands.add_parser(
+        "info",
+        parents=[sensing],
+        help="what a model is; what a scan looks like and which models it suits",
+    )
+    info.add_argument("things", nargs="+", metavar="MODEL|SCAN", help="a shipped model's name, an .onnx, or a scan")
+    info.set_defaults(command=_info)
+    return parser
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is no number of threads; expected 1 or more")
+    return value
+
+
+def _one_line(words: object) -> str:
+    return " ".join(str(words).split())
+
+
+def _complain(words: object) -> None:
+    print(f"edgeperc: {_one_line(words)}", file=sys.stderr)
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    _complain(f"warning: {message}")
+
+
+def _perceiver(arguments: argparse.Namespace, sensor: str, on_mismatch: str) -> Perceiver:
+    from .perceiver import Perceiver
+
+    return Perceiver(
+        arguments.model or list(SHIPPED),
+        sensor=sensor,
+        provider=arguments.provider,
+        n_threads=arguments.threads,
+        on_mismatch=on_mismatch,
+    )
+
+
+# run
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    kinds = [kind for kind in ("png", "html", "labels", "ply") if getattr(arguments, kind)]
+    if kinds and arguments.out is None:
+        arguments.usage_error(f"--{kinds[0]} writes files; add --out DIR")
+    if arguments.out is not None and not kinds:
+        arguments.usage_error("--out DIR without anything to write; add --png, --html, --labels or --ply")
+    if arguments.png:
+        _require_matplotlib()
+    scans, empty = _find_scans(arguments.paths)
+    targets = [arguments.out / name for name in _output_names(scans)] if kinds else [Path()] * len(scans)
+    files = [{kind: _file_of(target, kind) for kind in kinds} for target in targets]
+    sources = {os.path.realpath(scan) for scan in scans}
+    for file in (file for of_scan in files for file in of_scan.values()):
+        if os.path.realpath(file) in sources:
+            arguments.usage_error(f"{file} is one of the scans and would be overwritten; choose another --out")
+
+    perceive = _perceiver(arguments, arguments.sensor, arguments.on_mismatch)
+    if (arguments.labels or arguments.ply) and not any(card.view.kind == "range_image" for card in perceive.cards):
+        raise ModelError("--labels and --ply need a class for every point; add a range-image model: --model pointseg")
+    for target in targets if kinds else ():
+        target.parent.mkdir(parents=True, exist_ok=True)
+
+    progress = _Progress(len(scans))
+    n_failed = 0
+
+    def fail(source: Path, error: Exception) -> None:
+        nonlocal n_failed
+        n_failed += 1
+        progress.clear()
+        _complain(f"{source}: {str(error).removeprefix(f'{source}: ')}")
+        if arguments.json:
+            print(json.dumps({"scan": str(source), "error": _one_line(error)}), flush=True)
+
+    for folder in empty:
+        fail(folder, PointsError(f"no scan in this folder; expected {', '.join(SCAN_SUFFIXES)}"))
+    started = time.perf_counter()
+    for done, (scan, wanted) in enumerate(zip(scans, files, strict=True), start=1):
+        try:
+            perception = _perceive_file(perceive, scan, wanted)
+        except MissingExtraError:
+            raise
+        except (EdgepercError, OSError) as exc:
+            fail(scan, exc)
+        else:
+            progress.clear()
+            if arguments.json:
+                print(json.dumps({"scan": str(scan), **_record(perception)}, allow_nan=False), flush=True)
+            else:
+                print(f"{scan}  {_summary(perception)}", flush=True)
+        progress.show(done)
+    progress.clear()
+    if len(scans) > 1:
+        each_ms = 1e3 * (time.perf_counter() - started) / len(scans)
+        print(f"{len(scans)} scans, {n_failed} failed, {each_ms:.0f} ms a scan with files", file=sys.stderr)
+    return 1 if n_failed else 0
+
+
+def _require_matplotlib() -> None:
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as exc:
+        raise MissingExtraError("matplotlib", "view", "Drawing a picture") from exc
+
+
+def _find_scans(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Scans in the order given, folders opened and sorted, none twice; and the folders that hold none."""
+    scans: dict[str, Path] = {}
+    empty = []
+    for path in paths:
+        found = [path]
+        if path.is_dir():
+            found = sorted(
+                entry
+                for entry in path.iterdir()
+                if entry.suffix.lower() in SCAN_SUFFIXES and not entry.name.startswith(".") and entry.is_file()
+            )
+            if not found:
+                empty.append(path)
+        for scan in found:
+            scans.setdefault(_absolute(scan), scan)
+    return list(scans.values()), empty
+
+
+def _output_names(scans: Sequence[Path]) -> list[Path]:
+    """A name for each scan's files: its own, with as many folders before it as tell all scans apart."""
+    parts = [Path(_absolute(scan)).parts[1:] for scan in scans]
+    names: list[Path] = []
+    for depth in range(1, max(map(len, parts), default=0) + 1):
+        names = [Path(*of_scan[-depth:]) for of_scan in parts]
+        if _all_differ(names):
+            break
+    bare = [name.with_name(re.sub(r"(?i)(\.pcd)?\.[^.]+$", "", name.name) or name.name) for name in names]
+    return bare if _all_differ(bare) else names
+
+
+def _absolute(path: Path) -> str:
+    return os.path.abspath(path)  # noqa: PTH100 - resolve() follows links, and a linked scan keeps its name
+
+
+def _all_differ(names: Sequence[Path]) -> bool:
+    # Some file systems take A and a for the same.
+    return len({str(name).casefold() for name in names}) == len(names)
+
+
+def _file_of(target: Path, kind: str) -> Path:
+    return target.with_name(f"{target.name}.{'label' if kind == 'labels' else kind}")
+
+
+def _perceive_file(perceive: Perceiver, scan: Path, wanted: Mapping[str, Path]) -> Perception:
+    from . import view
+    from .points import read_points
+
+    points = read_points(scan)
+    perception = perceive(points)
+    if "png" in wanted:
+        view.draw(points, perception, wanted["png"], title=str(scan))
+    if "html" in wanted:
+        view.write_html(points, perception, wanted["html"], title=str(scan))
+    if "labels" in wanted:
+        view.write_labels(perception, wanted["labels"])
+    if "ply" in wanted:
+        view.write_ply(points, perception, wanted["ply"])
+    return perception
+
+
+def _record(perception: Perception) -> dict[str, Any]:
+    """What `run --json` says of a scan. Keys are always all there; null where no model of that kind took part."""
+    return {
+        "n_points": perception.n_points,
+        "n_dropped": perception.n_dropped,
+        "stage_ms": {name: round(ms, 3) for name, ms in perception.stage_ms.items()},
+        "providers": dict(perception.providers),
+        "boxes": [
+            {
+                "label": box.label,
+                "score": round(float(box.score), 4),
+                "center": [round(float(v), 4) for v in box.center],
+                "size": [round(float(v), 4) for v in box.size],
+                "yaw": round(float(box.yaw), 5),
+            }
+            for box in perception.boxes
+        ],
+        "drivable_area_m2": None if perception.top_view is None else round(perception.top_view.drivable_area_m2, 2),
+        "point_counts": None if perception.points is None else perception.points.counts(),
+        "tracks": [],
+        "fitness": list(perception.fitness),
+    }
+
+
+def _tally(perception: Perception) -> str:
+    if perception.points is None:
+        return ""
+    counts = perception.points.counts()
+    return ", ".join(f"{name} {counts[name]:,}" for name in perception.points.classes[1:])
+
+
+def _summary(perception: Perception) -> str:
+    words = [f"{perception.n_points:,} points", f"{sum(perception.stage_ms.values()):.1f} ms"]
+    if perception.top_view is not None:
+        words.append(f"drivable {perception.top_view.drivable_area_m2:.1f} m2")
+        labels = [box.label for box in perception.boxes]
+        boxes = ", ".join(f"{labels.count(label)} {label}" for label in dict.fromkeys(labels))
+        words.append(f"boxes: {boxes or 'none'}")
+    if perception.points is not None:
+        words.append(f"points: {_tally(perception)}")
+    return "  ".join(words)
+
+
+class _Progress:
+    """A bar on stderr, where that is a terminal and there is more than one scan."""
+
+    def __init__(self, total: int) -> None:
+        self.total = total
+        self.live = total > 1 and sys.stderr.isatty()
+        self.started = time.perf_counter()
+        self.show(0)
+
+    def show(self, done: int) -> None:
+        if not self.live:
+            return
+        left_s = (time.perf_counter() - self.started) / max(done, 1) * (self.total - done)
+        bar = "#" * (30 * done // self.total)
+        words = f", {left_s:.0f} s left" if done else ""
+        sys.stderr.write(f"\r\x1b[K[{bar:<30}] {done}/{self.total}{words}")
+        sys.stderr.flush()
+
+    def clear(self) -> None:
+        if self.live:
+            sys.stderr.write("\r\x1b[K")
+            sys.stderr.flush()

@@ -1,0 +1,81 @@
+"""Every error edgeperc raises on purpose.
+
+::
+
+    EdgepercError
+    ├── PointsError (ValueError)      an array or a sensor file that is no scan
+    ├── SensorError (ValueError)      an unknown or impossible sensor profile
+    ├── FitnessError                  a scan unlike those a model was trained on, and on_mismatch="raise"
+    ├── ModelError
+    │   ├── ModelFileError            missing, or onnxruntime cannot open it
+    │   ├── CardError                 card absent, unreadable or of a newer schema
+    │   └── CardMismatchError         the card and the graph disagree
+    ├── ProviderError                 the execution provider asked for is not there or not active
+    ├── InferenceError                the session failed on a valid tensor
+    └── MissingExtraError (ImportError)   an optional dependency is absent; says which line installs it
+
+Each message says what came, what was expected and what to do about it.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "CardError",
+    "CardMismatchError",
+    "EdgepercError",
+    "FitnessError",
+    "InferenceError",
+    "MissingExtraError",
+    "ModelError",
+    "ModelFileError",
+    "PointsError",
+    "ProviderError",
+    "SensorError",
+]
+
+
+class EdgepercError(Exception):
+    """Root of every error that edgeperc raises on purpose."""
+
+
+class PointsError(EdgepercError, ValueError):
+    """An array or a sensor file is no scan: wrong shape, dtype, fields or length."""
+
+
+class SensorError(EdgepercError, ValueError):
+    """A sensor profile is unknown or describes no possible sensor."""
+
+
+class FitnessError(EdgepercError):
+    """A scan is unlike those the model was trained on, and the caller asked for an error."""
+
+
+class ModelError(EdgepercError):
+    """A model cannot be used."""
+
+
+class ModelFileError(ModelError):
+    """The model file is missing, or onnxruntime cannot open it."""
+
+
+class CardError(ModelError):
+    """The model carries no card, an unreadable one, or one of a newer schema."""
+
+
+class CardMismatchError(ModelError):
+    """The card and the graph disagree on names, shapes or class counts."""
+
+
+class ProviderError(EdgepercError):
+    """The execution provider asked for is not installed or did not become active."""
+
+
+class InferenceError(EdgepercError):
+    """The session failed on a valid input tensor."""
+
+
+class MissingExtraError(EdgepercError, ImportError):
+    """An optional dependency is absent; the message holds the line that installs it."""
+
+    def __init__(self, package: str, extra: str, purpose: str) -> None:
+        super().__init__(f"{purpose} needs {package}, which is not installed. Run: pip install 'edgeperc[{extra}]'")

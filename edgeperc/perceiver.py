@@ -1,0 +1,275 @@
+"""The one file that joins the stages: a scan in, a perception out."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .card import ModelCard, RangeImageGeometry, TopViewGeometry
+from .decode import decode_classes, decode_dense, decode_slots
+from .errors import FitnessError
+from .models import model_path
+from .perception import Box, Perception, PointLabels, TopView
+from .points import as_points
+from .projection import RangeImageProjector, TopViewProjector, make_projector
+from .refine import label_points, remove_outliers
+from .sensors import FitnessProfile, SensorProfile, check_fitness, get_sensor
+from .session import Session
+
+__all__ = ["Perceiver"]
+
+STAGES = ("check", "project", "infer", "decode", "refine")
+# A wrong set-up shows in any scan; a few are looked at, as one may be taken in a tunnel or a depot.
+CHECKED_SCANS = 5
+
+
+class _Stopwatch:
+    """Adds up the wall time of each stage."""
+
+    def __init__(self) -> None:
+        self.ms = dict.fromkeys(STAGES, 0.0)
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.ms[stage] += 1e3 * (now - self._last)
+        self._last = now
+
+
+@dataclass(frozen=True)
+class _Network:
+    session: Session
+    projector: TopViewProjector | RangeImageProjector
+    index: NDArray[np.int32]
+    fitness: FitnessProfile | None
+
+
+class Perceiver:
+    """Turn a LiDAR scan into drivable area, boxes and a class for every point.
+
+    Everything a model needs is read from its card, so a name or a path is enough. Construction loads, checks and warms
+    up. Working buffers are reused between calls; results are yours. One instance answers one call at a time (others
+    wait); for parallel calls make one a thread.
+
+    Parameters
+    ----------
+    models : str, Path or sequence of these
+        Names of shipped models (``"ssadnet"``, ``"pointseg"``) or paths of .onnx files with a card; at most one model
+        a view.
+    sensor : str or SensorProfile
+        Where the points come from; says how raw remissions map to 0..1. See `edgeperc.sensors.SENSORS`.
+    provider : str
+        ``"auto"``, ``"cpu"``, ``"openvino"``, ... A provider asked for is required (`edgeperc.session.PROVIDERS`).
+    n_threads : int or None
+        Threads inside one call; None leaves it to the provider. The answer does not depend on it.
+    on_mismatch : {"warn", "raise", "ignore"}
+        What to do when one of the first scans is unlike those the model was trained on. ``"ignore"`` skips the check.
+    score_threshold : float or None
+        Least score of a box; None takes the card's.
+
+    Attributes
+    ----------
+    cards : tuple of ModelCard
+    providers : mapping
+        What really runs, by model name.
+
+    Raises
+    ------
+    ModelError, ProviderError, SensorError, MissingExtraError
+        From construction only.
+    PointsError, InferenceError, FitnessError
+        From a call.
+
+    Examples
+    --------
+    >>> perceive = Perceiver("pointseg")                        # doctest: +SKIP
+    >>> perception = perceive(read_points("000000.bin"))        # doctest: +SKIP
+    >>> perception.points.labels.shape                          # doctest: +SKIP
+    (123397,)
+    """
+
+    def __init__(
+        self,
+        models: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+        *,
+        sensor: str | SensorProfile = "hdl-64e",
+        provider: str = "auto",
+        n_threads: int | None = None,
+        on_mismatch: Literal["warn", "raise", "ignore"] = "warn",
+        score_threshold: float | None = None,
+    ) -> None:
+        if on_mismatch not in ("warn", "raise", "ignore"):
+            raise ValueError(f"on_mismatch is {on_mismatch!r}; expected warn, raise or ignore")
+        if score_threshold is not None and not 0.0 <= score_threshold <= 1.0:
+            raise ValueError(f"score_threshold is {score_threshold}; expected a number in 0..1")
+        self.sensor = get_sensor(sensor)
+        self.on_mismatch = on_mismatch
+        self.score_threshold = score_threshold
+        given = [models] if isinstance(models, (str, os.PathLike)) else list(models)
+        self._networks = [self._load(_resolve(m), provider, n_threads) for m in given]
+        views = [n.session.card.view.kind for n in self._networks]
+        if not views or len(views) != len(set(views)):
+            raise ValueError(f"models {[str(m) for m in given]} have views {views}; expected one or two, at most one a view")
+        self.cards: tuple[ModelCard, ...] = tuple(n.session.card for n in self._networks)
+        self.providers = MappingProxyType({n.session.card.name: n.session.provider for n in self._networks})
+        self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
+        self._lock = threading.Lock()
+        # The first call would compile the kernels; a scan of two points, one in every view, gets that over with here.
+        self._perceive(np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32), None, check=False)
+
+    @staticmethod
+    def _load(path: Path, provider: str, n_threads: int | None) -> _Network:
+        session = Session(path, provider, n_threads)
+        card = session.card
+        return _Network(
+            session=session,
+            projector=make_projector(card.view, card.input),
+            index=np.empty((card.view.height, card.view.width), np.int32),
+            fitness=None if card.fitness is None else FitnessProfile.from_dict(card.fitness),
+        )
+
+    def __call__(self, points: ArrayLike, stamp_s: float | None = None) -> Perception:
+        """Perceive one scan.
+
+        Parameters
+        ----------
+        points : (n, 4) or (n, 3) array_like, or a structured array
+            x, y, z [m] in the sensor frame, remission in the sensor's raw unit. Left unchanged. Rows that are not
+            finite are counted, labelled 0 and otherwise ignored; an empty scan gives an empty perception.
+        stamp_s : float or None
+            Passed through.
+        """
+        scan = as_points(points)
+        with self._lock:
+            check = self._to_check > 0 and len(scan) > 0
+            self._to_check -= check
+            perception = self._perceive(scan, stamp_s, check)
+        if perception.fitness and self.on_mismatch == "raise":
+            raise FitnessError("; ".join(perception.fitness))
+        for sentence in perception.fitness:
+            warnings.warn(sentence, stacklevel=2)
+        return perception
+
+    def _perceive(self, scan: NDArray[np.float32], stamp_s: float | None, check: bool) -> Perception:
+        watch = _Stopwatch()
+        n_dropped = len(scan) - int(np.count_nonzero(np.isfinite(scan).all(axis=1)))
+        fitness = self._check(scan) if check else ()
+        watch.lap("check")
+        points: PointLabels | None = None
+        top_view: TopView | None = None
+        boxes: tuple[Box, ...] = ()
+        for network in self._networks:
+            if isinstance(network.session.card.view, TopViewGeometry):
+                top_view, boxes = self._see_from_above(network, scan, watch)
+            else:
+                points = self._see_from_sensor(network, scan, watch)
+        return Perception(
+            n_points=len(scan),
+            n_dropped=n_dropped,
+            points=points,
+            top_view=top_view,
+            boxes=boxes,
+            stage_ms=MappingProxyType(watch.ms),
+            providers=self.providers,
+            fitness=fitness,
+            stamp_s=stamp_s,
+        )
+
+    def _check(self, scan: NDArray[np.float32]) -> tuple[str, ...]:
+        found: dict[str, None] = {}
+        scaled = scan.copy()
+        scaled[:, 3] = (scaled[:, 3] + np.float32(self.sensor.remission_offset)) * np.float32(
+            self.sensor.remission_scale
+        )
+        for network in self._networks:
+            if network.fitness is not None:
+                found |= dict.fromkeys(check_fitness(scaled, network.fitness, self.sensor))
+        return tuple(found)
+
+    def _project(self, network: _Network, scan: NDArray[np.float32]) -> NDArray[np.int32]:
+        pixel = np.empty(len(scan), np.int32)
+        network.projector.fill(
+            scan,
+            self.sensor.remission_offset,
+            self.sensor.remission_scale,
+            network.session.input,
+            network.index,
+            pixel,
+        )
+        return pixel
+
+    def _see_from_above(
+        self, network: _Network, scan: NDArray[np.float32], watch: _Stopwatch
+    ) -> tuple[TopView, tuple[Box, ...]]:
+        """SSADNet: segmentation map and boxes."""
+        card = network.session.card
+        assert isinstance(card.view, TopViewGeometry)
+        self._project(network, scan)
+        watch.lap("project")
+        outputs = network.session.run()
+        watch.lap("infer")
+        kind = next(k for k in outputs if k.startswith("class_"))
+        labels, scores = decode_classes(outputs[kind], kind, model=card.name)
+        found: list[Box] = []
+        threshold = card.score_threshold if self.score_threshold is None else self.score_threshold
+        if "box_dense" in outputs:
+            found = decode_dense(
+                outputs["box_dense"],
+                outputs[kind],
+                kind,
+                card.view,
+                card.classes,
+                card.box_classes,
+                score_threshold=threshold,
+                iou_threshold=card.nms_iou,
+                model=card.name,
+            )
+        elif "box_slots" in outputs:
+            found = decode_slots(
+                outputs["box_slots"],
+                labels,
+                scores,
+                card.view,
+                card.classes,
+                card.box_classes,
+                card.box_size_priors,
+                card.mount_height_m,
+                model=card.name,
+            )
+            found = [b for b in found if b.score >= threshold]
+        watch.lap("decode")
+        view = TopView(labels, card.classes, card.view.cell_m, card.view.x_range_m, card.view.y_range_m)
+        return view, tuple(found)
+
+    def _see_from_sensor(self, network: _Network, scan: NDArray[np.float32], watch: _Stopwatch) -> PointLabels:
+        """PointSeg: a class for every pixel, carried back to every point and cleaned."""
+        card = network.session.card
+        assert isinstance(card.view, RangeImageGeometry)
+        pixel = self._project(network, scan)
+        watch.lap("project")
+        outputs = network.session.run()
+        watch.lap("infer")
+        ((kind, raw),) = outputs.items()
+        labels, _ = decode_classes(raw, kind, model=card.name)
+        watch.lap("decode")
+        labelled = label_points(scan, pixel, network.index, labels)
+        labelled = remove_outliers(scan, pixel, network.index, labelled)
+        watch.lap("refine")
+        return PointLabels(labelled, pixel >= 0, card.classes)
+
+
+def _resolve(model: str | os.PathLike[str]) -> Path:
+    """A shipped name, or anything that looks like a file, as a path."""
+    if isinstance(model, str) and Path(model).suffix != ".onnx":
+        return model_path(model)
+    return Path(model)

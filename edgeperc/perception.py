@@ -1,0 +1,141 @@
+"""What comes out: frozen results, in the sensor frame (x forward, y left, z up, metres, radians)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Box", "Perception", "PointLabels", "TopView"]
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """An oriented box around one object.
+
+    Attributes
+    ----------
+    label : str
+        Class name, e.g. ``"car"``.
+    score : float
+        Confidence in 0..1.
+    center : tuple of 3 float
+        Middle of the box, x, y, z [m], sensor frame.
+    size : tuple of 3 float
+        Length (along the heading), width, height [m].
+    yaw : float
+        Heading about +z from +x [rad], in -pi..pi.
+    """
+
+    label: str
+    score: float
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    yaw: float
+
+    def corners(self) -> NDArray[np.float64]:
+        """Corners of the footprint, (4, 2) x, y [m]: front-left, rear-left, rear-right, front-right."""
+        along, across = self.size[0] / 2.0, self.size[1] / 2.0
+        local = np.array([[along, across], [-along, across], [-along, -across], [along, -across]])
+        cos, sin = np.cos(self.yaw), np.sin(self.yaw)
+        return local @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(self.center[:2])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TopView:
+    """A class for every cell of the ground ahead (SSADNet 2.1.2, 3.1.2).
+
+    Attributes
+    ----------
+    labels : (rows, columns) uint8
+        Index into ``classes``. Row 0 is farthest ahead, column 0 leftmost.
+    classes : tuple of str
+    cell_m : float
+        Edge of a cell [m].
+    x_range_m, y_range_m : tuple of 2 float
+        Nearest and farthest x, rightmost and leftmost y [m].
+    """
+
+    labels: NDArray[np.uint8]
+    classes: tuple[str, ...]
+    cell_m: float
+    x_range_m: tuple[float, float]
+    y_range_m: tuple[float, float]
+
+    @property
+    def drivable(self) -> NDArray[np.bool_]:
+        """Cells labelled drivable, (rows, columns) bool; all False where the model knows no such class."""
+        if "drivable" not in self.classes:
+            return np.zeros(self.labels.shape, dtype=np.bool_)
+        return self.labels == self.classes.index("drivable")
+
+    @property
+    def drivable_area_m2(self) -> float:
+        """Area of the drivable cells [m2]."""
+        return float(np.count_nonzero(self.drivable)) * self.cell_m**2
+
+    def to_metres(self, row: float, col: float) -> tuple[float, float]:
+        """Centre of a cell as x, y [m] in the sensor frame."""
+        return self.x_range_m[1] - (row + 0.5) * self.cell_m, self.y_range_m[1] - (col + 0.5) * self.cell_m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointLabels:
+    """A class for every input point, in input order.
+
+    Attributes
+    ----------
+    labels : (n,) uint8
+        Index into ``classes``; 0 for points out of the network's view and for points that are not finite.
+    in_view : (n,) bool
+        False where the network could not see the point, so that its 0 is no verdict.
+    classes : tuple of str
+    """
+
+    labels: NDArray[np.uint8]
+    in_view: NDArray[np.bool_]
+    classes: tuple[str, ...]
+
+    def counts(self) -> dict[str, int]:
+        """Number of points in view of each class."""
+        counted = np.bincount(self.labels[self.in_view], minlength=len(self.classes))
+        return {name: int(counted[k]) for k, name in enumerate(self.classes)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Perception:
+    """Everything perceived in one scan.
+
+    Attributes
+    ----------
+    n_points : int
+        Points in the input.
+    n_dropped : int
+        Input points that are not finite; they are labelled 0 and take part in nothing.
+    points : PointLabels or None
+        From a range-image model; None where the Perceiver holds none.
+    top_view : TopView or None
+        From a top-view model; None where the Perceiver holds none.
+    boxes : tuple of Box
+        Best score first.
+    stage_ms : mapping
+        Wall time of ``project``, ``infer``, ``decode``, ``refine`` and ``check`` [ms].
+    providers : mapping
+        What really ran, by model name, e.g. ``"CPUExecutionProvider (fp32)"``.
+    fitness : tuple of str
+        What is unlike the scans the models were trained on, in plain words; empty when nothing is.
+    stamp_s : float or None
+        The time given with the scan [s].
+    """
+
+    n_points: int
+    n_dropped: int
+    points: PointLabels | None
+    top_view: TopView | None
+    boxes: tuple[Box, ...]
+    stage_ms: Mapping[str, float]
+    providers: Mapping[str, str]
+    fitness: tuple[str, ...]
+    stamp_s: float | None

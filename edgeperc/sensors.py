@@ -1,0 +1,223 @@
+"""What a sensor is, and whether a scan is like those a model was trained on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from edgeperc.errors import SensorError
+
+__all__ = ["SENSORS", "SensorProfile", "get_sensor"]
+
+
+@dataclass(frozen=True)
+class SensorProfile:
+    """A spinning LiDAR, as far as the networks care.
+
+    A built-in one (`SENSORS`) fits one usual set-up of its model; change what differs with ``dataclasses.replace``,
+    e.g. ``replace(get_sensor("os1-64"), remission_range=(0, 65535), mount_height_m=2.1)`` for an Ouster whose 16-bit
+    signal is used instead of its 8-bit reflectivity. A sensor that is not built in is written down with
+    ``SensorProfile(...)``, or `SensorProfile.uniform` where the beams are evenly spaced.
+
+    Attributes
+    ----------
+    name : str
+    elevations_deg : tuple of float
+        Elevation of each beam, strictly decreasing from the top beam to the bottom one, up positive.
+    columns : int
+        Azimuth steps in one turn.
+    remission_range : tuple of 2 float
+        Raw values of the sensor's fourth channel that mean 0 and 1 to a network.
+    mount_height_m : float
+        Height of the sensor above the road.
+    min_range_m, max_range_m : float
+        Nearest and farthest return to expect.
+
+    Raises
+    ------
+    SensorError
+        When the values describe no possible sensor.
+    """
+
+    name: str
+    elevations_deg: tuple[float, ...]
+    columns: int
+    remission_range: tuple[float, float] = (0.0, 1.0)
+    mount_height_m: float = 1.73
+    min_range_m: float = 0.9
+    max_range_m: float = 120.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise SensorError(f"a sensor's name is a non-empty str, got {self.name!r}")
+        try:
+            object.__setattr__(self, "elevations_deg", tuple(float(e) for e in self.elevations_deg))
+            object.__setattr__(self, "remission_range", tuple(float(v) for v in self.remission_range))
+            for field in ("mount_height_m", "min_range_m", "max_range_m"):
+                object.__setattr__(self, field, float(getattr(self, field)))
+            columns_are_whole = int(self.columns) == self.columns
+            object.__setattr__(self, "columns", int(self.columns))
+        except (TypeError, ValueError, OverflowError) as exc:
+            raise SensorError(f"sensor {self.name!r}: a value is no number ({exc})") from exc
+        if not self.elevations_deg or not all(-90.0 < e < 90.0 for e in self.elevations_deg):
+            raise SensorError(f"sensor {self.name!r}: elevations_deg needs one angle a beam, between -90 and 90")
+        if any(upper <= lower for upper, lower in zip(self.elevations_deg, self.elevations_deg[1:], strict=False)):
+            raise SensorError(f"sensor {self.name!r}: elevations_deg must strictly decrease, from the top beam down")
+        if not columns_are_whole or self.columns < 1:
+            raise SensorError(f"sensor {self.name!r}: columns is a whole number of at least 1, got {self.columns!r}")
+        if len(self.remission_range) != 2 or not 0.0 < self.remission_range[1] - self.remission_range[0] < math.inf:
+            raise SensorError(
+                f"sensor {self.name!r}: remission_range is (lowest, highest) raw value, such as (0, 255), "
+                f"got {self.remission_range!r}"
+            )
+        if not 0.0 < self.mount_height_m < math.inf:
+            raise SensorError(f"sensor {self.name!r}: mount_height_m must be above 0, got {self.mount_height_m!r}")
+        if not 0.0 <= self.min_range_m < self.max_range_m < math.inf:
+            raise SensorError(
+                f"sensor {self.name!r}: 0 <= min_range_m < max_range_m must hold, "
+                f"got {self.min_range_m!r} and {self.max_range_m!r}"
+            )
+
+    @classmethod
+    def uniform(
+        cls,
+        name: str,
+        n_beams: int,
+        fov_up_deg: float,
+        fov_down_deg: float,
+        *,
+        columns: int = 1800,
+        remission_range: tuple[float, float] = (0.0, 1.0),
+        mount_height_m: float = 1.73,
+        min_range_m: float = 0.9,
+        max_range_m: float = 120.0,
+    ) -> SensorProfile:
+        """A sensor with evenly spaced beams, the top one at ``fov_up_deg``, the bottom one at ``fov_down_deg``."""
+        if isinstance(n_beams, bool) or not isinstance(n_beams, int | np.integer) or not 1 <= n_beams <= 4096:
+            raise SensorError(f"sensor {name!r}: n_beams is a whole number in 1..4096, got {n_beams!r}")
+        if not math.isfinite(fov_up_deg) or not math.isfinite(fov_down_deg):
+            raise SensorError(f"sensor {name!r}: fov_up_deg and fov_down_deg must be finite")
+        return cls(
+            name,
+            # Rounded, so that a card holds 2.3 and not 2.3000000000000003.
+            tuple(round(float(e), 4) for e in np.linspace(fov_up_deg, fov_down_deg, int(n_beams))),
+            columns,
+            remission_range,
+            mount_height_m,
+            min_range_m,
+            max_range_m,
+        )
+
+    @property
+    def n_beams(self) -> int:
+        return len(self.elevations_deg)
+
+    @property
+    def fov_up_deg(self) -> float:
+        """Elevation of the top beam."""
+        return self.elevations_deg[0]
+
+    @property
+    def fov_down_deg(self) -> float:
+        """Elevation of the bottom beam."""
+        return self.elevations_deg[-1]
+
+    @property
+    def azimuth_resolution_deg(self) -> float:
+        return 360.0 / self.columns
+
+    @property
+    def remission_offset(self) -> float:
+        """``(raw + remission_offset) * remission_scale`` lies in 0..1."""
+        return -self.remission_range[0]
+
+    @property
+    def remission_scale(self) -> float:
+        """See `remission_offset`."""
+        return 1.0 / (self.remission_range[1] - self.remission_range[0])
+
+
+# Median elevation of each laser's returns seen from the origin, over 77 KITTI scans of 15 drives; every scan's order
+# gives its lasers away. The unit's own angles are 0.6 deg (upper block) to 1.4 deg (bottom laser) lower, as the lasers
+# sit 0.21 and 0.12 m above the origin; S3 calibrations published for other units differ by up to 0.9 deg, and the
+# data sheet (2 .. -8.33 every 1/3, -8.83 .. -24.33 every 1/2) by up to 0.7 deg.
+_HDL_64E = (
+    *(2.54, 2.17, 1.92, 1.46, 1.21, 0.79, 0.53, 0.15, -0.19, -0.59, -0.88, -1.22, -1.59, -1.93, -2.26, -2.61),
+    *(-2.90, -3.27, -3.53, -3.91, -4.20, -4.55, -4.86, -5.18, -5.57, -5.88, -6.18, -6.45, -6.82, -7.17, -7.39, -7.76),
+    *(-8.37, -8.89, -9.36, -9.75, -10.21, -10.81, -11.31, -11.73, -12.18, -12.61, -13.13, -13.65, -14.22, -14.65),
+    *(-15.15, -15.51, -16.12, -16.64, -17.20, -17.65, -18.15, -18.55, -19.01, -19.55, -20.06, -20.66, -21.14, -21.54),
+    *(-21.99, -22.62, -23.14, -23.62),
+)
+# Velodyne's default calibration of the model.
+_VLP_32C = (
+    *(15.0, 10.33, 7.0, 4.67, 3.33, 2.33, 1.67, 1.33, 1.0, 0.67, 0.33, 0.0, -0.33, -0.67, -1.0, -1.33, -1.67, -2.0),
+    *(-2.33, -2.67, -3.0, -3.33, -3.67, -4.0, -4.67, -5.33, -6.15, -7.25, -8.84, -11.31, -15.64, -25.0),
+)
+# Hesai's Pandar64 manual, appendix "Channel distribution".
+_PANDAR_64 = (
+    *(14.88, 11.03, 8.06, 5.06, 3.04, 2.03, 1.86, 1.69, 1.52, 1.35, 1.18, 1.01, 0.85, 0.68, 0.51, 0.34, 0.17, 0.0),
+    *(-0.17, -0.34, -0.51, -0.68, -0.85, -1.01, -1.18, -1.35, -1.52, -1.69, -1.86, -2.03, -2.20, -2.37, -2.54, -2.70),
+    *(-2.87, -3.04, -3.21, -3.38, -3.55, -3.71, -3.88, -4.05, -4.22, -4.39, -4.56, -4.72, -4.89, -5.06, -5.23, -5.39),
+    *(-5.57, -5.73, -5.90, -6.06, -7.06, -8.06, -9.06, -9.89, -11.03, -12.01, -12.97, -13.93, -18.89, -24.90),
+)
+
+
+def _ouster(model: str, half_fov_deg: float, min_range_m: float, max_range_m: float) -> tuple[SensorProfile, ...]:
+    # Nominal field of view of the data sheets; single units were calibrated up to 1.3 deg off it. 8-bit reflectivity.
+    return tuple(
+        SensorProfile.uniform(
+            f"{model}-{beams}",
+            beams,
+            half_fov_deg,
+            -half_fov_deg,
+            columns=1024,
+            remission_range=(0.0, 255.0),
+            min_range_m=min_range_m,
+            max_range_m=max_range_m,
+        )
+        for beams in (32, 64, 128)
+    )
+
+
+_BYTE = (0.0, 255.0)
+_BUILT_IN = (
+    # KITTI, where a turn has up to 2,160 returns a laser; its files hold remission / 255.
+    SensorProfile("hdl-64e", _HDL_64E, 2083, (0.0, 1.0), 1.73, 0.9, 120.0),
+    # nuScenes (20 Hz, on the roof).
+    SensorProfile.uniform(
+        "hdl-32e", 32, 10.67, -30.67, columns=1084, remission_range=_BYTE, mount_height_m=1.84, max_range_m=105.0
+    ),
+    SensorProfile.uniform("vlp-16", 16, 15.0, -15.0, remission_range=_BYTE, min_range_m=0.5, max_range_m=105.0),
+    SensorProfile("vlp-32c", _VLP_32C, 1800, _BYTE, 1.73, 1.0, 200.0),
+    *_ouster("os0", 45.0, 0.3, 75.0),
+    *_ouster("os1", 22.5 - 1.25, 0.3, 170.0),
+    *_ouster("os2", 11.25, 0.8, 350.0),
+    SensorProfile("pandar64", _PANDAR_64, 1800, _BYTE, 1.73, 0.3, 200.0),
+    SensorProfile.uniform("pandarxt-32", 32, 15.0, -16.0, columns=2000, remission_range=_BYTE, min_range_m=0.05),
+)
+
+SENSORS: Mapping[str, SensorProfile] = MappingProxyType({profile.name: profile for profile in _BUILT_IN})
+"""The built-in profiles by name."""
+
+
+def get_sensor(sensor: str | SensorProfile) -> SensorProfile:
+    """The built-in profile of that name, or the profile itself.
+
+    Raises
+    ------
+    SensorError
+        When no built-in profile has that name.
+    """
+    if isinstance(sensor, SensorProfile):
+        return sensor
+    try:
+        return SENSORS[sensor]
+    except (KeyError, TypeError):
+        raise SensorError(
+            f"no sensor {sensor!r} is built in; known are {', '.join(SENSORS)}. "
+            "Write down another with SensorProfile(...) or SensorProfile.uniform(...)."
+        ) from None

@@ -1,0 +1,303 @@
+"""Network input to raw outputs; the only importer of onnxruntime.
+
+A provider asked for is required: where it is absent, or would hand part of the graph to another, construction raises
+`ProviderError`. ``"auto"`` takes the first of `AUTO` that this computer has, and says which.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .card import CARD_KEY, ModelCard
+from .errors import (
+    CardError,
+    CardMismatchError,
+    InferenceError,
+    MissingExtraError,
+    ModelFileError,
+    ProviderError,
+)
+
+__all__ = ["PROVIDERS", "Session", "available_providers"]
+
+PROVIDERS: Mapping[str, str] = {
+    "tensorrt-rtx": "NvTensorRTRTXExecutionProvider",
+    "tensorrt": "TensorrtExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "openvino": "OpenVINOExecutionProvider",
+    "coreml": "CoreMLExecutionProvider",
+    "directml": "DmlExecutionProvider",
+    "cpu": "CPUExecutionProvider",
+}
+AUTO = ("cuda", "openvino", "cpu")
+# Providers that come as plugins beside stock onnxruntime: provider, then the package that carries its library.
+PLUGINS = {"openvino": "onnxruntime_ep_openvino", "tensorrt-rtx": "onnxruntime_ep_nv_tensorrt_rtx"}
+PRECISIONS = {"fp32": "f32", "bf16": "bf16", "fp16": "f16"}
+# The key of a tensor's external-data entry as protobuf writes it: such a model would read files beside it, or anywhere.
+EXTERNAL_DATA = b"\n\x08location\x12"
+
+
+def _onnxruntime() -> Any:
+    try:
+        return importlib.import_module("onnxruntime")
+    except ImportError as exc:
+        raise MissingExtraError("onnxruntime", "cpu", "Running a model") from exc
+
+
+def _plugin_devices(ort: Any, short: str) -> list[Any]:
+    """Devices a plugin provider offers here; an empty list where its package is absent or finds none."""
+    if not hasattr(ort, "get_ep_devices"):
+        return []
+    name = PROVIDERS[short]
+
+    def devices() -> list[Any]:
+        return [d for d in ort.get_ep_devices() if d.ep_name == name]
+
+    if not devices():
+        try:
+            library = importlib.import_module(PLUGINS[short]).get_library_path()
+            ort.register_execution_provider_library(name, library)
+        except ImportError:
+            return []
+        except Exception as exc:  # onnxruntime's errors share no base but Exception
+            if "already registered" not in str(exc):
+                raise ProviderError(f"the plugin for provider {short!r} is installed but does not load: {exc}") from exc
+    return devices()
+
+
+def available_providers() -> tuple[str, ...]:
+    """Names that ``Perceiver(provider=...)`` can have on this computer."""
+    ort = _onnxruntime()
+    stock = ort.get_available_providers()
+    return tuple(s for s, name in PROVIDERS.items() if name in stock or (s in PLUGINS and _plugin_devices(ort, s)))
+
+
+class Session:
+    """One network, loaded, checked against its card and warmed up, with buffers of its own.
+
+    Parameters
+    ----------
+    path : Path
+        An .onnx with a card, its weights inside.
+    provider : str
+        ``"auto"``, or a name of `PROVIDERS`, with ``openvino`` optionally followed by a precision:
+        ``"openvino:bf16"``. Without one, networks run in the precision they were exported in.
+    n_threads : int or None
+        Threads inside one run; None leaves it to the provider.
+
+    Attributes
+    ----------
+    card : ModelCard
+    sha256 : str
+        Of the file.
+    provider : str
+        What really runs, e.g. ``"CPUExecutionProvider (fp32)"``.
+    input : (C, H, W) float32
+        Write the network's input here, then `run`.
+    outputs : mapping of str to ndarray
+        By output *kind*, without the batch axis; overwritten by every `run`.
+    golden_deviation : float
+        Largest difference between this computer's answer to the card's golden input and the exporter's, in standard
+        deviations of that output; NaN where the card holds none.
+
+    Raises
+    ------
+    ModelFileError, CardError, CardMismatchError, ProviderError, MissingExtraError
+    """
+
+    def __init__(self, path: Path | str, provider: str = "auto", n_threads: int | None = None) -> None:
+        if n_threads is not None and n_threads < 1:
+            raise ValueError(f"n_threads is {n_threads}; expected at least 1, or None")
+        ort = _onnxruntime()
+        self.path = Path(path)
+        try:
+            blob = self.path.read_bytes()
+        except OSError as exc:
+            raise ModelFileError(f"{self.path} cannot be read: {exc.strerror}") from exc
+        if EXTERNAL_DATA in blob:
+            raise ModelFileError(f"{self.path} keeps weights in other files; export it with its weights inside")
+        self.sha256 = hashlib.sha256(blob).hexdigest()
+        short, precision = self._choose(ort, provider)
+        self._session = self._open(ort, blob, short, precision, n_threads)
+        self.provider = f"{PROVIDERS[short]} ({precision})"
+        text = self._session.get_modelmeta().custom_metadata_map.get(CARD_KEY)
+        if text is None:
+            raise CardError(f"{self.path} carries no card; write one with: edgeperc-export card MODEL --card CARD.json")
+        try:
+            self.card = ModelCard.from_json(text)
+        except CardError as exc:
+            raise CardError(f"{self.path}: {exc}") from exc
+        self._check_graph()
+        self._bind()
+        self.golden_deviation = self._warm_up()
+
+    @staticmethod
+    def _choose(ort: Any, provider: str) -> tuple[str, str]:
+        short, _, precision = provider.partition(":")
+        present = available_providers()
+        if short == "auto":
+            short = next(s for s in AUTO if s in present)
+        if short not in PROVIDERS:
+            raise ProviderError(f"provider {provider!r} is unknown; expected auto or one of {', '.join(PROVIDERS)}")
+        if short not in present:
+            raise ProviderError(
+                f"provider {short!r} is not available on this computer (present: {', '.join(present)}); "
+                "install its onnxruntime build or plugin, or ask for one that is present"
+            )
+        if precision and (short != "openvino" or precision not in PRECISIONS):
+            raise ProviderError(
+                f"provider {provider!r}: only openvino takes a precision, one of {', '.join(PRECISIONS)}"
+            )
+        return short, precision or "fp32"
+
+    def _open(self, ort: Any, blob: bytes, short: str, precision: str, n_threads: int | None) -> Any:
+        options = ort.SessionOptions()
+        options.log_severity_level = 3
+        options.inter_op_num_threads = 1
+        options.use_deterministic_compute = True
+        if n_threads is not None:
+            options.intra_op_num_threads = n_threads
+        if short != "cpu":
+            # Part of a graph on another provider is a fall-back too.
+            options.add_session_config_entry("session.disable_cpu_ep_fallback", "1")
+        plugin = _plugin_devices(ort, short) if short in PLUGINS else []
+        try:
+            if plugin:
+                settings: dict[str, str] = {}
+                if short == "openvino":
+                    cpu = {"INFERENCE_PRECISION_HINT": PRECISIONS[precision]}
+                    if n_threads is not None:
+                        cpu["INFERENCE_NUM_THREADS"] = str(n_threads)
+                    settings["load_config"] = json.dumps({"CPU": cpu})
+                options.add_provider_for_devices(plugin[:1], settings)
+                session = ort.InferenceSession(blob, sess_options=options)
+            else:
+                session = ort.InferenceSession(blob, sess_options=options, providers=[PROVIDERS[short]])
+            session.disable_fallback()
+        except Exception as exc:  # onnxruntime's errors share no base but Exception
+            if short == "cpu":
+                raise ModelFileError(f"{self.path}: onnxruntime {ort.__version__} cannot open it: {exc}") from exc
+            raise ProviderError(f"{self.path}: provider {short!r} cannot run this model: {exc}") from exc
+        active = session.get_providers()
+        if active[0] != PROVIDERS[short]:
+            raise ProviderError(f"{self.path}: asked for {PROVIDERS[short]}, onnxruntime made {active} active")
+        return session
+
+    def _check_graph(self) -> None:
+        card, height, width = self.card, self.card.view.height, self.card.view.width
+        inputs = {i.name: i for i in self._session.get_inputs()}
+        outputs = {o.name: o for o in self._session.get_outputs()}
+        expected_shape = (1, len(card.input.channels), height, width)
+        if list(inputs) != [card.input.name]:
+            raise CardMismatchError(f"{self.path}: card names input {card.input.name!r}, the graph has {list(inputs)}")
+        self._match(card.input.name, inputs[card.input.name], expected_shape)
+        for output in card.outputs:
+            if output.name not in outputs:
+                raise CardMismatchError(
+                    f"{self.path}: card names output {output.name!r}, the graph has {list(outputs)}"
+                )
+            self._match(output.name, outputs[output.name], self._output_shape(output.kind))
+
+    def _output_shape(self, kind: str) -> tuple[int | None, ...]:
+        height, width = self.card.view.height, self.card.view.width
+        if kind == "box_slots":
+            return (1, None, 4)
+        if kind == "box_dense":
+            return (1, 9, height // 4, width // 4)
+        return (1, len(self.card.classes), height, width)
+
+    def _match(self, name: str, node: Any, expected: tuple[int | None, ...]) -> None:
+        shape = tuple(node.shape)
+        # A graph may leave a dimension open (a name, or None); what it then answers is checked by the first run.
+        fits = len(shape) == len(expected) and all(
+            e is None or not isinstance(s, int) or s == e for s, e in zip(shape, expected, strict=True)
+        )
+        if not fits or node.type != "tensor(float)":
+            raise CardMismatchError(
+                f"{self.path}: {name!r} is {node.type} of shape {shape} in the graph; its card says tensor(float) of "
+                f"shape {expected} (None: any)"
+            )
+
+    def _bind(self) -> None:
+        card = self.card
+        batch = np.zeros((1, len(card.input.channels), card.view.height, card.view.width), np.float32)
+        self.input: NDArray[np.float32] = batch[0]
+        first = self._run_unbound(batch)
+        self._binding = self._session.io_binding()
+        self._binding.bind_input(card.input.name, "cpu", 0, np.float32, batch.shape, batch.ctypes.data)
+        self.outputs: dict[str, NDArray[np.float32]] = {}
+        for output, value in zip(card.outputs, first, strict=True):
+            expected = self._output_shape(output.kind)
+            if value.ndim != len(expected) or any(
+                e is not None and s != e for s, e in zip(value.shape, expected, strict=True)
+            ):
+                raise CardMismatchError(
+                    f"{self.path}: {output.name!r} came out with shape {value.shape}, its card says {expected}"
+                )
+            buffer = np.zeros(value.shape, np.float32)
+            self._binding.bind_output(output.name, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
+            self.outputs[output.kind] = buffer[0]
+        self._batch = batch  # the binding holds a bare pointer
+
+    def _run_unbound(self, batch: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+        try:
+            names = [o.name for o in self.card.outputs]
+            answers: list[NDArray[np.float32]] = self._session.run(names, {self.card.input.name: batch})
+        except Exception as exc:  # onnxruntime's errors share no base but Exception
+            raise InferenceError(f"{self.path}: the first run on {self.provider} failed: {exc}") from exc
+        return answers
+
+    def _warm_up(self) -> float:
+        golden = self.card.golden
+        if golden is None:
+            self.run()
+            return float("nan")
+        self.input[:] = golden_input(golden.seed, self._batch.shape)[0]
+        if hashlib.sha256(self._batch.tobytes()).hexdigest() != golden.input_sha256:
+            raise CardMismatchError(f"{self.path}: the golden input made here is not the card's; export the model again")
+        self.run()
+        self.input[:] = 0.0
+        deviation = 0.0
+        for output in self.card.outputs:
+            known = golden.outputs.get(output.name)
+            if known is None:
+                raise CardMismatchError(f"{self.path}: the card's golden record lacks output {output.name!r}")
+            here = self.outputs[output.kind].reshape(-1)[np.asarray(known["positions"], np.int64)]
+            apart = np.abs(here - np.asarray(known["values"], np.float32)) / max(float(known["std"]), 1e-6)
+            deviation = max(deviation, float(np.nanmax(apart)) if np.isfinite(here).all() else float("inf"))
+        # fp32 runtimes were seen to differ by less than 1e-3; a graph or weights that changed differ by more than 1.
+        if deviation > 0.5:
+            raise CardMismatchError(
+                f"{self.path}: on {self.provider} the golden input gives answers {deviation:.2g} standard deviations "
+                "away from the exporter's; the file or the provider has changed the network"
+            )
+        return deviation
+
+    def run(self) -> Mapping[str, NDArray[np.float32]]:
+        """Run the network on `input`; the answer lies in `outputs`, which the next run overwrites.
+
+        Raises
+        ------
+        InferenceError
+        """
+        try:
+            self._session.run_with_iobinding(self._binding)
+        except Exception as exc:  # onnxruntime's errors share no base but Exception
+            raise InferenceError(f"{self.path}: a run on {self.provider} failed: {exc}") from exc
+        return self.outputs
+
+
+def golden_input(seed: int, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """The noise that a card's golden record is about."""
+    # Uniform, and from raw bits: the same bytes on every platform and numpy, which normal() does not promise.
+    bits = np.random.PCG64(seed).random_raw(int(np.prod(shape)))
+    uniform = (bits >> np.uint64(40)).astype(np.float32) / np.float32(2**23) - np.float32(1.0)
+    return uniform.reshape(shape)

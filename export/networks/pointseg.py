@@ -1,0 +1,171 @@
+"""PointSeg: segmentation of a range image (Wang et al., 2018, section 4).
+
+What the paper leaves open, and what is done here:
+
+* Channels are not stated. They follow SqueezeSeg, which PointSeg extends: 64 after the first convolution, 128, 256, 384
+  and 512 in the fire layers; each fire layer squeezes to a quarter of its input (section 4.1).
+* Fire1 stands for SqueezeNet's first convolution, as there; it halves the width, and three poolings halve it again, so
+  that the enlargement layer sees 64 x 32 (section 4.2). Each reweighting closes a resolution: SR-1 before the second
+  pooling, SR-2 before the third, SR-3 before the enlargement layer that stands in for a fourth.
+* Equation 4 with "X = sigmoid(chi)" cannot be meant as printed, as then the two fully connected layers would see no
+  input and the feature map would be lost. As in squeeze-and-excitation (and the paper's Figure 6):
+  Scale = sigmoid(FC(relu(FC(chi)))), Y = X * Scale. The first FC squeezes to a quarter.
+* Each branch of the enlargement layer is 80 wide; "compress to 1/4" is read as a quarter of the layer's input.
+* Convolutions are followed by batch norm, which disappears into them on export.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+__all__ = ["ENLARGEMENT_RATES", "PointSeg"]
+
+ENLARGEMENT_RATES = (6, 9, 12)
+
+
+def conv_bn_relu(
+    c_in: int, c_out: int, kernel: int, *, stride: tuple[int, int] = (1, 1), dilation: int = 1
+) -> nn.Sequential:
+    padding = dilation * (kernel // 2)
+    return nn.Sequential(
+        nn.Conv2d(c_in, c_out, kernel, stride=stride, padding=padding, dilation=dilation, bias=False),
+        nn.BatchNorm2d(c_out),
+        nn.ReLU(),
+    )
+
+
+def pool(x: Tensor) -> Tensor:
+    """Halve the width, never the height (section 4.4)."""
+    return F.max_pool2d(x, 3, stride=(1, 2), padding=1)
+
+
+class Fire(nn.Module):
+    """Squeeze to a quarter, expand by 1x1 and 3x3 (section 4.1; Figure 4, left)."""
+
+    def __init__(self, c_in: int, c_out: int) -> None:
+        super().__init__()
+        self.squeeze = conv_bn_relu(c_in, c_in // 4, 1)
+        self.expand1 = conv_bn_relu(c_in // 4, c_out // 2, 1)
+        self.expand3 = conv_bn_relu(c_in // 4, c_out // 2, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.squeeze(x)
+        return torch.cat([self.expand1(x), self.expand3(x)], dim=1)
+
+
+class FireDeconv(nn.Module):
+    """A fire layer that doubles the width between squeeze and expand (Figure 4, right)."""
+
+    def __init__(self, c_in: int, c_out: int) -> None:
+        super().__init__()
+        c_mid = c_in // 4
+        self.squeeze = conv_bn_relu(c_in, c_mid, 1)
+        self.deconv = nn.Sequential(
+            nn.ConvTranspose2d(c_mid, c_mid, (1, 4), stride=(1, 2), padding=(0, 1), bias=False),
+            nn.BatchNorm2d(c_mid),
+            nn.ReLU(),
+        )
+        self.expand1 = conv_bn_relu(c_mid, c_out // 2, 1)
+        self.expand3 = conv_bn_relu(c_mid, c_out // 2, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.deconv(self.squeeze(x))
+        return torch.cat([self.expand1(x), self.expand3(x)], dim=1)
+
+
+class SqueezeReweight(nn.Module):
+    """Scale each channel by what all channels hold on average (section 4.3, equations 3 and 4)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Conv2d(channels, channels // 4, 1)
+        self.fc2 = nn.Conv2d(channels // 4, channels, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        chi = x.mean((2, 3), keepdim=True)  # (B, C, 1, 1)
+        scale = torch.sigmoid(self.fc2(F.relu(self.fc1(chi))))
+        return x * scale
+
+
+class Enlargement(nn.Module):
+    """See far without pooling: 1x1, three dilated 3x3 and the image's average, compressed to 1/4 (section 4.2)."""
+
+    def __init__(self, c_in: int, width: int) -> None:
+        super().__init__()
+        self.point = conv_bn_relu(c_in, width, 1)
+        self.dilated = nn.ModuleList(conv_bn_relu(c_in, width, 3, dilation=rate) for rate in ENLARGEMENT_RATES)
+        # No batch norm: of one pixel an image, a small batch's statistics are noise.
+        self.average = nn.Sequential(nn.Conv2d(c_in, width, 1), nn.ReLU())
+        self.compress = conv_bn_relu(width * (2 + len(ENLARGEMENT_RATES)), c_in // 4, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        average = self.average(x.mean((2, 3), keepdim=True)).expand(-1, -1, x.shape[2], x.shape[3])
+        branches = [self.point(x), *(conv(x) for conv in self.dilated), average]
+        return self.compress(torch.cat(branches, dim=1))
+
+
+class PointSeg(nn.Module):
+    """Label every pixel of a range image.
+
+    Parameters
+    ----------
+    n_channels, n_classes : int
+        Of the input and of the output.
+    enlargement_width : int
+        Channels of each branch of the enlargement layer.
+    dropout : float
+        Before the last convolution, as in SqueezeSeg.
+
+    Notes
+    -----
+    In: (B, 5, 64, 512); any height, and any width divisible by 16 (a full turn: 2048).
+    Out: logits (B, 4, 64, 512).
+    """
+
+    def __init__(
+        self, *, n_channels: int = 5, n_classes: int = 4, enlargement_width: int = 80, dropout: float = 0.25
+    ) -> None:
+        super().__init__()
+        self.fire1 = conv_bn_relu(n_channels, 64, 3, stride=(1, 2))
+        self.skip1 = conv_bn_relu(n_channels, 64, 1)
+        self.fire2, self.fire3, self.sr1 = Fire(64, 128), Fire(128, 128), SqueezeReweight(128)
+        self.fire4, self.fire5, self.sr2 = Fire(128, 256), Fire(256, 256), SqueezeReweight(256)
+        self.fire6, self.fire7 = Fire(256, 384), Fire(384, 384)
+        self.fire8, self.fire9, self.sr3 = Fire(384, 512), Fire(512, 512), SqueezeReweight(512)
+        self.enlarge = Enlargement(512, enlargement_width)
+        self.deconv1_enlarged = FireDeconv(128, 128)
+        self.deconv1 = FireDeconv(512, 128)
+        self.deconv2 = FireDeconv(256, 128)
+        self.deconv3 = FireDeconv(128, 64)
+        self.deconv4 = FireDeconv(64, 64)
+        self.dropout = nn.Dropout2d(dropout)
+        self.classifier = nn.Conv2d(64, n_classes, 3, padding=1)
+        self._initialise()
+
+    def forward(self, x: Tensor) -> Tensor:
+        skip1 = self.skip1(x)  # (B, 64, 64, 512)
+        conv1 = self.fire1(x)  # (B, 64, 64, 256)
+        sr1 = self.sr1(self.fire3(self.fire2(pool(conv1))))  # (B, 128, 64, 128)
+        sr2 = self.sr2(self.fire5(self.fire4(pool(sr1))))  # (B, 256, 64, 64)
+        x = self.fire7(self.fire6(pool(sr2)))  # (B, 384, 64, 32)
+        sr3 = self.sr3(self.fire9(self.fire8(x)))  # (B, 512, 64, 32)
+        enlarged = self.enlarge(sr3)  # (B, 128, 64, 32)
+
+        x = torch.cat([self.deconv1_enlarged(enlarged), self.deconv1(sr3)], dim=1)  # (B, 256, 64, 64)
+        x = self.deconv2(x + sr2) + sr1  # (B, 128, 64, 128)
+        x = self.deconv3(x) + conv1  # (B, 64, 64, 256)
+        x = self.deconv4(x) + skip1  # (B, 64, 64, 512)
+        return self.classifier(self.dropout(x))  # (B, 4, 64, 512)
+
+    def _initialise(self) -> None:
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
+            elif isinstance(module, nn.ConvTranspose2d):
+                # Of its four taps across, an output pixel meets two.
+                nn.init.normal_(module.weight, std=(2.0 / (2 * module.in_channels)) ** 0.5)
+        nn.init.normal_(self.classifier.weight, std=0.01)

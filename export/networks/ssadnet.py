@@ -1,0 +1,271 @@
+"""SSADNet: segmentation and detection in one pass over a top view (Lee and Park, 2020, section 2.2).
+
+What the paper leaves open, and what is done here:
+
+* Channels are not stated. They follow LoDNN, which the segmentation branch extends: 32 in the encoder and the decoder,
+  128 in the context module, spatial dropout 0.25. The feature extractor's 16, 32, 64, 128, 128 are ours: full
+  resolution is dear, and the bridge already hands over 32 rich channels.
+* "Additional 3x3 convolution after each F.E. block except the first and last": it follows the block's pooling and has
+  the block's batch norm and ELU.
+* "Each B.B.R. block repeats the dropout and ELU on the 1x1 convolution": 1x1, ReLU, then twice (1x1, dropout, ELU),
+  then a 1x1 to one value a slot, averaged over the image. Without that last linear layer no slot could leave ELU's
+  range; averaging comes last, as in network-in-network.
+* How many boxes one pass may return is not stated: ``n_slots``.
+* Head "dense" replaces the regressor (and is not the paper's): one prediction every four cells, so that a box is
+  found where it is, and any number of boxes can be found.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+__all__ = ["CONTEXT_DILATIONS", "SSADNet", "max_pool_with_mask", "max_unpool", "receptive_fields"]
+
+CONTEXT_DILATIONS = ((1, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 64))
+"""Table 1, as printed: (width, height). torch's ``dilation`` wants (height, width)."""
+
+HEAT_PRIOR = 0.1
+"""What the untrained heat map says everywhere (CenterNet's start; a logit of -2.19)."""
+
+# Var(x) / E[elu(x)^2] for a standard normal x: He's argument, carried over from ReLU (where it is 2).
+ELU_GAIN = 1.55
+
+
+def receptive_fields(dilations: tuple[tuple[int, int], ...] = CONTEXT_DILATIONS) -> list[tuple[int, int]]:
+    """Receptive field (width, height) after each of a chain of 3x3 convolutions (Table 1)."""
+    width = height = 1
+    fields = []
+    for across, along in dilations:
+        width, height = width + 2 * across, height + 2 * along
+        fields.append((width, height))
+    return fields
+
+
+def max_pool_with_mask(x: Tensor) -> tuple[Tensor, Tensor]:
+    """2x2 max-pooling with stride 2 that remembers where each maximum stood.
+
+    Returns the pooled map (B, C, H/2, W/2) and a bool map (B, C, H, W) true at exactly one pixel of every window: its
+    maximum, the first in reading order where several are equal, which is the one `torch.nn.MaxPool2d` would point to.
+    Empty cells make such ties the rule. (`torch.nn.MaxUnpool2d` exports as a scatter few runtimes do well; pooling,
+    comparing and multiplying run anywhere.)
+    """
+    pooled = F.max_pool2d(x, 2)
+    with torch.no_grad():
+        order = x.new_tensor([[4.0, 3.0], [2.0, 1.0]]).repeat(x.shape[-2] // 2, x.shape[-1] // 2)
+        candidate = torch.where(x == _double(pooled), order, torch.zeros_like(order))
+        mask = candidate == _double(F.max_pool2d(candidate, 2))
+    return pooled, mask
+
+
+def max_unpool(x: Tensor, mask: Tensor) -> Tensor:
+    """Put every value (B, C, H/2, W/2) back where `max_pool_with_mask` took it from; zero elsewhere (B, C, H, W)."""
+    return _double(x) * mask
+
+
+def _double(x: Tensor) -> Tensor:
+    return F.interpolate(x, scale_factor=2.0, mode="nearest")
+
+
+def conv_elu(c_in: int, c_out: int) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(c_in, c_out, 3, padding=1), nn.ELU())
+
+
+def conv_bn_elu(c_in: int, c_out: int) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(c_in, c_out, 3, padding=1, bias=False), nn.BatchNorm2d(c_out), nn.ELU())
+
+
+class ContextModule(nn.Module):
+    """Seven dilated 3x3 convolutions that see 129 x 255 cells of the pooled map, and a 1x1 (Table 1)."""
+
+    def __init__(self, channels: int = 32, width: int = 128, dropout: float = 0.25) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        c_in = channels
+        for across, along in CONTEXT_DILATIONS:
+            dilation = (along, across)
+            layers += [
+                nn.Conv2d(c_in, width, 3, padding=dilation, dilation=dilation),
+                nn.Dropout2d(dropout),
+                nn.ELU(),
+            ]
+            c_in = width
+        self.dilated = nn.Sequential(*layers)
+        self.project = nn.Sequential(nn.Conv2d(width, channels, 1), nn.ELU())
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.project(self.dilated(x))
+
+
+class SegmentationBranch(nn.Module):
+    """Encoder, context module, decoder and pixel classifier (Figure 5)."""
+
+    def __init__(self, n_channels: int, n_classes: int, context_width: int, dropout: float) -> None:
+        super().__init__()
+        self.encoder = nn.Sequential(conv_elu(n_channels, 32), conv_elu(32, 32))
+        self.context = ContextModule(32, context_width, dropout)
+        self.decoder = nn.Sequential(conv_elu(32, 32), conv_elu(32, 32))
+        self.classifier = nn.Conv2d(32, n_classes, 1)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        x = self.encoder(x)  # (B, 32, 400, 200)
+        x, mask = max_pool_with_mask(x)  # (B, 32, 200, 100)
+        x = self.context(x)  # (B, 32, 200, 100)
+        x = max_unpool(x, mask)  # (B, 32, 400, 200)
+        features = self.decoder(x)  # (B, 32, 400, 200)
+        return self.classifier(features), features
+
+
+class FeatureBlock(nn.Module):
+    """F.E. block: twice (3x3, batch norm, ELU), 2x2 max-pooling (Figure 6a); ``extra``: a 3x3 after it."""
+
+    def __init__(self, c_in: int, c_out: int, extra: bool) -> None:
+        super().__init__()
+        self.convs = nn.Sequential(conv_bn_elu(c_in, c_out), conv_bn_elu(c_out, c_out))
+        self.extra = conv_bn_elu(c_out, c_out) if extra else nn.Identity()
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.extra(F.max_pool2d(self.convs(x), 2))
+
+
+class BoxRegressor(nn.Module):
+    """B.B.R. block: one number a slot, from the whole image (Figure 6b)."""
+
+    def __init__(self, channels: int, n_slots: int, dropout: float) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(channels, channels, 1),
+            nn.ReLU(),
+            nn.Conv2d(channels, channels, 1),
+            nn.Dropout(dropout),
+            nn.ELU(),
+            nn.Conv2d(channels, channels, 1),
+            nn.Dropout(dropout),
+            nn.ELU(),
+            nn.Conv2d(channels, n_slots, 1),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.layers(x).mean((2, 3))  # (B, n_slots)
+
+
+class SlotsHead(nn.Module):
+    """The paper's detection branch: five F.E. blocks, four B.B.R. blocks (Figure 7).
+
+    Out: (B, n_slots, 4), each row the centre column, centre row, width and height of an upright box in the top view,
+    as shares of its width and height; zeros where no box is left.
+    """
+
+    def __init__(self, c_in: int, n_slots: int, dropout: float) -> None:
+        super().__init__()
+        self.features = nn.Sequential(
+            FeatureBlock(c_in, 16, extra=False),  # -> (B, 16, 200, 100)
+            FeatureBlock(16, 32, extra=True),  # -> (B, 32, 100, 50)
+            FeatureBlock(32, 64, extra=True),  # -> (B, 64, 50, 25)
+            FeatureBlock(64, 128, extra=True),  # -> (B, 128, 25, 12)
+            FeatureBlock(128, 128, extra=False),  # -> (B, 128, 12, 6)
+        )
+        self.regressors = nn.ModuleList(BoxRegressor(128, n_slots, dropout) for _ in "xywh")
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.features(x)
+        return torch.stack([regressor(x) for regressor in self.regressors], dim=2)  # (B, n_slots, 4)
+
+
+class DenseHead(nn.Module):
+    """An anchor-free regressor on F.E. blocks 1 to 3: one prediction every four cells.
+
+    Out: (B, 9, H/4, W/4): heat-map logit; offset of the centre from the output cell's centre in rows, columns [output
+    cells]; log length, log width [m]; sin and cos of twice the yaw; centre z [m]; log height [m].
+    """
+
+    def __init__(self, c_in: int) -> None:
+        super().__init__()
+        self.fine = nn.Sequential(
+            FeatureBlock(c_in, 16, extra=False),  # -> (B, 16, 200, 100)
+            FeatureBlock(16, 32, extra=True),  # -> (B, 32, 100, 50)
+        )
+        self.coarse = nn.Sequential(
+            FeatureBlock(32, 64, extra=True),  # -> (B, 64, 50, 25)
+            # Not pooled again: trucks need a wider view, but 25 columns do not halve.
+            conv_bn_elu(64, 64),
+            conv_bn_elu(64, 64),
+        )
+        self.merge = nn.Sequential(conv_bn_elu(32 + 64, 64), conv_bn_elu(64, 64))  # -> (B, 64, 100, 50)
+        self.predict = nn.Conv2d(64, 9, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        fine = self.fine(x)
+        coarse = _double(self.coarse(fine))
+        return self.predict(self.merge(torch.cat([fine, coarse], dim=1)))  # (B, 9, 100, 50)
+
+
+class SSADNet(nn.Module):
+    """Label every cell of a top view and box the vehicles in it.
+
+    Parameters
+    ----------
+    n_channels, n_classes : int
+        Of the input and of the segmentation map.
+    head : {"slots", "dense"}
+        The paper's regressor, or one prediction every four cells.
+    n_slots : int
+        Boxes that head "slots" can return.
+    context_width : int
+        Channels inside the context module. They cost most of the time: 17.7 of 22.6 GMAC at 128.
+    dropout : float
+        Probability of the spatial dropout in the context module and of the dropout in the B.B.R. blocks.
+
+    Notes
+    -----
+    In: (B, 3, 400, 200); any height and width divisible by 8 will do ("slots": at least 32).
+    Out: segmentation logits (B, 5, 400, 200), and boxes: (B, n_slots, 4) or (B, 9, 100, 50).
+    """
+
+    def __init__(
+        self,
+        head: str = "slots",
+        *,
+        n_channels: int = 3,
+        n_classes: int = 5,
+        n_slots: int = 16,
+        context_width: int = 128,
+        dropout: float = 0.25,
+    ) -> None:
+        super().__init__()
+        self.segmentation = SegmentationBranch(n_channels, n_classes, context_width, dropout)
+        bridge = n_channels + 32
+        self.detection: nn.Module
+        if head == "slots":
+            self.detection = SlotsHead(bridge, n_slots, dropout)
+        elif head == "dense":
+            self.detection = DenseHead(bridge)
+        else:
+            raise ValueError(f'head is {head!r}; expected "slots" or "dense"')
+        self._initialise(dropout)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        logits, features = self.segmentation(x)
+        boxes = self.detection(torch.cat([x, features], dim=1))
+        return logits, boxes
+
+    def _initialise(self, dropout: float) -> None:
+        """Keep the signal's size through ELU and dropout, so that nine layers without batch norm train from scratch."""
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                fan_in = module.in_channels * module.kernel_size[0] * module.kernel_size[1]
+                nn.init.normal_(module.weight, std=math.sqrt(ELU_GAIN / fan_in))
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
+        for module in self.segmentation.context.dilated:
+            if isinstance(module, nn.Conv2d):
+                # Spatial dropout scales what it keeps, and so the variance, by 1 / (1 - p).
+                module.weight.data.mul_(math.sqrt(1.0 - dropout))
+        nn.init.normal_(self.segmentation.classifier.weight, std=0.01)
+        if isinstance(self.detection, DenseHead):
+            nn.init.normal_(self.detection.predict.weight, std=0.01)
+            assert self.detection.predict.bias is not None
+            self.detection.predict.bias.data[0] = -math.log(1.0 / HEAT_PRIOR - 1.0)

@@ -1,0 +1,247 @@
+"""torch -> ONNX with a card, and the proof that nothing changed on the way.
+
+A file is written only when onnxruntime, through the whole runtime, gives the network's own answers: raw outputs within
+`MAX_DEVIATION`, the same labels and boxes after post-processing, on every scan tried.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from edgeperc.card import CARD_KEY, Golden, ModelCard, OutputSpec
+from edgeperc.decode import decode_classes, decode_dense
+from edgeperc.errors import EdgepercError
+from edgeperc.projection import make_projector
+from edgeperc.sensors import FitnessProfile
+from edgeperc.session import Session, golden_input
+
+from .train import FEWEST, RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT, Recipe, build
+
+__all__ = ["ParityError", "export", "verify", "write_card"]
+
+OPSET = 18
+# fp32 convolutions summed in another order were seen to differ by 1e-4 of the outputs' deviation; a wrong operator
+# differs by 0.1 and more.
+MAX_DEVIATION = 0.01
+MIN_AGREEMENT = 0.9995
+N_GOLDEN_VALUES = 64
+
+
+class ParityError(EdgepercError):
+    """The exported graph does not give the network's answers; nothing was written."""
+
+
+def load(checkpoint: Path) -> tuple[nn.Module, Recipe, dict[str, Any]]:
+    """The averaged network of a checkpoint, ready to answer; its recipe; and what it was trained on."""
+    state = torch.load(checkpoint, weights_only=True, map_location="cpu")
+    recipe = Recipe(**json.loads(state["recipe"]))
+    network = build(recipe)
+    network.load_state_dict(state["averaged"])
+    notes = {"frames": json.loads(state["frames"]), "n_simulated": state["n_simulated"], "step": state["step"]}
+    return network.eval(), recipe, notes
+
+
+def card_of(recipe: Recipe, notes: Mapping[str, Any], fitness: FitnessProfile | None, version: str) -> ModelCard:
+    """The card of a network of this project."""
+    frames = notes["frames"]
+    training = {
+        "data": f"{len(frames)} KITTI frames, {notes['n_simulated']} simulated scans",
+        "frames": frames,
+        "licence": "CC BY-NC-SA 3.0, as KITTI's, on which it was trained" if frames else "Apache-2.0",
+        "recipe": {n: getattr(recipe, n) for n in Recipe.__dataclass_fields__},
+        "steps": notes["step"],
+    }
+    common = {"version": version, "fitness": None if fitness is None else fitness.to_dict(), "training": training}
+    if recipe.network == "pointseg":
+        return ModelCard(
+            name="pointseg",
+            view=RANGE_IMAGE,
+            input=RANGE_IMAGE_INPUT,
+            outputs=(OutputSpec("logits", "class_logits"),),
+            classes=("background", "car", "pedestrian", "cyclist"),
+            **common,
+        )
+    return ModelCard(
+        name="ssadnet",
+        view=TOP_VIEW,
+        input=TOP_VIEW_INPUT,
+        outputs=(OutputSpec("segmentation", "class_logits"), OutputSpec("boxes", f"box_{recipe.head}")),
+        classes=("background", "drivable", "car", "van", "truck"),
+        box_classes=("car", "van", "truck"),
+        # Medians of KITTI's labels: length, width, height.
+        box_size_priors={"car": (3.9, 1.6, 1.5), "van": (5.1, 1.9, 2.2), "truck": (10.1, 2.6, 3.2)},
+        **common,
+    )
+
+
+def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
+    """The network as an ONNX graph: weights inside, nothing of this computer in it, no card yet."""
+    example = torch.from_numpy(golden_input(0, (1, len(card.input.channels), card.view.height, card.view.width)))
+    program = torch.onnx.export(
+        network.eval(),
+        (example,),
+        input_names=[card.input.name],
+        output_names=[o.name for o in card.outputs],
+        opset_version=OPSET,
+        dynamo=True,
+        external_data=False,
+        verbose=False,
+    )
+    assert program is not None
+    model = program.model_proto
+    # The exporter keeps stack traces, with this computer's paths, beside every node.
+    stripped = [model, model.graph, *model.graph.node, *model.graph.value_info, *model.graph.input]
+    for holder in [*stripped, *model.graph.output, *model.graph.initializer, *model.functions]:
+        if hasattr(holder, "metadata_props"):
+            del holder.metadata_props[:]
+        if hasattr(holder, "doc_string"):
+            holder.doc_string = ""
+    model.producer_name, model.producer_version = "edgeperc", ""
+    return model
+
+
+def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
+    """Write a graph with its card, last of all, and read it back through onnxruntime.
+
+    Any network with a range-image or top-view input and class or box outputs of a kind the card can name will do.
+
+    Raises
+    ------
+    CardError, CardMismatchError, ModelFileError
+        Nothing is written, or left, in the place of ``path``.
+    """
+    kept = [p for p in model.metadata_props if p.key != CARD_KEY]
+    del model.metadata_props[:]
+    model.metadata_props.extend(kept)
+    model.metadata_props.add(key=CARD_KEY, value=card.to_json())
+    aside = path.with_name(f".{path.name}.aside.onnx")
+    try:
+        aside.write_bytes(model.SerializeToString(deterministic=True))
+        session = Session(aside, "cpu")
+        if session.card.to_json() != card.to_json():
+            raise ParityError(f"{path}: the card read back is not the card written")
+        aside.replace(path)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
+    """The card with a known input and this computer's answers to it."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    x = golden_input(0, (1, len(card.input.channels), card.view.height, card.view.width))
+    answers = session.run([o.name for o in card.outputs], {card.input.name: x})
+    outputs = {}
+    for spec, answer in zip(card.outputs, answers, strict=True):
+        at = np.random.default_rng(0).integers(answer.size, size=min(N_GOLDEN_VALUES, answer.size))
+        outputs[spec.name] = {
+            "sha256": hashlib.sha256(answer.tobytes()).hexdigest(),
+            "std": float(answer.std()),
+            "positions": [int(i) for i in at],
+            "values": [float(v) for v in answer.reshape(-1)[at]],
+        }
+    return replace(card, golden=Golden(0, hashlib.sha256(x.tobytes()).hexdigest(), outputs))
+
+
+def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]]) -> dict[str, float]:
+    """Hold an exported model against the network it was made of, through post-processing.
+
+    Parameters
+    ----------
+    network : nn.Module
+    path : Path
+        The .onnx.
+    scans : sequence of (n, 4) float32
+        Real or simulated, remission in 0..1.
+
+    Returns
+    -------
+    dict
+        ``n_scans``; ``max_deviation``, of raw outputs, in standard deviations of the output; ``label_agreement``, the
+        least share of pixels with the same label; ``box_deviation``, the largest difference of any number of a box.
+
+    Raises
+    ------
+    ParityError
+    """
+    session = Session(path, "cpu")
+    card = session.card
+    projector = make_projector(card.view, card.input)
+    worst, agreement, box_deviation = 0.0, 1.0, 0.0
+    for points in scans:
+        image = projector.project(np.ascontiguousarray(points)).image
+        with torch.no_grad():
+            answers = network.eval()(torch.from_numpy(image[None]))
+        answers = answers if isinstance(answers, tuple) else (answers,)
+        session.input[:] = image
+        here = session.run()
+        wanted = {o.kind: a[0].numpy() for o, a in zip(card.outputs, answers, strict=True)}
+        for kind, want in wanted.items():
+            worst = max(worst, float(np.abs(here[kind] - want).max()) / max(float(want.std()), 1e-6))
+        kind = next(k for k in wanted if k.startswith("class_"))
+        labels = [decode_classes(a[kind], kind)[0] for a in (here, wanted)]
+        agreement = min(agreement, float((labels[0] == labels[1]).mean()))
+        if "box_dense" in wanted:
+            boxes = [
+                decode_dense(a["box_dense"], a[kind], kind, card.view, card.classes, card.box_classes)
+                for a in (here, wanted)
+            ]
+            if [b.label for b in boxes[0]] != [b.label for b in boxes[1]]:
+                raise ParityError(f"{path}: onnxruntime finds {len(boxes[0])} boxes, torch {len(boxes[1])}, or others")
+            for mine, theirs in zip(*boxes, strict=True):
+                apart = np.abs(np.array([*mine.center, *mine.size]) - np.array([*theirs.center, *theirs.size]))
+                box_deviation = max(box_deviation, float(apart.max()))
+    if worst > MAX_DEVIATION or agreement < MIN_AGREEMENT or box_deviation > 0.05:
+        raise ParityError(
+            f"{path}: raw outputs differ by up to {worst:.3g} standard deviations (at most {MAX_DEVIATION}), labels "
+            f"agree on {agreement:.4%} of the pixels (at least {MIN_AGREEMENT:.2%}), boxes differ by up to "
+            f"{box_deviation:.3g} m (at most 0.05)"
+        )
+    return {
+        "n_scans": len(scans),
+        "max_deviation": worst,
+        "label_agreement": agreement,
+        "box_deviation": box_deviation,
+    }
+
+
+def export(
+    checkpoint: Path,
+    path: Path,
+    *,
+    scans: Sequence[NDArray[np.float32]],
+    fitness: FitnessProfile | None,
+    version: str = "1.0.0",
+    metrics: Mapping[str, Any] | None = None,
+) -> ModelCard:
+    """Export a checkpoint, prove it, and write it with its card.
+
+    Raises
+    ------
+    ParityError
+        The graph does not give the network's answers; ``path`` is left as it was.
+    """
+    network, recipe, notes = load(checkpoint)
+    card = replace(card_of(recipe, notes, fitness, version), metrics=dict(metrics or {}))
+    model = to_graph(network, card)
+    card = with_golden(model, card)
+    trial = path.with_name(f".{path.name}.trial.onnx")
+    try:
+        write_card(model, card, trial)
+        card = replace(card, parity=verify(network, trial, scans))
+        write_card(model, card, path)
+    finally:
+        trial.unlink(missing_ok=True)
+    return card

@@ -1,0 +1,76 @@
+"""Where the tests find real scans; everything else they make themselves."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numba
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+ARCHIVES = REPOSITORY.parent / "shared" / "data"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if numba.config.DISABLE_JIT:
+        # An interpreted kernel computes with numpy's scalars, which warn where compiled code yields NaN or infinity.
+        config.addinivalue_line("filterwarnings", "ignore:(invalid value|overflow|divide by zero):RuntimeWarning")
+
+
+def cache_root() -> Path:
+    """A folder of this user, outside the checkout, for what is unpacked once and used by many runs."""
+    default = Path.home() / ("AppData/Local" if sys.platform == "win32" else ".cache")
+    return Path(os.environ.get("XDG_CACHE_HOME", default)) / "edgeperc-tests"
+
+
+def unpack_group(group: str) -> Path:
+    """Unpack one group of archives, once for all processes and runs that see the same archives."""
+    from filelock import FileLock  # here, so that tests without real scans need no more than pytest
+
+    listing = "".join(f"{file.name} {file.stat().st_size}\n" for file in sorted(ARCHIVES.glob(f"{group}*.tar*")))
+    out = cache_root() / hashlib.sha256(listing.encode()).hexdigest()[:16]
+    out.mkdir(parents=True, exist_ok=True)
+    with FileLock(out / "lock"):
+        if not (out / "complete").exists():
+            command = [sys.executable, str(ARCHIVES / "unpack.py"), str(out), "--only", group]
+            done = subprocess.run(command, capture_output=True, text=True)
+            assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}{done.stderr}"
+            (out / "complete").touch()
+    return out / group
+
+
+@pytest.fixture(scope="session")
+def data_root() -> Callable[[str], Path]:
+    """A function from the name of a group of real data to the folder that holds it unpacked.
+
+    ``EDGEPERC_TEST_DATA`` names a folder of groups that are unpacked already. Otherwise the archives lie beside the
+    checkout, in ``../shared/data``; only where that folder does not exist is the test skipped.
+    """
+
+    def folder(group: str) -> Path:
+        if "EDGEPERC_TEST_DATA" in os.environ:
+            unpacked = Path(os.environ["EDGEPERC_TEST_DATA"]) / group
+            assert unpacked.is_dir(), f"EDGEPERC_TEST_DATA is set, but {unpacked} is no folder"
+            return unpacked
+        if not ARCHIVES.is_dir():
+            pytest.skip("no real data: neither ../shared/data beside the checkout nor EDGEPERC_TEST_DATA")
+        return unpack_group(group)
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def kitti_root(data_root: Callable[[str], Path]) -> Path:
+    """KITTI object detection frames: ``frames.csv`` and ``training/{velodyne,label_2,calib}``."""
+    return data_root("kitti3d")
+
+
+@pytest.fixture(scope="session")
+def semantickitti_root(data_root: Callable[[str], Path]) -> Path:
+    """SemanticKITTI: ``sequences/00/{velodyne,labels,label_origin}``."""
+    return data_root("semantickitti")

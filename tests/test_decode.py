@@ -1,0 +1,285 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import reference
+from edgeperc import decode
+from edgeperc.card import TopViewGeometry
+from edgeperc.decode import decode_classes, decode_dense, decode_slots
+from edgeperc.errors import CardMismatchError, InferenceError
+
+CLASSES = ("background", "drivable", "car", "van", "truck")
+VEHICLES = CLASSES[2:]
+PRIORS = {"car": (3.9, 1.6, 1.5), "van": (5.1, 1.9, 2.2), "truck": (10.0, 2.6, 3.3)}
+VIEW = TopViewGeometry()
+SHAPE = (VIEW.height, VIEW.width)
+
+
+def pixel_of(x, y):
+    return int((VIEW.x_range_m[1] - x) / VIEW.cell_m), int((VIEW.y_range_m[1] - y) / VIEW.cell_m)
+
+
+# --- classes
+
+
+@pytest.mark.parametrize("shape", [(1, 4, 64, 512), (1, 5, 7, 3), (2, 1, 1), (1, 1, 4, 5), (3, 0, 4)])
+def test_classes_agree_with_the_twin(shape):
+    logits = np.random.default_rng(1).normal(0.0, 5.0, shape).astype(np.float32)
+    values = logits[0] if logits.ndim == 4 else logits
+    labels, scores = decode_classes(logits, "class_logits")
+    expected_labels, expected_scores, _ = reference.classes(values, True) if values.size else (labels, scores, 0)
+    assert labels.dtype == np.uint8
+    assert scores.dtype == np.float32
+    np.testing.assert_array_equal(labels, expected_labels)
+    np.testing.assert_allclose(scores, expected_scores, atol=3e-6)
+
+    probabilities = reference.softmax(values).astype(np.float32) if values.size else values
+    labels, scores = decode_classes(probabilities, "class_probabilities")
+    np.testing.assert_array_equal(labels, expected_labels)
+    np.testing.assert_array_equal(scores, probabilities.max(axis=0))
+
+
+def test_lower_class_wins_a_tie_and_scores_stay_probabilities():
+    logits = np.zeros((1, 5, 2, 2), dtype=np.float32)
+    logits[0, 3:, 0, 0] = 7.0
+    logits[0, 4, 1, 1] = 1e30
+    logits[0, :, 1, 0] = -3e38
+    labels, scores = decode_classes(logits, "class_logits")
+    assert labels.tolist() == [[3, 0], [0, 4]]
+    np.testing.assert_allclose(scores, [[1.0 / (2.0 + 3.0 * math.exp(-7.0)), 0.2], [0.2, 1.0]], atol=1e-6)
+    assert ((scores > 0.0) & (scores <= 1.0)).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("kind", ["class_logits", "class_probabilities"])
+def test_classes_that_are_not_finite_raise(value, kind):
+    output = np.full((1, 3, 4, 5), 0.25, dtype=np.float32)
+    output[0, 1, 2, 3] = output[0, 2, 0, 0] = value
+    with pytest.raises(InferenceError, match=r"pointseg: 2 of 60 values of class_"):
+        decode_classes(output, kind, model="pointseg")
+
+
+def test_classes_of_another_shape_or_kind_raise():
+    with pytest.raises(CardMismatchError, match=r"\(2, 3, 4, 5\)"):
+        decode_classes(np.zeros((2, 3, 4, 5), dtype=np.float32), "class_logits")
+    with pytest.raises(CardMismatchError, match="box_dense"):
+        decode_classes(np.zeros((1, 3, 4, 5), dtype=np.float32), "box_dense")
+
+
+# --- slots
+
+
+def slots_for(slots, labels=None, scores=None):
+    labels = np.zeros(SHAPE, dtype=np.uint8) if labels is None else labels
+    scores = np.ones(SHAPE, dtype=np.float32) if scores is None else scores
+    return decode_slots(
+        np.asarray(slots, dtype=np.float32), labels, scores, VIEW, CLASSES, VEHICLES, PRIORS, 1.73, model="ssadnet"
+    )
+
+
+def test_slots_become_boxes_in_metres():
+    labels, scores = np.zeros(SHAPE, dtype=np.uint8), np.zeros(SHAPE, dtype=np.float32)
+    # A car 26 m ahead, 5 m to the left, 4 m along x; a truck 16 m ahead, 5 m right, lying across.
+    labels[200, 50], scores[200, 50] = 2, 0.75
+    labels[300, 150], scores[300, 150] = 4, 0.9
+    boxes = slots_for([[[0.2525, 0.50125, 0.1, 0.1], [0, 0, 0, 0], [0.7525, 0.75125, 0.5, 0.0625]]], labels, scores)
+    assert [b.label for b in boxes] == ["truck", "car"]
+    truck, car = boxes
+    assert car.score == 0.75
+    np.testing.assert_allclose(car.center, (25.95, 4.95, 0.75 - 1.73), atol=1e-5)
+    np.testing.assert_allclose(car.size, (4.0, 2.0, 1.5), atol=1e-5)
+    assert car.yaw == 0.0
+    np.testing.assert_allclose(truck.center, (15.95, -5.05, 1.65 - 1.73), atol=1e-5)
+    np.testing.assert_allclose(truck.size, (10.0, 2.5, 3.3), atol=1e-5)
+    assert truck.yaw == math.pi / 2.0
+
+
+@pytest.mark.parametrize(
+    "slot",
+    [
+        [0.5, 0.5, 0.0, 0.0],
+        [0.5, 0.5, 0.1, 0.012],  # 0.48 m long
+        [0.5, 0.5, 0.024, 0.1],  # 0.48 m wide
+        [0.5, 0.5, -0.1, 0.1],
+        [1.0, 0.5, 0.1, 0.1],
+        [0.5, -0.01, 0.1, 0.1],
+        [0.5, 1.2, 0.1, 0.1],
+    ],
+)
+def test_empty_slots(slot):
+    assert slots_for([slot], np.full(SHAPE, 2, dtype=np.uint8)) == []
+    assert len(slots_for([[0.5, 0.5, 0.1, 0.1]], np.full(SHAPE, 2, dtype=np.uint8))) == 1
+
+
+@pytest.mark.parametrize("label", [0, 1])
+def test_a_slot_on_no_vehicle_is_empty(label):
+    assert slots_for([[0.5, 0.5, 0.1, 0.1]], np.full(SHAPE, label, dtype=np.uint8)) == []
+
+
+def test_slots_refuse_what_they_cannot_read():
+    with pytest.raises(InferenceError, match="ssadnet: 1 of 4 values of box_slots"):
+        slots_for([[0.5, np.nan, 0.1, 0.1]])
+    with pytest.raises(CardMismatchError, match=r"\(1, 5\)"):
+        slots_for([[0.5, 0.5, 0.1, 0.1, 0.0]])
+    with pytest.raises(CardMismatchError, match="3, 3"):
+        slots_for([[0.5, 0.5, 0.1, 0.1]], labels=np.zeros((3, 3), dtype=np.uint8))
+    with pytest.raises(CardMismatchError, match="truck"):
+        decode_slots(
+            np.zeros((1, 4), dtype=np.float32),
+            np.zeros(SHAPE, dtype=np.uint8),
+            np.zeros(SHAPE, dtype=np.float32),
+            VIEW,
+            CLASSES,
+            VEHICLES,
+            {"car": PRIORS["car"], "van": PRIORS["van"]},
+            1.73,
+        )
+    assert slots_for(np.zeros((0, 4))) == []
+
+
+# --- dense
+
+
+def dense_of(*boxes):
+    """What a perfect network says of (x, y, z, length, width, height, yaw, logit)."""
+    dense = np.zeros((1, 9, SHAPE[0] // 4, SHAPE[1] // 4), dtype=np.float32)
+    dense[0, 0] = -10.0
+    for x, y, z, length, width, height, yaw, logit in boxes:
+        row, col = (VIEW.x_range_m[1] - x) / 0.4, (VIEW.y_range_m[1] - y) / 0.4
+        r, c = int(row), int(col)
+        dense[0, :, r, c] = [
+            logit,
+            row - r - 0.5,
+            col - c - 0.5,
+            math.log(length),
+            math.log(width),
+            math.sin(2.0 * yaw),
+            math.cos(2.0 * yaw),
+            z,
+            math.log(height),
+        ]
+    return dense
+
+
+def class_logits(*patches):
+    """Background, with (row slice, column slice, class, logit) on top."""
+    logits = np.zeros((1, 5, *SHAPE), dtype=np.float32)
+    logits[0, 0] = 2.0
+    for rows, cols, k, value in patches:
+        logits[0, k, rows, cols] = value
+    return logits
+
+
+def test_dense_gives_back_what_was_put_in():
+    a = (20.13, 3.37, -0.9, 4.2, 1.7, 1.5, 0.4, 3.0)
+    b = (38.8, -6.1, -0.5, 9.5, 2.5, 3.1, -1.2, 1.0)
+    rows_a, cols_a = pixel_of(a[0], a[1])
+    rows_b, cols_b = pixel_of(b[0], b[1])
+    logits = class_logits(
+        (slice(rows_a - 8, rows_a + 8), slice(cols_a - 8, cols_a + 8), 3, 6.0),
+        (slice(rows_b - 30, rows_b + 30), slice(cols_b - 30, cols_b + 30), 4, 6.0),
+    )
+    boxes = decode_dense(dense_of(b, a), logits, "class_logits", VIEW, CLASSES, VEHICLES)
+    assert [box.label for box in boxes] == ["van", "truck"]
+    for box, (x, y, z, length, width, height, yaw, logit) in zip(boxes, (a, b), strict=True):
+        np.testing.assert_allclose(box.center, (x, y, z), atol=1e-5)
+        np.testing.assert_allclose(box.size, (length, width, height), rtol=1e-5)
+        assert box.yaw == pytest.approx(yaw, abs=1e-5)
+        assert box.score == pytest.approx(1.0 / (1.0 + math.exp(-logit)), abs=1e-6)
+    probabilities = reference.softmax(logits[0])[None].astype(np.float32)
+    assert decode_dense(dense_of(b, a), probabilities, "class_probabilities", VIEW, CLASSES, VEHICLES) == boxes
+
+
+def test_one_odd_pixel_at_the_centre_does_not_name_the_box():
+    x, y = 26.05, 0.05
+    row, col = pixel_of(x, y)
+    logits = class_logits(
+        (slice(row - 15, row + 16), slice(col - 6, col + 7), 2, 5.0),
+        (slice(row, row + 1), slice(col, col + 1), 4, 9.0),
+    )
+    (box,) = decode_dense(
+        dense_of((x, y, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0)), logits, "class_logits", VIEW, CLASSES, VEHICLES
+    )
+    assert box.label == "car"
+
+
+def test_background_under_the_box_still_leaves_a_vehicle():
+    logits = class_logits()
+    logits[0, 3] = 0.1
+    (box,) = decode_dense(
+        dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0)), logits, "class_logits", VIEW, CLASSES, VEHICLES
+    )
+    assert box.label == "van"
+
+
+def test_overlapping_boxes_of_the_dense_head():
+    first = (20.2, 3.4, -0.9, 4.2, 1.7, 1.5, 0.0, 1.0)
+    second = (21.4, 3.4, -0.9, 4.2, 1.7, 1.5, 0.0, 2.0)
+    beside = (20.2, 0.6, -0.9, 4.2, 1.7, 1.5, 0.0, 0.5)
+    dense = dense_of(first, second, beside)
+    boxes = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
+    assert [round(box.center[0], 3) for box in boxes] == [21.4, 20.2]
+    assert [round(box.center[1], 3) for box in boxes] == [3.4, 0.6]
+    everything = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, iou_threshold=1.0)
+    assert len(everything) == 3
+    best = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, max_boxes=1)
+    assert best == boxes[:1]
+    sure = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, score_threshold=0.7)
+    assert sure == boxes[:1]
+
+
+def test_score_thresholds_at_their_ends():
+    dense = dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0))
+    assert decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, score_threshold=1.0) == []
+    # A flat heat map has one peak a plateau, and the plateau of -10 touches the real one.
+    everything = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, score_threshold=0.0)
+    assert 1 <= len(everything) <= 2
+    assert decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, ()) == []
+    assert decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, max_boxes=0) == []
+
+
+def test_dense_survives_absurd_sizes_and_refuses_what_is_not_finite():
+    dense = dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0))
+    dense[0, [3, 4, 8], 50, 25] = 200.0, -200.0, 90.0
+    (box,) = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
+    assert np.allclose(box.size, (40.0, 0.2, 40.0))
+    dense[0, 7, 3, 3] = np.nan
+    with pytest.raises(InferenceError, match="ssadnet: 1 of 45000 values of box_dense"):
+        decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, model="ssadnet")
+    logits = class_logits()
+    logits[0, 1, 2, 3] = np.inf
+    with pytest.raises(InferenceError, match="1 of 400000 values of class_logits"):
+        decode_dense(dense_of(), logits, "class_logits", VIEW, CLASSES, VEHICLES)
+    with pytest.raises(CardMismatchError, match=r"\(1, 8, 100, 50\).*\(1, 9, 100, 50\)"):
+        decode_dense(dense[:, :8], class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
+    with pytest.raises(CardMismatchError, match=r"\(1, 4, 400, 200\)"):
+        decode_dense(dense_of(), class_logits()[:, :4], "class_logits", VIEW, CLASSES, VEHICLES)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (20, 30)])
+def test_peaks_agree_with_the_twin(shape):
+    rng = np.random.default_rng(5)
+    for heat in (rng.normal(size=shape), rng.integers(0, 3, shape), np.zeros(shape)):
+        heat = heat.astype(np.float32)
+        peak = np.empty(shape, dtype=np.bool_)
+        decode.mark_peaks(heat, 0.0, peak)
+        np.testing.assert_array_equal(peak, reference.peaks(heat, 0.0))
+        assert peak.any() or (heat < 0.0).all()
+
+
+@pytest.mark.parametrize("are_logits", [True, False])
+def test_footprint_sums_agree_with_the_twin(are_logits):
+    rng = np.random.default_rng(6)
+    values = rng.normal(0.0, 3.0, (5, 40, 30)).astype(np.float32)
+    rectangles = np.column_stack(
+        [rng.uniform(4.0, 9.0, 12), rng.uniform(-2.0, 2.0, 12), rng.uniform(0.01, 4.0, (12, 2)), rng.uniform(-2, 2, 12)]
+    )
+    rectangles[-1] = [500.0, -500.0, 1.0, 1.0, 0.0]  # far out of view
+    sums = np.empty((12, 5))
+    decode.fill_footprint_sums(values, are_logits, rectangles, 8.0, 1.5, 0.1, sums)
+    np.testing.assert_allclose(
+        sums, reference.footprint_sums(values, are_logits, rectangles, 8.0, 1.5, 0.1), rtol=1e-9, atol=1e-9
+    )

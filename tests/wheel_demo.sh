@@ -1,0 +1,31 @@
+#!/usr/bin/env bash
+# Build the wheel (through the sdist), look at what is in it, install it into an empty environment outside the
+# checkout and run the demo there. PYTHON is an interpreter that has `build`.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+checkout=$PWD
+python=$(command -v "${PYTHON:-python3}")
+[[ $python = /* ]] || python=$checkout/$python
+away=$(cd "$(mktemp -d)" && pwd -P)
+trap 'rm -rf "$away"' EXIT
+
+"$python" -m build --outdir "$away/dist" . >"$away/build.log" 2>&1 || { cat "$away/build.log"; exit 1; }
+"$python" - "$away"/dist/*.whl <<'END'
+import sys, zipfile
+
+names = zipfile.ZipFile(sys.argv[1]).namelist()
+top = {name.split("/")[0] for name in names if ".dist-info/" not in name}
+assert top == {"edgeperc", "edgeperc_bench", "edgeperc_export"}, f"the wheel installs {sorted(top)}"
+assert "edgeperc/py.typed" in names and "edgeperc/models/__init__.py" in names, names
+assert [name for name in names if name.startswith("edgeperc/models/") and name.endswith(".onnx")], "no model in the wheel"
+END
+
+"$python" -m venv "$away/venv"
+wheel=$(echo "$away"/dist/*.whl)
+"$away/venv/bin/pip" install --quiet "${wheel}[cpu,view]"
+"$away/venv/bin/pip" check
+cd "$away"
+"$away/venv/bin/python" -c "import edgeperc; assert edgeperc.__file__.startswith('$away'), edgeperc.__file__"
+"$away/venv/bin/edgeperc" demo --out demo
+[ -n "$(find demo -name '*.png' -size +1k)" ] || { echo "the demo made no picture in $away/demo"; exit 1; }
+echo "The wheel works outside the checkout: $(du -h "$wheel" | cut -f1), $(find demo -type f | tr '\n' ' ')"
