@@ -7,7 +7,9 @@ Exit codes: 0 all is well, 1 some scans failed (each is reported, the others are
 from __future__ import annotations
 
 import argparse
+import io
 import json
+import math
 import os
 import re
 import sys
@@ -15,15 +17,15 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from . import __version__
-from .errors import EdgepercError, MissingExtraError, ModelError, PointsError
+from .errors import EdgepercError, MissingExtraError, ModelError, PointsError, SensorError
 
 # What takes long to import (numba's kernels, onnxruntime, matplotlib) is imported where a command needs it.
 if TYPE_CHECKING:
     from .perceiver import Perceiver
-    from .perception import Perception
+    from .perception import Box, Perception
 
 __all__ = ["main"]
 
@@ -46,6 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code; wrong usage leaves by argparse's ``SystemExit(2)``.
     """
     arguments = _parser().parse_args(argv)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names need not fit the terminal's encoding
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
@@ -140,16 +144,23 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__
     _complain(f"warning: {message}")
 
 
-def _perceiver(arguments: argparse.Namespace, sensor: str, on_mismatch: str) -> Perceiver:
+def _perceiver(
+    arguments: argparse.Namespace, sensor: str, on_mismatch: Literal["warn", "raise", "ignore"]
+) -> Perceiver:
     from .perceiver import Perceiver
 
-    return Perceiver(
-        arguments.model or list(SHIPPED),
-        sensor=sensor,
-        provider=arguments.provider,
-        n_threads=arguments.threads,
-        on_mismatch=on_mismatch,
-    )
+    try:
+        return Perceiver(
+            arguments.model or SHIPPED,
+            sensor=sensor,
+            provider=arguments.provider,
+            n_threads=arguments.threads,
+            on_mismatch=on_mismatch,
+        )
+    except EdgepercError:
+        raise
+    except ValueError as exc:  # two models of one view
+        raise ModelError(str(exc)) from exc
 
 
 # run
@@ -345,3 +356,178 @@ class _Progress:
         if self.live:
             sys.stderr.write("\r\x1b[K")
             sys.stderr.flush()
+
+
+# demo
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    import numpy as np
+
+    from . import view
+    from .simulation import random_scene, simulate
+
+    perceive = _perceiver(arguments, "hdl-64e", "ignore")
+    scan = simulate(random_scene(DEMO_SEED), "hdl-64e", DEMO_SEED)
+    perceive(scan.points)  # the first pass over a whole scan meets cold caches
+    perception = perceive(scan.points)
+
+    rows = [("scene", f"{perception.n_points:,} points, a simulated hdl-64e in a street that is known to the cell")]
+    if perception.top_view is not None:
+        area_m2 = perception.top_view.drivable_area_m2
+        rows.append(("drivable", f"{area_m2:.0f} m2 of the {_extent(perception)} ahead"))
+        rows.append(("boxes", "" if perception.boxes else "none"))
+        rows += [("", _box_words(box)) for box in perception.boxes]
+    if perception.points is not None:
+        there = np.bincount(scan.labels[perception.points.in_view], minlength=len(perception.points.classes))
+        for k, (name, count) in enumerate(perception.points.counts().items()):
+            rows.append(("points" if k == 0 else "", f"{name:<12}{count:>9,}   (there are {there[k]:,})"))
+    total_ms = sum(perception.stage_ms.values())
+    rows.append(("time", f"{total_ms:.1f} ms: " + ", ".join(f"{k} {ms:.1f}" for k, ms in perception.stage_ms.items())))
+    rows += [("ran on", f"{name}: {provider}") for name, provider in perception.providers.items()]
+
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    page, picture = arguments.out / "scene.html", arguments.out / "scene.png"
+    title = "edgeperc demo: a simulated street"
+    view.write_html(scan.points, perception, page, title=title)
+    try:
+        view.draw(scan.points, perception, picture, title=title)
+        rows.append(("picture", str(picture)))
+    except MissingExtraError as exc:
+        rows.append(("picture", _one_line(exc)))
+    rows.append(("3-D page", f"{page} (open it in a browser)"))
+    _print_rows(rows)
+    return 0
+
+
+def _extent(perception: Perception) -> str:
+    assert perception.top_view is not None
+    (x_near, x_far), (y_right, y_left) = perception.top_view.x_range_m, perception.top_view.y_range_m
+    return f"{x_far - x_near:.0f} x {y_left - y_right:.0f} m"
+
+
+def _box_words(box: Box) -> str:
+    x, y, _ = box.center
+    length, width, height = box.size
+    side = f"{abs(y):4.1f} m {'left' if y >= 0 else 'right'}"
+    return (
+        f"{box.label:<6}{box.score:5.2f}   {math.hypot(x, y):5.1f} m away: {x:5.1f} m ahead, {side:<13}"
+        f"{length:.1f} x {width:.1f} x {height:.1f} m, heading {math.degrees(box.yaw):4.0f} deg"
+    )
+
+
+def _print_rows(rows: Sequence[tuple[str, str]]) -> None:
+    width = max(len(name) for name, _ in rows) + 2
+    for name, words in rows:
+        print(f"{name:<{width}}{words}".rstrip())
+
+
+# info
+
+
+def _info(arguments: argparse.Namespace) -> int:
+    n_failed = n_told = 0
+    for thing in arguments.things:
+        try:
+            rows = _model_rows(thing) if _is_model(thing) else _scan_rows(Path(thing), arguments.sensor)
+        except (SensorError, MissingExtraError):
+            raise
+        except EdgepercError as exc:
+            n_failed += 1
+            _complain(exc)
+            continue
+        if n_told:
+            print()
+        _print_rows(rows)
+        n_told += 1
+    return 1 if n_failed else 0
+
+
+def _is_model(thing: str) -> bool:
+    """A path that exists, or looks like one, is a scan unless it ends in .onnx; any other word is a model's name."""
+    path = Path(thing)
+    return path.suffix.lower() == ".onnx" or not (path.exists() or path.suffix or len(path.parts) > 1)
+
+
+def _model_rows(thing: str) -> list[tuple[str, str]]:
+    from .card import TopViewGeometry
+    from .models import model_path
+    from .session import Session
+
+    session = Session(model_path(thing), "cpu")
+    card = session.card
+    channels, height, width = session.input.shape
+    if isinstance(card.view, TopViewGeometry):
+        (x_near, x_far), (y_right, y_left) = card.view.x_range_m, card.view.y_range_m
+        seen = f"x {x_near:g}..{x_far:g} m, y {y_right:g}..{y_left:g} m, cells of {card.view.cell_m:g} m"
+    else:
+        up, down = card.view.row_elevations_deg[0], card.view.row_elevations_deg[-1]
+        left, right = card.view.azimuth_left_deg, card.view.azimuth_right_deg
+        seen = f"{height} beams from {up:g} to {down:g} deg, azimuths {left:g} to {right:g} deg"
+    rows = [
+        ("model", f"{card.name} {card.version}"),
+        ("file", f"{session.path} ({session.path.stat().st_size / 1e6:.1f} MB)"),
+        ("sha256", session.sha256),
+        ("view", f"{card.view.kind}: {seen}"),
+        ("input", f"{channels} x {height} x {width}: {', '.join(card.input.channels)}"),
+        ("outputs", ", ".join(f"{output.name} ({output.kind})" for output in card.outputs)),
+        ("classes", ", ".join(card.classes)),
+    ]
+    if card.box_classes:
+        rows.append(("boxes", f"{', '.join(card.box_classes)}, score from {card.score_threshold:g}"))
+    for name in ("training", "metrics", "parity"):
+        rows += _nested(name, getattr(card, name))
+    if not math.isnan(session.golden_deviation):
+        rows.append(("here", f"{session.golden_deviation:.2g} standard deviations from the exporter's answers"))
+    return rows
+
+
+def _nested(name: str, value: Any) -> list[tuple[str, str]]:
+    """A card's free-form facts, an inner mapping's keys joined by dots; long lists shortened to their length."""
+    if isinstance(value, Mapping):
+        return [row for key, inner in value.items() for row in _nested(f"{name}.{key}", inner)]
+    if isinstance(value, (list, tuple)) and (len(value) > 12 or any(isinstance(v, (list, Mapping)) for v in value)):
+        return [(name, f"{len(value)} values")]
+    if isinstance(value, (list, tuple)):
+        return [(name, ", ".join(map(_one_line, value)))]
+    return [(name, f"{value:.4g}" if isinstance(value, float) else _one_line(value))]
+
+
+def _scan_rows(path: Path, sensor_name: str) -> list[tuple[str, str]]:
+    import numpy as np
+
+    from .models import model_path, shipped_models
+    from .points import read_points
+    from .sensors import FitnessProfile, check_fitness, get_sensor
+    from .session import Session
+
+    sensor = get_sensor(sensor_name)
+    points = read_points(path)
+    finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+    rows = [("scan", str(path)), ("points", f"{len(points):,}, of which {len(points) - len(finite):,} are not finite")]
+    if len(finite):
+        flat = np.hypot(finite[:, 0], finite[:, 1])
+        distance = np.hypot(flat, finite[:, 2])
+        low, high = np.percentile(np.degrees(np.arctan2(finite[:, 2], flat)), [0.5, 99.5])
+        for k, axis in enumerate(("x", "y", "z")):
+            rows.append((axis, f"{finite[:, k].min():.1f} .. {finite[:, k].max():.1f} m"))
+        rows.append(("range", "{:.1f} .. {:.1f} m, median {:.1f}".format(*np.percentile(distance, [0, 100, 50]))))
+        rows.append(("elevation", f"{low:.1f} .. {high:.1f} deg (99 % of the points)"))
+        quantiles = np.percentile(finite[:, 3], [0, 5, 50, 95, 100])
+        rows.append(("remission", "least {:g}, 5 % {:g}, median {:g}, 95 % {:g}, most {:g}".format(*quantiles)))
+    points = points.copy()
+    points[:, 3] = (points[:, 3] + np.float32(sensor.remission_offset)) * np.float32(sensor.remission_scale)
+    for name in shipped_models() if len(finite) else ():
+        try:
+            fitness = Session(model_path(name), "cpu").card.fitness
+        except MissingExtraError as exc:
+            rows.append((name, _one_line(exc)))
+            continue
+        if fitness is None:
+            rows.append((name, "its card does not say what its training scans looked like"))
+            continue
+        found = check_fitness(points, FitnessProfile.from_dict(fitness), sensor)
+        rows += [(name, f"as a scan of {sensor.name}: {sentence}") for sentence in found]
+        if not found:
+            rows.append((name, f"suits this scan, taken as one of {sensor.name}"))
+    return rows

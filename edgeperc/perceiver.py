@@ -119,7 +119,9 @@ class Perceiver:
         self._networks = [self._load(_resolve(m), provider, n_threads) for m in given]
         views = [n.session.card.view.kind for n in self._networks]
         if not views or len(views) != len(set(views)):
-            raise ValueError(f"models {[str(m) for m in given]} have views {views}; expected one or two, at most one a view")
+            raise ValueError(
+                f"models {[str(m) for m in given]} have views {views}; expected at least one model, at most one a view"
+            )
         self.cards: tuple[ModelCard, ...] = tuple(n.session.card for n in self._networks)
         self.providers = MappingProxyType({n.session.card.name: n.session.provider for n in self._networks})
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
@@ -262,8 +264,9 @@ class Perceiver:
         ((kind, raw),) = outputs.items()
         labels, _ = decode_classes(raw, kind, model=card.name)
         watch.lap("decode")
-        labelled = label_points(scan, pixel, network.index, labels)
-        labelled = remove_outliers(scan, pixel, network.index, labelled)
+        full_turn = card.view.azimuth_left_deg - card.view.azimuth_right_deg == 360.0
+        cleaned = remove_outliers(scan, network.index, labels, card.classes, full_turn=full_turn)
+        labelled = label_points(scan, pixel, network.index, cleaned, full_turn=full_turn)
         watch.lap("refine")
         return PointLabels(labelled, pixel >= 0, card.classes)
 

@@ -96,7 +96,7 @@ def draw(
     ground = _ground_z(points, names, painted)
 
     figure = Figure(figsize=(16, 10), dpi=100, facecolor=_GROUND)
-    canvas = FigureCanvasAgg(figure)
+    canvas: Any = FigureCanvasAgg(figure)
     left = 28.0
     if perception.top_view is not None:
         x_range, y_range = perception.top_view.x_range_m, perception.top_view.y_range_m
@@ -171,10 +171,10 @@ def write_html(points: NDArray[np.float32], perception: Perception, path: str | 
     }
     # "<" would let a class name close the script element.
     data = json.dumps(scene, allow_nan=False).replace("<", "\\u003c")
-    words = f"{perception.n_points:,} points · {_timing(perception)}"
+    facts = f"{perception.n_points:,} points · {_timing(perception)}"
     filled = {
         "@@TITLE@@": html.escape(title or "A scan"),
-        "@@WORDS@@": html.escape(words),
+        "@@WORDS@@": html.escape(facts),
         "@@FITNESS@@": "".join(f"<p class=warn>{html.escape(line)}</p>" for line in perception.fitness),
         "@@SCENE@@": data,
     }
@@ -395,12 +395,14 @@ def _draw_top_view(axes: Any, points: NDArray[np.float32], perception: Perceptio
         # Beside the box, on the side with more room.
         room_right = box.center[1] - y_right >= y_left - box.center[1]
         side = footprint[:, 1].min() - 0.25 if room_right else footprint[:, 1].max() + 0.25
-        words = _say(axes, side, box.center[0], f"{box.label} {box.score:.2f}", color=colour, fontsize=9.5, zorder=6)
+        ahead = min(max(box.center[0], x_near + 0.5), x_far - 0.5)
+        words = _say(axes, side, ahead, f"{box.label} {box.score:.2f}", color=colour, fontsize=9.5, zorder=6)
         words.set(ha="left" if room_right else "right", va="center", clip_on=True, fontweight="bold")
         _lift_clear(words, taken, 0.2)
         words.set_bbox({"facecolor": _PANEL, "edgecolor": "none", "alpha": 0.72, "pad": 1.5})
-    axes.plot([y_right + 5.8, y_right + 0.8], [x_near + 0.9] * 2, color=_INK, linewidth=3, zorder=7)
-    _say(axes, y_right + 3.3, x_near + 1.25, "5 m", ha="center", va="bottom", zorder=7)
+    below = x_near - 0.022 * (x_far - x_near)
+    axes.plot([y_right + 5.0, y_right], [below, below], color=_INK, linewidth=3, clip_on=False)
+    _say(axes, y_right + 5.4, below, "5 m", ha="right", va="center")
     axes.set_yticks(metres, labels=[f"{at:.0f} m" for at in metres])
     axes.tick_params(left=False, colors=_FAINT, labelsize=9.5, labelfontfamily="DejaVu Sans")
     _say(axes, 0.0, 1.008, "top view", color=_FAINT, transform=axes.transAxes, va="bottom")
@@ -582,7 +584,7 @@ Turn hardware acceleration on, or open the page in another browser.</div>
 <div id="modes"></div>
 <ul id="legend"></ul>
 </aside>
-<footer>drag: turn &nbsp; right-drag or two fingers: move &nbsp; wheel or pinch: zoom &nbsp; double-click: reset</footer>
+<footer>drag: turn · right-drag or two fingers: move · wheel or pinch: zoom · double-click: reset</footer>
 <script id="scene" type="application/json">@@SCENE@@</script>
 <script>
 "use strict";

@@ -67,7 +67,7 @@ class LabelledScan:
         """A simulated scan: everything about it is known."""
         surface = scan.top_view_labels(SURFACE)
         surface = np.where(surface == 1, 1, np.where(surface >= 2, IGNORE, 0)).astype(np.uint8)
-        return cls(scan.points, scan.labels, scan.boxes, tuple(int(c) for c in scan.box_counts), surface)
+        return cls(scan.points, scan.labels, scan.boxes, scan.box_points, surface)
 
     def save(self, path: Path) -> None:
         """Write to an .npz, without pickles."""

@@ -18,10 +18,9 @@ from edgeperc.card import TopViewGeometry
 from edgeperc.errors import PointsError
 from edgeperc.perception import Box
 from edgeperc.points import read_points
+from edgeperc.simulation import TOP_VIEW_CLASSES
 
 IGNORE = 255
-POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
-TOP_VIEW_CLASSES = ("background", "drivable", "car", "van", "truck")
 # PointSeg's car holds every vehicle with a box; pedestrians sit down too.
 POINT_CLASS_OF = {"car": 1, "van": 1, "truck": 1, "pedestrian": 2, "person_sitting": 2, "cyclist": 3}
 IMAGE_SIZE = (1242, 375)
@@ -111,9 +110,7 @@ class Frame:
         known = self.calibration.in_image(points)
         pixel, _ = self.calibration.to_image(points)
         for left, top, right, bottom in self.unlabelled:
-            known &= ~(
-                (pixel[:, 0] >= left) & (pixel[:, 0] <= right) & (pixel[:, 1] >= top) & (pixel[:, 1] <= bottom)
-            )
+            known &= ~((pixel[:, 0] >= left) & (pixel[:, 0] <= right) & (pixel[:, 1] >= top) & (pixel[:, 1] <= bottom))
         return known
 
     def point_labels(self) -> NDArray[np.uint8]:

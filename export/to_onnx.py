@@ -25,8 +25,9 @@ from edgeperc.errors import EdgepercError
 from edgeperc.projection import make_projector
 from edgeperc.sensors import FitnessProfile
 from edgeperc.session import Session, golden_input
+from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES
 
-from .train import FEWEST, RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT, Recipe, build
+from .train import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT, Recipe, build
 
 __all__ = ["ParityError", "export", "verify", "write_card"]
 
@@ -69,7 +70,7 @@ def card_of(recipe: Recipe, notes: Mapping[str, Any], fitness: FitnessProfile | 
             view=RANGE_IMAGE,
             input=RANGE_IMAGE_INPUT,
             outputs=(OutputSpec("logits", "class_logits"),),
-            classes=("background", "car", "pedestrian", "cyclist"),
+            classes=POINT_CLASSES,
             **common,
         )
     return ModelCard(
@@ -77,7 +78,7 @@ def card_of(recipe: Recipe, notes: Mapping[str, Any], fitness: FitnessProfile | 
         view=TOP_VIEW,
         input=TOP_VIEW_INPUT,
         outputs=(OutputSpec("segmentation", "class_logits"), OutputSpec("boxes", f"box_{recipe.head}")),
-        classes=("background", "drivable", "car", "van", "truck"),
+        classes=TOP_VIEW_CLASSES,
         box_classes=("car", "van", "truck"),
         # Medians of KITTI's labels: length, width, height.
         box_size_priors={"car": (3.9, 1.6, 1.5), "van": (5.1, 1.9, 2.2), "truck": (10.1, 2.6, 3.2)},

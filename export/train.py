@@ -24,12 +24,14 @@ from tqdm import tqdm
 from edgeperc.card import InputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.projection import make_projector
 from edgeperc.sensors import get_sensor
+from edgeperc.simulation import TOP_VIEW_CLASSES
 
 from .augment import LabelledScan, augmented
-from .kitti import TOP_VIEW_CLASSES, KittiObjects
+from .kitti import KittiObjects
 from .losses import IGNORE, dense_targets, pointseg_loss, slot_targets, ssadnet_loss
 from .networks.pointseg import PointSeg
 from .networks.ssadnet import SSADNet
+from .road import sure_surface
 
 TOP_VIEW = TopViewGeometry()
 RANGE_IMAGE = RangeImageGeometry(get_sensor("hdl-64e").elevations_deg)
@@ -70,6 +72,8 @@ class Recipe:
         Part of the samples that are simulated; what is left is real.
     ema : float
         Decay of the averaged weights, which are what is exported.
+    context_width : int
+        Channels of SSADNet's context module.
     seed : int
     """
 
@@ -81,6 +85,7 @@ class Recipe:
     weight_decay: float = 1e-3
     simulated_share: float = 0.6
     ema: float = 0.995
+    context_width: int = 128
     seed: int = 0
 
 
@@ -90,7 +95,7 @@ def build(recipe: Recipe) -> nn.Module:
     if recipe.network == "pointseg":
         return PointSeg()
     if recipe.network == "ssadnet":
-        return SSADNet(head=recipe.head)
+        return SSADNet(head=recipe.head, context_width=recipe.context_width)
     raise ValueError(f"network is {recipe.network!r}; expected ssadnet or pointseg")
 
 
@@ -166,7 +171,7 @@ def real_scans(kitti: KittiObjects, names: Sequence[str]) -> tuple[list[Labelled
     frames = [kitti.frame(n) for n in tqdm(names, desc="reading real scans", leave=False)]
     drives = [f.drive for f in frames]
     for frame in frames:
-        scans.append(LabelledScan.from_frame(frame))
+        scans.append(LabelledScan.from_frame(frame, sure_surface))
         # A drive counts with the square root of its frames: 154 neighbours are not 154 scenes.
         weights.append(drives.count(frame.drive) ** -0.5)
         hashes[frame.name] = hashlib.sha256(frame.points.tobytes()).hexdigest()[:16]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 # --- points ----------------------------------------------------------------------------------------------------------
@@ -33,6 +35,60 @@ def unpack_lzf(packed, size):
     except IndexError:
         return None
     return bytes(out)
+
+
+# --- sensors ---------------------------------------------------------------------------------------------------------
+
+
+def scan_sums(points, step, beam_step, view_right, view_left):
+    """Twin of `edgeperc.sensors.fill_scan_sums`: its outputs in their order, but ``rows`` as eight lists."""
+
+    def finite(rows):
+        return rows[np.isfinite(rows).all(axis=1)].astype(np.float64)
+
+    remissions, elevations, ranges = np.zeros(258, int), np.zeros(360, int), np.zeros(200, int)
+    heights, seen, n_near, n_view = np.zeros((3, 100), int), np.zeros(64, bool), 0, 0
+    sample = finite(points[::step])
+    for x, y, z, remission in sample:
+        remissions[0 if remission <= 0 else 257 if remission > 1 else 1 + min(int(remission * 256), 255)] += 1
+        if x == 0 and y == 0:
+            continue
+        azimuth = y / (abs(x) + abs(y))
+        if x < 0:
+            azimuth = (2 if y >= 0 else -2) - azimuth
+        seen[min(int((azimuth + 2) * 16), 63)] = True
+        n_view += view_right <= azimuth <= view_left
+        horizontal = math.sqrt(x * x + y * y)
+        elevations[min(int((math.atan(z / horizontal) * (180 / math.pi) + 90) * 2), 359)] += 1
+        ranges[min(max(int((math.log10(horizontal) + 3) * 20), 0), 199)] += 1
+        if 9 < x * x + y * y + z * z < 625:
+            n_near += 1
+            for axis, value in enumerate((x, y, z)):
+                if -10 <= value < 10:
+                    heights[axis, min(int((value + 10) * 5), 99)] += 1
+    middles = (np.arange(64) + 0.5) / 16 - 2
+    viewed = (middles >= view_right) & (middles <= view_left)
+
+    x, y, z, remission = sample.T
+    above = z - (heights[2].argmax() * 0.2 - 9.9)
+    stands = (above > 0.5) & (above < 6) & (abs(x) < 30) & (abs(y) < 30)
+    x, y = x[stands], y[stands]
+    in_the_way = [(abs(y) < 2) & (x > 3), (abs(y) < 2) & (x < -3), (abs(x) < 2) & (y > 3), (abs(x) < 2) & (y < -3)]
+    ahead, behind, left, right = (way.sum() + 0.002 * max(len(sample), 1) for way in in_the_way)
+    along_x, along_y = (np.histogram(v, np.arange(-30, 30.1, 0.5))[0] for v in (x, y))
+    alignment = np.log(max(left, right) / max(ahead, behind))
+    alignment += 0.5 * np.log(((along_y**2).sum() + 1) / ((along_x**2).sum() + 1))
+
+    rows = [[] for _ in range(8)]
+    for x, y, z, _ in finite(points[::beam_step]):
+        more, less = max(abs(x), abs(y)), min(abs(x), abs(y))
+        if more > 1 and (less < 0.0044 * more or more - less < 0.0087 * more):
+            direction = round(math.degrees(math.atan2(y, x)) / 45) % 8
+            if len(rows[direction]) < 1024:
+                rows[direction].append(math.degrees(math.atan(z / math.sqrt(x * x + y * y))))
+    lowest, highest = (remission.min(), remission.max()) if len(sample) else (np.inf, -np.inf)
+    sums = [len(sample), n_view, seen.sum(), seen[viewed].sum() / max(viewed.sum(), 1)]
+    return remissions, elevations, ranges, heights, rows, [*sums, alignment, lowest, highest, n_near]
 
 
 # --- projection ------------------------------------------------------------------------------------------------------
@@ -147,5 +203,82 @@ def footprint_sums(values, are_logits, rectangles, x_far, y_left, cell):
 
 
 # --- refine ----------------------------------------------------------------------------------------------------------
+
+
+def neighbours(row, col, reach, shape, full_turn):
+    """Pixels at most ``reach`` rows and columns away, row by row."""
+    for r in range(max(row - reach, 0), min(row + reach + 1, shape[0])):
+        for c in range(col - reach, col + reach + 1):
+            if full_turn or 0 <= c < shape[1]:
+                yield r, c % shape[1]
+
+
+def without_outliers(points, index, labels, radii, full_turn):
+    """Twin of `edgeperc.refine.fill_without_outliers`."""
+    cleaned = labels.copy()
+    seen = np.zeros(labels.shape, dtype=bool)
+    for first in np.ndindex(*labels.shape):
+        radius = radii[labels[first]]
+        if radius <= 0.0 or seen[first]:
+            continue
+        found = [first]
+        seen[first] = True
+        for pixel in found:
+            for other in neighbours(*pixel, 1, labels.shape, full_turn):
+                if not seen[other] and labels[other] == labels[first]:
+                    seen[other] = True
+                    found.append(other)
+        left = [pixel for pixel in found if index[pixel] >= 0]
+        draw = first[0] * labels.shape[1] + first[1]
+        rim = set()
+        for n_objects in range(64):
+            if not left:
+                break
+            ground = np.array([points[index[pixel], :2] for pixel in left], dtype=np.float64)
+            tested = ground[:: -(-len(left) // 512)]
+            most, center = 0, None
+            for _ in range(16):
+                draw = (draw * 1103515245 + 12345) % 2**31
+                hypothesis = tested[draw * len(tested) // 2**31]
+                near = ((tested - hypothesis) ** 2).sum(axis=1) <= radius**2
+                if not near.any():  # not finite
+                    continue
+                hypothesis = tested[near].mean(axis=0)
+                near = ((tested - hypothesis) ** 2).sum(axis=1) <= radius**2
+                if near.sum() > most:
+                    most, center = near.sum(), hypothesis
+            inside = np.zeros(len(left), dtype=bool)
+            if center is not None:
+                inside = ((ground - center) ** 2).sum(axis=1) <= radius**2
+            members = [pixel for pixel, near in zip(left, inside, strict=True) if near]
+            beyond = [pixel for pixel in members if pixel not in rim]
+            is_object = len(members) >= 5 and len(beyond) >= 0.1 * len(members)
+            if not members or (n_objects > 0 and not is_object):
+                for pixel in left:
+                    cleaned[pixel] = 0
+                break
+            for pixel in members:
+                rim.update(neighbours(*pixel, 2, labels.shape, full_turn))
+            left = [pixel for pixel, near in zip(left, inside, strict=True) if not near]
+    return cleaned
+
+
+def point_labels(points, pixel, index, labels, full_turn):
+    """Twin of `edgeperc.refine.fill_point_labels`."""
+    ranges = np.sqrt((points[:, :3].astype(np.float64) ** 2).sum(axis=1))
+    out = np.zeros(len(points), dtype=np.uint8)
+    for i, flat in enumerate(pixel):
+        if flat < 0:
+            continue
+        at = divmod(int(flat), labels.shape[1])
+        if index[at] == i:
+            out[i] = labels[at]
+            continue
+        around = [p for p in neighbours(*at, 2, labels.shape, full_turn) if index[p] >= 0]
+        gaps = [(abs(ranges[index[p]] - ranges[i]), k) for k, p in enumerate(around)]
+        votes = [labels[around[k]] for gap, k in sorted(g for g in gaps if g[0] <= 1.0)[:5]]
+        out[i] = max(votes, key=votes.count) if votes else 0
+    return out
+
 
 # --- simulation ------------------------------------------------------------------------------------------------------

@@ -23,9 +23,10 @@ MAY_IMPORT = {
     "models": {"errors"},
     **{noun: {"errors"} | NOUNS - {noun} for noun in NOUNS},
     **{stage: {"errors"} | NOUNS for stage in STAGES},
+    "metrics": {"errors"} | NOUNS,
     "view": {"errors"} | NOUNS,
     "perceiver": {"errors", "models"} | NOUNS | STAGES,
-    "cli": {"errors", "models", "perceiver", "view"} | NOUNS | STAGES,
+    "cli": {"errors", "metrics", "models", "perceiver", "view"} | NOUNS | STAGES,
     "__init__": {"errors", "perceiver"} | NOUNS | STAGES,
     "__main__": {"cli"},
 }

@@ -1,0 +1,494 @@
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from edgeperc import __version__, cli
+from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.errors import InferenceError, ModelFileError
+from edgeperc.perception import Box, Perception, PointLabels, TopView
+
+POINTSEG = ModelCard(
+    name="pointseg",
+    version="1.2.3",
+    view=RangeImageGeometry((2.0, 0.0, -10.0), width=8),
+    input=InputSpec("range_image", ("x", "y", "z"), (0.0,) * 3, (1.0,) * 3),
+    outputs=(OutputSpec("logits", "class_logits"),),
+    classes=("background", "car", "pedestrian", "cyclist"),
+    training={"data": "streets", "licence": "CC0", "frames": list(range(40)), "drives": ["a", "b"]},
+    metrics={"iou": {"car": 0.65123}},
+    parity={"max_abs_diff": 1.5e-5},
+)
+SSADNET = ModelCard(
+    name="ssadnet",
+    version="1.0.0",
+    view=TopViewGeometry(),
+    input=InputSpec("top_view", ("height",), (0.0,), (1.0,)),
+    outputs=(OutputSpec("map", "class_probabilities"), OutputSpec("boxes", "box_dense")),
+    classes=("background", "drivable", "car", "van", "truck"),
+    box_classes=("car", "van"),
+)
+
+
+class FakePerceiver:
+    """Labels every second point a car; chokes where the first point's remission is 1."""
+
+    made: ClassVar[list[FakePerceiver]] = []
+
+    def __init__(self, models, *, sensor="hdl-64e", provider="auto", n_threads=None, on_mismatch="warn") -> None:
+        self.given = (list(models), sensor, provider, n_threads, on_mismatch)
+        known = {"pointseg": POINTSEG, "ssadnet": SSADNET}
+        for name in models:
+            if name not in known:
+                raise ModelFileError(f"no model is called {name!r}.\nShipped: pointseg, ssadnet.")
+        if len(set(models)) < len(self.given[0]):
+            raise ValueError("two models of one view")
+        self.cards = tuple(known[name] for name in models)
+        FakePerceiver.made.append(self)
+
+    def __call__(self, points, stamp_s=None) -> Perception:
+        if len(points) and points[0, 3] == 1.0:
+            raise InferenceError("pointseg answered\nwith NaN")
+        if len(points) and points[0, 3] == 2.0:
+            raise KeyboardInterrupt
+        if len(points) and points[0, 3] == 3.0:
+            warnings.warn("the scan has 32 beams", stacklevel=2)
+        views = [card.view.kind for card in self.cards]
+        labels = np.arange(len(points), dtype=np.uint8) % 2
+        cells = np.zeros((400, 200), dtype=np.uint8)
+        cells[:100, :100] = 1
+        top_view = TopView(cells, SSADNET.classes, 0.1, (6.0, 46.0), (-10.0, 10.0))
+        box = Box("car", 0.912345, (20.0, -3.0, -0.9), (4.2, 1.8, 1.6), 0.3)
+        return Perception(
+            n_points=len(points),
+            n_dropped=0,
+            points=PointLabels(labels, np.ones(len(points), bool), POINTSEG.classes)
+            if "range_image" in views
+            else None,
+            top_view=top_view if "top_view" in views else None,
+            boxes=(box,) if "top_view" in views else (),
+            stage_ms={"project": 1.0, "infer": 20.25},
+            providers={card.name: "CPUExecutionProvider (fp32)" for card in self.cards},
+            fitness=("the scan has 32 beams",) if len(points) == 5 else (),
+            stamp_s=None,
+        )
+
+
+@pytest.fixture(autouse=True)
+def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakePerceiver]:
+    monkeypatch.setitem(sys.modules, "edgeperc.perceiver", SimpleNamespace(Perceiver=FakePerceiver))
+    monkeypatch.setattr(FakePerceiver, "made", [])
+    return FakePerceiver
+
+
+def write_scan(path: Path, n: int = 40, first_remission: float = 0.0) -> Path:
+    points = np.random.default_rng(n).uniform(-20.0, 20.0, (n, 4)).astype(np.float32)
+    points[:, 3] = 0.5
+    points[:1, 3] = first_remission
+    path.parent.mkdir(parents=True, exist_ok=True)
+    points.tofile(path)
+    return path
+
+
+def run(*arguments: object) -> int:
+    return cli.main([str(a) for a in arguments])
+
+
+def usage_code(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as left:
+        run(*arguments)
+    assert isinstance(left.value.code, int)
+    return left.value.code
+
+
+def test_version_and_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    assert usage_code("--version") == 0
+    assert capsys.readouterr().out == f"edgeperc {__version__}\n"
+    assert usage_code() == 2
+    assert usage_code("run") == 2
+    assert usage_code("run", "x.bin", "--threads", "0") == 2
+    assert "1 or more" in capsys.readouterr().err
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys, edgeperc.cli\n"
+        "try: edgeperc.cli.main(['run', '--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'numpy', 'numba', 'onnxruntime', 'matplotlib'} & set(sys.modules)\n"
+        "sys.exit(f'imported {heavy}' if heavy else 0)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "--on-mismatch" in done.stdout
+
+
+def test_run_prints_a_line_a_scan(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: type[FakePerceiver]
+) -> None:
+    scans = [write_scan(tmp_path / f"{k}.bin", n) for k, n in enumerate((40, 1200, 0 + 3))]
+    options = ("--sensor", "os1-64", "--provider", "cpu", "--threads", 2, "--on-mismatch", "ignore")
+    assert run("run", *scans, *options) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split("  ")[0] for line in lines] == [str(scan) for scan in scans]
+    assert "1,200 points" in lines[1]
+    assert "21.2 ms" in lines[1]
+    assert "drivable 100.0 m2" in lines[1]
+    assert "boxes: 1 car" in lines[1]
+    assert "car 600, pedestrian 0, cyclist 0" in lines[1]
+    assert fake.made[0].given == (["ssadnet", "pointseg"], "os1-64", "cpu", 2, "ignore")
+
+
+def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good, bad, short = tmp_path / "good.bin", tmp_path / "bad.bin", tmp_path / "short.bin"
+    write_scan(good, 5)
+    write_scan(bad, 40, first_remission=1.0)
+    short.write_bytes(b"123")
+    absent = tmp_path / "absent.bin"
+    assert run("run", bad, good, short, absent, "--json") == 1
+    captured = capsys.readouterr()
+    answers = [json.loads(line) for line in captured.out.splitlines()]
+    assert [answer["scan"] for answer in answers] == [str(path) for path in (bad, good, short, absent)]
+    assert ["error" in answer for answer in answers] == [True, False, True, True]
+    assert answers[0] == {"scan": str(bad), "error": "pointseg answered with NaN"}
+    assert answers[1] == {
+        "scan": str(good),
+        "n_points": 5,
+        "n_dropped": 0,
+        "stage_ms": {"project": 1.0, "infer": 20.25},
+        "providers": {"ssadnet": "CPUExecutionProvider (fp32)", "pointseg": "CPUExecutionProvider (fp32)"},
+        "boxes": [{"label": "car", "score": 0.9123, "center": [20.0, -3.0, -0.9], "size": [4.2, 1.8, 1.6], "yaw": 0.3}],
+        "drivable_area_m2": 100.0,
+        "point_counts": {"background": 3, "car": 2, "pedestrian": 0, "cyclist": 0},
+        "tracks": [],
+        "fitness": ["the scan has 32 beams"],
+    }
+    complaints = captured.err.splitlines()
+    assert [line.startswith("edgeperc: ") for line in complaints] == [True, True, True, False]
+    assert complaints[3].startswith("4 scans, 3 failed")
+    assert captured.err.count(str(short)) == 1
+    assert "Traceback" not in captured.err
+
+
+def test_json_of_one_model_says_null_for_the_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan = write_scan(tmp_path / "a.bin")
+    assert run("run", scan, "--json", "--model", "pointseg") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["drivable_area_m2"] is None
+    assert answer["boxes"] == []
+    assert run("run", scan, "--json", "--model", "ssadnet") == 0
+    assert json.loads(capsys.readouterr().out)["point_counts"] is None
+
+
+def test_folders_are_opened_and_sorted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "scans"
+    for name in ("b.bin", "a.BIN", ".hidden.bin", "deeper/c.bin"):
+        write_scan(folder / name)
+    np.save(folder / "c.npy", np.zeros((3, 4), np.float32))
+    (folder / "notes.txt").write_text("no scan")
+    (folder / "folder.bin").mkdir()
+    assert run("run", folder, folder / "b.bin", "--json") == 0
+    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [Path(answer["scan"]).name for answer in answers] == ["a.BIN", "b.bin", "c.npy"]
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    assert run("run", bare, folder / "b.bin", "--json") == 1
+    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert answers[0]["scan"] == str(bare)
+    assert "no scan in this folder" in answers[0]["error"]
+    assert answers[1]["n_points"] == 40
+
+
+def test_files_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    scan = write_scan(tmp_path / "in" / "000123.bin", 40)
+    out = tmp_path / "out"
+    assert run("run", scan, "--out", out, "--png", "--html", "--labels", "--ply", "--json") == 0
+    assert sorted(file.name for file in out.iterdir()) == ["000123.html", "000123.label", "000123.ply", "000123.png"]
+    np.testing.assert_array_equal(np.fromfile(out / "000123.label", "<u4"), np.arange(40) % 2 * 10)
+    assert (out / "000123.png").read_bytes().startswith(b"\x89PNG")
+    assert b"element vertex 40\n" in (out / "000123.ply").read_bytes()
+    assert "000123.bin" in (out / "000123.html").read_text(encoding="utf-8")
+    assert json.loads(capsys.readouterr().out)["n_points"] == 40
+
+
+def test_scans_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
+    for k, folder in enumerate(("day1/velodyne", "day2/velodyne")):
+        write_scan(tmp_path / folder / "000.bin", 10 + k)
+        write_scan(tmp_path / folder / "001.bin", 20 + k)
+    out = tmp_path / "out"
+    folders = [tmp_path / "day1" / "velodyne", tmp_path / "day2" / ".." / "day2" / "velodyne"]
+    assert run("run", *folders, "--out", out, "--labels") == 0
+    sizes = {file.relative_to(out).as_posix(): file.stat().st_size // 4 for file in out.rglob("*.label")}
+    assert sizes == {
+        "day1/velodyne/000.label": 10,
+        "day1/velodyne/001.label": 20,
+        "day2/velodyne/000.label": 11,
+        "day2/velodyne/001.label": 21,
+    }
+
+
+@pytest.mark.parametrize(
+    ("given", "names"),
+    [
+        (["/d/a.bin", "/d/b.pcd.bin"], ["a", "b"]),
+        (["/d/1699.25.bin", "/d/1699.50.bin"], ["1699.25", "1699.50"]),
+        (["/d/a.bin", "/d/a.pcd"], ["a.bin", "a.pcd"]),
+        (["/d/a.bin", "/d/a.pcd.bin", "/e/a.bin"], ["d/a.bin", "d/a.pcd.bin", "e/a.bin"]),
+        (["/d/A.bin", "/e/a.bin"], ["d/A", "e/a"]),
+        (["/x/d/a.bin", "/y/d/a.bin", "/y/d/b.bin"], ["x/d/a", "y/d/a", "y/d/b"]),
+        (["/a.bin", "/d/a.bin"], ["a", "d/a"]),
+        (["/d/.bin"], [".bin"]),
+        ([], []),
+    ],
+)
+def test_output_names(given: list[str], names: list[str]) -> None:
+    assert [name.as_posix() for name in cli._output_names([Path(scan) for scan in given])] == names
+
+
+def test_a_scan_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan = write_scan(tmp_path / "scan.bin")
+    ply = tmp_path / "scan.ply"
+    assert run("run", scan, "--ply", "--out", tmp_path) == 0
+    before = ply.read_bytes()
+    assert usage_code("run", ply, "--ply", "--out", tmp_path) == 2
+    assert "would be overwritten" in capsys.readouterr().err
+    assert ply.read_bytes() == before
+
+
+def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: type[FakePerceiver]) -> None:
+    scan = write_scan(tmp_path / "a.bin")
+    for arguments, words in [
+        (("--png",), "add --out"),
+        (("--out", tmp_path / "out"), "add --png"),
+        (("--on-mismatch", "explode"), "invalid choice"),
+    ]:
+        assert usage_code("run", scan, *arguments) == 2
+        assert words in capsys.readouterr().err
+    for arguments, words in [
+        (("--model", "nonesuch"), "no model is called 'nonesuch'. Shipped: pointseg, ssadnet."),
+        (("--model", "pointseg", "--model", "pointseg"), "two models of one view"),
+        (("--model", "ssadnet", "--labels", "--out", tmp_path / "out"), "add a range-image model"),
+    ]:
+        assert run("run", scan, *arguments) == 2
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.startswith("edgeperc: ")
+        assert captured.err.count("\n") == 1
+        assert words in captured.err
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "file").write_text("in the way")
+    assert run("run", scan, "--labels", "--out", tmp_path / "file") == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_file_that_cannot_be_written_fails_its_scan_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scans = [write_scan(tmp_path / name) for name in ("a.bin", "b.bin")]
+    (tmp_path / "out" / "a.label").mkdir(parents=True)
+    assert run("run", *scans, "--labels", "--out", tmp_path / "out") == 1
+    assert "a.label" in capsys.readouterr().err
+    assert (tmp_path / "out" / "b.label").stat().st_size == 160
+
+
+def test_missing_matplotlib_is_said_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, fake: type[FakePerceiver]
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert run("run", write_scan(tmp_path / "a.bin"), "--png", "--out", tmp_path / "out") == 2
+    assert "pip install 'edgeperc[view]'" in capsys.readouterr().err
+    assert fake.made == []
+
+
+def test_interrupted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scans = [write_scan(tmp_path / "a.bin"), write_scan(tmp_path / "b.bin", 40, first_remission=2.0)]
+    assert run("run", *scans, "--json") == 130
+    captured = capsys.readouterr()
+    assert len(captured.out.splitlines()) == 1
+    assert captured.err == "edgeperc: interrupted\n"
+
+
+@pytest.mark.filterwarnings("default::UserWarning")
+def test_warnings_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shown = warnings.showwarning
+    assert run("run", write_scan(tmp_path / "a.bin", 40, first_remission=3.0)) == 0
+    assert capsys.readouterr().err == "edgeperc: warning: the scan has 32 beams\n"
+    assert warnings.showwarning is shown
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes are told of differently elsewhere")
+def test_a_reader_that_goes_away_is_no_accident(tmp_path: Path) -> None:
+    for k in range(30):
+        write_scan(tmp_path / f"{k:02}.bin")
+    code = (
+        "import sys, types; sys.path.insert(0, sys.argv[1]); import test_cli\n"
+        "sys.modules['edgeperc.perceiver'] = types.SimpleNamespace(Perceiver=test_cli.FakePerceiver)\n"
+        "from edgeperc.cli import main; sys.exit(main(['run', sys.argv[2], '--json']))\n"
+    )
+    command = [sys.executable, "-c", code, str(Path(__file__).parent), str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    complaints = process.stderr.read().decode()
+    process.stderr.close()
+    assert process.wait() == 141
+    assert "Traceback" not in complaints
+    assert "BrokenPipe" not in complaints
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere file names are Unicode")
+def test_names_that_are_no_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan = tmp_path / os.fsdecode(b"caf\xe9.bin")
+    write_scan(scan)
+    assert run("run", scan) == 0
+    assert "\\udce9.bin" in capsys.readouterr().out
+    assert run("run", scan, "--html", "--out", tmp_path / "out") == 0
+    assert len(list((tmp_path / "out").iterdir())) == 1
+
+
+def test_progress_bar_only_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True  # type: ignore[method-assign]
+    monkeypatch.setattr(sys, "stderr", terminal)
+    progress = cli._Progress(4)
+    progress.show(2)
+    assert f"[{'#' * 15}{' ' * 15}] 2/4" in terminal.getvalue()
+    progress.clear()
+    assert terminal.getvalue().endswith("\r\x1b[K")
+    assert not cli._Progress(1).live
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    cli._Progress(4).show(1)
+    assert sys.stderr.getvalue() == ""
+
+
+@pytest.fixture
+def fake_street(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(0).uniform(-20.0, 20.0, (1000, 4)).astype(np.float32)
+    street = SimpleNamespace(points=points, labels=np.ones(1000, np.uint8))
+    made = SimpleNamespace(random_scene=lambda seed: seed, simulate=lambda scene, sensor, seed: street)
+    monkeypatch.setitem(sys.modules, "edgeperc.simulation", made)
+
+
+@pytest.mark.usefixtures("fake_street")
+def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    assert run("demo", "--out", tmp_path / "demo") == 0
+    out = capsys.readouterr().out
+    assert "100 m2 of the 40 x 20 m ahead" in out
+    assert "20.2 m away:  20.0 m ahead,  3.0 m right" in out
+    assert "heading   17 deg" in out
+    assert "(there are 1,000)" in out
+    assert "ssadnet: CPUExecutionProvider (fp32)" in out
+    for name in ("scene.png", "scene.html"):
+        assert str(tmp_path / "demo" / name) in out
+        assert (tmp_path / "demo" / name).stat().st_size > 10_000
+
+
+@pytest.mark.usefixtures("fake_street")
+def test_demo_without_matplotlib(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert run("demo", "--out", tmp_path / "demo", "--model", "ssadnet") == 0
+    out = capsys.readouterr().out
+    assert "pip install 'edgeperc[view]'" in out
+    assert "drivable" in out
+    assert [file.name for file in (tmp_path / "demo").iterdir()] == ["scene.html"]
+
+
+@pytest.fixture
+def fake_models(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    file = tmp_path / "pointseg.onnx"
+    file.write_bytes(bytes(2_500_000))
+    file.with_stem("ssadnet").write_bytes(bytes(10))
+
+    class FakeSession:
+        def __init__(self, path: Path, provider: str) -> None:
+            assert provider == "cpu"
+            self.path, self.sha256, self.golden_deviation = path, "ab" * 32, 2e-6
+            self.card = POINTSEG if path.stem == "pointseg" else SSADNET
+            self.input = np.zeros((3, 3, 8), np.float32)
+
+    def model_path(name: str) -> Path:
+        if name not in ("pointseg", "ssadnet", str(file)):
+            raise ModelFileError(f"no model is called {name!r}")
+        return file.with_stem(Path(name).stem)
+
+    models = SimpleNamespace(model_path=model_path, shipped_models=lambda: ("pointseg", "ssadnet"))
+    monkeypatch.setitem(sys.modules, "edgeperc.models", models)
+    monkeypatch.setitem(sys.modules, "edgeperc.session", SimpleNamespace(Session=FakeSession))
+
+
+@pytest.mark.usefixtures("fake_models")
+@pytest.mark.parametrize("thing", ["pointseg", "pointseg.onnx"])
+def test_info_of_a_model(thing: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info", thing if thing == "pointseg" else tmp_path / thing) == 0
+    rows = dict(line.split(None, 1) for line in capsys.readouterr().out.splitlines())
+    assert rows["model"] == "pointseg 1.2.3"
+    assert rows["file"].endswith("pointseg.onnx (2.5 MB)")
+    assert rows["sha256"] == "ab" * 32
+    assert rows["view"] == "range_image: 3 beams from 2 to -10 deg, azimuths 45 to -45 deg"
+    assert rows["input"] == "3 x 3 x 8: x, y, z"
+    assert rows["outputs"] == "logits (class_logits)"
+    assert rows["classes"] == "background, car, pedestrian, cyclist"
+    assert rows["training.licence"] == "CC0"
+    assert rows["training.frames"] == "40 values"
+    assert rows["training.drives"] == "a, b"
+    assert rows["metrics.iou.car"] == "0.6512"
+    assert rows["parity.max_abs_diff"] == "1.5e-05"
+    assert rows["here"].startswith("2e-06 standard deviations")
+
+
+@pytest.mark.usefixtures("fake_models")
+def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    from edgeperc import sensors
+
+    checked = []
+
+    def check_fitness(points, profile, sensor) -> tuple[str, ...]:
+        checked.append((points, profile, sensor.name))
+        return ("it has 32 beams",)
+
+    monkeypatch.setattr(sensors, "check_fitness", check_fitness, raising=False)
+    monkeypatch.setattr(sensors, "FitnessProfile", SimpleNamespace(from_dict=dict), raising=False)
+    monkeypatch.setattr(sys.modules[__name__], "POINTSEG", replace(POINTSEG, fitness={"n_beams": 64}))
+    points = np.array([[3, 4, 0, 10], [0, 10, 10, 255], [-6, 0, 8, 51], [np.nan, 0, 0, 0]], np.float32)
+    np.save(tmp_path / "scan.npy", points)
+    assert run("info", tmp_path / "scan.npy", "--sensor", "os1-64") == 0
+    out = capsys.readouterr().out
+    rows = dict(line.split(None, 1) for line in out.splitlines())
+    assert rows["points"] == "4, of which 1 are not finite"
+    assert rows["x"] == "-6.0 .. 3.0 m"
+    assert rows["range"] == "5.0 .. 14.1 m, median 10.0"
+    assert rows["remission"].startswith("least 10, 5 % ")
+    assert rows["pointseg"] == "as a scan of os1-64: it has 32 beams"
+    assert rows["ssadnet"].startswith("its card does not say")
+    ((scaled, profile, sensor),) = checked
+    np.testing.assert_allclose(scaled[:3, 3], np.array([10, 255, 51]) / 255, rtol=1e-6)
+    assert (profile, sensor) == ({"n_beams": 64}, "os1-64")
+
+
+@pytest.mark.usefixtures("fake_models")
+def test_info_goes_on_after_what_it_does_not_know(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    empty = tmp_path / "empty.npy"
+    np.save(empty, np.zeros((0, 4), np.float32))
+    assert run("info", "nonesuch", tmp_path / "absent.bin", empty, "ssadnet") == 1
+    captured = capsys.readouterr()
+    assert [line.split(":")[0] for line in captured.err.splitlines()] == ["edgeperc", "edgeperc"]
+    assert "0, of which 0 are not finite" in captured.out
+    assert "top_view: x 6..46 m, y -10..10 m, cells of 0.1 m" in captured.out
+    assert "boxes    car, van, score from 0.3" in captured.out
+    assert run("info", empty, "--sensor", "nonesuch") == 2
+    assert "nonesuch" in capsys.readouterr().err

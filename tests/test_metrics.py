@@ -1,0 +1,197 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edgeperc.errors import PointsError
+from edgeperc.metrics import BoxEvaluator, Confusion, average_precision
+from edgeperc.perception import Box
+
+
+def box(x, y, label="car", score=1.0, size=(4.0, 2.0), yaw=0.0):
+    return Box(label, score, (x, y, -1.0), (*size, 1.5), yaw)
+
+
+# --- labels
+
+
+def test_scores_of_a_table_made_by_hand():
+    confusion = Confusion(("background", "car", "pedestrian", "cyclist"))
+    # truth:      0  0  0  0  1  1  1  2  2  ignored
+    # predicted:  0  0  0  1  1  1  0  2  1  3
+    confusion.update([[0, 0, 0, 1, 1], [1, 0, 2, 1, 3]], [[0, 0, 0, 0, 1], [1, 1, 2, 2, 255]])
+    assert confusion.counts.tolist() == [[3, 1, 0, 0], [1, 2, 0, 0], [0, 1, 1, 0], [0, 0, 0, 0]]
+    np.testing.assert_allclose(confusion.precision(), [3 / 4, 2 / 4, 1.0, np.nan])
+    np.testing.assert_allclose(confusion.recall(), [3 / 4, 2 / 3, 1 / 2, np.nan])
+    np.testing.assert_allclose(confusion.iou(), [3 / 5, 2 / 5, 1 / 2, np.nan])
+    assert confusion.accuracy() == pytest.approx(6 / 9)
+    assert confusion.mean_iou() == pytest.approx(0.5)
+    assert confusion.weighted_precision() == pytest.approx((4 * 0.75 + 3 * 0.5 + 2 * 1.0) / 9)
+
+
+def test_updates_add_up_and_nothing_has_no_score():
+    confusion = Confusion(("a", "b"), ignore=7)
+    assert math.isnan(confusion.accuracy())
+    assert np.isnan(confusion.iou()).all()
+    assert math.isnan(confusion.mean_iou())
+    assert math.isnan(confusion.weighted_precision())
+    confusion.update(np.zeros(0, dtype=np.uint8), np.zeros(0, dtype=np.uint8))
+    confusion.update(np.uint8([1, 1, 0]), np.uint8([1, 0, 7]))
+    confusion.update(np.int64([1]), np.uint8([1]))
+    assert confusion.counts.tolist() == [[0, 1], [0, 2]]
+    # "a" occurs and was never predicted: no precision, but a recall and an IoU of 0.
+    np.testing.assert_allclose(confusion.precision(), [np.nan, 2 / 3])
+    np.testing.assert_allclose(confusion.recall(), [0.0, 1.0])
+    np.testing.assert_allclose(confusion.iou(), [0.0, 2 / 3])
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.sampled_from([0, 1, 2, 3, 255])), max_size=40))
+def test_scores_are_those_of_sets(pairs):
+    confusion = Confusion("abcd")
+    predicted, truth = np.array(pairs, dtype=np.uint8).reshape(-1, 2).T
+    confusion.update(predicted, truth)
+    for k in range(4):
+        p = {i for i, (a, b) in enumerate(pairs) if a == k and b != 255}
+        g = {i for i, (a, b) in enumerate(pairs) if b == k}
+        expected = len(p & g) / len(p | g) if p | g else math.nan
+        np.testing.assert_allclose(confusion.iou()[k], expected)
+
+
+def test_labels_that_cannot_be_counted_raise():
+    confusion = Confusion(("a", "b"))
+    with pytest.raises(PointsError, match=r"\(2,\) and truth \(3,\)"):
+        confusion.update([0, 0], [0, 0, 0])
+    with pytest.raises(PointsError, match=r"predicted labels from 0 to 2; expected 0\.\.1"):
+        confusion.update([0, 2], [0, 1])
+    with pytest.raises(PointsError, match="truth labels from -1"):
+        confusion.update([0, 1], [-1, 1])
+    assert confusion.counts.sum() == 0
+
+
+# --- average precision
+
+
+def test_average_precision_by_hand():
+    # Precision after each: 1, 1/2, 2/3, 3/4, 3/5; recall 1/4, 1/4, 1/2, 3/4, 3/4.
+    scores, hits = [0.9, 0.8, 0.7, 0.6, 0.5], [True, False, True, True, False]
+    expected = (3 * 1.0 + 5 * 0.75) / 11  # recalls 0, .1, .2 reach 1; .3 to .7 reach 3/4; .8 to 1 nothing
+    assert average_precision(scores, hits, 4) == pytest.approx(expected)
+    shuffled = [3, 0, 4, 2, 1]
+    again = average_precision([scores[k] for k in shuffled], [hits[k] for k in shuffled], 4)
+    assert again == pytest.approx(expected)
+
+
+def test_average_precision_at_its_ends():
+    assert average_precision([0.5, 0.4], [True, True], 2) == 1.0
+    assert average_precision([0.5, 0.4], [False, False], 2) == 0.0
+    assert average_precision([], [], 3) == 0.0
+    assert math.isnan(average_precision([0.5], [False], 0))
+    # A recall of exactly 0.3 counts for the four levels 0 to 0.3, whatever 0.1 * 3 rounds to.
+    assert average_precision([0.9, 0.8, 0.7], [True] * 3, 10) == pytest.approx(4 / 11)
+    # Of equal scores the earlier counts as the better.
+    assert average_precision([0.5, 0.5], [True, False], 1) == 1.0
+    assert average_precision([0.5, 0.5], [False, True], 1) == 0.5
+    with pytest.raises(PointsError, match=r"\(2,\) and hits \(1,\)"):
+        average_precision([0.5, 0.4], [True], 1)
+
+
+# --- boxes
+
+
+def test_boxes_by_hand():
+    evaluator = BoxEvaluator(0.5)
+    truth = [box(10.0, 0.0), box(20.0, 0.0), box(30.0, 5.0, "van")]
+    predicted = [
+        box(10.5, 0.0, score=0.9),  # 3.5 of 4.5 m: IoU 7/9
+        box(20.0, 0.5, score=0.8),  # 1.5 of 2.5 m: 3/5
+        box(20.0, 0.0, score=0.7),  # the truth is taken
+        box(30.0, 5.0, "car", score=0.6),  # a van, called a car
+        box(40.0, -5.0, "truck", score=0.5),  # nothing there
+    ]
+    evaluator.update(predicted, truth)
+    everything = evaluator.overall()
+    assert (everything.n_truth, everything.n_predicted, everything.n_hits) == (3, 5, 3)
+    assert everything.precision == pytest.approx(3 / 5)
+    assert everything.recall == pytest.approx(1.0)
+    assert everything.mean_iou_50 == pytest.approx((7 / 9 + 3 / 5 + 1.0) / 3)
+    assert everything.mean_iou_70 == pytest.approx((7 / 9 + 1.0) / 2)
+    # Precision at recalls 1/3, 2/3, 1: 1, 1, 3/4.
+    assert everything.ap == pytest.approx((7 * 1.0 + 4 * 0.75) / 11)
+    scores = evaluator.per_class()
+    assert set(scores) == {"car", "van", "truck"}
+    assert (scores["car"].n_truth, scores["car"].n_predicted, scores["car"].n_hits) == (2, 4, 2)
+    assert scores["car"].ap == 1.0
+    assert scores["van"].ap == 0.0
+    assert math.isnan(scores["van"].precision)
+    assert math.isnan(scores["truck"].ap)
+    assert scores["truck"].precision == 0.0
+    assert evaluator.mean_ap() == pytest.approx(0.5)
+
+
+def test_scans_add_up_and_do_not_mix():
+    evaluator = BoxEvaluator()
+    evaluator.update([box(10.0, 0.0, score=0.3)], [])
+    evaluator.update([], [box(10.0, 0.0)])
+    scores = evaluator.overall()
+    assert (scores.n_truth, scores.n_predicted, scores.n_hits) == (1, 1, 0)
+    assert scores.ap == scores.precision == scores.recall == 0.0
+    assert math.isnan(scores.mean_iou_50)
+    empty = BoxEvaluator()
+    empty.update([], [])
+    assert empty.per_class() == {}
+    assert math.isnan(empty.overall().ap)
+    assert math.isnan(empty.mean_ap())
+
+
+def test_better_scores_choose_first_and_take_what_fits_best():
+    truth = [box(10.0, 0.0), box(11.0, 0.0)]
+    evaluator = BoxEvaluator(0.5)
+    # Listed worst first. The better prediction overlaps both; it takes the nearer, and leaves the other.
+    evaluator.update([box(10.1, 0.0, score=0.2), box(10.8, 0.0, score=0.9)], truth)
+    assert evaluator.overall().n_hits == 2
+    assert evaluator.overall().mean_iou_50 == pytest.approx((3.8 / 4.2 + 3.9 / 4.1) / 2)
+
+
+def test_ignored_boxes_and_regions_make_neither_right_nor_wrong():
+    evaluator = BoxEvaluator(0.5)
+    evaluator.update(
+        [
+            box(10.0, 0.0, score=0.9),
+            box(20.0, 0.0, score=0.8),  # an ignored object
+            box(20.0, 0.3, "van", score=0.7),  # on the same, of another class
+            box(30.0, 0.0, score=0.6),  # within a region
+            box(33.0, 0.0, score=0.5),  # half a metre of it within the region
+        ],
+        [box(10.0, 0.0)],
+        ignored=[box(20.0, 0.0)],
+        ignored_regions=[[29.0, 0.0, 5.0, 20.0, 0.0]],
+    )
+    scores = evaluator.overall()
+    assert (scores.n_truth, scores.n_predicted, scores.n_hits) == (1, 2, 1)
+    # A truth is taken before an ignored box is thought of.
+    close = BoxEvaluator(0.5)
+    close.update([box(10.0, 0.0)], [box(10.5, 0.0)], ignored=[box(10.0, 0.0)])
+    assert close.overall().n_hits == 1
+
+
+def test_axis_aligned_bounds_are_what_the_paper_compares():
+    turned = [box(10.0, 0.0, yaw=math.pi / 4.0)]
+    other = [box(10.0, 0.0, yaw=-math.pi / 4.0)]
+    oriented, aligned = BoxEvaluator(0.5), BoxEvaluator(0.5, oriented=False)
+    oriented.update(other, turned)
+    aligned.update(other, turned)
+    assert oriented.overall().n_hits == 0  # two bars that cross: 4 of 12 m2
+    assert aligned.overall().mean_iou_50 == pytest.approx(1.0)
+    # Front and rear are the same footprint.
+    oriented.update([box(10.0, 0.0, yaw=-3.0 * math.pi / 4.0)], turned)
+    assert oriented.overall().n_hits == 1
+
+
+@pytest.mark.parametrize("threshold", [0.0, -0.5, 1.1, math.nan])
+def test_thresholds_out_of_range_raise(threshold):
+    with pytest.raises(PointsError, match="iou_threshold"):
+        BoxEvaluator(threshold)
