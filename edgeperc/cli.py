@@ -31,7 +31,8 @@ __all__ = ["main"]
 
 SHIPPED = ("ssadnet", "pointseg")
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
-DEMO_SEED = 7
+# A junction with cars, a van, pedestrians and a cyclist; far from the seeds that models are trained on.
+DEMO_SCENE = (2_000_000_058, "junction")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -368,7 +369,7 @@ def _demo(arguments: argparse.Namespace) -> int:
     from .simulation import random_scene, simulate
 
     perceive = _perceiver(arguments, "hdl-64e", "ignore")
-    scan = simulate(random_scene(DEMO_SEED), "hdl-64e", DEMO_SEED)
+    scan = simulate(random_scene(*DEMO_SCENE), "hdl-64e", DEMO_SCENE[0])
     perceive(scan.points)  # the first pass over a whole scan meets cold caches
     perception = perceive(scan.points)
 
@@ -446,7 +447,7 @@ def _info(arguments: argparse.Namespace) -> int:
 def _is_model(thing: str) -> bool:
     """A path that exists, or looks like one, is a scan unless it ends in .onnx; any other word is a model's name."""
     path = Path(thing)
-    return path.suffix.lower() == ".onnx" or not (path.exists() or path.suffix or len(path.parts) > 1)
+    return path.suffix == ".onnx" or not (path.exists() or path.suffix or len(path.parts) > 1)
 
 
 def _model_rows(thing: str) -> list[tuple[str, str]]:
@@ -454,7 +455,7 @@ def _model_rows(thing: str) -> list[tuple[str, str]]:
     from .models import model_path
     from .session import Session
 
-    session = Session(model_path(thing), "cpu")
+    session = Session(thing if Path(thing).suffix == ".onnx" else model_path(thing), "cpu")
     card = session.card
     channels, height, width = session.input.shape
     if isinstance(card.view, TopViewGeometry):
@@ -517,7 +518,12 @@ def _scan_rows(path: Path, sensor_name: str) -> list[tuple[str, str]]:
         rows.append(("remission", "least {:g}, 5 % {:g}, median {:g}, 95 % {:g}, most {:g}".format(*quantiles)))
     points = points.copy()
     points[:, 3] = (points[:, 3] + np.float32(sensor.remission_offset)) * np.float32(sensor.remission_scale)
-    for name in shipped_models() if len(finite) else ():
+    if not len(finite):
+        return rows
+    measured = FitnessProfile.from_scans([points])
+    rows.append(("beams", f"about {measured.beams[0]:.0f} rows of points ({sensor.name}: {sensor.n_beams})"))
+    rows.append(("ground", "not found" if measured.ground_m is None else f"at z = {measured.ground_m[0]:.1f} m"))
+    for name in shipped_models():
         try:
             fitness = Session(model_path(name), "cpu").card.fitness
         except MissingExtraError as exc:

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from edgeperc.errors import PointsError
+from .errors import PointsError
 
 __all__ = ["as_points", "read_points"]
 

@@ -161,7 +161,7 @@ _VLP_32C = (
     *(15.0, 10.33, 7.0, 4.67, 3.33, 2.33, 1.67, 1.33, 1.0, 0.67, 0.33, 0.0, -0.33, -0.67, -1.0, -1.33, -1.67, -2.0),
     *(-2.33, -2.67, -3.0, -3.33, -3.67, -4.0, -4.67, -5.33, -6.15, -7.25, -8.84, -11.31, -15.64, -25.0),
 )
-# Hesai's Pandar64 manual, appendix "Channel distribution".
+# Design angles of the Pandar64, as its drivers carry them for units without a calibration file.
 _PANDAR_64 = (
     *(14.88, 11.03, 8.06, 5.06, 3.04, 2.03, 1.86, 1.69, 1.52, 1.35, 1.18, 1.01, 0.85, 0.68, 0.51, 0.34, 0.17, 0.0),
     *(-0.17, -0.34, -0.51, -0.68, -0.85, -1.01, -1.18, -1.35, -1.52, -1.69, -1.86, -2.03, -2.20, -2.37, -2.54, -2.70),
@@ -372,7 +372,7 @@ def fill_scan_sums(
         else:
             continue
         z = np.float64(points[i, 2])
-        if more > 1.0 and n_rows[direction] < rows.shape[1] and math.isfinite(more + z + points[i, 3]):
+        if more > 1.0 and n_rows[direction] < rows.shape[1] and math.isfinite(x + y + z + np.float64(points[i, 3])):
             rows[direction, n_rows[direction]] = math.atan(z / math.sqrt(x * x + y * y)) * (180.0 / math.pi)
             n_rows[direction] += 1
 
@@ -660,8 +660,8 @@ def _geometry_findings(scan: _Measures, profile: FitnessProfile, sensor: SensorP
     if scan.elevation_p01_deg > low + 13.0 or scan.elevation_p99_deg > high + 8.0:
         findings.append(
             f"The points lie between {scan.elevation_p01_deg:.0f} and {scan.elevation_p99_deg:.0f} deg of elevation, "
-            f"in training between {low:.0f} and {high:.0f}: this is a sensor of another field of view, or the origin is "
-            "not the sensor, or it is not level."
+            f"in training between {low:.0f} and {high:.0f}: this is a sensor of another field of view, or the origin "
+            "is not the sensor, or it is not level."
         )
 
     left, right = profile.azimuth_deg

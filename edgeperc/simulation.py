@@ -5,10 +5,11 @@ slanted sides, cylinders, ellipsoids), some of them grouped into objects that mo
 azimuth step. All rays of one azimuth lie in a plane, so each primitive is tested in its azimuth interval only, and the
 ground is solved once an azimuth, from the lowest beam up.
 
-World frame: x forward, y left, z up, metres; the road at the origin is at z = 0.
+World frame: x forward, y left, z up, metres; the road at the origin is near z = 0.
 Numbers called "measured" are from KITTI scans (HDL-64E, 16 drives) and SemanticKITTI sequence 00.
 """
 
+# ruff: noqa: N803 - T_target_source, as everywhere
 from __future__ import annotations
 
 import math
@@ -183,8 +184,8 @@ class SimulatedScan:
             (the nearer vehicle wins).
         """
         view = TopViewGeometry() if geometry is None else geometry
-        x = view.x_range_m[1] - (np.arange(view.height) + 0.5) * view.cell_m
-        y = view.y_range_m[1] - (np.arange(view.width) + 0.5) * view.cell_m
+        x: NDArray[np.float64] = view.x_range_m[1] - (np.arange(view.height) + 0.5) * view.cell_m
+        y: NDArray[np.float64] = view.y_range_m[1] - (np.arange(view.width) + 0.5) * view.cell_m
         labels = np.zeros((view.height, view.width), dtype=np.uint8)
         fill_drivable(self.scene.strips, self.scene.terrain, self.scene.tile, self.T_world_sensor, x, y, labels)
         vehicles = [box for box in self.boxes if box.label in _VEHICLES]
@@ -271,7 +272,7 @@ def simulate(
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 7919))
     n_beams, n_columns = profile.n_beams, profile.columns
     step = 2.0 * math.pi / n_columns
-    azimuths = np.arange(n_columns) * step
+    azimuths: NDArray[np.float64] = np.arange(n_columns) * step
     range_offsets, remission_offsets = np.zeros(n_beams), np.zeros(n_beams)
     if noise:
         azimuths += rng.normal(0.0, 0.08, n_columns) * step
@@ -475,7 +476,7 @@ def fill_placed(
     T_world_sensor: NDArray[np.float64],
     placed: NDArray[np.float64],
 ) -> None:
-    """Write the primitives in the sensor frame into ``placed`` (n, 20); ``poses`` (m, 4) are x, y, z, yaw of objects."""
+    """Write the primitives in the sensor frame into ``placed`` (n, 20); ``poses`` (m, 4): x, y, z, yaw of objects."""
     T = T_world_sensor
     for k in range(primitives.shape[0]):
         placed[k] = primitives[k]
@@ -549,8 +550,8 @@ def fill_bounds(primitives: NDArray[np.float64], bounds: NDArray[np.float64]) ->
 def _columns_of(bounds: NDArray[np.float64], k: int, n_columns: int) -> tuple[int, int]:
     # One more to either side: azimuths jitter by a fraction of a step.
     step = 2.0 * math.pi / n_columns
-    first = int(math.floor(bounds[k, 0] / step)) - 1
-    count = int(math.ceil(bounds[k, 1] / step)) + 4
+    first = math.floor(bounds[k, 0] / step) - 1
+    count = math.ceil(bounds[k, 1] / step) + 4
     return first, min(count, n_columns)
 
 
@@ -847,7 +848,7 @@ def _ground_remission(
 
 @njit(cache=True, nogil=True)
 def _in_ego_shadow(azimuth: float, elevation: float) -> bool:
-    # Measured on KITTI: where nothing ever returns. The car's roof behind, its rear edges, its front, a mast to the right.
+    # Measured on KITTI: where nothing ever returns. The roof behind, its rear edges, its front, a mast to the right.
     a = azimuth - 2.0 * math.pi * math.floor((azimuth + math.pi) / (2.0 * math.pi))
     behind = math.pi - abs(a)
     if behind < 0.26:
@@ -934,7 +935,7 @@ def fill_points(
                     T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
                 )
                 # Measured: the road keeps its remission up to 20 m, has 0.07 at 25..40 m, 0.00 beyond; and thins out.
-                value *= min(max((cosine - 0.035) / 0.035, 0.0), 1.0)
+                value *= min(max((cosine - 0.04) / 0.034, 0.0), 1.0)
                 lost += min(max((0.045 - cosine) / 0.04, 0.0), 0.85)
             else:
                 p = primitives[k]
@@ -944,7 +945,7 @@ def fill_points(
                 if material == _PAINT:
                     # Clear coat over a dark or light base; a mirror off the normal.
                     value *= 0.5 + 0.5 * cosine
-                    value += 0.5 * max((cosine - 0.97) / 0.03, 0.0) * (0.25 + value) - 0.05
+                    value += 0.5 * max((cosine - 0.97) / 0.03, 0.0) * (0.25 + value) - 0.09
                     # Measured: half as many returns on a near car as its surface would give, a fifth beyond 45 m.
                     lost += 0.06 + p[3] * (1.0 - 0.7 * cosine) + min(max((t - 28.0) * 0.02, 0.0), 0.6)
                 elif material == _GLASS:
@@ -984,11 +985,14 @@ def fill_points(
                 else:
                     floor = 0.3
             if noise:
-                if luck < lost:
+                if luck > 1.0 - lost:
                     continue
                 t += range_offsets[b] + 0.01 * jitter * spread
                 spread = _normal(_mixed(np.uint64(ray ^ np.uint64(0xABCDEF))))
-                value += remission_offsets[b] * min(1.0, 0.2 + 4.0 * max(value, 0.0)) + 0.05 * jitter * spread - 0.02
+                value += remission_offsets[b] * min(1.0, 0.2 + 4.0 * max(value, 0.0)) + 0.05 * jitter * spread
+                # Measured: hardly anything between 0 and 0.1, and 57 % of a car's returns at 0: a weak echo reads 0.
+                if value < 0.01 + 0.1 * luck:
+                    value = 0.0
             if not min_range <= t < reach:
                 continue
             points[n, 0] = t * dx
@@ -1071,13 +1075,13 @@ def _paint(rng: np.random.Generator, light_share: float) -> tuple[float, float]:
     """Remission and drop-out of a coat of paint."""
     # Measured: mean remission of cars 0.01, 0.06, 0.11, 0.18, 0.27 (5, 25, 50, 75, 95 %), of vans 0.24 in the middle.
     if rng.random() < light_share:
-        return float(rng.uniform(0.3, 0.6)), float(rng.uniform(0.0, 0.2))
-    return float(rng.uniform(0.0, 0.2)), float(rng.uniform(0.1, 0.75))
+        return float(rng.uniform(0.35, 0.6)), float(rng.uniform(0.0, 0.2))
+    return float(rng.uniform(0.0, 0.22)), float(rng.uniform(0.1, 0.75))
 
 
 def _cloth(rng: np.random.Generator) -> float:
     # Measured: mean remission of people 0.29..0.47 with a twelfth at zero; most cloth is bright in the near infrared.
-    return float(rng.uniform(0.0, 0.15) if rng.random() < 0.15 else rng.uniform(0.3, 0.55))
+    return float(rng.uniform(0.0, 0.15) if rng.random() < 0.06 else rng.uniform(0.3, 0.6))
 
 
 def _car(size: _Vector, rng: np.random.Generator) -> list[_Row]:
@@ -1101,8 +1105,8 @@ def _car(size: _Vector, rng: np.random.Generator) -> list[_Row]:
                taper=(0.05, 0.04, 0.05)),
         _block(_PAINT, paint, ((nose - length / 2) / 2 - 0.02, 0, (hood + belt) / 2),
                (nose + length / 2 - 0.08, width * 0.97, belt - hood), density=lost, taper=(0.1, 0.02, 0.02)),
-        _block(_GLASS, 0.03, (middle, 0, (belt + roof) / 2), (2 * half, width * 0.93, rise), density=rng.uniform(0.5, 0.97),
-               taper=(screen * rise / half * 1.6, back * rise / half * 1.6, sides)),
+        _block(_GLASS, 0.03, (middle, 0, (belt + roof) / 2), (2 * half, width * 0.93, rise),
+               density=rng.uniform(0.5, 0.97), taper=(screen * rise / half * 1.6, back * rise / half * 1.6, sides)),
         _block(_PAINT, paint, (0, 0, 0), (1, 1, 1), density=lost),
     ]  # fmt: skip
     # The roof lies on the glass; pillars stand inside its edges.
@@ -1149,7 +1153,8 @@ def _van(size: _Vector, rng: np.random.Generator) -> list[_Row]:
     span = nose - left
     rows.append(
         _block(_GLASS, 0.03, ((nose + left) / 2, 0, (belt + height - 0.12) / 2),
-               (span, width * 0.95, height - 0.12 - belt), density=rng.uniform(0.5, 0.97), taper=(2 * screen / span, 0.02, 0.08))
+               (span, width * 0.95, height - 0.12 - belt), density=rng.uniform(0.5, 0.97),
+               taper=(2 * screen / span, 0.02, 0.08))
     )  # fmt: skip
     rows.append(
         _block(_PAINT, paint, ((nose - screen + back) / 2, 0, height - 0.06), (nose - screen - back, width * 0.9, 0.12),
@@ -1185,7 +1190,8 @@ def _truck(size: _Vector, rng: np.random.Generator) -> list[_Row]:
         )  # fmt: skip
     else:  # a tipper or flat bed
         top = 1.0 + (height - 1.0) * rng.uniform(0.3, 0.6)
-        rows.append(_block(_MATTE, cargo, ((box_end - front) / 2, 0, (1.0 + top) / 2), (box_end + front, width, top - 1)))
+        bed = (box_end + front, width, top - 1.0)
+        rows.append(_block(_MATTE, cargo, ((box_end - front) / 2, 0, (1.0 + top) / 2), bed))
         rows.append(_block(_MATTE, cargo, (box_end - 0.05, 0, (1.0 + height) / 2), (0.1, width, height - 1.0)))
     axles = [front - min(1.3, 0.2 * length), -front + 0.2 * length]
     axles += [-front + 0.2 * length + 1.2] if length > 7.5 else []
@@ -1404,25 +1410,23 @@ class _Street:
                 rows.append(_blob(_LEAVES, 0.34, (0, 0, level), (w, w, height / 4), 1.6))
         else:
             leaf, density = rng.uniform(0.32, 0.46), rng.uniform(0.4, 1.6)
-            for _ in range(int(rng.integers(4, 10))):
+            for _ in range(int(rng.integers(5, 14))):
                 turn, away = rng.uniform(0, 2 * math.pi), spread * math.sqrt(rng.random()) * 0.8
                 level = rng.uniform(bole + 0.5, height)
-                w = spread * rng.uniform(0.5, 1.1)
-                rows.append(
-                    _blob(_LEAVES, leaf, (away * math.cos(turn), away * math.sin(turn), level), (w, w, 0.9 * w), density)
-                )
+                w = spread * rng.uniform(0.35, 1.1)
+                center = (away * math.cos(turn), away * math.sin(turn), level)
+                rows.append(_blob(_LEAVES, leaf, center, (w, w, 0.9 * w), density))
         return self.add_static(rows, x, y, 2 * radius, 2 * radius, 0.0, 0.35)
 
     def bush(self, x: float, y: float, size: float) -> bool:
         rng = self.rng
         leaf = rng.uniform(0.3, 0.46)
         rows = []
-        for _ in range(int(rng.integers(2, 6))):
-            w, h = size * rng.uniform(0.5, 1.0), size * rng.uniform(0.5, 1.0)
-            rows.append(
-                _blob(_LEAVES, leaf, (*(rng.normal(0, 0.2, 2) * size).tolist(), 0.35 * h), (w, w, 1.2 * h),
-                      rng.uniform(1.5, 6))
-            )  # fmt: skip
+        for _ in range(int(rng.integers(3, 10))):
+            w, h = size * rng.uniform(0.2, 0.9), size * rng.uniform(0.3, 0.9)
+            x_off, y_off = (rng.normal(0, 0.25, 2) * size).tolist()
+            center = (x_off, y_off, 0.4 * h + rng.uniform(0.0, 0.4) * size)
+            rows.append(_blob(_LEAVES, leaf, center, (w, w * rng.uniform(0.6, 1.4), h), rng.uniform(0.8, 5)))
         return self.add_static(rows, x, y, size * 0.8, size * 0.8, 0.0, 0.3)
 
     def pole(self, x: float, y: float, yaw: float) -> bool:
@@ -1440,7 +1444,8 @@ class _Street:
             rows.append(_block(_RETRO, 0.9, (-0.06, 0, 0.75), (0.05, 0.06, 0.15)))
         else:  # a cabinet, a bin or a post box
             h = rng.uniform(0.9, 1.5)
-            rows = [_block(_MATTE, rng.uniform(0.1, 0.6), (0, 0, h / 2), (rng.uniform(0.3, 0.6), rng.uniform(0.4, 1.2), h))]
+            size = (rng.uniform(0.3, 0.6), rng.uniform(0.4, 1.2), h)
+            rows = [_block(_MATTE, rng.uniform(0.1, 0.6), (0, 0, h / 2), size)]
         return self.add_static(rows, x, y, 0.3, 0.4, yaw, 0.2)
 
     def building(self, x: float, y: float, yaw: float, length: float, depth: float) -> bool:
@@ -1469,7 +1474,8 @@ class _Street:
         elif kind == "rail":
             h, w = 0.75, 0.12
             rows = [_block(_MATTE, 0.35, (0, 0, 0.6), (length, 0.08, 0.3))]
-            rows += [_block(_MATTE, 0.35, (a, -0.08, 0.35), (0.06, 0.1, 0.7)) for a in np.arange(-length / 2, length / 2, 4)]
+            posts = np.arange(-length / 2, length / 2, 4.0)
+            rows += [_block(_MATTE, 0.35, (a, -0.08, 0.35), (0.06, 0.1, 0.7)) for a in posts]
         else:
             h, w = rng.uniform(0.9, 1.8), 0.06
             rows = [_block(_POROUS, 0.3, (0, 0, h / 2), (length, 0.04, h), density=rng.uniform(0.2, 0.7))]
@@ -1495,8 +1501,8 @@ def _terrain(rng: np.random.Generator, environment: str) -> NDArray[np.float64]:
     terrain[[_SLOPE_X, _SLOPE_Y]] = rng.normal(0.0, 0.008, 2)
     terrain[[_WAVE_X, _WAVE_Y]] = rng.uniform(0.0, 0.25 if open_land else 0.12, 2)
     terrain[[_WAVE_X_K, _WAVE_Y_K]] = 2.0 * math.pi / rng.uniform(45.0, 140.0, 2)
-    terrain[[_WAVE_X_0, _WAVE_Y_0]] = rng.uniform(0.0, 2.0 * math.pi, 2)
-    # The road at the origin is at 0.
+    # Waves that are zero at the origin.
+    terrain[[_WAVE_X_0, _WAVE_Y_0]] = rng.choice([0.0, math.pi], 2)
     terrain[_CROWN] = rng.uniform(0.0, 0.025)
     terrain[_KERB] = 0.0 if open_land else rng.choice([0.03, 0.08, 0.12, 0.15, 0.18], p=[0.15, 0.2, 0.3, 0.25, 0.1])
     terrain[_PAVEMENT] = rng.uniform(0.0, 0.7) if open_land else rng.uniform(1.2, 4.5)
@@ -1505,14 +1511,14 @@ def _terrain(rng: np.random.Generator, environment: str) -> NDArray[np.float64]:
     terrain[_ROUGH] = rng.uniform(0.02, 0.12) if open_land else rng.uniform(0.01, 0.06)
     terrain[_DITCH] = rng.uniform(0.0, 0.5) if open_land and rng.random() < 0.5 else 0.0
     terrain[_ROUNDING] = rng.uniform(3.0, 9.0)
-    # Measured: asphalt 0.16..0.30 by road, pavement and parking 0.30, grass 0.37.
-    terrain[_ASPHALT] = rng.uniform(0.14, 0.32)
+    # Measured: asphalt 0.2..0.3 by road, pavement and parking 0.30, grass 0.37.
+    terrain[_ASPHALT] = rng.uniform(0.19, 0.33)
     terrain[_PAVING] = rng.uniform(0.24, 0.36)
     terrain[_GRASS] = rng.uniform(0.33, 0.45)
     terrain[_MARKING] = rng.uniform(0.35, 0.6) if rng.random() < (0.9 if open_land else 0.55) else 0.0
     terrain[_LANE] = 3.4
     terrain[_DROPPED] = rng.uniform(0.0, 23.0)
-    terrain[_WEAR] = rng.uniform(0.1, 0.4)
+    terrain[_WEAR] = rng.uniform(0.1, 0.35)
     return terrain
 
 
@@ -1521,13 +1527,6 @@ def _strip(
     s_range: tuple[float, float] = (-200.0, 200.0), bay: bool = False,
 ) -> _Row:  # fmt: skip
     return (x, y, math.cos(yaw), math.sin(yaw), curvature, right, left, *s_range, float(bay))
-
-
-def _level(terrain: NDArray[np.float64], strips: NDArray[np.float64], tile: NDArray[np.float64]) -> None:
-    """Shift the waves' phase so that the ground at the origin is near z = 0."""
-    for wave, phase in ((_WAVE_X, _WAVE_X_0), (_WAVE_Y, _WAVE_Y_0)):
-        if terrain[wave] > 0.0:
-            terrain[phase] = 0.0 if terrain[phase] < math.pi else math.pi
 
 
 def random_scene(seed: int, environment: str | None = None) -> Scene:
@@ -1567,8 +1566,8 @@ def random_scene(seed: int, environment: str | None = None) -> Scene:
     curvature = float(rng.normal(0.0, 0.004)) if rng.random() < 0.6 else 0.0
     heading = float(rng.normal(0.0, 0.03))
     strips = [_strip(0, 0, heading, curvature, right, left)]
-    crossings = []
-    if place == "junction" or rng.random() < 0.3 and place != "highway":
+    crossings: list[float] = []
+    if place == "junction" or (place != "highway" and rng.random() < 0.3):
         for _ in range(int(rng.integers(1, 3))):
             s = float(rng.uniform(8.0, 60.0) * rng.choice([1.0, 1.0, -1.0]))
             if any(abs(s - other) < 20.0 for other in crossings):
@@ -1587,7 +1586,6 @@ def random_scene(seed: int, environment: str | None = None) -> Scene:
         bay = (edge, edge + deep) if side > 0 else (-edge - deep, -edge)
         strips.append(_strip(0, 0, heading, curvature, *bay, (start, start + float(rng.uniform(10.0, 45.0))), True))
     street = _Street(rng, strips, terrain)
-    _level(terrain, street.strips, street.tile)
     street.take(-0.3, 0.0, 4.8, 2.2, 0.0)  # the sensor's own vehicle
     _add_traffic(street, place, lane, same, oncoming, ego_lane, sway, crossings)
     _add_parked(street, park_right > 0.0, park_left > 0.0, crossings, place)
@@ -1734,7 +1732,8 @@ def _add_roadside(street: _Street, place: str) -> None:
             while s < high:
                 if rng.random() < built:
                     length, depth = rng.uniform(7.0, 22.0), rng.uniform(6.0, 11.0)
-                    x, y, yaw = street.on_strip(s + length / 2, side * (edge + setback + depth / 2 + rng.normal(0, 0.3)), k)
+                    u = side * (edge + setback + depth / 2 + rng.normal(0, 0.3))
+                    x, y, yaw = street.on_strip(s + length / 2, u, k)
                     street.building(x, y, yaw, length, depth)
                     s += length + (0.3 if rng.random() < 0.6 else rng.uniform(2.0, 9.0))
                 else:
@@ -1757,7 +1756,8 @@ def _add_roadside(street: _Street, place: str) -> None:
                 x, y, _ = street.on_strip(rng.uniform(low, high), side * (edge + away + 0.5), k)
                 street.bush(x, y, rng.uniform(0.4, 3.0))
             for _ in range(int(rng.poisson(9 if place != "rural" else 3))):
-                x, y, yaw = street.on_strip(rng.uniform(low, high), side * (edge + rng.uniform(0.3, max(pavement, 1.0))), k)
+                u = side * (edge + rng.uniform(0.3, max(pavement, 1.0)))
+                x, y, yaw = street.on_strip(rng.uniform(low, high), u, k)
                 street.pole(x, y, yaw + (0.0 if side < 0 else math.pi))
     for _ in range(int(rng.integers(15, 50))):  # the background
         turn, away = rng.uniform(0, 2 * math.pi), rng.uniform(25.0, 75.0)
@@ -1826,7 +1826,6 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
         slopes = np.linalg.solve(xy.T @ xy + 1000.0 * np.eye(2), xy.T @ bottoms[:, 2])
         terrain[[_SLOPE_X, _SLOPE_Y]] = np.clip(slopes, -0.04, 0.04)
     street = _Street(rng, strips, terrain)
-    _level(terrain, street.strips, street.tile)
     street.take(-0.3, 0.0, 4.8, 2.2, 0.0)
     for box in boxes:
         if box.label in _SHAPES:
@@ -1840,8 +1839,9 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
             length, width, height = box.size
             rows = [
                 _block(_PAINT, 0.4, (0, 0, 0.25 + height * 0.3), (length, width, height * 0.5), density=0.1),
-                _block(_GLASS if height > 2.2 else _MATTE, 0.2, (0, 0, height * 0.75), (length, width * 0.96, height * 0.5)),
-            ]
+                _block(_GLASS if height > 2.2 else _MATTE, 0.2, (0, 0, height * 0.75),
+                       (length, width * 0.96, height * 0.5), density=0.6),
+            ]  # fmt: skip
             street.take(*box.center[:2], length, width, box.yaw)
             z, _ = street.ground(*box.center[:2])
             for row in rows:

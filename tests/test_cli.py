@@ -376,7 +376,7 @@ def test_progress_bar_only_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> Non
 def fake_street(monkeypatch: pytest.MonkeyPatch) -> None:
     points = np.random.default_rng(0).uniform(-20.0, 20.0, (1000, 4)).astype(np.float32)
     street = SimpleNamespace(points=points, labels=np.ones(1000, np.uint8))
-    made = SimpleNamespace(random_scene=lambda seed: seed, simulate=lambda scene, sensor, seed: street)
+    made = SimpleNamespace(random_scene=lambda seed, environment: seed, simulate=lambda scene, sensor, seed: street)
     monkeypatch.setitem(sys.modules, "edgeperc.simulation", made)
 
 
@@ -415,16 +415,17 @@ def fake_models(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     file.with_stem("ssadnet").write_bytes(bytes(10))
 
     class FakeSession:
-        def __init__(self, path: Path, provider: str) -> None:
+        def __init__(self, path: Path | str, provider: str) -> None:
             assert provider == "cpu"
+            path = Path(path)
             self.path, self.sha256, self.golden_deviation = path, "ab" * 32, 2e-6
             self.card = POINTSEG if path.stem == "pointseg" else SSADNET
             self.input = np.zeros((3, 3, 8), np.float32)
 
     def model_path(name: str) -> Path:
-        if name not in ("pointseg", "ssadnet", str(file)):
+        if name not in ("pointseg", "ssadnet"):
             raise ModelFileError(f"no model is called {name!r}")
-        return file.with_stem(Path(name).stem)
+        return file.with_stem(name)
 
     models = SimpleNamespace(model_path=model_path, shipped_models=lambda: ("pointseg", "ssadnet"))
     monkeypatch.setitem(sys.modules, "edgeperc.models", models)
@@ -461,8 +462,8 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
         checked.append((points, profile, sensor.name))
         return ("it has 32 beams",)
 
-    monkeypatch.setattr(sensors, "check_fitness", check_fitness, raising=False)
-    monkeypatch.setattr(sensors, "FitnessProfile", SimpleNamespace(from_dict=dict), raising=False)
+    monkeypatch.setattr(sensors, "check_fitness", check_fitness)
+    monkeypatch.setattr(sensors.FitnessProfile, "from_dict", dict)
     monkeypatch.setattr(sys.modules[__name__], "POINTSEG", replace(POINTSEG, fitness={"n_beams": 64}))
     points = np.array([[3, 4, 0, 10], [0, 10, 10, 255], [-6, 0, 8, 51], [np.nan, 0, 0, 0]], np.float32)
     np.save(tmp_path / "scan.npy", points)
@@ -473,6 +474,8 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     assert rows["x"] == "-6.0 .. 3.0 m"
     assert rows["range"] == "5.0 .. 14.1 m, median 10.0"
     assert rows["remission"].startswith("least 10, 5 % ")
+    assert rows["beams"].endswith("rows of points (os1-64: 64)")
+    assert rows["ground"] == "not found"
     assert rows["pointseg"] == "as a scan of os1-64: it has 32 beams"
     assert rows["ssadnet"].startswith("its card does not say")
     ((scaled, profile, sensor),) = checked

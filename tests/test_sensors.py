@@ -122,7 +122,7 @@ def street(seed, sensor=SENSOR, columns=1000):
         distance[hit], reflectance[hit] = t[hit], rng.uniform(0.2, 0.5)
     for _ in range(12):
         low = np.array([rng.uniform(-40, 40), rng.choice([-5.5, 3.7]), ground])
-        high = low + [4.2, 1.8, 1.5]
+        high = low + np.array([4.2, 1.8, 1.5])
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             slabs = np.stack([low / direction, high / direction])
         enter, leave = np.nanmax(slabs.min(axis=0), axis=1), np.nanmin(slabs.max(axis=0), axis=1)
