@@ -377,15 +377,16 @@ def _demo(arguments: argparse.Namespace) -> int:
     if perception.top_view is not None:
         area_m2 = perception.top_view.drivable_area_m2
         rows.append(("drivable", f"{area_m2:.0f} m2 of the {_extent(perception)} ahead"))
-        rows.append(("boxes", "" if perception.boxes else "none"))
-        rows += [("", _box_words(box)) for box in perception.boxes]
+        found = [_box_words(box) for box in perception.boxes] or ["none"]
+        rows += [("boxes" if k == 0 else "", words) for k, words in enumerate(found)]
     if perception.points is not None:
         there = np.bincount(scan.labels[perception.points.in_view], minlength=len(perception.points.classes))
         for k, (name, count) in enumerate(perception.points.counts().items()):
             rows.append(("points" if k == 0 else "", f"{name:<12}{count:>9,}   (there are {there[k]:,})"))
     total_ms = sum(perception.stage_ms.values())
     rows.append(("time", f"{total_ms:.1f} ms: " + ", ".join(f"{k} {ms:.1f}" for k, ms in perception.stage_ms.items())))
-    rows += [("ran on", f"{name}: {provider}") for name, provider in perception.providers.items()]
+    for k, (name, provider) in enumerate(perception.providers.items()):
+        rows.append(("ran on" if k == 0 else "", f"{name}: {provider}"))
 
     arguments.out.mkdir(parents=True, exist_ok=True)
     page, picture = arguments.out / "scene.html", arguments.out / "scene.png"
@@ -413,7 +414,7 @@ def _box_words(box: Box) -> str:
     side = f"{abs(y):4.1f} m {'left' if y >= 0 else 'right'}"
     return (
         f"{box.label:<6}{box.score:5.2f}   {math.hypot(x, y):5.1f} m away: {x:5.1f} m ahead, {side:<13}"
-        f"{length:.1f} x {width:.1f} x {height:.1f} m, heading {math.degrees(box.yaw):4.0f} deg"
+        f"{length:.1f} x {width:.1f} x {height:.1f} m, heading {round(math.degrees(box.yaw)):4d} deg"
     )
 
 
@@ -479,12 +480,14 @@ def _model_rows(thing: str) -> list[tuple[str, str]]:
     for name in ("training", "metrics", "parity"):
         rows += _nested(name, getattr(card, name))
     if not math.isnan(session.golden_deviation):
-        rows.append(("here", f"{session.golden_deviation:.2g} standard deviations from the exporter's answers"))
+        rows.append(("here", f"answers within {session.golden_deviation:.2g} standard deviations of the exporter's"))
     return rows
 
 
 def _nested(name: str, value: Any) -> list[tuple[str, str]]:
-    """A card's free-form facts, an inner mapping's keys joined by dots; long lists shortened to their length."""
+    """A card's free-form facts, an inner mapping's keys joined by dots; what is long by its length."""
+    if isinstance(value, Mapping) and len(value) > 24:
+        return [(name, f"{len(value)} entries")]
     if isinstance(value, Mapping):
         return [row for key, inner in value.items() for row in _nested(f"{name}.{key}", inner)]
     if isinstance(value, (list, tuple)) and (len(value) > 12 or any(isinstance(v, (list, Mapping)) for v in value)):

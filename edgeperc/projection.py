@@ -68,7 +68,17 @@ class Projection:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mark_top_view(points, x_range, y_range, z_range, cells_per_m, height, width, winner, pixel):
+def mark_top_view(
+    points: NDArray[np.float32],
+    x_range: NDArray[np.float32],
+    y_range: NDArray[np.float32],
+    z_range: NDArray[np.float32],
+    cells_per_m: np.float32,
+    height: np.int32,
+    width: np.int32,
+    winner: NDArray[np.int64],
+    pixel: NDArray[np.int32],
+) -> None:
     """Mark the highest point of each cell in ``winner``, and the cell of each point in ``pixel``.
 
     Parameters
@@ -136,8 +146,18 @@ def mark_top_view(points, x_range, y_range, z_range, cells_per_m, height, width,
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_range_image(
-    points, wedge, row_scale, row_base, row_split, col_scale, col_base, col_split, width, winner, pixel
-):
+    points: NDArray[np.float32],
+    wedge: NDArray[np.float32],
+    row_scale: NDArray[np.float32],
+    row_base: NDArray[np.int32],
+    row_split: NDArray[np.float32],
+    col_scale: NDArray[np.float32],
+    col_base: NDArray[np.int32],
+    col_split: NDArray[np.float32],
+    width: np.int32,
+    winner: NDArray[np.int64],
+    pixel: NDArray[np.int32],
+) -> None:
     """Mark the nearest point of each pixel in ``winner``, and the pixel of each point in ``pixel``.
 
     Parameters
@@ -228,7 +248,17 @@ def mark_range_image(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_image(points, winner, remission_offset, remission_scale, channels, mean, std, image, index):
+def fill_image(
+    points: NDArray[np.float32],
+    winner: NDArray[np.int64],
+    remission_offset: np.float32,
+    remission_scale: np.float32,
+    channels: NDArray[np.int32],
+    mean: NDArray[np.float32],
+    std: NDArray[np.float32],
+    image: NDArray[np.float32],
+    index: NDArray[np.int32],
+) -> None:
     """Write the winners' values into ``image`` and their rows into ``index``.
 
     Parameters
@@ -291,7 +321,13 @@ class TopViewProjector:
     ----------
     view : TopViewGeometry
     input : InputSpec
-        Channels, in any order: ``"distance"``, sqrt(x^2 + y^2) [m] (SSADNet eq. 1), ``"remission"``, ``"height"``, z [m].
+        Channels, any of ``"distance"``, sqrt(x^2 + y^2) [m] (SSADNet equation 1), ``"remission"`` and ``"height"``,
+        z [m], in any order.
+
+    Raises
+    ------
+    CardError
+        A channel is not one of these.
     """
 
     def __init__(self, view: TopViewGeometry, input: InputSpec) -> None:
@@ -429,7 +465,7 @@ def make_projector(
 
 
 def row_edges(view: RangeImageGeometry) -> NDArray[np.float32]:
-    """Pseudo-elevations z / (sqrt(x^2 + y^2) + |z|) of the H + 1 edges between rows, top to bottom, float32."""
+    """Pseudo-elevations z / (sqrt(x^2 + y^2) + |z|) of the H + 1 edges of rows, top to bottom, float32."""
     beams = np.asarray(view.row_elevations_deg, dtype=np.float64)
     middles = (beams[:-1] + beams[1:]) / 2.0
     edges_deg = np.concatenate(([2.0 * beams[0] - middles[0]], middles, [2.0 * beams[-1] - middles[-1]]))
@@ -438,7 +474,7 @@ def row_edges(view: RangeImageGeometry) -> NDArray[np.float32]:
 
 
 def column_edges(view: RangeImageGeometry) -> NDArray[np.float32]:
-    """Pseudo-azimuths, y / (|x| + |y|) unfolded to -2..2, of the W + 1 edges between columns, left to right, float32."""
+    """Pseudo-azimuths, y / (|x| + |y|) unfolded to -2..2, of the W + 1 edges of columns, left to right, float32."""
     edges = np.deg2rad(np.linspace(view.azimuth_left_deg, view.azimuth_right_deg, view.width + 1))
     x, y = np.cos(edges), np.sin(edges)
     folded = y / (np.abs(x) + np.abs(y))
@@ -474,7 +510,7 @@ def tabulate(
     Returns
     -------
     scale : (3,) float32
-        First edge, last edge (below any value where the view closes a full turn), cells_per_unit.
+        First edge, last edge (below any value where that is straight behind), cells_per_unit.
     base : (cells + 2,) int32
     split : (cells + 2,) float32
 
@@ -486,14 +522,14 @@ def tabulate(
     first, last = edges[0], edges[-1]
     inner = edges[1:-1]
     cells = 64
-    while cells <= 65536:
+    while cells <= 65536 and first > last:
         cells_per_unit = np.float32(cells) / (first - last)
         at = ((first - inner) * cells_per_unit).astype(np.int32)
-        if at.size == 0 or (at[0] >= 0 and np.all(np.diff(at) > 0)):
+        if np.all(np.diff(at) > 0):
             base = np.searchsorted(at, np.arange(cells + 2)).astype(np.int32)
             split = np.full(cells + 2, -np.inf, dtype=np.float32)
             split[at] = inner
-            # -2 is both the right edge of a full turn and what values a hair to the left of it round to.
+            # -2 is straight behind, and what azimuths a hair to the left of that round to.
             open_end = np.float32(-3.0) if last == np.float32(-2.0) else last
             return np.array([first, open_end, cells_per_unit], dtype=np.float32), base, split
         cells *= 2
@@ -506,7 +542,7 @@ def _channels(
     """Channel codes, means and deviations of an input, as the kernels take them."""
     unknown = [name for name in spec.channels if name not in known]
     if unknown:
-        raise CardError(f"input channels {', '.join(unknown)} are unknown to this view; expected some of {', '.join(known)}")
+        raise CardError(f"input has channels {unknown}, unknown to this view; expected some of {list(known)}")
     codes = np.array([CHANNEL_CODES[name] for name in spec.channels], dtype=np.int32)
     return codes, np.array(spec.mean, dtype=np.float32), np.array(spec.std, dtype=np.float32)
 
@@ -561,7 +597,5 @@ def _project(
         index=np.empty(projector.shape[1:], dtype=np.int32),
         pixel=np.empty(points.shape[0], dtype=np.int32),
     )
-    projector.fill(
-        points, remission_offset, remission_scale, projection.image, projection.index, projection.pixel
-    )
+    projector.fill(points, remission_offset, remission_scale, projection.image, projection.index, projection.pixel)
     return projection

@@ -41,6 +41,9 @@ AUTO = ("cuda", "openvino", "cpu")
 # Providers that come as plugins beside stock onnxruntime: provider, then the package that carries its library.
 PLUGINS = {"openvino": "onnxruntime_ep_openvino", "tensorrt-rtx": "onnxruntime_ep_nv_tensorrt_rtx"}
 PRECISIONS = {"fp32": "f32", "bf16": "bf16", "fp16": "f16"}
+# In standard deviations of an output. The same graph in fp32 was seen to differ by 1e-5 between engines; weights of one
+# layer tripled, by 0.5.
+MAX_GOLDEN_DEVIATION = {"fp32": 0.02, "reduced": 0.5}
 # The key of a tensor's external-data entry as protobuf writes it: such a model would read files beside it, or anywhere.
 EXTERNAL_DATA = b"\n\x08location\x12"
 
@@ -273,8 +276,7 @@ class Session:
             here = self.outputs[output.kind].reshape(-1)[np.asarray(known["positions"], np.int64)]
             apart = np.abs(here - np.asarray(known["values"], np.float32)) / max(float(known["std"]), 1e-6)
             deviation = max(deviation, float(np.nanmax(apart)) if np.isfinite(here).all() else float("inf"))
-        # fp32 runtimes were seen to differ by less than 1e-3; a graph or weights that changed differ by more than 1.
-        if deviation > 0.5:
+        if deviation > MAX_GOLDEN_DEVIATION["fp32" if self.provider.endswith("(fp32)") else "reduced"]:
             raise CardMismatchError(
                 f"{self.path}: on {self.provider} the golden input gives answers {deviation:.2g} standard deviations "
                 "away from the exporter's; the file or the provider has changed the network"

@@ -184,8 +184,8 @@ class SimulatedScan:
             (the nearer vehicle wins).
         """
         view = TopViewGeometry() if geometry is None else geometry
-        x: NDArray[np.float64] = view.x_range_m[1] - (np.arange(view.height) + 0.5) * view.cell_m
-        y: NDArray[np.float64] = view.y_range_m[1] - (np.arange(view.width) + 0.5) * view.cell_m
+        x = np.float64(view.x_range_m[1]) - (np.arange(view.height, dtype=np.float64) + 0.5) * np.float64(view.cell_m)
+        y = np.float64(view.y_range_m[1]) - (np.arange(view.width, dtype=np.float64) + 0.5) * np.float64(view.cell_m)
         labels = np.zeros((view.height, view.width), dtype=np.uint8)
         fill_drivable(self.scene.strips, self.scene.terrain, self.scene.tile, self.T_world_sensor, x, y, labels)
         vehicles = [box for box in self.boxes if box.label in _VEHICLES]
@@ -272,14 +272,14 @@ def simulate(
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 7919))
     n_beams, n_columns = profile.n_beams, profile.columns
     step = 2.0 * math.pi / n_columns
-    azimuths: NDArray[np.float64] = np.arange(n_columns) * step
+    azimuths = np.arange(n_columns, dtype=np.float64) * np.float64(step)
     range_offsets, remission_offsets = np.zeros(n_beams), np.zeros(n_beams)
     if noise:
         azimuths += rng.normal(0.0, 0.08, n_columns) * step
         # Measured: a flat road's points lie 0.008 m off their neighbours of the same laser; lasers differ by more.
         range_offsets = rng.normal(0.0, 0.012, n_beams)
         # Measured: mean remission of the road by laser spreads by 0.08, a few lasers almost blind.
-        remission_offsets = np.clip(rng.normal(-0.01, 0.085, n_beams), -0.25, 0.1)
+        remission_offsets = np.clip(rng.normal(-0.01, 0.075, n_beams), -0.25, 0.1)
     elevations = np.radians(np.asarray(profile.elevations_deg))
     reach = min(float(max_range_m), profile.max_range_m)
 
@@ -734,12 +734,14 @@ def fill_cast(
     """
     n_beams, n_columns = elevations.shape[0], azimuths.shape[0]
     tangents = np.tan(elevations)
-    # Radii grow by 2.5 %: at 30 m a step is half the distance between two beams' rings on the road.
-    n_radii = int(math.log(max(reach, 2.0) / 0.3) / math.log(1.025)) + 2
+    T = T_world_sensor
+    # Radii from well inside the lowest beam's ring, growing by 3 %: at 30 m a third of the way between two rings.
+    height = _height_above(strips, terrain, tile, T, 0.0, 0.0, 0.0)
+    innermost = min(max(0.3, 0.4 * height / max(-tangents[n_beams - 1], 0.05)), 5.0)
+    n_radii = int(math.log(max(reach / innermost, 2.0)) / math.log(1.03)) + 2
     radii, heights = np.empty(n_radii), np.empty(n_radii)
     for i in range(n_radii):
-        radii[i] = 0.3 * 1.025**i
-    T = T_world_sensor
+        radii[i] = innermost * 1.03**i
     straight = abs(T[2, 2]) > 0.999999999
     for column in range(n_columns):
         ca, sa = math.cos(azimuths[column]), math.sin(azimuths[column])
@@ -775,7 +777,7 @@ def fill_cast(
                     share = min(max(share, 0.1), 0.9) if high - low > 0.02 else share
                     r = low + share * (high - low)
                     gap = _height_above(strips, terrain, tile, T, r * ca, r * sa, r * tan)
-                    if abs(gap) < 1e-5:
+                    if abs(gap) < 1e-4:
                         break
                     if gap > 0.0:
                         low, above = r, gap
@@ -945,7 +947,7 @@ def fill_points(
                 if material == _PAINT:
                     # Clear coat over a dark or light base; a mirror off the normal.
                     value *= 0.5 + 0.5 * cosine
-                    value += 0.5 * max((cosine - 0.97) / 0.03, 0.0) * (0.25 + value) - 0.09
+                    value += 0.5 * max((cosine - 0.97) / 0.03, 0.0) * (0.25 + value) - 0.11
                     # Measured: half as many returns on a near car as its surface would give, a fifth beyond 45 m.
                     lost += 0.06 + p[3] * (1.0 - 0.7 * cosine) + min(max((t - 28.0) * 0.02, 0.0), 0.6)
                 elif material == _GLASS:
@@ -970,7 +972,7 @@ def fill_points(
                     storey = (wz - 0.9) / 2.9 - math.floor((wz - 0.9) / 2.9)
                     if fraction < 0.42 and storey < 0.5:
                         lost += 0.35
-                        value *= 0.5
+                        value *= 0.3
                         t += 0.12 / max(cosine, 0.2) + (2.5 * (other - 0.75) / 0.25 if other > 0.75 else 0.0)
                     value *= 0.55 + 0.45 * cosine
                 elif material == _LEAVES:
@@ -991,7 +993,7 @@ def fill_points(
                 spread = _normal(_mixed(np.uint64(ray ^ np.uint64(0xABCDEF))))
                 value += remission_offsets[b] * min(1.0, 0.2 + 4.0 * max(value, 0.0)) + 0.05 * jitter * spread
                 # Measured: hardly anything between 0 and 0.1, and 57 % of a car's returns at 0: a weak echo reads 0.
-                if value < 0.01 + 0.1 * luck:
+                if value < 0.01 + 0.1 * luck or other > 0.965:
                     value = 0.0
             if not min_range <= t < reach:
                 continue
@@ -1201,7 +1203,7 @@ def _truck(size: _Vector, rng: np.random.Generator) -> list[_Row]:
 def _pedestrian(size: _Vector, rng: np.random.Generator) -> list[_Row]:
     length, width, h = size
     cloth, trousers, skin = _cloth(rng), _cloth(rng), float(rng.uniform(0.4, 0.55))
-    stride = max(0.04, length / 2 - 0.12) * rng.uniform(0.2, 1.0)
+    stride = max(0.02, length / 2 - 0.15) * rng.uniform(0.2, 1.0)
     half = max(0.12, width / 2 - 0.1)
     hip, shoulder = 0.5 * h, 0.82 * h
     swing = stride * rng.uniform(0.3, 0.9)
@@ -1218,20 +1220,19 @@ def _pedestrian(size: _Vector, rng: np.random.Generator) -> list[_Row]:
     rows.append(_blob(_MATTE, cloth, (0.0, 0.0, 0.66 * h), (girth * 1.1, min(0.46, 2 * half), 0.42 * h)))
     rows.append(_block(_MATTE, cloth, (0, 0, 0.66 * h), (girth, min(0.4, 1.7 * half), 0.34 * h), kind=_CYLINDER))
     if rng.random() < 0.25:  # a coat or skirt
-        rows.append(_block(_MATTE, cloth, (0, 0, 0.42 * h), (0.3, 0.38, 0.3 * h), kind=_CYLINDER))
+        rows.append(_block(_MATTE, cloth, (0, 0, 0.42 * h), (0.3, min(0.38, width - 0.04), 0.3 * h), kind=_CYLINDER))
     rows.append(_blob(_MATTE, skin, (0.02, 0.0, 0.93 * h), (0.19, 0.16, 0.14 * h)))
     if rng.random() < 0.3 and length > 0.6:  # a rucksack
         rows.append(_block(_MATTE, 0.3, (-0.2, 0, 0.68 * h), (0.16, 0.28, 0.26 * h)))
     return rows
 
 
-def _bicycle(length: float, rng: np.random.Generator, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> list[_Row]:
+def _bicycle(length: float, half: float, rng: np.random.Generator, y: float = 0.0) -> list[_Row]:
     r = min(0.35, 0.2 * length)
     axle = length / 2 - r
-    cos, sin = math.cos(yaw), math.sin(yaw)
 
     def to(a: float, b: float, z: float) -> _Vector:
-        return (x + cos * a - sin * b, y + sin * a + cos * b, z)
+        return (a, y + b, z)
 
     rows = []
     for s in (-1.0, 1.0):
@@ -1241,10 +1242,10 @@ def _bicycle(length: float, rng: np.random.Generator, x: float = 0.0, y: float =
     seat, head, pedals = to(-0.2 * length, 0, 0.85), to(0.28 * length, 0, 0.85), to(-0.06 * length, 0, 0.3)
     for a, b in ((to(-axle, 0, r), seat), (seat, head), (pedals, head), (head, to(axle, 0, r)), (seat, pedals)):
         rows.append(_rod(0.25, a, b, 0.022))
-    rows.append(_rod(0.2, to(0.24 * length, -0.27, 1.0), to(0.24 * length, 0.27, 1.0), 0.02))
-    rows.append(_block(_MATTE, 0.1, to(-0.2 * length, 0, 0.92), (0.25, 0.14, 0.07), yaw=yaw))
+    rows.append(_rod(0.2, to(0.24 * length, -half, 1.0), to(0.24 * length, half, 1.0), 0.02))
+    rows.append(_block(_MATTE, 0.1, to(-0.2 * length, 0, 0.92), (0.25, 0.14, 0.07)))
     if rng.random() < 0.5:
-        rows.append(_block(_RETRO, 0.6, to(-0.42 * length, 0, 0.55), (0.05, 0.07, 0.07), yaw=yaw))
+        rows.append(_block(_RETRO, 0.6, to(-0.42 * length, 0, 0.55), (0.05, 0.07, 0.07)))
     return rows
 
 
@@ -1254,18 +1255,18 @@ def _cyclist(size: _Vector, rng: np.random.Generator) -> list[_Row]:
     half = min(0.24, width / 2 - 0.08)
     hip, lean = (-0.16 * length, 0.0, 0.55 * h), rng.uniform(0.08, 0.24)
     shoulder = (hip[0] + lean * length, 0.0, 0.83 * h)
-    rows = _bicycle(length, rng)
+    rows = _bicycle(length, min(0.27, width / 2 - 0.02), rng)
     crank = rng.uniform(-0.13, 0.13)
     for s in (-1.0, 1.0):
         knee = (0.1 * length + s * crank * 0.5, s * 0.12, 0.45 * h + s * crank * 0.6)
-        rows.append(_rod(trousers, (hip[0], s * 0.09, hip[2]), knee, 0.09))
+        rows.append(_rod(trousers, (hip[0], s * 0.09, hip[2]), knee, 0.08))
         rows.append(_rod(trousers, knee, (-0.04 * length, s * 0.12, 0.22 + s * crank), 0.055))
         elbow = ((shoulder[0] + 0.24 * length) / 2 - 0.03, s * half, 0.69 * h)
         rows.append(_rod(cloth, (shoulder[0], s * 0.19, shoulder[2]), elbow, 0.05))
         rows.append(_rod(cloth, elbow, (0.24 * length, s * half, 1.02), 0.04))
-    rows.append(_rod(cloth, hip, shoulder, 0.17))
+    rows.append(_rod(cloth, hip, shoulder, min(0.17, width / 2 - 0.02)))
     middle = tuple((a + b) / 2 for a, b in zip(hip, shoulder, strict=True))
-    rows.append(_blob(_MATTE, cloth, (middle[0], 0.0, middle[2]), (0.34, 0.42, 0.4 * h)))
+    rows.append(_blob(_MATTE, cloth, (middle[0], 0.0, middle[2]), (0.34, min(0.42, width - 0.02), 0.4 * h)))
     rows.append(_blob(_MATTE, 0.45, (shoulder[0] + 0.06, 0, 0.93 * h), (0.22, 0.18, 0.14 * h)))
     return rows
 
@@ -1708,7 +1709,7 @@ def _add_people(street: _Street, place: str) -> None:
         rows: list[_Row] = []
         n = int(rng.integers(1, 6))
         for k in range(n):
-            rows += _bicycle(1.75, rng, 0.0, (k - (n - 1) / 2) * 0.5)
+            rows += _bicycle(1.75, 0.27, rng, (k - (n - 1) / 2) * 0.5)
         street.add_static(rows, x, y, 1.8, 0.5 * n, yaw)
 
 

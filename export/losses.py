@@ -56,6 +56,11 @@ def slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> NDArr
     (n_slots, 4) float32
         Centre column, centre row, width and height as shares of the image's width and height; zeros in empty slots.
         Boxes whose centre is outside the view are left out.
+
+    Raises
+    ------
+    ValueError
+        A length, width or height is not positive.
     """
     boxes, rows, cols = _boxes_in_view(boxes, view)
     length, width, yaw = boxes[:, 3], boxes[:, 4], boxes[:, 6]
@@ -130,6 +135,8 @@ def _boxes_in_view(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Boxes whose centre is in the view, and the row and column [cells, from the far left corner] of those centres."""
     boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
+    if not (boxes[:, 3:6] > 0.0).all():
+        raise ValueError("a box is without extent; expected length, width and height above 0 m")
     rows = (view.x_range_m[1] - boxes[:, 0]) / view.cell_m
     cols = (view.y_range_m[1] - boxes[:, 1]) / view.cell_m
     inside = (rows >= 0) & (rows < view.height) & (cols >= 0) & (cols < view.width)

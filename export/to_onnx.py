@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -89,16 +90,18 @@ def card_of(recipe: Recipe, notes: Mapping[str, Any], fitness: FitnessProfile | 
 def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
     """The network as an ONNX graph: weights inside, nothing of this computer in it, no card yet."""
     example = torch.from_numpy(golden_input(0, (1, len(card.input.channels), card.view.height, card.view.width)))
-    program = torch.onnx.export(
-        network.eval(),
-        (example,),
-        input_names=[card.input.name],
-        output_names=[o.name for o in card.outputs],
-        opset_version=OPSET,
-        dynamo=True,
-        external_data=False,
-        verbose=False,
-    )
+    with warnings.catch_warnings():  # the exporter speaks of its own future, which is not the user's affair
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            network.eval(),
+            (example,),
+            input_names=[card.input.name],
+            output_names=[o.name for o in card.outputs],
+            opset_version=OPSET,
+            dynamo=True,
+            external_data=False,
+            verbose=False,
+        )
     assert program is not None
     model = program.model_proto
     # The exporter keeps stack traces, with this computer's paths, beside every node.

@@ -26,7 +26,13 @@ POINTSEG = ModelCard(
     input=InputSpec("range_image", ("x", "y", "z"), (0.0,) * 3, (1.0,) * 3),
     outputs=(OutputSpec("logits", "class_logits"),),
     classes=("background", "car", "pedestrian", "cyclist"),
-    training={"data": "streets", "licence": "CC0", "frames": list(range(40)), "drives": ["a", "b"]},
+    training={
+        "data": "streets",
+        "licence": "CC0",
+        "frames": list(range(40)),
+        "drives": ["a", "b"],
+        "seen": dict.fromkeys("abcdefghijklmnopqrstuvwxyz", 0),
+    },
     metrics={"iou": {"car": 0.65123}},
     parity={"max_abs_diff": 1.5e-5},
 )
@@ -447,9 +453,10 @@ def test_info_of_a_model(thing: str, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert rows["training.licence"] == "CC0"
     assert rows["training.frames"] == "40 values"
     assert rows["training.drives"] == "a, b"
+    assert rows["training.seen"] == "26 entries"
     assert rows["metrics.iou.car"] == "0.6512"
     assert rows["parity.max_abs_diff"] == "1.5e-05"
-    assert rows["here"].startswith("2e-06 standard deviations")
+    assert rows["here"].startswith("answers within 2e-06 standard deviations")
 
 
 @pytest.mark.usefixtures("fake_models")
@@ -475,7 +482,6 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     assert rows["range"] == "5.0 .. 14.1 m, median 10.0"
     assert rows["remission"].startswith("least 10, 5 % ")
     assert rows["beams"].endswith("rows of points (os1-64: 64)")
-    assert rows["ground"] == "not found"
     assert rows["pointseg"] == "as a scan of os1-64: it has 32 beams"
     assert rows["ssadnet"].startswith("its card does not say")
     ((scaled, profile, sensor),) = checked

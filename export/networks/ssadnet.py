@@ -56,7 +56,7 @@ def max_pool_with_mask(x: Tensor) -> tuple[Tensor, Tensor]:
     pooled = F.max_pool2d(x, 2)
     with torch.no_grad():
         order = x.new_tensor([[4.0, 3.0], [2.0, 1.0]]).repeat(x.shape[-2] // 2, x.shape[-1] // 2)
-        candidate = torch.where(x == _double(pooled), order, torch.zeros_like(order))
+        candidate = torch.where(x == _double(pooled), order, 0.0)
         mask = candidate == _double(F.max_pool2d(candidate, 2))
     return pooled, mask
 
@@ -249,7 +249,8 @@ class SSADNet(nn.Module):
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         logits, features = self.segmentation(x)
-        boxes = self.detection(torch.cat([x, features], dim=1))
+        # The bridge. Under autocast the input must follow, or concatenation would turn all 35 channels to float32.
+        boxes = self.detection(torch.cat([x.to(features.dtype), features], dim=1))
         return logits, boxes
 
     def _initialise(self, dropout: float) -> None:

@@ -1,0 +1,135 @@
+"""Cards: what is written is read back, and every corruption has its own error."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edgeperc.card import Golden, InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.errors import CardError
+
+TOP_VIEW_CARD = ModelCard(
+    name="network",
+    version="1.2.3",
+    view=TopViewGeometry(),
+    input=InputSpec("x", ("distance", "height"), (0.0, -2.5), (47.0, 5.0)),
+    outputs=(OutputSpec("map", "class_logits"), OutputSpec("boxes", "box_dense")),
+    classes=("background", "drivable", "car"),
+    box_classes=("car",),
+    box_size_priors={"car": (3.9, 1.6, 1.5)},
+    fitness={"a": 1.0},
+    training={"licence": "Apache-2.0", "data": "Straße"},
+    golden=Golden(7, "00", {"map": {"positions": [0], "values": [0.5], "std": 1.0, "sha256": "11"}}),
+)
+RANGE_CARD = replace(
+    TOP_VIEW_CARD,
+    view=RangeImageGeometry((2.0, 0.0, -5.0), width=2048, azimuth_left_deg=180.0, azimuth_right_deg=-180.0),
+    input=InputSpec("x", ("range",), (10.0,), (5.0,)),
+    outputs=(OutputSpec("p", "class_probabilities"),),
+    box_classes=(),
+    box_size_priors={},
+    golden=None,
+)
+
+
+@pytest.mark.parametrize("card", [TOP_VIEW_CARD, RANGE_CARD])
+def test_a_card_survives_json(card: ModelCard) -> None:
+    assert ModelCard.from_json(card.to_json()) == card
+    assert ModelCard.from_json(card.to_json()).to_json() == card.to_json()
+
+
+def test_geometries_know_their_shape() -> None:
+    assert (TopViewGeometry().height, TopViewGeometry().width) == (400, 200)  # SSADNet 2.1.2
+    assert RANGE_CARD.view.height == 3
+
+
+def test_unknown_keys_are_ignored() -> None:
+    document = json.loads(TOP_VIEW_CARD.to_json()) | {"from_the_future": [1, 2]}
+    assert ModelCard.from_json(json.dumps(document)) == TOP_VIEW_CARD
+
+
+@pytest.mark.parametrize("key", sorted(json.loads(TOP_VIEW_CARD.to_json())))
+def test_no_key_is_defaulted(key: str) -> None:
+    document = json.loads(TOP_VIEW_CARD.to_json())
+    del document[key]
+    with pytest.raises(CardError, match="schema" if key == "schema" else key):
+        ModelCard.from_json(json.dumps(document))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"schema": 2}, "schema 2.*upgrade edgeperc"),
+        ({"schema": 0}, "schema 0.*export the model again"),
+        ({"schema": "1"}, "no schema number"),
+        ({"name": ""}, "name ''"),
+        ({"classes": ["background", "background"]}, "different names"),
+        ({"classes": ["background"]}, "2 to 255"),
+        ({"outputs": [{"name": "a", "kind": "magic"}]}, "'magic'.*class_logits"),
+        ({"outputs": []}, "one class output"),
+        ({"box_classes": []}, "without box_classes"),
+        ({"box_classes": ["tram"]}, "tram"),
+        ({"score_threshold": 1.5}, "score_threshold"),
+        ({"view": {"kind": "sphere"}}, "'sphere'.*top_view"),
+        ({"view": 3}, "malformed"),
+        ({"input": {"name": "x", "channels": ["colour"], "mean": [0], "std": [1]}}, "colour"),
+        ({"input": {"name": "x", "channels": ["height"], "mean": [0, 1], "std": [1]}}, "2 means"),
+        ({"input": {"name": "x", "channels": ["height"], "mean": [0], "std": [0]}}, "positive deviations"),
+    ],
+)
+def test_each_corruption_is_named(change: dict[str, Any], words: str) -> None:
+    document = json.loads(TOP_VIEW_CARD.to_json()) | change
+    with pytest.raises(CardError, match=words):
+        ModelCard.from_json(json.dumps(document))
+
+
+def test_boxes_need_a_top_view() -> None:
+    with pytest.raises(CardError, match="boxes need a top_view"):
+        replace(RANGE_CARD, outputs=(*RANGE_CARD.outputs, OutputSpec("b", "box_slots")), box_classes=("car",))
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        {"row_elevations_deg": (0.0, 1.0)},
+        {"row_elevations_deg": (1.0,)},
+        {"row_elevations_deg": (1.0, 0.0), "width": 0},
+        {"row_elevations_deg": (1.0, 0.0), "azimuth_left_deg": -60.0},
+    ],
+)
+def test_impossible_range_images_are_refused(view: dict[str, Any]) -> None:
+    with pytest.raises(CardError, match="expected"):
+        RangeImageGeometry(**view)
+
+
+@pytest.mark.parametrize("view", [{"x_range_m": (46.0, 6.0)}, {"cell_m": 0.0}, {"z_range_m": (0.0, float("nan"))}])
+def test_impossible_top_views_are_refused(view: dict[str, Any]) -> None:
+    with pytest.raises(CardError, match="expected"):
+        TopViewGeometry(**view)
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@given(st.text() | json_values.map(json.dumps))
+def test_anything_else_is_a_card_error(text: str) -> None:
+    with pytest.raises(CardError):
+        ModelCard.from_json(text)
+
+
+@given(st.sampled_from(sorted(json.loads(TOP_VIEW_CARD.to_json()))), json_values)
+def test_any_value_anywhere_is_read_or_refused(key: str, value: object) -> None:
+    document = json.loads(TOP_VIEW_CARD.to_json()) | {key: value}
+    try:
+        ModelCard.from_json(json.dumps(document))
+    except CardError:
+        pass

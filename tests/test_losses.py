@@ -1,0 +1,400 @@
+"""Targets and losses against plain numpy."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from edgeperc.card import TopViewGeometry  # noqa: E402
+from edgeperc.decode import decode_dense, decode_slots  # noqa: E402
+from edgeperc_export.losses import (  # noqa: E402
+    GEOMETRY_WEIGHTS,
+    IGNORE,
+    REGRESSED_FROM,
+    cross_entropy,
+    dense_loss,
+    dense_targets,
+    lovasz_softmax,
+    pointseg_loss,
+    slot_targets,
+    slots_loss,
+    ssadnet_loss,
+)
+
+VIEW = TopViewGeometry()  # x 6..46 m, y -10..10 m, 0.1 m cells
+CAR = (26.0, 2.0, -1.0, 4.0, 1.6, 1.5, 0.0)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def log_softmax(logits):
+    shifted = logits - logits.max(1, keepdims=True)
+    return shifted - np.log(np.exp(shifted).sum(1, keepdims=True))
+
+
+def random_maps(rng, n_classes=5, shape=(2, 6, 7), ignored=0.2):
+    logits = rng.normal(size=(shape[0], n_classes, *shape[1:])).astype(np.float32)
+    labels = rng.integers(n_classes, size=shape).astype(np.uint8)
+    labels[rng.random(shape) < ignored] = IGNORE
+    return logits, labels
+
+
+# --- slot_targets ---------------------------------------------------------------------------------------------------
+
+
+def test_slot_of_a_box_ahead():
+    (slot,) = slot_targets([CAR], VIEW, 1)
+    # Row (46 - 26) / 0.1 = 200 of 400, column (10 - 2) / 0.1 = 80 of 200; 16 columns across, 40 rows along.
+    np.testing.assert_allclose(slot, [80 / 200, 200 / 400, 16 / 200, 40 / 400], rtol=1e-6)
+
+
+def test_slots_of_rotated_boxes_hold_the_footprint(rng):
+    for _ in range(20):
+        yaw = rng.uniform(-np.pi, np.pi)
+        box = np.array([rng.uniform(12, 40), rng.uniform(-5, 5), 0.0, rng.uniform(1, 9), rng.uniform(1, 3), 1.5, yaw])
+        corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * box[3:5] / 2
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        corners = corners @ turn.T + box[:2]
+        rows, cols = (46 - corners[:, 0]) / 0.1, (10 - corners[:, 1]) / 0.1
+        expected = [
+            (cols.min() + cols.max()) / 2 / 200,
+            (rows.min() + rows.max()) / 2 / 400,
+            np.ptp(cols) / 200,
+            np.ptp(rows) / 400,
+        ]
+        np.testing.assert_allclose(slot_targets([box], VIEW, 1)[0], expected, rtol=1e-5)
+
+
+def test_slots_are_nearest_first_and_the_farthest_are_dropped():
+    boxes = [(x, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0) for x in (30.0, 10.0, 40.0, 20.0)]
+    target = slot_targets(boxes, VIEW, 3)
+    np.testing.assert_allclose(target[:, 1], [0.9, 0.65, 0.4], rtol=1e-6)
+
+
+def test_empty_slots_are_zero():
+    assert slot_targets([CAR], VIEW, 4)[1:].tolist() == [[0.0] * 4] * 3
+    assert slot_targets([], VIEW, 2).tolist() == [[0.0] * 4] * 2
+    assert slot_targets(np.empty((0, 7)), VIEW, 2).dtype == np.float32
+
+
+@pytest.mark.parametrize("centre", [(5.9, 0.0), (46.1, 0.0), (20.0, 10.1), (20.0, -10.1), (6.0, 0.0), (np.nan, 0.0)])
+def test_boxes_centred_outside_the_view_are_left_out(centre):
+    box = [(*centre, *CAR[2:])]
+    assert not slot_targets(box, VIEW, 2).any()
+    assert not dense_targets(box, VIEW).any()
+
+
+@pytest.mark.parametrize("targets", [lambda b: slot_targets(b, VIEW, 1), lambda b: dense_targets(b, VIEW)])
+def test_boxes_without_extent_are_refused(targets):
+    with pytest.raises(ValueError, match="without extent"):
+        targets([(20.0, 0.0, 0.0, 4.0, 0.0, 1.5, 0.0)])
+
+
+# --- dense_targets --------------------------------------------------------------------------------------------------
+
+
+def test_dense_target_of_one_box():
+    yaw = 0.3
+    target = dense_targets([(26.13, 2.27, -0.8, 4.1, 1.7, 1.5, yaw)], VIEW)
+    assert target.shape == (9, 100, 50)
+    assert target.dtype == np.float32
+    ((row, col),) = np.argwhere(target[0] == 1.0)
+    assert (row, col) == (49, 19)  # (46 - 26.13) / 0.4 = 49.675, (10 - 2.27) / 0.4 = 19.325
+    expected = [0.175, -0.175, np.log(4.1), np.log(1.7), np.sin(2 * yaw), np.cos(2 * yaw), -0.8, np.log(1.5)]
+    np.testing.assert_allclose(target[1:, row, col], expected, atol=1e-5)
+
+
+def test_every_learning_cell_points_at_the_same_centre():
+    target = dense_targets([(26.13, 2.27, -0.8, 9.0, 3.0, 1.5, 0.3)], VIEW)
+    rows, cols = np.nonzero(target[0] >= REGRESSED_FROM)
+    assert len(rows) > 5
+    np.testing.assert_allclose(rows + 0.5 + target[1, rows, cols], 49.675, atol=1e-4)
+    np.testing.assert_allclose(cols + 0.5 + target[2, rows, cols], 19.325, atol=1e-4)
+    assert not target[1:, target[0] < REGRESSED_FROM].any()
+
+
+def test_heat_lies_along_the_box():
+    # 45 degrees to the left: ahead (up a row) goes with left (down a column).
+    heat = dense_targets([(26.0, 0.0, 0.0, 8.0, 2.0, 1.5, np.pi / 4)], VIEW)[0]
+    ((row, col),) = np.argwhere(heat == 1.0)
+    assert heat[row - 2, col - 2] == pytest.approx(heat[row + 2, col + 2])
+    assert heat[row - 2, col - 2] > 0.5 > 0.1 > heat[row - 2, col + 2]
+    # The edge of the footprint, 4 m from the centre, is three standard deviations away.
+    ahead = dense_targets([(26.0, 0.0, 0.0, 8.0, 2.0, 1.5, 0.0)], VIEW)[0]
+    ((row, col),) = np.argwhere(ahead == 1.0)
+    assert ahead[row - 10, col] == pytest.approx(np.exp(-4.5), rel=1e-5)
+
+
+def test_neighbours_keep_their_own_geometry():
+    near, far = (20.0, 0.1, -1.0, 4.0, 1.6, 1.5, 0.0), (21.7, 0.1, -0.5, 8.0, 2.4, 3.0, 0.0)
+    for boxes in ([near, far], [far, near]):
+        target = dense_targets(boxes, VIEW)
+        centres = np.argwhere(target[0] == 1.0)
+        assert len(centres) == 2
+        (far_row, far_col), (near_row, near_col) = centres  # farther ahead is higher up
+        assert target[7, far_row, far_col] == pytest.approx(-0.5)
+        assert target[7, near_row, near_col] == pytest.approx(-1.0)
+        alone = np.maximum(dense_targets([near], VIEW)[0], dense_targets([far], VIEW)[0])
+        np.testing.assert_array_equal(target[0], alone)
+
+
+def test_unlabelled_cells_learn_nothing():
+    labelled = np.ones((400, 200), bool)
+    labelled[:101] = False  # the 26th output row is only partly labelled
+    heat = dense_targets([CAR, (44.0, 0.0, *CAR[2:])], VIEW, labelled=labelled)[0]
+    assert (heat[26:] >= 0.0).all()
+    assert set(np.unique(heat[:26])) - {-1.0} == set(np.unique(heat[:26][heat[:26] >= REGRESSED_FROM]))
+    assert (heat == 1.0).sum() == 2  # a labelled box counts wherever it is
+
+
+def test_unsure_boxes_are_neither_found_nor_missed():
+    unsure = (26.0, -4.0, *CAR[2:])
+    target = dense_targets([CAR], VIEW, unsure=[unsure])
+    np.testing.assert_array_equal(target[0] == -1.0, dense_targets([unsure], VIEW)[0] > 0.1)
+    np.testing.assert_array_equal(target[1:], dense_targets([CAR], VIEW)[1:])
+    np.testing.assert_array_equal(
+        dense_targets([CAR], VIEW, unsure=[CAR])[0] == 1.0, dense_targets([CAR], VIEW)[0] == 1.0
+    )
+    assert (dense_targets([], VIEW, unsure=np.empty((0, 7))) == 0.0).all()
+
+
+# --- The runtime reads back what the networks are trained towards ---------------------------------------------------
+
+CLASSES = ("background", "drivable", "car", "van", "truck")
+ROUND_TRIP = {  # nearest first, as slots are
+    "car": (9.37, -4.21, -0.91, 3.9, 1.6, 1.5, np.pi / 2),
+    "van": (22.04, 3.33, -0.62, 5.1, 1.9, 2.2, 0.0),
+    "truck": (38.81, -2.4, -0.1, 10.0, 2.6, 3.3, 0.0),
+}
+
+
+def painted(boxes):
+    """Labels (400, 200) of upright boxes, by class."""
+    labels = np.zeros((400, 200), np.uint8)
+    for label, box in boxes.items():
+        col, row, width, height = slot_targets([box], VIEW, 1)[0] * [200, 400, 200, 400]
+        rows, cols = np.ogrid[:400, :200]
+        inside = (np.abs(rows + 0.5 - row) <= height / 2) & (np.abs(cols + 0.5 - col) <= width / 2)
+        labels[inside] = CLASSES.index(label)
+    return labels
+
+
+def same_boxes(found, boxes, *, atol):
+    assert sorted(box.label for box in found) == sorted(boxes)
+    for box in found:
+        x, y, z, length, width, height, yaw = boxes[box.label]
+        np.testing.assert_allclose(box.center, (x, y, z), atol=atol)
+        np.testing.assert_allclose(box.size, (length, width, height), atol=atol)
+        assert abs(np.sin(box.yaw - yaw)) < 1e-4  # front and rear look alike
+
+
+def test_slots_survive_the_round_trip():
+    priors = {label: box[3:6] for label, box in ROUND_TRIP.items()}
+    slots = slot_targets(list(ROUND_TRIP.values()), VIEW, 8)[None]
+    scores = np.full((400, 200), 0.5, np.float32)
+    found = decode_slots(slots, painted(ROUND_TRIP), scores, VIEW, CLASSES, CLASSES[2:], priors, 1.73)
+    standing = {label: (*box[:2], box[5] / 2 - 1.73, *box[3:]) for label, box in ROUND_TRIP.items()}
+    same_boxes(found, standing, atol=1e-4)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, 1.0, 2.2, -0.8, -2.9])
+def test_dense_boxes_survive_the_round_trip(turn):
+    boxes = {label: (*box[:6], box[6] + turn) for label, box in ROUND_TRIP.items()}
+    dense = dense_targets(list(boxes.values()), VIEW)
+    heat = dense[0].clip(1e-6, 1.0 - 1e-6)
+    dense[0] = np.log(heat) - np.log1p(-heat)
+    probabilities = np.eye(5, dtype=np.float32)[painted(boxes)].transpose(2, 0, 1)
+    found = decode_dense(dense, probabilities, "class_probabilities", VIEW, CLASSES, CLASSES[2:])
+    same_boxes(found, boxes, atol=1e-4)
+    assert all(box.score > 0.999 for box in found)
+
+
+# --- Cross-entropy (equation 4), focal, Lovász ----------------------------------------------------------------------
+
+
+def test_segmentation_loss_is_equation_4(rng):
+    logits, labels = random_maps(rng, ignored=0.0)
+    n, height, width = labels.shape
+    y_true = np.eye(5)[labels].transpose(0, 3, 1, 2)
+    expected = -(y_true * log_softmax(logits)).sum() / (n * width * height)
+    assert cross_entropy(torch.tensor(logits), torch.tensor(labels)).item() == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("gamma", [0.0, 2.0])
+@pytest.mark.parametrize("weights", [None, [0.1, 1.0, 2.0, 0.0, 5.0]])
+def test_weighted_cross_entropy_with_ignored_pixels(rng, weights, gamma):
+    logits, labels = random_maps(rng)
+    total = share = 0.0
+    log_p = log_softmax(logits)
+    for (n, r, c), label in np.ndenumerate(labels):
+        if label != IGNORE:
+            weight = 1.0 if weights is None else weights[label]
+            p = np.exp(log_p[n, label, r, c])
+            total -= weight * (1 - p) ** gamma * log_p[n, label, r, c]
+            share += weight
+    tensor = None if weights is None else torch.tensor(weights)
+    loss = cross_entropy(torch.tensor(logits), torch.tensor(labels), tensor, focal_gamma=gamma)
+    assert loss.item() == pytest.approx(total / share, rel=1e-4)
+
+
+@pytest.mark.parametrize("loss", [cross_entropy, lovasz_softmax, lambda x, y: pointseg_loss(x, y, lovasz_weight=1.0)])
+def test_nothing_labelled_costs_nothing(loss):
+    logits = torch.randn(2, 4, 3, 3, requires_grad=True)
+    value = loss(logits, torch.full((2, 3, 3), IGNORE, dtype=torch.uint8))
+    value.backward()
+    assert value.item() == 0.0
+    assert not logits.grad.any()
+
+
+@pytest.mark.parametrize("loss", [cross_entropy, lovasz_softmax])
+def test_ignored_pixels_get_no_gradient(rng, loss):
+    logits, labels = random_maps(rng)
+    tensor = torch.tensor(logits, requires_grad=True)
+    loss(tensor, torch.tensor(labels)).backward()
+    gradient = tensor.grad.abs().sum(1).numpy()
+    assert not gradient[labels == IGNORE].any()
+    assert gradient[labels != IGNORE].any()
+
+
+def test_lovasz_of_hard_predictions_is_one_minus_mean_iou(rng):
+    _, labels = random_maps(rng, n_classes=3)
+    predicted = rng.integers(3, size=labels.shape)
+    known = labels != IGNORE
+    ious = [
+        ((predicted == c) & (labels == c))[known].sum() / ((predicted == c) | (labels == c))[known].sum()
+        for c in range(3)
+    ]
+    logits = 1e4 * np.eye(3, dtype=np.float32)[predicted].transpose(0, 3, 1, 2)
+    loss = lovasz_softmax(torch.tensor(logits), torch.tensor(labels))
+    assert loss.item() == pytest.approx(1.0 - np.mean(ious), abs=1e-5)
+
+
+def test_lovasz_is_the_extension_of_the_jaccard_loss(rng):
+    """Against its definition: the Jaccard loss of each set of largest errors, weighted by the steps between errors."""
+    logits, labels = random_maps(rng, n_classes=2, shape=(1, 3, 4), ignored=0.0)
+    p = np.exp(log_softmax(logits))[0]
+    expected = []
+    for c in range(2):
+        truth = labels[0] == c
+        errors = np.abs(truth - p[c]).ravel()
+        levels = np.append(np.sort(errors)[::-1], 0.0)
+        value = 0.0
+        for higher, lower in itertools.pairwise(levels):
+            wrong = (errors >= higher).reshape(truth.shape)
+            value += (higher - lower) * wrong.sum() / (truth | wrong).sum()
+        expected.append(value)
+    loss = lovasz_softmax(torch.tensor(logits), torch.tensor(labels))
+    assert loss.item() == pytest.approx(np.mean(expected), rel=1e-5)
+
+
+def test_pointseg_loss_is_the_sum_of_its_parts(rng):
+    logits, labels = (torch.tensor(a) for a in random_maps(rng, n_classes=4))
+    weights = torch.tensor([0.1, 1.0, 2.0, 3.0])
+    total = pointseg_loss(logits, labels, weights, focal_gamma=1.5, lovasz_weight=0.7)
+    parts = cross_entropy(logits, labels, weights, focal_gamma=1.5) + 0.7 * lovasz_softmax(logits, labels)
+    torch.testing.assert_close(total, parts)
+    torch.testing.assert_close(pointseg_loss(logits, labels), cross_entropy(logits, labels))
+
+
+# --- Boxes ----------------------------------------------------------------------------------------------------------
+
+
+def test_slots_loss_is_equations_5_and_6(rng):
+    predicted, target = rng.random((2, 3, 6, 4)).astype(np.float32)
+    n, k, _ = target.shape
+    mean_squared = [((target[..., i] - predicted[..., i]) ** 2).sum() / (n * k) for i in range(4)]
+    assert slots_loss(torch.tensor(predicted), torch.tensor(target)).item() == pytest.approx(sum(mean_squared))
+
+
+def test_negative_slots_are_not_learned(rng):
+    predicted, target = (torch.tensor(a.astype(np.float32)) for a in rng.random((2, 2, 6, 4)))
+    target[1] = -1.0
+    torch.testing.assert_close(slots_loss(predicted, target), slots_loss(predicted[:1], target[:1]))
+    assert slots_loss(predicted[1:], target[1:]).item() == 0.0
+
+
+def dense_case(rng):
+    target = np.stack([dense_targets([CAR, (15.0, -3.0, 0.0, 6.0, 2.0, 2.0, 0.7)], VIEW), dense_targets([], VIEW)])
+    target[:, 0, :20] = -1.0
+    return rng.normal(size=target.shape).astype(np.float32), target
+
+
+def test_dense_loss(rng):
+    predicted, target = dense_case(rng)
+    heat, p = target[:, 0], 1.0 / (1.0 + np.exp(-predicted[:, 0].astype(np.float64)))
+    hit = (1 - p) ** 2 * np.log(p)
+    miss = (1 - heat) ** 4 * p**2 * np.log(1 - p)
+    expected_heat = -(hit[heat == 1].sum() + miss[(heat >= 0) & (heat < 1)].sum()) / 2
+    share = np.where(heat >= REGRESSED_FROM, heat, 0.0)
+    error = (np.abs(predicted - target)[:, 1:] * np.reshape(GEOMETRY_WEIGHTS, (1, 8, 1, 1))).sum(1)
+    heat_loss, geometry_loss = dense_loss(torch.tensor(predicted), torch.tensor(target))
+    assert heat_loss.item() == pytest.approx(expected_heat, rel=1e-4)
+    assert geometry_loss.item() == pytest.approx((error * share).sum() / share.sum(), rel=1e-4)
+
+
+def test_dense_loss_ignores_what_is_not_learned(rng):
+    predicted, target = dense_case(rng)
+    tensor = torch.tensor(predicted, requires_grad=True)
+    sum(dense_loss(tensor, torch.tensor(target))).backward()
+    gradient = tensor.grad.numpy()
+    assert not gradient[:, 0][target[:, 0] == -1.0].any()
+    assert not gradient[:, 1:].any(1)[target[:, 0] < REGRESSED_FROM].any()
+    assert gradient[:, 1:].any(1)[target[:, 0] >= REGRESSED_FROM].all()
+
+
+def test_dense_loss_of_the_truth_is_small_and_of_no_boxes_is_finite():
+    target = torch.tensor(dense_targets([CAR], VIEW))[None]
+    perfect = target.clone()
+    perfect[:, 0] = torch.where(target[:, 0] == 1.0, 30.0, -30.0)
+    heat_loss, geometry_loss = dense_loss(perfect, target)
+    assert heat_loss.item() < 1e-6
+    assert geometry_loss.item() < 1e-6
+    extreme = torch.full((1, 9, 100, 50), 200.0, requires_grad=True)
+    heat_loss, geometry_loss = dense_loss(extreme, torch.zeros(1, 9, 100, 50))
+    (heat_loss + geometry_loss).backward()
+    assert torch.isfinite(heat_loss)
+    assert geometry_loss.item() == 0.0
+    assert torch.isfinite(extreme.grad).all()
+
+
+@pytest.mark.parametrize("head", ["slots", "dense"])
+def test_ssadnet_loss_is_equation_3(rng, head):
+    logits, labels = (torch.tensor(a) for a in random_maps(rng))
+    if head == "slots":
+        boxes, targets = (torch.tensor(a.astype(np.float32)) for a in rng.random((2, 2, 6, 4)))
+        detection = slots_loss(boxes, targets)
+    else:
+        boxes, targets = (torch.tensor(a) for a in dense_case(rng))
+        detection = sum(dense_loss(boxes, targets))
+    segmentation = cross_entropy(logits, labels)
+    total, parts = ssadnet_loss(logits, boxes, labels, targets)
+    torch.testing.assert_close(total, 1.0 * segmentation + 0.1 * detection)
+    assert set(parts) == ({"seg", "det"} if head == "slots" else {"seg", "heat", "geometry"})
+    total, _ = ssadnet_loss(logits, boxes, labels, targets, lw_seg=2.0, lw_det=0.5)
+    torch.testing.assert_close(total, 2.0 * segmentation + 0.5 * detection)
+
+
+@pytest.mark.parametrize("shape", [(2, 6, 4), (2, 9, 4, 3)])
+def test_a_batch_without_truth_is_not_learned(shape):
+    logits, boxes = torch.randn(2, 5, 16, 12, requires_grad=True), torch.randn(shape, requires_grad=True)
+    labels = torch.full((2, 16, 12), IGNORE, dtype=torch.uint8)
+    total, _ = ssadnet_loss(logits, boxes, labels, torch.full(shape, -1.0), class_weights=torch.rand(5))
+    total.backward()
+    assert total.item() == 0.0
+    assert not logits.grad.any()
+    assert not boxes.grad.any()
+
+
+def test_losses_take_bfloat16(rng):
+    logits, labels = (torch.tensor(a) for a in random_maps(rng))
+    assert cross_entropy(logits.bfloat16(), labels).dtype == torch.float32
+    assert cross_entropy(logits.bfloat16(), labels).item() == pytest.approx(
+        cross_entropy(logits, labels).item(), rel=0.02
+    )

@@ -1,0 +1,372 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from torch import nn  # noqa: E402
+from torch.utils.flop_counter import FlopCounterMode  # noqa: E402
+
+from edgeperc_export.networks.pointseg import ENLARGEMENT_RATES, Fire, FireDeconv, PointSeg, SqueezeReweight  # noqa: E402
+from edgeperc_export.networks.ssadnet import (  # noqa: E402
+    CONTEXT_DILATIONS,
+    ELU_GAIN,
+    HEAT_PRIOR,
+    BoxRegressor,
+    ContextModule,
+    FeatureBlock,
+    SSADNet,
+    max_pool_with_mask,
+    max_unpool,
+    receptive_fields,
+)
+
+# SSADNet, Table 1: dilation (width, height) and receptive field (width, height) of the context module's layers.
+TABLE_1 = [
+    ((1, 1), (3, 3)),
+    ((1, 2), (5, 7)),
+    ((2, 4), (9, 15)),
+    ((4, 8), (17, 31)),
+    ((8, 16), (33, 63)),
+    ((16, 32), (65, 127)),
+    ((32, 64), (129, 255)),
+]
+
+
+@pytest.fixture(autouse=True)
+def _seed():
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        yield
+
+
+def run_and_watch(network, x, *names):
+    """What the network returns, and by name what the named modules got and returned."""
+    seen = {}
+
+    def watch(name):
+        return lambda module, inputs, output: seen.__setitem__(name, (inputs[0], output))
+
+    handles = [network.get_submodule(name).register_forward_hook(watch(name)) for name in names]
+    with torch.no_grad():
+        output = network(x)
+    for handle in handles:
+        handle.remove()
+    return output, seen
+
+
+def on_meta(make):
+    """The network in inference mode, with shapes but without numbers."""
+    with torch.device("meta"):
+        return make().eval()
+
+
+def n_parameters(module):
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def giga_macs(network, *shape):
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        network(torch.empty(shape, device="meta"))
+    return counter.get_total_flops() / 2e9
+
+
+def agree(actual, expected):
+    torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-6)
+
+
+# --- SSADNet: context module
+
+
+def test_receptive_fields_follow_from_the_dilations():
+    assert list(CONTEXT_DILATIONS) == [dilation for dilation, _ in TABLE_1]
+    assert receptive_fields() == [field for _, field in TABLE_1]
+    assert receptive_fields(((1, 1), (1, 1), (3, 2))) == [(3, 3), (5, 5), (11, 9)]
+    assert receptive_fields(()) == []
+
+
+@pytest.mark.parametrize("k", range(1, 8))
+def test_the_first_k_context_layers_see_what_table_1_says(k):
+    module = ContextModule(channels=1, width=1).eval()
+    for layer in module.dilated:
+        if isinstance(layer, nn.Conv2d):
+            nn.init.ones_(layer.weight)
+            nn.init.zeros_(layer.bias)
+    x = torch.ones(1, 1, 261, 135, requires_grad=True)
+    y = module.dilated[: 3 * k](x)  # convolution, dropout, ELU
+    assert y.shape == x.shape
+    y[0, 0, 130, 67].backward()
+    rows, cols = torch.nonzero(x.grad[0, 0], as_tuple=True)
+    width, height = TABLE_1[k - 1][1]
+    assert (rows.min(), rows.max()) == (130 - height // 2, 130 + height // 2)
+    assert (cols.min(), cols.max()) == (67 - width // 2, 67 + width // 2)
+    assert len(rows) == width * height  # no cell within is skipped
+
+
+def test_context_layers_are_dilated_farther_along_the_road():
+    module = ContextModule()
+    convolutions = [layer for layer in module.dilated if isinstance(layer, nn.Conv2d)]
+    assert [conv.kernel_size for conv in convolutions] == [(3, 3)] * 7
+    assert [conv.dilation for conv in convolutions] == [(height, width) for (width, height), _ in TABLE_1]
+    assert [type(layer) for layer in module.dilated] == [nn.Conv2d, nn.Dropout2d, nn.ELU] * 7
+    assert module.project[0].kernel_size == (1, 1)  # layer 8
+
+
+def test_spatial_dropout_drops_whole_channels():
+    names = [f"dilated.{3 * k + 1}" for k in range(7)]
+    _, seen = run_and_watch(ContextModule(4, 32, dropout=0.25).train(), torch.randn(2, 4, 9, 5), *names)
+    dropped = 0
+    for before, after in seen.values():
+        gone = (after == 0).all((2, 3))
+        agree(after, torch.where(gone[:, :, None, None], torch.zeros_like(before), before / 0.75))
+        dropped += int(gone.sum())
+    assert 0.15 * 448 < dropped < 0.35 * 448  # 7 x 2 x 32 channels: five standard deviations either way
+
+
+# --- SSADNet: pooling and its inverse
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 2, 2), (2, 3, 8, 6), (1, 4, 10, 14)])
+@pytest.mark.parametrize("ties", [False, True])
+@pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
+def test_unpooling_is_torchs(shape, ties, memory_format):
+    x = torch.randint(-1, 2, shape).float() if ties else torch.randn(shape)
+    x = x.to(memory_format=memory_format).requires_grad_()
+    weights, scale = torch.randn(shape), torch.rand(shape[0], shape[1], shape[2] // 2, shape[3] // 2)
+
+    pooled, mask = max_pool_with_mask(x)
+    restored = max_unpool(pooled * scale, mask)
+    (gradient,) = torch.autograd.grad((restored * weights).sum(), x)
+
+    expected, indices = nn.MaxPool2d(2, return_indices=True)(x)
+    expected_restored = nn.MaxUnpool2d(2)(expected * scale, indices)
+    (expected_gradient,) = torch.autograd.grad((expected_restored * weights).sum(), x)
+
+    assert mask.dtype == torch.bool
+    assert torch.equal(pooled, expected)
+    assert torch.equal(restored, expected_restored)
+    assert torch.equal(gradient, expected_gradient)
+
+
+@pytest.mark.parametrize("value", [0.0, -2.5, float("inf")])
+def test_where_all_are_equal_the_first_is_the_maximum(value):
+    pooled, mask = max_pool_with_mask(torch.full((1, 2, 4, 6), value))
+    assert (pooled == value).all()
+    expected = torch.zeros(4, 6, dtype=torch.bool)
+    expected[::2, ::2] = True
+    assert torch.equal(mask, expected.expand(1, 2, 4, 6))
+
+
+# --- SSADNet: the whole
+
+
+@pytest.mark.parametrize("head", ["slots", "dense"])
+def test_ssadnet_shapes_at_each_stage(head):
+    network = on_meta(lambda: SSADNet(head))
+    names = [f"segmentation.{name}" for name in ("encoder", "context.dilated", "context", "decoder")]
+    blocks = {
+        "slots": {
+            "features.0": (16, 200, 100),
+            "features.1": (32, 100, 50),
+            "features.2": (64, 50, 25),
+            "features.3": (128, 25, 12),
+            "features.4": (128, 12, 6),
+        },
+        "dense": {"fine.0": (16, 200, 100), "fine.1": (32, 100, 50), "coarse": (64, 50, 25), "merge": (64, 100, 50)},
+    }[head]
+    x = torch.empty(2, 3, 400, 200, device="meta")
+    (logits, boxes), seen = run_and_watch(network, x, *names, *(f"detection.{name}" for name in blocks))
+    encoded, dilated, context, decoded = (tuple(seen[name][1].shape) for name in names)
+    assert encoded == (2, 32, 400, 200)
+    assert dilated == (2, 128, 200, 100)
+    assert context == (2, 32, 200, 100)
+    assert decoded == (2, 32, 400, 200)
+    for name, shape in blocks.items():
+        assert tuple(seen[f"detection.{name}"][1].shape) == (2, *shape)
+    assert logits.shape == (2, 5, 400, 200)
+    assert boxes.shape == {"slots": (2, 16, 4), "dense": (2, 9, 100, 50)}[head]
+
+
+@pytest.mark.parametrize(("head", "height", "width"), [("slots", 32, 40), ("dense", 8, 24), ("dense", 72, 40)])
+def test_ssadnet_takes_other_sizes(head, height, width):
+    network = SSADNet(head, n_channels=2, n_classes=3, n_slots=7, context_width=4).eval()
+    with torch.no_grad():
+        logits, boxes = network(torch.randn(3, 2, height, width))
+    assert logits.shape == (3, 3, height, width)
+    assert boxes.shape == ((3, 7, 4) if head == "slots" else (3, 9, height // 4, width // 4))
+    assert logits.isfinite().all()
+    assert boxes.isfinite().all()
+
+
+def test_ssadnet_refuses_other_heads():
+    with pytest.raises(ValueError, match="'anchors'"):
+        SSADNet("anchors")
+
+
+@pytest.mark.parametrize(("head", "detection"), [("slots", 994_416), ("dense", 290_169)])
+def test_ssadnet_costs(head, detection):
+    network = on_meta(lambda: SSADNet(head))
+    assert n_parameters(network.segmentation) == 955_429
+    assert n_parameters(network.detection) == detection
+    assert n_parameters(network) == 955_429 + detection
+    assert giga_macs(network, 1, 3, 400, 200) == pytest.approx(22.6, rel=0.05)
+
+
+@pytest.mark.parametrize("head", ["slots", "dense"])
+def test_the_bridge_is_the_input_on_top_of_the_decoders_map(head):
+    x = torch.randn(2, 3, 32, 32)
+    (logits, _), seen = run_and_watch(
+        SSADNet(head, context_width=4).eval(), x, "segmentation.decoder", "segmentation.classifier", "detection"
+    )
+    decoded = seen["segmentation.decoder"][1]
+    assert torch.equal(seen["detection"][0], torch.cat([x, decoded], dim=1))
+    assert torch.equal(seen["segmentation.classifier"][0], decoded)
+    assert torch.equal(seen["segmentation.classifier"][1], logits)
+
+
+def test_the_bridge_stays_narrow_under_autocast():
+    with torch.autocast("cpu", torch.bfloat16):
+        _, seen = run_and_watch(SSADNet("dense", context_width=4).eval(), torch.randn(1, 3, 16, 16), "detection")
+    assert seen["detection"][0].dtype == torch.bfloat16
+
+
+def test_slots_head_has_five_feature_blocks_and_four_regressors():
+    network = SSADNet("slots", n_slots=6, context_width=4).eval()
+    blocks = [module for module in network.modules() if isinstance(module, FeatureBlock)]
+    regressors = [module for module in network.modules() if isinstance(module, BoxRegressor)]
+    assert len(regressors) == 4
+
+    # Two 3x3 a block, and one more after all but the first and the last.
+    layers = [[type(m) for m in block.modules() if type(m) in (nn.Conv2d, nn.BatchNorm2d, nn.ELU)] for block in blocks]
+    assert layers == [[nn.Conv2d, nn.BatchNorm2d, nn.ELU] * n for n in (2, 3, 3, 3, 2)]
+    kernels = {m.kernel_size for block in blocks for m in block.modules() if isinstance(m, nn.Conv2d)}
+    assert kernels == {(3, 3)}
+
+    # Each regressor is a chain of 1x1 over all pixels, averaged last, and fills one of the four columns.
+    names = [f"detection.regressors.{i}" for i in range(4)]
+    (_, boxes), seen = run_and_watch(network, torch.randn(2, 3, 64, 96), "detection.features", *names)
+    features = seen["detection.features"][1]
+    assert features.shape == (2, 128, 2, 3)
+    for i, regressor in enumerate(regressors):
+        assert seen[names[i]][0] is features
+        assert {m.kernel_size for m in regressor.modules() if isinstance(m, nn.Conv2d)} == {(1, 1)}
+        assert type(regressor.layers[1]) is nn.ReLU
+        assert sum(type(m) is nn.ELU for m in regressor.layers) == sum(type(m) is nn.Dropout for m in regressor.layers)
+        agree(boxes[:, :, i], regressor(features.flatten(2)[..., torch.randperm(6)].unflatten(2, (3, 2))))
+
+
+def test_ssadnet_starts_with_signals_of_sound_size():
+    z = np.linspace(-12.0, 12.0, 240_001)
+    density = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
+    elu = np.where(z > 0.0, z, np.expm1(np.minimum(z, 0.0)))
+    assert 1.0 / np.sum(elu**2 * density * (z[1] - z[0])) == pytest.approx(ELU_GAIN, rel=1e-3)
+
+    network = SSADNet("dense", dropout=0.4).train()
+    for conv in (network.segmentation.encoder[1][0], network.detection.merge[0][0]):
+        assert conv.weight.var() * conv.weight[0].numel() == pytest.approx(ELU_GAIN, rel=0.1)
+    for conv in list(network.segmentation.context.dilated)[::3]:
+        assert conv.weight.var() * conv.weight[0].numel() == pytest.approx(ELU_GAIN * (1.0 - 0.4), rel=0.05)
+    with torch.no_grad():
+        _, boxes = network(torch.randn(2, 3, 64, 64))
+    assert boxes[:, 0].sigmoid().mean() == pytest.approx(HEAT_PRIOR, abs=0.03)
+
+
+# --- PointSeg
+
+
+@pytest.mark.parametrize("width", [512, 2048])
+def test_pointseg_halves_widths_only(width):
+    network = on_meta(PointSeg)
+    stages = {
+        "fire1": (64, 2),
+        "fire3": (128, 4),
+        "sr1": (128, 4),
+        "sr2": (256, 8),
+        "fire7": (384, 16),
+        "sr3": (512, 16),
+        "enlarge": (128, 16),
+        "deconv1": (128, 8),
+        "deconv1_enlarged": (128, 8),
+        "deconv2": (128, 4),
+        "deconv3": (64, 2),
+        "deconv4": (64, 1),
+        "skip1": (64, 1),
+    }
+    logits, seen = run_and_watch(network, torch.empty(2, 5, 64, width, device="meta"), *stages)
+    for name, (channels, shrink) in stages.items():
+        assert tuple(seen[name][1].shape) == (2, channels, 64, width // shrink), name
+    assert logits.shape == (2, 4, 64, width)
+    if width == 512:
+        assert seen["enlarge"][0].shape[2:] == (64, 32)
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 2048), (5, 16), (32, 48)])
+def test_pointseg_takes_other_sizes(height, width):
+    with torch.inference_mode():
+        logits = PointSeg().eval()(torch.randn(1, 5, height, width))
+    assert logits.shape == (1, 4, height, width)
+    assert logits.isfinite().all()
+
+
+def test_pointseg_costs():
+    network = on_meta(PointSeg)
+    assert n_parameters(network) == 2_983_700
+    assert n_parameters(network.enlarge) == 1_240_016
+    assert giga_macs(network, 1, 5, 64, 512) == pytest.approx(7.3, rel=0.05)
+
+
+def test_fire_layers_squeeze_to_a_quarter():
+    layers = {name: m for name, m in PointSeg().named_modules() if isinstance(m, (Fire, FireDeconv))}
+    assert [name for name, m in layers.items() if isinstance(m, Fire)] == [f"fire{i}" for i in range(2, 10)]
+    assert sum(isinstance(m, FireDeconv) for m in layers.values()) == 5
+    for layer in layers.values():
+        squeeze, expand1, expand3 = layer.squeeze[0], layer.expand1[0], layer.expand3[0]
+        assert squeeze.out_channels == squeeze.in_channels // 4 == expand1.in_channels == expand3.in_channels
+        assert (squeeze.kernel_size, expand1.kernel_size, expand3.kernel_size) == ((1, 1), (1, 1), (3, 3))
+        assert expand1.out_channels == expand3.out_channels
+
+
+def test_squeeze_reweighting_is_equations_3_and_4():
+    layer = SqueezeReweight(8)
+    x = torch.randn(3, 8, 5, 7)
+    with torch.no_grad():
+        actual = layer(x).numpy()
+        w1, b1, w2, b2 = (parameter.squeeze().double().numpy() for parameter in layer.parameters())
+    p = x.double().numpy()
+    assert w1.shape == (2, 8)
+    for sample, y in zip(p, actual, strict=True):
+        chi = np.array([sample[n].sum() / (5 * 7) for n in range(8)])  # equation 3
+        scale = 1.0 / (1.0 + np.exp(-(w2 @ np.maximum(w1 @ chi + b1, 0.0) + b2)))
+        np.testing.assert_allclose(y, sample * scale[:, None, None], rtol=1e-5)  # equation 4
+
+
+def test_enlargement_looks_at_five_scales():
+    network = PointSeg().eval()
+    nn.init.ones_(network.enlarge.average[0].bias)
+    names = ["point", "dilated.0", "dilated.1", "dilated.2", "average"]
+    _, seen = run_and_watch(network.enlarge, torch.randn(2, 512, 8, 6), *names, "compress")
+    rates = [conv[0].dilation for conv in network.enlarge.dilated]
+    assert list(ENLARGEMENT_RATES) == [6, 9, 12]
+    assert rates == [(6, 6), (9, 9), (12, 12)]
+    assert [conv[0].kernel_size for conv in network.enlarge.dilated] == [(3, 3)] * 3
+    branches = [seen[name][1].expand(2, 80, 8, 6) for name in names]
+    assert seen["average"][1].shape == (2, 80, 1, 1)
+    assert seen["average"][1].std() > 0.0
+    assert torch.equal(seen["compress"][0], torch.cat(branches, dim=1))
+    assert seen["compress"][1].shape == (2, 512 // 4, 8, 6)
+
+
+def test_pointseg_adds_its_skips_and_joins_only_the_enlarged():
+    names = ["fire1", "skip1", "sr1", "sr2", "sr3", "enlarge", "deconv1", "deconv1_enlarged"]
+    names += ["deconv2", "deconv3", "deconv4", "classifier"]
+    logits, seen = run_and_watch(PointSeg().eval(), torch.randn(1, 5, 4, 64), *names)
+    got, gave = ({name: pair[i] for name, pair in seen.items()} for i in (0, 1))
+    assert torch.equal(got["enlarge"], gave["sr3"])
+    assert torch.equal(got["deconv1"], gave["sr3"])
+    assert torch.equal(got["deconv1_enlarged"], gave["enlarge"])
+    agree(got["deconv2"], torch.cat([gave["deconv1_enlarged"], gave["deconv1"]], dim=1) + gave["sr2"])
+    agree(got["deconv3"], gave["deconv2"] + gave["sr1"])
+    agree(got["deconv4"], gave["deconv3"] + gave["fire1"])
+    agree(got["classifier"], gave["deconv4"] + gave["skip1"])
+    assert torch.equal(gave["classifier"], logits)

@@ -1,0 +1,336 @@
+"""The whole runtime on shipped models: simulated scans, real ones where there are any, and bad input of every kind."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import edgeperc
+from edgeperc import FitnessError, Perceiver, Perception, PointsError
+from edgeperc.card import RangeImageGeometry
+from edgeperc.models import model_path, shipped_models
+from edgeperc.sensors import get_sensor
+from edgeperc.simulation import SimulatedScan, random_scene, simulate
+
+
+@pytest.fixture(scope="module")
+def scan() -> SimulatedScan:
+    return simulate(random_scene(4, "urban"), "hdl-64e", seed=4)
+
+
+@pytest.fixture(scope="module")
+def perceive() -> Perceiver:
+    return Perceiver(["ssadnet", "pointseg"], provider="cpu", n_threads=1)
+
+
+@pytest.fixture(scope="module")
+def perception(perceive: Perceiver, scan: SimulatedScan) -> Perception:
+    return perceive(scan.points, stamp_s=12.5)
+
+
+def assert_same(one: Perception, other: Perception) -> None:
+    assert one.points is not None and other.points is not None
+    assert one.top_view is not None and other.top_view is not None
+    np.testing.assert_array_equal(one.points.labels, other.points.labels)
+    np.testing.assert_array_equal(one.points.in_view, other.points.in_view)
+    np.testing.assert_array_equal(one.top_view.labels, other.top_view.labels)
+    assert one.boxes == other.boxes  # bit for bit: tuples of floats
+
+
+def test_every_point_has_an_answer(perception: Perception, scan: SimulatedScan) -> None:
+    assert perception.points is not None
+    assert perception.n_points == len(scan.points)
+    assert perception.n_dropped == 0
+    assert perception.points.labels.shape == (len(scan.points),)
+    assert perception.points.labels.dtype == np.uint8
+    assert perception.points.classes == ("background", "car", "pedestrian", "cyclist")
+    assert not perception.points.labels[~perception.points.in_view].any()
+    azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
+    assert not perception.points.in_view[np.abs(azimuth) > 45.01].any()
+    assert perception.points.in_view[np.abs(azimuth) < 44.9].mean() > 0.95
+    assert sum(perception.points.counts().values()) == int(perception.points.in_view.sum())
+
+
+def test_the_answer_resembles_the_truth(perception: Perception, scan: SimulatedScan) -> None:
+    assert perception.points is not None and perception.top_view is not None
+    seen = perception.points.in_view
+    found, true = perception.points.labels[seen] == 1, scan.labels[seen] == 1
+    assert true.sum() > 500
+    assert (found & true).sum() / (found | true).sum() > 0.5
+    truth = scan.top_view_labels()
+    drivable = perception.top_view.drivable
+    assert (drivable & (truth == 1)).sum() / (drivable | (truth == 1)).sum() > 0.5
+    assert any(b.score > 0.5 for b in perception.boxes)
+
+
+def test_the_rest_of_the_perception(perception: Perception, perceive: Perceiver) -> None:
+    assert perception.stamp_s == 12.5
+    assert perception.top_view is not None
+    assert perception.top_view.labels.shape == (400, 200)
+    assert perception.top_view.classes == ("background", "drivable", "car", "van", "truck")
+    assert perception.top_view.to_metres(399, 0) == pytest.approx((6.05, 9.95))
+    assert set(perception.stage_ms) == {"check", "project", "infer", "decode", "refine"}
+    assert all(v >= 0.0 for v in perception.stage_ms.values())
+    assert perception.providers == {n: "CPUExecutionProvider (fp32)" for n in ("ssadnet", "pointseg")}
+    assert [c.name for c in perceive.cards] == ["ssadnet", "pointseg"]
+    scores = [b.score for b in perception.boxes]
+    assert scores == sorted(scores, reverse=True)
+    for box in perception.boxes:
+        assert box.label in ("car", "van", "truck")
+        assert 6.0 <= box.center[0] <= 46.0 and abs(box.center[1]) <= 10.0
+        assert -np.pi <= box.yaw <= np.pi
+
+
+def test_same_scan_same_answer_for_any_thread_count(perception: Perception, scan: SimulatedScan) -> None:
+    assert_same(perception, Perceiver(["ssadnet", "pointseg"], provider="cpu", n_threads=2)(scan.points))
+    assert_same(perception, Perceiver(["pointseg", "ssadnet"], provider="cpu", n_threads=1)(scan.points))
+
+
+def test_the_answer_does_not_depend_on_what_came_before(perceive: Perceiver, perception: Perception) -> None:
+    other = simulate(random_scene(9), "hdl-64e", seed=9).points
+    again = simulate(random_scene(4, "urban"), "hdl-64e", seed=4).points
+    perceive(other)
+    assert_same(perception, perceive(again))
+
+
+def test_perceivers_in_threads_answer_like_one(perception: Perception, scan: SimulatedScan) -> None:
+    answers: list[Perception] = []
+
+    def work() -> None:
+        one = Perceiver(["ssadnet", "pointseg"], provider="cpu", n_threads=1)
+        answers.extend(one(scan.points) for _ in range(3))
+
+    threads = [threading.Thread(target=work) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(answers) == 9
+    for answer in answers:
+        assert_same(perception, answer)
+
+
+def test_one_perceiver_in_threads_answers_like_one(perceive: Perceiver, scan: SimulatedScan) -> None:
+    scans = [scan.points, scan.points[::2], scan.points[:1000], scan.points[:0]]
+    alone = [perceive(s) for s in scans]
+    answers: dict[int, Perception] = {}
+    threads = [threading.Thread(target=lambda k=k: answers.update({k: perceive(scans[k])})) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for k in range(4):
+        assert_same(alone[k], answers[k])
+
+
+def test_results_are_the_callers(perceive: Perceiver, scan: SimulatedScan) -> None:
+    first = perceive(scan.points)
+    assert first.points is not None and first.top_view is not None
+    kept = first.points.labels.copy(), first.top_view.labels.copy()
+    perceive(scan.points[::3])
+    np.testing.assert_array_equal(first.points.labels, kept[0])
+    np.testing.assert_array_equal(first.top_view.labels, kept[1])
+
+
+def test_not_finite_points_are_counted_and_otherwise_absent(
+    perceive: Perceiver, perception: Perception, scan: SimulatedScan
+) -> None:
+    rng = np.random.default_rng(0)
+    rows = np.sort(rng.choice(len(scan.points), size=500, replace=False))
+    dirty = np.insert(scan.points, rows, scan.points[rows], axis=0)
+    at = rows + np.arange(500)
+    dirty[at[:300], rng.integers(4, size=300)] = np.nan
+    dirty[at[300:], rng.integers(4, size=200)] = np.inf
+    answer = perceive(dirty)
+    assert answer.n_dropped == 500
+    assert answer.points is not None and perception.points is not None
+    assert not answer.points.labels[at].any()
+    assert not answer.points.in_view[at].any()
+    np.testing.assert_array_equal(np.delete(answer.points.labels, at), perception.points.labels)
+    assert answer.boxes == perception.boxes
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda p: p.astype(np.float64),
+        lambda p: np.asfortranarray(p),
+        lambda p: np.repeat(p, 2, axis=0)[::2],
+        lambda p: p.astype(">f4"),
+        lambda p: np.frombuffer(p.tobytes(), np.float32).reshape(-1, 4),  # read-only
+        lambda p: np.hstack([p, p])[:, :4],
+    ],
+)
+def test_any_layout_in_memory(
+    perceive: Perceiver,
+    perception: Perception,
+    scan: SimulatedScan,
+    change: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+) -> None:
+    given = change(scan.points)
+    before = given.copy()
+    assert_same(perception, perceive(given))
+    np.testing.assert_array_equal(given, before)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_hardly_any_points(perceive: Perceiver, n: int) -> None:
+    points = np.array([[12.0, 1.0, -1.0, 0.3], [30.0, -2.0, -1.5, 0.1]], np.float32)[:n]
+    answer = perceive(points)
+    assert answer.n_points == n
+    assert answer.points is not None and answer.points.labels.shape == (n,)
+    assert answer.top_view is not None and answer.top_view.labels.shape == (400, 200)
+
+
+def test_nothing_but_points_that_are_not_finite(perceive: Perceiver) -> None:
+    answer = perceive(np.full((10, 4), np.nan, np.float32))
+    assert answer.n_dropped == 10
+    assert answer.points is not None and not answer.points.in_view.any()
+
+
+def test_points_without_remission(perceive: Perceiver, scan: SimulatedScan) -> None:
+    answer = perceive(np.ascontiguousarray(scan.points[:, :3]))
+    assert answer.n_points == len(scan.points)
+
+
+def test_ten_million_points(perceive: Perceiver, scan: SimulatedScan) -> None:
+    many = np.resize(scan.points, (10_000_000, 4))
+    answer = perceive(many)
+    assert answer.points is not None
+    assert answer.points.labels.shape == (10_000_000,)
+    assert np.count_nonzero(answer.points.labels == 1) > 10_000
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        np.zeros((5, 2), np.float32),
+        np.zeros((5, 4), np.complex64),
+        np.zeros((2, 5, 4), np.float32),
+        np.array([["a"] * 4]),
+        np.zeros(4, np.float32),
+        "nonsense",
+        None,
+    ],
+)
+def test_what_is_no_scan_is_a_points_error(perceive: Perceiver, bad: object) -> None:
+    with pytest.raises(PointsError):
+        perceive(bad)  # type: ignore[arg-type]
+
+
+def test_remission_is_scaled_by_the_sensors_profile(perception: Perception, scan: SimulatedScan) -> None:
+    raw = scan.points.copy()
+    raw[:, 3] *= 255.0
+    sensor = replace(get_sensor("hdl-64e"), remission_range=(0.0, 255.0))
+    answer = Perceiver(["ssadnet", "pointseg"], sensor=sensor, provider="cpu")(raw)
+    assert answer.points is not None and perception.points is not None
+    assert (answer.points.labels == perception.points.labels).mean() > 0.999
+
+
+def spoilt(points: NDArray[np.float32], how: str) -> NDArray[np.float32]:
+    x, y, z, remission = points.T
+    return np.ascontiguousarray(
+        {
+            "remission 0..255": np.c_[x, y, z, remission * 255],
+            "no remission": np.c_[x, y, z, remission * 0],
+            "upside down": np.c_[x, -y, -z, remission],
+            "camera axes": np.c_[-y, -z, x, remission],
+            "millimetres": np.c_[x * 1000, y * 1000, z * 1000, remission],
+        }[how],
+        dtype=np.float32,
+    )
+
+
+FAULTS = ("remission 0..255", "no remission", "upside down", "camera axes", "millimetres")
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_wrong_set_up_is_told_in_words(scan: SimulatedScan, fault: str) -> None:
+    perceive = Perceiver("pointseg", provider="cpu")
+    with pytest.warns(UserWarning, match=r"\w+ \w+") as caught:
+        answer = perceive(spoilt(scan.points, fault))
+    assert answer.fitness == tuple(str(w.message) for w in caught)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_wrong_set_up_can_be_an_error(scan: SimulatedScan, fault: str) -> None:
+    with pytest.raises(FitnessError):
+        Perceiver("pointseg", provider="cpu", on_mismatch="raise")(spoilt(scan.points, fault))
+
+
+def test_a_wrong_set_up_can_be_ignored(scan: SimulatedScan) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        answer = Perceiver("pointseg", provider="cpu", on_mismatch="ignore")(spoilt(scan.points, "millimetres"))
+    assert answer.fitness == ()
+
+
+def test_only_the_first_scans_are_checked(scan: SimulatedScan) -> None:
+    perceive = Perceiver("pointseg", provider="cpu")
+    bad = spoilt(scan.points, "no remission")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        told = [bool(perceive(bad).fitness) for _ in range(7)]
+    assert told == [True] * 5 + [False] * 2
+    assert len(caught) >= 5
+
+
+def test_one_model_answers_its_part() -> None:
+    points = np.zeros((0, 4), np.float32)
+    seen = Perceiver("pointseg", provider="cpu")(points)
+    assert seen.points is not None and seen.top_view is None and seen.boxes == ()
+    above = Perceiver(model_path("ssadnet"), provider="cpu")(points)
+    assert above.points is None and above.top_view is not None
+
+
+def test_two_models_of_one_view_are_refused() -> None:
+    with pytest.raises(ValueError, match="at most one a view"):
+        Perceiver(["pointseg", model_path("pointseg")], provider="cpu")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"on_mismatch": "panic"}, "on_mismatch is 'panic'"),
+        ({"score_threshold": 2.0}, "score_threshold is 2.0"),
+        ({"sensor": "radar"}, "hdl-64e"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments: dict[str, object], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Perceiver("pointseg", **arguments)  # type: ignore[arg-type]
+
+
+def test_a_threshold_of_ones_own(scan: SimulatedScan) -> None:
+    few = Perceiver("ssadnet", provider="cpu", score_threshold=0.9)(scan.points).boxes
+    many = Perceiver("ssadnet", provider="cpu", score_threshold=0.05)(scan.points).boxes
+    assert all(b.score >= 0.9 for b in few)
+    assert len(many) > len(few)
+
+
+def test_the_shipped_views_are_the_papers() -> None:
+    cards = {name: Perceiver(name, provider="cpu").cards[0] for name in shipped_models()}
+    above = cards["ssadnet"].view
+    assert (above.height, above.width) == (400, 200)
+    seen = cards["pointseg"].view
+    assert isinstance(seen, RangeImageGeometry)
+    assert (seen.height, seen.width, seen.azimuth_left_deg, seen.azimuth_right_deg) == (64, 512, 45.0, -45.0)
+    for card in cards.values():
+        assert card.fitness is not None and card.golden is not None
+        assert card.training["licence"] and card.parity["n_scans"] >= 4
+
+
+def test_real_scans_are_answered_and_fit(kitti_root: Path) -> None:
+    perceive = Perceiver(["ssadnet", "pointseg"], provider="cpu", on_mismatch="raise")
+    for name in ("000000", "000160", "000200", "000264", "000300"):
+        points = edgeperc.read_points(kitti_root / "training/velodyne" / f"{name}.bin")
+        answer = perceive(points)
+        assert answer.points is not None and answer.points.labels.shape == (len(points),)
+        assert answer.top_view is not None and answer.top_view.drivable_area_m2 > 50.0

@@ -1,0 +1,199 @@
+"""Sessions: shipped models open, and every way of being unusable has its own error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgeperc.card import CARD_KEY
+from edgeperc.errors import CardError, CardMismatchError, InferenceError, ModelFileError, ProviderError
+from edgeperc.models import model_path, shipped_models
+from edgeperc.session import PROVIDERS, Session, available_providers, golden_input
+
+
+def edited(tmp_path: Path, name: str, *changes: tuple[bytes, bytes]) -> Path:
+    """A shipped model with bytes of its card replaced by as many others, so that the file stays well formed."""
+    blob = model_path(name).read_bytes()
+    for old, new in changes:
+        assert len(old) == len(new)
+        assert blob.count(old) == 1, old
+        blob = blob.replace(old, new)
+    path = tmp_path / "edited.onnx"
+    path.write_bytes(blob)
+    return path
+
+
+@pytest.mark.parametrize("name", shipped_models())
+def test_a_shipped_model_gives_the_exporters_answers(name: str) -> None:
+    session = Session(model_path(name), "cpu")
+    assert session.card.name == name
+    assert session.provider == "CPUExecutionProvider (fp32)"
+    assert session.golden_deviation < 0.01
+    assert len(session.sha256) == 64
+
+
+@pytest.mark.parametrize("name", shipped_models())
+def test_a_shipped_model_says_nothing_of_the_computer_it_was_made_on(name: str) -> None:
+    blob = model_path(name).read_bytes()
+    for word in (b"/home/", b"/root/", b"/work/", b"/tmp/", b"site-packages", b"Traceback"):
+        assert word not in blob
+
+
+def test_shipped_models_are_small() -> None:
+    assert sum(model_path(n).stat().st_size for n in shipped_models()) < 60e6
+
+
+def test_a_second_run_overwrites_the_first() -> None:
+    session = Session(model_path("pointseg"), "cpu", n_threads=1)
+    logits = session.outputs["class_logits"]
+    session.input[:] = golden_input(1, session.input.shape)
+    session.run()
+    first = logits.copy()
+    session.input[:] = 0.0
+    session.run()
+    assert not np.array_equal(first, logits)
+    session.input[:] = golden_input(1, session.input.shape)
+    session.run()
+    np.testing.assert_array_equal(first, logits)
+
+
+def test_the_golden_input_never_changes() -> None:
+    x = golden_input(0, (2, 3))
+    assert x.dtype == np.float32
+    assert np.abs(golden_input(5, (10_000,))).max() <= 1.0
+    assert abs(float(golden_input(5, (10_000,)).mean())) < 0.05
+    # PCG64 promises its raw bits for good.
+    raw = np.random.PCG64(0).random_raw(6) >> np.uint64(40)
+    np.testing.assert_array_equal(x.ravel(), raw.astype(np.float32) / np.float32(2**23) - np.float32(1))
+
+
+def test_no_card(tmp_path: Path) -> None:
+    path = edited(tmp_path, "pointseg", (CARD_KEY.encode(), b"someone.cards"))
+    with pytest.raises(CardError, match="carries no card.*edgeperc-export card"):
+        Session(path, "cpu")
+
+
+def test_a_newer_card(tmp_path: Path) -> None:
+    path = edited(tmp_path, "pointseg", (b'"schema":1', b'"schema":9'))
+    with pytest.raises(CardError, match="edited.onnx: the card has schema 9.*upgrade edgeperc"):
+        Session(path, "cpu")
+
+
+def test_swapped_outputs(tmp_path: Path) -> None:
+    card = Session(model_path("ssadnet"), "cpu").card
+    first, second = (f'{{"kind":"{o.kind}","name":"{o.name}"}}' for o in card.outputs)
+    names = [o.name for o in card.outputs]
+    swapped = f"{first},{second}".replace(names[0], "@").replace(names[1], names[0]).replace("@", names[1])
+    path = edited(tmp_path, "ssadnet", (f"{first},{second}".encode(), swapped.encode()))
+    with pytest.raises(CardMismatchError, match=r"its card says tensor\(float\) of shape \(1, 5, 400, 200\)"):
+        Session(path, "cpu")
+
+
+def test_another_name_than_the_graphs(tmp_path: Path) -> None:
+    path = edited(tmp_path, "pointseg", (b'"name":"range_image"', b'"name":"range_imagE"'))
+    with pytest.raises(CardMismatchError, match=r"card names input 'range_imagE', the graph has \['range_image'\]"):
+        Session(path, "cpu")
+
+
+def test_weights_that_changed_are_noticed(tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(model_path("pointseg"))
+    largest = max(model.graph.initializer, key=lambda t: len(t.raw_data))
+    weights = np.frombuffer(largest.raw_data, np.float32) * np.float32(3)
+    largest.raw_data = weights.tobytes()
+    onnx.save(model, tmp_path / "changed.onnx")
+    with pytest.raises(CardMismatchError, match="standard deviations away from the exporter's"):
+        Session(tmp_path / "changed.onnx", "cpu")
+
+
+def test_external_weights_are_refused_wherever_they_lie(tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx")
+    outside = tmp_path / "outside.bin"
+    inside = tmp_path / "folder"
+    inside.mkdir()
+    for location in ("weights.bin", "../outside.bin", str(outside)):
+        model = onnx.load(model_path("pointseg"))
+        tensor = max(model.graph.initializer, key=lambda t: len(t.raw_data))
+        for target in (outside, inside / "weights.bin"):
+            target.write_bytes(tensor.raw_data)
+        tensor.ClearField("raw_data")
+        tensor.data_location = onnx.TensorProto.EXTERNAL
+        tensor.external_data.add(key="location", value=location)
+        path = inside / "model.onnx"
+        path.write_bytes(model.SerializeToString())
+        with pytest.raises(ModelFileError, match="weights in other files"):
+            Session(path, "cpu")
+
+
+@pytest.mark.parametrize("content", [b"", b"not a model", b"\x08\x07" * 100])
+def test_a_file_that_is_no_model(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "model.onnx"
+    path.write_bytes(content)
+    with pytest.raises(ModelFileError, match=r"model\.onnx: onnxruntime .* cannot open it"):
+        Session(path, "cpu")
+
+
+def test_a_truncated_model(tmp_path: Path) -> None:
+    blob = model_path("pointseg").read_bytes()
+    path = tmp_path / "model.onnx"
+    path.write_bytes(blob[: len(blob) // 2])
+    with pytest.raises(ModelFileError):
+        Session(path, "cpu")
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(ModelFileError, match="cannot be read"):
+        Session(tmp_path / "model.onnx", "cpu")
+
+
+def test_every_provider_is_there_or_refused() -> None:
+    present = available_providers()
+    assert "cpu" in present
+    for name in PROVIDERS:
+        if name not in present:
+            with pytest.raises(ProviderError, match=f"{name!r} is not available.*present: .*cpu"):
+                Session(model_path("pointseg"), name)
+
+
+@pytest.mark.parametrize("name", ["gpu", "CPUExecutionProvider", ""])
+def test_unknown_providers_are_refused(name: str) -> None:
+    with pytest.raises(ProviderError, match="is unknown; expected auto or one of"):
+        Session(model_path("pointseg"), name)
+
+
+def test_a_precision_the_provider_does_not_have() -> None:
+    with pytest.raises(ProviderError, match="only openvino takes a precision"):
+        Session(model_path("pointseg"), "cpu:bf16")
+
+
+def test_auto_says_what_it_took() -> None:
+    session = Session(model_path("pointseg"), "auto")
+    assert any(session.provider.startswith(PROVIDERS[p]) for p in available_providers())
+
+
+def test_the_openvino_plugin_agrees_with_the_cpu_provider() -> None:
+    if "openvino" not in available_providers():
+        pytest.skip("the OpenVINO plugin is absent, or finds no device of Intel's")
+    for name in shipped_models():
+        assert Session(model_path(name), "openvino:fp32").golden_deviation < 0.05
+
+
+def test_a_failing_run_is_an_inference_error() -> None:
+    session = Session(model_path("pointseg"), "cpu")
+
+    class Broken:
+        def run_with_iobinding(self, _: object) -> None:
+            raise RuntimeError("no memory")
+
+    session._session = Broken()
+    with pytest.raises(InferenceError, match="no memory"):
+        session.run()
+
+
+def test_threads_must_be_positive() -> None:
+    with pytest.raises(ValueError, match="n_threads is 0"):
+        Session(model_path("pointseg"), "cpu", n_threads=0)
+
+
