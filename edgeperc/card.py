@@ -6,6 +6,7 @@ never be separated from the weights they belong to.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Mapping
@@ -86,7 +87,7 @@ class RangeImageGeometry:
 
     def __post_init__(self) -> None:
         rows = self.row_elevations_deg
-        falling = all(a > b for a, b in zip(rows, rows[1:], strict=False))
+        falling = all(a > b for a, b in itertools.pairwise(rows))
         if len(rows) < 2 or not falling or not all(-90.0 < e < 90.0 for e in rows):
             raise CardError(
                 f"view.row_elevations_deg holds {len(rows)} values; expected two or more, strictly decreasing, "

@@ -265,7 +265,9 @@ class Session:
             return float("nan")
         self.input[:] = golden_input(golden.seed, self._batch.shape)[0]
         if hashlib.sha256(self._batch.tobytes()).hexdigest() != golden.input_sha256:
-            raise CardMismatchError(f"{self.path}: the golden input made here is not the card's; export the model again")
+            raise CardMismatchError(
+                f"{self.path}: the golden input made here is not the card's; export the model again"
+            )
         self.run()
         self.input[:] = 0.0
         deviation = 0.0

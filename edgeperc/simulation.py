@@ -439,8 +439,10 @@ def _ground_at(
     z += kerb * min(d / 0.05, 1.0) + 0.02 * min(d, terrain[_PAVEMENT])
     e = d - terrain[_PAVEMENT]
     if e > 0.0:
-        z += min(terrain[_BANK_SLOPE] * e, terrain[_BANK_RISE]) if terrain[_BANK_RISE] > 0.0 else (
-            max(-terrain[_BANK_SLOPE] * e, terrain[_BANK_RISE])
+        z += (
+            min(terrain[_BANK_SLOPE] * e, terrain[_BANK_RISE])
+            if terrain[_BANK_RISE] > 0.0
+            else (max(-terrain[_BANK_SLOPE] * e, terrain[_BANK_RISE]))
         )
         basin = (e - 1.6) / 1.2
         z -= terrain[_DITCH] * max(1.0 - basin * basin, 0.0)
@@ -556,9 +558,7 @@ def _columns_of(bounds: NDArray[np.float64], k: int, n_columns: int) -> tuple[in
 
 
 @njit(cache=True, nogil=True)
-def fill_column_counts(
-    bounds: NDArray[np.float64], n_columns: int, reach: float, starts: NDArray[np.int64]
-) -> None:
+def fill_column_counts(bounds: NDArray[np.float64], n_columns: int, reach: float, starts: NDArray[np.int64]) -> None:
     """Write where the list of each azimuth step begins into ``starts`` (n_columns + 1,)."""
     starts[:] = 0
     for k in range(bounds.shape[0]):
@@ -1393,9 +1393,7 @@ class _Street:
             axes = []
             for i in (7, 10, 13):
                 axes += [cos * row[i] - sin * row[i + 1], sin * row[i] + cos * row[i + 1], row[i + 2]]
-            self.rows.append(
-                (*row[:4], x + cos * cx - sin * cy, y + sin * cx + cos * cy, z + cz, *axes, *row[16:])
-            )
+            self.rows.append((*row[:4], x + cos * cx - sin * cy, y + sin * cx + cos * cy, z + cz, *axes, *row[16:]))
         return True
 
     # What stands beside a road.

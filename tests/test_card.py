@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import replace
 from typing import Any
@@ -129,7 +130,5 @@ def test_anything_else_is_a_card_error(text: str) -> None:
 @given(st.sampled_from(sorted(json.loads(TOP_VIEW_CARD.to_json()))), json_values)
 def test_any_value_anywhere_is_read_or_refused(key: str, value: object) -> None:
     document = json.loads(TOP_VIEW_CARD.to_json()) | {key: value}
-    try:
+    with contextlib.suppress(CardError):
         ModelCard.from_json(json.dumps(document))
-    except CardError:
-        pass

@@ -143,7 +143,8 @@ def test_an_export_proves_itself(tmp_path: Path, scans: Sequence[np.ndarray], ne
     assert session.card == card
     assert session.golden_deviation < 1e-3
     blob = path.read_bytes()
-    assert str(tmp_path).encode() not in blob and b"site-packages" not in blob
+    assert str(tmp_path).encode() not in blob
+    assert b"site-packages" not in blob
     answer = Perceiver(path, provider="cpu", on_mismatch="ignore")(scans[0])
     assert (answer.points is None) == (network == "ssadnet")
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted([checkpoint.name, "model.onnx"])
@@ -252,7 +253,8 @@ def test_the_command_line_from_scans_to_a_model(tmp_path: Path, capsys: pytest.C
     assert main(["export", str(run / "checkpoint.pt"), str(model)]) == 0
     assert main(["verify", str(run / "checkpoint.pt"), str(model)]) == 0
     shown = capsys.readouterr().out
-    assert "parity" in shown and '"n_scans": 4' in shown
+    assert "parity" in shown
+    assert '"n_scans": 4' in shown
     assert Session(model, "cpu").card.fitness is not None
 
 

@@ -53,7 +53,7 @@ def objects(tmp_path: Path, calibration: Calibration, *lines: str) -> tuple[tupl
 
 
 def test_a_box_comes_into_the_sensor_frame(tmp_path: Path, calibration: Calibration) -> None:
-    # 1.5 m high, 1.6 m wide, 4 m long; the middle of its bottom 20 m ahead of the camera, 3 m to the right; facing right.
+    # 1.5 m high, 1.6 m wide, 4 m long, facing right; 20 m ahead of the sensor, 3 m to the right.
     boxes, unlabelled = objects(
         tmp_path,
         calibration,
@@ -129,7 +129,9 @@ def test_footprints_at_the_edge_are_cut() -> None:
     surface = np.zeros((VIEW.height, VIEW.width), np.uint8)
     for centre in ((46.0, 0.0), (6.0, 10.0), (100.0, 0.0), (20.0, -10.0)):
         draw_vehicles(surface, [Box("car", 1.0, (*centre, 0.0), (4.0, 2.0, 1.5), 0.0)], VIEW)
-    assert surface[0, 95:105].all() and surface[-1, 0] == 2 and surface[255:262, -1].all()
+    assert surface[0, 95:105].all()
+    assert surface[-1, 0] == 2
+    assert surface[255:262, -1].all()
     assert 500 < np.count_nonzero(surface) < 1300
 
 

@@ -36,8 +36,10 @@ def perception(perceive: Perceiver, scan: SimulatedScan) -> Perception:
 
 
 def assert_same(one: Perception, other: Perception) -> None:
-    assert one.points is not None and other.points is not None
-    assert one.top_view is not None and other.top_view is not None
+    assert one.points is not None
+    assert other.points is not None
+    assert one.top_view is not None
+    assert other.top_view is not None
     np.testing.assert_array_equal(one.points.labels, other.points.labels)
     np.testing.assert_array_equal(one.points.in_view, other.points.in_view)
     np.testing.assert_array_equal(one.top_view.labels, other.top_view.labels)
@@ -59,7 +61,8 @@ def test_every_point_has_an_answer(perception: Perception, scan: SimulatedScan) 
 
 
 def test_the_answer_resembles_the_truth(perception: Perception, scan: SimulatedScan) -> None:
-    assert perception.points is not None and perception.top_view is not None
+    assert perception.points is not None
+    assert perception.top_view is not None
     seen = perception.points.in_view
     found, true = perception.points.labels[seen] == 1, scan.labels[seen] == 1
     assert true.sum() > 500
@@ -84,7 +87,8 @@ def test_the_rest_of_the_perception(perception: Perception, perceive: Perceiver)
     assert scores == sorted(scores, reverse=True)
     for box in perception.boxes:
         assert box.label in ("car", "van", "truck")
-        assert 6.0 <= box.center[0] <= 46.0 and abs(box.center[1]) <= 10.0
+        assert 6.0 <= box.center[0] <= 46.0
+        assert abs(box.center[1]) <= 10.0
         assert -np.pi <= box.yaw <= np.pi
 
 
@@ -132,7 +136,8 @@ def test_one_perceiver_in_threads_answers_like_one(perceive: Perceiver, scan: Si
 
 def test_results_are_the_callers(perceive: Perceiver, scan: SimulatedScan) -> None:
     first = perceive(scan.points)
-    assert first.points is not None and first.top_view is not None
+    assert first.points is not None
+    assert first.top_view is not None
     kept = first.points.labels.copy(), first.top_view.labels.copy()
     perceive(scan.points[::3])
     np.testing.assert_array_equal(first.points.labels, kept[0])
@@ -150,7 +155,8 @@ def test_not_finite_points_are_counted_and_otherwise_absent(
     dirty[at[300:], rng.integers(4, size=200)] = np.inf
     answer = perceive(dirty)
     assert answer.n_dropped == 500
-    assert answer.points is not None and perception.points is not None
+    assert answer.points is not None
+    assert perception.points is not None
     assert not answer.points.labels[at].any()
     assert not answer.points.in_view[at].any()
     np.testing.assert_array_equal(np.delete(answer.points.labels, at), perception.points.labels)
@@ -185,14 +191,17 @@ def test_hardly_any_points(perceive: Perceiver, n: int) -> None:
     points = np.array([[12.0, 1.0, -1.0, 0.3], [30.0, -2.0, -1.5, 0.1]], np.float32)[:n]
     answer = perceive(points)
     assert answer.n_points == n
-    assert answer.points is not None and answer.points.labels.shape == (n,)
-    assert answer.top_view is not None and answer.top_view.labels.shape == (400, 200)
+    assert answer.points is not None
+    assert answer.points.labels.shape == (n,)
+    assert answer.top_view is not None
+    assert answer.top_view.labels.shape == (400, 200)
 
 
 def test_nothing_but_points_that_are_not_finite(perceive: Perceiver) -> None:
     answer = perceive(np.full((10, 4), np.nan, np.float32))
     assert answer.n_dropped == 10
-    assert answer.points is not None and not answer.points.in_view.any()
+    assert answer.points is not None
+    assert not answer.points.in_view.any()
 
 
 def test_points_without_remission(perceive: Perceiver, scan: SimulatedScan) -> None:
@@ -230,7 +239,8 @@ def test_remission_is_scaled_by_the_sensors_profile(perception: Perception, scan
     raw[:, 3] *= 255.0
     sensor = replace(get_sensor("hdl-64e"), remission_range=(0.0, 255.0))
     answer = Perceiver(["ssadnet", "pointseg"], sensor=sensor, provider="cpu")(raw)
-    assert answer.points is not None and perception.points is not None
+    assert answer.points is not None
+    assert perception.points is not None
     assert (answer.points.labels == perception.points.labels).mean() > 0.999
 
 
@@ -285,9 +295,12 @@ def test_only_the_first_scans_are_checked(scan: SimulatedScan) -> None:
 def test_one_model_answers_its_part() -> None:
     points = np.zeros((0, 4), np.float32)
     seen = Perceiver("pointseg", provider="cpu")(points)
-    assert seen.points is not None and seen.top_view is None and seen.boxes == ()
+    assert seen.points is not None
+    assert seen.top_view is None
+    assert seen.boxes == ()
     above = Perceiver(model_path("ssadnet"), provider="cpu")(points)
-    assert above.points is None and above.top_view is not None
+    assert above.points is None
+    assert above.top_view is not None
 
 
 def test_two_models_of_one_view_are_refused() -> None:
@@ -323,8 +336,10 @@ def test_the_shipped_views_are_the_papers() -> None:
     assert isinstance(seen, RangeImageGeometry)
     assert (seen.height, seen.width, seen.azimuth_left_deg, seen.azimuth_right_deg) == (64, 512, 45.0, -45.0)
     for card in cards.values():
-        assert card.fitness is not None and card.golden is not None
-        assert card.training["licence"] and card.parity["n_scans"] >= 4
+        assert card.fitness is not None
+        assert card.golden is not None
+        assert card.training["licence"]
+        assert card.parity["n_scans"] >= 4
 
 
 def test_real_scans_are_answered_and_fit(kitti_root: Path) -> None:
@@ -332,5 +347,7 @@ def test_real_scans_are_answered_and_fit(kitti_root: Path) -> None:
     for name in ("000000", "000160", "000200", "000264", "000300"):
         points = edgeperc.read_points(kitti_root / "training/velodyne" / f"{name}.bin")
         answer = perceive(points)
-        assert answer.points is not None and answer.points.labels.shape == (len(points),)
-        assert answer.top_view is not None and answer.top_view.drivable_area_m2 > 50.0
+        assert answer.points is not None
+        assert answer.points.labels.shape == (len(points),)
+        assert answer.top_view is not None
+        assert answer.top_view.drivable_area_m2 > 50.0

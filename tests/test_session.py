@@ -71,13 +71,13 @@ def test_the_golden_input_never_changes() -> None:
 
 def test_no_card(tmp_path: Path) -> None:
     path = edited(tmp_path, "pointseg", (CARD_KEY.encode(), b"someone.cards"))
-    with pytest.raises(CardError, match="carries no card.*edgeperc-export card"):
+    with pytest.raises(CardError, match=r"carries no card.*edgeperc-export card"):
         Session(path, "cpu")
 
 
 def test_a_newer_card(tmp_path: Path) -> None:
     path = edited(tmp_path, "pointseg", (b'"schema":1', b'"schema":9'))
-    with pytest.raises(CardError, match="edited.onnx: the card has schema 9.*upgrade edgeperc"):
+    with pytest.raises(CardError, match=r"edited\.onnx: the card has schema 9.*upgrade edgeperc"):
         Session(path, "cpu")
 
 
@@ -195,5 +195,3 @@ def test_a_failing_run_is_an_inference_error() -> None:
 def test_threads_must_be_positive() -> None:
     with pytest.raises(ValueError, match="n_threads is 0"):
         Session(model_path("pointseg"), "cpu", n_threads=0)
-
-
