@@ -20,12 +20,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from . import __version__
-from .errors import EdgepercError, MissingExtraError, ModelError, PointsError, SensorError
+from .errors import EdgepercError, MissingExtraError, ModelError, ModelFileError, PointsError, SensorError
 
 # What takes long to import (numba's kernels, onnxruntime, matplotlib) is imported where a command needs it.
 if TYPE_CHECKING:
     from .perceiver import Perceiver
     from .perception import Box, Perception
+    from .session import Session
 
 __all__ = ["main"]
 
@@ -122,6 +123,7 @@ def _parser() -> argparse.ArgumentParser:
         help="what a model is; what a scan looks like and which models it suits",
     )
     info.add_argument("things", nargs="+", metavar="MODEL|SCAN", help="a shipped model's name, an .onnx, or a scan")
+    info.add_argument("--json", action="store_true", help="print a model's card as it is, one line of JSON a model")
     info.set_defaults(command=_info)
     return parser
 
@@ -431,6 +433,10 @@ def _info(arguments: argparse.Namespace) -> int:
     n_failed = n_told = 0
     for thing in arguments.things:
         try:
+            if arguments.json:
+                print(_card(thing))
+                n_told += 1
+                continue
             rows = _model_rows(thing) if _is_model(thing) else _scan_rows(Path(thing), arguments.sensor)
         except (SensorError, MissingExtraError):
             raise
@@ -451,12 +457,23 @@ def _is_model(thing: str) -> bool:
     return path.suffix == ".onnx" or not (path.exists() or path.suffix or len(path.parts) > 1)
 
 
-def _model_rows(thing: str) -> list[tuple[str, str]]:
-    from .card import TopViewGeometry
+def _open(thing: str) -> Session:
     from .models import model_path
     from .session import Session
 
-    session = Session(thing if Path(thing).suffix == ".onnx" else model_path(thing), "cpu")
+    return Session(thing if Path(thing).suffix == ".onnx" else model_path(thing), "cpu")
+
+
+def _card(thing: str) -> str:
+    if not _is_model(thing):
+        raise ModelFileError(f"{thing} is a scan; only models have a card")
+    return _open(thing).card.to_json()
+
+
+def _model_rows(thing: str) -> list[tuple[str, str]]:
+    from .card import TopViewGeometry
+
+    session = _open(thing)
     card = session.card
     channels, height, width = session.input.shape
     if isinstance(card.view, TopViewGeometry):

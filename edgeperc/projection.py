@@ -522,7 +522,7 @@ def tabulate(
     first, last = edges[0], edges[-1]
     inner = edges[1:-1]
     cells = 64
-    while cells <= 65536 and first > last:
+    while cells <= 65536 and np.all(edges[:-1] > edges[1:]):
         cells_per_unit = np.float32(cells) / (first - last)
         at = ((first - inner) * cells_per_unit).astype(np.int32)
         if np.all(np.diff(at) > 0):

@@ -85,7 +85,18 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--provider", default="cpu")
     evaluate.add_argument("--json", type=Path, help="also write the figures here")
     evaluate.set_defaults(run=_evaluate)
+
+    models = commands.add_parser("models", help="write MODELS.md from the cards of a folder's models")
+    models.add_argument("folder", type=Path)
+    models.set_defaults(run=_models)
     return parser
+
+
+def _models(args: argparse.Namespace) -> int:
+    from .models_page import models_page
+
+    (args.folder / "MODELS.md").write_text(models_page(args.folder))
+    return 0
 
 
 def _simulate(args: argparse.Namespace) -> int:

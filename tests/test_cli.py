@@ -489,6 +489,14 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     assert (profile, sensor) == ({"n_beams": 64}, "os1-64")
 
 
+def test_info_prints_a_card_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "scan.npy", np.zeros((1, 4), np.float32))
+    assert run("info", "ssadnet", tmp_path / "scan.npy", "--json") == 1
+    captured = capsys.readouterr()
+    assert ModelCard.from_json(captured.out).name == "ssadnet"
+    assert "scan.npy is a scan" in captured.err
+
+
 @pytest.mark.usefixtures("fake_models")
 def test_info_goes_on_after_what_it_does_not_know(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     empty = tmp_path / "empty.npy"

@@ -24,6 +24,7 @@ from edgeperc.session import Session
 from edgeperc_export.augment import LabelledScan
 from edgeperc_export.cli import main
 from edgeperc_export.dataset import parity_scans, simulate, simulated_scan
+from edgeperc_export.models_page import models_page
 from edgeperc_export.to_onnx import ParityError, export, load, to_graph, verify, write_card
 from edgeperc_export.train import Recipe, Samples, build, loss_of, train
 
@@ -263,6 +264,11 @@ def test_wrong_usage_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "no scans to train on" in capsys.readouterr().err
     assert main(["verify", str(tmp_path / "no.pt"), str(tmp_path / "no.onnx")]) == 2
     assert "no.pt" in capsys.readouterr().err
+
+
+def test_the_models_page_is_what_the_cards_say() -> None:
+    folder = Path(__file__).resolve().parent.parent / "models"
+    assert (folder / "MODELS.md").read_text() == models_page(folder), "run: edgeperc-export models models"
 
 
 def test_parity_scans_are_no_training_scans() -> None:

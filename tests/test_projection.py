@@ -1,0 +1,250 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import reference
+from edgeperc import projection
+from edgeperc.card import InputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.errors import CardError, PointsError
+from edgeperc.projection import column_edges, make_projector, row_edges
+
+KERNELS = ("mark_top_view", "mark_range_image", "fill_image")
+UNEVEN = (2.0, 1.7, 1.3, 0.2, -0.1, -4.0, -4.4, -11.0, -24.8)
+HDL_64E = tuple(2.0 - k / 3.0 for k in range(32)) + tuple(-8.83 - k / 2.0 for k in range(32))
+
+VIEWS = {
+    "top view": TopViewGeometry(),
+    "coarse top view": TopViewGeometry((-3.0, 4.0), (-2.0, 5.0), (-1.0, 1.0), 0.7),
+    "front": RangeImageGeometry(HDL_64E),
+    "front, uneven": RangeImageGeometry(UNEVEN, 40),
+    "full turn": RangeImageGeometry(HDL_64E, 2048, 180.0, -180.0),
+    "full turn, uneven": RangeImageGeometry(UNEVEN, 36, 180.0, -180.0),
+    "left half": RangeImageGeometry((80.0, 20.0, -20.0, -80.0), 7, 180.0, 0.0),
+    "right rear": RangeImageGeometry((5.0, -5.0), 1, -95.0, -180.0),
+    "all but the rear": RangeImageGeometry((30.0, 0.0, -30.0), 11, 170.0, -100.0),
+}
+SMALL = [name for name, view in VIEWS.items() if view.height * view.width < 2000]
+
+
+def spec_of(view, order=1):
+    names = ("distance", "remission", "height") if view.kind == "top_view" else ("x", "y", "z", "remission", "range")
+    names = names[::order]
+    return InputSpec(
+        "input", names, tuple(0.5 * k for k in range(len(names))), tuple(1.0 + k for k in range(len(names)))
+    )
+
+
+def random_points(rng, n):
+    """Points in every direction, near and far, on and off the grid, some not finite, some twice."""
+    points = rng.normal(0.0, 1.0, (n, 4)) * 10.0 ** rng.uniform(-1.0, 1.7, (n, 1)) * (1.0, 1.0, 0.2, 1.0)
+    points[: n // 4] = np.round(points[: n // 4], 1)
+    bad = rng.integers(0, n, n // 20)
+    points[bad, rng.integers(0, 4, n // 20)] = rng.choice([math.nan, math.inf, -math.inf, 1e30], n // 20)
+    points[n // 2 :: 7] = points[n // 3 :: 7][: len(points[n // 2 :: 7])]
+    return points.astype(np.float32)
+
+
+def assert_same(got, expected):
+    for name, expected_array in zip(("image", "index", "pixel"), expected, strict=True):
+        np.testing.assert_array_equal(getattr(got, name), expected_array, err_msg=name)
+
+
+def check(points, view, spec=None, offset=0.0, scale=1.0):
+    """Compiled, interpreted and slow runs agree to the last bit; returns the projection."""
+    spec = spec or spec_of(view)
+    projector = make_projector(view, spec)
+    projector.project(np.full((3, 4), 7.0, np.float32))  # leftovers must not shine through
+    compiled = projector.project(points, offset, scale)
+    edges = (row_edges(view), column_edges(view)) if view.kind == "range_image" else ()
+    assert_same(compiled, reference.project(points, view, edges, spec, offset, scale))
+    with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
+        for name in KERNELS:
+            kernel = getattr(projection, name)
+            patch.setattr(projection, name, getattr(kernel, "py_func", kernel))
+        if view.height * view.width < 2000:  # an interpreted run visits every pixel
+            assert_same(projector.project(points, offset, scale), (compiled.image, compiled.index, compiled.pixel))
+    return compiled
+
+
+@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize("n", [1, 255, 256, 257, 3000])
+def test_random_points(name, n):
+    rng = np.random.default_rng(n)
+    seen = check(random_points(rng, n), VIEWS[name], spec_of(VIEWS[name], (-1) ** n), 0.1, 0.7)
+    assert n < 3000 or (seen.index >= 0).any()
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_no_points(name):
+    seen = check(np.empty((0, 4), np.float32), VIEWS[name])
+    assert (seen.index == -1).all()
+    assert (seen.image == 0.0).all()
+
+
+numbers = st.one_of(
+    st.floats(width=32),
+    st.floats(-12.0, 12.0, width=32),
+    st.sampled_from([0.0, -0.0, 1.0, -1.0, 4.0, 5.0, 0.7, -3.0, -2.0, 1e-30, -1e-30, 1e25, math.inf, math.nan]),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(numbers, numbers, numbers, numbers), max_size=12), st.sampled_from(SMALL))
+def test_any_numbers(rows, name):
+    check(np.array(rows, np.float32).reshape(-1, 4), VIEWS[name])
+
+
+@pytest.mark.parametrize("name", [name for name, view in VIEWS.items() if view.kind == "range_image"])
+def test_pixels_are_those_of_true_angles(name):
+    view = VIEWS[name]
+    points = random_points(np.random.default_rng(5), 20000)
+    seen = make_projector(view, spec_of(view)).project(points)
+    with np.errstate(all="ignore"):
+        x, y, z, _ = points.astype(np.float64).T
+        azimuth, elevation = np.degrees(np.arctan2(y, x)), np.degrees(np.arctan2(z, np.hypot(x, y)))
+    beams = np.array(view.row_elevations_deg)
+    middles = (beams[1:] + beams[:-1]) / 2.0
+    edges = np.array([2.0 * beams[0] - middles[0], *middles, 2.0 * beams[-1] - middles[-1]])
+    left, right = view.azimuth_left_deg, view.azimuth_right_deg
+    col = (left - azimuth) / (left - right) * view.width
+    row = (elevation[:, None] <= edges).sum(axis=1) - 1
+    sure = np.isfinite(points).all(axis=1) & (np.abs(points) < 1e9).all(axis=1) & (np.hypot(x, y) > 0.0)
+    sure &= (np.abs(elevation[:, None] - edges) > 1e-4).all(axis=1) & (np.abs(col - np.round(col)) > 1e-4)
+    inside = sure & (col > 0) & (col < view.width) & (row >= 0) & (row < view.height)
+    expected = np.where(inside, row * view.width + np.floor(np.where(inside, col, 0)), -1)
+    np.testing.assert_array_equal(seen.pixel[sure], expected[sure])
+    assert sure.mean() > 0.85
+    assert inside.sum() > 200
+
+
+def test_edges_of_the_top_view():
+    points = np.float32([
+        [6.0, -10.0, -2.5, 0.0], [46.0, 0.0, 0.0, 0.0], [6.0, 10.0, 0.0, 0.0],
+        [np.nextafter(np.float32(46), np.float32(0)), np.nextafter(np.float32(10), np.float32(0)), 2.5, 0.0],
+        [np.nextafter(np.float32(6), np.float32(0)), 0.0, 0.0, 0.0], [26.0, 0.0, 0.0, 0.0],
+        [26.0, 0.0, np.nextafter(np.float32(2.5), np.float32(9)), 0.0],
+    ])  # fmt: skip
+    seen = check(points, VIEWS["top view"])
+    assert seen.pixel.tolist() == [399 * 200 + 199, -1, -1, 0, -1, 199 * 200 + 99, -1]
+
+
+def test_edges_of_the_range_image():
+    view = RangeImageGeometry((45.0, 0.0, -45.0), 2)  # edges at 67.5, 22.5, -22.5, -67.5 degrees
+    points = np.float32([[5, 5, 0, 0], [5, -5, 0, 0], [5, 0, 0, 0], [5, -0.001, 0, 0], [5, 0, 5, 0], [-5, 0, 0, 0]])
+    assert check(points, view).pixel.tolist() == [2, -1, 3, 3, 1, -1]
+
+
+def test_straight_behind_is_in_a_full_turn():
+    points = np.float32([[-5, 0.0, 0, 0], [-5, -0.0, 0, 0], [-5, -1e-20, 0, 0], [-5, 1e-20, 0, 0]])
+    view = VIEWS["full turn, uneven"]
+    seen = check(points, view)
+    assert (seen.pixel % view.width).tolist() == [0, 0, view.width - 1, 0]
+
+
+def test_axis_and_origin_are_out_of_view():
+    points = np.float32([[0, 0, 0, 0], [-0.0, 0, 0, 0.5], [0, 0, 1, 0], [0, 0, -1, 0]])
+    for name, view in VIEWS.items():
+        if view.kind == "range_image":
+            assert (check(points, view).pixel == -1).all(), name
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("column", range(4))
+def test_points_not_finite_are_out_of_view(bad, column):
+    points = np.float32([[10.0, 1.0, -1.0, 0.5]] * 2)
+    points[0, column] = bad
+    for view in VIEWS.values():
+        seen = check(points, view)
+        assert seen.pixel[0] == -1
+        assert not (seen.index == 0).any()
+
+
+def test_the_best_point_wins_and_the_earlier_of_two():
+    points = np.full((1000, 4), (10.02, 0.03, 0.0, 0.5), np.float32)
+    for view in (VIEWS["top view"], VIEWS["front"]):
+        seen = check(points, view)
+        assert len(set(seen.pixel.tolist())) == 1
+        assert seen.index.max() == 0
+    points[:, 2] = np.where(np.arange(1000) % 2, 0.0, -0.0)
+    assert check(points, VIEWS["top view"]).index.max() == 0
+    points[[600, 700], 2] = 1.0
+    assert check(points, VIEWS["top view"]).index.max() == 600
+    points[:, 2] = 0.0
+    points[[300, 800], 0] = 10.01
+    assert check(points, VIEWS["front"]).index.max() == 300
+
+
+def test_points_may_be_read_only():
+    points = random_points(np.random.default_rng(0), 500)
+    before = points.copy()
+    points.flags.writeable = False
+    for view in VIEWS.values():
+        check(points, view)
+    np.testing.assert_array_equal(points, before)
+
+
+def test_every_pixel_leads_back_to_its_point():
+    points = random_points(np.random.default_rng(1), 5000)
+    for view in VIEWS.values():
+        seen = make_projector(view, spec_of(view)).project(points)
+        flat = np.flatnonzero(seen.index >= 0)
+        np.testing.assert_array_equal(seen.pixel[seen.index.reshape(-1)[flat]], flat)
+        np.testing.assert_array_equal(np.unique(seen.pixel[seen.pixel >= 0]), flat)
+
+
+def test_what_the_papers_azimuth_would_cost():
+    paper_deg = math.degrees(math.asin(math.sin(math.radians(45.0)) * math.cos(math.radians(-24.8))))
+    assert paper_deg == pytest.approx(39.9, abs=0.05)
+    assert round((45.0 - paper_deg) / 90.0 * 512) == 29
+
+
+def test_wrong_arrays_are_told():
+    view = VIEWS["coarse top view"]
+    projector = make_projector(view, spec_of(view))
+    good = np.zeros((5, 4), np.float32)
+    for bad, words in (
+        (good.astype(np.float64), "float64"),
+        (good[:, :3], r"\(5, 3\)"),
+        (good[::2], "C-contiguous: False"),
+        (good.reshape(-1), r"\(20,\)"),
+        ([[1.0, 2.0, 3.0, 4.0]], "list"),
+    ):
+        with pytest.raises(PointsError, match=words):
+            projector.project(bad)
+    seen = projector.project(good)
+    locked = seen.pixel.copy()
+    locked.flags.writeable = False
+    buffers = {"image": seen.image, "index": seen.index, "pixel": seen.pixel}
+    for name, bad in (
+        ("image", seen.image[:1]),
+        ("image", seen.image.astype(np.float64)),
+        ("index", seen.index.astype(np.int64)),
+        ("index", seen.index.T.copy().T),
+        ("pixel", seen.pixel[:2]),
+        ("pixel", locked),
+    ):
+        with pytest.raises(PointsError, match=f"^{name} buffer"):
+            projector.fill(good, 0.0, 1.0, **(buffers | {name: bad}))
+    for offset, scale in ((math.nan, 1.0), (0.0, math.inf)):
+        with pytest.raises(PointsError, match="finite"):
+            projector.fill(good, offset, scale, **buffers)
+
+
+def test_wrong_cards_are_told():
+    with pytest.raises(CardError, match="range"):
+        make_projector(VIEWS["top view"], InputSpec("input", ("range",), (0.0,), (1.0,)))
+    with pytest.raises(CardError, match="height"):
+        make_projector(VIEWS["front"], InputSpec("input", ("x", "height"), (0.0, 0.0), (1.0, 1.0)))
+    spec = InputSpec("input", ("x",), (0.0,), (1.0,))
+    for view in (
+        RangeImageGeometry((1.0, 1.0 - 1e-9, -1.0)),
+        RangeImageGeometry((1.0, -1.0), 200000),
+        RangeImageGeometry((1.0, -1.0), 4, 45.0 + 1e-9, 45.0),
+    ):
+        with pytest.raises(CardError, match="closer than"):
+            make_projector(view, spec)
