@@ -182,7 +182,8 @@ def cross_entropy(
     weights = known.float() if class_weights is None else class_weights.float()[truth] * known
     loss = -log_p_true
     if focal_gamma > 0.0:
-        loss = loss * (1.0 - log_p_true.exp()) ** focal_gamma
+        # Clamped, for below 1 the power's slope at 0 is infinite.
+        loss = loss * (1.0 - log_p_true.exp()).clamp(min=1e-6) ** focal_gamma
     return (weights * loss).sum() / weights.sum().clamp(min=1e-6)
 
 
@@ -205,7 +206,7 @@ def lovasz_softmax(logits: Tensor, labels: Tensor) -> Tensor:
         jaccard = 1.0 - intersection / union
         steps = torch.cat([jaccard[:1], jaccard[1:] - jaccard[:-1]])
         losses.append(errors @ steps)
-    return torch.stack(losses).mean() if losses else logits.sum() * 0.0
+    return torch.stack(losses).mean() if losses else logits.float().sum() * 0.0
 
 
 def pointseg_loss(

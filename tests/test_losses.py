@@ -9,9 +9,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from edgeperc.card import TopViewGeometry  # noqa: E402
-from edgeperc.decode import decode_dense, decode_slots  # noqa: E402
-from edgeperc_export.losses import (  # noqa: E402
+from edgeperc.card import TopViewGeometry
+from edgeperc.decode import decode_dense, decode_slots
+from edgeperc_export.losses import (
     GEOMETRY_WEIGHTS,
     IGNORE,
     REGRESSED_FROM,
@@ -398,3 +398,10 @@ def test_losses_take_bfloat16(rng):
     assert cross_entropy(logits.bfloat16(), labels).item() == pytest.approx(
         cross_entropy(logits, labels).item(), rel=0.02
     )
+
+
+@pytest.mark.parametrize("gamma", [0.5, 1.0, 2.0])
+def test_a_pixel_that_is_certain_has_a_finite_gradient(gamma):
+    logits = torch.tensor([[[[30.0]], [[0.0]]]], requires_grad=True)
+    cross_entropy(logits, torch.zeros((1, 1, 1), dtype=torch.uint8), focal_gamma=gamma).backward()
+    assert torch.isfinite(logits.grad).all()

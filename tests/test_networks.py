@@ -7,11 +7,11 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from torch import nn  # noqa: E402
-from torch.utils.flop_counter import FlopCounterMode  # noqa: E402
+from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
-from edgeperc_export.networks.pointseg import ENLARGEMENT_RATES, Fire, FireDeconv, PointSeg, SqueezeReweight  # noqa: E402
-from edgeperc_export.networks.ssadnet import (  # noqa: E402
+from edgeperc_export.networks.pointseg import ENLARGEMENT_RATES, Fire, FireDeconv, PointSeg, SqueezeReweight
+from edgeperc_export.networks.ssadnet import (
     CONTEXT_DILATIONS,
     ELU_GAIN,
     HEAT_PRIOR,

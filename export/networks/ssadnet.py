@@ -215,7 +215,7 @@ class SSADNet(nn.Module):
     n_slots : int
         Boxes that head "slots" can return.
     context_width : int
-        Channels inside the context module. They cost most of the time: 17.7 of 22.6 GMAC at 128.
+        Channels inside the context module. They cost most of the time: 18.5 of 22.6 GMAC at 128.
     dropout : float
         Probability of the spatial dropout in the context module and of the dropout in the B.B.R. blocks.
 
