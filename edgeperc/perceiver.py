@@ -164,7 +164,9 @@ class Perceiver:
 
     def _perceive(self, scan: NDArray[np.float32], stamp_s: float | None, check: bool) -> Perception:
         watch = _Stopwatch()
-        n_dropped = len(scan) - int(np.count_nonzero(np.isfinite(scan).all(axis=1)))
+        finite = np.isfinite(scan)
+        # Reducing rows of four costs ten times the count, and nearly every scan is finite throughout.
+        n_dropped = 0 if finite.all() else len(scan) - int(np.count_nonzero(finite.all(axis=1)))
         fitness = self._check(scan) if check else ()
         watch.lap("check")
         points: PointLabels | None = None
@@ -189,10 +191,11 @@ class Perceiver:
 
     def _check(self, scan: NDArray[np.float32]) -> tuple[str, ...]:
         found: dict[str, None] = {}
-        scaled = scan.copy()
-        scaled[:, 3] = (scaled[:, 3] + np.float32(self.sensor.remission_offset)) * np.float32(
-            self.sensor.remission_scale
-        )
+        offset, scale = np.float32(self.sensor.remission_offset), np.float32(self.sensor.remission_scale)
+        scaled = scan
+        if (offset, scale) != (0.0, 1.0):
+            scaled = scan.copy()
+            scaled[:, 3] = (scaled[:, 3] + offset) * scale
         for network in self._networks:
             if network.fitness is not None:
                 found |= dict.fromkeys(check_fitness(scaled, network.fitness, self.sensor))

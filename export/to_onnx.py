@@ -51,6 +51,7 @@ def load(checkpoint: Path) -> tuple[nn.Module, Recipe, dict[str, Any]]:
     network = build(recipe)
     network.load_state_dict(state["averaged"])
     notes = {"frames": json.loads(state["frames"]), "n_simulated": state["n_simulated"], "step": state["step"]}
+    notes["before"] = json.loads(state["before"])
     return network.eval(), recipe, notes
 
 
@@ -63,6 +64,7 @@ def card_of(recipe: Recipe, notes: Mapping[str, Any], fitness: FitnessProfile | 
         "licence": "CC BY-NC-SA 3.0, as KITTI's, on which it was trained" if frames else "Apache-2.0",
         "recipe": {n: getattr(recipe, n) for n in Recipe.__dataclass_fields__},
         "steps": notes["step"],
+        "started_from": notes["before"],
     }
     common = {"version": version, "fitness": None if fitness is None else fitness.to_dict(), "training": training}
     if recipe.network == "pointseg":

@@ -219,8 +219,11 @@ def train(
     samples = Samples(recipe, real, weights, sorted(simulated.glob("*.npz")) if simulated else [])
 
     network = build(recipe)
+    before: list[dict[str, object]] = []
     if start_from is not None:
-        network.load_state_dict(torch.load(start_from, weights_only=True)["averaged"])
+        state = torch.load(start_from, weights_only=True)
+        network.load_state_dict(state["averaged"])
+        before = [*json.loads(state["before"]), json.loads(state["recipe"])]
     network = network.to(device, memory_format=torch.channels_last)
     averaged = copy.deepcopy(network).eval()
     decayed = [p for p in network.parameters() if p.ndim > 1]
@@ -234,6 +237,7 @@ def train(
         state = torch.load(checkpoint, weights_only=True, map_location=device)
         if json.loads(state["recipe"]) != asdict(recipe):
             raise ValueError(f"{checkpoint} is of another recipe: {state['recipe']}; train into an empty folder")
+        before = json.loads(state["before"])
         network.load_state_dict(state["network"])
         averaged.load_state_dict(state["averaged"])
         optimizer.load_state_dict(state["optimizer"])
@@ -244,6 +248,7 @@ def train(
         torch.save(
             {
                 "recipe": json.dumps(asdict(recipe)),
+                "before": json.dumps(before),
                 "step": step,
                 "network": network.state_dict(),
                 "averaged": averaged.state_dict(),

@@ -55,7 +55,7 @@ def untrained(network: str, folder: Path, **changes: object) -> Path:
             net(torch.rand(1, channels, height, width))
     state = {k: v for k, v in net.state_dict().items()}
     path = folder / f"{network}-{recipe.head}.pt"
-    notes = {"frames": "{}", "n_simulated": 2, "step": 0, "recipe": json.dumps(recipe.__dict__)}
+    notes = {"frames": "{}", "before": "[]", "n_simulated": 2, "step": 0, "recipe": json.dumps(recipe.__dict__)}
     torch.save({"averaged": state, **notes}, path)
     return path
 
