@@ -32,8 +32,9 @@ __all__ = ["main"]
 
 SHIPPED = ("ssadnet", "pointseg")
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
-# A junction with cars, a van, pedestrians and a cyclist; far from the seeds that models are trained on.
-DEMO_SCENE = (2_000_000_058, "junction")
+# A junction with cars, a truck, pedestrians and a cyclist, most of which are found; far from the seeds that models are
+# trained on.
+DEMO_SCENE = (2_000_000_120, "junction")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -6,7 +6,7 @@ import os
 import threading
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -223,35 +223,8 @@ class Perceiver:
         watch.lap("project")
         outputs = network.session.run()
         watch.lap("infer")
-        kind = next(k for k in outputs if k.startswith("class_"))
-        labels, scores = decode_classes(outputs[kind], kind, model=card.name)
-        found: list[Box] = []
         threshold = card.score_threshold if self.score_threshold is None else self.score_threshold
-        if "box_dense" in outputs:
-            found = decode_dense(
-                outputs["box_dense"],
-                outputs[kind],
-                kind,
-                card.view,
-                card.classes,
-                card.box_classes,
-                score_threshold=threshold,
-                iou_threshold=card.nms_iou,
-                model=card.name,
-            )
-        elif "box_slots" in outputs:
-            found = decode_slots(
-                outputs["box_slots"],
-                labels,
-                scores,
-                card.view,
-                card.classes,
-                card.box_classes,
-                card.box_size_priors,
-                card.mount_height_m,
-                model=card.name,
-            )
-            found = [b for b in found if b.score >= threshold]
+        labels, found = decode_top_view(card, outputs, threshold)
         watch.lap("decode")
         view = TopView(labels, card.classes, card.view.cell_m, card.view.x_range_m, card.view.y_range_m)
         return view, tuple(found)
@@ -272,6 +245,42 @@ class Perceiver:
         labelled = label_points(scan, pixel, network.index, cleaned, full_turn=full_turn)
         watch.lap("refine")
         return PointLabels(labelled, pixel >= 0, card.classes)
+
+
+def decode_top_view(
+    card: ModelCard, outputs: Mapping[str, NDArray[np.float32]], score_threshold: float
+) -> tuple[NDArray[np.uint8], list[Box]]:
+    """Labels (rows, cols) and boxes from a top-view network's raw outputs, by kind."""
+    assert isinstance(card.view, TopViewGeometry)
+    kind = next(k for k in outputs if k.startswith("class_"))
+    labels, scores = decode_classes(outputs[kind], kind, model=card.name)
+    found: list[Box] = []
+    if "box_dense" in outputs:
+        found = decode_dense(
+            outputs["box_dense"],
+            outputs[kind],
+            kind,
+            card.view,
+            card.classes,
+            card.box_classes,
+            score_threshold=score_threshold,
+            iou_threshold=card.nms_iou,
+            model=card.name,
+        )
+    elif "box_slots" in outputs:
+        found = decode_slots(
+            outputs["box_slots"],
+            labels,
+            scores,
+            card.view,
+            card.classes,
+            card.box_classes,
+            card.box_size_priors,
+            card.mount_height_m,
+            model=card.name,
+        )
+        found = [b for b in found if b.score >= score_threshold]
+    return labels, found
 
 
 def _resolve(model: str | os.PathLike[str]) -> Path:

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from torch import nn
 
 from edgeperc.card import CARD_KEY, Golden, ModelCard, OutputSpec
-from edgeperc.decode import decode_classes, decode_dense
+from edgeperc.decode import decode_classes
 from edgeperc.errors import EdgepercError
+from edgeperc.perceiver import decode_top_view
 from edgeperc.projection import make_projector
 from edgeperc.sensors import FitnessProfile
 from edgeperc.session import Session, golden_input
@@ -59,9 +60,11 @@ def card_of(recipe: Recipe, notes: Mapping[str, Any], fitness: FitnessProfile | 
     """The card of a network of this project."""
     frames = notes["frames"]
     training = {
-        "data": f"{len(frames)} KITTI frames, {notes['n_simulated']} simulated scans",
+        "data": f"{len(frames)} real frames (KITTI), {notes['n_simulated']} simulated scans",
         "frames": frames,
-        "licence": "CC BY-NC-SA 3.0, as KITTI's, on which it was trained" if frames else "Apache-2.0",
+        "licence": "CC BY-NC-SA 3.0, as KITTI's, on which it was trained"
+        if frames
+        else "Apache-2.0, unless the simulated scans have layouts of somebody else's",
         "recipe": {n: getattr(recipe, n) for n in Recipe.__dataclass_fields__},
         "steps": notes["step"],
         "started_from": notes["before"],
@@ -196,19 +199,19 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
         wanted = {o.kind: a[0].numpy() for o, a in zip(card.outputs, answers, strict=True)}
         for kind, want in wanted.items():
             worst = max(worst, float(np.abs(here[kind] - want).max()) / max(float(want.std()), 1e-6))
-        kind = next(k for k in wanted if k.startswith("class_"))
-        labels = [decode_classes(a[kind], kind)[0] for a in (here, wanted)]
-        agreement = min(agreement, float((labels[0] == labels[1]).mean()))
-        if "box_dense" in wanted:
-            boxes = [
-                decode_dense(a["box_dense"], a[kind], kind, card.view, card.classes, card.box_classes)
-                for a in (here, wanted)
-            ]
-            if [b.label for b in boxes[0]] != [b.label for b in boxes[1]]:
-                raise ParityError(f"{path}: onnxruntime finds {len(boxes[0])} boxes, torch {len(boxes[1])}, or others")
-            for mine, theirs in zip(*boxes, strict=True):
-                apart = np.abs(np.array([*mine.center, *mine.size]) - np.array([*theirs.center, *theirs.size]))
+        if card.view.kind == "top_view":
+            (here_labels, mine), (labels, theirs) = (
+                decode_top_view(card, a, card.score_threshold) for a in (here, wanted)
+            )
+            if [b.label for b in mine] != [b.label for b in theirs]:
+                raise ParityError(f"{path}: onnxruntime finds {len(mine)} boxes, torch {len(theirs)}, or others")
+            for box, other in zip(mine, theirs, strict=True):
+                apart = np.abs(np.array([*box.center, *box.size]) - np.array([*other.center, *other.size]))
                 box_deviation = max(box_deviation, float(apart.max()))
+        else:
+            ((kind, logits),) = wanted.items()
+            here_labels, labels = (decode_classes(a, kind)[0] for a in (here[kind], logits))
+        agreement = min(agreement, float((here_labels == labels).mean()))
     if worst > MAX_DEVIATION or agreement < MIN_AGREEMENT or box_deviation > 0.05:
         raise ParityError(
             f"{path}: raw outputs differ by up to {worst:.3g} standard deviations (at most {MAX_DEVIATION}), labels "
