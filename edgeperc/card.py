@@ -13,6 +13,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from .errors import CardError
 
 __all__ = ["CARD_KEY", "Golden", "InputSpec", "ModelCard", "OutputSpec", "RangeImageGeometry", "TopViewGeometry"]
@@ -64,6 +67,14 @@ class TopViewGeometry:
     def width(self) -> int:
         """Columns, along y."""
         return round((self.y_range_m[1] - self.y_range_m[0]) / self.cell_m)
+
+    def cell_centres(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """x (rows, 1) and y (1, cols) of the middles of the cells [m]."""
+        # numpy's own float64: older stubs take a product with Python's float for any float
+        cell_m = np.float64(self.cell_m)
+        x = np.float64(self.x_range_m[1]) - (np.arange(self.height, dtype=np.float64)[:, None] + 0.5) * cell_m
+        y = np.float64(self.y_range_m[1]) - (np.arange(self.width, dtype=np.float64)[None, :] + 0.5) * cell_m
+        return x, y
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from edgeperc.card import TopViewGeometry
 from edgeperc.perception import Box
-from edgeperc.simulation import SimulatedScan
+from edgeperc.simulation import SimulatedScan, draw_vehicles
 
-from .kitti import IGNORE, Frame, cell_centres, draw_vehicles, inside
+from .kitti import IGNORE, Frame, inside
 
 # The ground is kept wider and coarser than the network sees it, so that a turned scan still has truth everywhere.
 SURFACE = TopViewGeometry(x_range_m=(-50.0, 50.0), y_range_m=(-50.0, 50.0), cell_m=0.2)
@@ -101,13 +101,13 @@ class LabelledScan:
 
     def labelled(self, geometry: TopViewGeometry) -> NDArray[np.bool_]:
         """Cells in which a vehicle would have been labelled, (rows, cols) bool."""
-        x, y = cell_centres(geometry)
+        x, y = geometry.cell_centres()
         azimuth = np.arctan2(y, x)
         return (azimuth >= self.azimuths[0]) & (azimuth <= self.azimuths[1])
 
     def top_view_truth(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
         """SSADNet's segmentation truth (3.1.2): the surface under the vehicles' footprints, `IGNORE` where unknown."""
-        x, y = cell_centres(geometry)
+        x, y = geometry.cell_centres()
         if self.mirrored:
             y = -y
         cos, sin = np.cos(self.turn), np.sin(self.turn)

@@ -6,7 +6,7 @@ Labels cover the left colour camera's field of view only: outside it, truth is u
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,6 @@ from edgeperc.card import TopViewGeometry
 from edgeperc.errors import PointsError
 from edgeperc.perception import Box
 from edgeperc.points import read_points
-from edgeperc.simulation import TOP_VIEW_CLASSES
 
 IGNORE = 255
 # PointSeg's car holds every vehicle with a box; pedestrians sit down too.
@@ -157,35 +156,6 @@ def inside(box: Box, points: NDArray, margin_m: float = 0.0) -> NDArray[np.bool_
     across = offset[:, 1] * cos - offset[:, 0] * sin
     half = np.asarray(box.size) / 2.0 + margin_m
     return (np.abs(along) <= half[0]) & (np.abs(across) <= half[1]) & (np.abs(offset[:, 2]) <= half[2])
-
-
-def cell_centres(geometry: TopViewGeometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """x (rows, 1) and y (1, cols) of the cells' centres [m]."""
-    x = geometry.x_range_m[1] - (np.arange(geometry.height)[:, None] + 0.5) * geometry.cell_m
-    y = geometry.y_range_m[1] - (np.arange(geometry.width)[None, :] + 0.5) * geometry.cell_m
-    return x, y
-
-
-def draw_vehicles(surface: NDArray[np.uint8], boxes: Sequence[Box], geometry: TopViewGeometry) -> None:
-    """Draw the footprints of cars, vans and trucks over a top-view truth, in place (SSADNet 3.1.2).
-
-    A cell belongs to a vehicle when its centre lies in the footprint; nearer vehicles are drawn last.
-    """
-    all_x, all_y = cell_centres(geometry)
-    for box in sorted(boxes, key=lambda b: -b.center[0]):
-        if box.label not in TOP_VIEW_CLASSES[2:]:
-            continue
-        corners = box.corners()
-        top = (geometry.x_range_m[1] - corners[:, 0]) / geometry.cell_m
-        left = (geometry.y_range_m[1] - corners[:, 1]) / geometry.cell_m
-        rows = slice(max(int(top.min()), 0), max(min(int(top.max()) + 1, geometry.height), 0))
-        cols = slice(max(int(left.min()), 0), max(min(int(left.max()) + 1, geometry.width), 0))
-        x, y = all_x[rows], all_y[:, cols]
-        cos, sin = np.cos(box.yaw), np.sin(box.yaw)
-        along = (x - box.center[0]) * cos + (y - box.center[1]) * sin
-        across = (y - box.center[1]) * cos - (x - box.center[0]) * sin
-        covered = (np.abs(along) <= box.size[0] / 2.0) & (np.abs(across) <= box.size[1] / 2.0)
-        surface[rows, cols][covered] = TOP_VIEW_CLASSES.index(box.label)
 
 
 class KittiObjects:

@@ -15,6 +15,7 @@ pytest.importorskip("tqdm")
 from edgeperc.card import TopViewGeometry
 from edgeperc.errors import PointsError
 from edgeperc.perception import Box
+from edgeperc.simulation import draw_vehicles
 from edgeperc_export.augment import SURFACE, LabelledScan, augmented, mirrored, turned
 from edgeperc_export.dataset import simulated_scan
 from edgeperc_export.kitti import (
@@ -23,7 +24,6 @@ from edgeperc_export.kitti import (
     Calibration,
     Frame,
     KittiObjects,
-    draw_vehicles,
     inside,
     layouts,
     read_objects,

@@ -37,7 +37,14 @@ def test_a_shipped_model_gives_the_exporters_answers(name: str) -> None:
 @pytest.mark.parametrize("name", shipped_models())
 def test_a_shipped_model_says_nothing_of_the_computer_it_was_made_on(name: str) -> None:
     blob = model_path(name).read_bytes()
-    for word in (b"/home/", b"/root/", b"/work/", b"/tmp/", b"site-packages", b"Traceback"):
+    for word in (
+        b"/home/",
+        b"/Users/",
+        b"/tmp/",
+        b"site-packages",
+        str(Path.home()).encode(),
+        str(Path.cwd()).encode(),
+    ):
         assert word not in blob
 
 
