@@ -11,7 +11,9 @@ import reference
 from edgeperc import projection
 from edgeperc.card import InputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.errors import CardError, PointsError
-from edgeperc.projection import column_edges, make_projector, row_edges
+from edgeperc.projection import column_edges, make_projector, row_edges, tabulate
+from edgeperc.sensors import get_sensor
+from edgeperc_bench.projection import contenders
 
 KERNELS = ("mark_top_view", "mark_range_image", "fill_image")
 UNEVEN = (2.0, 1.7, 1.3, 0.2, -0.1, -4.0, -4.4, -11.0, -24.8)
@@ -27,6 +29,7 @@ VIEWS = {
     "left half": RangeImageGeometry((80.0, 20.0, -20.0, -80.0), 7, 180.0, 0.0),
     "right rear": RangeImageGeometry((5.0, -5.0), 1, -95.0, -180.0),
     "all but the rear": RangeImageGeometry((30.0, 0.0, -30.0), 11, 170.0, -100.0),
+    "front of a vlp-32c": RangeImageGeometry(get_sensor("vlp-32c").elevations_deg, 256),
 }
 SMALL = [name for name, view in VIEWS.items() if view.height * view.width < 2000]
 
@@ -122,6 +125,45 @@ def test_pixels_are_those_of_true_angles(name):
     assert inside.sum() > 200
 
 
+def test_a_point_lands_where_the_equations_say():
+    point = np.float32([[10.0, 0.0, -1.0, 0.25]])
+    above = check(point, VIEWS["top view"], InputSpec("input", ("distance", "remission", "height"), (0,) * 3, (1,) * 3))
+    assert above.pixel[0] == 359 * 200 + 99  # (46 - 10) / 0.1 cells from the far edge; half-way across, on the edge
+    np.testing.assert_array_equal(above.image[:, 359, 99], np.float32([10.0, 0.25, -1.0]))
+    # atan(-1 / 10) is -5.71 degrees: HDL_64E has beams at -5.667 (row 23) and -6 (row 24).
+    ahead = check(point, VIEWS["front"], InputSpec("input", ("x", "y", "z", "remission", "range"), (0,) * 5, (1,) * 5))
+    assert ahead.pixel[0] == 23 * 512 + 256
+    np.testing.assert_allclose(ahead.image[:, 23, 256], [10.0, 0.0, -1.0, 0.25, math.sqrt(101.0)], rtol=1e-6)
+    assert np.count_nonzero(ahead.image) == 4
+
+
+@pytest.mark.parametrize("channels", [("height",), ("remission", "distance"), ("height", "distance", "remission")])
+def test_channels_are_normalised_in_the_order_asked_for(channels):
+    mean, std = (10.0, 0.5, -1.0)[: len(channels)], (2.0, 0.25, 4.0)[: len(channels)]
+    points = np.float32([[3.0, 4.0, 1.0, 100.0], [1.0, 1.0, 0.5, 200.0]])
+    seen = check(points, VIEWS["coarse top view"], InputSpec("input", channels, mean, std), -50.0, 0.01)
+    raw = {"distance": 5.0, "remission": 0.5, "height": 1.0}
+    expected = [(raw[name] - m) / s for name, m, s in zip(channels, mean, std, strict=True)]
+    np.testing.assert_allclose(seen.image.reshape(len(channels), -1)[:, seen.pixel[0]], expected, rtol=1e-6)
+    assert seen.pixel[0] >= 0
+    assert (seen.image[:, seen.index < 0] == 0.0).all()
+
+
+@pytest.mark.parametrize("name", [name for name, view in VIEWS.items() if view.kind == "range_image"])
+def test_tables_find_the_interval_of_every_value(name):
+    for edges in (row_edges(VIEWS[name]), column_edges(VIEWS[name])):
+        (first, last, cells_per_unit), base, split = tabulate(edges, "edges")
+        rng = np.random.default_rng(2)
+        values = np.concatenate(
+            [edges, np.nextafter(edges, np.float32(9)), np.nextafter(edges, np.float32(-9)),
+             rng.uniform(edges[-1], edges[0], 5000).astype(np.float32)]
+        )  # fmt: skip
+        values = values[(values <= first) & (values > max(last, edges[-1] - 1e-6))]
+        cells = ((first - values) * cells_per_unit).astype(np.int32)
+        found = base[cells] + (values <= split[cells])
+        np.testing.assert_array_equal(found, (values[:, None] <= edges[1:-1]).sum(axis=1))
+
+
 def test_edges_of_the_top_view():
     points = np.float32([
         [6.0, -10.0, -2.5, 0.0], [46.0, 0.0, 0.0, 0.0], [6.0, 10.0, 0.0, 0.0],
@@ -147,7 +189,9 @@ def test_straight_behind_is_in_a_full_turn():
 
 
 def test_axis_and_origin_are_out_of_view():
-    points = np.float32([[0, 0, 0, 0], [-0.0, 0, 0, 0.5], [0, 0, 1, 0], [0, 0, -1, 0]])
+    # The squares of 1e-30 are 0 in float32.
+    points = np.float32([[0, 0, 0, 0], [-0.0, 0, 0, 0.5], [0, 0, 1, 0], [0, 0, -1, 0], [1e-30, 1e-30, 1, 0]])
+    points = np.concatenate([points, points * np.float32([-1, 1, 1, 1])])
     for name, view in VIEWS.items():
         if view.kind == "range_image":
             assert (check(points, view).pixel == -1).all(), name
@@ -212,6 +256,8 @@ def test_wrong_arrays_are_told():
         (good[:, :3], r"\(5, 3\)"),
         (good[::2], "C-contiguous: False"),
         (good.reshape(-1), r"\(20,\)"),
+        (good.astype(">f4"), ">f4|float32"),
+        (np.asfortranarray(good), "C-contiguous: False"),
         ([[1.0, 2.0, 3.0, 4.0]], "list"),
     ):
         with pytest.raises(PointsError, match=words):
@@ -233,6 +279,12 @@ def test_wrong_arrays_are_told():
     for offset, scale in ((math.nan, 1.0), (0.0, math.inf)):
         with pytest.raises(PointsError, match="finite"):
             projector.fill(good, offset, scale, **buffers)
+
+
+def test_the_benchmark_compares_equal_answers():
+    points = random_points(np.random.default_rng(3), 20000)
+    calls = contenders(points[(np.abs(points) < 1e9).all(axis=1)])  # raises where numpy and the kernels differ
+    assert set(calls) >= {"copy loop", "top view", "top view, numpy", "range image", "range image, numpy"}
 
 
 def test_wrong_cards_are_told():
