@@ -126,8 +126,8 @@ class Perceiver:
         self.providers = MappingProxyType({n.session.card.name: n.session.provider for n in self._networks})
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
         self._lock = threading.Lock()
-        # The first call would compile the kernels; a scan of two points, one in every view, gets that over with here.
-        self._perceive(np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32), None, check=False)
+        # The first call would compile the kernels; a scan of two points, in every view, gets that over with here.
+        self._perceive(np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32), None, check=self._to_check > 0)
 
     @staticmethod
     def _load(path: Path, provider: str, n_threads: int | None) -> _Network:

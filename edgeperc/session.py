@@ -1,7 +1,7 @@
 """Network input to raw outputs; the only importer of onnxruntime.
 
 A provider asked for is required: where it is absent, or would hand part of the graph to another, construction raises
-`ProviderError`. ``"auto"`` takes the first of `AUTO` that this computer has, and says which.
+`ProviderError`. ``"auto"`` takes the first of `AUTO` that runs the whole model here, and says which.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,8 @@ from .errors import (
 )
 
 __all__ = ["PROVIDERS", "Session", "available_providers"]
+
+logger = logging.getLogger(__name__)
 
 PROVIDERS: Mapping[str, str] = {
     "tensorrt-rtx": "NvTensorRTRTXExecutionProvider",
@@ -128,8 +131,15 @@ class Session:
         if EXTERNAL_DATA in blob:
             raise ModelFileError(f"{self.path} keeps weights in other files; export it with its weights inside")
         self.sha256 = hashlib.sha256(blob).hexdigest()
-        short, precision = self._choose(ort, provider)
-        self._session = self._open(ort, blob, short, precision, n_threads)
+        for candidate in [s for s in AUTO if s in available_providers()] if provider == "auto" else [provider]:
+            short, precision = self._choose(candidate)
+            try:
+                self._session = self._open(ort, blob, short, precision, n_threads)
+                break
+            except ProviderError as exc:
+                if provider != "auto":
+                    raise
+                logger.warning("auto passes over %s: %s", short, exc)
         self.provider = f"{PROVIDERS[short]} ({precision})"
         text = self._session.get_modelmeta().custom_metadata_map.get(CARD_KEY)
         if text is None:
@@ -143,11 +153,9 @@ class Session:
         self.golden_deviation = self._warm_up()
 
     @staticmethod
-    def _choose(ort: Any, provider: str) -> tuple[str, str]:
+    def _choose(provider: str) -> tuple[str, str]:
         short, _, precision = provider.partition(":")
         present = available_providers()
-        if short == "auto":
-            short = next(s for s in AUTO if s in present)
         if short not in PROVIDERS:
             raise ProviderError(f"provider {provider!r} is unknown; expected auto or one of {', '.join(PROVIDERS)}")
         if short not in present:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import edgeperc.session as session_module
 from edgeperc.card import CARD_KEY
 from edgeperc.errors import CardError, CardMismatchError, InferenceError, ModelFileError, ProviderError
 from edgeperc.models import model_path, shipped_models
@@ -178,6 +179,20 @@ def test_a_precision_the_provider_does_not_have() -> None:
 def test_auto_says_what_it_took() -> None:
     session = Session(model_path("pointseg"), "auto")
     assert any(session.provider.startswith(PROVIDERS[p]) for p in available_providers())
+
+
+def test_auto_passes_over_a_provider_that_cannot_run_the_model(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(session_module, "AUTO", ("coreml", "cpu"))
+    monkeypatch.setattr(session_module, "available_providers", lambda: ("coreml", "cpu"))
+    # Not built into this onnxruntime, whatever the line above says; asked for by name it is an error.
+    if "CoreMLExecutionProvider" in pytest.importorskip("onnxruntime").get_available_providers():
+        pytest.skip("this onnxruntime has CoreML")
+    assert Session(model_path("pointseg"), "auto").provider == "CPUExecutionProvider (fp32)"
+    assert "auto passes over coreml" in caplog.text
+    with pytest.raises(ProviderError):
+        Session(model_path("pointseg"), "coreml")
 
 
 def test_the_openvino_plugin_agrees_with_the_cpu_provider() -> None:
