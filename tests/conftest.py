@@ -45,6 +45,12 @@ def unpack_group(group: str) -> Path:
 
 
 @pytest.fixture(scope="session")
+def matplotlib() -> None:
+    """For tests that draw: skips them where only the runtime is installed."""
+    pytest.importorskip("matplotlib")
+
+
+@pytest.fixture(scope="session")
 def data_root() -> Callable[[str], Path]:
     """A function from the name of a group of real data to the folder that holds it unpacked.
 

@@ -216,8 +216,8 @@ def test_folders_are_opened_and_sorted(tmp_path: Path, capsys: pytest.CaptureFix
     assert answers[1]["n_points"] == 40
 
 
+@pytest.mark.usefixtures("matplotlib")
 def test_files_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("matplotlib")
     scan = write_scan(tmp_path / "in" / "000123.bin", 40)
     out = tmp_path / "out"
     assert run("run", scan, "--out", out, "--png", "--html", "--labels", "--ply", "--json") == 0
@@ -386,9 +386,8 @@ def fake_street(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "edgeperc.simulation", made)
 
 
-@pytest.mark.usefixtures("fake_street")
+@pytest.mark.usefixtures("fake_street", "matplotlib")
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("matplotlib")
     assert run("demo", "--out", tmp_path / "demo") == 0
     out = capsys.readouterr().out
     assert "100 m2 of the 40 x 20 m ahead" in out

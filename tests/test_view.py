@@ -63,8 +63,9 @@ def perception(scan: np.ndarray) -> Perception:
 
 
 def pixels(png: bytes) -> np.ndarray:
-    image = pytest.importorskip("PIL.Image")
-    with image.open(io.BytesIO(png)) as opened:
+    from PIL import Image  # comes with matplotlib
+
+    with Image.open(io.BytesIO(png)) as opened:
         assert opened.format == "PNG"
         return np.asarray(opened.convert("RGB")).astype(np.int16)
 
@@ -74,8 +75,8 @@ def near(picture: np.ndarray, name: str, tolerance: int = 12) -> np.ndarray:
     return (np.abs(picture - wanted) <= tolerance).all(axis=2)
 
 
+@pytest.mark.usefixtures("matplotlib")
 def test_picture_shows_classes_where_they_are(scan: np.ndarray, perception: Perception) -> None:
-    pytest.importorskip("matplotlib")
     picture = pixels(view.draw(scan, perception, title="a scan"))
     assert picture.shape == (1000, 1600, 3)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 500
@@ -94,8 +95,8 @@ def test_picture_shows_classes_where_they_are(scan: np.ndarray, perception: Perc
     assert all(near(picture[850:910], name).sum() > 60 for name in {*POINT_CLASSES, *TOP_CLASSES})
 
 
+@pytest.mark.usefixtures("matplotlib")
 def test_picture_of_one_view(scan: np.ndarray, perception: Perception) -> None:
-    pytest.importorskip("matplotlib")
     points_alone = pixels(view.draw(scan, replace(perception, top_view=None, boxes=())))
     assert near(points_alone, "pedestrian").sum() > 100
     assert not near(points_alone, "drivable").any()
@@ -105,8 +106,8 @@ def test_picture_of_one_view(scan: np.ndarray, perception: Perception) -> None:
     assert (points_alone[100:800, 30:480] != top_alone[100:800, 30:480]).any()
 
 
+@pytest.mark.usefixtures("matplotlib")
 def test_picture_is_the_same_again_and_in_other_threads(scan: np.ndarray, perception: Perception) -> None:
-    pytest.importorskip("matplotlib")
     wanted = view.draw(scan, perception)
     got: list[bytes] = []
     threads = [threading.Thread(target=lambda: got.append(view.draw(scan, perception))) for _ in range(3)]
@@ -118,8 +119,8 @@ def test_picture_is_the_same_again_and_in_other_threads(scan: np.ndarray, percep
 
 
 @pytest.mark.parametrize("n", [0, 1])
+@pytest.mark.usefixtures("matplotlib")
 def test_tiny_scans(n: int, tmp_path, scan: np.ndarray) -> None:
-    pytest.importorskip("matplotlib")
     whole = a_perception(scan)
     for points in (scan[:n], np.full((n, 4), np.nan, dtype=np.float32)):
         labels = PointLabels(np.zeros(n, np.uint8), np.zeros(n, bool), POINT_CLASSES)
@@ -131,8 +132,8 @@ def test_tiny_scans(n: int, tmp_path, scan: np.ndarray) -> None:
         assert (tmp_path / "points.label").stat().st_size == 4 * n
 
 
+@pytest.mark.usefixtures("matplotlib")
 def test_strange_titles_and_classes(scan: np.ndarray, perception: Perception, tmp_path) -> None:
-    pytest.importorskip("matplotlib")
     strange = "$\\frac{ <script>alert(1)</script> 走 \n \udcff @@SCENE@@" + "x" * 200
     classes = (*POINT_CLASSES[:3], "</script> & tram\nelement vertex 3")
     perception = replace(perception, points=replace(perception.points, classes=classes))
@@ -147,8 +148,8 @@ def test_strange_titles_and_classes(scan: np.ndarray, perception: Perception, tm
     assert [line for line in header if line.startswith("element")] == [f"element vertex {len(scan)}"]
 
 
+@pytest.mark.usefixtures("matplotlib")
 def test_file_is_replaced_whole(scan: np.ndarray, perception: Perception, tmp_path) -> None:
-    pytest.importorskip("matplotlib")
     target = tmp_path / "scan.png"
     target.write_bytes(b"old")
     png = view.draw(scan, perception, target)
@@ -247,8 +248,8 @@ def test_import_loads_no_matplotlib() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+@pytest.mark.usefixtures("matplotlib")
 def test_drawing_uses_no_pyplot(scan: np.ndarray, perception: Perception) -> None:
-    pytest.importorskip("matplotlib")
     before = "matplotlib.pyplot" in sys.modules
     view.draw(scan, perception)
     assert ("matplotlib.pyplot" in sys.modules) == before
