@@ -63,7 +63,8 @@ class Projection:
 # leave only the table look-ups and the contest for the pixel to scalar code. Three habits matter for that, each
 # worth a factor of two to three in its loop: points are indexed flat (4 * i + 1, as the compiler does not know the
 # stride of points[i, 1]), all four values of a point are used (a gap in the loads stops it), and positions are kept
-# unsigned (a signed one costs a test for counting from the end).
+# unsigned (a signed one costs a test for counting from the end). Choosing the points in
+# view stands in both kernels, for as a function of its own it made them 2 to 5 % slower.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

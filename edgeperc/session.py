@@ -46,7 +46,7 @@ PLUGINS = {"openvino": "onnxruntime_ep_openvino", "tensorrt-rtx": "onnxruntime_e
 PRECISIONS = {"fp32": "f32", "bf16": "bf16", "fp16": "f16"}
 # In standard deviations of an output. The same graph in fp32 was seen to differ by 1e-5 between engines; weights of one
 # layer tripled, by 0.5.
-MAX_GOLDEN_DEVIATION = {"fp32": 0.02, "reduced": 0.5}
+MAX_GOLDEN_DEVIATION = {"fp32": 0.02, "bf16": 0.5, "fp16": 0.5}
 # The key of a tensor's external-data entry as protobuf writes it: such a model would read files beside it, or anywhere.
 EXTERNAL_DATA = b"\n\x08location\x12"
 
@@ -150,7 +150,7 @@ class Session:
             raise CardError(f"{self.path}: {exc}") from exc
         self._check_graph()
         self._bind()
-        self.golden_deviation = self._warm_up()
+        self.golden_deviation = self._warm_up(MAX_GOLDEN_DEVIATION[precision])
 
     @staticmethod
     def _choose(provider: str) -> tuple[str, str]:
@@ -266,7 +266,7 @@ class Session:
             raise InferenceError(f"{self.path}: the first run on {self.provider} failed: {exc}") from exc
         return answers
 
-    def _warm_up(self) -> float:
+    def _warm_up(self, limit: float) -> float:
         golden = self.card.golden
         if golden is None:
             self.run()
@@ -286,7 +286,7 @@ class Session:
             here = self.outputs[output.kind].reshape(-1)[np.asarray(known["positions"], np.int64)]
             apart = np.abs(here - np.asarray(known["values"], np.float32)) / max(float(known["std"]), 1e-6)
             deviation = max(deviation, float(np.nanmax(apart)) if np.isfinite(here).all() else float("inf"))
-        if deviation > MAX_GOLDEN_DEVIATION["fp32" if self.provider.endswith("(fp32)") else "reduced"]:
+        if deviation > limit:
             raise CardMismatchError(
                 f"{self.path}: on {self.provider} the golden input gives answers {deviation:.2g} standard deviations "
                 "away from the exporter's; the file or the provider has changed the network"

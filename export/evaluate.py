@@ -15,7 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from edgeperc import Perceiver
-from edgeperc.card import ModelCard
+from edgeperc.card import ModelCard, TopViewGeometry
 from edgeperc.metrics import BoxEvaluator, BoxScores, Confusion
 from edgeperc.perception import Box, Perception
 
@@ -118,11 +118,12 @@ def _judged_boxes(frame: Frame, found: Perception, card: ModelCard) -> tuple[lis
 
 def _on_road(perceive: Perceiver, frames: Iterable[RoadFrame]) -> dict[str, Any]:
     confusion, n_frames = Confusion(("other", "road")), 0
+    view = next(c.view for c in perceive.cards if "drivable" in c.classes)
+    assert isinstance(view, TopViewGeometry)
     for frame in tqdm(frames, desc="SemanticKITTI", leave=False):
         found = perceive(frame.points)
-        card = next(c for c in perceive.cards if "drivable" in c.classes)
         assert found.top_view is not None
-        confusion.update(found.top_view.drivable.astype(np.uint8), frame.top_view(card.view))  # type: ignore[arg-type]
+        confusion.update(found.top_view.drivable.astype(np.uint8), frame.top_view(view))
         n_frames += 1
     precision, recall = float(confusion.precision()[1]), float(confusion.recall()[1])
     return {

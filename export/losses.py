@@ -10,8 +10,9 @@ from torch import Tensor
 
 from edgeperc.card import TopViewGeometry
 
+from .kitti import IGNORE
+
 __all__ = [
-    "IGNORE",
     "cross_entropy",
     "dense_loss",
     "dense_targets",
@@ -21,9 +22,6 @@ __all__ = [
     "slots_loss",
     "ssadnet_loss",
 ]
-
-IGNORE = 255
-"""Label of a pixel that nobody labelled."""
 
 STRIDE = 4
 """Top-view cells along the edge of an output cell of head "dense"."""

@@ -27,8 +27,8 @@ from edgeperc.sensors import get_sensor
 from edgeperc.simulation import TOP_VIEW_CLASSES
 
 from .augment import LabelledScan, augmented
-from .kitti import KittiObjects
-from .losses import IGNORE, dense_targets, pointseg_loss, slot_targets, ssadnet_loss
+from .kitti import IGNORE, KittiObjects
+from .losses import dense_targets, pointseg_loss, slot_targets, ssadnet_loss
 from .networks.pointseg import PointSeg
 from .networks.ssadnet import SSADNet
 from .road import sure_surface
@@ -118,6 +118,8 @@ class Samples:
         if not real and not simulated:
             raise ValueError("no scans to train on; give --kitti, --simulated or both")
         self.recipe, self.real, self.simulated = recipe, real, simulated
+        view = (RANGE_IMAGE, RANGE_IMAGE_INPUT) if recipe.network == "pointseg" else (TOP_VIEW, TOP_VIEW_INPUT)
+        self.projector = make_projector(*view)
         weights = np.asarray(real_weights, np.float64)
         self.real_odds = weights / weights.sum() if len(weights) else weights
         share = recipe.simulated_share if real else 1.0
@@ -138,15 +140,15 @@ class Samples:
         """One input (C, H, W) and its targets."""
         points = np.ascontiguousarray(scan.points, np.float32)
         if self.recipe.network == "pointseg":
-            seen = make_projector(RANGE_IMAGE, RANGE_IMAGE_INPUT).project(points)
+            seen = self.projector.project(points)
             truth = np.where(seen.index >= 0, scan.labels[seen.index], IGNORE).astype(np.uint8)
             return seen.image, truth
-        seen = make_projector(TOP_VIEW, TOP_VIEW_INPUT).project(points)
+        seen = self.projector.project(points)
         truth = scan.top_view_truth(TOP_VIEW)
         vehicles = [b for b in zip(scan.boxes, scan.counts, strict=True) if b[0].label in TOP_VIEW_CLASSES[2:]]
         found, unsure = (
-            np.array([[*b.center, *b.size, b.yaw] for b, n in vehicles if (n >= FEWEST) == seen], np.float64)
-            for seen in (True, False)
+            np.array([[*b.center, *b.size, b.yaw] for b, n in vehicles if (n >= FEWEST) == hit], np.float64)
+            for hit in (True, False)
         )
         if self.recipe.head == "slots":
             boxes = slot_targets(found, TOP_VIEW, N_SLOTS)
