@@ -273,7 +273,7 @@ class ModelCard:
         """
         try:
             document = json.loads(text)
-        except ValueError as exc:
+        except (RecursionError, ValueError) as exc:
             raise CardError(f"the card is no JSON ({exc}); export the model again") from exc
         if not isinstance(document, dict) or not isinstance(document.get("schema"), int):
             raise CardError("the card has no schema number; export the model again")
@@ -284,7 +284,7 @@ class ModelCard:
             )
         try:
             return _card(document)
-        except (KeyError, TypeError, ValueError, AttributeError) as exc:
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as exc:
             raise CardError(f"the card is malformed: {type(exc).__name__} {exc}; export the model again") from exc
 
 
@@ -323,7 +323,8 @@ def _card(document: dict[str, Any]) -> ModelCard:
         classes=tuple(str(c) for c in document["classes"]),
         box_classes=tuple(str(c) for c in document["box_classes"]),
         box_size_priors={
-            str(c): (float(s[0]), float(s[1]), float(s[2])) for c, s in document["box_size_priors"].items()
+            str(c): (float(length), float(width), float(height))
+            for c, (length, width, height) in document["box_size_priors"].items()
         },
         score_threshold=float(document["score_threshold"]),
         nms_iou=float(document["nms_iou"]),

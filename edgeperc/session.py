@@ -283,8 +283,13 @@ class Session:
             known = golden.outputs.get(output.name)
             if known is None:
                 raise CardMismatchError(f"{self.path}: the card's golden record lacks output {output.name!r}")
-            here = self.outputs[output.kind].reshape(-1)[np.asarray(known["positions"], np.int64)]
-            apart = np.abs(here - np.asarray(known["values"], np.float32)) / max(float(known["std"]), 1e-6)
+            try:
+                here = self.outputs[output.kind].reshape(-1)[np.asarray(known["positions"], np.int64)]
+                apart = np.abs(here - np.asarray(known["values"], np.float32)) / max(float(known["std"]), 1e-6)
+            except (ArithmeticError, LookupError, TypeError, ValueError) as exc:
+                raise CardError(
+                    f"{self.path}: the card's golden record of {output.name!r} is malformed: {exc}"
+                ) from exc
             deviation = max(deviation, float(np.nanmax(apart)) if np.isfinite(here).all() else float("inf"))
         if deviation > limit:
             raise CardMismatchError(

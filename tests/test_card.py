@@ -76,6 +76,9 @@ def test_no_key_is_defaulted(key: str) -> None:
         ({"box_classes": []}, "without box_classes"),
         ({"box_classes": ["tram"]}, "tram"),
         ({"score_threshold": 1.5}, "score_threshold"),
+        ({"box_size_priors": {"car": []}}, "malformed"),
+        ({"box_size_priors": {"car": [1, 2, 3, 4]}}, "malformed"),
+        ({"golden": {"seed": float("inf"), "input_sha256": "", "outputs": {}}}, "malformed"),
         ({"view": {"kind": "sphere"}}, "'sphere'.*top_view"),
         ({"view": 3}, "malformed"),
         ({"input": {"name": "x", "channels": ["colour"], "mean": [0], "std": [1]}}, "colour"),
@@ -119,6 +122,11 @@ json_values = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
     max_leaves=6,
 )
+
+
+def test_a_bottomless_card_is_a_card_error() -> None:
+    with pytest.raises(CardError, match="no JSON"):
+        ModelCard.from_json("[" * 200_000)
 
 
 @given(st.text() | json_values.map(json.dumps))

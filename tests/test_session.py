@@ -99,6 +99,12 @@ def test_swapped_outputs(tmp_path: Path) -> None:
         Session(path, "cpu")
 
 
+def test_a_golden_record_that_is_none(tmp_path: Path) -> None:
+    path = edited(tmp_path, "pointseg", (b'"positions":', b'"positionz":'))
+    with pytest.raises(CardError, match="golden record of 'logits' is malformed: 'positions'"):
+        Session(path, "cpu")
+
+
 def test_another_name_than_the_graphs(tmp_path: Path) -> None:
     path = edited(tmp_path, "pointseg", (b'"name":"range_image"', b'"name":"range_imagE"'))
     with pytest.raises(CardMismatchError, match=r"card names input 'range_imagE', the graph has \['range_image'\]"):
