@@ -31,6 +31,7 @@ from .errors import (
     PointsError,
     ProviderError,
     SensorError,
+    SplitError,
 )
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ __all__ = [
     "ProviderError",
     "SensorError",
     "SensorProfile",
+    "SplitError",
     "TopView",
     "__version__",
     "read_points",

@@ -1,4 +1,4 @@
-"""The ``edgeperc`` command: ``demo``, ``run`` and ``info``.
+"""The ``edgeperc`` command: ``demo``, ``run``, ``info`` and ``eval``.
 
 Exit codes: 0 all is well, 1 some scans failed (each is reported, the others are done), 2 nothing could be done
 (usage, model, provider, a missing extra), 130 interrupted, 141 the reader of the output went away.
@@ -12,6 +12,7 @@ import json
 import math
 import os
 import re
+import shlex
 import sys
 import time
 import warnings
@@ -50,7 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     code : int
         The exit code; wrong usage leaves by argparse's ``SystemExit(2)``.
     """
-    arguments = _parser().parse_args(argv)
+    words = sys.argv[1:] if argv is None else list(argv)
+    arguments = _parser().parse_args(words, argparse.Namespace(typed=shlex.join(["edgeperc", *words])))
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names need not fit the terminal's encoding
     try:
@@ -126,6 +128,31 @@ def _parser() -> argparse.ArgumentParser:
     info.add_argument("things", nargs="+", metavar="MODEL|SCAN", help="a shipped model's name, an .onnx, or a scan")
     info.add_argument("--json", action="store_true", help="print a model's card as it is, one line of JSON a model")
     info.set_defaults(command=_info)
+
+    judge = commands.add_parser(
+        "eval",
+        help="the papers' figures on labelled scans",
+        description="Hold what models say of labelled scans against the truth: points, boxes, top view and road, over "
+        "all distances and by range, with 95 % intervals over drives.",
+    )
+    judge.add_argument(
+        "datasets",
+        nargs="+",
+        metavar="DATASET",
+        help="the root of a KITTI object set or of SemanticKITTI, or simulation:N for N simulated scans (default: 24)",
+    )
+    judge.add_argument("--model", action="append", metavar="NAME", help="as in run")
+    judge.add_argument(
+        "--split", choices=("test", "train", "all"), help="which drives (default: test, or those of --fold)"
+    )
+    judge.add_argument("--fold", type=int, choices=(0, 1, 2), help="the drives held back by this fold of the training")
+    judge.add_argument(
+        "--road-by", metavar="NAME", help="another top-view model whose drivable cells count as true on KITTI"
+    )
+    judge.add_argument("--json", type=Path, metavar="FILE", help="every figure, also those without a table")
+    judge.add_argument("--worst", type=Path, metavar="PNG", help="a picture of the scans with most mistakes")
+    judge.add_argument("--provider", default="cpu", metavar="P", help="as in run (default: cpu)")
+    judge.set_defaults(command=_eval)
     return parser
 
 
@@ -558,3 +585,131 @@ def _scan_rows(path: Path, sensor_name: str) -> list[tuple[str, str]]:
         if not found:
             rows.append((name, f"suits this scan, taken as one of {sensor.name}"))
     return rows
+
+
+# eval
+
+
+def _eval(arguments: argparse.Namespace) -> int:
+    if arguments.worst is not None:
+        _require_matplotlib()
+    for file in filter(None, (arguments.json, arguments.worst)):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    from .evaluate import evaluate
+
+    progress: list[_Progress] = []
+
+    def on_scan(done: int, total: int) -> None:
+        progress[:] = progress or [_Progress(total)]
+        progress[0].show(done)
+
+    figures, mistakes = evaluate(
+        arguments.datasets,
+        arguments.model or SHIPPED,
+        split=arguments.split,
+        fold=arguments.fold,
+        road_by=arguments.road_by,
+        provider=arguments.provider,
+        on_scan=on_scan,
+    )
+    for bar in progress:
+        bar.clear()
+    print("\n".join(_figure_lines(figures)))
+    if arguments.json is not None:
+        text = json.dumps({"command": arguments.typed, **figures}, indent=1, allow_nan=False)
+        arguments.json.write_text(text + "\n", encoding="utf-8")
+    if arguments.worst is not None:
+        from .view import draw_mistakes
+
+        models = ", ".join(f"{name} {version}" for name, version in figures["models"].items())
+        draw_mistakes(mistakes, arguments.worst, title=f"the {len(mistakes)} scans with most mistakes: {models}")
+    return 0
+
+
+# Columns of the tables: heading and key. Shares are printed in per cent.
+_RATES = (("precision", "precision"), ("recall", "recall"))
+_POINT_COLUMNS = (*_RATES, ("IoU", "iou"), ("95 %", "iou_interval"), ("points", "n_points"), ("objects", "n_objects"))
+_BOX_COLUMNS = (
+    *(("AP50", "ap"), ("95 %", "ap_interval"), *_RATES, ("mIoU@.5", "mean_iou_50"), ("mIoU@.7", "mean_iou_70")),
+    *(("true", "n_truth"), ("predicted", "n_predicted"), ("hits", "n_hits")),
+)
+_MAP_COLUMNS = (("ACC", "accuracy"), ("mAP", "mean_ap"), ("mIoU", "mean_iou"), ("95 %", "mean_iou_interval"))
+_ROAD_COLUMNS = (
+    *(("IoU", "iou"), ("PRE", "precision"), ("REC", "recall"), ("F1", "f1"), ("95 %", "f1_interval")),
+    *(("ACC", "accuracy"), ("MaxF", "max_f1"), ("AP", "ap"), ("cells", "n_cells")),
+)
+_BLOCKS = {"real": "real scans with boxes", "semantickitti": "SemanticKITTI", "simulated": "simulated scans"}
+
+
+def _figure_lines(figures: Mapping[str, Any]) -> list[str]:
+    models = ", ".join(f"{name} {version}" for name, version in figures["models"].items())
+    fold = "" if figures["fold"] is None else f", fold {figures['fold']}"
+    lines = [f"{models}; {figures['split']} drives{fold}; shares in per cent, intervals over drives"]
+    for block, name in _BLOCKS.items():
+        if block not in figures:
+            continue
+        told = figures[block]
+        lines += ["", f"== {name}: {_many(told['n_frames'], 'scan')}, {_many(told['n_drives'], 'drive')} =="]
+        for kind, title in (("points", "points"), ("pixels", "points, each as its pixel, unrefined")):
+            lines += _table(title, _POINT_COLUMNS, _class_rows(told.get(kind, {}), "n_points"))
+        for kind, of_kind in told.get("boxes", {}).items():
+            means = {
+                band: {"mean": {"ap": rows["mean_ap"], "ap_interval": rows.get("mean_ap_interval")}}
+                for band, rows in of_kind.items()
+                if rows["mean_ap"] is not None
+            }
+            rows = [*_class_rows(of_kind, "n_truth"), *_class_rows(means, "ap")]
+            lines += _table(f"boxes, {kind}", _BOX_COLUMNS, sorted(rows, key=lambda row: [*of_kind].index(row[0][0])))
+        for kind, of_kind in told.get("segmentation", {}).items():
+            names = next(iter(of_kind.values()))["iou"]
+            columns = (*_MAP_COLUMNS, *((name, name) for name in names), ("cells", "n_cells"))
+            rows = [((band, ""), {**row, **row["iou"]}) for band, row in of_kind.items() if row["n_cells"]]
+            lines += _table(f"top view, {kind}; the classes' columns are IoU", columns, rows)
+        rows = [((band, ""), row) for band, row in told.get("road", {}).items() if row["n_cells"]]
+        lines += _table("road", _ROAD_COLUMNS, rows)
+    return lines
+
+
+def _many(n: int, noun: str) -> str:
+    return f"{n:,} {noun}{'s' * (n != 1)}"
+
+
+def _class_rows(bands: Mapping[str, Any], count: str) -> list[tuple[tuple[str, str], Mapping[str, Any]]]:
+    """A row a class and band, of those with anything to tell."""
+    return [
+        ((band, name), row)
+        for band, rows in bands.items()
+        for name, row in rows.items()
+        if isinstance(row, Mapping) and (row[count] or row.get("n_predicted"))
+    ]
+
+
+def _table(
+    title: str, columns: Sequence[tuple[str, str]], rows: Sequence[tuple[tuple[str, str], Mapping[str, Any]]]
+) -> list[str]:
+    if not rows:
+        return []
+    cells = [["", "", *(heading for heading, _ in columns)]]
+    cells += [[*names, *(_cell(row.get(key)) for _, key in columns)] for names, row in rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for k in range(len(cells) - 1, 1, -1):
+        if cells[k][0] == cells[k - 1][0]:
+            cells[k][0] = ""
+    lines = []
+    for cell in cells:
+        left = "  ".join(text.ljust(width) for text, width in zip(cell[:2], widths[:2], strict=True))
+        right = "  ".join(text.rjust(width) for text, width in zip(cell[2:], widths[2:], strict=True))
+        lines.append(f"  {left}  {right}".rstrip())
+    return ["", title, *lines]
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, list):
+        return "-".join(f"{100.0 * bound:.1f}" for bound in value)
+    return f"{100.0 * value:.1f}" if isinstance(value, float) else f"{value:,}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

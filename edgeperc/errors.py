@@ -5,6 +5,7 @@
     EdgepercError
     ├── PointsError (ValueError)      an array or a sensor file that is no scan
     ├── SensorError (ValueError)      an unknown or impossible sensor profile
+    ├── SplitError (ValueError)       a model is to be judged by a scan that it was trained on
     ├── FitnessError                  a scan unlike those a model was trained on, and on_mismatch="raise"
     ├── ModelError
     │   ├── ModelFileError            missing, or onnxruntime cannot open it
@@ -31,6 +32,7 @@ __all__ = [
     "PointsError",
     "ProviderError",
     "SensorError",
+    "SplitError",
 ]
 
 
@@ -44,6 +46,10 @@ class PointsError(EdgepercError, ValueError):
 
 class SensorError(EdgepercError, ValueError):
     """A sensor profile is unknown or describes no possible sensor."""
+
+
+class SplitError(EdgepercError, ValueError):
+    """A model is to be judged by a scan that it was trained on."""
 
 
 class FitnessError(EdgepercError):

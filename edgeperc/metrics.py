@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +13,9 @@ from .errors import PointsError
 from .geometry import bounding_rectangles, oriented_iou
 from .perception import Box
 
-__all__ = ["BoxEvaluator", "BoxScores", "Confusion", "average_precision"]
+__all__ = ["BoxEvaluator", "BoxScores", "Confusion", "ProbabilitySweep", "average_precision"]
+
+EVERYWHERE = (0.0, math.inf)
 
 
 class Confusion:
@@ -62,6 +65,21 @@ class Confusion:
                     f"got {name} labels from {labels.min()} to {labels.max()}; expected 0..{n - 1} ({n} classes)"
                 )
         self.counts += np.bincount(right * n + guess, minlength=n * n).reshape(n, n)
+
+    def __add__(self, other: Confusion) -> Confusion:
+        """What counting both one's labels and the other's would have given."""
+        if (self.classes, self.ignore) != (other.classes, other.ignore):
+            raise PointsError(f"got counts of {self.classes} and of {other.classes}; expected the same classes")
+        both = Confusion(self.classes, ignore=self.ignore)
+        both.counts = self.counts + other.counts
+        return both
+
+    def merged(self, groups: Mapping[str, Sequence[str]]) -> Confusion:
+        """Counts of coarser classes: each key stands for the classes it lists. Classes listed nowhere are left out."""
+        member = np.array([[name in group for name in self.classes] for group in groups.values()], dtype=np.int64)
+        coarse = Confusion(tuple(groups), ignore=self.ignore)
+        coarse.counts = member @ self.counts @ member.T
+        return coarse
 
     def precision(self) -> NDArray[np.float64]:
         """Share of what was predicted as a class that is one, (C,): P of PointSeg 5.1, equation A3 of SSADNet."""
@@ -118,11 +136,74 @@ def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float
         raise PointsError(f"got scores {values.shape} and hits {right.shape}; expected two lists of one length")
     if n_truth == 0:
         return float("nan")
-    found = np.cumsum(right[np.argsort(-values, kind="stable")])
-    precision = found / np.arange(1, len(found) + 1)
+    found = np.cumsum(right[np.argsort(-values, kind="stable")], dtype=np.int64)
+    return _eleven_points(found, np.arange(1, len(found) + 1), n_truth)
+
+
+def _eleven_points(found: NDArray[np.int64], predicted: NDArray[np.int64], n_truth: int) -> float:
+    """Mean of the best precision at recalls 0, 0.1 .. 1, from both counts at ever lower thresholds."""
+    best_from_here = np.maximum.accumulate((found / np.maximum(predicted, 1))[::-1])[::-1]
     # Whole numbers: 0.1 * 3 is not 0.3, and a recall of just 3 in 10 must reach it.
-    best = [np.max(precision[found * 10 >= step * n_truth], initial=0.0) for step in range(11)]
-    return float(np.mean(best))
+    reached = np.searchsorted(found * 10, np.arange(11) * n_truth)
+    return float(np.append(best_from_here, 0.0)[reached].mean())
+
+
+class ProbabilitySweep:
+    """How right one class is at every threshold of its probability, over any number of images (KITTI road, LoDNN).
+
+    Attributes
+    ----------
+    counts : (2, 256) int64
+        Of what is not of the class, and of what is, by probability in steps of 1/255.
+    """
+
+    def __init__(self) -> None:
+        self.counts = np.zeros((2, 256), dtype=np.int64)
+
+    def update(self, probability: ArrayLike, truth: ArrayLike) -> None:
+        """Count one image.
+
+        Parameters
+        ----------
+        probability : array_like of float
+            Of the class, in 0..1.
+        truth : array_like of bool
+            Of the same shape. Leave out whatever is not to be judged.
+
+        Raises
+        ------
+        PointsError
+            Shapes disagree, or a probability is none.
+        """
+        values, right = np.asarray(probability, dtype=np.float64), np.asarray(truth, dtype=np.bool_)
+        if values.shape != right.shape or not ((values >= 0.0) & (values <= 1.0)).all():
+            raise PointsError(
+                f"got probabilities {values.shape} and truth {right.shape}; expected one shape, and all in 0..1"
+            )
+        level = np.rint(values * 255.0).astype(np.int64)
+        self.counts += np.bincount((right * 256 + level).ravel(), minlength=512).reshape(2, 256)
+
+    def __add__(self, other: ProbabilitySweep) -> ProbabilitySweep:
+        """What counting both one's images and the other's would have given."""
+        both = ProbabilitySweep()
+        both.counts = self.counts + other.counts
+        return both
+
+    def max_f1(self) -> float:
+        """Best F1 over the thresholds (KITTI road's MaxF); NaN where there was nothing of the class."""
+        found, predicted = self._above()
+        n_truth = self.counts[1].sum()
+        return float(np.max(2.0 * found / (predicted + n_truth))) if n_truth else float("nan")
+
+    def average_precision(self) -> float:
+        """Mean of the best precision at recalls 0, 0.1 .. 1; NaN where there was nothing of the class."""
+        n_truth = int(self.counts[1].sum())
+        return _eleven_points(*self._above(), n_truth) if n_truth else float("nan")
+
+    def _above(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """What is rightly, and what is at all, taken for the class at each threshold, from the highest down."""
+        found = np.cumsum(self.counts[1, ::-1])
+        return found, np.cumsum(self.counts.sum(axis=0)[::-1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +237,16 @@ class BoxScores:
 class _Matches:
     scores: list[float] = field(default_factory=list)
     overlaps: list[float] = field(default_factory=list)  # with the truth that the box was matched to; 0 for none
-    n_truth: int = 0
+    ranges_m: list[float] = field(default_factory=list)  # of that truth from the sensor; of the box itself for none
+    truth_m: list[float] = field(default_factory=list)
+
+    def __add__(self, other: _Matches) -> _Matches:
+        return _Matches(
+            self.scores + other.scores,
+            self.overlaps + other.overlaps,
+            self.ranges_m + other.ranges_m,
+            self.truth_m + other.truth_m,
+        )
 
 
 class BoxEvaluator:
@@ -195,7 +285,7 @@ class BoxEvaluator:
         *,
         ignored: Iterable[Box] = (),
         ignored_regions: ArrayLike = (),
-    ) -> None:
+    ) -> list[tuple[Box | None, Box | None]]:
         """Count the boxes of one scan.
 
         Parameters
@@ -206,6 +296,12 @@ class BoxEvaluator:
             predictions of any class.
         ignored_regions : (r, 5) array_like
             x, y, length, width [m], yaw [rad] of ground where nothing is known.
+
+        Returns
+        -------
+        list of (Box or None, Box or None)
+            Predictions and the truth each was matched to, whatever their classes; None beside a wrong prediction and
+            beside a truth that was missed. Excused predictions are left out.
         """
         guesses = sorted(predicted, key=lambda box: -box.score)
         rights, spares = list(truth), list(ignored)
@@ -216,55 +312,92 @@ class BoxEvaluator:
             matches = self._classes.setdefault(label, _Matches())
             rows = [i for i, box in enumerate(guesses) if box.label == label]
             columns = [j for j, box in enumerate(rights) if box.label == label]
-            self._match(matches, [guesses[i] for i in rows], overlap[np.ix_(rows, columns)], excused[rows])
-        self._match(self._all, guesses, overlap, excused)
+            of_class = [guesses[i] for i in rows], [rights[j] for j in columns]
+            self._match(matches, *of_class, overlap[np.ix_(rows, columns)], excused[rows])
+        return self._match(self._all, guesses, rights, overlap, excused)
 
-    def per_class(self) -> dict[str, BoxScores]:
-        """Scores of every class seen so far, each compared with its own kind only."""
-        return {label: self._scores(matches) for label, matches in self._classes.items()}
+    def __add__(self, other: BoxEvaluator) -> BoxEvaluator:
+        """What updating with one's scans and then with the other's would have given."""
+        if (self.iou_threshold, self.oriented) != (other.iou_threshold, other.oriented):
+            raise PointsError(
+                f"got boxes matched at {self.iou_threshold} (oriented: {self.oriented}) and at {other.iou_threshold} "
+                f"(oriented: {other.oriented}); expected the same"
+            )
+        both = BoxEvaluator(self.iou_threshold, oriented=self.oriented)
+        for label in dict.fromkeys((*self._classes, *other._classes)):
+            both._classes[label] = self._classes.get(label, _Matches()) + other._classes.get(label, _Matches())
+        both._all = self._all + other._all
+        return both
 
-    def overall(self) -> BoxScores:
+    def per_class(self, within_m: tuple[float, float] = EVERYWHERE) -> dict[str, BoxScores]:
+        """Scores of every class seen so far, each compared with its own kind only.
+
+        ``within_m`` keeps the truth from the nearer up to the farther distance from the sensor [m], seen from above,
+        the predictions that were matched to such truth, and the wrong predictions whose own centre lies there.
+        """
+        return {label: self._scores(matches, within_m) for label, matches in self._classes.items()}
+
+    def overall(self, within_m: tuple[float, float] = EVERYWHERE) -> BoxScores:
         """Scores of all boxes, whatever their classes."""
-        return self._scores(self._all)
+        return self._scores(self._all, within_m)
 
-    def mean_ap(self) -> float:
+    def mean_ap(self, within_m: tuple[float, float] = EVERYWHERE) -> float:
         """Mean AP over the classes that there were to find (SSADNet appendix A, mAP)."""
-        return _mean(np.array([scores.ap for scores in self.per_class().values()]))
+        return _mean(np.array([scores.ap for scores in self.per_class(within_m).values()]))
 
     def _rectangles(self, boxes: list[Box]) -> NDArray[np.float64]:
         rectangles = _rectangles(boxes)
         return rectangles if self.oriented else bounding_rectangles(rectangles)
 
     def _match(
-        self, matches: _Matches, guesses: list[Box], overlap: NDArray[np.float64], excused: NDArray[np.bool_]
-    ) -> None:
+        self,
+        matches: _Matches,
+        guesses: list[Box],
+        rights: list[Box],
+        overlap: NDArray[np.float64],
+        excused: NDArray[np.bool_],
+    ) -> list[tuple[Box | None, Box | None]]:
         free = overlap.copy()
-        matches.n_truth += free.shape[1]
+        missed = dict(enumerate(rights))
+        pairs: list[tuple[Box | None, Box | None]] = []
+        matches.truth_m += [_range_m(box) for box in rights]
         for i, box in enumerate(guesses):
-            best = int(np.argmax(free[i])) if free.shape[1] else -1
+            best = int(np.argmax(free[i])) if rights else -1
             if best >= 0 and free[i, best] >= self.iou_threshold:
                 matches.overlaps.append(float(free[i, best]))
                 free[:, best] = -1.0
+                pairs.append((box, missed.pop(best)))
             elif excused[i]:
                 continue
             else:
                 matches.overlaps.append(0.0)
+                pairs.append((box, None))
             matches.scores.append(box.score)
+            matches.ranges_m.append(_range_m(pairs[-1][1] or box))
+        return [*pairs, *((None, box) for box in missed.values())]
 
-    def _scores(self, matches: _Matches) -> BoxScores:
-        overlaps = np.array(matches.overlaps)
+    def _scores(self, matches: _Matches, within_m: tuple[float, float]) -> BoxScores:
+        near, far = within_m
+        ranges_m, truth_m = np.array(matches.ranges_m), np.array(matches.truth_m)
+        kept = (ranges_m >= near) & (ranges_m < far)
+        scores, overlaps = np.array(matches.scores)[kept], np.array(matches.overlaps)[kept]
+        n_truth = int(np.count_nonzero((truth_m >= near) & (truth_m < far)))
         hits = overlaps >= self.iou_threshold
         n_hits = int(np.count_nonzero(hits))
         return BoxScores(
-            ap=average_precision(matches.scores, hits, matches.n_truth),
+            ap=average_precision(scores, hits, n_truth),
             precision=float(_share(n_hits, len(hits))),
-            recall=float(_share(n_hits, matches.n_truth)),
+            recall=float(_share(n_hits, n_truth)),
             mean_iou_50=_mean(overlaps[overlaps >= max(0.5, self.iou_threshold)]),
             mean_iou_70=_mean(overlaps[overlaps >= max(0.7, self.iou_threshold)]),
-            n_truth=matches.n_truth,
+            n_truth=n_truth,
             n_predicted=len(hits),
             n_hits=n_hits,
         )
+
+
+def _range_m(box: Box) -> float:
+    return math.hypot(box.center[0], box.center[1])
 
 
 def _rectangles(boxes: list[Box]) -> NDArray[np.float64]:

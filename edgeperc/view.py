@@ -1,7 +1,7 @@
 """Pictures of a perception, and files that other viewers read.
 
-`draw` needs the extra ``view``; `write_html`, `write_ply` and `write_labels` need numpy alone. One set of colours
-serves them all.
+`draw` and `draw_mistakes` need the extra ``view``; `write_html`, `write_ply` and `write_labels` need numpy alone. One
+set of colours serves them all.
 """
 
 from __future__ import annotations
@@ -13,6 +13,9 @@ import json
 import math
 import os
 import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +25,16 @@ from numpy.typing import NDArray
 from .errors import MissingExtraError, PointsError
 from .perception import Box, Perception
 
-__all__ = ["CLASS_COLOURS", "SEMANTICKITTI_IDS", "draw", "write_html", "write_labels", "write_ply"]
+__all__ = [
+    "CLASS_COLOURS",
+    "SEMANTICKITTI_IDS",
+    "Mistakes",
+    "draw",
+    "draw_mistakes",
+    "write_html",
+    "write_labels",
+    "write_ply",
+]
 
 # Okabe and Ito's palette: tells the classes apart for colour-blind readers too, and stays clear on dark ground.
 CLASS_COLOURS = {
@@ -52,6 +64,58 @@ _INK, _FAINT, _PANEL, _GROUND = "#e8edf2", "#8b98a7", "#0b0f14", "#131920"
 _AMBER = "#ffc46b"
 # From the ground up (height) and from near to far (range): dim and cool, so that the classes stand out.
 _LOW, _HIGH = "#3a5067", "#c3d0dd"
+_FOUND, _MISSED, _FALSE = "#00b98a", "#ff5c5c", "#ffa928"
+
+
+@dataclass(frozen=True, eq=False)
+class Mistakes:
+    """A scan held against its truth, to be drawn.
+
+    Attributes
+    ----------
+    name, drive : str
+    points : (n, 4) float32
+        Those to be drawn.
+    wrong : (n,) uint8
+        1 where a point of an object was not labelled as its class, 2 where a point of none was labelled as one.
+    found : tuple of Box
+        True boxes that were found.
+    missed : tuple of (Box, int)
+        True boxes that were not, and the points in each.
+    false : tuple of Box
+        Predicted boxes where there is nothing.
+    wrong_share : float
+        Wrong points, of those that belong to objects or were said to.
+    """
+
+    name: str
+    drive: str
+    points: NDArray[np.float32]
+    wrong: NDArray[np.uint8]
+    found: tuple[Box, ...] = ()
+    missed: tuple[tuple[Box, int], ...] = ()
+    false: tuple[Box, ...] = ()
+    wrong_share: float = 0.0
+
+    @property
+    def n_errors(self) -> float:
+        """Boxes missed and boxes made up; among equals, scans with more wrong points come first."""
+        return len(self.missed) + len(self.false) + self.wrong_share
+
+    @property
+    def words(self) -> str:
+        """Such as ``"missed: 2 car, 1 cyclist (340 points); false: 1 car"``."""
+
+        def listed(boxes: Sequence[Box]) -> str:
+            return ", ".join(f"{n} {label}" for label, n in Counter(box.label for box in boxes).most_common())
+
+        told = []
+        if self.missed:
+            n_points = sum(n for _, n in self.missed)
+            told.append(f"missed: {listed([box for box, _ in self.missed])} ({n_points:,} points)")
+        if self.false:
+            told.append(f"false: {listed(self.false)}")
+        return "; ".join(told) or "no box missed or false"
 
 
 def draw(
@@ -114,6 +178,94 @@ def draw(
     if path is not None:
         _write(path, stream.getvalue())
     return stream.getvalue()
+
+
+def draw_mistakes(
+    scans: Sequence[Mistakes], path: str | Path | None = None, *, title: str = "", columns: int = 5
+) -> bytes:
+    """Draw scans from above with what was found, missed and made up, a panel a scan.
+
+    Parameters
+    ----------
+    scans : sequence of Mistakes
+    path : str or Path, optional
+        Where to write the picture as well; an existing file is replaced whole.
+    title : str
+    columns : int
+
+    Returns
+    -------
+    png : bytes
+
+    Raises
+    ------
+    MissingExtraError
+        matplotlib is not installed.
+    OSError
+        The file cannot be written.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as exc:
+        raise MissingExtraError("matplotlib", "view", "Drawing a picture") from exc
+    columns = max(1, min(columns, len(scans)))
+    rows = max(1, -(-len(scans) // columns))
+    width, height, head = 470, 520, 80
+    size = columns * width, rows * height + head
+    figure = Figure(figsize=(size[0] / 100.0, size[1] / 100.0), dpi=100, facecolor=_GROUND)
+    canvas: Any = FigureCanvasAgg(figure)
+    _say(figure, 14 / size[0], 1.0 - 26 / size[1], title, fontsize=15.0, fontweight="bold", va="center")
+    at = 14.0
+    for colour, words in ((_FOUND, "found"), (_MISSED, "missed"), (_FALSE, "false")):
+        for text, style in (("■", {"color": colour, "fontsize": 15.0}), (words, {"color": _FAINT, "fontsize": 12.0})):
+            end = _say(figure, at / size[0], 1.0 - 58 / size[1], text, va="center", **style).get_window_extent().x1
+            at = float(end) + 8.0
+        at += 14.0
+    for k, scan in enumerate(scans):
+        left, top = k % columns * width + 8, k // columns * height + head + 48
+        place = left / size[0], 1.0 - (top + height - 56) / size[1], (width - 16) / size[0], (height - 56) / size[1]
+        axes = figure.add_axes(place)
+        _draw_mistakes_of(axes, scan)
+        words = scan.words if len(scan.words) <= 66 else f"{scan.words[:65]}…"
+        _say(axes, 0.0, 1.055, f"{scan.name}  {scan.drive}", transform=axes.transAxes, fontweight="bold")
+        _say(axes, 0.0, 1.015, words, transform=axes.transAxes, color=_FAINT, fontsize=9.5)
+    stream = io.BytesIO()
+    canvas.print_png(stream)
+    if path is not None:
+        _write(path, stream.getvalue())
+    return stream.getvalue()
+
+
+def _draw_mistakes_of(axes: Any, scan: Mistakes) -> None:
+    from matplotlib.patches import Polygon
+
+    axes.set_facecolor(_PANEL)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.set_xlim(26.0, -26.0)  # left is left
+    axes.set_ylim(-1.5, 51.5)
+    for spine in axes.spines.values():
+        spine.set_color("#2a343f")
+    for ring in (15.0, 30.0, 46.0):
+        turn = np.linspace(-math.pi / 2.0, math.pi / 2.0, 90)
+        axes.plot(ring * np.sin(turn), ring * np.cos(turn), color=_INK, alpha=0.16, linewidth=0.8)
+        _say(axes, -0.5 * ring, 0.87 * ring, f"{ring:.0f} m", color=_FAINT, fontsize=7.5, ha="right", va="bottom")
+    for kind, colour, dot, alpha in ((0, "#66737f", 0.5, 0.6), (2, _FALSE, 2.5, 0.9), (1, _MISSED, 2.5, 0.9)):
+        kept = scan.points[scan.wrong == kind]
+        axes.scatter(kept[:, 1], kept[:, 0], s=dot, c=colour, alpha=alpha, linewidths=0, zorder=2 + (kind > 0))
+    boxes = [(box, _FOUND, "-", "") for box in scan.found] + [(box, _FALSE, "--", box.label) for box in scan.false]
+    boxes += [(box, _MISSED, "-", f"{box.label} {n}") for box, n in scan.missed]
+    taken: list[Any] = []
+    for box, colour, line, words in boxes:
+        footprint = box.corners()[:, ::-1]
+        style = {"edgecolor": colour, "linestyle": line, "linewidth": 1.6, "zorder": 5}
+        axes.add_patch(Polygon(footprint, closed=True, fill=False, **style))
+        if words:
+            above = footprint[:, 1].max() + 0.5
+            text = _say(axes, box.center[1], above, words, color=colour, fontsize=8.5, ha="center", zorder=6)
+            text.set(va="bottom", clip_on=True, fontweight="bold")
+            _lift_clear(text, taken, 0.5)
 
 
 def write_html(points: NDArray[np.float32], perception: Perception, path: str | Path, *, title: str = "") -> None:

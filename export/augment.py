@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,13 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc.card import TopViewGeometry
+from edgeperc.datasets import IGNORE, POINT_CLASS_OF, Frame, inside, labels_by_boxes
 from edgeperc.perception import Box
 from edgeperc.simulation import SimulatedScan, draw_vehicles
 
-from .kitti import IGNORE, Frame, inside
-
 # The ground is kept wider and coarser than the network sees it, so that a turned scan still has truth everywhere.
 SURFACE = TopViewGeometry(x_range_m=(-50.0, 50.0), y_range_m=(-50.0, 50.0), cell_m=0.2)
+RARE = ("pedestrian", "cyclist")
+PASTE_AZIMUTHS = (-0.65, 0.65)
+FEWEST_PASTED = 5
 CAMERA_AZIMUTHS = (-0.70, 0.69)  # KITTI's left colour camera sees 41.2 degrees to the right and 40.2 to the left
 
 
@@ -67,7 +69,7 @@ class LabelledScan:
         """A simulated scan: everything about it is known."""
         surface = scan.top_view_labels(SURFACE)
         surface = np.where(surface == 1, 1, np.where(surface >= 2, IGNORE, 0)).astype(np.uint8)
-        return cls(scan.points, scan.labels, scan.boxes, scan.box_points, surface)
+        return cls(scan.points, labels_by_boxes(scan), scan.boxes, scan.box_points, surface)
 
     def save(self, path: Path) -> None:
         """Write to an .npz, without pickles."""
@@ -126,18 +128,7 @@ def turned(scan: LabelledScan, angle: float) -> LabelledScan:
     points = scan.points.copy()
     points[:, 0] = cos * scan.points[:, 0] - sin * scan.points[:, 1]
     points[:, 1] = sin * scan.points[:, 0] + cos * scan.points[:, 1]
-    boxes = tuple(
-        replace(
-            b,
-            center=(
-                float(cos * b.center[0] - sin * b.center[1]),
-                float(sin * b.center[0] + cos * b.center[1]),
-                b.center[2],
-            ),
-            yaw=b.yaw + angle,
-        )
-        for b in scan.boxes
-    )
+    boxes = tuple(_turned_box(b, angle) for b in scan.boxes)
     low, high = scan.azimuths
     full = high - low >= 2.0 * np.pi
     azimuths = (low, high) if full else (low + angle, high + angle)
@@ -152,17 +143,208 @@ def mirrored(scan: LabelledScan) -> LabelledScan:
     return replace(scan, points=points, boxes=boxes, azimuths=(-high, -low), mirrored=not scan.mirrored)
 
 
-def augmented(scan: LabelledScan, rng: np.random.Generator) -> LabelledScan:
+@dataclass(frozen=True)
+class ObjectBank:
+    """Objects cut out of labelled scans, to be pasted into others (GT sampling of SECOND; Yan et al., 2018).
+
+    Attributes
+    ----------
+    objects : dict of str to list of (Box, (n, 4) float32)
+        By the box's label.
+    """
+
+    objects: dict[str, list[tuple[Box, NDArray[np.float32]]]]
+
+    @classmethod
+    def of(cls, scans: Iterable[LabelledScan], fewest: int = 8) -> ObjectBank:
+        """Everything with ``fewest`` returns and more."""
+        objects: dict[str, list[tuple[Box, NDArray[np.float32]]]] = {}
+        for scan in scans:
+            for box, count in zip(scan.boxes, scan.counts, strict=True):
+                name = "pedestrian" if box.label == "person_sitting" else box.label
+                if name not in POINT_CLASS_OF or count < fewest or np.hypot(*box.center[:2]) > 60.0:
+                    continue
+                points = scan.points[inside(box, scan.points)]
+                if len(points) >= fewest:
+                    objects.setdefault(name, []).append((box, points))
+        return cls(objects)
+
+
+def pasted(
+    scan: LabelledScan, bank: ObjectBank, rng: np.random.Generator, n: int, odds: Mapping[str, float]
+) -> LabelledScan:
+    """The scan with up to ``n`` objects of the bank standing in it, their kinds drawn by ``odds``.
+
+    An object keeps its distance, so that its returns stay as dense as the sensor would see them, and goes around the
+    sensor to another azimuth in the front; it is set on the ground found there, if it is clear. What it would
+    hide goes, and of itself what stands behind something nearer, both ray by ray.
+    """
+    names = [name for name in odds if bank.objects.get(name)]
+    if not names or n == 0:
+        return scan
+    shares = np.array([odds[name] for name in names])
+    points, labels = scan.points, scan.labels
+    flat = np.hypot(points[:, 0], points[:, 1])
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    kept = np.ones(len(points), bool)
+    boxes, counts, new_points, new_labels = list(scan.boxes), list(scan.counts), [], []
+    for name in rng.choice(names, size=n, p=shares / shares.sum()):
+        box, cut = bank.objects[name][rng.integers(len(bank.objects[name]))]
+        angle = rng.uniform(*PASTE_AZIMUTHS) - np.arctan2(box.center[1], box.center[0])
+        box = _turned_box(box, angle)
+        reach = np.hypot(*box.size[:2]) / 2.0 + 0.5
+        distance = np.hypot(*box.center[:2])
+        middle = np.arctan2(box.center[1], box.center[0])
+        window = np.nonzero(np.abs(azimuth - middle) < np.arctan2(reach, max(distance - reach, 1.0)))[0]
+        window = window[kept[window]]
+        around = window[np.abs(flat[window] - distance) < reach]
+        foot = box.center[2] - box.size[2] / 2.0
+        near = points[around]
+        low = near[np.abs(near[:, 2] - foot) < 0.6]
+        if len(low) < 6:
+            continue
+        ground = float(np.percentile(low[:, 2], 15))
+        box = replace(box, center=(box.center[0], box.center[1], ground + box.size[2] / 2.0))
+        standing = inside(box, near, 0.1) & (near[:, 2] > ground + 0.25)
+        if np.count_nonzero(standing) > 2 or any(_close(box, other) for other in boxes):
+            continue
+        cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+        here = cut.copy()
+        here[:, 0], here[:, 1] = cos * cut[:, 0] - sin * cut[:, 1], sin * cut[:, 0] + cos * cut[:, 1]
+        here[:, 2] += np.float32(ground - foot)
+
+        # Rays: an HDL-64E's beams lie 0.4 degrees apart, its columns 0.17.
+        own, own_range = _rays(here)
+        other, other_range = _rays(points[window])
+        rays = np.unique(own)
+        nearest = np.full(len(rays), np.inf)
+        np.minimum.at(nearest, np.searchsorted(rays, own), own_range)
+        at = np.minimum(np.searchsorted(rays, other), len(rays) - 1)
+        met = rays[at] == other
+        blocking = np.full(len(rays), np.inf)
+        np.minimum.at(blocking, at[met], other_range[met])
+        seen = own_range < blocking[np.searchsorted(rays, own)] + 0.3
+        if np.count_nonzero(seen) < FEWEST_PASTED:
+            continue
+        kept[window[met & (other_range > nearest[at])]] = False
+        new_points.append(here[seen])
+        new_labels.append(np.full(np.count_nonzero(seen), POINT_CLASS_OF[box.label], np.uint8))
+        boxes.append(box)
+        counts.append(int(np.count_nonzero(seen)))
+    if not new_points:
+        return scan
+    return replace(
+        scan,
+        points=np.concatenate([points[kept], *new_points]),
+        labels=np.concatenate([labels[kept], *new_labels]),
+        boxes=tuple(boxes),
+        counts=tuple(counts),
+    )
+
+
+def _turned_box(box: Box, angle: float) -> Box:
+    cos, sin = float(np.cos(angle)), float(np.sin(angle))
+    x, y, z = box.center
+    return replace(box, center=(cos * x - sin * y, sin * x + cos * y, z), yaw=box.yaw + float(angle))
+
+
+def _close(box: Box, other: Box) -> bool:
+    apart = np.hypot(box.center[0] - other.center[0], box.center[1] - other.center[1])
+    return bool(apart < 0.45 * (np.hypot(*box.size[:2]) + np.hypot(*other.size[:2])))
+
+
+def _rays(points: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    flat = np.hypot(points[:, 0], points[:, 1])
+    row = np.floor(np.degrees(np.arctan2(points[:, 2], flat)) / 0.42).astype(np.int64)
+    column = np.floor(np.degrees(np.arctan2(points[:, 1], points[:, 0])) / 0.18).astype(np.int64)
+    return (row + 500) * 10_000 + column + 5_000, np.hypot(flat, points[:, 2])
+
+
+def swapped(scan: LabelledScan, other: LabelledScan, rng: np.random.Generator) -> LabelledScan:
+    """The scan with one sector of another (PolarMix; Xiao et al., 2022): points and their labels, not boxes.
+
+    For point labels alone: boxes and surface know nothing of the sector.
+    """
+    low = rng.uniform(-np.pi / 4.0, np.pi / 8.0)
+    high = low + rng.uniform(np.pi / 8.0, np.pi / 4.0)
+    parts = []
+    for each, wanted in ((scan, False), (other, True)):
+        azimuth = np.arctan2(each.points[:, 1], each.points[:, 0])
+        chosen = ((azimuth >= low) & (azimuth < high)) == wanted
+        parts.append((each.points[chosen], each.labels[chosen]))
+    points, labels = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return replace(scan, points=points, labels=labels)
+
+
+def weathered(scan: LabelledScan, rng: np.random.Generator) -> LabelledScan:
+    """The scan in rain, snow or fog: returns lost the more the farther they are, and a few from drops in the air."""
+    points, labels = scan.points, scan.labels
+    distance = np.linalg.norm(points[:, :3], axis=1)
+    kept = rng.random(len(points)) < np.exp(-rng.uniform(0.0, 0.02) * distance)
+    points, labels = points[kept].copy(), labels[kept].copy()
+    drops = np.nonzero(rng.random(len(points)) < rng.uniform(0.0, 0.01))[0]
+    share = np.minimum(rng.gamma(2.0, 3.0, len(drops)) / np.maximum(distance[kept][drops], 1.0), 1.0)
+    points[drops, :3] *= share.astype(np.float32)[:, None]
+    points[drops, 3] *= 0.3
+    labels[drops] = np.where(labels[drops] == IGNORE, IGNORE, 0)
+    return replace(scan, points=points, labels=labels)
+
+
+def facing(scan: LabelledScan, rng: np.random.Generator) -> float:
+    """The angle that turns a pedestrian or cyclist of the scan to the front; 0 where there is none within 40 m."""
+    rare = [b for b, n in zip(scan.boxes, scan.counts, strict=True) if b.label in RARE and n >= FEWEST_PASTED]
+    rare = [b for b in rare if np.hypot(*b.center[:2]) < 40.0]
+    if not rare:
+        return 0.0
+    box = rare[rng.integers(len(rare))]
+    return float(rng.uniform(-0.6, 0.6) - np.arctan2(box.center[1], box.center[0]))
+
+
+def augmented(
+    scan: LabelledScan,
+    rng: np.random.Generator,
+    *,
+    bank: ObjectBank | None = None,
+    n_pasted: float = 0.0,
+    odds: Mapping[str, float] | None = None,
+    turn_to_rare: float = 0.0,
+    weather: float = 0.0,
+) -> LabelledScan:
     """A scan as it might have been: turned, mirrored, thinned, its heights and remissions a little off.
 
     Where truth is known all around (simulation), one scan gives as many views as there are directions along the
     street: it is looked at forwards or backwards, give or take 10 degrees.
+
+    Parameters
+    ----------
+    scan : LabelledScan
+    rng : np.random.Generator
+    bank : ObjectBank, optional
+    n_pasted : float
+        Objects of the bank to paste, on average.
+    odds : mapping of str to float, optional
+        How often each kind is pasted; by default all alike.
+    turn_to_rare : float
+        Share of fully known scans that are turned to a pedestrian or cyclist instead of along the street.
+    weather : float
+        Share of scans in bad weather.
     """
     full = scan.azimuths[1] - scan.azimuths[0] >= 2.0 * np.pi
-    angle = rng.normal(0.0, np.radians(5.0)) + (np.pi if full and rng.random() < 0.5 else 0.0)
+    angle = rng.normal(0.0, np.radians(5.0))
+    if full and rng.random() < turn_to_rare:
+        angle = facing(scan, rng)
+    elif full and rng.random() < 0.5:
+        angle += np.pi
     scan = turned(scan, float(angle))
     if rng.random() < 0.5:
         scan = mirrored(scan)
+    # Both views look ahead; what lies behind only costs time.
+    ahead = scan.points[:, 0] > 0.0
+    scan = replace(scan, points=scan.points[ahead], labels=scan.labels[ahead])
+    if bank is not None and n_pasted > 0.0:
+        scan = pasted(scan, bank, rng, int(rng.poisson(n_pasted)), odds or dict.fromkeys(bank.objects, 1.0))
+    if rng.random() < weather:
+        scan = weathered(scan, rng)
     points, labels = scan.points, scan.labels
     if rng.random() < 0.3:
         kept = rng.random(len(points)) < rng.uniform(0.75, 1.0)

@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 from edgeperc import __version__
@@ -45,15 +45,15 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("out", type=Path, help="folder for checkpoint.pt and log.jsonl")
     train.add_argument("--kitti", type=Path, help="root of a KITTI object set")
     train.add_argument("--simulated", type=Path, help="folder made by: edgeperc-export simulate")
-    train.add_argument("--head", choices=["dense", "slots"], help="SSADNet's boxes (default dense)")
-    train.add_argument("--steps", type=int)
-    train.add_argument("--batch", type=int)
-    train.add_argument("--learning-rate", type=float)
-    train.add_argument("--simulated-share", type=float)
-    train.add_argument("--context-width", type=int)
-    train.add_argument("--seed", type=int)
+    train.add_argument("--fold", type=int, help="fold of the training drives to leave out and stop by: 0, 1 or 2")
+    train.add_argument("--recipe", choices=["ours", "paper"], default="ours", help="where the options below start from")
     train.add_argument("--start-from", type=Path, help="a checkpoint whose weights a new run starts from")
     train.add_argument("--threads", type=int)
+    train.add_argument("--compile", action="store_true", help="through torch.compile, which needs a C++ compiler")
+    recipe = train.add_argument_group("recipe", "see edgeperc_export.train.Recipe")
+    for option, of in _recipe_options().items():
+        how = {"action": argparse.BooleanOptionalAction} if of is bool else {"type": of}
+        recipe.add_argument(option, **how)
     train.set_defaults(run=_train)
 
     export = commands.add_parser("export", help="checkpoint -> .onnx with a card, or an error that says how far off")
@@ -61,8 +61,12 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("out", type=Path, help="the .onnx to write")
     export.add_argument("--scans", type=Path, nargs="*", default=[], help="scans to compare torch and onnxruntime on")
     export.add_argument("--kitti", type=Path, help="also describe the training scans, for the fitness check")
-    export.add_argument("--metrics", type=Path, help="JSON of edgeperc-export evaluate, to keep in the card")
+    export.add_argument("--metrics", type=Path, help="JSON of edgeperc eval, to keep in the card")
+    export.add_argument("--name", help="what the model is called (default: the network)")
     export.add_argument("--model-version", default="1.0.0")
+    export.add_argument(
+        "--licence", default="Apache-2.0", help="of the weights, where no real scan was trained on (default Apache-2.0)"
+    )
     export.set_defaults(run=_export)
 
     verify = commands.add_parser("verify", help="hold an .onnx against its checkpoint")
@@ -77,19 +81,69 @@ def _parser() -> argparse.ArgumentParser:
     card.add_argument("out", type=Path, help="the .onnx to write")
     card.set_defaults(run=_card)
 
-    evaluate = commands.add_parser("evaluate", help="the papers' figures on drives nobody trained on")
-    evaluate.add_argument("models", nargs="+", help="shipped names or .onnx files")
-    evaluate.add_argument("--kitti", type=Path, help="root of a KITTI object set: points and boxes")
-    evaluate.add_argument("--semantickitti", type=Path, help="root of SemanticKITTI: road")
-    evaluate.add_argument("--split", choices=["validation", "train"], default="validation")
-    evaluate.add_argument("--provider", default="cpu")
-    evaluate.add_argument("--json", type=Path, help="also write the figures here")
-    evaluate.set_defaults(run=_evaluate)
+    make = commands.add_parser("make", help="a shipped model from nothing: simulate, train, export, judge")
+    make.add_argument("name", choices=["pointseg", "pointseg-sim", "ssadnet", "ssadnet-paper", "ssadnet-sim"])
+    make.add_argument("out", type=Path, help="folder for scans, checkpoints and the model")
+    make.add_argument("--kitti", type=Path, help="root of a KITTI object set")
+    make.add_argument("--layouts", type=Path, help="folder of KITTI label_2, calib and frames.csv")
+    make.add_argument("--semantickitti", type=Path, help="root of SemanticKITTI, to judge the road by")
+    make.add_argument("--fold", type=int, help="fold of the training drives to leave out and stop by: 0, 1 or 2")
+    make.add_argument("--threads", type=int)
+    make.add_argument("--model-version", default="1.0.0")
+    make.set_defaults(run=_make)
+
+    ablate = commands.add_parser("ablate", help="what each part of the training is worth, on a fold left out")
+    ablate.add_argument("network", choices=["ssadnet", "pointseg"])
+    ablate.add_argument("out", type=Path, help="folder for the runs and ablation.json")
+    ablate.add_argument("--kitti", type=Path, required=True)
+    ablate.add_argument("--simulated", type=Path, required=True)
+    ablate.add_argument("--start-from", type=Path, required=True, help="checkpoint of the -sim model")
+    ablate.add_argument("--fold", type=int, default=0)
+    ablate.add_argument("--steps", type=int, default=150)
+    ablate.add_argument("--variant", action="append", default=[], help="one of them; again for more (default: all)")
+    ablate.add_argument("--threads", type=int)
+    ablate.set_defaults(run=_ablate)
 
     models = commands.add_parser("models", help="write MODELS.md from the cards of a folder's models")
     models.add_argument("folder", type=Path)
     models.set_defaults(run=_models)
     return parser
+
+
+def _make(args: argparse.Namespace) -> int:
+    from .recipes import make
+
+    path = make(
+        args.name,
+        args.out,
+        kitti=args.kitti,
+        layouts=args.layouts,
+        semantickitti=args.semantickitti,
+        fold=args.fold,
+        n_threads=args.threads,
+        version=args.model_version,
+    )
+    print(path)
+    return 0
+
+
+def _ablate(args: argparse.Namespace) -> int:
+    from .ablation import ablate
+
+    rows = ablate(
+        args.network,
+        args.out,
+        kitti=args.kitti,
+        simulated=args.simulated,
+        start_from=args.start_from,
+        fold=args.fold,
+        steps=args.steps,
+        variants=args.variant,
+        n_threads=args.threads,
+    )
+    for row in rows:
+        print(f"{row['network']}, fold {row['fold']}, {row['steps']} steps, {row['variant']}: {row['figures']}")
+    return 0
 
 
 def _models(args: argparse.Namespace) -> int:
@@ -106,18 +160,32 @@ def _simulate(args: argparse.Namespace) -> int:
     return 0
 
 
+def _recipe_options() -> dict[str, type]:
+    """Command line options of a recipe and their types, without loading torch for --help."""
+    return {
+        "--head": str, "--steps": int, "--batch": int, "--optimizer": str, "--learning-rate": float,
+        "--weight-decay": float, "--cooldown": float, "--halve-after": int, "--simulated-share": float,
+        "--augment": bool, "--n-pasted": float, "--swap": float, "--turn-to-rare": float, "--weather": float,
+        "--class-weights": bool, "--focal-gamma": float, "--lovasz-weight": float, "--deep-supervision": float,
+        "--ema": float, "--context-width": int, "--batch-norm": bool,
+        "--seed": int,
+    }  # fmt: skip
+
+
 def _train(args: argparse.Namespace) -> int:
-    from .train import Recipe, train
+    from .train import PAPER, Recipe, train
 
     given = {f.name: getattr(args, f.name, None) for f in fields(Recipe)}
-    recipe = Recipe(**{name: value for name, value in given.items() if value is not None})
+    start = PAPER[args.network] if args.recipe == "paper" else Recipe(args.network)
     checkpoint = train(
-        recipe,
+        replace(start, **{name: value for name, value in given.items() if value is not None}),
         args.out,
         kitti=args.kitti,
         simulated=args.simulated,
+        fold=args.fold,
         start_from=args.start_from,
         n_threads=args.threads,
+        compiled=args.compile,
     )
     print(checkpoint)
     return 0
@@ -133,8 +201,10 @@ def _export(args: argparse.Namespace) -> int:
         args.out,
         scans=parity_scans(args.scans),
         fitness=fitness_of(args.kitti),
+        name=args.name,
         version=args.model_version,
         metrics=metrics,
+        licence=args.licence,
     )
     print(f"{args.out}: {card.name} {card.version}, parity {json.dumps(dict(card.parity))}")
     return 0
@@ -159,22 +229,6 @@ def _card(args: argparse.Namespace) -> int:
     card = with_golden(model, ModelCard.from_json(args.card.read_text()))
     write_card(model, card, args.out)
     print(f"{args.out}: {card.name} {card.version}")
-    return 0
-
-
-def _evaluate(args: argparse.Namespace) -> int:
-    from .evaluate import evaluate, table
-
-    figures = evaluate(
-        args.models,
-        kitti=args.kitti,
-        semantickitti=args.semantickitti,
-        split=args.split,
-        provider=args.provider,
-    )
-    print(table(figures))
-    if args.json:
-        args.json.write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
     return 0
 
 

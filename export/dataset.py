@@ -9,32 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from edgeperc.perception import Box
+from edgeperc.datasets import KittiObjects, layouts, simulated_scan
 from edgeperc.points import read_points
 from edgeperc.sensors import FitnessProfile
-from edgeperc.simulation import SimulatedScan, random_scene, scene_from_boxes, sensor_pose
-from edgeperc.simulation import simulate as cast
 
 from .augment import LabelledScan
-from .kitti import KittiObjects, layouts
 
-__all__ = ["fitness_of", "parity_scans", "simulate", "simulated_scan"]
-
-
-def simulated_scan(seed: int, sensor: str = "hdl-64e", boxes: Sequence[Box] | None = None) -> SimulatedScan:
-    """One scan of a scene of its own, the vehicle a little off its lane, pitched and rolled as on a real road.
-
-    ``boxes`` gives the scene a real layout; without, everything is drawn from the seed.
-    """
-    rng = np.random.default_rng((seed, 1))
-    if boxes is None:
-        scene = random_scene(seed)
-        x, y, yaw = rng.normal(0.0, 4.0), rng.normal(0.0, 0.5), rng.normal(0.0, 0.05)
-    else:
-        scene, x, y, yaw = scene_from_boxes(boxes, seed), 0.0, 0.0, 0.0
-    pitch, roll = rng.normal(0.0, 0.008, size=2)
-    pose = sensor_pose(scene, sensor, x, y, yaw=yaw, pitch=pitch, roll=roll)
-    return cast(scene, sensor, seed, pose)
+__all__ = ["fitness_of", "parity_scans", "simulate"]
 
 
 def simulate(out: Path, n: int, *, first: int = 0, layouts_root: Path | None = None, sensor: str = "hdl-64e") -> None:
@@ -62,5 +43,5 @@ def fitness_of(kitti: Path | None) -> FitnessProfile:
     if kitti is None:
         return FitnessProfile.from_scans(simulated_scan(10**9 + k).points for k in range(32))
     objects = KittiObjects(kitti)
-    names = objects.names("train", crops=False)
+    names = objects.names("train", grades="AB")
     return FitnessProfile.from_scans(objects.frame(n).points for n in names[:: max(1, len(names) // 64)])

@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from edgeperc.datasets import IGNORE
+
 from .augment import SURFACE
-from .kitti import IGNORE
 
 __all__ = ["ground_plane", "sure_surface"]
 

@@ -20,16 +20,16 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from edgeperc.card import CARD_KEY, Golden, ModelCard, OutputSpec
+from edgeperc.card import CARD_KEY, Golden, ModelCard
 from edgeperc.decode import decode_classes
 from edgeperc.errors import EdgepercError
 from edgeperc.perceiver import decode_top_view
 from edgeperc.projection import make_projector
 from edgeperc.sensors import FitnessProfile
 from edgeperc.session import Session, golden_input
-from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES
 
-from .train import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT, Recipe, build
+from .cards import card_of
+from .train import Recipe, build
 
 __all__ = ["ParityError", "export", "verify", "write_card"]
 
@@ -50,46 +50,26 @@ def load(checkpoint: Path) -> tuple[nn.Module, Recipe, dict[str, Any]]:
     state = torch.load(checkpoint, weights_only=True, map_location="cpu")
     recipe = Recipe(**json.loads(state["recipe"]))
     network = build(recipe)
-    network.load_state_dict(state["averaged"])
+    # A training aid (deep supervision) is no part of what is exported.
+    network.load_state_dict(state["best"] or state["averaged"])
     notes = {"frames": json.loads(state["frames"]), "n_simulated": state["n_simulated"], "step": state["step"]}
-    notes["before"] = json.loads(state["before"])
+    notes |= {"before": json.loads(state["before"]), "curve": json.loads(state["curve"])}
     return network.eval(), recipe, notes
 
 
-def card_of(recipe: Recipe, notes: Mapping[str, Any], fitness: FitnessProfile | None, version: str) -> ModelCard:
-    """The card of a network of this project."""
+def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:
+    """What the card says of how the weights came about."""
     frames = notes["frames"]
-    training = {
-        "data": f"{len(frames)} real frames (KITTI), {notes['n_simulated']} simulated scans",
+    simulated = f"{notes['n_simulated']} simulated scans"
+    return {
+        "data": f"{len(frames)} real frames (KITTI), {simulated}" if frames else f"{simulated}, no real frame",
         "frames": frames,
-        "licence": "CC BY-NC-SA 3.0, as KITTI's, on which it was trained"
-        if frames
-        else "Apache-2.0, unless the simulated scans have layouts of somebody else's",
+        "licence": "CC BY-NC-SA 3.0, as KITTI's, on which it was trained" if frames else notes["licence"],
         "recipe": {n: getattr(recipe, n) for n in Recipe.__dataclass_fields__},
         "steps": notes["step"],
         "started_from": notes["before"],
+        "curve": notes["curve"],
     }
-    common = {"version": version, "fitness": None if fitness is None else fitness.to_dict(), "training": training}
-    if recipe.network == "pointseg":
-        return ModelCard(
-            name="pointseg",
-            view=RANGE_IMAGE,
-            input=RANGE_IMAGE_INPUT,
-            outputs=(OutputSpec("logits", "class_logits"),),
-            classes=POINT_CLASSES,
-            **common,
-        )
-    return ModelCard(
-        name="ssadnet",
-        view=TOP_VIEW,
-        input=TOP_VIEW_INPUT,
-        outputs=(OutputSpec("segmentation", "class_logits"), OutputSpec("boxes", f"box_{recipe.head}")),
-        classes=TOP_VIEW_CLASSES,
-        box_classes=("car", "van", "truck"),
-        # Medians of KITTI's labels: length, width, height.
-        box_size_priors={"car": (3.9, 1.6, 1.5), "van": (5.1, 1.9, 2.2), "truck": (10.1, 2.6, 3.2)},
-        **common,
-    )
 
 
 def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
@@ -232,8 +212,10 @@ def export(
     *,
     scans: Sequence[NDArray[np.float32]],
     fitness: FitnessProfile | None,
+    name: str | None = None,
     version: str = "1.0.0",
     metrics: Mapping[str, Any] | None = None,
+    licence: str = "Apache-2.0",
 ) -> ModelCard:
     """Export a checkpoint, prove it, and write it with its card.
 
@@ -243,7 +225,15 @@ def export(
         The graph does not give the network's answers; ``path`` is left as it was.
     """
     network, recipe, notes = load(checkpoint)
-    card = replace(card_of(recipe, notes, fitness, version), metrics=dict(metrics or {}))
+    card = card_of(
+        recipe.network,
+        recipe.head,
+        name=name or recipe.network,
+        version=version,
+        fitness=None if fitness is None else fitness.to_dict(),
+        training=_training(recipe, notes | {"licence": licence}),
+        metrics=dict(metrics or {}),
+    )
     model = to_graph(network, card)
     card = with_golden(model, card)
     trial = path.with_name(f".{path.name}.trial.onnx")

@@ -9,11 +9,12 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-import time
+import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,43 +22,43 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from edgeperc.card import InputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.datasets import IGNORE, KittiObjects
+from edgeperc.metrics import BoxEvaluator, Confusion
+from edgeperc.perceiver import decode_top_view
+from edgeperc.perception import Box
 from edgeperc.projection import make_projector
-from edgeperc.sensors import get_sensor
-from edgeperc.simulation import TOP_VIEW_CLASSES
+from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES
 
-from .augment import LabelledScan, augmented
-from .kitti import IGNORE, KittiObjects
+from .augment import LabelledScan, ObjectBank, augmented, swapped
+from .cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT, card_of
 from .losses import dense_targets, pointseg_loss, slot_targets, ssadnet_loss
 from .networks.pointseg import PointSeg
 from .networks.ssadnet import SSADNet
 from .road import sure_surface
-
-TOP_VIEW = TopViewGeometry()
-RANGE_IMAGE = RangeImageGeometry(get_sensor("hdl-64e").elevations_deg)
-# SSADNet 2.1.2 scales every channel to its range; the farthest corner of the view is 47.07 m away.
-TOP_VIEW_INPUT = InputSpec("top_view", ("distance", "remission", "height"), (0.0, 0.0, -2.5), (47.07, 1.0, 5.0))
-# Means and deviations of the returns in the front 90 degrees of 27 training scans.
-RANGE_IMAGE_INPUT = InputSpec(
-    "range_image",
-    ("x", "y", "z", "remission", "range"),
-    (12.95, 0.0, -1.31, 0.234, 14.51),
-    (11.35, 7.86, 0.82, 0.148, 12.27),
-)
+from .selftraining import pseudo_labelled, unlabelled_scans
 
 # Three returns are the fewest that any network could tell from clutter.
 FEWEST = 3
 N_SLOTS = 16
 # Vehicles are 4 % of the labelled pixels, pedestrians and cyclists 0.2 %.
-POINT_WEIGHTS = (1.0, 2.0, 8.0, 8.0)
+POINT_WEIGHTS = (1.0, 2.0, 4.0, 4.0)
 TOP_VIEW_WEIGHTS = (1.0, 1.0, 2.0, 4.0, 4.0)
 # The dense head's loss is a sum a box, ten times the segmentation's per pixel.
 LW_DET_DENSE = 0.2
+WARM_UP_STEPS = 100
+# Of neighbouring frames one in so many is enough to watch a run by.
+VALIDATION_STRIDE = 6
+# Scans whose objects are cut out for pasting; each holds about five.
+BANK_SCANS = 400
+PASTE_ODDS = {
+    "pointseg": {"pedestrian": 0.4, "cyclist": 0.35, "van": 0.15, "truck": 0.1},
+    "ssadnet": {"car": 0.3, "van": 0.4, "truck": 0.3},
+}
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Everything that decides a training run.
+    """Everything that decides a training run, but the scans.
 
     Attributes
     ----------
@@ -66,14 +67,40 @@ class Recipe:
     head : str
         SSADNet's boxes: ``"slots"`` (the paper's) or ``"dense"``.
     steps, batch : int
+    optimizer : str
+        ``"adamw"``, ``"adam"`` or ``"adagrad"``.
     learning_rate, weight_decay : float
-        Of AdamW; warmed up over 5 % of the steps, then a cosine to zero.
+        Warmed up over 100 steps, then constant, then a cosine to zero.
+    cooldown : float
+        Share of the steps that the cosine takes. Until it begins, a longer run is the same run.
+    halve_after : int
+        Epochs without a lower validation loss after which the learning rate is halved (SSADNet 3.2); 0: never.
     simulated_share : float
         Part of the samples that are simulated; what is left is real.
+    augment : bool
+        Turn, mirror, thin and shift every scan.
+    n_pasted : float
+        Objects cut from other scans that are pasted into one, on average.
+    swap : float
+        Share of scans one sector of which comes from another scan; point labels only.
+    turn_to_rare : float
+        Share of simulated scans turned to a pedestrian or cyclist.
+    weather : float
+        Share of scans in rain, snow or fog.
+    class_weights : bool
+        Weigh classes in the cross-entropy by how rare they are.
+    focal_gamma : float
+        Of PointSeg's cross-entropy.
+    lovasz_weight : float
+        Of the Lovasz-softmax loss beside the cross-entropy.
+    deep_supervision : float
+        Weight of PointSeg's loss at a quarter of the width.
     ema : float
-        Decay of the averaged weights, which are what is exported.
+        Decay of the averaged weights, which are what is exported; 0: the last weights.
     context_width : int
         Channels of SSADNet's context module.
+    batch_norm : bool
+        In SSADNet's segmentation branch.
     seed : int
     """
 
@@ -81,21 +108,59 @@ class Recipe:
     head: str = "dense"
     steps: int = 2000
     batch: int = 8
+    optimizer: str = "adamw"
     learning_rate: float = 2e-3
     weight_decay: float = 1e-3
-    simulated_share: float = 0.6
-    ema: float = 0.995
+    cooldown: float = 0.4
+    halve_after: int = 0
+    simulated_share: float = 0.5
+    augment: bool = True
+    n_pasted: float = 6.0
+    swap: float = 0.3
+    turn_to_rare: float = 0.3
+    weather: float = 0.1
+    class_weights: bool = True
+    focal_gamma: float = 0.0
+    lovasz_weight: float = 1.0
+    deep_supervision: float = 0.0
+    ema: float = 0.998
     context_width: int = 128
+    batch_norm: bool = True
     seed: int = 0
+
+
+PLAIN = {
+    "simulated_share": 0.0,
+    "augment": False,
+    "n_pasted": 0.0,
+    "swap": 0.0,
+    "turn_to_rare": 0.0,
+    "weather": 0.0,
+    "class_weights": False,
+    "lovasz_weight": 0.0,
+    "weight_decay": 0.0,
+    "cooldown": 0.0,
+    "ema": 0.0,
+    "batch_norm": False,
+}
+PAPER = {
+    # SSADNet 3.2: Adam, 1e-5, halved after 100 epochs without gain; batch 8; cross-entropy and 0.1 x MSE.
+    "ssadnet": Recipe(
+        "ssadnet", head="slots", optimizer="adam", learning_rate=1e-5, halve_after=100, steps=65_000, **PLAIN
+    ),
+    # PointSeg 5: Adagrad, 1e-3, batch 32, 50,000 steps.
+    "pointseg": Recipe("pointseg", optimizer="adagrad", learning_rate=1e-3, batch=32, steps=50_000, **PLAIN),
+}
+"""What the papers say of their training; what they do not mention is left out."""
 
 
 def build(recipe: Recipe) -> nn.Module:
     """The network of a recipe, its weights drawn from the recipe's seed."""
     torch.manual_seed(recipe.seed)
     if recipe.network == "pointseg":
-        return PointSeg()
+        return PointSeg(deep_supervision=recipe.deep_supervision > 0.0)
     if recipe.network == "ssadnet":
-        return SSADNet(head=recipe.head, context_width=recipe.context_width)
+        return SSADNet(head=recipe.head, context_width=recipe.context_width, batch_norm=recipe.batch_norm)
     raise ValueError(f"network is {recipe.network!r}; expected ssadnet or pointseg")
 
 
@@ -124,19 +189,40 @@ class Samples:
         self.real_odds = weights / weights.sum() if len(weights) else weights
         share = recipe.simulated_share if real else 1.0
         self.simulated_share = share if simulated else 0.0
+        self.bank: ObjectBank | None = None
+        if recipe.n_pasted > 0.0:
+            every = max(1, len(simulated) // BANK_SCANS)
+            self.bank = ObjectBank.of([*real, *(LabelledScan.load(path) for path in simulated[::every])])
 
     def batch(self, step: int) -> tuple[NDArray, ...]:
         """Inputs (B, C, H, W) and targets of one step; the same for the same step, always."""
         rng = np.random.default_rng((self.recipe.seed, step))
-        drawn = [self._sample(augmented(self._scan(rng), rng)) for _ in range(self.recipe.batch)]
+        drawn = [self.sample(self._drawn(rng)) for _ in range(self.recipe.batch)]
         return tuple(np.stack(parts) for parts in zip(*drawn, strict=True))
+
+    def _drawn(self, rng: np.random.Generator) -> LabelledScan:
+        recipe = self.recipe
+        scan = self._scan(rng)
+        if not recipe.augment:
+            return scan
+        changes = {
+            "bank": self.bank,
+            "n_pasted": recipe.n_pasted,
+            "odds": PASTE_ODDS[recipe.network],
+            "turn_to_rare": recipe.turn_to_rare,
+            "weather": recipe.weather,
+        }
+        scan = augmented(scan, rng, **changes)
+        if recipe.network == "pointseg" and rng.random() < recipe.swap:
+            scan = swapped(scan, augmented(self._scan(rng), rng, **changes), rng)
+        return scan
 
     def _scan(self, rng: np.random.Generator) -> LabelledScan:
         if rng.random() < self.simulated_share:
             return LabelledScan.load(self.simulated[rng.integers(len(self.simulated))])
         return self.real[rng.choice(len(self.real), p=self.real_odds)]
 
-    def _sample(self, scan: LabelledScan) -> tuple[NDArray, ...]:
+    def sample(self, scan: LabelledScan) -> tuple[NDArray, ...]:
         """One input (C, H, W) and its targets."""
         points = np.ascontiguousarray(scan.points, np.float32)
         if self.recipe.network == "pointseg":
@@ -160,11 +246,19 @@ class Samples:
 def loss_of(recipe: Recipe, outputs: Tensor | tuple[Tensor, Tensor], targets: Sequence[Tensor]) -> Tensor:
     """The loss of a recipe."""
     if recipe.network == "pointseg":
-        weights = torch.tensor(POINT_WEIGHTS, device=targets[0].device)
-        return pointseg_loss(outputs, targets[0], weights, lovasz_weight=1.0)
-    weights = torch.tensor(TOP_VIEW_WEIGHTS, device=targets[0].device)
+        weights = torch.tensor(POINT_WEIGHTS, device=targets[0].device) if recipe.class_weights else None
+        how = {"focal_gamma": recipe.focal_gamma, "lovasz_weight": recipe.lovasz_weight}
+        if not isinstance(outputs, tuple):
+            return pointseg_loss(outputs, targets[0], weights, **how)
+        logits, early = outputs
+        # The nearest of every four columns: a mean of labels would be none.
+        coarse = targets[0][:, :, 1 :: targets[0].shape[2] // early.shape[3]]
+        loss = pointseg_loss(logits, targets[0], weights, **how)
+        return loss + recipe.deep_supervision * pointseg_loss(early, coarse, weights, **how)
+    weights = torch.tensor(TOP_VIEW_WEIGHTS, device=targets[0].device) if recipe.class_weights else None
     lw_det = LW_DET_DENSE if recipe.head == "dense" else 0.1
-    return ssadnet_loss(*outputs, *targets, lw_det=lw_det, class_weights=weights)[0]
+    how = {"lw_det": lw_det, "class_weights": weights, "lovasz_weight": recipe.lovasz_weight}
+    return ssadnet_loss(*outputs, *targets, **how)[0]
 
 
 def real_scans(kitti: KittiObjects, names: Sequence[str]) -> tuple[list[LabelledScan], list[float], dict[str, str]]:
@@ -186,8 +280,11 @@ def train(
     *,
     kitti: Path | None,
     simulated: Path | None,
+    fold: int | None = None,
     start_from: Path | None = None,
+    teacher: Path | None = None,
     n_threads: int | None = None,
+    compiled: bool = False,
     checkpoint_every: int = 100,
 ) -> Path:
     """Train, or go on training, the network of a recipe.
@@ -198,12 +295,21 @@ def train(
     out : Path
         Folder for ``checkpoint.pt`` and ``log.jsonl``. A checkpoint already there, of the same recipe, is resumed.
     kitti : Path or None
-        Root of a KITTI object set; frames of validation drives are left out.
+        Root of a KITTI object set; frames of test drives are left out, and so are all where the recipe's
+        ``simulated_share`` is 1.
     simulated : Path or None
         Folder of scans from ``edgeperc-export simulate``.
+    fold : int, optional
+        Fold of the training drives that is not trained on but watched: every ``checkpoint_every`` steps the averaged
+        network is judged on it, and the best is kept (early stopping). Without real scans to train on, all training
+        drives are watched.
     start_from : Path or None
-        A checkpoint whose weights a new run starts from.
+        A checkpoint whose weights a new run starts from; what the recipe's network lacks or has besides is left.
+    teacher : Path or None
+        A PointSeg checkpoint that labels what nobody labelled in the real scans of the training drives.
     n_threads : int or None
+    compiled : bool
+        Through `torch.compile`: a minute and a C++ compiler first, then PointSeg is a third faster.
     checkpoint_every : int
         Steps between checkpoints.
 
@@ -217,33 +323,43 @@ def train(
         torch.set_num_threads(n_threads)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     objects = KittiObjects(kitti) if kitti else None
-    real, weights, hashes = real_scans(objects, objects.names("train", grades="A")) if objects else ([], [], {})
+    watched: list[str] = []
+    real: list[LabelledScan] = []
+    weights: list[float] = []
+    hashes: dict[str, str] = {}
+    if objects:
+        only_simulated = recipe.simulated_share == 1.0
+        watched = objects.names("train") if only_simulated else objects.names("validation", fold=fold or 0)
+        watched = watched if only_simulated or fold is not None else []
+        real, weights, hashes = real_scans(objects, [] if only_simulated else objects.names("train", fold=fold))
+    if teacher is not None and objects is not None:
+        extra = unlabelled_scans(objects, fold)
+        real = pseudo_labelled(_teacher(teacher), [*real, *extra])
+        weights += [len(extra) ** -0.5] * len(extra)
     samples = Samples(recipe, real, weights, sorted(simulated.glob("*.npz")) if simulated else [])
+    watch = Watch(recipe, samples, objects, watched[::VALIDATION_STRIDE]) if objects and watched else None
 
     network = build(recipe)
     before: list[dict[str, object]] = []
     if start_from is not None:
-        state = torch.load(start_from, weights_only=True)
-        network.load_state_dict(state["averaged"])
-        before = [*json.loads(state["before"]), json.loads(state["recipe"])]
+        before = _start(network, start_from)
     network = network.to(device, memory_format=torch.channels_last)
     averaged = copy.deepcopy(network).eval()
-    decayed = [p for p in network.parameters() if p.ndim > 1]
-    kept = [p for p in network.parameters() if p.ndim <= 1]
-    optimizer = torch.optim.AdamW(
-        [{"params": decayed, "weight_decay": recipe.weight_decay}, {"params": kept, "weight_decay": 0.0}],
-        lr=recipe.learning_rate,
-    )
+    optimizer = _optimizer(recipe, network)
     checkpoint, step = out / "checkpoint.pt", 0
+    best, since_best, halvings = None, 0, 0
+    best_figure, lowest_loss = -1.0, math.inf
+    curve: list[dict[str, Any]] = []
     if checkpoint.exists():
         state = torch.load(checkpoint, weights_only=True, map_location=device)
         if json.loads(state["recipe"]) != asdict(recipe):
             raise ValueError(f"{checkpoint} is of another recipe: {state['recipe']}; train into an empty folder")
-        before = json.loads(state["before"])
+        before, curve = json.loads(state["before"]), json.loads(state["curve"])
         network.load_state_dict(state["network"])
         averaged.load_state_dict(state["averaged"])
         optimizer.load_state_dict(state["optimizer"])
-        step = state["step"]
+        step, best = state["step"], state["best"]
+        best_figure, lowest_loss, since_best, halvings = state["watched"]
 
     def save() -> None:
         aside = checkpoint.with_suffix(".tmp")
@@ -254,26 +370,32 @@ def train(
                 "step": step,
                 "network": network.state_dict(),
                 "averaged": averaged.state_dict(),
+                "best": best,
+                "watched": (best_figure, lowest_loss, since_best, halvings),
                 "optimizer": optimizer.state_dict(),
+                "curve": json.dumps(curve),
                 "frames": json.dumps(hashes),
+                "fold": -1 if fold is None else fold,
                 "n_simulated": len(samples.simulated),
             },
             aside,
         )
         aside.replace(checkpoint)
 
+    # The averaged network and the checkpoint know the network as it is; compiled, it shares its weights.
+    forward = torch.compile(network) if compiled else network
     progress = tqdm(total=recipe.steps, initial=step, desc=recipe.network, unit="step")
+    losses: list[float] = []
     with (out / "log.jsonl").open("a") as log, progress:
-        started = time.monotonic()
         for inputs, *targets in _ahead(samples, step, recipe.steps):
             for group in optimizer.param_groups:
-                group["lr"] = recipe.learning_rate * _schedule(step, recipe.steps)
+                group["lr"] = recipe.learning_rate * _schedule(recipe, step) * 0.5**halvings
             torch.manual_seed((recipe.seed << 32) + step)
             x = torch.from_numpy(inputs).to(device, memory_format=torch.channels_last)
             y = [torch.from_numpy(t).to(device) for t in targets]
             network.train()
             with torch.autocast(device.type, torch.bfloat16):
-                outputs = network(x)
+                outputs = forward(x)
             loss = loss_of(recipe, outputs, y)
             if not torch.isfinite(loss):
                 raise FloatingPointError(f"the loss is {loss.item()} at step {step}; lower --learning-rate")
@@ -283,15 +405,70 @@ def train(
             optimizer.step()
             step += 1
             _average(averaged, network, min(recipe.ema, (1 + step) / (10 + step)))
+            losses.append(loss.item())
             progress.update()
-            progress.set_postfix(loss=f"{loss.item():.3f}")
-            if step % 10 == 0:
-                line = {"step": step, "loss": round(loss.item(), 5), "s": round(time.monotonic() - started, 1)}
+            progress.set_postfix(loss=f"{losses[-1]:.3f}")
+            if step % checkpoint_every == 0 or step == recipe.steps:
+                line: dict[str, Any] = {"step": step, "loss": round(float(np.mean(losses)), 5)}
+                losses.clear()
+                if watch is not None:
+                    figure, watched_loss, figures = watch.judge(averaged)
+                    line |= {"validation_loss": round(watched_loss, 5), "validation": figures}
+                    if figure > best_figure:
+                        best_figure, best = figure, copy.deepcopy(averaged.state_dict())
+                    since_best = 0 if watched_loss < lowest_loss else since_best + checkpoint_every
+                    lowest_loss = min(lowest_loss, watched_loss)
+                    epoch = max(1, len(real) // recipe.batch)
+                    if recipe.halve_after and since_best >= recipe.halve_after * epoch:
+                        halvings, since_best = halvings + 1, 0
+                curve.append(line)
                 log.write(json.dumps(line) + "\n")
                 log.flush()
-            if step % checkpoint_every == 0 or step == recipe.steps:
                 save()
     return checkpoint
+
+
+class Watch:
+    """Judges a network on real frames that it is not trained on: pixel labels, and boxes where it finds any.
+
+    Parameters
+    ----------
+    recipe : Recipe
+    samples : Samples
+        Makes the inputs.
+    objects : KittiObjects
+    names : sequence of str
+        Frames to judge.
+    """
+
+    def __init__(self, recipe: Recipe, samples: Samples, objects: KittiObjects, names: Sequence[str]) -> None:
+        self.recipe, self.card = recipe, card_of(recipe.network, recipe.head, version="0")
+        scans = [LabelledScan.from_frame(objects.frame(name), sure_surface) for name in names]
+        self.inputs = [samples.sample(scan) for scan in scans]
+        self.scans = scans
+
+    def judge(self, network: nn.Module) -> tuple[float, float, dict[str, float | None]]:
+        """The figure that decides (mean IoU of objects, or AP of boxes), the mean loss, and every figure by name."""
+        losses, classes = [], POINT_CLASSES if self.recipe.network == "pointseg" else TOP_VIEW_CLASSES
+        pixels, boxes = Confusion(classes), BoxEvaluator()
+        device = next(network.parameters()).device
+        for (image, *targets), scan in zip(self.inputs, self.scans, strict=True):
+            with torch.no_grad():
+                outputs = network(torch.from_numpy(image[None]).to(device))
+            losses.append(float(loss_of(self.recipe, outputs, [torch.from_numpy(t[None]).to(device) for t in targets])))
+            logits = outputs[0] if isinstance(outputs, tuple) else outputs
+            pixels.update(logits[0].argmax(0).cpu().numpy(), targets[0])
+            if self.recipe.network == "ssadnet":
+                kind = f"box_{self.recipe.head}"
+                answers = {"class_logits": logits[0].cpu().numpy(), kind: outputs[1][0].cpu().numpy()}
+                found = decode_top_view(self.card, answers, self.card.score_threshold)[1]
+                _update(boxes, found, scan)
+        figures = {name: _rounded(iou) for name, iou in zip(classes, pixels.iou(), strict=True)}
+        if self.recipe.network == "pointseg":
+            return float(np.nanmean(pixels.iou()[1:])), float(np.mean(losses)), figures
+        scores = boxes.overall()
+        figures |= {"ap": _rounded(scores.ap), "recall": _rounded(scores.recall)}
+        return scores.ap, float(np.mean(losses)), figures
 
 
 def _ahead(samples: Samples, start: int, stop: int) -> Iterator[tuple[NDArray, ...]]:
@@ -305,11 +482,64 @@ def _ahead(samples: Samples, start: int, stop: int) -> Iterator[tuple[NDArray, .
             yield batch
 
 
-def _schedule(step: int, steps: int) -> float:
-    warm = max(1, steps // 20)
-    if step < warm:
-        return (step + 1) / warm
-    return float(0.5 * (1.0 + np.cos(np.pi * (step - warm) / max(1, steps - warm))))
+def _schedule(recipe: Recipe, step: int) -> float:
+    """Share of the learning rate: up, level, down."""
+    begin = round(recipe.steps * (1.0 - recipe.cooldown))
+    if step >= begin:
+        return float(0.5 * (1.0 + np.cos(np.pi * (step - begin) / max(1, recipe.steps - begin))))
+    return min(1.0, (step + 1) / WARM_UP_STEPS) if recipe.cooldown else 1.0
+
+
+def _optimizer(recipe: Recipe, network: nn.Module) -> torch.optim.Optimizer:
+    if recipe.optimizer == "adagrad":
+        return torch.optim.Adagrad(network.parameters(), lr=recipe.learning_rate)
+    if recipe.optimizer == "adam":
+        return torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)
+    if recipe.optimizer != "adamw":
+        raise ValueError(f"optimizer is {recipe.optimizer!r}; expected adamw, adam or adagrad")
+    decayed = [p for p in network.parameters() if p.ndim > 1]
+    kept = [p for p in network.parameters() if p.ndim <= 1]
+    return torch.optim.AdamW(
+        [{"params": decayed, "weight_decay": recipe.weight_decay}, {"params": kept, "weight_decay": 0.0}],
+        lr=recipe.learning_rate,
+    )
+
+
+def _start(network: nn.Module, checkpoint: Path) -> list[dict[str, object]]:
+    """Take over what another checkpoint has in common with the network; the recipes that made it."""
+    state = torch.load(checkpoint, weights_only=True, map_location="cpu")
+    own, theirs = network.state_dict(), state["best"] or state["averaged"]
+    common = {name: value for name, value in theirs.items() if name in own and own[name].shape == value.shape}
+    if not common:
+        raise ValueError(f"{checkpoint} has no weight in common with the recipe's network")
+    network.load_state_dict(common, strict=False)
+    return [*json.loads(state["before"]), json.loads(state["recipe"])]
+
+
+def _update(evaluator: BoxEvaluator, found: Sequence[Box], scan: LabelledScan) -> None:
+    """Count boxes whose centre is where truth is known."""
+    labelled = scan.labelled(TOP_VIEW)
+
+    def judged(box: Box) -> bool:
+        row = int((TOP_VIEW.x_range_m[1] - box.center[0]) / TOP_VIEW.cell_m)
+        col = int((TOP_VIEW.y_range_m[1] - box.center[1]) / TOP_VIEW.cell_m)
+        return 0 <= row < TOP_VIEW.height and 0 <= col < TOP_VIEW.width and bool(labelled[row, col])
+
+    truth, ignored = [], []
+    for box, count in zip(scan.boxes, scan.counts, strict=True):
+        wanted = box.label in TOP_VIEW_CLASSES[2:] and count >= FEWEST and judged(box)
+        (truth if wanted else ignored).append(box)
+    evaluator.update([b for b in found if judged(b)], truth, ignored=ignored)
+
+
+def _teacher(checkpoint: Path) -> nn.Module:
+    network = build(Recipe("pointseg"))
+    _start(network, checkpoint)
+    return network
+
+
+def _rounded(value: float) -> float | None:
+    return None if math.isnan(value) else round(float(value), 4)
 
 
 @torch.no_grad()

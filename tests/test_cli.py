@@ -140,6 +140,56 @@ def test_help_imports_nothing_heavy() -> None:
     assert "--on-mismatch" in done.stdout
 
 
+def test_help_of_eval_and_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    assert usage_code("eval", "--help") == 0
+    assert "95 % intervals over drives" in " ".join(capsys.readouterr().out.split())
+    assert usage_code("eval") == 2
+    assert usage_code("eval", "simulation:1", "--split", "some") == 2
+    assert "invalid choice: 'some'" in capsys.readouterr().err
+
+
+def test_eval_needs_matplotlib_for_a_picture_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert run("eval", "simulation:1", "--worst", tmp_path / "worst.png", "--json", tmp_path / "out" / "a.json") == 2
+    assert "pip install 'edgeperc[view]'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_tables_of_figures() -> None:
+    car = {"precision": 0.5, "recall": 0.25, "iou": 0.2, "iou_interval": [0.1, 0.3], "n_points": 1200, "n_objects": 3}
+    none = dict.fromkeys(car) | {"n_points": 0, "n_objects": 0}
+    boxes = {
+        "ap": 1.0,
+        "ap_interval": None,
+        "precision": None,
+        "recall": 0.0,
+        "n_truth": 2,
+        "n_predicted": 0,
+        "n_hits": 0,
+    }
+    figures = {
+        "models": {"pointseg": "1.2.3"},
+        "split": "validation",
+        "fold": 1,
+        "semantickitti": {
+            "n_frames": 1,
+            "n_drives": 1,
+            "points": {"all": {"car": car, "cyclist": none}, "0-15 m": {"car": none, "cyclist": none}},
+            "boxes": {"upright": {"all": {"mean_ap": 1.0, "car": boxes, "vehicle": boxes}}},
+        },
+    }
+    lines = cli._figure_lines(figures)
+    assert lines[0].startswith("pointseg 1.2.3; validation drives, fold 1")
+    assert lines[2] == "== SemanticKITTI: 1 scan, 1 drive =="
+    words = [line.split() for line in lines[3:]]
+    assert ["all", "car", "50.0", "25.0", "20.0", "10.0-30.0", "1,200", "3"] in words
+    assert ["all", "car", "100.0", "-", "-", "0.0", "-", "-", "2", "0", "0"] in words
+    assert ["mean", "100.0", *"--------"] in words
+    assert not any("cyclist" in line for line in words)
+
+
 def test_run_prints_a_line_a_scan(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: type[FakePerceiver]
 ) -> None:

@@ -18,12 +18,13 @@ from torch import Tensor, nn
 
 from edgeperc import Perceiver
 from edgeperc.card import CARD_KEY, InputSpec, ModelCard, OutputSpec, RangeImageGeometry
+from edgeperc.datasets import simulated_scan
 from edgeperc.errors import CardMismatchError
 from edgeperc.sensors import FitnessProfile
 from edgeperc.session import Session
 from edgeperc_export.augment import LabelledScan
 from edgeperc_export.cli import main
-from edgeperc_export.dataset import parity_scans, simulate, simulated_scan
+from edgeperc_export.dataset import parity_scans, simulate
 from edgeperc_export.models_page import models_page
 from edgeperc_export.to_onnx import ParityError, export, load, to_graph, verify, write_card
 from edgeperc_export.train import Recipe, Samples, build, loss_of, train
@@ -55,8 +56,8 @@ def untrained(network: str, folder: Path, **changes: object) -> Path:
             net(torch.rand(1, channels, height, width))
     state = {k: v for k, v in net.state_dict().items()}
     path = folder / f"{network}-{recipe.head}.pt"
-    notes = {"frames": "{}", "before": "[]", "n_simulated": 2, "step": 0, "recipe": json.dumps(recipe.__dict__)}
-    torch.save({"averaged": state, **notes}, path)
+    notes = {"frames": "{}", "before": "[]", "curve": "[]", "n_simulated": 2, "step": 0}
+    torch.save({"averaged": state, "best": None, "recipe": json.dumps(recipe.__dict__), **notes}, path)
     return path
 
 

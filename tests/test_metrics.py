@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgeperc.errors import PointsError
-from edgeperc.metrics import BoxEvaluator, Confusion, average_precision
+from edgeperc.metrics import BoxEvaluator, Confusion, ProbabilitySweep, average_precision
 from edgeperc.perception import Box
 
 
@@ -72,7 +72,51 @@ def test_labels_that_cannot_be_counted_raise():
     assert confusion.counts.sum() == 0
 
 
+PAIRS = st.lists(st.tuples(st.integers(0, 3), st.sampled_from([0, 1, 2, 3, 255])), max_size=20)
+
+
+@given(PAIRS, PAIRS)
+def test_counts_of_two_are_counts_of_both(one, other):
+    together = Confusion("abcd")
+    apart = []
+    for pairs in (one, other):
+        predicted, truth = np.array(pairs, dtype=np.uint8).reshape(-1, 2).T
+        together.update(predicted, truth)
+        apart.append(Confusion("abcd"))
+        apart[-1].update(predicted, truth)
+    before = apart[0].counts.copy()
+    np.testing.assert_array_equal((apart[0] + apart[1]).counts, together.counts)
+    np.testing.assert_array_equal(apart[0].counts, before)
+
+
+def test_coarser_classes():
+    confusion = Confusion(("other", "road", "car", "van"))
+    confusion.update([0, 1, 2, 3, 2, 3, 1], [0, 0, 2, 2, 3, 1, 1])
+    coarse = confusion.merged({"ground": ["other", "road"], "vehicle": ["car", "van"]})
+    assert coarse.classes == ("ground", "vehicle")
+    assert coarse.counts.tolist() == [[3, 1], [0, 3]]
+    assert confusion.merged({"vehicle": ["van", "car"]}).counts.tolist() == [[3]]
+    with pytest.raises(PointsError, match="expected the same classes"):
+        confusion + coarse
+
+
 # --- average precision
+
+
+def eleven_points(scores, hits, n_truth):
+    """As SSADNet's appendix has it, word for word."""
+    order = np.argsort(-np.array(scores), kind="stable")
+    found = np.cumsum(np.array(hits)[order])
+    precision = found / np.arange(1, len(found) + 1)
+    return np.mean([max(precision[found * 10 >= step * n_truth], default=0.0) for step in range(11)])
+
+
+@given(st.lists(st.tuples(st.sampled_from([0.2, 0.5, 0.9]), st.booleans()), min_size=1), st.integers(0, 5))
+def test_average_precision_is_what_its_definition_says(predictions, n_missed):
+    scores, hits = zip(*predictions, strict=True)
+    n_truth = sum(hits) + n_missed
+    if n_truth:
+        assert average_precision(scores, hits, n_truth) == pytest.approx(eleven_points(scores, hits, n_truth))
 
 
 def test_average_precision_by_hand():
@@ -97,6 +141,44 @@ def test_average_precision_at_its_ends():
     assert average_precision([0.5, 0.5], [False, True], 1) == 0.5
     with pytest.raises(PointsError, match=r"\(2,\) and hits \(1,\)"):
         average_precision([0.5, 0.4], [True], 1)
+
+
+# --- thresholds
+
+
+def test_sweep_by_hand():
+    sweep = ProbabilitySweep()
+    assert math.isnan(sweep.max_f1())
+    assert math.isnan(sweep.average_precision())
+    sweep.update([0.9, 0.8, 0.7, 0.6], [True, False, True, False])
+    # Taken from above: 1 of 1, 1 of 2, 2 of 3, 2 of 4; there are 2.
+    assert sweep.max_f1() == pytest.approx(2 * 2 / (3 + 2))
+    assert sweep.average_precision() == pytest.approx((6 * 1.0 + 5 * 2 / 3) / 11)
+    other = ProbabilitySweep()
+    other.update([[1.0, 0.0]], [[False, True]])
+    both = sweep + other
+    assert both.counts.sum() == 6
+    assert both.counts[0, 255] == both.counts[1, 0] == 1
+    # From above, with 3 to find: 0 of 1, 1 of 2, 1 of 3, 2 of 4, 2 of 5, and everything: 3 of 6.
+    assert both.max_f1() == pytest.approx(2 * 3 / (6 + 3))
+    assert both.average_precision() == pytest.approx(0.5)
+
+
+@given(st.lists(st.tuples(st.integers(0, 255), st.booleans()), min_size=1, max_size=30))
+def test_sweep_takes_the_best_threshold(cells):
+    level, truth = np.array(cells).T
+    truth = truth.astype(bool)
+    sweep = ProbabilitySweep()
+    sweep.update(level / 255, truth)
+    if truth.any():
+        f1 = [2 * (truth & (level >= t)).sum() / ((level >= t).sum() + truth.sum()) for t in range(256)]
+        assert sweep.max_f1() == pytest.approx(max(f1))
+
+
+def test_probabilities_that_are_none_raise():
+    for values, truth in (([0.5, 1.5], [True, False]), ([math.nan], [True]), ([0.5], [True, False])):
+        with pytest.raises(PointsError, match=r"expected one shape, and all in 0\.\.1"):
+            ProbabilitySweep().update(values, truth)
 
 
 # --- boxes
@@ -145,6 +227,48 @@ def test_scans_add_up_and_do_not_mix():
     assert empty.per_class() == {}
     assert math.isnan(empty.overall().ap)
     assert math.isnan(empty.mean_ap())
+
+
+def test_boxes_by_range():
+    evaluator = BoxEvaluator()
+    truth = [box(10.0, 0.0), box(28.0, 0.0), box(40.0, 0.0)]
+    predicted = [box(10.0, 0.0, score=0.9), box(28.5, 0.0, score=0.8), box(12.0, 5.0, score=0.7)]
+    pairs = evaluator.update(predicted, truth)
+    assert pairs == [(predicted[0], truth[0]), (predicted[1], truth[1]), (predicted[2], None), (None, truth[2])]
+    counts = [(s.n_truth, s.n_predicted, s.n_hits) for s in map(evaluator.overall, ((0, 15), (15, 28.2), (28.2, 50)))]
+    assert counts == [(1, 2, 1), (1, 1, 1), (1, 0, 0)]
+    assert evaluator.per_class((0, 15))["car"].precision == 0.5
+    assert evaluator.mean_ap((15, 28.2)) == 1.0
+    assert math.isnan(evaluator.mean_ap((50, 60)))
+    # A box is as far as its truth: this one lies beyond 28.2 m, and is a hit of the band before.
+    assert evaluator.overall((28.2, 28.6)).n_predicted == 0
+
+
+def test_what_is_excused_is_in_no_pair():
+    evaluator = BoxEvaluator()
+    assert evaluator.update([box(20.0, 0.0)], [], ignored=[box(20.0, 0.0)]) == []
+
+
+SOME_BOXES = st.lists(
+    st.tuples(st.integers(0, 20), st.integers(0, 3), st.sampled_from(["car", "van"]), st.sampled_from([0.2, 0.5, 0.9])),
+    max_size=4,
+)
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(SOME_BOXES, SOME_BOXES), min_size=2, max_size=4), st.integers(1, 3), st.booleans())
+def test_evaluators_put_together_say_what_one_says(scans, split, oriented):
+    whole, first, second = (BoxEvaluator(oriented=oriented) for _ in range(3))
+    for k, (predicted, truth) in enumerate(scans):
+        scan = [box(*each) for each in predicted], [box(*each) for each in truth]
+        whole.update(*scan)
+        (first if k < split else second).update(*scan)
+    both = first + second
+    for within_m in ((0.0, math.inf), (5.0, 12.0)):
+        assert repr(both.per_class(within_m)) == repr(whole.per_class(within_m))  # NaN is not equal to itself
+        assert repr(both.overall(within_m)) == repr(whole.overall(within_m))
+    with pytest.raises(PointsError, match="expected the same"):
+        both + BoxEvaluator(0.7, oriented=oriented)
 
 
 def test_better_scores_choose_first_and_take_what_fits_best():

@@ -253,3 +253,54 @@ def test_drawing_uses_no_pyplot(scan: np.ndarray, perception: Perception) -> Non
     before = "matplotlib.pyplot" in sys.modules
     view.draw(scan, perception)
     assert ("matplotlib.pyplot" in sys.modules) == before
+
+
+def some_mistakes(points: np.ndarray, **given) -> view.Mistakes:
+    return view.Mistakes("000123", "drive_0011", points, np.zeros(len(points), np.uint8), **given)
+
+
+def amount(picture: np.ndarray, colour: str) -> int:
+    wanted = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+    return int((np.abs(picture - wanted) <= 12).all(axis=2).sum())
+
+
+def test_mistakes_in_words(scan: np.ndarray) -> None:
+    told = some_mistakes(scan, missed=((CAR, 300), (VAN, 1040), (CAR, 5)), false=(VAN,), wrong_share=0.25)
+    assert told.words == "missed: 2 car, 1 van (1,345 points); false: 1 van"
+    assert told.n_errors == 4.25
+    assert some_mistakes(scan, found=(CAR,)).words == "no box missed or false"
+    assert some_mistakes(scan, false=(CAR,)).words == "false: 1 car"
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_mistakes_are_drawn(scan: np.ndarray, tmp_path) -> None:
+    right = some_mistakes(scan, found=(CAR, VAN))
+    missed = some_mistakes(scan, found=(CAR,), missed=((VAN, 300),))
+    false = some_mistakes(scan, found=(CAR, VAN), false=(replace(CAR, center=(40.0, -12.0, -1.0)),))
+    points = replace(right, wrong=np.where(np.arange(len(scan)) < 3000, 1, 0).astype(np.uint8))
+    png = view.draw_mistakes([right, missed, false, points], tmp_path / "worst.png", title="a title", columns=2)
+    assert (tmp_path / "worst.png").read_bytes() == png
+    picture = pixels(png)
+    assert picture.shape == (80 + 2 * 520, 2 * 470, 3)
+    panels = [picture[80 + 520 * k : 600 + 520 * k, 470 * m : 470 * m + 470] for k in (0, 1) for m in (0, 1)]
+    red, orange = ([amount(panel, colour) for panel in panels] for colour in (view._MISSED, view._FALSE))
+    assert red[0] == red[2] == 0
+    assert red[1] > 50
+    blended = panels[3][..., 0] - panels[3][..., 1] > 100  # points are smaller than pixels
+    assert np.count_nonzero(blended) > 500
+    assert orange[0] == orange[1] == orange[3] == 0
+    assert orange[2] > 50
+    assert all(amount(panel, view._FOUND) > 50 for panel in panels)
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_no_mistakes_to_draw(scan: np.ndarray) -> None:
+    assert pixels(view.draw_mistakes([], title="none")).ndim == 3
+    assert pixels(view.draw_mistakes([some_mistakes(scan[:0])])).ndim == 3
+
+
+def test_mistakes_need_matplotlib(monkeypatch: pytest.MonkeyPatch, scan: np.ndarray) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.backends.backend_agg", None)
+    with pytest.raises(MissingExtraError, match=r"edgeperc\[view\]"):
+        view.draw_mistakes([some_mistakes(scan)])

@@ -117,6 +117,8 @@ class PointSeg(nn.Module):
         Channels of each branch of the enlargement layer.
     dropout : float
         Before the last convolution, as in SqueezeSeg.
+    deep_supervision : bool
+        In training also return logits (B, n_classes, H, W/4), made where a quarter of the width is reached again.
 
     Notes
     -----
@@ -125,7 +127,13 @@ class PointSeg(nn.Module):
     """
 
     def __init__(
-        self, *, n_channels: int = 5, n_classes: int = 4, enlargement_width: int = 80, dropout: float = 0.25
+        self,
+        *,
+        n_channels: int = 5,
+        n_classes: int = 4,
+        enlargement_width: int = 80,
+        dropout: float = 0.25,
+        deep_supervision: bool = False,
     ) -> None:
         super().__init__()
         self.fire1 = conv_bn_relu(n_channels, 64, 3, stride=(1, 2))
@@ -142,9 +150,10 @@ class PointSeg(nn.Module):
         self.deconv4 = FireDeconv(64, 64)
         self.dropout = nn.Dropout2d(dropout)
         self.classifier = nn.Conv2d(64, n_classes, 3, padding=1)
+        self.early = nn.Conv2d(128, n_classes, 1) if deep_supervision else None
         self._initialise()
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         skip1 = self.skip1(x)  # (B, 64, 64, 512)
         conv1 = self.fire1(x)  # (B, 64, 64, 256)
         sr1 = self.sr1(self.fire3(self.fire2(pool(conv1))))  # (B, 128, 64, 128)
@@ -155,9 +164,11 @@ class PointSeg(nn.Module):
 
         x = torch.cat([self.deconv1_enlarged(enlarged), self.deconv1(sr3)], dim=1)  # (B, 256, 64, 64)
         x = self.deconv2(x + sr2) + sr1  # (B, 128, 64, 128)
+        early = self.early(x) if self.early is not None and self.training else None
         x = self.deconv3(x) + conv1  # (B, 64, 64, 256)
         x = self.deconv4(x) + skip1  # (B, 64, 64, 512)
-        return self.classifier(self.dropout(x))  # (B, 4, 64, 512)
+        logits = self.classifier(self.dropout(x))  # (B, 4, 64, 512)
+        return logits if early is None else (logits, early)
 
     def _initialise(self) -> None:
         for module in self.modules():

@@ -1,4 +1,4 @@
-"""Real scans with 3-D boxes in KITTI's layout, and the truth that SSADNet and PointSeg are trained on.
+"""Labelled real scans, and the truth that SSADNet and PointSeg are trained on and judged by.
 
 Labels cover the left colour camera's field of view only: outside it, truth is unknown, not background.
 """
@@ -6,27 +6,43 @@ Labels cover the left colour camera's field of view only: outside it, truth is u
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeperc.card import TopViewGeometry
-from edgeperc.errors import PointsError
-from edgeperc.perception import Box
-from edgeperc.points import read_points
+from .card import TopViewGeometry
+from .errors import PointsError
+from .perception import Box
+from .points import read_points
+from .simulation import SimulatedScan, random_scene, scene_from_boxes, sensor_pose, simulate
+from .splits import TEST_DRIVES, in_split
+
+__all__ = [
+    "IGNORE",
+    "POINT_CLASS_OF",
+    "ROAD_CLASSES",
+    "Calibration",
+    "Frame",
+    "KittiObjects",
+    "RoadFrame",
+    "SemanticKitti",
+    "inside",
+    "layouts",
+    "read_objects",
+    "simulated_scan",
+]
 
 IGNORE = 255
 # PointSeg's car holds every vehicle with a box; pedestrians sit down too.
 POINT_CLASS_OF = {"car": 1, "van": 1, "truck": 1, "pedestrian": 2, "person_sitting": 2, "cyclist": 3}
 IMAGE_SIZE = (1242, 375)
-
-# Validation drives: 21 checked frames of three drives, with cars, vans, trucks, pedestrians and cyclists; and all of
-# SemanticKITTI at hand (2011_10_03_drive_0027). Neither their scans nor their layouts are ever trained on.
-VALIDATION_DRIVES = ("2011_09_26_drive_0011", "2011_09_26_drive_0015", "2011_09_26_drive_0032", "2011_10_03_drive_0027")
+# Measured: the bottom of KITTI's boxes lies this far above the ground around them (median of 720 boxes).
+BOX_ABOVE_GROUND_M = 0.03
 
 
 @dataclass(frozen=True)
@@ -54,13 +70,13 @@ class Calibration:
                 values[key] = np.array([float(v) for v in numbers.split()])
         rectify, from_velo = np.eye(4), np.eye(4)
         try:
-            rectify[:3, :3] = values.get("R0_rect", values.get("R_rect")).reshape(3, 3)
-            from_velo[:3] = values.get("Tr_velo_to_cam", values.get("Tr_velo_cam")).reshape(3, 4)
+            rectify[:3, :3] = values["R0_rect" if "R0_rect" in values else "R_rect"].reshape(3, 3)
+            from_velo[:3] = values["Tr_velo_to_cam" if "Tr_velo_to_cam" in values else "Tr_velo_cam"].reshape(3, 4)
             return cls(rectify @ from_velo, values["P2"].reshape(3, 4))
-        except (AttributeError, KeyError, ValueError) as exc:
+        except (KeyError, ValueError) as exc:
             raise PointsError(f"{path} holds no KITTI calibration; expected P2, R0_rect and Tr_velo_to_cam") from exc
 
-    def to_image(self, points: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def to_image(self, points: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Pixels (n, 2) and depth (n,) [m] of points (n, 3+) in the sensor frame."""
         cam = np.asarray(points[:, :3], np.float64) @ self.T_cam_velo[:3, :3].T + self.T_cam_velo[:3, 3]
         image = cam @ self.P2[:, :3].T + self.P2[:, 3]
@@ -68,7 +84,7 @@ class Calibration:
         with np.errstate(divide="ignore", invalid="ignore"):
             return image[:, :2] / depth[:, None], depth
 
-    def in_image(self, points: NDArray) -> NDArray[np.bool_]:
+    def in_image(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """Which points the camera sees, (n,) bool."""
         pixel, depth = self.to_image(points)
         return (depth > 0.1) & (pixel >= 0).all(axis=1) & (pixel[:, 0] < IMAGE_SIZE[0]) & (pixel[:, 1] < IMAGE_SIZE[1])
@@ -104,7 +120,7 @@ class Frame:
         """Points whose truth is known, (n,) bool: seen by the camera, outside DontCare."""
         return self.judges(self.points)
 
-    def judges(self, points: NDArray) -> NDArray[np.bool_]:
+    def judges(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """Whether truth is known at each of these places (n, 3+), sensor frame."""
         known = self.calibration.in_image(points)
         pixel, _ = self.calibration.to_image(points)
@@ -148,7 +164,7 @@ def read_objects(label_path: Path, calibration: Calibration) -> tuple[tuple[Box,
     return tuple(boxes), np.array(unlabelled, np.float64).reshape(-1, 4)
 
 
-def inside(box: Box, points: NDArray, margin_m: float = 0.0) -> NDArray[np.bool_]:
+def inside(box: Box, points: NDArray[Any], margin_m: float = 0.0) -> NDArray[np.bool_]:
     """Points (n, 3+) within a box grown by a margin, (n,) bool."""
     offset = points[:, :3] - np.asarray(box.center, np.float32)
     cos, sin = np.cos(box.yaw), np.sin(box.yaw)
@@ -173,21 +189,20 @@ class KittiObjects:
                 rows = list(csv.DictReader(file))
         else:
             rows = [{"name": p.stem, "drive": p.stem} for p in sorted((self.root / "training/label_2").glob("*.txt"))]
+        self.drives = {r["name"]: r["drive"] for r in rows}
         self.rows = [r for r in rows if (self.root / "training/label_2" / f"{r['name']}.txt").exists()]
         if not self.rows:
             raise PointsError(f"{self.root} holds no training/label_2/*.txt; expected the root of a KITTI object set")
 
-    def names(self, split: str, grades: str = "AB", crops: bool = True) -> list[str]:
-        """Names of the ``"train"``, ``"validation"`` or ``"all"`` frames; drives are never shared between splits."""
-        if split not in ("train", "validation", "all"):
-            raise ValueError(f"split is {split!r}; expected train, validation or all")
-        return [
-            r["name"]
-            for r in self.rows
-            if (split == "all" or (r["drive"] in VALIDATION_DRIVES) == (split == "validation"))
-            and r.get("grade", "A") in grades
-            and (crops or r.get("crop", "0") == "0")
-        ]
+    def names(self, split: str, *, fold: int | None = None, grades: str = "A") -> list[str]:
+        """Names of the frames of a split (`edgeperc.splits.in_split`) whose boxes are of one of the ``grades``."""
+        return [r["name"] for r in self.rows if in_split(r["drive"], split, fold) and r.get("grade", "A") in grades]
+
+    def unlabelled(self, split: str, *, fold: int | None = None) -> list[str]:
+        """Names of the scans of a split that have no label file."""
+        labelled = {r["name"] for r in self.rows}
+        names = [name for name, drive in self.drives.items() if name not in labelled and in_split(drive, split, fold)]
+        return [name for name in names if (self.root / "training/velodyne" / f"{name}.bin").exists()]
 
     def frame(self, name: str) -> Frame:
         """Read one frame whole."""
@@ -199,51 +214,128 @@ class KittiObjects:
 
 
 def layouts(root: Path | str) -> Iterator[tuple[Box, ...]]:
-    """Boxes of every KITTI label file below ``root`` that is of no validation drive: real scenes to simulate."""
+    """Boxes of every KITTI label file below ``root`` that is of no test drive: real scenes to simulate."""
     root = Path(root)
     with (root / "frames.csv").open(newline="") as file:
-        names = [r["name"] for r in csv.DictReader(file) if r["drive"] not in VALIDATION_DRIVES]
+        names = [r["name"] for r in csv.DictReader(file) if r["drive"] not in TEST_DRIVES]
     for name in names:
         calibration = Calibration.read(root / "calib" / f"{name}.txt")
         yield read_objects(root / "label_2" / f"{name}.txt", calibration)[0]
 
 
+ROAD_CLASSES = ("other", "road", "vehicle")
+# SemanticKITTI's raw ids: road and lane marking; car, bus, truck, other vehicle, and those that move.
+ROAD_IDS = (40, 60)
+VEHICLE_IDS = (10, 13, 18, 20, 252, 257, 258, 259)
+# KITTI's odometry sequences with labels are raw drives too.
+SEQUENCE_DRIVES = {
+    "00": "2011_10_03_drive_0027",
+    "01": "2011_10_03_drive_0042",
+    "02": "2011_10_03_drive_0034",
+    "03": "2011_09_26_drive_0067",
+    "04": "2011_09_30_drive_0016",
+    "05": "2011_09_30_drive_0018",
+    "06": "2011_09_30_drive_0020",
+    "07": "2011_09_30_drive_0027",
+    "08": "2011_09_30_drive_0028",
+    "09": "2011_09_30_drive_0033",
+    "10": "2011_09_30_drive_0034",
+}
+
+
 @dataclass(frozen=True)
 class RoadFrame:
-    """A SemanticKITTI scan whose road is known (validation only).
+    """A SemanticKITTI scan whose road and vehicles are known.
 
     Attributes
     ----------
+    name, drive : str
     points : (n, 4) float32
-    road : (n,) uint8
-        1 on road (raw ids 40 road, 60 lane marking), 0 elsewhere, `IGNORE` where unlabelled.
+    labels : (n,) uint8
+        Index into `ROAD_CLASSES`, `IGNORE` where unlabelled.
     """
 
     name: str
+    drive: str
     points: NDArray[np.float32]
-    road: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
 
     def top_view(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
-        """Road truth of the observed cells, (rows, cols) uint8: 1 where most labelled returns of a cell are road.
+        """Truth of the observed cells, (rows, cols) uint8: road or vehicle where most labelled returns are, else other.
 
         `IGNORE` where no labelled return fell: what the sensor did not see, nobody can call right or wrong.
         """
-        p, known = self.points, self.road != IGNORE
+        p, known = self.points, self.labels != IGNORE
         row = np.floor((geometry.x_range_m[1] - p[:, 0]) / geometry.cell_m).astype(np.int64)
         col = np.floor((geometry.y_range_m[1] - p[:, 1]) / geometry.cell_m).astype(np.int64)
         known &= (row >= 0) & (row < geometry.height) & (col >= 0) & (col < geometry.width)
         known &= (p[:, 2] >= geometry.z_range_m[0]) & (p[:, 2] <= geometry.z_range_m[1])
         cell = row[known] * geometry.width + col[known]
         size = geometry.height * geometry.width
-        total = np.bincount(cell, minlength=size)
-        road = np.bincount(cell, weights=self.road[known] == 1, minlength=size)
-        truth = np.where(total == 0, IGNORE, 2 * road > total).astype(np.uint8)
+        counts = [np.bincount(cell, weights=self.labels[known] == k, minlength=size) for k in range(len(ROAD_CLASSES))]
+        total = np.sum(counts, axis=0)
+        truth = np.where(total == 0, IGNORE, 0).astype(np.uint8)
+        for k in (1, 2):
+            truth[2 * counts[k] > total] = k
         return truth.reshape(geometry.height, geometry.width)
 
 
-def road_frames(root: Path | str) -> Iterator[RoadFrame]:
-    """Every SemanticKITTI scan with point labels below ``root/sequences``."""
-    for path in sorted(Path(root).glob("sequences/*/velodyne/*.bin")):
-        raw = np.fromfile(path.parents[1] / "labels" / f"{path.stem}.label", np.uint32) & 0xFFFF
-        road = np.where(raw == 0, IGNORE, np.isin(raw, (40, 60))).astype(np.uint8)
-        yield RoadFrame(f"{path.parents[1].name}/{path.stem}", read_points(path), road)
+class SemanticKitti:
+    """The scans with point labels below a SemanticKITTI root (``sequences/00/velodyne``, ``labels``), by drive."""
+
+    def __init__(self, root: Path | str) -> None:
+        self.root = Path(root)
+        found = sorted(self.root.glob("sequences/*/labels/*.label"))
+        if not found:
+            raise PointsError(
+                f"{self.root} holds no sequences/*/labels/*.label; expected the root of a SemanticKITTI set"
+            )
+        self.drives = {
+            f"{path.parts[-3]}/{path.stem}": SEQUENCE_DRIVES.get(path.parts[-3], path.parts[-3]) for path in found
+        }
+
+    def names(self, split: str, *, fold: int | None = None) -> list[str]:
+        """Names, ``"00/000123"``, of the scans of a split (`edgeperc.splits.in_split`)."""
+        return [name for name, drive in self.drives.items() if in_split(drive, split, fold)]
+
+    def frame(self, name: str) -> RoadFrame:
+        """Read one scan and its labels."""
+        sequence, stem = name.split("/")
+        points = read_points(self.root / "sequences" / sequence / "velodyne" / f"{stem}.bin")
+        path = self.root / "sequences" / sequence / "labels" / f"{stem}.label"
+        raw = np.fromfile(path, np.uint32) & 0xFFFF  # above is the instance
+        if len(raw) != len(points):
+            raise PointsError(
+                f"{path} holds {len(raw)} labels for a scan of {len(points)} points; expected one a point"
+            )
+        labels = np.where(np.isin(raw, ROAD_IDS), 1, np.where(np.isin(raw, VEHICLE_IDS), 2, 0))
+        return RoadFrame(name, self.drives[name], points, np.where(raw == 0, IGNORE, labels).astype(np.uint8))
+
+
+def simulated_scan(seed: int, sensor: str = "hdl-64e", boxes: Sequence[Box] | None = None) -> SimulatedScan:
+    """One scan of a scene of its own, the vehicle a little off its lane, pitched and rolled as on a real road.
+
+    ``boxes`` gives the scene a real layout; without, everything is drawn from the seed.
+    """
+    rng = np.random.default_rng((seed, 1))
+    if boxes is None:
+        scene = random_scene(seed)
+        x, y, yaw = rng.normal(0.0, 4.0), rng.normal(0.0, 0.5), rng.normal(0.0, 0.05)
+    else:
+        scene, x, y, yaw = scene_from_boxes(boxes, seed), 0.0, 0.0, 0.0
+    pitch, roll = rng.normal(0.0, 0.008, size=2)
+    pose = sensor_pose(scene, sensor, x, y, yaw=yaw, pitch=pitch, roll=roll)
+    return simulate(scene, sensor, seed, pose)
+
+
+def labels_by_boxes(scan: SimulatedScan) -> NDArray[np.uint8]:
+    """A simulated scan's point labels (n,) as they would be in KITTI, where a box is all that is known of an object.
+
+    What lies in the box of an object that was hit is the object, the ground at its feet included.
+    """
+    labels = scan.labels.copy()
+    for box, returns in zip(scan.boxes, scan.box_points, strict=True):
+        if returns:
+            raised = replace(box, center=(box.center[0], box.center[1], box.center[2] + BOX_ABOVE_GROUND_M))
+            labels[inside(raised, scan.points)] = POINT_CLASS_OF[box.label]
+    return labels

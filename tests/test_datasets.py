@@ -13,22 +13,23 @@ import pytest
 pytest.importorskip("tqdm")
 
 from edgeperc.card import TopViewGeometry
-from edgeperc.errors import PointsError
-from edgeperc.perception import Box
-from edgeperc.simulation import draw_vehicles
-from edgeperc_export.augment import SURFACE, LabelledScan, augmented, mirrored, turned
-from edgeperc_export.dataset import simulated_scan
-from edgeperc_export.kitti import (
+from edgeperc.datasets import (
     IGNORE,
-    VALIDATION_DRIVES,
     Calibration,
     Frame,
     KittiObjects,
+    RoadFrame,
+    SemanticKitti,
     inside,
     layouts,
     read_objects,
-    road_frames,
+    simulated_scan,
 )
+from edgeperc.errors import PointsError
+from edgeperc.perception import Box
+from edgeperc.simulation import draw_vehicles
+from edgeperc.splits import FOLDS, TEST_DRIVES, fold_of
+from edgeperc_export.augment import SURFACE, LabelledScan, augmented, mirrored, turned
 from edgeperc_export.road import ground_plane, sure_surface
 
 VIEW = TopViewGeometry()
@@ -135,6 +136,41 @@ def test_footprints_at_the_edge_are_cut() -> None:
     assert 500 < np.count_nonzero(surface) < 1300
 
 
+def test_most_returns_of_a_cell_decide() -> None:
+    def cell(col: int, *labels: int) -> list[tuple[float, float, float, float, int]]:
+        return [(20.05, 9.95 - 0.1 * col, -1.7, 0.0, label) for label in labels]
+
+    rows = cell(0, 1, 1, 0) + cell(1, 1, 0) + cell(2, 2, 2, 1) + cell(3, 1, 2, 0) + cell(4, IGNORE) + cell(5, 1, IGNORE)
+    rows += [(20.05, 9.95, 3.0, 0.0, 0)] * 9 + [(50.0, 0.0, -1.7, 0.0, 1)]  # above the view, and beyond it
+    table = np.array(rows)
+    one = RoadFrame("00/0", "drive", table[:, :4].astype(np.float32), table[:, 4].astype(np.uint8))
+    truth = one.top_view(VIEW)
+    assert truth[259, :7].tolist() == [1, 0, 2, 0, IGNORE, 1, IGNORE]
+    assert np.count_nonzero(truth != IGNORE) == 5
+
+
+def test_semantickitti_files(tmp_path: Path) -> None:
+    with pytest.raises(PointsError, match="SemanticKITTI"):
+        SemanticKitti(tmp_path)
+    raw = np.array([0, 40, 60, 10, 13, 18, 20, 252, 257, 258, 259, 30, 48, 72, (7 << 16) + 10], np.uint32)
+    for name in ("00/000003", "08/000001", "77/000000"):
+        sequence, stem = name.split("/")
+        for part in ("velodyne", "labels"):
+            (tmp_path / "sequences" / sequence / part).mkdir(parents=True)
+        np.zeros((15, 4), np.float32).tofile(tmp_path / "sequences" / sequence / "velodyne" / f"{stem}.bin")
+        raw.tofile(tmp_path / "sequences" / sequence / "labels" / f"{stem}.label")
+    sequences = SemanticKitti(tmp_path)
+    assert sequences.names("all") == ["00/000003", "08/000001", "77/000000"]
+    assert sequences.names("test") == ["00/000003"]  # the one that is a test drive among the raw drives
+    assert sequences.frame("08/000001").drive == "2011_09_30_drive_0028"
+    one = sequences.frame("77/000000")
+    assert (one.name, one.drive) == ("77/000000", "77")
+    assert one.labels.tolist() == [IGNORE, 1, 1, 2, 2, 2, 2, 2, 2, 2, 2, 0, 0, 0, 2]
+    raw[1:].tofile(tmp_path / "sequences/77/labels/000000.label")
+    with pytest.raises(PointsError, match="14 labels for a scan of 15 points"):
+        sequences.frame("77/000000")
+
+
 # --- scans and their changes -----------------------------------------------------------------------------------------
 
 
@@ -223,17 +259,22 @@ def test_no_ground_no_claim() -> None:
 def test_drives_are_never_shared(kitti_root: Path) -> None:
     objects = KittiObjects(kitti_root)
     drive = {r["name"]: r["drive"] for r in objects.rows}
-    train, validation = (objects.names(s) for s in ("train", "validation"))
-    assert len(train) + len(validation) == len(objects.names("all")) == 228
-    assert {drive[n] for n in validation} == set(VALIDATION_DRIVES) - {"2011_10_03_drive_0027"}
-    assert not {drive[n] for n in train} & set(VALIDATION_DRIVES)
+    train, test = (objects.names(s, grades="AB") for s in ("train", "test"))
+    assert len(train) + len(test) == len(objects.names("all", grades="AB")) == 228
+    assert {drive[n] for n in test} == TEST_DRIVES - {"2011_10_03_drive_0027"}
+    assert not {drive[n] for n in train} & TEST_DRIVES
+    for fold in range(len(FOLDS)):
+        left, held_back = (objects.names(s, fold=fold, grades="AB") for s in ("train", "validation"))
+        assert sorted(left + held_back) == sorted(train)
+        assert {fold_of(drive[n]) for n in held_back} == {fold}
+        assert fold not in {fold_of(drive[n]) for n in left}
 
 
-def test_layouts_of_validation_drives_are_left_out(data_root) -> None:  # type: ignore[no-untyped-def]
+def test_layouts_of_test_drives_are_left_out(data_root) -> None:  # type: ignore[no-untyped-def]
     root = data_root("kitti_labels_7481")
-    assert any(d in (root / "frames.csv").read_text() for d in VALIDATION_DRIVES)
+    assert any(d in (root / "frames.csv").read_text() for d in TEST_DRIVES)
     rows = (root / "frames.csv").read_text().splitlines()[1:]
-    kept = [r for r in rows if not any(d in r for d in VALIDATION_DRIVES)]
+    kept = [r for r in rows if not any(d in r for d in TEST_DRIVES)]
     first = next(iter(layouts(root)))
     name = kept[0].split(",")[0]
     calibration = Calibration.read(root / "calib" / f"{name}.txt")
@@ -254,8 +295,13 @@ def test_real_boxes_are_full_of_points(kitti_root: Path) -> None:
 
 
 def test_road_truth_of_observed_cells(semantickitti_root: Path) -> None:
-    one = next(iter(road_frames(semantickitti_root)))
+    sequences = SemanticKitti(semantickitti_root)
+    assert sequences.names("test") == sequences.names("all")
+    assert not sequences.names("train")
+    one = sequences.frame(sequences.names("test")[0])
+    assert one.drive == "2011_10_03_drive_0027"
     truth = one.top_view(VIEW)
     assert truth.shape == (400, 200)
     assert 3000 < (truth != IGNORE).sum() < 12_000
     assert 0.2 < (truth[truth != IGNORE] == 1).mean() < 0.9
+    assert set(np.unique(truth)) <= {0, 1, 2, IGNORE}

@@ -1,0 +1,452 @@
+"""The papers' tables on labelled scans: points (PointSeg 5.1), boxes and top view (SSADNet 3.3, appendix A), road.
+
+Everything goes through `edgeperc.Perceiver`, as it would in a vehicle: what is judged is what a user gets. One pass
+makes a small `Record` of each scan; every figure is computed from records put together, so that an interval is the
+same figures over drives drawn anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .card import ModelCard, TopViewGeometry
+from .datasets import (
+    IGNORE,
+    POINT_CLASS_OF,
+    ROAD_CLASSES,
+    Frame,
+    KittiObjects,
+    RoadFrame,
+    SemanticKitti,
+    inside,
+    labels_by_boxes,
+    simulated_scan,
+)
+from .decode import decode_classes
+from .errors import EdgepercError, ModelError, PointsError, SplitError
+from .figures import BANDS, VEHICLES, Record, banded, figures, within
+from .metrics import BoxEvaluator, ProbabilitySweep
+from .models import model_path
+from .perceiver import Perceiver
+from .perception import Box, Perception, PointLabels, TopView
+from .projection import make_projector
+from .session import Session
+from .simulation import POINT_CLASSES, TOP_VIEW_CLASSES, draw_vehicles
+from .view import Mistakes
+
+__all__ = ["Judge", "Truth", "evaluate"]
+
+SHIPPED = ("ssadnet", "pointseg")
+FEWEST_RETURNS = 3  # no network could tell an object of fewer from clutter
+FIRST_SEED = 2 * 10**9  # training draws its scenes from 0, proofs of exports from 10**9
+N_WORST = 20
+FARTHEST_M = 46.0  # objects beyond count among the points' figures, but for no mistake
+GROUND_Z_M = -1.5  # where a cell is looked up in the camera's image
+
+# Names of what is judged in the top view; never put together, for each counts other cells by other truth.
+BY_BOXES, OBSERVED, EVERY_CELL = "vehicles from 3-D boxes", "observed cells", "every cell"
+
+
+Cells = dict[str, tuple[tuple[str, ...], NDArray[np.uint8]]]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A scan and what is known about it.
+
+    Attributes
+    ----------
+    name, drive : str
+    points : (n, 4) float32
+    labels : (n,) uint8 or None
+        Index into `POINT_CLASSES`, `IGNORE` where unknown; None where neither points nor objects are to be judged.
+    boxes : tuple of Box
+    returns : tuple of int
+        Returns from each box's object.
+    known : callable
+        Which of some places (k, 3) truth is known at, (k,) bool.
+    cells : mapping
+        Name of a table to its classes and the truth of every cell (rows, columns) uint8, `IGNORE` where unknown.
+    road : tuple of 2 str, or None
+        The table and its class by which the drivable cells are judged.
+    """
+
+    name: str
+    drive: str
+    points: NDArray[np.float32]
+    labels: NDArray[np.uint8] | None
+    boxes: tuple[Box, ...]
+    returns: tuple[int, ...]
+    known: Callable[[NDArray[np.float64]], NDArray[np.bool_]]
+    cells: Cells
+    road: tuple[str, str] | None = None
+
+
+class _Network:
+    """A model's own outputs, for the figures that a perception does not hold."""
+
+    def __init__(self, model: str | Path, provider: str) -> None:
+        self.session = Session(model if Path(model).suffix == ".onnx" else model_path(str(model)), provider)
+        self.card = self.session.card
+        self.projector = make_projector(self.card.view, self.card.input)
+        self.kind = next(output.kind for output in self.card.outputs if output.kind.startswith("class_"))
+
+    def classes(self, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        """Logits or probabilities (C, H, W), and the flat pixel of every point."""
+        projected = self.projector.project(points)
+        self.session.input[:] = projected.image
+        return self.session.run()[self.kind], projected.pixel
+
+    def probability(self, points: NDArray[np.float32], name: str) -> NDArray[np.float64]:
+        """Of one class in every pixel, (H, W)."""
+        values = self.classes(points)[0].astype(np.float64)
+        if self.kind == "class_logits":
+            values = np.exp(values - values.max(axis=0))
+        return values[self.card.classes.index(name)] / values.sum(axis=0)
+
+    def point_labels(self, points: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """The label of every point's pixel, as PointSeg has it before any refinement, (n,) uint8."""
+        output, pixel = self.classes(points)
+        labels, _ = decode_classes(output, self.kind, model=self.card.name)
+        return np.where(pixel >= 0, labels.ravel()[pixel], 0).astype(np.uint8)
+
+
+class Judge:
+    """Perceives scans and holds them against their truth.
+
+    Parameters
+    ----------
+    models : sequence of str or Path
+        Shipped names or paths; a range-image model is judged by points, a top-view model by boxes and cells.
+    provider : str
+    road_by : str, Path or None
+        A top-view model whose drivable cells count as the truth of real scans with boxes (SSADNet 3.1.2 takes LoDNN's).
+    training_scans : bool
+        Judge scans that a model was trained on, too.
+    """
+
+    def __init__(
+        self,
+        models: Sequence[str | Path],
+        *,
+        provider: str = "cpu",
+        road_by: str | Path | None = None,
+        training_scans: bool = False,
+    ) -> None:
+        self.perceive = _perceiver(models, provider)
+        networks = [_Network(model, provider) for model in models]
+        self.from_sensor = next((n for n in networks if n.card.view.kind == "range_image"), None)
+        self.from_above = next((n for n in networks if n.card.view.kind == "top_view"), None)
+        self.box_classes = self.from_above.card.box_classes if self.from_above else ()
+        self.view = self.from_above.card.view if self.from_above else None
+        if isinstance(self.view, TopViewGeometry):
+            x, y = np.broadcast_arrays(*self.view.cell_centres())
+            self.cell_range_m = np.hypot(x, y)
+            self.places = np.stack([x.ravel(), y.ravel(), np.full(x.size, GROUND_Z_M)], axis=1)
+        self.draw_road = None if road_by is None else _perceiver([road_by], provider)
+        cards = [*self.perceive.cards]
+        if self.draw_road is not None:
+            (card,) = self.draw_road.cards
+            if card.view != self.view or "drivable" not in card.classes:
+                raise ModelError(f"{card.name} does not draw the road that {cards[0].name} sees; expected one top view")
+            if any((card.name, card.version) == (own.name, own.version) for own in cards):
+                raise ModelError(f"{card.name} {card.version} cannot draw its own truth; name another model")
+            cards.append(card)
+        self.trained_on = {} if training_scans else {f"{c.name} {c.version}": _training_hashes(c) for c in cards}
+
+    def kitti(self, frame: Frame) -> Truth:
+        """Boxes, and the points and cells in the camera's view outside DontCare.
+
+        Raises
+        ------
+        SplitError
+            A model was trained on this scan.
+        """
+        self._check(frame.name, frame.drive, frame.points)
+        cells: Cells = {}
+        if isinstance(self.view, TopViewGeometry):
+            vehicles, unnamed = np.zeros((2, self.view.height, self.view.width), np.uint8)
+            draw_vehicles(vehicles, frame.boxes, self.view)
+            # Nobody said whether a tram is a truck.
+            strange = [replace(box, label="car") for box in frame.boxes if box.label in ("tram", "misc")]
+            draw_vehicles(unnamed, strange, self.view)
+            known = frame.judges(self.places).reshape(vehicles.shape) & (unnamed == 0)
+            by_boxes = np.where(vehicles > 0, vehicles - 1, 0)
+            cells[BY_BOXES] = ("background", *VEHICLES), np.where(known, by_boxes, IGNORE).astype(np.uint8)
+        if self.draw_road is not None:
+            drawn = self.draw_road(frame.points).top_view
+            assert drawn is not None
+            surface = np.where(vehicles > 0, vehicles, drawn.drivable)
+            (card,) = self.draw_road.cards
+            title = f"road drawn by {card.name} {card.version}"
+            cells[title] = TOP_VIEW_CLASSES, np.where(known, surface, IGNORE).astype(np.uint8)
+        returns = tuple(int(np.count_nonzero(inside(box, frame.points, 0.1))) for box in frame.boxes)
+        labels = frame.point_labels()
+        return Truth(frame.name, frame.drive, frame.points, labels, frame.boxes, returns, frame.judges, cells)
+
+    def semantickitti(self, frame: RoadFrame) -> Truth:
+        """Cells with labelled returns.
+
+        Raises
+        ------
+        SplitError
+            A model was trained on this scan.
+        """
+        self._check(frame.name, frame.drive, frame.points)
+        cells: Cells = {}
+        if isinstance(self.view, TopViewGeometry):
+            cells[OBSERVED] = ROAD_CLASSES, frame.top_view(self.view)
+        return Truth(frame.name, frame.drive, frame.points, None, (), (), _everywhere, cells, (OBSERVED, "road"))
+
+    def simulated(self, seed: int) -> Truth:
+        """A scene drawn from a seed, which is a drive of its own: everything is known."""
+        name, scan = f"scene {seed}", simulated_scan(seed)
+        cells: Cells = {}
+        if isinstance(self.view, TopViewGeometry):
+            cells[EVERY_CELL] = TOP_VIEW_CLASSES, scan.top_view_labels(self.view)
+        road = EVERY_CELL, "drivable"
+        return Truth(
+            name, name, scan.points, labels_by_boxes(scan), scan.boxes, scan.box_points, _everywhere, cells, road
+        )
+
+    def _check(self, name: str, drive: str, points: NDArray[np.float32]) -> None:
+        digest = hashlib.sha256(points.tobytes()).hexdigest()[:16]
+        for model, hashes in self.trained_on.items():
+            if digest in hashes:
+                raise SplitError(
+                    f"{model} was trained on scan {name} of drive {drive}, so its figures there say nothing; judge the "
+                    "test split or a model trained without this drive, or ask for split 'train' to see training scans"
+                )
+
+    def record(self, truth: Truth) -> tuple[Record, Mistakes | None]:
+        """Judge one scan; the mistakes are None where no objects are known."""
+        found = self.perceive(truth.points)
+        tallies: dict[tuple[str, ...], Any] = {}
+        mistakes = None
+        if truth.labels is not None:
+            x, y = truth.points[:, 0], truth.points[:, 1]
+            shown = (x > -2.0) & (x < 52.0) & (np.abs(y) < 27.0)
+            mistakes = Mistakes(truth.name, truth.drive, truth.points[shown], np.zeros(int(shown.sum()), np.uint8))
+            if self.box_classes:
+                mistakes = self._count_boxes(tallies, truth, found, mistakes)
+            if found.points is not None:
+                mistakes = self._count_points(tallies, truth, found.points, mistakes, shown)
+        if found.top_view is not None:
+            self._count_cells(tallies, truth, found.top_view)
+        return Record(truth.name, truth.drive, tallies), mistakes
+
+    def _count_boxes(
+        self, tallies: dict[tuple[str, ...], Any], truth: Truth, found: Perception, mistakes: Mistakes
+    ) -> Mistakes:
+        predicted, wanted, ignored = self._judged_boxes(truth, found)
+        for kind in ("upright", "oriented"):
+            evaluator = tallies["boxes", kind] = BoxEvaluator(oriented=kind == "oriented")
+            pairs = evaluator.update(predicted, wanted, ignored=ignored)
+        returns = dict(zip(map(id, truth.boxes), truth.returns, strict=True))
+        return replace(
+            mistakes,
+            found=tuple(right for guess, right in pairs if guess and right),
+            missed=tuple((right, returns[id(right)]) for guess, right in pairs if right and not guess),
+            false=tuple(guess for guess, right in pairs if guess and not right),
+        )
+
+    def _count_points(
+        self,
+        tallies: dict[tuple[str, ...], Any],
+        truth: Truth,
+        found: PointLabels,
+        mistakes: Mistakes,
+        shown: NDArray[np.bool_],
+    ) -> Mistakes:
+        """Also takes objects for found or missed that no box is predicted for, as most of their points are labelled."""
+        assert self.from_sensor is not None
+        assert truth.labels is not None
+        right = np.where(found.in_view, truth.labels, IGNORE).astype(np.uint8)
+        range_m = np.hypot(truth.points[:, 0], truth.points[:, 1])
+        labels = _renamed(found.labels, found.classes, POINT_CLASSES)
+        pixels = _renamed(self.from_sensor.point_labels(truth.points), found.classes, POINT_CLASSES)
+        tallies |= banded(("points",), POINT_CLASSES, labels, right, range_m)
+        tallies |= banded(("pixels",), POINT_CLASSES, pixels, right, range_m)
+        tallies |= {("objects", band): Counter() for band in BANDS}
+        by_box = {id(box) for box in (*mistakes.found, *(box for box, _ in mistakes.missed))}
+        hit, missed = [*mistakes.found], [*mistakes.missed]
+        for box in truth.boxes:
+            kind, distance_m = POINT_CLASS_OF.get(box.label), math.hypot(*box.center[:2])
+            own = inside(box, truth.points) & (right == kind)
+            n_own = int(np.count_nonzero(own))
+            if kind is None or n_own < FEWEST_RETURNS:
+                continue
+            for band, within_m in BANDS.items():
+                tallies["objects", band][POINT_CLASSES[kind]] += int(within(distance_m, within_m))
+            if id(box) in by_box or distance_m >= FARTHEST_M:
+                continue
+            if 2 * int(np.count_nonzero(labels[own] == kind)) >= n_own:
+                hit.append(box)
+            else:
+                missed.append((box, n_own))
+        counted = right != IGNORE
+        wrong = np.where(counted & (labels != right), np.where(right > 0, 1, 2), 0).astype(np.uint8)
+        n_objects = int(np.count_nonzero(counted & ((right > 0) | (labels > 0))))
+        share = int(np.count_nonzero(wrong)) / max(n_objects, 1)
+        return replace(mistakes, wrong=wrong[shown], found=tuple(hit), missed=tuple(missed), wrong_share=share)
+
+    def _count_cells(self, tallies: dict[tuple[str, ...], Any], truth: Truth, found: TopView) -> None:
+        assert self.from_above is not None
+        for table, (classes, right) in truth.cells.items():
+            labels = _renamed(found.labels, found.classes, classes)
+            tallies |= banded(("segmentation", table), classes, labels, right, self.cell_range_m)
+        if truth.road is None or "drivable" not in found.classes:
+            return
+        table, name = truth.road
+        classes, right = truth.cells[table]
+        road = np.where(right == IGNORE, IGNORE, right == classes.index(name)).astype(np.uint8)
+        tallies |= banded(("decision",), ("other", name), found.drivable.astype(np.uint8), road, self.cell_range_m)
+        probability = self.from_above.probability(truth.points, "drivable")
+        for band, within_m in BANDS.items():
+            judged = (road != IGNORE) & within(self.cell_range_m, within_m)
+            tallies["road", band] = ProbabilitySweep()
+            tallies["road", band].update(probability[judged], road[judged])
+
+    def _judged_boxes(self, truth: Truth, found: Perception) -> tuple[list[Box], list[Box], list[Box]]:
+        """Predictions where truth is known, the boxes to find, and those that need not be found.
+
+        To be found is every vehicle whose centre lies in the top view and which `FEWEST_RETURNS` or more came from.
+        """
+        assert isinstance(self.view, TopViewGeometry)
+        (near, far), (right, left) = self.view.x_range_m, self.view.y_range_m
+        centres = np.array([box.center for box in found.boxes], np.float64).reshape(-1, 3)
+        predicted = [box for box, known in zip(found.boxes, truth.known(centres), strict=True) if known]
+        wanted: list[Box] = []
+        ignored: list[Box] = []
+        for box, returns in zip(truth.boxes, truth.returns, strict=True):
+            seen = near <= box.center[0] < far and right <= box.center[1] < left
+            counts = box.label in self.box_classes and seen and returns >= FEWEST_RETURNS
+            (wanted if counts else ignored).append(box)
+        return predicted, wanted, ignored
+
+
+def _perceiver(models: Sequence[str | Path], provider: str) -> Perceiver:
+    try:
+        return Perceiver(list(models), sensor="hdl-64e", provider=provider, on_mismatch="ignore")
+    except EdgepercError:
+        raise
+    except ValueError as exc:  # two models of one view
+        raise ModelError(str(exc)) from exc
+
+
+def _training_hashes(card: ModelCard) -> set[str]:
+    """The first 16 hexadecimal digits of the SHA-256 of every real scan that a model was trained on."""
+    frames = card.training.get("frames", {})
+    return set(frames.values()) if isinstance(frames, Mapping) else set()
+
+
+def _everywhere(places: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return np.ones(len(places), np.bool_)
+
+
+def _renamed(labels: NDArray[np.uint8], names: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:
+    """Labels of a model as those of a table; the first class stands for what the table does not tell apart."""
+    coarse = {"drivable": "road", **dict.fromkeys(VEHICLES, "vehicle")}
+    own = [name if name in classes else coarse.get(name, "") for name in names]
+    return np.array([classes.index(name) if name in classes else 0 for name in own], np.uint8)[labels]
+
+
+def evaluate(
+    datasets: Sequence[str | Path],
+    models: Sequence[str | Path] = SHIPPED,
+    *,
+    split: str | None = None,
+    fold: int | None = None,
+    road_by: str | Path | None = None,
+    provider: str = "cpu",
+    n_resamples: int = 1000,
+    on_scan: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[dict[str, Any], list[Mistakes]]:
+    """Figures of models on labelled scans.
+
+    Parameters
+    ----------
+    datasets : sequence of str or Path
+        Roots of a KITTI object set or of SemanticKITTI, or ``"simulation:N"`` for N simulated scans (24 without).
+    models, road_by, provider
+        As `Judge` has them.
+    split : str or None
+        ``"test"``, ``"train"``, ``"validation"`` or ``"all"`` of the real scans (`edgeperc.splits`); None takes the
+        validation drives where there is a ``fold`` and the test drives where there is none.
+    fold : int or None
+    n_resamples : int
+        For the intervals.
+    on_scan : callable
+        Told after every scan how many are done, of how many.
+
+    Returns
+    -------
+    figures : dict
+        ``"models"``, ``"split"``, ``"fold"``, and `figures` of ``"real"``, ``"semantickitti"`` and ``"simulated"``
+        scans, whichever there are.
+    mistakes : list of Mistakes
+        The twenty scans with most mistakes, worst first; of real ones where there are any.
+
+    Raises
+    ------
+    PointsError
+        A dataset is none, or has no scans of the split.
+    SplitError
+        A model was trained on a scan, and ``split`` is not ``"train"``.
+    """
+    split = split or ("test" if fold is None else "validation")
+    judge = Judge(models, provider=provider, road_by=road_by, training_scans=split == "train")
+    scans = [scan for dataset in datasets for scan in _scans(judge, dataset, split, fold)]
+    records: dict[str, list[Record]] = {}
+    worst: dict[str, list[Mistakes]] = {}
+    for done, (block, read) in enumerate(scans, start=1):
+        record, mistakes = judge.record(read())
+        records.setdefault(block, []).append(record)
+        if mistakes is not None:
+            ranked = sorted([*worst.get(block, ()), mistakes], key=lambda each: -each.n_errors)
+            worst[block] = ranked[:N_WORST]
+        on_scan(done, len(scans))
+    told: dict[str, Any] = {"models": {card.name: card.version for card in judge.perceive.cards}}
+    told |= {"split": split, "fold": fold}
+    told |= {block: figures(of_block, n_resamples) for block, of_block in records.items()}
+    return told, worst.get("real") or worst.get("simulated", [])
+
+
+def _scans(judge: Judge, dataset: str | Path, split: str, fold: int | None) -> list[tuple[str, Callable[[], Truth]]]:
+    """The scans of a dataset, yet to be read, each with the block of figures that it belongs to."""
+    word, _, number = str(dataset).partition(":")
+    if word == "simulation":
+        if not (number or "24").isdecimal() or number == "0":
+            raise PointsError(f"got {dataset!r}; expected simulation, or simulation:N with a number of scans from 1")
+        return [("simulated", partial(judge.simulated, FIRST_SEED + k)) for k in range(int(number or 24))]
+    root = Path(dataset)
+    if (root / "training" / "label_2").is_dir():
+        objects = KittiObjects(root)
+        names = objects.names(split, fold=fold)
+        scans = [("real", _later(judge.kitti, objects.frame, name)) for name in names]
+    elif any(root.glob("sequences/*/labels")):
+        sequences = SemanticKitti(root)
+        names = sequences.names(split, fold=fold)
+        scans = [("semantickitti", _later(judge.semantickitti, sequences.frame, name)) for name in names]
+    else:
+        raise PointsError(
+            f"{dataset} holds no labelled scans; expected the root of a KITTI object set (training/label_2 below it), "
+            "of SemanticKITTI (sequences/*/labels below it), or the word simulation"
+        )
+    if not scans:
+        raise PointsError(f"{dataset} holds no scans of the {split} drives (fold: {fold}); name another, or 'all'")
+    return scans
+
+
+def _later(judge: Callable[[Any], Truth], read: Callable[[str], Any], name: str) -> Callable[[], Truth]:
+    return lambda: judge(read(name))

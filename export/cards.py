@@ -1,0 +1,46 @@
+"""What this project's networks see, and the cards their files will carry."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.sensors import get_sensor
+from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES
+
+__all__ = ["RANGE_IMAGE", "RANGE_IMAGE_INPUT", "TOP_VIEW", "TOP_VIEW_INPUT", "card_of"]
+
+TOP_VIEW = TopViewGeometry()
+RANGE_IMAGE = RangeImageGeometry(get_sensor("hdl-64e").elevations_deg)
+# SSADNet 2.1.2 scales every channel to its range; the farthest corner of the view is 47.07 m away.
+TOP_VIEW_INPUT = InputSpec("top_view", ("distance", "remission", "height"), (0.0, 0.0, -2.5), (47.07, 1.0, 5.0))
+# Means and deviations of the returns in the front 90 degrees of 27 training scans.
+RANGE_IMAGE_INPUT = InputSpec(
+    "range_image",
+    ("x", "y", "z", "remission", "range"),
+    (12.95, 0.0, -1.31, 0.234, 14.51),
+    (11.35, 7.86, 0.82, 0.148, 12.27),
+)
+
+
+def card_of(network: str, head: str = "dense", **facts: Any) -> ModelCard:
+    """The card of a network; ``facts`` are whatever else `ModelCard` takes, at least its version."""
+    facts = {"name": network, **facts}
+    if network == "pointseg":
+        return ModelCard(
+            view=RANGE_IMAGE,
+            input=RANGE_IMAGE_INPUT,
+            outputs=(OutputSpec("logits", "class_logits"),),
+            classes=POINT_CLASSES,
+            **facts,
+        )
+    return ModelCard(
+        view=TOP_VIEW,
+        input=TOP_VIEW_INPUT,
+        outputs=(OutputSpec("segmentation", "class_logits"), OutputSpec("boxes", f"box_{head}")),
+        classes=TOP_VIEW_CLASSES,
+        box_classes=("car", "van", "truck"),
+        # Medians of KITTI's labels: length, width, height.
+        box_size_priors={"car": (3.9, 1.6, 1.5), "van": (5.1, 1.9, 2.2), "truck": (10.1, 2.6, 3.2)},
+        **facts,
+    )

@@ -1,0 +1,186 @@
+"""Objects pasted, sectors swapped, bad weather: whatever is done to a scan, its labels stay true."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+pytest.importorskip("tqdm")
+
+from edgeperc.datasets import IGNORE, POINT_CLASS_OF, inside, simulated_scan
+from edgeperc.perception import Box
+from edgeperc_export.augment import (
+    SURFACE,
+    LabelledScan,
+    ObjectBank,
+    augmented,
+    facing,
+    pasted,
+    swapped,
+    turned,
+    weathered,
+)
+
+GROUND_M = -1.73
+
+
+def flat_street(boxes: tuple[Box, ...] = ()) -> LabelledScan:
+    """Ground points every 10 cm ahead, and nothing else."""
+    x, y = np.meshgrid(np.arange(3.0, 40.0, 0.1), np.arange(-12.0, 12.0, 0.1))
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, GROUND_M), np.full(x.size, 0.3)], 1).astype(np.float32)
+    unknown = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
+    return LabelledScan(points, np.zeros(len(points), np.uint8), boxes, (0,) * len(boxes), unknown)
+
+
+def post(x: float, y: float, label: str = "pedestrian") -> tuple[Box, np.ndarray]:
+    """A flat figure facing the sensor, 0.4 m wide and 1.7 m tall."""
+    across, up = np.meshgrid(np.arange(-0.2, 0.2, 0.02), np.arange(0.05, 1.7, 0.05))
+    points = np.full((across.size, 4), 0.5, np.float32)
+    points[:, 0], points[:, 1], points[:, 2] = x, y + across.ravel(), GROUND_M + up.ravel()
+    return Box(label, 1.0, (x, y, GROUND_M + 0.85), (0.6, 0.6, 1.7), 0.0), points
+
+
+@pytest.fixture(scope="module")
+def scan() -> LabelledScan:
+    return LabelledScan.from_simulation(simulated_scan(17))
+
+
+def test_what_lies_in_a_simulated_box_is_the_object(scan: LabelledScan) -> None:
+    for box, count in zip(scan.boxes, scan.counts, strict=True):
+        core = replace(box, size=(box.size[0], box.size[1], box.size[2] - 0.2))  # clear of the ground
+        if count and not any(b is not box and np.hypot(*np.subtract(b.center, box.center)[:2]) < 6 for b in scan.boxes):
+            assert set(scan.labels[inside(core, scan.points)]) <= {POINT_CLASS_OF[box.label]}
+
+
+def test_a_bank_holds_each_object_with_its_points() -> None:
+    box, points = post(10.0, 0.0)
+    street = flat_street()
+    held = replace(
+        street,
+        points=np.concatenate([street.points, points]),
+        boxes=(box, replace(box, center=(20.0, 5.0, -0.88)), replace(box, label="tram")),
+        counts=(len(points), 3, 50),  # enough, too few to be worth it, no class of ours
+    )
+    bank = ObjectBank.of([held])
+    ((kept, cut),) = bank.objects.pop("pedestrian")
+    assert not bank.objects
+    assert kept == box
+    assert len(cut) >= len(points)
+    assert inside(box, cut).all()
+
+
+def test_a_pasted_object_hides_what_is_behind_it_and_nothing_else() -> None:
+    box, points = post(10.0, 0.0)
+    street = flat_street()
+    bank = ObjectBank({"pedestrian": [(box, points)]})
+    out = pasted(street, bank, np.random.default_rng(0), 1, {"pedestrian": 1.0})
+    (there,) = out.boxes
+    (count,) = out.counts
+    assert count == np.count_nonzero(out.labels == 2) == len(points)
+    assert np.hypot(*there.center[:2]) == pytest.approx(10.0)  # as far away as it was
+    assert there.center[2] - there.size[2] / 2 == pytest.approx(GROUND_M, abs=0.01)
+    assert inside(there, out.points[out.labels == 2], 0.01).all()
+    azimuth = np.arctan2(there.center[1], there.center[0])
+
+    left = {tuple(p) for p in out.points[out.labels == 0].tolist()}
+    lost = np.array([p for p in street.points.tolist() if tuple(p) not in left])
+    assert len(lost) > 50
+    assert (np.hypot(lost[:, 0], lost[:, 1]) > 9.5).all()  # its shadow begins at its feet
+    assert (np.abs(np.arctan2(lost[:, 1], lost[:, 0]) - azimuth) < np.radians(1.6)).all()
+
+
+def test_an_object_behind_a_wall_is_not_pasted() -> None:
+    y, z = np.meshgrid(np.arange(-12.0, 12.0, 0.01), np.arange(GROUND_M, 2.0, 0.03))
+    wall = np.stack([np.full(y.size, 5.0), y.ravel(), z.ravel(), np.full(y.size, 0.2)], 1).astype(np.float32)
+    street = flat_street()
+    hidden = replace(
+        street, points=np.concatenate([street.points, wall]), labels=np.zeros(len(street.points) + len(wall), np.uint8)
+    )
+    bank = ObjectBank({"pedestrian": [post(10.0, 0.0)]})
+    for seed in range(5):
+        assert pasted(hidden, bank, np.random.default_rng(seed), 1, {"pedestrian": 1.0}) is hidden
+
+
+def test_objects_are_not_pasted_into_one_another() -> None:
+    bank = ObjectBank({"pedestrian": [post(10.0, 0.0)], "cyclist": [post(10.0, 0.0, "cyclist")]})
+    out = pasted(flat_street(), bank, np.random.default_rng(3), 60, {"pedestrian": 1.0, "cyclist": 1.0})
+    centres = np.array([b.center[:2] for b in out.boxes])
+    apart = np.hypot(*(centres[:, None] - centres[None]).transpose(2, 0, 1)) + 9 * np.eye(len(centres))
+    assert len(centres) > 5
+    assert apart.min() > 0.7
+    assert {b.label for b in out.boxes} == {"pedestrian", "cyclist"}
+
+
+def test_nothing_to_paste_is_no_change(scan: LabelledScan) -> None:
+    rng = np.random.default_rng(0)
+    assert pasted(scan, ObjectBank({}), rng, 5, {"pedestrian": 1.0}) is scan
+    assert pasted(scan, ObjectBank({"pedestrian": [post(10, 0)]}), rng, 0, {"pedestrian": 1.0}) is scan
+    empty = replace(flat_street(), points=np.zeros((0, 4), np.float32), labels=np.zeros(0, np.uint8))
+    assert pasted(empty, ObjectBank({"pedestrian": [post(10, 0)]}), rng, 5, {"pedestrian": 1.0}) is empty
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_pasted_labels_are_those_of_the_boxes(scan: LabelledScan, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    bank = ObjectBank.of([scan])
+    out = pasted(scan, bank, rng, 6, dict.fromkeys(bank.objects, 1.0))
+    assert len(out.points) == len(out.labels)
+    assert len(out.boxes) == len(out.counts)
+    for box, count in zip(out.boxes[len(scan.boxes) :], out.counts[len(scan.boxes) :], strict=True):
+        own = inside(box, out.points, 0.05) & (out.labels == POINT_CLASS_OF[box.label])
+        assert np.count_nonzero(own) >= 0.9 * count > 0
+
+
+def test_a_swapped_sector_brings_its_labels_along(scan: LabelledScan) -> None:
+    other = replace(scan, points=scan.points + np.float32([0, 0, 0.5, 0]), labels=np.full_like(scan.labels, 3))
+    scan = replace(scan, labels=np.zeros_like(scan.labels))
+    out = swapped(scan, other, np.random.default_rng(1))
+    azimuth = np.arctan2(out.points[:, 1], out.points[:, 0])
+    low, high = azimuth[out.labels == 3].min(), azimuth[out.labels == 3].max()
+    assert np.radians(20) < high - low <= np.pi / 4
+    within = (azimuth > low) & (azimuth < high)
+    assert (out.labels[within] == 3).all()
+    assert (out.labels[~within & (azimuth != low) & (azimuth != high)] == 0).all()
+
+
+def test_weather_loses_returns_and_labels_drops_background(scan: LabelledScan) -> None:
+    out = weathered(replace(scan, labels=np.ones_like(scan.labels)), np.random.default_rng(4))
+    far = [np.mean(np.linalg.norm(s.points[:, :3], axis=1) > 30) for s in (scan, out)]
+    assert far[1] < far[0]
+    assert len(out.points) == len(out.labels) < len(scan.points)
+    drops = out.labels == 0
+    assert 0 < drops.mean() < 0.02
+    unknown = weathered(replace(scan, labels=np.full_like(scan.labels, IGNORE)), np.random.default_rng(4))
+    assert (unknown.labels == IGNORE).all()
+
+
+def test_facing_turns_somebody_to_the_front(scan: LabelledScan) -> None:
+    rare = [b for b, n in zip(scan.boxes, scan.counts, strict=True) if b.label in ("pedestrian", "cyclist") and n >= 5]
+    assert rare, "the scene has nobody in it"
+    for seed in range(5):
+        angle = facing(scan, np.random.default_rng(seed))
+        ahead = [b for b in turned(scan, angle).boxes if b.label in ("pedestrian", "cyclist")]
+        assert min(abs(np.arctan2(b.center[1], b.center[0])) for b in ahead) <= 0.6
+    assert facing(flat_street(), np.random.default_rng(0)) == 0.0
+
+
+def test_the_same_draw_gives_the_same_scan(scan: LabelledScan) -> None:
+    bank = ObjectBank.of([scan])
+    how = {"bank": bank, "n_pasted": 5.0, "turn_to_rare": 0.5, "weather": 0.5}
+    one, other = (augmented(scan, np.random.default_rng(9), **how) for _ in range(2))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(one.points, other.points)
+    np.testing.assert_array_equal(one.labels, other.labels)
+    assert one.boxes == other.boxes
+
+
+def test_saved_scans_read_back(tmp_path: Path, scan: LabelledScan) -> None:
+    scan.save(tmp_path / "scan.npz")
+    back = LabelledScan.load(tmp_path / "scan.npz")
+    np.testing.assert_array_equal(back.labels, scan.labels)
+    assert back.counts == scan.counts

@@ -1,0 +1,541 @@
+"""The papers' figures: frames whose figures are known by hand, drives kept apart, and what users see of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edgeperc import cli, evaluate
+from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.datasets import IGNORE, Calibration, Frame, KittiObjects, RoadFrame, SemanticKitti
+from edgeperc.errors import ModelError, PointsError, SplitError
+from edgeperc.evaluate import FIRST_SEED, Judge
+from edgeperc.figures import BANDS, Record, banded, figures
+from edgeperc.metrics import BoxEvaluator, Confusion
+from edgeperc.models import model_path, shipped_models
+from edgeperc.perception import Box, Perception, PointLabels, TopView
+from edgeperc.session import Session
+
+VIEW = TopViewGeometry()
+POINTS = ("background", "car", "pedestrian", "cyclist")
+CELLS = ("background", "drivable", "car", "van", "truck")
+# The camera stands at the sensor and looks along x; a quarter turn of the scan is in its image.
+T_CAM_VELO = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], np.float64)
+CAMERA = Calibration(T_CAM_VELO, np.array([[621.0, 0, 621.0, 0], [0, 621.0, 187.0, 0], [0, 0, 1, 0]]))
+
+
+def card(name: str, **given: Any) -> ModelCard:
+    top = name != "pointseg"
+    return ModelCard(
+        **{
+            "name": name,
+            "version": "1.0.0",
+            "view": VIEW if top else RangeImageGeometry((2.0, 0.0, -10.0), width=8),
+            "input": InputSpec("image", ("remission",), (0.0,), (1.0,)),
+            "outputs": (OutputSpec("logits", "class_logits"), *((OutputSpec("boxes", "box_dense"),) if top else ())),
+            "classes": CELLS if top else POINTS,
+            "box_classes": ("car", "van", "truck") if top else (),
+            **given,
+        }
+    )
+
+
+def box(x: float, y: float, label: str = "car", score: float = 1.0) -> Box:
+    return Box(label, score, (x, y, -1.0), (4.0, 2.0, 1.6), 0.0)
+
+
+class World:
+    """Scripted models: the nth point's label is its remission, and everything else is said beforehand."""
+
+    def __init__(self) -> None:
+        self.cards = {name: card(name) for name in ("pointseg", "ssadnet", "lodnn")}
+        self.cells = dict.fromkeys(self.cards, np.zeros((400, 200), np.uint8))
+        self.probability = np.zeros((400, 200))
+        self.boxes: tuple[Box, ...] = ()
+
+    def perceiver(self, models: list[str], **_: Any) -> Callable[[np.ndarray], Perception]:
+        def perceive(points: np.ndarray) -> Perception:
+            kinds = {self.cards[name].view.kind: name for name in models}
+            labels = PointLabels(points[:, 3].astype(np.uint8), np.isfinite(points).all(axis=1), POINTS)
+            view = TopView(self.cells[kinds.get("top_view", "lodnn")], CELLS, 0.1, VIEW.x_range_m, VIEW.y_range_m)
+            return Perception(
+                n_points=len(points),
+                n_dropped=0,
+                points=labels if "range_image" in kinds else None,
+                top_view=view if "top_view" in kinds else None,
+                boxes=self.boxes if "top_view" in kinds else (),
+                stage_ms={},
+                providers={},
+                fitness=(),
+                stamp_s=None,
+            )
+
+        perceive.cards = tuple(self.cards[name] for name in models)  # type: ignore[attr-defined]
+        return perceive
+
+    def network(self, model: str, provider: str) -> Any:
+        return SimpleNamespace(
+            card=self.cards[model],
+            probability=lambda points, name: self.probability,
+            point_labels=lambda points: np.zeros(len(points), np.uint8),
+        )
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> World:
+    made = World()
+    monkeypatch.setattr(evaluate, "Perceiver", made.perceiver)
+    monkeypatch.setattr(evaluate, "_Network", made.network)
+    return made
+
+
+def frame(*boxes: Box, points: list[list[float]] | None = None, drive: str = "a", unlabelled: Any = ()) -> Frame:
+    scan = np.array(points or [[0.0, 0.0, 0.0, 0.0]], np.float32)
+    return Frame("000000", drive, "A", scan, boxes, np.array(unlabelled, np.float64).reshape(-1, 4), CAMERA)
+
+
+def hits(at: Box, n: int, label: int = 1) -> list[list[float]]:
+    """n points in a box, which the scripted model labels so."""
+    return [[at.center[0] + 0.1 * k, at.center[1], at.center[2], label] for k in range(n)]
+
+
+def judged(judge: Judge, *frames: Frame, n_resamples: int = 50) -> dict[str, Any]:
+    return figures([judge.record(judge.kitti(each))[0] for each in frames], n_resamples)
+
+
+# --- tables made by hand ---------------------------------------------------------------------------------------------
+
+
+def test_points_by_hand(world: World) -> None:
+    near, far, rider, van = box(10, 0), box(40, 4), box(20, -3, "cyclist"), box(60, 0, "van")
+    points = [
+        *hits(near, 3),
+        *hits(near, 1, label=0),
+        *hits(rider, 2, label=3),
+        *hits(rider, 2, label=1),
+        *hits(far, 2),  # too few to be an object, and points all the same
+        *hits(van, 3),
+        [12.0, 5.0, -1.7, 1],  # ground, said to be a car
+        [12.0, 6.0, -1.7, 0],
+        [-12.0, 5.0, -1.7, 1],  # behind the camera
+        [np.nan, 5.0, -1.7, 0],
+    ]
+    table = judged(Judge(["pointseg"]), frame(near, far, rider, van, points=points))["points"]
+    assert set(table) == set(BANDS)
+    car = table["all"]["car"]
+    assert (car["n_points"], car["n_objects"]) == (4 + 2 + 3, 2)
+    assert car["precision"] == pytest.approx(8 / 11, abs=1e-4)
+    assert car["recall"] == pytest.approx(8 / 9, abs=1e-4)
+    assert car["iou"] == pytest.approx(8 / 12, abs=1e-4)
+    assert car["iou_interval"] is None  # one drive
+    assert (table["0-15 m"]["car"]["n_points"], table["0-15 m"]["car"]["n_objects"]) == (4, 1)
+    assert table["0-15 m"]["car"]["iou"] == pytest.approx(3 / 5)
+    assert (table["30-46 m"]["car"]["n_points"], table["30-46 m"]["car"]["n_objects"]) == (2, 0)
+    assert table["15-30 m"]["cyclist"]["recall"] == 0.5
+    assert table["15-30 m"]["car"]["recall"] is None
+    assert table["0-15 m"]["background"] == {
+        "precision": 0.5,
+        "recall": 0.5,
+        "iou": pytest.approx(1 / 3, abs=1e-4),
+        "iou_interval": None,
+        "n_points": 2,
+        "n_objects": 0,
+    }
+    assert table["all"]["pedestrian"]["iou"] is None
+
+
+def test_boxes_by_hand(world: World) -> None:
+    near, middle, far, hidden = box(10, 0), box(29, 0), box(40, 4, "van"), box(20, 5)
+    beside = box(30, -13)
+    points = [p for each in (near, middle, far, beside) for p in hits(each, 3)] + hits(hidden, 2)
+    world.boxes = (
+        box(10, 0, score=0.9),
+        box(30.2, 0, score=0.8),  # 2.8 of 5.2 m: a hit, of a truth in the middle band
+        box(40, 4, "car", score=0.7),  # a van, called a car
+        box(20, 5, score=0.6),  # two returns: need not be found, and may be
+        box(35, -5, score=0.5),  # nothing there
+        box(9, -9.9, score=0.4),  # out of the camera's sight
+    )
+    table = judged(Judge(["ssadnet"]), frame(near, middle, far, hidden, beside, points=points))["boxes"]
+    for kind in ("upright", "oriented"):
+        every = table[kind]["all"]
+        assert {key for key in every if not key.startswith("mean")} == {"car", "van", "vehicle"}
+        assert [every["vehicle"][k] for k in ("n_truth", "n_predicted", "n_hits")] == [3, 4, 3]
+        assert [every["car"][k] for k in ("n_truth", "n_predicted", "n_hits")] == [2, 4, 2]
+        assert every["vehicle"]["ap"] == 1.0
+        assert every["vehicle"]["precision"] == 0.75
+        assert every["vehicle"]["mean_iou_50"] == pytest.approx((1 + 2.8 / 5.2 + 1) / 3, abs=1e-4)
+        assert every["vehicle"]["mean_iou_70"] == 1.0
+        assert (every["van"]["ap"], every["van"]["precision"], every["van"]["ap_interval"]) == (0.0, None, None)
+        assert every["mean_ap"] == 0.5
+        counts = {
+            band: [rows["vehicle"][k] for k in ("n_truth", "n_hits", "n_predicted")]
+            for band, rows in table[kind].items()
+        }
+        assert counts == {"all": [3, 3, 4], "0-15 m": [1, 1, 1], "15-30 m": [1, 1, 1], "30-46 m": [1, 1, 2]}
+
+
+def test_cells_under_boxes(world: World) -> None:
+    world.cells["ssadnet"] = np.ones((400, 200), np.uint8)  # drivable counts as background here
+    world.cells["ssadnet"][240:280, 90:110] = 2  # x 18..22, y -1..1: the car to the cell
+    world.cells["ssadnet"][100:110, 100:110] = 4
+    tram = box(30, 5, "tram")
+    told = judged(Judge(["ssadnet"]), frame(box(20, 0), box(40, 5, "van"), tram))["segmentation"]
+    assert set(told) == {"vehicles from 3-D boxes"}
+    row = told["vehicles from 3-D boxes"]["all"]
+    assert row["n_cells_of"] == {
+        "background": row["n_cells"] - 1600,
+        "car": 800,
+        "van": 800,
+        "truck": 0,
+        "vehicle": 1600,
+    }
+    assert 65_000 < row["n_cells"] < 80_000 - 800  # the camera does not see the nearest corners; trams are not judged
+    assert row["iou"]["car"] == 1.0
+    assert row["iou"]["van"] == row["iou"]["truck"] == 0.0
+    assert row["iou"]["vehicle"] == pytest.approx(800 / (1600 + 100), abs=1e-4)
+    assert row["accuracy"] == pytest.approx((row["n_cells"] - 900) / row["n_cells"], abs=1e-4)
+    rest = row["n_cells"] - 1600 - 100
+    assert row["iou"]["background"] == pytest.approx(rest / (rest + 100 + 800), abs=1e-4)
+    assert row["mean_iou"] == pytest.approx((row["iou"]["background"] + 1.0) / 4, abs=1e-4)
+    # Vans were never predicted: what has no precision takes no part in the weighted mean.
+    weights = (row["n_cells"] - 1600, 800)
+    assert row["mean_ap"] == pytest.approx((weights[0] * rest / (rest + 800) + weights[1]) / sum(weights), abs=1e-4)
+    bands = told["vehicles from 3-D boxes"]
+    assert [bands[b]["n_cells_of"]["car"] for b in BANDS] == [800, 0, 800, 0]
+    assert sum(bands[b]["n_cells"] for b in list(BANDS)[1:]) < row["n_cells"]  # some corners lie beyond 46 m
+
+
+def test_nothing_is_known_of_cells_nobody_labelled(world: World) -> None:
+    judge = Judge(["ssadnet"])
+    whole = judge.kitti(frame()).cells["vehicles from 3-D boxes"][1]
+    half = judge.kitti(frame(unlabelled=[[0, 0, 621, 375]])).cells["vehicles from 3-D boxes"][1]
+    assert (half[:, :99] == IGNORE).all()
+    np.testing.assert_array_equal(half[:, 101:], whole[:, 101:])
+
+
+def test_road_drawn_by_another_model(world: World) -> None:
+    world.cells["lodnn"] = np.zeros((400, 200), np.uint8)
+    world.cells["lodnn"][:, 50:150] = 1
+    world.cells["ssadnet"] = world.cells["lodnn"].copy()
+    world.cells["ssadnet"][240:280, 90:110] = 2
+    told = judged(Judge(["ssadnet"], road_by="lodnn"), frame(box(20, 0)))["segmentation"]
+    assert list(told) == ["vehicles from 3-D boxes", "road drawn by lodnn 1.0.0"]
+    row = told["road drawn by lodnn 1.0.0"]["all"]
+    assert set(row["iou"]) == {*CELLS, "vehicle"}
+    assert row["accuracy"] == row["iou"]["drivable"] == row["iou"]["car"] == row["mean_iou"] == 1.0
+    assert row["iou"]["van"] is None
+    with pytest.raises(ModelError, match="cannot draw its own truth"):
+        Judge(["ssadnet"], road_by="ssadnet")
+    with pytest.raises(ModelError, match="pointseg does not draw the road"):
+        Judge(["ssadnet"], road_by="pointseg")
+
+
+def test_road_by_hand(world: World) -> None:
+    # A row of cells 20 m ahead: four of road, a car, three of something else, and one that nobody labelled.
+    y = 5.05 - np.arange(9)
+    points = np.stack([np.full(9, 20.05), y, np.full(9, -1.7), np.zeros(9)], axis=1).astype(np.float32)
+    scan = RoadFrame("00/000000", "b", points, np.array([1, 1, 1, 1, 2, 0, 0, 0, IGNORE], np.uint8))
+    cols = np.floor((10.0 - y) / 0.1).astype(int)
+    said = np.zeros((400, 200), np.uint8)
+    said[259, cols[[0, 1, 5, 8]]] = 1
+    said[259, cols[[4, 6]]] = 3
+    world.cells["ssadnet"] = said
+    world.probability = np.full((400, 200), 0.9)
+    world.probability[259, cols[:8]] = [1.0, 0.8, 0.4, 0.3, 0.0, 0.6, 0.0, 0.0]
+    judge = Judge(["ssadnet"])
+    record, mistakes = judge.record(judge.semantickitti(scan))
+    assert mistakes is None
+    told = figures([record])
+    assert told["n_frames"] == told["n_drives"] == 1
+    road = told["road"]["all"]
+    assert road == told["road"]["15-30 m"]
+    assert told["road"]["0-15 m"]["iou"] is None
+    assert (road["n_cells"], road["n_road"]) == (8, 4)
+    assert [road[k] for k in ("precision", "recall", "iou", "f1")] == pytest.approx(
+        [2 / 3, 2 / 4, 2 / 5, 4 / 7], abs=1e-4
+    )
+    assert road["accuracy"] == pytest.approx(5 / 8)
+    # By falling probability: road, road, other, road, road. With all four taken: 4 of 5 right.
+    assert road["max_f1"] == pytest.approx(8 / 9, abs=1e-4)
+    assert road["ap"] == pytest.approx((6 * 1.0 + 5 * 4 / 5) / 11, abs=1e-4)
+    cells = told["segmentation"]["observed cells"]["all"]
+    assert cells["iou"] == {"other": pytest.approx(1 / 5), "road": 0.4, "vehicle": 0.5}
+    assert cells["n_cells_of"] == {"other": 3, "road": 4, "vehicle": 1}
+
+
+# --- drives ----------------------------------------------------------------------------------------------------------
+
+
+def test_intervals_are_over_drives(world: World) -> None:
+    right = frame(box(10, 0), box(20, 3, "cyclist"), points=hits(box(10, 0), 10) + hits(box(20, 3), 3, 3), drive="b")
+    half = frame(box(10, 0), points=hits(box(10, 0), 5) + hits(box(10, 0), 5, label=0))
+    told = judged(Judge(["pointseg"]), half, half, right, n_resamples=1000)
+    assert (told["n_frames"], told["n_drives"]) == (3, 2)
+    car, cyclist = told["points"]["all"]["car"], told["points"]["all"]["cyclist"]
+    assert car["iou"] == pytest.approx(20 / 30, abs=1e-4)
+    # A quarter of the draws takes the one drive twice, a quarter the other.
+    assert car["iou_interval"] == [0.5, 1.0]
+    assert cyclist["iou"] == 1.0
+    assert cyclist["iou_interval"] is None  # in one drive only
+    assert judged(Judge(["pointseg"]), half, right, n_resamples=1000) == judged(
+        Judge(["pointseg"]), half, right, n_resamples=1000
+    )
+
+
+def test_a_mean_over_classes_needs_them_all_in_two_drives(world: World) -> None:
+    world.cells["ssadnet"][240:280, 90:110] = 2
+    judge = Judge(["ssadnet"])
+    car, other = frame(box(20, 0)), frame(box(20, 0), drive="b")
+    assert judged(judge, car, other)["segmentation"]["vehicles from 3-D boxes"]["all"]["mean_iou_interval"] == [
+        1.0,
+        1.0,
+    ]
+    van = frame(box(20, 0), box(30, 3, "van"), drive="b")
+    row = judged(judge, car, van)["segmentation"]["vehicles from 3-D boxes"]["all"]
+    assert row["mean_iou_interval"] is None
+    assert row["iou_interval"]["van"] is None
+    assert row["iou_interval"]["car"] == [1.0, 1.0]
+    assert row["iou_interval"]["vehicle"] == [0.5, 1.0]
+
+
+LABELS = st.lists(st.tuples(st.integers(0, 3), st.sampled_from([0, 1, 2, 3, 255]), st.floats(0, 60)), max_size=12)
+BOXES = st.lists(st.tuples(st.integers(6, 45), st.integers(-9, 9), st.sampled_from(["car", "van"])), max_size=3)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.tuples(LABELS, BOXES, BOXES, st.sampled_from("ab")), min_size=1, max_size=5))
+def test_records_put_together_say_what_one_pass_says(scans: list[Any]) -> None:
+    records, together = [], Confusion(POINTS)
+    evaluator = BoxEvaluator()
+    for k, (labels, predicted, truth, drive) in enumerate(scans):
+        said, right, range_m = np.array(labels, np.float64).reshape(-1, 3).T
+        tallies: dict[tuple[str, ...], Any] = banded(
+            ("segmentation", "t"), POINTS, said.astype(np.uint8), right.astype(np.uint8), range_m
+        )
+        own = BoxEvaluator()
+        guesses = [box(x, y, label, score=0.9 - 0.1 * k - 0.01 * i) for i, (x, y, label) in enumerate(predicted)]
+        rights = [box(*each) for each in truth]
+        own.update(guesses, rights)
+        evaluator.update(guesses, rights)
+        together.update(said, right)
+        records.append(Record(str(k), drive, tallies | {("boxes", "oriented"): own}))
+    told = figures(records, n_resamples=5)
+    one = figures([Record("", "", {("segmentation", "t", "all"): together, ("boxes", "oriented"): evaluator})])
+
+    def without_intervals(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: without_intervals(inner) for key, inner in value.items() if not key.endswith("_interval")}
+        return value
+
+    assert without_intervals(told["boxes"]) == without_intervals(one["boxes"])
+    assert without_intervals(told["segmentation"]["t"]["all"]) == without_intervals(one["segmentation"]["t"]["all"])
+
+
+def kitti_set(root: Path, drives: dict[str, str] | None = None) -> Path:
+    """A KITTI object set with a point and a car a scan."""
+    for part in ("velodyne", "label_2", "calib"):
+        (root / "training" / part).mkdir(parents=True)
+    for k, name in enumerate(drives or {"000000": "", "000001": ""}):
+        np.array([[10.0 + k, 0, -1, 1]] * 3, np.float32).tofile(root / "training/velodyne" / f"{name}.bin")
+        (root / "training/label_2" / f"{name}.txt").write_text("Car 0 0 0 0 0 9 9 1.6 2.0 4.0 0 1.8 10 -1.5708\n")
+        (root / "training/calib" / f"{name}.txt").write_text(
+            "P2: 621 0 621 0 0 621 187 0 0 0 1 0\n"
+            "R0_rect: 1 0 0 0 1 0 0 0 1\n"
+            "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
+        )
+    if drives:
+        rows = "".join(f"{name},{drive}\n" for name, drive in drives.items())
+        (root / "frames.csv").write_text("name,drive\n" + rows)
+    return root
+
+
+def test_scans_of_a_split(world: World, tmp_path: Path) -> None:
+    root = kitti_set(
+        tmp_path,
+        {"000000": "2011_09_26_drive_0011", "000001": "2011_09_26_drive_0005", "000002": "2011_09_26_drive_0059"},
+    )
+    for asked, n_frames in (
+        ({}, 1),
+        ({"split": "test"}, 1),
+        ({"fold": 0}, 1),
+        ({"fold": 2}, 1),
+        ({"fold": 0, "split": "train"}, 1),
+        ({"split": "train"}, 2),
+        ({"split": "all"}, 3),
+    ):
+        done: list[int] = []
+        told, worst = evaluate.evaluate(
+            [root], ["pointseg"], **asked, on_scan=lambda *counts, to=done: to.extend(counts)
+        )
+        assert told["real"]["n_frames"] == len(worst) == n_frames
+        assert told["split"] == asked.get("split", "validation" if "fold" in asked else "test")
+        assert done == [count for k in range(n_frames) for count in (k + 1, n_frames)]
+    with pytest.raises(PointsError, match=r"no scans of the validation drives \(fold: 1\)"):
+        evaluate.evaluate([root], ["pointseg"], fold=1)
+
+
+def test_scans_of_drives_named_nowhere_are_judged(world: World, tmp_path: Path) -> None:
+    told, _ = evaluate.evaluate([kitti_set(tmp_path)], ["pointseg"])
+    assert told["real"]["n_drives"] == 2
+
+
+@pytest.mark.parametrize("guilty", ["pointseg", "lodnn"])
+def test_training_scans_are_never_judged_in_silence(world: World, tmp_path: Path, guilty: str) -> None:
+    root = kitti_set(tmp_path, {"000000": "2011_09_26_drive_0011", "000001": "2011_09_26_drive_0005"})
+    seen = hashlib.sha256(KittiObjects(root).frame("000001").points.tobytes()).hexdigest()[:16]
+    models = ["pointseg", "ssadnet"]
+    # Whatever the scan was called when it was trained on.
+    world.cards[guilty] = card(guilty, training={"frames": {"renamed": seen}})
+    told, _ = evaluate.evaluate([root], models, road_by="lodnn")
+    assert told["real"]["n_frames"] == 1
+    for asked in ({"split": "all"}, {"fold": 0}):
+        with pytest.raises(SplitError, match=rf"{guilty} 1\.0\.0 was trained on scan 000001 of drive .*_0005.*'train'"):
+            evaluate.evaluate([root], models, road_by="lodnn", **asked)
+    assert evaluate.evaluate([root], models, road_by="lodnn", split="train")[0]["real"]["n_frames"] == 1
+    world.cards[guilty] = card(guilty)
+    assert evaluate.evaluate([root], models, road_by="lodnn", split="all")[0]["real"]["n_frames"] == 2
+
+
+@pytest.mark.parametrize("dataset", ["nowhere", "simulation:0", "simulation:-1", "simulation:many"])
+def test_what_is_no_dataset(world: World, dataset: str) -> None:
+    with pytest.raises(PointsError, match="expected"):
+        evaluate.evaluate([dataset], ["pointseg"])
+
+
+# --- mistakes --------------------------------------------------------------------------------------------------------
+
+
+def test_mistakes_are_named(world: World) -> None:
+    car, van, rider, walker = box(10, 0), box(20, 3, "van"), box(15, -3, "cyclist"), box(12, 3, "pedestrian")
+    beside, beyond = box(20, 14), box(50, 0)
+    points = hits(car, 4) + hits(van, 5, 0) + hits(rider, 6, 0) + hits(walker, 4, 2)
+    points += hits(beside, 7, 0) + hits(beyond, 7, 0) + [[8.0, -3.0, -1.7, 2]]
+    world.boxes = (box(10, 0), box(35, 0, "truck"))
+    judge = Judge(["pointseg", "ssadnet"])
+    _, mistakes = judge.record(judge.kitti(frame(car, van, rider, walker, beside, beyond, points=points)))
+    assert mistakes is not None
+    assert set(mistakes.found) == {car, walker}
+    assert dict(mistakes.missed) == {van: 5, rider: 6, beside: 7}  # no box was to be predicted beside the view
+    assert mistakes.false == (box(35, 0, "truck"),)
+    assert mistakes.words == "missed: 1 van, 1 cyclist, 1 car (18 points); false: 1 truck"
+    assert np.bincount(mistakes.wrong).tolist() == [8, 25, 1]
+    assert mistakes.wrong_share == pytest.approx(26 / 34)
+    assert mistakes.n_errors == pytest.approx(4 + 26 / 34)
+
+
+def test_the_worst_come_first(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [f"{k:06d}" for k in range(30)]
+    root = kitti_set(tmp_path, dict.fromkeys(names, "2011_09_26_drive_0011"))
+    wrong = {"000007": 2, "000023": 3}
+    read = KittiObjects.frame
+
+    def spoilt(objects: KittiObjects, name: str) -> Frame:
+        one = read(objects, name)
+        extra = tuple(box(15.0 + 5 * k, 0) for k in range(wrong.get(name, 0)))
+        return replace(one, boxes=extra, points=np.array([p for b in extra for p in hits(b, 3, 0)] or one.points))
+
+    monkeypatch.setattr(KittiObjects, "frame", spoilt)
+    _, worst = evaluate.evaluate([root], ["pointseg"])
+    assert [each.name for each in worst[:2]] == ["000023", "000007"]
+    assert len(worst) == 20
+
+
+# --- the shipped models ----------------------------------------------------------------------------------------------
+
+
+def test_a_network_agrees_with_the_perceiver() -> None:
+    judge = Judge(["ssadnet", "pointseg"])
+    truth = judge.simulated(FIRST_SEED)
+    found = judge.perceive(truth.points)
+    assert judge.from_above is not None
+    assert judge.from_sensor is not None
+    assert found.top_view is not None
+    assert found.points is not None
+    drivable = judge.from_above.probability(truth.points, "drivable")
+    assert drivable.min() >= 0.0
+    assert drivable.max() <= 1.0
+    assert found.top_view.drivable[drivable > 0.5].all()
+    assert (drivable[found.top_view.drivable] > 1 / 5 - 1e-6).all()
+    pixels = judge.from_sensor.point_labels(truth.points)
+    assert (pixels[~found.points.in_view] == 0).all()
+    assert np.mean(pixels == found.points.labels) > 0.97
+
+
+def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    out, picture = tmp_path / "deeper" / "figures.json", tmp_path / "worst.png"
+    assert cli.main(["eval", "simulation:2", "--json", str(out), "--worst", str(picture)]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    for words in ("== simulated scans: 2 scans, 2 drives ==", "boxes, oriented", "top view, every cell", "MaxF"):
+        assert words in printed.out
+    told = json.loads(out.read_text())
+    assert told["command"].startswith("edgeperc eval simulation:2 --json ")
+    assert set(told["models"]) == {"ssadnet", "pointseg"}
+    assert (told["split"], told["fold"]) == ("test", None)
+    simulated = told["simulated"]
+    assert set(simulated) == {"points", "pixels", "boxes", "segmentation", "road", "n_frames", "n_drives"}
+    assert simulated["segmentation"]["every cell"]["all"]["n_cells"] == 160_000
+    assert 0.5 < simulated["points"]["all"]["car"]["iou"] <= 1.0
+    assert 0.5 < simulated["road"]["all"]["f1"] <= simulated["road"]["all"]["max_f1"] + 0.05
+    low, high = simulated["road"]["all"]["f1_interval"]
+    assert low <= simulated["road"]["all"]["f1"] <= high
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert f"{100 * simulated['road']['all']['ap']:.1f}" in printed.out
+
+
+def test_the_command_on_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["eval", str(tmp_path)]) == 2
+    assert "expected the root of a KITTI object set" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        cli.main(["eval", "simulation:1", "--fold", "3"])
+
+
+# --- real scans ------------------------------------------------------------------------------------------------------
+
+
+def test_no_shipped_model_was_trained_on_a_test_scan(kitti_root: Path, semantickitti_root: Path) -> None:
+    objects, sequences = KittiObjects(kitti_root), SemanticKitti(semantickitti_root)
+    scans = [objects.frame(name).points for name in objects.names("test", grades="AB")]
+    scans += [sequences.frame(name).points for name in sequences.names("test")]
+    assert len(scans) > 35
+    tested = {hashlib.sha256(points.tobytes()).hexdigest()[:16] for points in scans}
+    for name in shipped_models():
+        trained_on = evaluate._training_hashes(Session(model_path(name), "cpu").card)
+        assert len(trained_on) > 100, f"{name} does not say what it was trained on"
+        assert not tested & trained_on
+
+
+def test_shipped_models_refuse_their_training_scans(kitti_root: Path) -> None:
+    with pytest.raises(SplitError, match="was trained on scan 000000 of drive 2011_09_26_drive_0005"):
+        evaluate.evaluate([kitti_root], split="all")
+
+
+def test_real_scans(kitti_root: Path, semantickitti_root: Path) -> None:
+    judge = Judge(["ssadnet", "pointseg"])
+    objects, sequences = KittiObjects(kitti_root), SemanticKitti(semantickitti_root)
+    told = figures([judge.record(judge.kitti(objects.frame(name)))[0] for name in objects.names("test")[::7]], 100)
+    assert told["points"]["all"]["car"]["iou"] > 0.5
+    low, high = told["points"]["all"]["car"]["iou_interval"]
+    assert low <= told["points"]["all"]["car"]["iou"] <= high
+    assert told["boxes"]["oriented"]["all"]["vehicle"]["ap"] > 0.5
+    assert told["points"]["all"]["car"]["n_points"] > 1000
+    cells = told["segmentation"]["vehicles from 3-D boxes"]["all"]
+    assert cells["accuracy"] > 0.9
+    assert 70_000 < cells["n_cells"] / told["n_frames"] < 80_000
+    road = figures([judge.record(judge.semantickitti(sequences.frame(sequences.names("test")[0])))[0]])["road"]["all"]
+    assert road["f1"] > 0.7
+    assert road["max_f1"] >= road["f1"] - 0.01
+    assert not math.isnan(road["ap"])
