@@ -28,7 +28,7 @@ from edgeperc.datasets import (
 from edgeperc.errors import PointsError
 from edgeperc.perception import Box
 from edgeperc.simulation import draw_vehicles
-from edgeperc.splits import FOLDS, TEST_DRIVES, fold_of
+from edgeperc.splits import FOLDS, TEST_DRIVES, fold_of, in_split
 from edgeperc_export.augment import SURFACE, LabelledScan, augmented, mirrored, turned
 from edgeperc_export.road import ground_plane, sure_surface
 
@@ -161,7 +161,8 @@ def test_semantickitti_files(tmp_path: Path) -> None:
         raw.tofile(tmp_path / "sequences" / sequence / "labels" / f"{stem}.label")
     sequences = SemanticKitti(tmp_path)
     assert sequences.names("all") == ["00/000003", "08/000001", "77/000000"]
-    assert sequences.names("test") == ["00/000003"]  # the one that is a test drive among the raw drives
+    assert sequences.names("test") == sequences.names("all")  # one is a test drive, the others nobody's
+    assert sequences.names("train") == ["08/000001", "77/000000"]
     assert sequences.frame("08/000001").drive == "2011_09_30_drive_0028"
     one = sequences.frame("77/000000")
     assert (one.name, one.drive) == ("77/000000", "77")
@@ -254,6 +255,18 @@ def test_no_ground_no_claim() -> None:
 
 
 # --- real data -------------------------------------------------------------------------------------------------------
+
+
+def test_every_named_drive_has_one_place() -> None:
+    for drive in {*TEST_DRIVES, *(d for fold in FOLDS for d in fold)}:
+        for fold in range(len(FOLDS)):
+            assert [in_split(drive, s, fold) for s in ("train", "validation", "test")].count(True) == 1
+        assert not in_split(drive, "validation")
+    assert [in_split("mine", s) for s in ("train", "validation", "test", "all")] == [True, False, True, True]
+    with pytest.raises(ValueError, match="expected train, validation, test or all"):
+        in_split("mine", "both")
+    with pytest.raises(ValueError, match="expected 0 to 2"):
+        in_split("mine", "train", 3)
 
 
 def test_drives_are_never_shared(kitti_root: Path) -> None:
