@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import warnings
 from collections.abc import Sequence
@@ -18,16 +19,19 @@ from torch import Tensor, nn
 
 from edgeperc import Perceiver
 from edgeperc.card import CARD_KEY, InputSpec, ModelCard, OutputSpec, RangeImageGeometry
-from edgeperc.datasets import simulated_scan
+from edgeperc.datasets import IGNORE, KittiObjects, simulated_scan
 from edgeperc.errors import CardMismatchError
 from edgeperc.sensors import FitnessProfile
 from edgeperc.session import Session
+from edgeperc_export.ablation import PAPERS, VARIANTS, ablate
 from edgeperc_export.augment import LabelledScan
 from edgeperc_export.cli import main
 from edgeperc_export.dataset import parity_scans, simulate
 from edgeperc_export.models_page import models_page
+from edgeperc_export.recipes import MODELS
+from edgeperc_export.selftraining import pseudo_labelled, unlabelled_scans
 from edgeperc_export.to_onnx import ParityError, export, load, to_graph, verify, write_card
-from edgeperc_export.train import Recipe, Samples, build, loss_of, train
+from edgeperc_export.train import PAPER, Recipe, Samples, Watch, _optimizer, _schedule, _start, build, loss_of, train
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +104,170 @@ def test_another_recipe_does_not_resume(tmp_path: Path, simulated: Path) -> None
     train(small("pointseg", steps=1), tmp_path, kitti=None, simulated=simulated, n_threads=1)
     with pytest.raises(ValueError, match="of another recipe"):
         train(small("pointseg", steps=2), tmp_path, kitti=None, simulated=simulated, n_threads=1)
+
+
+def test_a_longer_run_begins_as_a_shorter_one(tmp_path: Path, simulated: Path) -> None:
+    arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "checkpoint_every": 2}
+    train(small("pointseg", steps=4, cooldown=0.5), tmp_path / "short", **arguments)
+    train(small("pointseg", steps=10, cooldown=0.5), tmp_path / "long", **arguments)
+    one, other = (
+        [json.loads(line)["loss"] for line in (tmp_path / run / "log.jsonl").read_text().splitlines()]
+        for run in ("short", "long")
+    )
+    assert one[0] == other[0]  # of steps 1 and 2, before either cools down
+    assert len(other) == 5
+
+
+def test_the_learning_rate_rises_stays_and_falls() -> None:
+    recipe = Recipe("pointseg", steps=1000, cooldown=0.4)
+    rates = [_schedule(recipe, step) for step in range(1000)]
+    assert rates[0] == 0.01
+    assert set(rates[99:600]) == {1.0}
+    assert all(a > b for a, b in itertools.pairwise(rates[600:]))
+    assert rates[-1] < 1e-4
+    assert {_schedule(PAPER["ssadnet"], step) for step in (0, 30_000, 64_999)} == {1.0}
+
+
+def test_a_run_starts_from_what_another_has_in_common(tmp_path: Path, simulated: Path) -> None:
+    dense = untrained("ssadnet", tmp_path)
+    slots = build(small("ssadnet", head="slots", seed=5))
+    before = {name: value.clone() for name, value in slots.state_dict().items()}
+    told = _start(slots, dense)
+    assert told[-1]["head"] == "dense"
+    for name, value in slots.state_dict().items():
+        origin = weights(dense).get(name) if name.startswith("segmentation") else before[name]
+        assert torch.equal(value, origin), name
+    with pytest.raises(ValueError, match="no weight in common"):
+        _start(build(small("pointseg")), dense)
+
+
+def test_the_papers_recipes_are_theirs() -> None:
+    """SSADNet 3.2 and PointSeg 5, and nothing that they do not mention."""
+    ssadnet, pointseg = PAPER["ssadnet"], PAPER["pointseg"]
+    assert (ssadnet.head, ssadnet.optimizer, ssadnet.learning_rate, ssadnet.batch) == ("slots", "adam", 1e-5, 8)
+    assert ssadnet.halve_after == 100
+    assert (pointseg.optimizer, pointseg.learning_rate, pointseg.batch, pointseg.steps) == ("adagrad", 1e-3, 32, 50_000)
+    for recipe in (ssadnet, pointseg):
+        assert not recipe.augment
+        assert recipe.n_pasted == recipe.swap == recipe.ema == recipe.lovasz_weight == recipe.simulated_share == 0.0
+    assert not any(isinstance(m, nn.BatchNorm2d) for m in build(ssadnet).segmentation.modules())  # type: ignore[union-attr, operator]
+    optimizer = _optimizer(pointseg, build(pointseg))
+    assert type(optimizer) is torch.optim.Adagrad
+
+
+@pytest.fixture(scope="module")
+def kitti(tmp_path_factory: pytest.TempPathFactory, scans: list[np.ndarray]) -> Path:
+    """A KITTI object set of two simulated scans, one labelled frame of fold 0 and one of fold 1, and one unlabelled."""
+    root = tmp_path_factory.mktemp("kitti")
+    for part in ("velodyne", "label_2", "calib"):
+        (root / "training" / part).mkdir(parents=True)
+    calibration = "P2: 700 0 620 0 0 700 180 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
+    calibration += "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
+    rows = ["name,drive"]
+    for k, drive in enumerate(["2011_09_26_drive_0005", "2011_09_26_drive_0048", "2011_09_26_drive_0048"]):
+        scan = simulated_scan(10**9 + k % 2)
+        scan.points.tofile(root / "training/velodyne" / f"{k:06d}.bin")
+        rows.append(f"{k:06d},{drive}")
+        if k == 2:
+            continue
+        lines = []
+        for box, count in zip(scan.boxes, scan.box_points, strict=True):
+            (x, y, z), (length, width, height) = box.center, box.size
+            if count and x > 1.0:
+                turn = -box.yaw - np.pi / 2
+                shape = f"{height} {width} {length} {-y} {-z + height / 2} {x} {turn}"
+                lines.append(f"{box.label.capitalize()} 0 0 0 0 0 0 0 {shape}")
+        (root / "training/label_2" / f"{k:06d}.txt").write_text("\n".join(lines) + "\n")
+        (root / "training/calib" / f"{k:06d}.txt").write_text(calibration)
+    (root / "frames.csv").write_text("\n".join(rows) + "\n")
+    return root
+
+
+@pytest.mark.parametrize("network", ["pointseg", "ssadnet"])
+def test_a_fold_is_watched_and_not_trained_on(tmp_path: Path, kitti: Path, simulated: Path, network: str) -> None:
+    arguments = {"kitti": kitti, "simulated": simulated, "fold": 1, "n_threads": 1, "checkpoint_every": 1}
+    checkpoint = train(small(network, steps=2, n_pasted=0.0), tmp_path, **arguments)
+    state = torch.load(checkpoint, weights_only=True)
+    assert json.loads(state["frames"]).keys() == {"000000"}  # of fold 0
+    curve = json.loads(state["curve"])
+    assert [line["step"] for line in curve] == [1, 2]
+    assert all(0.0 <= line["validation"]["background"] <= 1.0 for line in curve)
+    assert all(np.isfinite(line["validation_loss"]) for line in curve)
+    assert state["best"].keys() == state["averaged"].keys()
+    network_, _, notes = load(checkpoint)
+    assert notes["curve"] == curve
+    for name, value in network_.state_dict().items():
+        assert torch.equal(value, state["best"][name])
+
+
+def test_only_simulated_means_no_real_frame(tmp_path: Path, kitti: Path, simulated: Path) -> None:
+    recipe = small("pointseg", steps=1, simulated_share=1.0, n_pasted=0.0)
+    checkpoint = train(recipe, tmp_path, kitti=kitti, simulated=simulated, n_threads=1)
+    assert load(checkpoint)[2]["frames"] == {}
+    assert json.loads(torch.load(checkpoint, weights_only=True)["curve"])[0]["validation"].keys() >= {"car"}
+
+
+def test_the_rate_is_halved_after_epochs_without_gain(
+    tmp_path: Path, kitti: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Watch, "judge", lambda self, network: (0.5, 1.0, {"car": 0.5}))
+    recipe = small("pointseg", steps=4, halve_after=2, n_pasted=0.0)
+    checkpoint = train(recipe, tmp_path, kitti=kitti, simulated=simulated, fold=1, n_threads=1, checkpoint_every=1)
+    state = torch.load(checkpoint, weights_only=True)
+    assert state["watched"][-1] == 1  # at step 3, two epochs of one step after the first and best
+    assert state["optimizer"]["param_groups"][0]["lr"] < 0.6 * recipe.learning_rate
+
+
+class Sure(nn.Module):
+    """Takes everything for a car."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        out = torch.zeros(x.shape[0], 4, *x.shape[2:])
+        out[:, 1] = 9.0
+        return out
+
+
+def test_a_teacher_labels_what_nobody_did(kitti: Path) -> None:
+    objects = KittiObjects(kitti)
+    (nobodys,) = unlabelled_scans(objects, fold=0)
+    assert not unlabelled_scans(objects, fold=1)  # a fold that is left out is left out
+    frame = LabelledScan.from_frame(objects.frame("000000"))
+    told, all_around = pseudo_labelled(Sure(), [frame, nobodys])
+    own = frame.labels != IGNORE
+    np.testing.assert_array_equal(told.labels[own], frame.labels[own])
+    assert (told.labels[~own] == 1).mean() > 0.5
+    azimuth = np.degrees(np.arctan2(all_around.points[:, 1], all_around.points[:, 0]))
+    for left in range(-180, 180, 15):
+        sector = all_around.labels[(azimuth >= left) & (azimuth < left + 15)]
+        assert (sector == 1).mean() > 0.5 if len(sector) > 50 else True
+    unsure = pseudo_labelled(Sure(), [nobodys], sure=1.1)[0]
+    assert (unsure.labels == IGNORE).all()
+
+
+def test_deep_supervision_is_for_training_alone(simulated: Path) -> None:
+    recipe = small("pointseg", deep_supervision=0.4)
+    network = build(recipe)
+    inputs, truth = (torch.from_numpy(a) for a in Samples(recipe, [], [], sorted(simulated.glob("*.npz"))).batch(0))
+    logits, early = network.train()(inputs)
+    assert early.shape == (1, 4, 64, 128)
+    plain = loss_of(replace(recipe, deep_supervision=0.0), logits, [truth])
+    assert loss_of(recipe, (logits, early), [truth]) > plain
+    assert isinstance(network.eval()(inputs), Tensor)
+
+
+def test_an_ablation_changes_what_it_says(tmp_path: Path, kitti: Path, simulated: Path) -> None:
+    for network, variants in VARIANTS.items():
+        whole = MODELS[network].recipe
+        for name, changes in variants.items():
+            changed = replace(whole, **{k: v for k, v in changes.items() if k != "teacher"})
+            assert name == "as shipped" or "teacher" in changes or changed != whole
+    start = untrained("pointseg", tmp_path)
+    arguments = {"kitti": kitti, "simulated": simulated, "start_from": start, "fold": 1, "steps": 1, "n_threads": 1}
+    asked = ["nothing pasted", PAPERS]
+    rows = ablate("pointseg", tmp_path / "out", **arguments, variants=asked)
+    assert [row["variant"] for row in rows] == asked
+    assert ablate("pointseg", tmp_path / "out", **arguments, variants=asked) == rows
+    assert all(row["figures"].keys() == {"background", "car", "pedestrian", "cyclist"} for row in rows)
 
 
 def test_training_learns(tmp_path: Path, simulated: Path) -> None:
