@@ -89,6 +89,7 @@ def _parser() -> argparse.ArgumentParser:
     make.add_argument("--semantickitti", type=Path, help="root of SemanticKITTI, to judge the road by")
     make.add_argument("--fold", type=int, help="fold of the training drives to leave out and stop by: 0, 1 or 2")
     make.add_argument("--threads", type=int)
+    make.add_argument("--compile", action="store_true", help="through torch.compile, which needs a C++ compiler")
     make.add_argument("--model-version", default="1.0.0")
     make.set_defaults(run=_make)
 
@@ -121,6 +122,7 @@ def _make(args: argparse.Namespace) -> int:
         semantickitti=args.semantickitti,
         fold=args.fold,
         n_threads=args.threads,
+        compiled=args.compile,
         version=args.model_version,
     )
     print(path)
@@ -167,7 +169,7 @@ def _recipe_options() -> dict[str, type]:
         "--weight-decay": float, "--cooldown": float, "--halve-after": int, "--simulated-share": float,
         "--augment": bool, "--n-pasted": float, "--swap": float, "--turn-to-rare": float, "--weather": float,
         "--class-weights": bool, "--focal-gamma": float, "--lovasz-weight": float, "--deep-supervision": float,
-        "--ema": float, "--context-width": int, "--batch-norm": bool,
+        "--ema": float, "--context-width": int, "--batch-norm": bool, "--dropout": float,
         "--seed": int,
     }  # fmt: skip
 

@@ -101,6 +101,8 @@ class Recipe:
         Channels of SSADNet's context module.
     batch_norm : bool
         In SSADNet's segmentation branch.
+    dropout : float
+        SSADNet's spatial dropout, PointSeg's before the last convolution.
     seed : int
     """
 
@@ -126,6 +128,7 @@ class Recipe:
     ema: float = 0.998
     context_width: int = 128
     batch_norm: bool = True
+    dropout: float = 0.25
     seed: int = 0
 
 
@@ -158,9 +161,10 @@ def build(recipe: Recipe) -> nn.Module:
     """The network of a recipe, its weights drawn from the recipe's seed."""
     torch.manual_seed(recipe.seed)
     if recipe.network == "pointseg":
-        return PointSeg(deep_supervision=recipe.deep_supervision > 0.0)
+        return PointSeg(dropout=recipe.dropout, deep_supervision=recipe.deep_supervision > 0.0)
     if recipe.network == "ssadnet":
-        return SSADNet(head=recipe.head, context_width=recipe.context_width, batch_norm=recipe.batch_norm)
+        width, norm = recipe.context_width, recipe.batch_norm
+        return SSADNet(head=recipe.head, context_width=width, batch_norm=norm, dropout=recipe.dropout)
     raise ValueError(f"network is {recipe.network!r}; expected ssadnet or pointseg")
 
 
