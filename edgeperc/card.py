@@ -21,7 +21,7 @@ from .errors import CardError
 __all__ = ["CARD_KEY", "Golden", "InputSpec", "ModelCard", "OutputSpec", "RangeImageGeometry", "TopViewGeometry"]
 
 CARD_KEY = "edgeperc.card"
-SCHEMA = 1
+SCHEMA = 2
 OUTPUT_KINDS = ("class_logits", "class_probabilities", "box_slots", "box_dense")
 CHANNELS = {
     "top_view": ("distance", "remission", "height"),
@@ -189,7 +189,9 @@ class ModelCard:
     box_classes : tuple of str
         Classes that boxes may have; a subset of ``classes``.
     box_size_priors : mapping
-        Class to usual (length, width, height) [m], for heads that do not measure all three.
+        Class to usual (length, width, height) [m].
+    box_size_spreads : mapping
+        Class to the standard deviations of their logarithms; empty where sizes do not tell classes apart.
     score_threshold, nms_iou : float
         Defaults for boxes.
     mount_height_m : float
@@ -213,6 +215,7 @@ class ModelCard:
     classes: tuple[str, ...]
     box_classes: tuple[str, ...] = ()
     box_size_priors: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    box_size_spreads: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     score_threshold: float = 0.3
     nms_iou: float = 0.2
     mount_height_m: float = 1.73
@@ -244,6 +247,13 @@ class ModelCard:
         strange = [c for c in (*self.box_classes, *self.box_size_priors) if c not in self.classes]
         if strange:
             raise CardError(f"box classes {strange} are not among the classes {self.classes}")
+        if (
+            self.box_size_spreads
+            and not set(self.box_classes) <= self.box_size_spreads.keys() & self.box_size_priors.keys()
+        ):
+            raise CardError(f"box_size_spreads of {[*self.box_size_spreads]}; expected them, and priors, for all boxes")
+        if any(spread <= 0.0 for spreads in self.box_size_spreads.values() for spread in spreads):
+            raise CardError(f"box_size_spreads are {self.box_size_spreads}; expected numbers above 0")
         for name in ("score_threshold", "nms_iou"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise CardError(f"{name} is {getattr(self, name)}; expected a number in 0..1")
@@ -322,10 +332,8 @@ def _card(document: dict[str, Any]) -> ModelCard:
         outputs=tuple(OutputSpec(name=str(o["name"]), kind=str(o["kind"])) for o in document["outputs"]),
         classes=tuple(str(c) for c in document["classes"]),
         box_classes=tuple(str(c) for c in document["box_classes"]),
-        box_size_priors={
-            str(c): (float(length), float(width), float(height))
-            for c, (length, width, height) in document["box_size_priors"].items()
-        },
+        box_size_priors=_sizes(document["box_size_priors"]),
+        box_size_spreads=_sizes(document["box_size_spreads"]),
         score_threshold=float(document["score_threshold"]),
         nms_iou=float(document["nms_iou"]),
         mount_height_m=float(document["mount_height_m"]),
@@ -337,6 +345,10 @@ def _card(document: dict[str, Any]) -> ModelCard:
         if golden is None
         else Golden(int(golden["seed"]), str(golden["input_sha256"]), dict(golden["outputs"])),
     )
+
+
+def _sizes(document: dict[str, Any]) -> dict[str, tuple[float, float, float]]:
+    return {str(c): (float(length), float(width), float(height)) for c, (length, width, height) in document.items()}
 
 
 def _pair(values: Any) -> tuple[float, float]:

@@ -146,6 +146,8 @@ def decode_dense(
     classes: Sequence[str],
     box_classes: Sequence[str],
     *,
+    box_size_priors: Mapping[str, tuple[float, float, float]] | None = None,
+    box_size_spreads: Mapping[str, tuple[float, float, float]] | None = None,
     score_threshold: float = 0.3,
     iou_threshold: float = 0.2,
     max_boxes: int = 100,
@@ -165,6 +167,9 @@ def decode_dense(
         Names of the class output's channels.
     box_classes : sequence of str
         Classes that boxes may have.
+    box_size_priors, box_size_spreads : mapping, optional
+        Usual length, width and height [m] of each box class, and the deviations of their logarithms. Without spreads
+        the map alone tells classes apart.
     score_threshold : float
         Least score, in 0..1.
     iou_threshold : float
@@ -191,7 +196,8 @@ def decode_dense(
     -----
     The paper reads a box's class at its centre pixel of the segmentation map. Here the probabilities of the box
     classes are summed over all pixels of the footprint and the largest sum wins (the earlier box class on ties), so
-    that one pixel, a hole in the roof or an edge between two classes, does not decide.
+    that one pixel, a hole in the roof or an edge between two classes, does not decide. With spreads, each sum is
+    weighed by how likely the measured size is for the class (log-normal): from above a van is a car but for its size.
     """
     maps = dense[0] if dense.ndim == 4 and dense.shape[0] == 1 else dense
     height, width = geometry.height, geometry.width
@@ -244,9 +250,18 @@ def decode_dense(
         sums,
     )
     candidates = np.array([list(classes).index(name) for name in box_classes])
+    evidence = sums[:, candidates]
+    if box_size_spreads:
+        assert box_size_priors is not None
+        sizes = np.log(np.stack([rectangles[keep, 2], rectangles[keep, 3], tall[keep]], axis=1))
+        usual = np.log([box_size_priors[name] for name in box_classes])
+        spread = np.array([box_size_spreads[name] for name in box_classes])
+        off = (sizes[:, None] - usual) / spread
+        likelihood = -0.5 * (off**2).sum(axis=2) - np.log(spread).sum(axis=1)
+        evidence = np.log(np.maximum(evidence, np.finfo(np.float64).tiny)) + likelihood
     return [
         Box(
-            label=box_classes[int(np.argmax(sums[k, candidates]))],
+            label=box_classes[int(np.argmax(evidence[k]))],
             score=float(scores[i]),
             center=(float(rectangles[i, 0]), float(rectangles[i, 1]), float(z[i])),
             size=(float(rectangles[i, 2]), float(rectangles[i, 3]), float(tall[i])),

@@ -35,13 +35,14 @@ from .datasets import (
 from .decode import decode_classes
 from .errors import EdgepercError, ModelError, PointsError, SplitError
 from .figures import BANDS, VEHICLES, Record, banded, figures, within
+from .geometry import draw_footprints
 from .metrics import BoxEvaluator, ProbabilitySweep
 from .models import model_path
 from .perceiver import Perceiver
 from .perception import Box, Perception, PointLabels, TopView
 from .projection import make_projector
 from .session import Session
-from .simulation import POINT_CLASSES, TOP_VIEW_CLASSES, draw_vehicles
+from .simulation import POINT_CLASSES, TOP_VIEW_CLASSES
 from .view import Mistakes
 
 __all__ = ["Judge", "Truth", "evaluate"]
@@ -176,10 +177,10 @@ class Judge:
         cells: Cells = {}
         if isinstance(self.view, TopViewGeometry):
             vehicles, unnamed = np.zeros((2, self.view.height, self.view.width), np.uint8)
-            draw_vehicles(vehicles, frame.boxes, self.view)
+            draw_footprints(vehicles, frame.boxes, self.view, TOP_VIEW_CLASSES)
             # Nobody said whether a tram is a truck.
             strange = [replace(box, label="car") for box in frame.boxes if box.label in ("tram", "misc")]
-            draw_vehicles(unnamed, strange, self.view)
+            draw_footprints(unnamed, strange, self.view, TOP_VIEW_CLASSES)
             known = frame.judges(self.places).reshape(vehicles.shape) & (unnamed == 0)
             by_boxes = np.where(vehicles > 0, vehicles - 1, 0)
             cells[BY_BOXES] = ("background", *VEHICLES), np.where(known, by_boxes, IGNORE).astype(np.uint8)

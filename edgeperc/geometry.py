@@ -1,4 +1,4 @@
-"""Rectangles on the ground: overlap and suppression, shared by `decode` and `metrics`.
+"""Rectangles on the ground: overlap, suppression and drawing, shared by several stages.
 
 A rectangle is a row ``x, y, length, width, yaw``: centre [m], extent along and across the heading [m], heading about
 +z from +x [rad].
@@ -7,14 +7,49 @@ A rectangle is a row ``x, y, length, width, yaw``: centre [m], extent along and 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from .card import TopViewGeometry
 from .errors import PointsError
+from .perception import Box
 
-__all__ = ["bounding_rectangles", "oriented_iou", "suppress_overlaps"]
+__all__ = ["bounding_rectangles", "draw_footprints", "oriented_iou", "suppress_overlaps"]
+
+
+def draw_footprints(
+    labels: NDArray[np.uint8], boxes: Iterable[Box], view: TopViewGeometry, classes: Sequence[str]
+) -> None:
+    """Draw the footprints of boxes over top-view labels, in place (SSADNet 3.1.2).
+
+    A cell belongs to a box when its centre lies in the footprint; the nearer of two boxes wins. Boxes of other classes
+    are left out.
+
+    Parameters
+    ----------
+    labels : (rows, columns) uint8
+    boxes : iterable of Box
+    view : TopViewGeometry
+    classes : sequence of str
+        What the labels are called; a footprint gets the number of its box's class.
+    """
+    all_x, all_y = view.cell_centres()
+    for box in sorted(boxes, key=lambda box: -math.hypot(box.center[0], box.center[1])):
+        if box.label not in classes:
+            continue
+        corners = box.corners()
+        top = (view.x_range_m[1] - corners[:, 0]) / view.cell_m
+        left = (view.y_range_m[1] - corners[:, 1]) / view.cell_m
+        rows = slice(max(int(top.min()), 0), max(min(int(top.max()) + 1, view.height), 0))
+        cols = slice(max(int(left.min()), 0), max(min(int(left.max()) + 1, view.width), 0))
+        dx, dy = all_x[rows] - box.center[0], all_y[:, cols] - box.center[1]
+        cos, sin = math.cos(box.yaw), math.sin(box.yaw)
+        inside = np.abs(cos * dx + sin * dy) <= box.size[0] / 2.0
+        inside &= np.abs(cos * dy - sin * dx) <= box.size[1] / 2.0
+        labels[rows, cols][inside] = classes.index(box.label)
 
 
 def oriented_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:

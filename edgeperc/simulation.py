@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .card import TopViewGeometry
 from .errors import PointsError
+from .geometry import draw_footprints
 from .perception import Box
 from .sensors import SensorProfile, get_sensor
 
@@ -32,7 +33,6 @@ __all__ = [
     "Scene",
     "SceneObject",
     "SimulatedScan",
-    "draw_vehicles",
     "random_scene",
     "scene_from_boxes",
     "sensor_pose",
@@ -189,29 +189,8 @@ class SimulatedScan:
         labels = np.zeros((view.height, view.width), dtype=np.uint8)
         strips, terrain, tile = self.scene.strips, self.scene.terrain, self.scene.tile
         fill_drivable(strips, terrain, tile, self.T_world_sensor, x.ravel(), y.ravel(), labels)
-        draw_vehicles(labels, self.boxes, view)
+        draw_footprints(labels, self.boxes, view, TOP_VIEW_CLASSES)
         return labels
-
-
-def draw_vehicles(labels: NDArray[np.uint8], boxes: Sequence[Box], view: TopViewGeometry) -> None:
-    """Draw the footprints of cars, vans and trucks over top-view labels, in place (SSADNet 3.1.2).
-
-    A cell belongs to a vehicle when its centre lies in the footprint; the nearer of two vehicles wins.
-    """
-    all_x, all_y = view.cell_centres()
-    for box in sorted(boxes, key=lambda box: -math.hypot(box.center[0], box.center[1])):
-        if box.label not in _VEHICLES:
-            continue
-        corners = box.corners()
-        top = (view.x_range_m[1] - corners[:, 0]) / view.cell_m
-        left = (view.y_range_m[1] - corners[:, 1]) / view.cell_m
-        rows = slice(max(int(top.min()), 0), max(min(int(top.max()) + 1, view.height), 0))
-        cols = slice(max(int(left.min()), 0), max(min(int(left.max()) + 1, view.width), 0))
-        dx, dy = all_x[rows] - box.center[0], all_y[:, cols] - box.center[1]
-        cos, sin = math.cos(box.yaw), math.sin(box.yaw)
-        inside = np.abs(cos * dx + sin * dy) <= box.size[0] / 2.0
-        inside &= np.abs(cos * dy - sin * dx) <= box.size[1] / 2.0
-        labels[rows, cols][inside] = TOP_VIEW_CLASSES.index(box.label)
 
 
 def sensor_pose(

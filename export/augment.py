@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from edgeperc.card import TopViewGeometry
 from edgeperc.datasets import IGNORE, POINT_CLASS_OF, Frame, inside, labels_by_boxes
+from edgeperc.geometry import draw_footprints
 from edgeperc.perception import Box
-from edgeperc.simulation import SimulatedScan, draw_vehicles
+from edgeperc.simulation import TOP_VIEW_CLASSES, SimulatedScan
 
 # The ground is kept wider and coarser than the network sees it, so that a turned scan still has truth everywhere.
 SURFACE = TopViewGeometry(x_range_m=(-50.0, 50.0), y_range_m=(-50.0, 50.0), cell_m=0.2)
@@ -117,7 +118,7 @@ class LabelledScan:
         col = np.floor((SURFACE.y_range_m[1] - (cos * y - sin * x)) / SURFACE.cell_m).astype(np.int64)
         covered = (row >= 0) & (row < SURFACE.height) & (col >= 0) & (col < SURFACE.width)
         truth = np.where(covered, self.surface[row % SURFACE.height, col % SURFACE.width], IGNORE).astype(np.uint8)
-        draw_vehicles(truth, self.boxes, geometry)
+        draw_footprints(truth, self.boxes, geometry, TOP_VIEW_CLASSES)
         truth[~self.labelled(geometry)] = IGNORE
         return truth
 

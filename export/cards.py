@@ -40,7 +40,8 @@ def card_of(network: str, head: str = "dense", **facts: Any) -> ModelCard:
         outputs=(OutputSpec("segmentation", "class_logits"), OutputSpec("boxes", f"box_{head}")),
         classes=TOP_VIEW_CLASSES,
         box_classes=("car", "van", "truck"),
-        # Medians of KITTI's labels: length, width, height.
-        box_size_priors={"car": (3.9, 1.6, 1.5), "van": (5.1, 1.9, 2.2), "truck": (10.1, 2.6, 3.2)},
+        # Length, width, height of 28,963 labels of KITTI, test drives apart: geometric means, deviations of logarithms.
+        box_size_priors={"car": (3.86, 1.63, 1.52), "van": (5.0, 1.9, 2.18), "truck": (10.02, 2.58, 3.2)},
+        box_size_spreads={"car": (0.11, 0.06, 0.084), "van": (0.164, 0.087, 0.143), "truck": (0.291, 0.09, 0.144)},
         **facts,
     )

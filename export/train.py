@@ -460,13 +460,14 @@ class Watch:
             with torch.no_grad():
                 outputs = network(torch.from_numpy(image[None]).to(device))
             losses.append(float(loss_of(self.recipe, outputs, [torch.from_numpy(t[None]).to(device) for t in targets])))
-            logits = outputs[0] if isinstance(outputs, tuple) else outputs
-            pixels.update(logits[0].argmax(0).cpu().numpy(), targets[0])
-            if self.recipe.network == "ssadnet":
-                kind = f"box_{self.recipe.head}"
-                answers = {"class_logits": logits[0].cpu().numpy(), kind: outputs[1][0].cpu().numpy()}
-                found = decode_top_view(self.card, answers, self.card.score_threshold)[1]
-                _update(boxes, found, scan)
+            if self.recipe.network == "pointseg":
+                pixels.update(outputs[0].argmax(0).cpu().numpy(), targets[0])
+                continue
+            logits, regressed = (output[0].cpu().numpy() for output in outputs)
+            answers = {"class_logits": logits, f"box_{self.recipe.head}": regressed}
+            labels, found = decode_top_view(self.card, answers, self.card.score_threshold)
+            pixels.update(labels, targets[0])
+            _update(boxes, found, scan)
         figures = {name: _rounded(iou) for name, iou in zip(classes, pixels.iou(), strict=True)}
         if self.recipe.network == "pointseg":
             return float(np.nanmean(pixels.iou()[1:])), float(np.mean(losses)), figures

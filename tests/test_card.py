@@ -65,7 +65,7 @@ def test_no_key_is_defaulted(key: str) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"schema": 2}, "schema 2.*upgrade edgeperc"),
+        ({"schema": 3}, "schema 3.*upgrade edgeperc"),
         ({"schema": 0}, "schema 0.*export the model again"),
         ({"schema": "1"}, "no schema number"),
         ({"name": ""}, "name ''"),

@@ -26,8 +26,9 @@ from edgeperc.datasets import (
     simulated_scan,
 )
 from edgeperc.errors import PointsError
+from edgeperc.geometry import draw_footprints
 from edgeperc.perception import Box
-from edgeperc.simulation import draw_vehicles
+from edgeperc.simulation import TOP_VIEW_CLASSES
 from edgeperc.splits import FOLDS, TEST_DRIVES, fold_of, in_split
 from edgeperc_export.augment import SURFACE, LabelledScan, augmented, mirrored, turned
 from edgeperc_export.road import ground_plane, sure_surface
@@ -119,7 +120,7 @@ def test_nothing_is_known_where_nobody_labelled(calibration: Calibration) -> Non
 def test_drawn_footprints_agree_with_points_in_boxes(yaw: float) -> None:
     box = Box("truck", 1.0, (26.337, 1.713, 0.0), (9.02, 2.51, 3.0), yaw)
     surface = np.ones((VIEW.height, VIEW.width), np.uint8)
-    draw_vehicles(surface, [box, replace(box, label="pedestrian", center=(40.0, 0.0, 0.0))], VIEW)
+    draw_footprints(surface, [box, replace(box, label="pedestrian", center=(40.0, 0.0, 0.0))], VIEW, TOP_VIEW_CLASSES)
     rows, cols = np.indices(surface.shape)
     centres = np.stack([46 - (rows + 0.5) * 0.1, 10 - (cols + 0.5) * 0.1, 0 * rows], axis=-1).reshape(-1, 3)
     np.testing.assert_array_equal(surface.ravel() == 4, inside(box, centres))
@@ -129,7 +130,7 @@ def test_drawn_footprints_agree_with_points_in_boxes(yaw: float) -> None:
 def test_footprints_at_the_edge_are_cut() -> None:
     surface = np.zeros((VIEW.height, VIEW.width), np.uint8)
     for centre in ((46.0, 0.0), (6.0, 10.0), (100.0, 0.0), (20.0, -10.0)):
-        draw_vehicles(surface, [Box("car", 1.0, (*centre, 0.0), (4.0, 2.0, 1.5), 0.0)], VIEW)
+        draw_footprints(surface, [Box("car", 1.0, (*centre, 0.0), (4.0, 2.0, 1.5), 0.0)], VIEW, TOP_VIEW_CLASSES)
     assert surface[0, 95:105].all()
     assert surface[-1, 0] == 2
     assert surface[255:262, -1].all()

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,9 @@ from edgeperc import decode
 from edgeperc.card import TopViewGeometry
 from edgeperc.decode import decode_classes, decode_dense, decode_slots
 from edgeperc.errors import CardMismatchError, InferenceError
+from edgeperc.geometry import draw_footprints
+from edgeperc.perceiver import decode_top_view
+from edgeperc_export.cards import card_of
 
 CLASSES = ("background", "drivable", "car", "van", "truck")
 VEHICLES = CLASSES[2:]
@@ -215,6 +219,24 @@ def test_background_under_the_box_still_leaves_a_vehicle():
     assert box.label == "van"
 
 
+def test_sizes_tell_classes_apart_where_the_map_does_not():
+    priors = {"car": (3.9, 1.6, 1.5), "van": (5.0, 1.9, 2.2), "truck": (10.0, 2.6, 3.2)}
+    spreads = dict.fromkeys(priors, (0.1, 0.1, 0.1))
+    sizes = {"box_size_priors": priors, "box_size_spreads": spreads}
+    for name, size in priors.items():
+        dense = dense_of((26.0, 0.0, -1.0, *size, 0.0, 2.0))
+        (by_map,) = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
+        (by_both,) = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, **sizes)
+        assert by_both.label == name
+        assert replace(by_both, label=by_map.label) == by_map
+    # A map that is sure of a car outweighs a size a little nearer to a van's.
+    logits = class_logits((slice(None), slice(None), CLASSES.index("car"), 30.0))
+    sizes["box_size_priors"] = priors | {"van": (4.15, 1.6, 1.5)}
+    dense = dense_of((26.0, 0.0, -1.0, 4.1, 1.6, 1.5, 0.0, 2.0))
+    (box,) = decode_dense(dense, logits, "class_logits", VIEW, CLASSES, VEHICLES, **sizes)
+    assert box.label == "car"
+
+
 def test_overlapping_boxes_of_the_dense_head():
     first = (20.2, 3.4, -0.9, 4.2, 1.7, 1.5, 0.0, 1.0)
     second = (21.4, 3.4, -0.9, 4.2, 1.7, 1.5, 0.0, 2.0)
@@ -283,3 +305,28 @@ def test_footprint_sums_agree_with_the_twin(are_logits):
     np.testing.assert_allclose(
         sums, reference.footprint_sums(values, are_logits, rectangles, 8.0, 1.5, 0.1), rtol=1e-9, atol=1e-9
     )
+
+
+def test_boxes_are_drawn_into_the_map():
+    card = card_of("ssadnet", version="1")
+    drivable, stray = CLASSES.index("drivable"), CLASSES.index("van")
+    logits = class_logits((slice(0, 10), slice(None), drivable, 9.0), (slice(350, 360), slice(0, 20), stray, 9.0))[0]
+    dense = dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0), (38.0, 5.0, -1.0, 10.0, 2.6, 3.2, 0.4, 2.0))[0]
+    labels, boxes = decode_top_view(card, {"class_logits": logits, "box_dense": dense}, 0.3)
+    assert [box.label for box in boxes] == ["truck", "car"]  # of equal scores, the farther first
+    expected = np.zeros(SHAPE, np.uint8)
+    expected[:10] = 1
+    draw_footprints(expected, boxes, VIEW, CLASSES)
+    np.testing.assert_array_equal(labels, expected)
+    assert abs(np.count_nonzero(labels == 2) - 40 * 16) < 60
+    assert abs(np.count_nonzero(labels == 4) - 100 * 26) < 60
+
+
+def test_the_papers_boxes_leave_the_map_alone():
+    card = card_of("ssadnet", "slots", version="1")
+    logits = class_logits((slice(100, 140), slice(50, 66), CLASSES.index("van"), 9.0))[0]
+    slots = np.zeros((2, 4), np.float32)
+    slots[0] = 58 / 200, 120 / 400, 20 / 200, 44 / 400
+    labels, (box,) = decode_top_view(card, {"class_logits": logits, "box_slots": slots}, 0.3)
+    assert box.label == "van"
+    assert np.count_nonzero(labels == 3) == 40 * 16
