@@ -202,7 +202,7 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
             worst = max(worst, float(np.abs(here[kind] - want).max()) / max(float(want.std()), 1e-6))
         if card.view.kind == "top_view":
             (here_labels, mine), (labels, theirs) = (
-                decode_top_view(card, a, card.score_threshold) for a in (here, wanted)
+                decode_top_view(card, image, a, card.score_threshold) for a in (here, wanted)
             )
             if [b.label for b in mine] != [b.label for b in theirs]:
                 raise ParityError(f"{path}: onnxruntime finds {len(mine)} boxes, torch {len(theirs)}, or others")

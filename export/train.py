@@ -465,7 +465,7 @@ class Watch:
                 continue
             logits, regressed = (output[0].cpu().numpy() for output in outputs)
             answers = {"class_logits": logits, f"box_{self.recipe.head}": regressed}
-            labels, found = decode_top_view(self.card, answers, self.card.score_threshold)
+            labels, found = decode_top_view(self.card, image, answers, self.card.score_threshold)
             pixels.update(labels, targets[0])
             _update(boxes, found, scan)
         figures = {name: _rounded(iou) for name, iou in zip(classes, pixels.iou(), strict=True)}
