@@ -228,7 +228,14 @@ def draw_mistakes(
         axes = figure.add_axes(place)
         _draw_mistakes_of(axes, scan)
         words = scan.words if len(scan.words) <= 66 else f"{scan.words[:65]}…"
-        _say(axes, 0.0, 1.055, f"{scan.name}  {scan.drive}", transform=axes.transAxes, fontweight="bold")
+        _say(
+            axes,
+            0.0,
+            1.055,
+            "  ".join(dict.fromkeys((scan.name, scan.drive))),
+            transform=axes.transAxes,
+            fontweight="bold",
+        )
         _say(axes, 0.0, 1.015, words, transform=axes.transAxes, color=_FAINT, fontsize=9.5)
     stream = io.BytesIO()
     canvas.print_png(stream)

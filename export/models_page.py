@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from edgeperc.card import ModelCard, TopViewGeometry
+from edgeperc.figures import BANDS
 from edgeperc.session import Session
 from edgeperc.splits import FOLDS, TEST_DRIVES
 
@@ -71,14 +72,14 @@ def _model(card: ModelCard, sha256: str, size: int) -> Iterable[str]:
 def _figures(figures: Mapping[str, Any], scans: str) -> Iterable[str]:
     if "points" in figures:
         yield from _head(f"points, {scans}", ["range", "precision", "recall", "IoU", "points", "objects"])
-        for band, rows in figures["points"].items():
+        for band, rows in _by_band(figures["points"]):
             for name, row in rows.items():
                 rates = [_percent(row, key) for key in ("precision", "recall", "iou")]
                 yield _row(name, band, *rates, f"{row['n_points']:,}", row["n_objects"] or "-")
     for kind, bands in figures.get("boxes", {}).items():
         head = ["range", "AP50", "precision", "recall", "mIoU@0.5", "mIoU@0.7", "boxes"]
         yield from _head(f"{kind} boxes, {scans}", head)
-        for band, rows in bands.items():
+        for band, rows in _by_band(bands):
             yield _row("mean of classes (mAP50)", band, _percent(rows, "mean_ap"), *["-"] * 5)
             for name, row in rows.items():
                 if isinstance(row, Mapping):
@@ -89,14 +90,19 @@ def _figures(figures: Mapping[str, Any], scans: str) -> Iterable[str]:
         yield from _head(
             f"segmentation, {table}, {scans}", ["ACC", "mAP", "mIoU", *(f"IoU {c}" for c in classes), "cells"]
         )
-        for band, row in bands.items():
+        for band, row in _by_band(bands):
             rates = [_percent(row, key) for key in ("accuracy", "mean_ap", "mean_iou")]
             yield _row(band, *rates, *(_share(row["iou"][c]) for c in classes), f"{row['n_cells']:,}")
     if "road" in figures:
         yield from _head(f"road, {scans}", ["F1", "best F1", "AP", "ACC", "PRE", "REC", "IoU", "cells"])
-        for band, row in figures["road"].items():
+        for band, row in _by_band(figures["road"]):
             keys = ("f1", "max_f1", "ap", "accuracy", "precision", "recall", "iou")
             yield _row(band, *(_percent(row, key) for key in keys), f"{row['n_cells']:,}")
+
+
+def _by_band(rows: Mapping[str, Any]) -> Iterable[tuple[str, Any]]:
+    """In the order of the bands, which a card's sorted keys lose."""
+    return ((band, rows[band]) for band in BANDS if band in rows)
 
 
 def _curve(curve: Sequence[Mapping[str, Any]]) -> Iterable[str]:

@@ -84,7 +84,7 @@ def test_no_card(tmp_path: Path) -> None:
 
 
 def test_a_newer_card(tmp_path: Path) -> None:
-    path = edited(tmp_path, "pointseg", (b'"schema":1', b'"schema":9'))
+    path = edited(tmp_path, "pointseg", (b'"schema":2', b'"schema":9'))
     with pytest.raises(CardError, match=r"edited\.onnx: the card has schema 9.*upgrade edgeperc"):
         Session(path, "cpu")
 

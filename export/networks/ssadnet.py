@@ -80,8 +80,8 @@ def conv_bn_elu(c_in: int, c_out: int) -> nn.Sequential:
     return nn.Sequential(nn.Conv2d(c_in, c_out, 3, padding=1, bias=False), nn.BatchNorm2d(c_out), nn.ELU())
 
 
-def normed(channels: int, batch_norm: bool) -> nn.Module:
-    return nn.BatchNorm2d(channels) if batch_norm else nn.Identity()
+def norm(channels: int, batch_norm: bool) -> list[nn.Module]:
+    return [nn.BatchNorm2d(channels)] if batch_norm else []
 
 
 class ContextModule(nn.Module):
@@ -95,13 +95,13 @@ class ContextModule(nn.Module):
             dilation = (along, across)
             layers += [
                 nn.Conv2d(c_in, width, 3, padding=dilation, dilation=dilation),
-                normed(width, batch_norm),
+                *norm(width, batch_norm),
                 nn.Dropout2d(dropout),
                 nn.ELU(),
             ]
             c_in = width
         self.dilated = nn.Sequential(*layers)
-        self.project = nn.Sequential(nn.Conv2d(width, channels, 1), normed(channels, batch_norm), nn.ELU())
+        self.project = nn.Sequential(nn.Conv2d(width, channels, 1), *norm(channels, batch_norm), nn.ELU())
 
     def forward(self, x: Tensor) -> Tensor:
         return self.project(self.dilated(x))
