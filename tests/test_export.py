@@ -308,7 +308,7 @@ def test_an_export_proves_itself(tmp_path: Path, scans: Sequence[np.ndarray], ne
     fitness = FitnessProfile.from_scans(scans)
     card = export(checkpoint, path, scans=scans, fitness=fitness, version="0.0.1")
     assert card.parity["n_scans"] == 2
-    assert card.parity["max_deviation"] < 1e-3
+    assert card.parity["max_deviation"] < (0.02 if network == "pointseg" else 1e-3)  # of rounded weights
     session = Session(path, "cpu")
     assert session.card == card
     assert session.golden_deviation < 1e-3
@@ -328,13 +328,14 @@ def test_a_graph_that_disagrees_is_not_written(
     path.write_bytes(b"the model before")
     import edgeperc_export.to_onnx as module
 
-    def wrong(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
+    def broken(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
         model = to_graph(network, card)
         largest = max(model.graph.initializer, key=lambda t: len(t.raw_data))
-        largest.raw_data = (np.frombuffer(largest.raw_data, np.float32) * np.float32(1.5)).tobytes()
+        wrong = onnx.numpy_helper.to_array(largest) * np.float16(1.5)
+        largest.CopyFrom(onnx.numpy_helper.from_array(wrong, largest.name))
         return model
 
-    monkeypatch.setattr(module, "to_graph", wrong)
+    monkeypatch.setattr(module, "to_graph", broken)
     with pytest.raises(ParityError, match=r"raw outputs differ by up to \S+ standard deviations"):
         export(checkpoint, path, scans=scans, fitness=None)
     assert path.read_bytes() == b"the model before"
