@@ -38,7 +38,7 @@ OPSET = 18
 # of a pooling window are equal but for that, unpooling puts one in another's place, which was seen to move a cell by
 # 0.011; a wrong operator differs by 0.1 and more.
 MAX_DEVIATION = 0.03
-# Rounding weights moved 0.07 % of the labels of an untrained network, whose classes lie close; 0.006 % of a trained one.
+# Rounding weights moved 0.07 % of an untrained network's labels, which lie close, and 0.006 % of a trained one's.
 MIN_AGREEMENT = 0.999
 # Biases and scales are few, and stay as they are.
 FEWEST_HALVED = 1024
