@@ -231,7 +231,7 @@ class Samples:
         points = np.ascontiguousarray(scan.points, np.float32)
         if self.recipe.network == "pointseg":
             seen = self.projector.project(points)
-            truth = np.where(seen.index >= 0, scan.labels[seen.index], IGNORE).astype(np.uint8)
+            truth = np.append(scan.labels, np.uint8(IGNORE))[seen.index]  # an empty pixel's index is -1
             return seen.image, truth
         seen = self.projector.project(points)
         truth = scan.top_view_truth(TOP_VIEW)

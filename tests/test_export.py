@@ -293,6 +293,17 @@ def test_a_step_always_draws_the_same_samples(simulated: Path) -> None:
     assert not np.array_equal(samples.batch(5)[0], samples.batch(6)[0])
 
 
+def test_an_empty_scan_is_a_sample_without_truth(simulated: Path) -> None:
+    files = sorted(simulated.glob("*.npz"))
+    scan = LabelledScan.load(files[0])
+    nothing = replace(scan, points=scan.points[:0], labels=scan.labels[:0])
+    image, truth = Samples(small("pointseg"), [], [], files).sample(nothing)
+    assert not image.any()
+    assert (truth == IGNORE).all()
+    full_image, full_truth = Samples(small("pointseg"), [], [], files).sample(scan)
+    assert ((full_truth == IGNORE) == (full_image == 0.0).all(axis=0)).all()
+
+
 def test_simulated_scans_resume_too(tmp_path: Path) -> None:
     simulate(tmp_path, 1)
     stamp = (tmp_path / "000000.npz").stat().st_mtime_ns
