@@ -6,6 +6,7 @@ Labels cover the left colour camera's field of view only: outside it, truth is u
 from __future__ import annotations
 
 import csv
+import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -32,8 +33,10 @@ __all__ = [
     "RoadFrame",
     "SemanticKitti",
     "inside",
+    "labels_by_boxes",
     "layouts",
     "read_objects",
+    "scan_hash",
     "simulated_scan",
 ]
 
@@ -162,6 +165,11 @@ def read_objects(label_path: Path, calibration: Calibration) -> tuple[tuple[Box,
             )
         )
     return tuple(boxes), np.array(unlabelled, np.float64).reshape(-1, 4)
+
+
+def scan_hash(points: NDArray[np.float32]) -> str:
+    """What a card calls a scan that its model was trained on: the first 16 digits of its SHA-256."""
+    return hashlib.sha256(points.tobytes()).hexdigest()[:16]
 
 
 def inside(box: Box, points: NDArray[Any], margin_m: float = 0.0) -> NDArray[np.bool_]:

@@ -96,7 +96,8 @@ def make(
     simulate(scans, N_SIMULATED, layouts_root=None if simulated_only else layouts)
     start_from = None
     if stage.after is not None:
-        make(stage.after, out, kitti=kitti, layouts=None, n_threads=n_threads, compiled=compiled, version=version)
+        if not (out / f"{stage.after}.onnx").exists():
+            make(stage.after, out, kitti=kitti, layouts=None, n_threads=n_threads, compiled=compiled, version=version)
         start_from = out / stage.after / "checkpoint.pt"
     suffix = "" if fold is None else f"-fold{fold}"
     checkpoint = train(

@@ -7,7 +7,6 @@ from its checkpoint ends, bit for bit, where an uninterrupted one ends.
 from __future__ import annotations
 
 import copy
-import hashlib
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from edgeperc.datasets import IGNORE, KittiObjects
+from edgeperc.datasets import IGNORE, KittiObjects, scan_hash
 from edgeperc.metrics import BoxEvaluator, Confusion
 from edgeperc.perceiver import decode_top_view
 from edgeperc.perception import Box
@@ -274,7 +273,7 @@ def real_scans(kitti: KittiObjects, names: Sequence[str]) -> tuple[list[Labelled
         scans.append(LabelledScan.from_frame(frame, sure_surface))
         # A drive counts with the square root of its frames: 154 neighbours are not 154 scenes.
         weights.append(drives.count(frame.drive) ** -0.5)
-        hashes[frame.name] = hashlib.sha256(frame.points.tobytes()).hexdigest()[:16]
+        hashes[frame.name] = scan_hash(frame.points)
     return scans, weights, hashes
 
 
@@ -333,8 +332,7 @@ def train(
     hashes: dict[str, str] = {}
     if objects:
         only_simulated = recipe.simulated_share == 1.0
-        watched = objects.names("train") if only_simulated else objects.names("validation", fold=fold or 0)
-        watched = watched if only_simulated or fold is not None else []
+        watched = objects.names("train") if only_simulated else objects.names("validation", fold=fold)
         real, weights, hashes = real_scans(objects, [] if only_simulated else objects.names("train", fold=fold))
     if teacher is not None and objects is not None:
         extra = unlabelled_scans(objects, fold)
