@@ -59,8 +59,8 @@ _STRIP = 10
 (
     _SLOPE_X, _SLOPE_Y, _WAVE_X, _WAVE_X_K, _WAVE_X_0, _WAVE_Y, _WAVE_Y_K, _WAVE_Y_0, _KERB, _PAVEMENT, _CROWN,
     _BANK_SLOPE, _BANK_RISE, _ROUGH, _DITCH, _ROUNDING, _ASPHALT, _PAVING, _GRASS, _MARKING, _LANE, _DROPPED, _WEAR,
-    _TERRAIN,
-) = range(24)  # fmt: skip
+    _LIP, _BAY, _TERRAIN,
+) = range(26)  # fmt: skip
 _TILE = 256  # cells of the noise tile a side; 0.3 m each
 
 _GROUND, _NOTHING = -1, -2  # in place of a primitive's row
@@ -106,7 +106,7 @@ class Scene:
         Shapes; those of an object in the frame of the object (origin in the middle of the footprint, on the ground).
     strips : (k, 10) float64
         Road surfaces and parking bays; the first is the road the sensor is on.
-    terrain : (23,) float64
+    terrain : (25,) float64
         What the ground is like.
     tile : (256, 256) float64
         Noise in -1..1 that repeats; roughness and stains.
@@ -424,7 +424,7 @@ def _ground_at(
     if d <= 0.0:
         z += terrain[_CROWN] * min(-d, 4.0)
         if outside > 0.0:
-            z += 0.02  # the lip of a parking bay
+            z += terrain[_LIP]
         return z, outside, outside_bays, u_first, s_first
     kerb = terrain[_KERB]
     along = (s_first + terrain[_DROPPED]) / 23.0
@@ -836,7 +836,7 @@ def _ground_remission(
                 value = terrain[_MARKING] + 0.1 * stain
         return value
     if outside_bays < 0.0:
-        return terrain[_PAVING] * (1.0 + 0.15 * patch)
+        return terrain[_BAY] * (1.0 + 0.15 * patch)
     if outside < terrain[_PAVEMENT]:
         return terrain[_PAVING] * (1.0 + 0.1 * stain + 0.1 * patch)
     return terrain[_GRASS] * (1.0 + 0.25 * stain + 0.1 * patch)
@@ -1306,6 +1306,12 @@ class _Street:
         z, outside, _, _, _ = _ground_at(self.strips, self.terrain, self.tile, float(x), float(y))
         return z, outside
 
+    def edge(self, road: int, side: float) -> float:
+        """How far a road reaches to the left (1) or right (-1) of its axis [m]; bays along the first one count."""
+        beside = self.strips[:, 9] > 0.0 if road == 0 else np.zeros(len(self.strips), np.bool_)
+        beside[road] = True
+        return float((side * self.strips[beside, 6 if side > 0 else 5]).max())
+
     def on_strip(self, s: float, u: float, strip: int = 0) -> _Vector:
         """x, y and direction of the road at s along, u to the left of a strip's axis."""
         x0, y0, cos, sin, curvature = self.strips[strip, :5]
@@ -1512,6 +1518,9 @@ def _terrain(rng: np.random.Generator, environment: str) -> NDArray[np.float64]:
     terrain[_LANE] = 3.4
     terrain[_DROPPED] = rng.uniform(0.0, 23.0)
     terrain[_WEAR] = rng.uniform(0.1, 0.35)
+    # Of parking bays: paved like the pavement with a lip, or the road's own asphalt behind a line.
+    terrain[_LIP] = rng.uniform(0.0, 0.04)
+    terrain[_BAY] = terrain[_PAVING if rng.random() < 0.5 else _ASPHALT]
     return terrain
 
 
@@ -1520,6 +1529,13 @@ def _strip(
     s_range: tuple[float, float] = (-200.0, 200.0), bay: bool = False,
 ) -> _Row:  # fmt: skip
     return (x, y, math.cos(yaw), math.sin(yaw), curvature, right, left, *s_range, float(bay))
+
+
+# A row of parked cars is as wide as this, and as often as this no part of the road: SemanticKITTI tells them apart.
+_ROW_WIDTH_M = 2.1
+_ROW_RANGE_M = (-70.0, 78.0)
+_IN_BAYS = 0.75
+_ROW_GAP_M = 9.0  # from one parked car's middle to the next one's
 
 
 def random_scene(seed: int, environment: str | None = None) -> Scene:
@@ -1551,7 +1567,8 @@ def random_scene(seed: int, environment: str | None = None) -> Scene:
         same, oncoming = ((1, 1), (1, 0), (2, 1), (2, 2))[int(rng.integers(0, 4))]
     park_right = park_left = 0.0
     if place in ("urban", "residential", "junction"):
-        park_right, park_left = (2.1 if rng.random() < 0.5 else 0.0 for _ in range(2))
+        park_right, park_left = (_ROW_WIDTH_M if rng.random() < 0.5 else 0.0 for _ in range(2))
+    in_bays = rng.random() < _IN_BAYS
     ego_lane = int(rng.integers(0, same))  # from the right
     sway = float(rng.normal(0.0, 0.25))
     right = -lane / 2 - ego_lane * lane - park_right + sway - rng.uniform(0.0, 0.6)
@@ -1571,7 +1588,14 @@ def random_scene(seed: int, environment: str | None = None) -> Scene:
             width = float(rng.uniform(2.6, 5.5))
             ends = ((-200.0, 200.0), (0.0, 200.0), (-200.0, 0.0))[int(rng.integers(0, 3))]
             strips.append(_strip(x, y, across, float(rng.normal(0, 0.004)), -width, width, ends))
-    if place in ("urban", "residential") and rng.random() < 0.5:
+    if in_bays:
+        right, left = right + park_right, left - park_left
+        strips[0] = _strip(0, 0, heading, curvature, right, left)
+        for edge, width in ((right - park_right, park_right), (left, park_left)):
+            if width > 0.0:
+                strips.append(_strip(0, 0, heading, curvature, edge, edge + width, _ROW_RANGE_M, True))
+        park_right = park_left = 0.0
+    if place in ("urban", "residential") and strips[-1][9] == 0.0 and rng.random() < 0.5:
         side = float(rng.choice([-1.0, 1.0]))
         start = float(rng.uniform(-30.0, 30.0))
         edge = left if side > 0 else -right
@@ -1659,19 +1683,19 @@ def _add_parked(street: _Street, right: bool, left: bool, crossings: Sequence[fl
         u0, u1, s0, s1, bay = street.strips[k, 5:10]
         if bay == 0.0:
             continue
-        deep = u1 - u0 > 4.0
-        s = s0 + 1.3
-        while s < s1 - 1.0:
-            if rng.random() < 0.65:
+        deep, fill = u1 - u0 > 4.0, rng.uniform(0.1, 0.95)
+        for s in np.arange(s0 + 1.3, s1 - 1.0, 2.6 if deep else 5.6):
+            if rng.random() < fill:
                 x, y, yaw = street.on_strip(s, float((u0 + u1) / 2 + rng.normal(0, 0.15)), k)
+                if street.ground(x, y)[1] < 0.0:
+                    continue  # where another road crosses
                 turn = math.pi / 2 if deep else 0.0
                 yaw += turn + math.pi * bool(rng.random() < 0.5) + float(rng.normal(0, 0.04))
                 street.add_object("car" if rng.random() < 0.85 else "van", x, y, yaw)
-            s += 2.6 if deep else 5.6
     if place in ("urban", "residential", "junction"):  # cars in drives and yards
         for _ in range(int(rng.poisson(3.0))):
             side = float(rng.choice([-1.0, 1.0]))
-            edge = abs(float(street.strips[0, 6 if side > 0 else 5])) + street.terrain[_PAVEMENT]
+            edge = street.edge(0, side) + street.terrain[_PAVEMENT]
             x, y, yaw = street.on_strip(float(rng.uniform(-50, 70)), side * float(edge + rng.uniform(2.5, 9.0)))
             if street.ground(x, y)[1] > 2.0:
                 street.add_object("car", x, y, yaw + float(rng.choice([0.0, 0.5, 1.0, 1.5]) * math.pi))
@@ -1682,7 +1706,7 @@ def _add_people(street: _Street, place: str) -> None:
     mean = {"urban": 7.0, "residential": 3.0, "junction": 7.0, "rural": 0.4, "highway": 0.0}[place]
     for _ in range(int(rng.poisson(mean))):
         side = float(rng.choice([-1.0, 1.0]))
-        edge = abs(float(street.strips[0, 6 if side > 0 else 5]))
+        edge = street.edge(0, side)
         s = float(rng.uniform(-30.0, 50.0))
         u = side * (edge + float(rng.uniform(0.4, max(0.8, street.terrain[_PAVEMENT]))))
         if rng.random() < 0.1:
@@ -1695,7 +1719,7 @@ def _add_people(street: _Street, place: str) -> None:
             street.add_object("pedestrian", px, py, yaw + float(rng.normal(0, 0.2)), None, speed)
     for _ in range(int(rng.poisson(1.0 if place in ("urban", "junction") else 0.2))):  # bicycles without a rider
         side = float(rng.choice([-1.0, 1.0]))
-        edge = abs(float(street.strips[0, 6 if side > 0 else 5]))
+        edge = street.edge(0, side)
         x, y, yaw = street.on_strip(float(rng.uniform(-20, 40)), side * (edge + float(rng.uniform(0.6, 3.0))))
         yaw += float(rng.choice([0.0, math.pi / 2])) + float(rng.normal(0, 0.1))
         rows: list[_Row] = []
@@ -1713,7 +1737,7 @@ def _add_roadside(street: _Street, place: str) -> None:
     n_roads = int(np.count_nonzero(street.strips[:, 9] == 0.0))
     for k in range(n_roads):
         for side in (-1.0, 1.0):
-            edge = abs(float(street.strips[k, 6 if side > 0 else 5]))
+            edge = street.edge(k, side)
             setback = pavement + (rng.uniform(0.1, 7.0) if place == "urban" else rng.uniform(3.0, 16.0))
             border = str(rng.choice(["hedge", "wall", "fence", "none"], p=[0.3, 0.2, 0.2, 0.3]))
             if place == "highway":
@@ -1802,6 +1826,9 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
     on_foot = any(box.label == "pedestrian" for box in boxes)
     fast = len(beside) > 0 and not on_foot and rng.random() < 0.15
     place = str(rng.choice(["urban", "residential"])) if not fast else str(rng.choice(["rural", "highway"]))
+    bays: list[_Row] = []
+    if rng.random() < _IN_BAYS:
+        right, left, bays = _parking_rows(beside, lane, right, left, heading, curvature)
     strips = [_strip(0, 0, heading, curvature, right, left)]
     crossings: list[float] = []
     if across or rng.random() < 0.2:
@@ -1810,6 +1837,7 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
         x, y = s * math.cos(heading), s * math.sin(heading) + curvature * s * s / 2
         width = float(rng.uniform(3.0, 5.5))
         strips.append(_strip(x, y, heading + curvature * s + math.pi / 2, 0.0, -width, width))
+    strips += bays
     terrain = _terrain(rng, place)
     terrain[_LANE] = lane
     bottoms = np.array([(b.center[0], b.center[1], b.center[2] - b.size[2] / 2 + mount_height_m) for b in vehicles])
@@ -1857,6 +1885,33 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
     _add_unlabelled_people(street, boxes)
     _add_roadside(street, place)
     return street.scene()
+
+
+def _parking_rows(
+    beside: Sequence[tuple[float, float, float, float]],
+    lane: float,
+    right: float,
+    left: float,
+    heading: float,
+    curvature: float,
+) -> tuple[float, float, list[_Row]]:
+    """The road's edges without the outermost row of vehicles, where it looks parked, and bays for those rows.
+
+    Parked looks a row of two and more, some of them close behind each other, clear of the sensor's own lane.
+    """
+    edges, bays = {-1.0: -right, 1.0: left}, []
+    for side in edges:
+        own = [(s, side * u, w) for s, u, w, _ in beside if side * u - w > lane / 2 + 0.3]
+        outermost = max((u for _, u, _ in own), default=0.0)
+        row = sorted((s, u, w) for s, u, w in own if outermost - u < 0.8)
+        gaps = np.diff([s for s, _, _ in row])
+        if len(row) < 2 or gaps.min() > _ROW_GAP_M:
+            continue
+        inner = min(u - w for _, u, w in row) - 0.2
+        bay = (inner, edges[side]) if side > 0 else (-edges[side], -inner)
+        bays.append(_strip(0, 0, heading, curvature, *bay, _ROW_RANGE_M, True))
+        edges[side] = inner
+    return -edges[-1.0], edges[1.0], bays
 
 
 def _add_unlabelled_people(street: _Street, boxes: Sequence[Box]) -> None:

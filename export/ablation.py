@@ -35,6 +35,7 @@ VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "deep supervision (0.4)": {"deep_supervision": 0.4},
         "weights not averaged": {"ema": 0.0},
         "self-training on unlabelled scans": {"teacher": True},
+        "distilled from where it starts, mirrored too": {"teacher": True, "distil": 1.0},
     },
     "ssadnet": {
         "as shipped": {},
@@ -43,6 +44,9 @@ VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "real scans alone": {"simulated_share": 0.0},
         "simulated scans four times of five": {"simulated_share": 0.8},
         "classes weighed alike": {"class_weights": False},
+        "cross-entropy without Lovasz": {"lovasz_weight": 0.0},
+        "spatial dropout (0.25)": {"dropout": 0.25},
+        "batches of eight": {"batch": 8},
         "weights not averaged": {"ema": 0.0},
         "the paper's slots": {"head": "slots"},
     },
@@ -95,9 +99,8 @@ def ablate(
         recipe: Recipe = replace(shipped, **changes)
         start: Path | None = start_from
         if variant == PAPERS:
-            recipe, start = PAPER[network], None
-            recipe = replace(recipe, steps=max(1, steps * shipped.batch // recipe.batch))
-            recipe = replace(recipe, context_width=shipped.context_width)
+            recipe, start = replace(PAPER[network], context_width=shipped.context_width), None
+        recipe = replace(recipe, steps=max(1, steps * shipped.batch // recipe.batch))  # as many scans
         folder = out / f"{network}-{fold}-{steps}-{'-'.join(variant.split())}"
         train(
             recipe, folder, kitti=kitti, simulated=simulated, fold=fold, start_from=start, teacher=teacher,

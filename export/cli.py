@@ -48,6 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--fold", type=int, help="fold of the training drives to leave out and stop by: 0, 1 or 2")
     train.add_argument("--recipe", choices=["ours", "paper"], default="ours", help="where the options below start from")
     train.add_argument("--start-from", type=Path, help="a checkpoint whose weights a new run starts from")
+    train.add_argument("--teacher", type=Path, help="a checkpoint to learn from: see the recipe's distil")
     train.add_argument("--threads", type=int)
     train.add_argument("--compile", action="store_true", help="through torch.compile, which needs a C++ compiler")
     recipe = train.add_argument_group("recipe", "see edgeperc_export.train.Recipe")
@@ -186,6 +187,7 @@ def _train(args: argparse.Namespace) -> int:
         simulated=args.simulated,
         fold=args.fold,
         start_from=args.start_from,
+        teacher=args.teacher,
         n_threads=args.threads,
         compiled=args.compile,
     )

@@ -15,6 +15,7 @@ __all__ = [
     "cross_entropy",
     "dense_loss",
     "dense_targets",
+    "distillation_loss",
     "lovasz_softmax",
     "pointseg_loss",
     "slot_targets",
@@ -217,6 +218,11 @@ def pointseg_loss(
     """Class-weighted cross-entropy, `focal_gamma` included, plus ``lovasz_weight`` times `lovasz_softmax`."""
     loss = cross_entropy(logits, labels, class_weights, focal_gamma=focal_gamma)
     return loss + lovasz_weight * lovasz_softmax(logits, labels) if lovasz_weight > 0.0 else loss
+
+
+def distillation_loss(logits: Tensor, probabilities: Tensor) -> Tensor:
+    """Mean cross-entropy of pixels towards a teacher's probabilities (B, C, H, W) (Hinton et al., 2015)."""
+    return -(probabilities * F.log_softmax(logits.float(), dim=1)).sum(1).mean()
 
 
 def slots_loss(predicted: Tensor, target: Tensor) -> Tensor:

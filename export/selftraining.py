@@ -1,4 +1,4 @@
-"""Labels for what nobody labelled: a trained PointSeg looks around, and what it is sure of is taken for true.
+"""What a trained network teaches another: labels for what nobody labelled, and probabilities where there are labels.
 
 Real scans are labelled ahead only, and some not at all; yet each holds a street on every side. A teacher, trained on
 simulation or on labels, names what it is sure of (Lee's pseudo-labels, 2013); everything else stays unknown.
@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from edgeperc.datasets import IGNORE, KittiObjects
@@ -22,7 +22,7 @@ from edgeperc.projection import make_projector
 from .augment import SURFACE, LabelledScan, turned
 from .cards import RANGE_IMAGE, RANGE_IMAGE_INPUT
 
-__all__ = ["pseudo_labelled", "unlabelled_scans"]
+__all__ = ["pseudo_labelled", "seen_twice", "unlabelled_scans"]
 
 SURE = 0.9
 # Four looks of 90 degrees cover the circle; half a step more each way, so that nothing lies on an edge alone.
@@ -57,3 +57,19 @@ def pseudo_labelled(network: nn.Module, scans: Iterable[LabelledScan], sure: flo
             labels[at] = np.where(labels[at] == IGNORE, best[trusted], labels[at])
         done.append(replace(scan, labels=labels, azimuths=(-np.pi, np.pi)))
     return done
+
+
+@torch.no_grad()
+def seen_twice(network: nn.Module, image: Tensor, kind: str) -> Tensor:
+    """Class probabilities (B, C, H, W) of a batch of inputs, averaged over the scene and its mirror image.
+
+    ``kind`` is ``"pointseg"``, whose y changes its sign in a mirror, or ``"ssadnet"``.
+    """
+    mirrored = image.flip(-1)
+    if kind == "pointseg":
+        mirrored = mirrored.clone()
+        mirrored[:, RANGE_IMAGE_INPUT.channels.index("y")] *= -1.0
+    with torch.autocast(image.device.type, torch.bfloat16):
+        answers = [network(each) for each in (image, mirrored)]
+    p, q = (a[0] if isinstance(a, tuple) else a for a in answers)
+    return 0.5 * (p.float().softmax(1) + q.float().softmax(1).flip(-1))

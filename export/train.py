@@ -30,11 +30,11 @@ from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES
 
 from .augment import LabelledScan, ObjectBank, augmented, swapped
 from .cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT, card_of
-from .losses import dense_targets, pointseg_loss, slot_targets, ssadnet_loss
+from .losses import dense_targets, distillation_loss, pointseg_loss, slot_targets, ssadnet_loss
 from .networks.pointseg import PointSeg
 from .networks.ssadnet import SSADNet
 from .road import sure_surface
-from .selftraining import pseudo_labelled, unlabelled_scans
+from .selftraining import pseudo_labelled, seen_twice, unlabelled_scans
 
 # Three returns are the fewest that any network could tell from clutter.
 FEWEST = 3
@@ -102,6 +102,11 @@ class Recipe:
         In SSADNet's segmentation branch.
     dropout : float
         SSADNet's spatial dropout, PointSeg's before the last convolution.
+    distil : float
+        Weight of the cross-entropy towards a teacher's class probabilities (Hinton et al., 2015), for which each scan
+        is shown to the teacher as it is and mirrored.
+    head_only : bool
+        Leave SSADNet's segmentation branch as it was started from; only the boxes are learnt.
     seed : int
     """
 
@@ -128,6 +133,8 @@ class Recipe:
     context_width: int = 128
     batch_norm: bool = True
     dropout: float = 0.25
+    distil: float = 0.0
+    head_only: bool = False
     seed: int = 0
 
 
@@ -309,7 +316,8 @@ def train(
     start_from : Path or None
         A checkpoint whose weights a new run starts from; what the recipe's network lacks or has besides is left.
     teacher : Path or None
-        A PointSeg checkpoint that labels what nobody labelled in the real scans of the training drives.
+        A checkpoint that the recipe distils from; where it distils nothing, a PointSeg that labels what nobody labelled
+        in the real scans of the training drives.
     n_threads : int or None
     compiled : bool
         Through `torch.compile`: a minute and a C++ compiler first, then PointSeg is a third faster.
@@ -334,9 +342,12 @@ def train(
         only_simulated = recipe.simulated_share == 1.0
         watched = objects.names("train") if only_simulated else objects.names("validation", fold=fold)
         real, weights, hashes = real_scans(objects, [] if only_simulated else objects.names("train", fold=fold))
-    if teacher is not None and objects is not None:
+    if recipe.distil > 0.0 and teacher is None:
+        raise ValueError(f"the recipe distils ({recipe.distil:g}) from no teacher; give --teacher")
+    tutor = None if teacher is None else _teacher(teacher).to(device)
+    if tutor is not None and objects is not None and recipe.distil == 0.0:
         extra = unlabelled_scans(objects, fold)
-        real = pseudo_labelled(_teacher(teacher), [*real, *extra])
+        real = pseudo_labelled(tutor.cpu(), [*real, *extra])
         weights += [len(extra) ** -0.5] * len(extra)
     samples = Samples(recipe, real, weights, sorted(simulated.glob("*.npz")) if simulated else [])
     watch = Watch(recipe, samples, objects, watched[::VALIDATION_STRIDE]) if objects and watched else None
@@ -396,9 +407,14 @@ def train(
             x = torch.from_numpy(inputs).to(device, memory_format=torch.channels_last)
             y = [torch.from_numpy(t).to(device) for t in targets]
             network.train()
+            if recipe.head_only:
+                network.segmentation.requires_grad_(False).eval()
             with torch.autocast(device.type, torch.bfloat16):
                 outputs = forward(x)
             loss = loss_of(recipe, outputs, y)
+            if tutor is not None and recipe.distil > 0.0:
+                logits = outputs[0] if isinstance(outputs, tuple) else outputs
+                loss = loss + recipe.distil * distillation_loss(logits, seen_twice(tutor, x, recipe.network))
             if not torch.isfinite(loss):
                 raise FloatingPointError(f"the loss is {loss.item()} at step {step}; lower --learning-rate")
             optimizer.zero_grad(set_to_none=True)
@@ -536,9 +552,10 @@ def _update(evaluator: BoxEvaluator, found: Sequence[Box], scan: LabelledScan) -
 
 
 def _teacher(checkpoint: Path) -> nn.Module:
-    network = build(Recipe("pointseg"))
-    _start(network, checkpoint)
-    return network
+    state = torch.load(checkpoint, weights_only=True, map_location="cpu")
+    network = build(Recipe(**json.loads(state["recipe"])))
+    network.load_state_dict(state["best"] or state["averaged"])
+    return network.eval()
 
 
 def _rounded(value: float) -> float | None:

@@ -409,7 +409,7 @@ def ground(scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
             outside = np.minimum(outside, d) - np.maximum(rounding - abs(outside - d), 0) ** 2 / (4 * rounding)
     z = slope_x * x + slope_y * y + ax * np.sin(kx * x + px) + ay * np.sin(ky * y + py)
     d = np.minimum(outside, bays)
-    inside = crown * np.minimum(-d, 4.0) + 0.02 * (outside > 0)
+    inside = crown * np.minimum(-d, 4.0) + scene.terrain[23] * (outside > 0)
     dropped = ((along + scene.terrain[21]) / 23.0) % 1.0 < 0.15
     verge = kerb * np.where(dropped, 0.25, 1.0) * np.minimum(d / 0.05, 1.0) + 0.02 * np.minimum(d, pavement)
     e = d - pavement

@@ -29,7 +29,7 @@ from edgeperc_export.cli import main
 from edgeperc_export.dataset import parity_scans, simulate
 from edgeperc_export.models_page import models_page
 from edgeperc_export.recipes import MODELS
-from edgeperc_export.selftraining import pseudo_labelled, unlabelled_scans
+from edgeperc_export.selftraining import pseudo_labelled, seen_twice, unlabelled_scans
 from edgeperc_export.to_onnx import ParityError, export, load, to_graph, verify, write_card
 from edgeperc_export.train import PAPER, Recipe, Samples, Watch, _optimizer, _schedule, _start, build, loss_of, train
 
@@ -139,6 +139,20 @@ def test_a_run_starts_from_what_another_has_in_common(tmp_path: Path, simulated:
         assert torch.equal(value, origin), name
     with pytest.raises(ValueError, match="no weight in common"):
         _start(build(small("pointseg")), dense)
+
+
+def test_only_the_head_learns(tmp_path: Path, simulated: Path) -> None:
+    start = untrained("ssadnet", tmp_path)
+    recipe = small("ssadnet", head="slots", head_only=True, steps=2, ema=0.0)
+    state = torch.load(
+        train(recipe, tmp_path / "run", kitti=None, simulated=simulated, start_from=start, n_threads=1),
+        weights_only=True,
+    )["network"]
+    drawn = build(recipe).state_dict()
+    for name, value in state.items():
+        if name.startswith("segmentation"):
+            assert torch.equal(value, weights(start)[name]), name
+    assert any(not torch.equal(value, drawn[name]) for name, value in state.items() if name.startswith("detection"))
 
 
 def test_the_papers_recipes_are_theirs() -> None:
@@ -253,6 +267,37 @@ def test_deep_supervision_is_for_training_alone(simulated: Path) -> None:
     plain = loss_of(replace(recipe, deep_supervision=0.0), logits, [truth])
     assert loss_of(recipe, (logits, early), [truth]) > plain
     assert isinstance(network.eval()(inputs), Tensor)
+
+
+def test_a_teacher_looks_twice() -> None:
+    class Outward(nn.Module):
+        """Sure of class 1 where y points away from the middle column; knows left from right by the column alone."""
+
+        def forward(self, image: Tensor) -> Tensor:
+            side = torch.tensor([1.0] * 4 + [-1.0] * 4)
+            away = 10.0 * (image[:, 1:2] * side).sign()
+            return torch.cat([-away, away], dim=1)
+
+    image = torch.randn(2, 5, 3, 8)
+    p = seen_twice(Outward(), image, "pointseg")
+    assert torch.equal(p.argmax(1), Outward()(image).argmax(1))
+    assert p.max(1).values.min() > 0.99
+    # A top view has no y to turn round, so the two looks contradict each other here.
+    assert torch.allclose(seen_twice(Outward(), image, "ssadnet"), torch.full((2, 2, 3, 8), 0.5))
+
+
+def test_a_network_distils_from_another(tmp_path: Path, simulated: Path) -> None:
+    recipe = small("pointseg", steps=1, distil=1.0)
+    teacher = untrained("pointseg", tmp_path, seed=9)
+    arguments = {"kitti": None, "simulated": simulated, "n_threads": 1}
+    with pytest.raises(ValueError, match=r"distils \(1\) from no teacher; give --teacher"):
+        train(recipe, tmp_path / "none", **arguments)
+    losses = []
+    for distil in (0.0, 1.0):
+        out = tmp_path / f"distil{distil:g}"
+        train(replace(recipe, distil=distil), out, teacher=teacher, **arguments)
+        losses.append(json.loads((out / "log.jsonl").read_text())["loss"])
+    assert losses[1] > losses[0] + 0.1
 
 
 def test_an_ablation_changes_what_it_says(tmp_path: Path, kitti: Path, simulated: Path) -> None:

@@ -18,6 +18,7 @@ from edgeperc_export.losses import (
     cross_entropy,
     dense_loss,
     dense_targets,
+    distillation_loss,
     lovasz_softmax,
     pointseg_loss,
     slot_targets,
@@ -261,6 +262,15 @@ def test_ignored_pixels_get_no_gradient(rng, loss):
     gradient = tensor.grad.abs().sum(1).numpy()
     assert not gradient[labels == IGNORE].any()
     assert gradient[labels != IGNORE].any()
+
+
+def test_distillation_is_least_at_the_teachers_word(rng):
+    logits, _ = random_maps(rng)
+    teacher = np.exp(log_softmax(rng.normal(size=logits.shape)))
+    expected = -(teacher * log_softmax(logits.astype(np.float64))).sum(1).mean()
+    told = distillation_loss(torch.from_numpy(logits), torch.from_numpy(teacher))
+    assert float(told) == pytest.approx(expected, rel=1e-5)
+    assert distillation_loss(torch.from_numpy(np.log(teacher)), torch.from_numpy(teacher)) < told
 
 
 def test_lovasz_of_hard_predictions_is_one_minus_mean_iou(rng):

@@ -345,10 +345,22 @@ def test_top_view_labels() -> None:
 def test_bays_are_not_drivable() -> None:
     scene = flat(street())
     bay = (*scene.strips[0, :5], 20.0, 25.0, 10.0, 20.0, 1.0)
-    scene = replace(scene, strips=np.vstack([scene.strips, bay]))
+    scene = replace(scene, strips=np.vstack([scene.strips[:1], bay]))
     x, y, _ = simulation._Street(np.random.default_rng(0), list(scene.strips), scene.terrain).on_strip(15.0, 22.0)
     assert not scene.on_road(x, y)
     assert scene.on_road(5.0, 0.0)
+
+
+def test_rows_of_a_layout_stand_in_bays_where_they_look_parked() -> None:
+    parked = [box("car", 12.0 + 6.0 * k, -4.5) for k in range(3)]
+    moving = [box("car", 15.0, 0.0), box("car", 10.0, 3.2, math.pi), box("car", 40.0, 3.2, math.pi)]
+    scenes = [scene_from_boxes([*parked, *moving], seed) for seed in range(20)]
+    in_bays = [scene.strips[-1, 9] > 0.0 for scene in scenes]
+    assert 10 <= sum(in_bays) < 20
+    for scene, bay in zip(scenes, in_bays, strict=True):
+        # Not only the cars: the whole strip is no road.
+        assert all(scene.on_road(x, -4.5) != bay for x in (9.0, 12.0, 21.0))
+        assert all(scene.on_road(*each.center[:2]) for each in moving)
 
 
 def test_layout_keeps_its_boxes() -> None:
