@@ -89,6 +89,7 @@ def _parser() -> argparse.ArgumentParser:
     make.add_argument("--layouts", type=Path, help="folder of KITTI label_2, calib and frames.csv")
     make.add_argument("--semantickitti", type=Path, help="root of SemanticKITTI, to judge the road by")
     make.add_argument("--fold", type=int, help="fold of the training drives to leave out and stop by: 0, 1 or 2")
+    make.add_argument("--steps", type=int, help="another number than the shipped model's, as for folds")
     make.add_argument("--threads", type=int)
     make.add_argument("--compile", action="store_true", help="through torch.compile, which needs a C++ compiler")
     make.add_argument("--model-version", default="1.0.0")
@@ -122,6 +123,7 @@ def _make(args: argparse.Namespace) -> int:
         layouts=args.layouts,
         semantickitti=args.semantickitti,
         fold=args.fold,
+        steps=args.steps,
         n_threads=args.threads,
         compiled=args.compile,
         version=args.model_version,

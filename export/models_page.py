@@ -123,12 +123,12 @@ def _folds(rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
         "## Over folds",
         "",
         f"Each model was made without one of the {len(FOLDS)} folds of the training drives, by",
-        "`edgeperc-export make NAME OUT --fold K`, and judged on that fold, grade A frames.",
+        "`edgeperc-export make NAME OUT --fold K --steps N`, and judged on that fold, grade A frames. The steps are",
+        "fewer than the shipped models', and so are the drives.",
     )
     for row in rows:
-        yield from _figures(
-            row["real"], f"{row['name']} without fold {row['fold']}, {row['real']['n_frames']} real scans"
-        )
+        made = f"{row['name']} without fold {row['fold']}, {row['steps']} steps of {row['batch']}"
+        yield from _figures(row["real"], f"{made}, {row['real']['n_frames']} real scans")
 
 
 def _ablations(rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
@@ -142,7 +142,7 @@ def _ablations(rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
         "drives that the run has not seen (`edgeperc-export ablate`): IoU of pixel labels, and AP50 of all vehicles as",
         "one class.",
     )
-    for network, fold, steps in dict.fromkeys((r["network"], r["fold"], r["steps"]) for r in rows):
+    for network, fold, steps in sorted({(r["network"], r["fold"], r["steps"]) for r in rows}):
         here = [r for r in rows if (r["network"], r["fold"], r["steps"]) == (network, fold, steps)]
         names = list(here[0]["figures"])
         yield from _head(f"{network}, fold {fold}, {steps} steps", names)

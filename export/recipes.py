@@ -54,6 +54,7 @@ def make(
     layouts: Path | None,
     semantickitti: Path | None = None,
     fold: int | None = None,
+    steps: int | None = None,
     n_threads: int | None = None,
     compiled: bool = False,
     version: str = "1.0.0",
@@ -71,6 +72,8 @@ def make(
         ``-sim`` are made without the first two, and judged on them where they are given.
     fold : int, optional
         Leave out this fold of the training drives and stop by it, as for figures over folds.
+    steps : int, optional
+        Another number of steps than the shipped model's, as for figures over folds.
     n_threads : int or None
     compiled : bool
         As `edgeperc_export.train.train` has it; the shipped PointSegs were, the SSADNets not.
@@ -82,6 +85,7 @@ def make(
         ``out/NAME.onnx``, its figures in its card.
     """
     stage = MODELS[name]
+    recipe = stage.recipe if steps is None else replace(stage.recipe, steps=steps)
     simulated_only = stage.recipe.simulated_share == 1.0
     if not simulated_only and (kitti is None or layouts is None):
         raise ValueError(f"{name} is trained on real scans too; give --kitti and --layouts")
@@ -105,7 +109,7 @@ def make(
             )
         start_from = base / "checkpoint.pt"
     checkpoint = train(
-        stage.recipe,
+        recipe,
         out / f"{name}{_suffix(fold)}",
         kitti=kitti,
         simulated=scans,

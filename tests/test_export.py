@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,14 +22,16 @@ from edgeperc import Perceiver
 from edgeperc.card import CARD_KEY, InputSpec, ModelCard, OutputSpec, RangeImageGeometry
 from edgeperc.datasets import IGNORE, KittiObjects, simulated_scan
 from edgeperc.errors import CardMismatchError
+from edgeperc.evaluate import evaluate
 from edgeperc.sensors import FitnessProfile
 from edgeperc.session import Session
+from edgeperc_export import recipes
 from edgeperc_export.ablation import PAPERS, VARIANTS, ablate
 from edgeperc_export.augment import LabelledScan
 from edgeperc_export.cli import main
 from edgeperc_export.dataset import parity_scans, simulate
 from edgeperc_export.models_page import models_page
-from edgeperc_export.recipes import MODELS
+from edgeperc_export.recipes import MODELS, Stage
 from edgeperc_export.selftraining import pseudo_labelled, seen_twice, unlabelled_scans
 from edgeperc_export.to_onnx import ParityError, export, load, to_graph, verify, write_card
 from edgeperc_export.train import PAPER, Recipe, Samples, Watch, _optimizer, _schedule, _start, build, loss_of, train
@@ -171,17 +174,17 @@ def test_the_papers_recipes_are_theirs() -> None:
 
 @pytest.fixture(scope="module")
 def kitti(tmp_path_factory: pytest.TempPathFactory, scans: list[np.ndarray]) -> Path:
-    """A KITTI object set of two simulated scans, one labelled frame of fold 0 and one of fold 1, and one unlabelled."""
+    """A KITTI object set, simulated: a labelled frame of fold 0, of fold 1 and of a test drive, and one unlabelled."""
     root = tmp_path_factory.mktemp("kitti")
     for part in ("velodyne", "label_2", "calib"):
         (root / "training" / part).mkdir(parents=True)
     calibration = "P2: 700 0 620 0 0 700 180 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
     calibration += "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
     rows = ["name,drive"]
-    for k, drive in enumerate(["2011_09_26_drive_0005", "2011_09_26_drive_0048", "2011_09_26_drive_0048"]):
-        scan = simulated_scan(10**9 + k % 2)
+    for k, drive in enumerate(["0005", "0048", "0048", "0011"]):
+        scan = simulated_scan(10**9 + (0, 1, 0, 3)[k])
         scan.points.tofile(root / "training/velodyne" / f"{k:06d}.bin")
-        rows.append(f"{k:06d},{drive}")
+        rows.append(f"{k:06d},2011_09_26_drive_{drive}")
         if k == 2:
             continue
         lines = []
@@ -313,6 +316,42 @@ def test_an_ablation_changes_what_it_says(tmp_path: Path, kitti: Path, simulated
     assert [row["variant"] for row in rows] == asked
     assert ablate("pointseg", tmp_path / "out", **arguments, variants=asked) == rows
     assert all(row["figures"].keys() == {"background", "car", "pedestrian", "cyclist"} for row in rows)
+
+
+def test_one_command_makes_a_model_and_what_it_starts_from(
+    tmp_path: Path, kitti: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    layouts = tmp_path / "layouts"
+    shutil.copytree(kitti / "training", layouts)
+    rows = (kitti / "frames.csv").read_text().splitlines()
+    (layouts / "frames.csv").write_text("\n".join(row for row in rows if "000002" not in row))  # it has no labels
+    base = Stage(small("pointseg", simulated_share=1.0, steps=1, n_pasted=1.0))
+    stages = {"pointseg-sim": base, "pointseg": Stage(small("pointseg", steps=3, n_pasted=1.0), after="pointseg-sim")}
+    judged = []
+
+    def judge(datasets: list[object], *args: object, **kwargs: object) -> tuple[dict[str, object], list[object]]:
+        judged.append([*map(str, datasets)])
+        return evaluate(["simulation:1" if d == "simulation" else d for d in datasets], *args, **kwargs)
+
+    monkeypatch.setattr(recipes, "MODELS", stages)
+    monkeypatch.setattr(recipes, "N_SIMULATED", 2)
+    monkeypatch.setattr(recipes, "evaluate", judge)
+    out = tmp_path / "out"
+    arguments = {"kitti": kitti, "layouts": layouts, "n_threads": 1}
+    made = recipes.make("pointseg", out, fold=0, steps=1, **arguments)
+    assert made == out / "pointseg-fold0.onnx"
+    assert judged == [[str(kitti), "simulation"]] * 2
+    cards = [Session(path, "cpu").card for path in (out / "pointseg-sim.onnx", made)]
+    assert [card.training["recipe"]["steps"] for card in cards] == [1, 1]
+    assert [bool(card.training["frames"]) for card in cards] == [False, True]
+    assert [card.metrics["command"] for card in cards] == [
+        "edgeperc eval KITTI simulation --model pointseg-sim",
+        "edgeperc eval KITTI simulation --model pointseg --fold 0",
+    ]
+    assert cards[1].training["started_from"] == [cards[0].training["recipe"]]
+    assert json.loads(made.with_suffix(".json").read_text())["real"]["n_frames"] == 1
+    with pytest.raises(ValueError, match="trained on real scans too; give --kitti and --layouts"):
+        recipes.make("pointseg", out, kitti=None, layouts=None)
 
 
 def test_training_learns(tmp_path: Path, simulated: Path) -> None:
