@@ -38,11 +38,11 @@ class Stage:
 SSADNET = Recipe("ssadnet", batch=4, learning_rate=1.5e-3, context_width=64, n_pasted=3.0, dropout=0.0)
 MODELS = {
     "pointseg-sim": Stage(Recipe("pointseg", simulated_share=1.0, steps=1000, learning_rate=2e-3, cooldown=0.3)),
-    "pointseg": Stage(Recipe("pointseg", steps=5000, batch=4, learning_rate=1e-3), after="pointseg-sim"),
+    "pointseg": Stage(Recipe("pointseg", steps=3600, batch=4, learning_rate=1e-3), after="pointseg-sim"),
     "ssadnet-sim": Stage(replace(SSADNET, simulated_share=1.0, steps=1300, cooldown=0.3)),
-    "ssadnet": Stage(replace(SSADNET, steps=2600), after="ssadnet-sim"),
+    "ssadnet": Stage(replace(SSADNET, steps=2000), after="ssadnet-sim"),
     # On the very segmentation branch of ssadnet, so that the heads can be compared.
-    "ssadnet-paper": Stage(replace(SSADNET, head="slots", head_only=True, steps=2000), after="ssadnet"),
+    "ssadnet-paper": Stage(replace(SSADNET, head="slots", head_only=True, steps=1500), after="ssadnet"),
 }
 
 
