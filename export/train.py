@@ -365,7 +365,7 @@ def train(
     curve: list[dict[str, Any]] = []
     if checkpoint.exists():
         state = torch.load(checkpoint, weights_only=True, map_location=device)
-        if json.loads(state["recipe"]) != asdict(recipe):
+        if Recipe(**json.loads(state["recipe"])) != recipe:
             raise ValueError(f"{checkpoint} is of another recipe: {state['recipe']}; train into an empty folder")
         before, curve = json.loads(state["before"]), json.loads(state["curve"])
         network.load_state_dict(state["network"])
