@@ -22,7 +22,9 @@ VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "as shipped": {},
         "nothing pasted": {"n_pasted": 0.0},
         "no sector of another scan": {"swap": 0.0},
+        "a third of what is pasted cars": {"paste_cars": 0.33},
         "never turned to a pedestrian or cyclist": {"turn_to_rare": 0.0},
+        "a third of the scans turned to any side": {"turn_anywhere": 0.33},
         "no bad weather": {"weather": 0.0},
         "no change to a scan at all": {
             "augment": False, "n_pasted": 0.0, "swap": 0.0, "turn_to_rare": 0.0, "weather": 0.0,

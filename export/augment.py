@@ -309,6 +309,7 @@ def augmented(
     n_pasted: float = 0.0,
     odds: Mapping[str, float] | None = None,
     turn_to_rare: float = 0.0,
+    turn_anywhere: float = 0.0,
     weather: float = 0.0,
 ) -> LabelledScan:
     """A scan as it might have been: turned, mirrored, thinned, its heights and remissions a little off.
@@ -327,6 +328,8 @@ def augmented(
         How often each kind is pasted; by default all alike.
     turn_to_rare : float
         Share of fully known scans that are turned to a pedestrian or cyclist instead of along the street.
+    turn_anywhere : float
+        Share of the other fully known scans that are turned to any side.
     weather : float
         Share of scans in bad weather.
     """
@@ -334,6 +337,8 @@ def augmented(
     angle = rng.normal(0.0, np.radians(5.0))
     if full and rng.random() < turn_to_rare:
         angle = facing(scan, rng)
+    elif full and turn_anywhere > 0.0 and rng.random() < turn_anywhere:
+        angle = rng.uniform(-np.pi, np.pi)
     elif full and rng.random() < 0.5:
         angle += np.pi
     scan = turned(scan, float(angle))

@@ -82,8 +82,12 @@ class Recipe:
         Objects cut from other scans that are pasted into one, on average.
     swap : float
         Share of scans one sector of which comes from another scan; point labels only.
+    paste_cars : float
+        Share of cars among what PointSeg has pasted.
     turn_to_rare : float
         Share of simulated scans turned to a pedestrian or cyclist.
+    turn_anywhere : float
+        Share of simulated scans turned to any side, so that vehicles stand where streets have none.
     weather : float
         Share of scans in rain, snow or fog.
     class_weights : bool
@@ -123,7 +127,9 @@ class Recipe:
     augment: bool = True
     n_pasted: float = 6.0
     swap: float = 0.3
+    paste_cars: float = 0.0
     turn_to_rare: float = 0.3
+    turn_anywhere: float = 0.0
     weather: float = 0.1
     class_weights: bool = True
     focal_gamma: float = 0.0
@@ -215,11 +221,16 @@ class Samples:
         scan = self._scan(rng)
         if not recipe.augment:
             return scan
+        odds = PASTE_ODDS[recipe.network]
+        if recipe.paste_cars > 0.0:
+            others = {name: share * (1.0 - recipe.paste_cars) for name, share in odds.items()}
+            odds = {**others, "car": recipe.paste_cars}
         changes = {
             "bank": self.bank,
             "n_pasted": recipe.n_pasted,
-            "odds": PASTE_ODDS[recipe.network],
+            "odds": odds,
             "turn_to_rare": recipe.turn_to_rare,
+            "turn_anywhere": recipe.turn_anywhere,
             "weather": recipe.weather,
         }
         scan = augmented(scan, rng, **changes)

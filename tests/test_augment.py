@@ -170,6 +170,21 @@ def test_facing_turns_somebody_to_the_front(scan: LabelledScan) -> None:
     assert facing(flat_street(), np.random.default_rng(0)) == 0.0
 
 
+def test_a_scan_known_all_around_turns_anywhere(scan: LabelledScan) -> None:
+    middle = np.array([scan.boxes[0].center[:2]])
+
+    def turns(**how: float) -> np.ndarray:
+        seen = [augmented(scan, np.random.default_rng(seed), **how).boxes[0].center[:2] for seed in range(60)]
+        return np.abs(np.degrees(np.angle(np.array(seen) @ [1, 1j] / (middle @ [1, 1j]))))
+
+    # A mirror changes the sign of an angle, so an object ahead or behind tells how far the scan was turned.
+    along = np.degrees(np.abs(np.arctan2(middle[0, 1], np.abs(middle[0, 0]))))
+    street = turns()
+    assert np.minimum(street, 180.0 - street).max() < 2 * along + 25.0
+    anywhere = turns(turn_anywhere=1.0)
+    assert np.histogram(anywhere, bins=6, range=(0.0, 180.0))[0].min() >= 2
+
+
 def test_the_same_draw_gives_the_same_scan(scan: LabelledScan) -> None:
     bank = ObjectBank.of([scan])
     how = {"bank": bank, "n_pasted": 5.0, "turn_to_rare": 0.5, "weather": 0.5}
