@@ -35,7 +35,7 @@ SHIPPED = ("ssadnet", "pointseg")
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 # A junction with cars, a truck, pedestrians and a cyclist, most of which are found; far from the seeds that models are
 # trained on.
-DEMO_SCENE = (2_000_000_120, "junction")
+DEMO_SCENE = (2_000_000_110, "junction")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

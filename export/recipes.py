@@ -42,7 +42,7 @@ MODELS = {
     "ssadnet-sim": Stage(replace(SSADNET, simulated_share=1.0, steps=1300, cooldown=0.3)),
     "ssadnet": Stage(replace(SSADNET, steps=2000), after="ssadnet-sim"),
     # On the very segmentation branch of ssadnet, so that the heads can be compared.
-    "ssadnet-paper": Stage(replace(SSADNET, head="slots", head_only=True, steps=1500), after="ssadnet"),
+    "ssadnet-paper": Stage(replace(SSADNET, head="slots", head_only=True, steps=1000), after="ssadnet"),
 }
 
 

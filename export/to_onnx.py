@@ -34,10 +34,12 @@ from .train import Recipe, build
 __all__ = ["ParityError", "export", "verify", "write_card"]
 
 OPSET = 18
-# fp32 convolutions summed in another order were seen to differ by 1e-4 of the outputs' deviation; where the two largest
-# of a pooling window are equal but for that, unpooling puts one in another's place, which was seen to move a cell by
-# 0.011; a wrong operator differs by 0.1 and more.
+# fp32 convolutions summed in another order were seen to differ by 1e-4 of the outputs' deviation; a wrong operator
+# differs by 0.1 and more.
 MAX_DEVIATION = 0.03
+# Where the two largest of a pooling window are equal but for rounding, unpooling may put one in the other's place, and
+# the cells around it differ, by 0.011 in a trained network and by 0.5 in one of random weights. Such places are few.
+COMPARED = 0.999
 # Rounding weights moved 0.07 % of an untrained network's labels, which lie close, and 0.006 % of a trained one's.
 MIN_AGREEMENT = 0.999
 # Biases and scales are few, and stay as they are.
@@ -180,8 +182,8 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
     Returns
     -------
     dict
-        ``n_scans``; ``max_deviation``, of raw outputs, in standard deviations of the output; ``label_agreement``, the
-        least share of pixels with the same label; ``box_deviation``, the largest difference of any number of a box.
+        ``n_scans``; ``max_deviation``, what 99.9 % of the raw outputs stay within, in standard deviations of the
+        output; ``label_agreement``, the least share of pixels with the same label; ``box_deviation``, the largest difference of any number of a box.
 
     Raises
     ------
@@ -200,7 +202,8 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
         here = session.run()
         wanted = {o.kind: a[0].numpy() for o, a in zip(card.outputs, answers, strict=True)}
         for kind, want in wanted.items():
-            worst = max(worst, float(np.abs(here[kind] - want).max()) / max(float(want.std()), 1e-6))
+            apart = np.quantile(np.abs(here[kind] - want), COMPARED)
+            worst = max(worst, float(apart) / max(float(want.std()), 1e-6))
         if card.view.kind == "top_view":
             (here_labels, mine), (labels, theirs) = (
                 decode_top_view(card, image, a, card.score_threshold) for a in (here, wanted)
@@ -216,7 +219,7 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
         agreement = min(agreement, float((here_labels == labels).mean()))
     if worst > MAX_DEVIATION or agreement < MIN_AGREEMENT or box_deviation > 0.05:
         raise ParityError(
-            f"{path}: raw outputs differ by up to {worst:.3g} standard deviations (at most {MAX_DEVIATION}), labels "
+            f"{path}: raw outputs differ by {worst:.3g} standard deviations (at most {MAX_DEVIATION}), labels "
             f"agree on {agreement:.4%} of the pixels (at least {MIN_AGREEMENT:.2%}), boxes differ by up to "
             f"{box_deviation:.3g} m (at most 0.05)"
         )
