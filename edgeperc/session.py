@@ -114,8 +114,8 @@ class Session:
     outputs : mapping of str to ndarray
         By output *kind*, without the batch axis; overwritten by every `run`.
     golden_deviation : float
-        What nine of ten of this computer's answers to the card's golden input stay within of the exporter's, in standard
-        deviations of that output; NaN where the card holds none.
+        How far this computer's answers to the card's golden input are from the exporter's, in standard deviations of
+        that output: nine of ten are nearer. NaN where the card holds none.
 
     Raises
     ------

@@ -183,7 +183,8 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
     -------
     dict
         ``n_scans``; ``max_deviation``, what 99.9 % of the raw outputs stay within, in standard deviations of the
-        output; ``label_agreement``, the least share of pixels with the same label; ``box_deviation``, the largest difference of any number of a box.
+        output; ``label_agreement``, the least share of pixels with the same label; ``box_deviation``, the largest
+        difference of any number of a box.
 
     Raises
     ------
