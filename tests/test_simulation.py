@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import reference
@@ -186,6 +186,7 @@ def test_a_scan_is_consistent(environment: str) -> None:
 
 
 @settings(max_examples=25, deadline=None)
+@example("truck", 1.0, 0.0, 0.0, 0.25, 0)
 @given(
     st.sampled_from(LABELS),
     st.floats(-1, 1),
@@ -197,11 +198,12 @@ def test_a_scan_is_consistent(environment: str) -> None:
 def test_shapes_fill_their_boxes(label: str, a: float, b: float, c: float, yaw: float, seed: int) -> None:
     mean, spread = simulation._SIZES[label]
     size = tuple(m + 2 * s * v for m, s, v in zip(mean, spread, (a, b, c), strict=True))
-    each = Box(label, 1.0, (9.0, 2.0, size[2] / 2 - 1.73), size, yaw)
+    # Its end is never so near that it fills the view.
+    each = Box(label, 1.0, (7.0 + size[0] / 2, 2.0, size[2] / 2 - 1.73), size, yaw)
     scan = simulate(flat(street(each, seed=seed)), TALL, seed, noise=False)
     mine = scan.points[scan.objects == 0]
     assert len(mine) > 5
-    assert in_box(mine, scan.boxes[0], 0.01).all()
+    assert in_box(mine, scan.boxes[0], 0.03).all()  # handlebars stick out of the narrowest cyclists
     # It reaches near its own top, and what shows is not a sliver of the box.
     assert np.ptp(mine[:, 2]) > 0.6 * size[2]
     assert math.hypot(np.ptp(mine[:, 0]), np.ptp(mine[:, 1])) > 0.4 * min(size[0], size[1])
