@@ -118,6 +118,17 @@ def test_library_code_leaves_the_process_alone(name: str) -> None:
     assert not {"print", "exit", "quit", "sys.exit", "os._exit", "logging.basicConfig", "signal.signal"} & {*calls}
 
 
+@pytest.mark.parametrize("path", sorted((REPOSITORY / "bench").glob("*.py")), ids=lambda path: path.stem)
+def test_the_bench_stands_on_the_runtime_alone(path: Path) -> None:
+    """It measures what a vehicle installs: nothing of training, and what draws or drives it only where asked for."""
+    tree = ast.parse(path.read_text("utf-8"))
+    packages = {dotted.partition(".")[0] for dotted in imported(tree)}
+    assert not packages & {"edgeperc_export", "onnx", "onnxruntime", "scipy", "torch"}
+    for statement in at_import(tree):
+        if isinstance(statement, ast.Import | ast.ImportFrom):
+            assert not {dotted.partition(".")[0] for dotted in imported(statement)} & {"matplotlib", "mlperf_loadgen"}
+
+
 def kernels(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef, ast.expr]]:
     """Functions under numba's decorator, each with it."""
     for node in ast.walk(tree):

@@ -1,0 +1,116 @@
+"""The scans that are measured with: simulated ones, which carry their truth, or the user's own."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeperc import Box, PointsError, read_points
+from edgeperc.cli import SCAN_SUFFIXES
+from edgeperc.datasets import simulated_scan
+from edgeperc.evaluate import FIRST_SEED
+from edgeperc.sensors import get_sensor
+from edgeperc.simulation import SimulatedScan
+
+__all__ = ["Input", "crowd", "read", "simulate", "sized"]
+
+
+@dataclass(frozen=True)
+class Input:
+    """Scans as files that processes load.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        .npy, (n, 4) float32 in the sensor's raw unit of remission.
+    truth : tuple of SimulatedScan
+        Empty where nothing is known.
+    told : dict
+        What the report says of them; ``sha256`` tells whether two reports are of the same scans.
+    """
+
+    files: tuple[Path, ...]
+    truth: tuple[SimulatedScan, ...]
+    told: dict[str, Any]
+
+
+def simulate(folder: Path, n: int, sensor: str) -> Input:
+    """The first scans that `edgeperc eval simulation` judges by, of no scene that a model was trained on."""
+    truth = [simulated_scan(FIRST_SEED + k, sensor) for k in range(n)]
+    scans = [raw(scan.points, sensor) for scan in truth]
+    source = f"{n} simulated scans, seeds {FIRST_SEED} to {FIRST_SEED + n - 1}"
+    return _stored(folder, scans, tuple(truth), source, sensor)
+
+
+def raw(points: NDArray[np.float32], sensor: str) -> NDArray[np.float32]:
+    """Simulated points with their remission, 0..1, in the unit that the sensor's own files have."""
+    profile = get_sensor(sensor)
+    points = points.copy()
+    points[:, 3] = points[:, 3] / np.float32(profile.remission_scale) - np.float32(profile.remission_offset)
+    return points
+
+
+def read(folder: Path, paths: Sequence[Path], sensor: str) -> Input:
+    """The user's scans, folders opened.
+
+    Raises
+    ------
+    PointsError
+        A file is no scan, or a folder holds none.
+    """
+    get_sensor(sensor)
+    files: list[Path] = []
+    for path in paths:
+        found = sorted(p for p in path.iterdir() if p.suffix.lower() in SCAN_SUFFIXES) if path.is_dir() else [path]
+        if not found:
+            raise PointsError(f"{path} holds no scan; expected files that end in {', '.join(SCAN_SUFFIXES)}")
+        files += found
+    scans = [np.ascontiguousarray(read_points(file)) for file in files]
+    source = f"{len(files)} scan{'s' * (len(files) != 1)}: {', '.join(file.name for file in files[:8])}"
+    return _stored(folder, scans, (), source + (" ..." if len(files) > 8 else ""), sensor)
+
+
+def store(folder: Path, name: str, points: NDArray[np.float32]) -> Path:
+    """Points as a file in ``folder``."""
+    file = folder / f"{name}.npy"
+    np.save(file, points)
+    return file
+
+
+def _stored(
+    folder: Path, scans: Sequence[NDArray[np.float32]], truth: tuple[SimulatedScan, ...], source: str, sensor: str
+) -> Input:
+    files = tuple(store(folder, f"{k:06d}", scan) for k, scan in enumerate(scans))
+    told = {
+        "source": source,
+        "sensor": sensor,
+        "n_points": [len(scan) for scan in scans],
+        "sha256": hashlib.sha256(b"".join(hashlib.sha256(scan.tobytes()).digest() for scan in scans)).hexdigest(),
+        "scan_sha256": [hashlib.sha256(scan.tobytes()).hexdigest() for scan in scans],
+    }
+    return Input(files, truth, told)
+
+
+def sized(n_points: int, sensor: str) -> NDArray[np.float32]:
+    """A scan of a number of points: rows of one simulated scan left out, or as many scans laid over one another."""
+    scans: list[NDArray[np.float32]] = []
+    while sum(map(len, scans)) < n_points:
+        scans.append(simulated_scan(FIRST_SEED + len(scans), sensor).points)
+    points = np.concatenate(scans)
+    # Order is kept: a sensor's own order is what caches meet.
+    kept = np.sort(np.random.default_rng(0).choice(len(points), n_points, replace=False))
+    return raw(points[kept], sensor)
+
+
+def crowd(n_cars: int, sensor: str) -> NDArray[np.float32]:
+    """A scan of a street with up to 28 cars in the top view, in rows of four, the nearest first."""
+    size = (4.2, 1.8, 1.6)
+    places = [(9.0 + 5.5 * row, y) for row in range(7) for y in (2.5, -2.5, 7.5, -7.5)][:n_cars]
+    boxes = [Box("car", 1.0, (x, y, -1.73 + size[2] / 2.0), size, 0.0) for x, y in places]
+    return raw(simulated_scan(FIRST_SEED, sensor, boxes).points, sensor)

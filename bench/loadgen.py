@@ -1,0 +1,107 @@
+"""MLPerf LoadGen in the place of our own loop: it draws the scans, takes the time, and writes its own logs."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeperc import MissingExtraError
+
+from .scenarios import KeepGoing, Limits, Perceive, Samples, back_to_back
+
+__all__ = ["require", "single_stream", "told"]
+
+SUMMARY = "mlperf_log_summary.txt"
+# Of MLPerf's early stopping: the least queries that support a 99.9th percentile.
+QUERIES_FOR_P999 = 6636
+
+
+def require() -> Any:
+    """The module of the package ``mlcommons-loadgen``."""
+    try:
+        import mlperf_loadgen
+    except ImportError as exc:
+        raise MissingExtraError("mlcommons-loadgen", "loadgen", "--loadgen") from exc
+    return mlperf_loadgen
+
+
+def single_stream(
+    perceive: Perceive,
+    scans: Sequence[NDArray[np.float32]],
+    limits: Limits,
+    *,
+    folder: Path,
+    keep_going: KeepGoing = lambda samples: True,
+    on_start: Callable[[], None] = lambda: None,
+) -> Samples:
+    """MLPerf's single stream: LoadGen draws a scan, waits for its answer, draws the next.
+
+    Parameters
+    ----------
+    folder : Path
+        Where LoadGen writes ``mlperf_log_summary.txt``, ``mlperf_log_detail.txt`` and so on.
+    perceive, scans, limits, keep_going, on_start
+        As in `back_to_back`, but a test that has begun cannot be stopped.
+
+    Returns
+    -------
+    Samples
+        Of the calls as seen from here, for the stages; LoadGen's own figures are in its logs (`told`).
+    """
+    loadgen = require()
+    samples = back_to_back(perceive, scans, Limits(0, 0.0, limits.warm_up_scans), keep_going=keep_going)
+    on_start()
+    first = samples.first_s = time.perf_counter()
+    failed: list[Exception] = []
+
+    def issue(queries: Sequence[Any]) -> None:
+        for query in queries:
+            if not failed:
+                began = time.perf_counter()
+                try:
+                    found = perceive(scans[query.index])
+                except Exception as exc:  # one of LoadGen's threads; raised below, in ours
+                    failed.append(exc)
+                else:
+                    took_ms = 1e3 * (time.perf_counter() - began)
+                    samples.add(began - first, took_ms, took_ms, found.stage_ms)
+            loadgen.QuerySamplesComplete([loadgen.QuerySampleResponse(query.id, 0, 0)])
+        keep_going(samples)
+
+    settings = loadgen.TestSettings()
+    settings.scenario = loadgen.TestScenario.SingleStream
+    settings.mode = loadgen.TestMode.PerformanceOnly
+    settings.min_query_count = limits.min_scans
+    settings.min_duration_ms = round(1e3 * limits.min_seconds)
+    settings.single_stream_target_latency_percentile = 0.999 if limits.min_scans >= QUERIES_FOR_P999 else 0.9
+    logs = loadgen.LogSettings()
+    logs.log_output.outdir = str(folder)
+    logs.log_output.copy_summary_to_stdout = False
+    logs.enable_trace = False
+    sut = loadgen.ConstructSUT(issue, lambda: None)
+    library = loadgen.ConstructQSL(len(scans), len(scans), lambda indices: None, lambda indices: None)
+    try:
+        loadgen.StartTestWithLogSettings(sut, library, settings, logs)
+    finally:
+        loadgen.DestroyQSL(library)
+        loadgen.DestroySUT(sut)
+    if failed:
+        raise failed[0]
+    return samples
+
+
+def told(folder: Path) -> dict[str, Any]:
+    """Percentiles [ms], the number of queries and LoadGen's verdict, as its summary has them."""
+    text = (folder / SUMMARY).read_text(encoding="utf-8", errors="replace")
+    found: dict[str, Any] = {
+        f"p{float(p):g}": int(ns) / 1e6
+        for p, ns in re.findall(r"^([\d.]+) percentile latency \(ns\)\s*: (\d+)", text, re.M)
+    }
+    verdict = re.search(r"^Result is\s*: (\w+)", text, re.M)
+    return found | {"result": verdict[1] if verdict else None, "summary": text}

@@ -1,0 +1,783 @@
+"""The latency harness: its arithmetic by hand, its schedule by a clock of its own, and one true run of a few scans."""
+
+from __future__ import annotations
+
+import html
+import io
+import json
+import re
+import signal
+import sys
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("psutil")
+
+from edgeperc.datasets import simulated_scan
+from edgeperc.errors import MissingExtraError, ModelFileError, PointsError
+from edgeperc.perception import Box, PointLabels, TopView
+from edgeperc.simulation import TOP_VIEW_CLASSES
+from edgeperc_bench import accuracy, cli, context, inputs, loadgen, measure, recommendation, report, worker
+from edgeperc_bench.samples import compare, noise_floor, percentile, summary, supported, trend
+from edgeperc_bench.scenarios import Clock, Limits, Samples, back_to_back, paced, throughput
+
+# samples
+
+
+def test_a_percentile_is_a_sample() -> None:
+    values = [5.0, 1.0, 4.0, 2.0, 3.0]
+    assert [percentile(values, p) for p in (20.0, 20.1, 50.0, 90.0, 100.0)] == [1.0, 2.0, 3.0, 5.0, 5.0]
+    # 9,990 of 10,000 do not exceed 9,990.
+    assert percentile(np.arange(1, 10_001), 99.9) == 9990.0
+    assert np.isnan(percentile([], 50.0))
+
+
+@pytest.mark.parametrize(("p", "least"), [(50.0, 20), (90.0, 100), (99.0, 1000), (99.9, 10_000)])
+def test_a_percentile_needs_ten_samples_above_it(p: float, least: int) -> None:
+    assert supported(p, least)
+    assert not supported(p, least - 1)
+
+
+def test_a_summary_leaves_out_what_is_not_supported() -> None:
+    assert summary(range(1, 101)) == {"n": 100, "p50": 50.0, "p90": 90.0, "p99": None, "p99.9": None, "max": 100.0}
+    assert summary([]) == {"n": 0, "p50": None, "p90": None, "p99": None, "p99.9": None, "max": None}
+
+
+def test_the_noise_floor_is_the_spread_of_medians() -> None:
+    assert noise_floor([[1.0, 10.0, 90.0], [11.0], [10.5, 10.5]]) == pytest.approx(1.0 / 10.5)
+    assert noise_floor([[1.0, 2.0, 3.0]]) is None
+    assert noise_floor([[1.0, 2.0], []]) is None
+
+
+def repeats(medians: Sequence[float], spread: float, seed: int, n: int = 300) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [median + rng.gamma(2.0, spread, n) for median in medians]
+
+
+@pytest.mark.parametrize(
+    ("medians", "word"),
+    [
+        ((20.0, 20.1, 19.9), "no difference"),
+        ((20.6, 20.7, 20.5), "slower"),
+        ((19.0, 19.1, 18.9), "faster"),
+        # Farther apart than A, yet so are B's own repeats.
+        ((20.0, 23.0, 20.6), "no difference"),
+    ],
+)
+def test_a_verdict_knows_the_noise(medians: Sequence[float], word: str) -> None:
+    a = repeats((20.0, 20.1, 19.9), 0.3, 0)
+    verdict = compare(a, repeats(medians, 0.3, 1))
+    assert verdict.word == word
+    assert verdict.interval[0] <= verdict.ratio <= verdict.interval[1]
+
+
+def test_the_same_samples_never_differ_and_single_runs_say_nothing() -> None:
+    a = repeats((20.0, 20.5), 1.0, 0)
+    assert compare(a, a).word == "no difference"
+    assert compare(a, a).ratio == 1.0
+    assert compare(a, a[:1]).word == "unusable"
+    assert compare([], a).word == "unusable"
+
+
+def test_most_runs_of_the_same_thing_show_no_difference() -> None:
+    rng = np.random.default_rng(5)
+    words = []
+    for seed in range(60):
+        medians = rng.normal(20.0, 0.3, (2, 3))
+        words.append(compare(repeats(medians[0], 0.5, seed), repeats(medians[1], 0.5, 1000 + seed)).word)
+    assert words.count("no difference") >= 45
+
+
+def test_a_trend_is_least_squares() -> None:
+    line = trend([0.0, 1.0, 2.0, 3.0], [1.0, 3.0, 5.0, 7.0])
+    assert (line.slope, line.intercept, line.error, line.r2) == pytest.approx((2.0, 1.0, 0.0, 1.0))
+    # Residuals -1, 1, 1, -1 about the mean: slope 0 with squares 4, spread 5 and 2 degrees of freedom.
+    level = trend([0.0, 1.0, 2.0, 3.0], [-1.0, 1.0, 1.0, -1.0])
+    assert level.slope == pytest.approx(0.0)
+    assert level.error == pytest.approx(1.96 * np.sqrt(4.0 / 2.0 / 5.0))
+    assert np.isnan(trend([1.0, 2.0], [1.0, 2.0]).slope)
+
+
+def test_a_trends_error_grows_where_neighbours_are_alike() -> None:
+    rng = np.random.default_rng(0)
+    x, steps = np.arange(400.0), rng.normal(0.0, 1.0, 400)
+    assert trend(x, np.repeat(steps[:20], 20)).error > 2.0 * trend(x, steps).error
+
+
+@pytest.mark.parametrize(("slope", "verdict"), [(0.0, "level"), (1e-3, "grows"), (1e-6, "level")])
+def test_a_soak_tells_growth_from_noise(slope: float, verdict: str) -> None:
+    done = np.linspace(0, 18_000, 500)
+    mb = 300.0 + slope * done + np.random.default_rng(2).normal(0.0, 0.3, 500)
+    told = cli.memory_growth(np.stack([done, mb], axis=1).tolist(), 2000)
+    assert told["verdict"] == verdict
+    assert told["growth_mb"] == pytest.approx(slope * 18_000, abs=0.3)
+
+
+def test_a_soak_may_be_undecided() -> None:
+    done = np.linspace(0, 18_000, 8)
+    mb = [300.0, 310.0, 295.0, 305.0, 300.0, 312.0, 296.0, 303.0]
+    assert cli.memory_growth(np.stack([done, mb], axis=1).tolist(), 0)["verdict"] == "undecided"
+    assert cli.memory_growth([[10, 300.0]], 0)["verdict"] == "undecided"
+
+
+# scenarios
+
+
+class FakeClock(Clock):
+    """Stands still but for what is slept and worked; sleeping oversleeps by ``late_s``."""
+
+    def __init__(self, late_s: float = 0.0) -> None:
+        self.time_s, self.late_s = 100.0, late_s
+
+    def now(self) -> float:
+        return self.time_s
+
+    def sleep_until(self, due_s: float) -> None:
+        if due_s > self.time_s:
+            self.time_s = due_s + self.late_s
+
+
+class FakePerceiver:
+    def __init__(self, clock: FakeClock, takes_s: Sequence[float]) -> None:
+        self.clock, self.takes_s, self.seen = clock, takes_s, []
+
+    def __call__(self, scan: Any) -> Any:
+        self.clock.time_s += self.takes_s[len(self.seen) % len(self.takes_s)]
+        self.seen.append(scan)
+        return SimpleNamespace(stage_ms={"infer": 1.0})
+
+
+def test_back_to_back_wants_both_scans_and_seconds() -> None:
+    clock = FakeClock()
+    perceive = FakePerceiver(clock, [0.5])
+    samples = back_to_back(perceive, ["a", "b"], Limits(3, 4.0, 2), clock=clock)
+    assert len(samples.ms) == 8
+    assert len(samples.warm_up_ms) == 2
+    assert perceive.seen == ["a", "b"] * 5
+    assert samples.ms == samples.age_ms == pytest.approx([500.0] * 8)
+    assert samples.start_s == pytest.approx([0.5 * k for k in range(8)])
+    assert samples.first_s == pytest.approx(101.0)
+    assert samples.stage_ms == {"infer": [1.0] * 8}
+    assert len(back_to_back(perceive, ["a"], Limits(9, 0.0, 0), clock=clock).ms) == 9
+
+
+def test_the_pace_is_kept_without_drift() -> None:
+    clock = FakeClock(late_s=0.003)
+    samples = paced(FakePerceiver(clock, [0.02]), ["a"], 10.0, Limits(1000, 0.0, 0), clock=clock)
+    # Only the very first scan is there without sleeping; every later one starts 3 ms late, the thousandth too.
+    assert samples.start_s[-1] == pytest.approx(99.903)
+    assert samples.age_ms[1:] == pytest.approx([23.0] * 999)
+    assert (samples.missed, samples.skipped) == (0, 0)
+
+
+def test_a_late_answer_is_counted_and_the_newest_scan_is_next() -> None:
+    clock = FakeClock()
+    perceive = FakePerceiver(clock, [0.05, 0.35, 0.05, 0.05])
+    samples = paced(perceive, list(range(10)), 10.0, Limits(4, 0.0, 0), clock=clock)
+    # The second scan arrives at 0.1 s and is answered at 0.45 s: scans 2 and 3 are overtaken by scan 4, of 0.4 s.
+    assert perceive.seen == [0, 1, 4, 5]
+    assert samples.skipped == 2
+    assert samples.missed == 1
+    assert samples.age_ms == pytest.approx([50.0, 350.0, 100.0, 50.0])
+    assert samples.start_s == pytest.approx([0.0, 0.1, 0.45, 0.5])
+
+
+def test_a_long_run_keeps_few_samples_and_counts_all() -> None:
+    clock = FakeClock()
+    samples = back_to_back(FakePerceiver(clock, [0.1]), ["a"], Limits(100, 0.0, 0, stride=40), clock=clock)
+    assert samples.n == 100
+    assert samples.start_s == pytest.approx([0.0, 4.0, 8.0])
+    assert len(samples.ms) == len(samples.age_ms) == len(samples.stage_ms["infer"]) == 3
+
+
+def test_a_scenario_ends_when_told() -> None:
+    clock = FakeClock()
+    samples = back_to_back(
+        FakePerceiver(clock, [0.1]), ["a"], Limits(100, 0.0, 5), clock=clock, keep_going=lambda s: len(s.ms) < 7
+    )
+    assert (len(samples.warm_up_ms), len(samples.ms)) == (5, 7)
+
+
+def test_throughput_counts_the_time_that_all_share() -> None:
+    # From 1 to 4 s both are at work: three calls of the one, one and a half of the other.
+    one, other = ([0.0, 1.0, 2.0, 3.0], [1000.0] * 4), ([1.0, 3.0], [2000.0] * 2)
+    rate, seconds = throughput([one, other])
+    assert (rate, seconds) == pytest.approx((1.5, 3.0))
+    assert np.isnan(throughput([one, ([], [])])[0])
+    assert np.isnan(throughput([one, ([9.0], [1.0])])[0])
+
+
+# context
+
+
+def test_the_machine_is_told_in_json() -> None:
+    told = context.machine()
+    json.dumps(told, allow_nan=False)
+    assert told["logical_cores"] >= 1
+    assert context.fingerprint(told) == context.fingerprint(dict(told, memory_mb=0))
+    assert context.fingerprint(told) != context.fingerprint(dict(told, cpu="another"))
+    assert context.software()["numpy"] == np.__version__
+    assert context.rss_mb() > 10.0
+    assert (context.peak_rss_mb() or 1e9) >= 10.0
+
+
+def quiet(**changed: Any) -> dict[str, Any]:
+    state = {"at_s": 0.0, "busy_s": 0.0, "stolen_s": 0.0, "mhz": 3000.0, "temperature_c": 50.0, "critical_c": 100.0}
+    return state | {"throttle_count": 7, "quota_throttled": 0, "load_average": 0.1, "on_battery": False} | changed
+
+
+def test_what_disturbs_is_said_out_loud() -> None:
+    hardware = {"logical_cores": 4}
+    fine = quiet(at_s=10.0, busy_s=8.5)
+    assert context.spoilers(hardware, quiet(), fine, 8.0) == []
+    loud = quiet(
+        at_s=10.0,
+        busy_s=28.0,
+        stolen_s=2.0,
+        throttle_count=9,
+        quota_throttled=3,
+        mhz=2000.0,
+        temperature_c=95.0,
+        on_battery=True,
+    )
+    told = "\n".join(context.spoilers(hardware, quiet(), loud, 8.0))
+    for words in (
+        "2.0 of 4 cores",
+        "5% of the CPU time",
+        "heat 2 times",
+        "quota stopped it 3 times",
+        "95 C",
+        "2000 MHz",
+    ):
+        assert words in told
+    assert "battery" in told
+
+
+def test_energy_counters_wrap_and_rails_integrate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rapl, rail = tmp_path / "class/powercap/intel-rapl:0", tmp_path / "class/hwmon/hwmon3"
+    files = {
+        rapl: {"name": "package-0", "energy_uj": "900000", "max_energy_range_uj": "999999"},
+        rail: {"name": "ina3221", "in1_label": "VDD_IN", "in1_input": "5000", "curr1_input": "1000"},
+    }
+    for folder, texts in files.items():
+        folder.mkdir(parents=True)
+        for name, text in texts.items():
+            (folder / name).write_text(f"{text}\n")
+    now_s = 10.0
+    monkeypatch.setattr(context.time, "perf_counter", lambda: now_s)
+    meter = context.EnergyMeter(tmp_path)
+    (rapl / "energy_uj").write_text("100000\n")
+    (rail / "curr1_input").write_text("3000\n")
+    now_s = 12.0
+    meter.tick()
+    # 100,000 microjoules up to the wrap at a million, 100,000 after it; 5 and 15 W for 2 s.
+    assert meter.joules == pytest.approx({"package-0 (intel-rapl:0)": 0.2, "VDD_IN (hwmon3)": 20.0})
+
+
+# accuracy
+
+
+def answer(labels: Sequence[int], cells: int, boxes: Sequence[Box]) -> worker.Answer:
+    points = PointLabels(np.array(labels, np.uint8), np.array([True, True, True, False]), ("background", "car"))
+    top_view = TopView(np.full((2, 2), cells, np.uint8), ("background", "drivable"), 0.1, (6.0, 6.2), (-0.1, 0.1))
+    return worker.Answer(points, top_view, tuple(boxes))
+
+
+def test_agreement_counts_labels_and_boxes() -> None:
+    car, far = (
+        Box("car", 0.9, (20.0, 0.0, -1.0), (4.0, 2.0, 1.5), 0.0),
+        Box("car", 0.9, (30.0, 0.0, -1.0), (4.0, 2.0, 1.5), 0.0),
+    )
+    right, guess = [answer([0, 1, 1, 0], 1, [car])], [answer([0, 1, 0, 1], 1, [car, far])]
+    told = accuracy.agreement(right, guess)
+    # The last point is out of view; background: 1 of 2, car: 1 of 2.
+    assert told["points"] == pytest.approx({"equal": 2.0 / 3.0, "mean_iou": 0.5}, abs=1e-6)
+    assert told["cells"]["equal"] == 1.0
+    assert told["boxes"] == pytest.approx({"n_reference": 1, "n_found": 2, "n_both": 1, "f1": 2.0 / 3.0})
+    same = {"agreement": accuracy.agreement(right, right), "truth": None, "reference_truth": None}
+    assert accuracy.agrees(same)
+    assert not accuracy.agrees(same | {"agreement": told})
+    assert not accuracy.agrees(same | {"truth": {"points_mean_iou": 0.58}, "reference_truth": {"points_mean_iou": 0.6}})
+
+
+def test_correctness_of_the_truth_itself_is_full() -> None:
+    scan = simulated_scan(3)
+    geometry = TopView(scan.top_view_labels(), TOP_VIEW_CLASSES, 0.1, (6.0, 46.0), (-10.0, 10.0))
+    boxes = [
+        box
+        for box, n in zip(scan.boxes, scan.box_points, strict=True)
+        if n >= 3 and box.label in ("car", "van", "truck")
+    ]
+    inside = [box for box in boxes if 6.0 <= box.center[0] < 46.0 and abs(box.center[1]) < 10.0]
+    told = accuracy.correctness([worker.Answer(None, geometry, tuple(inside))], [scan])
+    assert told["cells_mean_iou"] == 1.0
+    assert told["vehicle_ap50"] == (1.0 if inside else None)
+    assert told["points_mean_iou"] is None
+
+
+# reports
+
+
+def samples_document(ms: Sequence[float], rate_hz: float | None = None) -> dict[str, Any]:
+    samples = Samples(start_s=[0.1 * k for k in range(len(ms))], ms=[*ms], age_ms=[v + 1.0 for v in ms])
+    samples.n = len(ms)
+    samples.stage_ms = {"project": [1.0] * len(ms), "infer": [v - 2.0 for v in ms]}
+    return {
+        **{"rate_hz": rate_hz, "limits": {}, **vars(samples), "wall_s": 2.0, "cpu_s": 1.0, "rss_mb": [[0, 300.0]]},
+        **{"energy_j": {"<rail>": 5.0}, "before": {}, "after": {}, "interrupted": False},
+    }
+
+
+def document(*medians: float, sha256: str = "s", spread: float = 0.2) -> dict[str, Any]:
+    engine = {"name": "pointseg", "version": "1", "sha256": "f" * 64, "provider": "CPU", "threads": 1, "spinning": "1"}
+    drawn = repeats(medians, spread, 3, n=120)
+    setting = {
+        **{
+            "models": ["pointseg"],
+            "provider": "cpu",
+            "n_threads": 1,
+            "sensor": "hdl-64e",
+            "offline": [],
+            "cold_start": [],
+        },
+        "accuracy": None,
+        "loadgen": None,
+        "repeats": [
+            {
+                **{
+                    "engines": [engine],
+                    "construct_s": 0.5,
+                    "first_call_ms": 30.0,
+                    "rss_mb": 300.0,
+                    "peak_rss_mb": 310.0,
+                },
+                **{"scans_mb": 5.0, "warnings": ["<script>alert(1)</script> & more"], "interrupted": False},
+                "scenarios": {"single-stream": samples_document(ms), "paced:10": samples_document(ms, 10.0)},
+            }
+            for ms in drawn
+        ],
+    }
+    given = {"source": "two <b>scans</b>", "sensor": "hdl-64e", "n_points": [5, 6], "sha256": sha256}
+    return {
+        **{"schema": 1, "kind": "run", "command": "edgeperc-bench run", "complete": True, "input": given},
+        **{
+            "machine": {"cpu": "A <fast> & quiet CPU", "fingerprint": "m"},
+            "software": {"numpy": "2", "environment": {}},
+        },
+        **{"spoilers": ["others | are busy"], "settings": [setting], "skipped": [], "recommended": [], "tables": []},
+        "soak": None,
+    }
+
+
+def plain(value: Any) -> Any:
+    return json.loads(json.dumps(value, default=float))
+
+
+def test_json_comes_back_as_it_went(tmp_path: Path) -> None:
+    written = plain(document(20.0, 20.1))
+    report.write_report(written, tmp_path / "a.json")
+    assert report.read_report(tmp_path / "a.json") == written
+    for k, text in enumerate(("nonsense", "[]", '{"schema": 99, "kind": "run"}')):
+        (tmp_path / f"{k}.json").write_text(text)
+        with pytest.raises(report.ReportError, match=rf"{k}\.json"):
+            report.read_report(tmp_path / f"{k}.json")
+
+
+def test_figures_of_a_scenario_are_of_all_repeats() -> None:
+    setting = document(20.0, 22.0)["settings"][0]
+    told = report.latency(setting, "single-stream")
+    assert told["n"] == 240
+    assert told["p99"] is None
+    assert told["noise"] == pytest.approx(0.1, abs=0.02)
+    assert told["cpu_s_per_scan"] == pytest.approx(2.0 / 240)
+    assert told["energy_j_per_scan"] == pytest.approx({"<rail>": 10.0 / 240})
+    assert told["age"]["p50"] == pytest.approx(told["p50"] + 1.0)
+    stages = report.stage_medians(setting, "single-stream")
+    assert stages["project"] == stages["outside"] == pytest.approx(1.0)
+
+
+def test_a_page_is_well_formed_and_needs_nothing_from_elsewhere(matplotlib: None) -> None:
+    told = document(20.0, 20.1)
+    page = report.html_page(report.sections(told), "<title>", report.pictures(told))
+    root = ET.fromstring(page.partition("\n")[2])
+    assert len([element for element in root.iter() if element.tag.endswith("svg")]) == 1
+    assert "A <fast> & quiet CPU" in "".join(root.itertext())
+    assert not [
+        element for element in root.iter() if element.tag.rpartition("}")[2] in {"script", "link", "img", "iframe"}
+    ]
+    for element in root.iter():
+        for name, value in element.attrib.items():
+            local = name.rpartition("}")[2]
+            assert local not in {"src", "srcset", "action"}
+            assert local != "href" or value.startswith("#"), value
+            assert "url(" not in value or "url(#" in value
+    # Names of namespaces are no addresses that anybody asks.
+    addresses = set(re.findall(r"(?:https?:)?//[^\"'\s<)]+", html.unescape(page)))
+    assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
+    assert "@import" not in page
+
+
+def test_words_and_tables_hold_what_was_measured() -> None:
+    parts = report.sections(document(20.0, 20.1))
+    shown = report.text(parts)
+    assert "disturbed: others | are busy" in shown
+    assert "single-stream" in shown
+    assert "paced:10" in shown
+    written = report.markdown(parts, "a | b")
+    assert written.startswith("# a \\| b\n")
+    for block in re.findall(r"(?:^\|.*\n)+", written, flags=re.M):
+        counts = {len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}
+        assert len(counts) == 1
+    interrupted = report.text(report.sections(document(20.0) | {"complete": False}))
+    assert "interrupted" in interrupted
+
+
+def test_a_live_table_replaces_itself_on_a_terminal_only() -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    live, file = report.LiveTable(Terminal()), report.LiveTable(io.StringIO())
+    for table in (live, file):
+        table("single-stream", [3.0] * 30)
+        table.say("next")
+    shown = live.stream.getvalue()
+    assert re.search(r"single-stream +30 +3\.00 +- ", shown)
+    assert "\x1b[2A\x1b[J" in shown  # the head and one row are taken away before the next line
+    assert file.stream.getvalue() == "edgeperc-bench: next\n"
+    assert file.ms == {"single-stream": [3.0] * 30}
+
+
+# the command
+
+
+@pytest.fixture
+def reports(tmp_path: Path) -> Any:
+    def written(name: str, *medians: float, **changes: Any) -> str:
+        report.write_report(plain(document(*medians, **changes)), tmp_path / name)
+        return str(tmp_path / name)
+
+    return written
+
+
+def test_compare_answers_by_its_exit_code(reports: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    a = reports("a.json", 20.0, 20.1)
+    assert cli.main(["compare", a, reports("same.json", 20.05, 19.95)]) == 0
+    assert "no difference" in capsys.readouterr().out
+    assert cli.main(["compare", a, reports("fast.json", 17.0, 17.1)]) == 0
+    assert "faster" in capsys.readouterr().out
+    assert cli.main(["compare", a, reports("slow.json", 23.0, 23.1)]) == 1
+    assert "slower" in capsys.readouterr().out
+    assert cli.main(["compare", a, reports("once.json", 23.0)]) == 2
+    assert "--repeats" in capsys.readouterr().out
+    assert cli.main(["compare", a, reports("other.json", 20.0, 20.1, sha256="t")]) == 2
+    assert "different scans" in capsys.readouterr().err
+    assert cli.main(["compare", a, "nowhere.json"]) == 2
+    assert "nowhere.json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--scenario", "paced:0"],
+        ["--scenario", "offline:x"],
+        ["--min-scans", "0"],
+        ["--threads", "none"],
+        ["matrix", "--providers", "abacus"],
+        ["--precisions", "fp7"],
+        ["scaling", "--cars", "29"],
+        ["soak", "--scans", "3"],
+        ["compare", "only-one.json"],
+    ],
+)
+def test_wrong_words_are_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main(words)
+    assert left.value.code == 2
+    assert "edgeperc-bench" in capsys.readouterr().err
+
+
+def test_the_matrix_skips_nothing_silently() -> None:
+    settings, skipped = cli.settings_to_try(["all"], ["fp32", "bf16"], ("openvino", "cpu"))
+    assert settings == ["openvino:fp32", "openvino:bf16", "cpu"]
+    told = "\n".join(skipped)
+    assert "cuda: not available" in told
+    assert "cpu in bf16" in told
+    assert cli.settings_to_try(["cpu"], ["bf16"], ("cpu",))[0] == []
+
+
+def test_the_matrix_recommends_the_fastest_that_agrees() -> None:
+    settings = []
+    for provider, median, agrees in (("cpu", 30.0, True), ("openvino:fp32", 20.0, True), ("openvino:bf16", 9.0, False)):
+        (setting,) = document(median, median + 0.1)["settings"]
+        settings.append(setting | {"provider": provider, "accuracy": {"agrees": agrees}})
+    told = {"settings": settings, "machine": {"cpu": "c"}, "software": {"onnxruntime": "1", "taken": "t"}}
+    (found,) = cli._recommended(told)
+    assert found["entry"]["provider"] == "openvino:fp32"
+    assert found["sha256"] == "f" * 64
+    assert "is slower" in found["words"]
+    for setting in settings:
+        setting["accuracy"] = {"agrees": False}
+    assert cli._recommended(told) == []
+
+
+def test_recommendations_of_machines_and_models_live_side_by_side(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "settings.json"
+    assert recommendation.read_recommendation(path, "m", "s") is None
+    recommendation.write_recommendation(path, "m", {"s": {"provider": "cpu", "n_threads": 2}})
+    recommendation.write_recommendation(path, "m", {"t": {"provider": "openvino", "n_threads": 1}})
+    recommendation.write_recommendation(path, "n", {"s": {"provider": "cuda", "n_threads": 1}})
+    recommendation.write_recommendation(path, "m", {"s": {"provider": "cpu", "n_threads": 4}})
+    assert recommendation.read_recommendation(path, "m", "s") == {"provider": "cpu", "n_threads": 4}
+    assert recommendation.read_recommendation(path, "m", "t") == {"provider": "openvino", "n_threads": 1}
+    assert recommendation.read_recommendation(path, "n", "t") is None
+    assert [*path.parent.iterdir()] == [path]
+    path.write_text("[]")
+    with pytest.raises(report.ReportError, match=r"settings\.json"):
+        recommendation.read_recommendation(path, "m", "s")
+
+
+def test_scans_are_sized_and_crowded(tmp_path: Path) -> None:
+    assert inputs.sized(1000, "hdl-64e").shape == (1000, 4)
+    assert inputs.sized(150_000, "hdl-64e").shape == (150_000, 4)
+    assert len(inputs.crowd(4, "hdl-64e")) > 50_000
+    with pytest.raises(PointsError, match="holds no scan"):
+        inputs.read(tmp_path, [tmp_path], "hdl-64e")
+
+
+def test_simulated_scans_come_in_the_sensors_own_unit(tmp_path: Path) -> None:
+    given = inputs.simulate(tmp_path, 1, "os1-64")
+    raw = np.load(given.files[0])
+    profile = inputs.get_sensor("os1-64")
+    back = (raw[:, 3] + np.float32(profile.remission_offset)) * np.float32(profile.remission_scale)
+    np.testing.assert_allclose(back, given.truth[0].points[:, 3], atol=1e-4)
+
+
+def test_loadgen_absent_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "mlperf_loadgen", None)
+    with pytest.raises(MissingExtraError, match=r"edgeperc\[loadgen\]"):
+        loadgen.require()
+    assert cli.main(["run", "--loadgen", str(tmp_path)]) == 2
+
+
+def test_loadgens_summary_is_read(tmp_path: Path) -> None:
+    lines = [
+        "Result is : VALID",
+        "50.00 percentile latency (ns)   : 1500000",
+        "99.90 percentile latency (ns)   : 2500000",
+    ]
+    (tmp_path / loadgen.SUMMARY).write_text("\n".join(lines))
+    told = loadgen.told(tmp_path)
+    assert (told["p50"], told["p99.9"], told["result"]) == (1.5, 2.5, "VALID")
+
+
+def test_loadgen_drives_the_single_stream(tmp_path: Path) -> None:
+    pytest.importorskip("mlperf_loadgen")
+    clock = FakeClock()
+    scans = [np.zeros((k, 4), np.float32) for k in range(1, 4)]
+    perceive = FakePerceiver(clock, [0.0])
+    started = []
+    samples = loadgen.single_stream(
+        perceive, scans, Limits(30, 0.0, 2), folder=tmp_path, on_start=lambda: started.append(len(perceive.seen))
+    )
+    told = loadgen.told(tmp_path)
+    assert started == [2]
+    assert len(samples.ms) == samples.n >= 30
+    assert {"p50", "p90", "p99.9"} <= told.keys()
+    assert told["result"] in ("VALID", "INVALID")
+
+    def fails(scan: Any) -> Any:
+        raise ModelFileError("the model is gone")
+
+    with pytest.raises(ModelFileError, match="is gone"):
+        loadgen.single_stream(fails, scans, Limits(3, 0.0, 0), folder=tmp_path)
+
+
+class Street:
+    """In the place of a Perceiver: every answer the same."""
+
+    def __call__(self, scan: np.ndarray) -> Any:
+        points = PointLabels(np.zeros(len(scan), np.uint8), np.ones(len(scan), bool), ("background", "car"))
+        return SimpleNamespace(points=points, top_view=None, boxes=(), stage_ms={"project": 0.0, "infer": 0.0})
+
+
+@pytest.fixture
+def in_process(no_wait: None, monkeypatch: pytest.MonkeyPatch) -> list[worker.Job]:
+    """Measuring without processes and networks; the jobs that were asked for."""
+    jobs: list[worker.Job] = []
+    connection = SimpleNamespace(send=lambda message: None, recv=lambda: "go", poll=lambda: False)
+
+    def measured(asked: Sequence[worker.Job], on_tick: Any = None) -> list[dict[str, Any]]:
+        jobs.extend(asked)
+        if any(job.provider == "openvino:bf16" for job in asked):
+            raise ModelFileError("cannot run this model")
+        return [worker._work(connection, job) for job in asked]
+
+    def engines(perceive: Street) -> list[dict[str, Any]]:
+        return [{"name": "n", "version": "1", "sha256": "a" * 64, "provider": "P", "threads": 1, "spinning": "0"}]
+
+    monkeypatch.setattr(worker, "make_perceiver", lambda job: Street())
+    monkeypatch.setattr(worker, "_engines", engines)
+    monkeypatch.setattr(measure, "measure", measured)
+    return jobs
+
+
+def test_a_matrix_measures_every_setting_and_keeps_the_best(
+    in_process: list[worker.Job], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli, "available_providers", lambda: ("openvino", "cpu"))
+    np.save(tmp_path / "own.npy", np.ones((50, 4), np.float32))
+    words = ["--model", "pointseg", "--providers", "all", "--precisions", "fp32,bf16", "--threads", "1,2"]
+    words += ["--min-scans", "20", "--min-seconds", "0", "--input", str(tmp_path / "own.npy")]
+    assert cli.main([*words, "--recommend", str(tmp_path / "r.json"), "--json", str(tmp_path / "m.json")]) == 0
+    told = report.read_report(tmp_path / "m.json")
+    assert [(s["provider"], s["n_threads"]) for s in told["settings"]] == [
+        ("openvino:fp32", 1),
+        ("openvino:fp32", 2),
+        ("cpu", 1),
+        ("cpu", 2),
+    ]
+    skipped = "\n".join(told["skipped"])
+    for words_ in ("cuda: not available", "cpu in bf16", "openvino:bf16, 1 threads: cannot run this model"):
+        assert words_ in skipped
+    machine = told["machine"]["fingerprint"]
+    kept = recommendation.read_recommendation(tmp_path / "r.json", machine, "a" * 64)
+    assert kept is not None
+    assert kept["provider"] in ("openvino:fp32", "cpu")
+    assert "recommended for n" in capsys.readouterr().out
+
+
+def test_scaling_tells_points_cars_and_processes(
+    in_process: list[worker.Job], tmp_path: Path, matplotlib: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["scaling", "--points", "1000,2000,4000", "--cars", "0,2", "--processes", "1,2", "--min-scans", "20"]
+    plot = tmp_path / "new" / "growth.svg"
+    assert cli.main([*words, "--min-seconds", "0", "--plot", str(plot), "--json", str(tmp_path / "s.json")]) == 0
+    tables = report.read_report(tmp_path / "s.json")["tables"]
+    assert [[row[0] for row in table["rows"]] for table in tables] == [
+        ["1,000", "2,000", "4,000"],
+        ["0", "2"],
+        ["1", "2"],
+    ]
+    assert "ms per 1,000 points" in capsys.readouterr().out
+    ET.fromstring(plot.read_text())
+
+
+def test_a_soak_reports_memory(
+    in_process: list[worker.Job], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["soak", "--scans", "1000", "--json", str(tmp_path / "s.json")]) == 0
+    told = report.read_report(tmp_path / "s.json")
+    samples = told["settings"][0]["repeats"][0]["scenarios"]["soak"]
+    assert (samples["n"], len(samples["warm_up_ms"]), len(samples["ms"])) == (900, 100, 450)
+    assert told["soak"]["verdict"] in ("level", "grows", "undecided")
+    assert "Memory over a long run" in capsys.readouterr().out
+
+
+FEW = [
+    "--model",
+    "pointseg",
+    "--provider",
+    "cpu",
+    "--threads",
+    "1",
+    "--repeats",
+    "1",
+    "--warm-up",
+    "1",
+    "--min-seconds",
+    "0",
+]
+
+
+@pytest.fixture
+def no_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(context, "busiest", lambda: [])
+
+
+def test_a_run_from_scans_to_files(no_wait: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    simulated_scan(5).points.tofile(tmp_path / "own.bin")
+    files = ["--json", str(tmp_path / "a.json"), "--markdown", str(tmp_path / "a.md")]
+    wanted = ["--scenario", "single-stream", "--scenario", "paced:20", "--min-scans", "3"]
+    assert cli.main(["run", *FEW, *wanted, *files, "--input", str(tmp_path / "own.bin")]) == 0
+    told = report.read_report(tmp_path / "a.json")
+    assert told["complete"]
+    (setting,) = told["settings"]
+    (only,) = setting["repeats"]
+    assert [len(each["ms"]) for each in only["scenarios"].values()] == [3, 3]
+    assert only["engines"][0]["provider"] == "CPUExecutionProvider (fp32)"
+    assert len(only["engines"][0]["sha256"]) == 64
+    assert setting["accuracy"]["agreement"]["points"]["equal"] == 1.0
+    assert setting["accuracy"]["truth"] is None
+    assert told["input"]["source"] == "1 scan: own.bin"
+    assert "CPUExecutionProvider (fp32)" in capsys.readouterr().out
+    assert "## Latency" in (tmp_path / "a.md").read_text()
+
+
+def test_an_interrupted_run_writes_what_it_has(
+    no_wait: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "own.npy", simulated_scan(5).points[::10])
+
+    told_once = []
+
+    def interrupt(live: report.LiveTable, name: str, ms: Sequence[float]) -> None:
+        if not told_once:  # a second Ctrl-C would end it at once
+            told_once.append(name)
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(report.LiveTable, "__call__", interrupt)
+    given = ["--input", str(tmp_path / "own.npy"), "--json", str(tmp_path / "a.json")]
+    # Far more scans than anybody has time for: without the interruption this would not end.
+    assert cli.main(["run", *FEW, *given, "--scenario", "single-stream", "--min-scans", "1000000000"]) == 130
+    told = report.read_report(tmp_path / "a.json")
+    assert not told["complete"]
+    assert told["settings"][0]["repeats"][0]["interrupted"]
+    assert "interrupted: what follows" in capsys.readouterr().out
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_errors_of_a_process_arrive_as_they_were() -> None:
+    with pytest.raises(ModelFileError, match="no model is called 'nobody'"):
+        worker.measure([worker.Job(("nobody",), "cpu")])
+
+
+def test_a_dead_process_is_no_answer() -> None:
+    class Dead:
+        exitcode = -9
+
+        def join(self) -> None:
+            pass
+
+    class Silent:
+        def recv(self) -> Any:
+            raise EOFError
+
+    with pytest.raises(worker.WorkerError, match="exit code -9"):
+        worker._receive(Silent(), Dead())
+
+
+def test_a_cold_start_is_told_step_by_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = {"interpreter_s": 0.1, "total_s": 1.0}
+    caches = []
+
+    def start(command: list[str], env: dict[str, str], **_: Any) -> Any:
+        assert json.loads(command[-1])["models"] == ["pointseg"]
+        caches.append(env["NUMBA_CACHE_DIR"])
+        return SimpleNamespace(returncode=0, stdout=json.dumps(steps), stderr="")
+
+    monkeypatch.setattr(measure.subprocess, "run", start)
+    told = measure.cold_starts(worker.Job(("pointseg",)), tmp_path / "scan.npy", 3)
+    assert [each["start"] for each in told] == ["first", "again (1)", "again (2)"]
+    assert len(set(caches)) == 1
+    monkeypatch.setattr(
+        measure.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1, stderr="no such model")
+    )
+    with pytest.raises(worker.WorkerError, match="no such model"):
+        measure.cold_starts(worker.Job(("pointseg",)), tmp_path / "scan.npy", 1)
