@@ -83,7 +83,8 @@ def _parser() -> argparse.ArgumentParser:
     card.set_defaults(run=_card)
 
     make = commands.add_parser("make", help="a shipped model from nothing: simulate, train, export, judge")
-    make.add_argument("name", choices=["pointseg", "pointseg-sim", "ssadnet", "ssadnet-paper", "ssadnet-sim"])
+    shipped = ["pointseg", "pointseg-edge", "pointseg-sim", "ssadnet", "ssadnet-edge", "ssadnet-paper", "ssadnet-sim"]
+    make.add_argument("name", choices=shipped)
     make.add_argument("out", type=Path, help="folder for scans, checkpoints and the model")
     make.add_argument("--kitti", type=Path, help="root of a KITTI object set")
     make.add_argument("--layouts", type=Path, help="folder of KITTI label_2, calib and frames.csv")
@@ -172,7 +173,8 @@ def _recipe_options() -> dict[str, type]:
         "--weight-decay": float, "--cooldown": float, "--halve-after": int, "--simulated-share": float,
         "--augment": bool, "--n-pasted": float, "--swap": float, "--turn-to-rare": float, "--weather": float,
         "--class-weights": bool, "--focal-gamma": float, "--lovasz-weight": float, "--deep-supervision": float,
-        "--ema": float, "--context-width": int, "--batch-norm": bool, "--dropout": float,
+        "--ema": float, "--context-width": int, "--batch-norm": bool, "--dropout": float, "--distil": float,
+        "--seen-twice": bool, "--paste-cars": float, "--turn-anywhere": float, "--head-only": bool, "--edge": bool,
         "--seed": int,
     }  # fmt: skip
 

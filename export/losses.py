@@ -12,6 +12,7 @@ from edgeperc.card import TopViewGeometry
 from edgeperc.datasets import IGNORE
 
 __all__ = [
+    "box_distillation_loss",
     "cross_entropy",
     "dense_loss",
     "dense_targets",
@@ -223,6 +224,20 @@ def pointseg_loss(
 def distillation_loss(logits: Tensor, probabilities: Tensor) -> Tensor:
     """Mean cross-entropy of pixels towards a teacher's probabilities (B, C, H, W) (Hinton et al., 2015)."""
     return -(probabilities * F.log_softmax(logits.float(), dim=1)).sum(1).mean()
+
+
+def box_distillation_loss(predicted: Tensor, taught: Tensor) -> Tensor:
+    """Distance of dense boxes (B, 9, H, W) from a teacher's: cross-entropy of the heat maps and L1 of the geometry.
+
+    Both count by the teacher's heat: the first is a sum a box, as in `dense_loss`, the second a weighted mean.
+    """
+    predicted, taught = predicted.float(), taught.float()
+    heat = taught[:, 0].sigmoid()
+    heat_loss = F.binary_cross_entropy_with_logits(predicted[:, 0], heat, reduction="sum")
+    share = heat * (heat >= REGRESSED_FROM)
+    error = (predicted[:, 1:] - taught[:, 1:]).abs() * predicted.new_tensor(GEOMETRY_WEIGHTS).view(1, -1, 1, 1)
+    total = share.sum().clamp(min=1.0)
+    return (heat_loss + (error.sum(1) * share).sum()) / total
 
 
 def slots_loss(predicted: Tensor, target: Tensor) -> Tensor:

@@ -27,15 +27,20 @@ class Stage:
         One whose ``simulated_share`` is 1 sees no real scan and no real layout, and owes nothing to anybody's terms.
     after : str or None
         The model whose weights the run starts from.
+    teacher : str or None
+        The model that the run learns from.
     """
 
     recipe: Recipe
     after: str | None = None
+    teacher: str | None = None
 
 
 # Batches of four: for as many scans twice the steps, and better figures. SSADNet without dropout, which a network that
 # sees so few scans does not need, and which upsets batch norm.
 SSADNET = Recipe("ssadnet", batch=4, learning_rate=1.5e-3, context_width=64, n_pasted=3.0, dropout=0.0)
+EDGE = Recipe("ssadnet", edge=True, steps=6000, batch=4, learning_rate=3e-3, cooldown=0.2, n_pasted=3.0)
+TAUGHT = replace(EDGE, steps=2400, learning_rate=1e-3, cooldown=0.4, distil=1.0, seen_twice=False)
 MODELS = {
     "pointseg-sim": Stage(Recipe("pointseg", simulated_share=1.0, steps=1000, learning_rate=2e-3, cooldown=0.3)),
     "pointseg": Stage(Recipe("pointseg", steps=3600, batch=4, learning_rate=1e-3), after="pointseg-sim"),
@@ -43,6 +48,12 @@ MODELS = {
     "ssadnet": Stage(replace(SSADNET, steps=2000), after="ssadnet-sim"),
     # On the very segmentation branch of ssadnet, so that the heads can be compared.
     "ssadnet-paper": Stage(replace(SSADNET, head="slots", head_only=True, steps=1000), after="ssadnet"),
+    # A step of a network for small computers takes a quarter of the full one's, a step with its teacher's answers as
+    # long: first many on labels alone, then some with both.
+    "pointseg-edge-start": Stage(replace(EDGE, network="pointseg", n_pasted=6.0)),
+    "pointseg-edge": Stage(replace(TAUGHT, network="pointseg", n_pasted=6.0), "pointseg-edge-start", "pointseg"),
+    "ssadnet-edge-start": Stage(EDGE),
+    "ssadnet-edge": Stage(TAUGHT, "ssadnet-edge-start", "ssadnet"),
 }
 
 
@@ -91,14 +102,16 @@ def make(
         raise ValueError(f"{name} is trained on real scans too; give --kitti and --layouts")
     scans = out / ("scans" if simulated_only else "scans-with-layouts")
     simulate(scans, N_SIMULATED, layouts_root=None if simulated_only else layouts)
-    start_from = None
-    if stage.after is not None:
-        # What a model starts from must not have seen the fold either.
-        base_fold = None if MODELS[stage.after].recipe.simulated_share == 1.0 else fold
-        base = out / f"{stage.after}{_suffix(base_fold)}"
+    before: dict[str, Path | None] = {"start_from": None, "teacher": None}
+    for role, other in zip(before, (stage.after, stage.teacher), strict=True):
+        if other is None:
+            continue
+        # What a model starts or learns from must not have seen the fold either.
+        base_fold = None if MODELS[other].recipe.simulated_share == 1.0 else fold
+        base = out / f"{other}{_suffix(base_fold)}"
         if not base.with_suffix(".onnx").exists():
             make(
-                stage.after,
+                other,
                 out,
                 kitti=kitti,
                 layouts=layouts,
@@ -107,14 +120,14 @@ def make(
                 compiled=compiled,
                 version=version,
             )
-        start_from = base / "checkpoint.pt"
+        before[role] = base / "checkpoint.pt"
     checkpoint = train(
         recipe,
         out / f"{name}{_suffix(fold)}",
         kitti=kitti,
         simulated=scans,
         fold=fold,
-        start_from=start_from,
+        **before,
         n_threads=n_threads,
         compiled=compiled,
     )

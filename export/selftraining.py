@@ -22,7 +22,7 @@ from edgeperc.projection import make_projector
 from .augment import SURFACE, LabelledScan, turned
 from .cards import RANGE_IMAGE, RANGE_IMAGE_INPUT
 
-__all__ = ["pseudo_labelled", "seen_twice", "unlabelled_scans"]
+__all__ = ["pseudo_labelled", "taught", "unlabelled_scans"]
 
 SURE = 0.9
 # Four looks of 90 degrees cover the circle; half a step more each way, so that nothing lies on an edge alone.
@@ -60,16 +60,22 @@ def pseudo_labelled(network: nn.Module, scans: Iterable[LabelledScan], sure: flo
 
 
 @torch.no_grad()
-def seen_twice(network: nn.Module, image: Tensor, kind: str) -> Tensor:
-    """Class probabilities (B, C, H, W) of a batch of inputs, averaged over the scene and its mirror image.
+def taught(network: nn.Module, image: Tensor, kind: str, *, mirror: bool) -> tuple[Tensor, Tensor | None]:
+    """What a network says of a batch of inputs: class probabilities (B, C, H, W), and boxes where it finds any.
 
-    ``kind`` is ``"pointseg"``, whose y changes its sign in a mirror, or ``"ssadnet"``.
+    With ``mirror`` the probabilities are an average over the scene and its mirror image. ``kind`` is ``"pointseg"``,
+    whose y changes its sign in a mirror, or ``"ssadnet"``.
     """
-    mirrored = image.flip(-1)
-    if kind == "pointseg":
-        mirrored = mirrored.clone()
-        mirrored[:, RANGE_IMAGE_INPUT.channels.index("y")] *= -1.0
     with torch.autocast(image.device.type, torch.bfloat16):
-        answers = [network(each) for each in (image, mirrored)]
-    p, q = (a[0] if isinstance(a, tuple) else a for a in answers)
-    return 0.5 * (p.float().softmax(1) + q.float().softmax(1).flip(-1))
+        answer = network(image)
+        logits, boxes = answer if isinstance(answer, tuple) else (answer, None)
+        p = logits.float().softmax(1)
+        if mirror:
+            mirrored = image.flip(-1)
+            if kind == "pointseg":
+                mirrored = mirrored.clone()
+                mirrored[:, RANGE_IMAGE_INPUT.channels.index("y")] *= -1.0
+            answer = network(mirrored)
+            other = answer[0] if isinstance(answer, tuple) else answer
+            p = 0.5 * (p + other.float().softmax(1).flip(-1))
+    return p, boxes

@@ -30,11 +30,12 @@ from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES
 
 from .augment import LabelledScan, ObjectBank, augmented, swapped
 from .cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT, card_of
-from .losses import dense_targets, distillation_loss, pointseg_loss, slot_targets, ssadnet_loss
+from .losses import box_distillation_loss, dense_targets, distillation_loss, pointseg_loss, slot_targets, ssadnet_loss
+from .networks.edge import PointSegEdge, SSADNetEdge
 from .networks.pointseg import PointSeg
 from .networks.ssadnet import SSADNet
 from .road import sure_surface
-from .selftraining import pseudo_labelled, seen_twice, unlabelled_scans
+from .selftraining import pseudo_labelled, taught, unlabelled_scans
 
 # Three returns are the fewest that any network could tell from clutter.
 FEWEST = 3
@@ -107,8 +108,12 @@ class Recipe:
     dropout : float
         SSADNet's spatial dropout, PointSeg's before the last convolution.
     distil : float
-        Weight of the cross-entropy towards a teacher's class probabilities (Hinton et al., 2015), for which each scan
-        is shown to the teacher as it is and mirrored.
+        Weight of what a teacher's answers are learnt with: cross-entropy towards its class probabilities (Hinton et
+        al., 2015), and its dense boxes.
+    seen_twice : bool
+        Show each scan to the teacher as it is and mirrored, and average; twice the teacher's time.
+    edge : bool
+        The network of the same inputs and outputs for small computers (`edgeperc_export.networks.edge`).
     head_only : bool
         Leave SSADNet's segmentation branch as it was started from; only the boxes are learnt.
     seed : int
@@ -140,10 +145,13 @@ class Recipe:
     batch_norm: bool = True
     dropout: float = 0.25
     distil: float = 0.0
+    seen_twice: bool = True
+    edge: bool = False
     head_only: bool = False
     seed: int = 0
 
 
+EDGE: dict[str, type[nn.Module]] = {"pointseg": PointSegEdge, "ssadnet": SSADNetEdge}
 PLAIN = {
     "simulated_share": 0.0,
     "augment": False,
@@ -172,6 +180,8 @@ PAPER = {
 def build(recipe: Recipe) -> nn.Module:
     """The network of a recipe, its weights drawn from the recipe's seed."""
     torch.manual_seed(recipe.seed)
+    if recipe.edge and recipe.network in EDGE:
+        return EDGE[recipe.network]()
     if recipe.network == "pointseg":
         return PointSeg(dropout=recipe.dropout, deep_supervision=recipe.deep_supervision > 0.0)
     if recipe.network == "ssadnet":
@@ -280,6 +290,15 @@ def loss_of(recipe: Recipe, outputs: Tensor | tuple[Tensor, Tensor], targets: Se
     lw_det = LW_DET_DENSE if recipe.head == "dense" else 0.1
     how = {"lw_det": lw_det, "class_weights": weights, "lovasz_weight": recipe.lovasz_weight}
     return ssadnet_loss(*outputs, *targets, **how)[0]
+
+
+def _distilled(recipe: Recipe, teacher: nn.Module, x: Tensor, outputs: Tensor | tuple[Tensor, Tensor]) -> Tensor:
+    probabilities, boxes = taught(teacher, x, recipe.network, mirror=recipe.seen_twice)
+    logits = outputs[0] if isinstance(outputs, tuple) else outputs
+    loss = distillation_loss(logits, probabilities)
+    if recipe.network == "ssadnet" and recipe.head == "dense":
+        loss = loss + LW_DET_DENSE * box_distillation_loss(outputs[1], boxes)
+    return loss
 
 
 def real_scans(kitti: KittiObjects, names: Sequence[str]) -> tuple[list[LabelledScan], list[float], dict[str, str]]:
@@ -424,8 +443,7 @@ def train(
                 outputs = forward(x)
             loss = loss_of(recipe, outputs, y)
             if tutor is not None and recipe.distil > 0.0:
-                logits = outputs[0] if isinstance(outputs, tuple) else outputs
-                loss = loss + recipe.distil * distillation_loss(logits, seen_twice(tutor, x, recipe.network))
+                loss = loss + recipe.distil * _distilled(recipe, tutor, x, outputs)
             if not torch.isfinite(loss):
                 raise FloatingPointError(f"the loss is {loss.item()} at step {step}; lower --learning-rate")
             optimizer.zero_grad(set_to_none=True)

@@ -32,7 +32,7 @@ from edgeperc_export.cli import main
 from edgeperc_export.dataset import parity_scans, simulate
 from edgeperc_export.models_page import models_page
 from edgeperc_export.recipes import MODELS, Stage
-from edgeperc_export.selftraining import pseudo_labelled, seen_twice, unlabelled_scans
+from edgeperc_export.selftraining import pseudo_labelled, taught, unlabelled_scans
 from edgeperc_export.to_onnx import ParityError, export, load, to_graph, verify, write_card
 from edgeperc_export.train import PAPER, Recipe, Samples, Watch, _optimizer, _schedule, _start, build, loss_of, train
 
@@ -282,16 +282,21 @@ def test_a_teacher_looks_twice() -> None:
             return torch.cat([-away, away], dim=1)
 
     image = torch.randn(2, 5, 3, 8)
-    p = seen_twice(Outward(), image, "pointseg")
+    p, boxes = taught(Outward(), image, "pointseg", mirror=True)
+    assert boxes is None
     assert torch.equal(p.argmax(1), Outward()(image).argmax(1))
     assert p.max(1).values.min() > 0.99
     # A top view has no y to turn round, so the two looks contradict each other here.
-    assert torch.allclose(seen_twice(Outward(), image, "ssadnet"), torch.full((2, 2, 3, 8), 0.5))
+    p, _ = taught(Outward(), image, "ssadnet", mirror=True)
+    assert torch.allclose(p, torch.full((2, 2, 3, 8), 0.5))
+    p, _ = taught(Outward(), image, "ssadnet", mirror=False)
+    assert torch.equal(p.argmax(1), Outward()(image).argmax(1))
 
 
-def test_a_network_distils_from_another(tmp_path: Path, simulated: Path) -> None:
-    recipe = small("pointseg", steps=1, distil=1.0)
-    teacher = untrained("pointseg", tmp_path, seed=9)
+@pytest.mark.parametrize(("network", "edge"), [("pointseg", False), ("pointseg", True), ("ssadnet", True)])
+def test_a_network_distils_from_another(tmp_path: Path, simulated: Path, network: str, edge: bool) -> None:
+    recipe = small(network, steps=1, distil=1.0, edge=edge)
+    teacher = untrained(network, tmp_path, seed=9)
     arguments = {"kitti": None, "simulated": simulated, "n_threads": 1}
     with pytest.raises(ValueError, match=r"distils \(1\) from no teacher; give --teacher"):
         train(recipe, tmp_path / "none", **arguments)
@@ -326,7 +331,12 @@ def test_one_command_makes_a_model_and_what_it_starts_from(
     rows = (kitti / "frames.csv").read_text().splitlines()
     (layouts / "frames.csv").write_text("\n".join(row for row in rows if "000002" not in row))  # it has no labels
     base = Stage(small("pointseg", simulated_share=1.0, steps=1, n_pasted=1.0))
-    stages = {"pointseg-sim": base, "pointseg": Stage(small("pointseg", steps=3, n_pasted=1.0), after="pointseg-sim")}
+    full = small("pointseg", steps=3, n_pasted=1.0)
+    stages = {
+        "pointseg-sim": base,
+        "pointseg": Stage(full, after="pointseg-sim"),
+        "pointseg-edge": Stage(replace(full, edge=True, distil=1.0, steps=1), teacher="pointseg"),
+    }
     judged = []
 
     def judge(datasets: list[object], *args: object, **kwargs: object) -> tuple[dict[str, object], list[object]]:
@@ -350,6 +360,9 @@ def test_one_command_makes_a_model_and_what_it_starts_from(
     ]
     assert cards[1].training["started_from"] == [cards[0].training["recipe"]]
     assert json.loads(made.with_suffix(".json").read_text())["real"]["n_frames"] == 1
+    taught = recipes.make("pointseg-edge", out, fold=0, **arguments)
+    assert len(judged) == 3  # the teacher of this fold was there
+    assert taught.stat().st_size < 0.6 * made.stat().st_size
     with pytest.raises(ValueError, match="trained on real scans too; give --kitti and --layouts"):
         recipes.make("pointseg", out, kitti=None, layouts=None)
 

@@ -15,6 +15,7 @@ from edgeperc_export.losses import (
     GEOMETRY_WEIGHTS,
     IGNORE,
     REGRESSED_FROM,
+    box_distillation_loss,
     cross_entropy,
     dense_loss,
     dense_targets,
@@ -271,6 +272,23 @@ def test_distillation_is_least_at_the_teachers_word(rng):
     told = distillation_loss(torch.from_numpy(logits), torch.from_numpy(teacher))
     assert float(told) == pytest.approx(expected, rel=1e-5)
     assert distillation_loss(torch.from_numpy(np.log(teacher)), torch.from_numpy(teacher)) < told
+
+
+def test_boxes_are_distilled_by_the_teachers_heat(rng):
+    taught = rng.normal(size=(2, 9, 3, 4)).astype(np.float32)
+    own = rng.normal(size=(2, 9, 3, 4)).astype(np.float32)
+    heat = 1.0 / (1.0 + np.exp(-taught[:, 0].astype(np.float64)))
+    p = 1.0 / (1.0 + np.exp(-own[:, 0].astype(np.float64)))
+    share = heat * (heat >= REGRESSED_FROM)
+    assert share.sum() > 1.0
+    cross = -(heat * np.log(p) + (1.0 - heat) * np.log(1.0 - p)).sum()
+    apart = (np.abs(own - taught)[:, 1:] * np.array(GEOMETRY_WEIGHTS).reshape(1, -1, 1, 1)).sum(1)
+    expected = (cross + (apart * share).sum()) / share.sum()
+    loss = box_distillation_loss(torch.from_numpy(own), torch.from_numpy(taught))
+    assert loss.item() == pytest.approx(expected, rel=1e-5)
+    nothing = torch.from_numpy(taught).clone()
+    nothing[:, 0] = -50.0
+    assert torch.isfinite(box_distillation_loss(torch.from_numpy(own), nothing))
 
 
 def test_lovasz_of_hard_predictions_is_one_minus_mean_iou(rng):

@@ -10,6 +10,7 @@ torch = pytest.importorskip("torch")
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
+from edgeperc_export.networks.edge import PointSegEdge, SSADNetEdge, spread
 from edgeperc_export.networks.pointseg import ENLARGEMENT_RATES, Fire, FireDeconv, PointSeg, SqueezeReweight
 from edgeperc_export.networks.ssadnet import (
     CONTEXT_DILATIONS,
@@ -374,3 +375,39 @@ def test_pointseg_adds_its_skips_and_joins_only_the_enlarged():
     agree(got["deconv4"], gave["deconv3"] + gave["fire1"])
     agree(got["classifier"], gave["deconv4"] + gave["skip1"])
     assert torch.equal(gave["classifier"], logits)
+
+
+@pytest.mark.parametrize(
+    ("network", "channels", "sizes"),
+    [(PointSegEdge, 5, [(64, 512), (32, 2048), (4, 8)]), (SSADNetEdge, 3, [(400, 200), (8, 16)])],
+)
+def test_edge_networks_answer_as_the_full_ones_do(network, channels, sizes):
+    edge = network().eval()
+    full = PointSeg().eval() if network is PointSegEdge else SSADNet("dense", context_width=64).eval()
+    for height, width in sizes:
+        x = torch.rand(1, channels, height, width)
+        with torch.no_grad():
+            answers = edge(x)
+            if network is PointSegEdge:
+                assert answers.shape == (1, 4, height, width)
+            else:
+                assert [tuple(a.shape) for a in answers] == [(1, 5, height, width), (1, 9, height // 4, width // 4)]
+    x = torch.rand(1, channels, *sizes[0])
+    costs = []
+    for each in (edge, full):
+        with FlopCounterMode(display=False) as counter, torch.no_grad():
+            each(x)
+        costs.append(counter.get_total_flops() / 2e9)
+    assert costs[0] == pytest.approx(0.94 if network is PointSegEdge else 1.54, abs=0.05)
+    assert costs[0] < costs[1] / 5.5
+
+
+@pytest.mark.parametrize("block", [(1, 2), (2, 2), (2, 3)])
+def test_spreading_moves_channels_to_pixels(block):
+    rows, cols = block
+    x = torch.rand(2, 3 * rows * cols, 4, 5)
+    out = spread(x, block)
+    assert out.shape == (2, 3, 4 * rows, 5 * cols)
+    for row in range(rows):
+        for col in range(cols):
+            assert torch.equal(out[:, :, row::rows, col::cols], x[:, row * cols + col :: rows * cols])

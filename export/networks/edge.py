@@ -1,0 +1,135 @@
+"""SSADNet and PointSeg made for small computers: the same inputs and outputs at a seventh of the arithmetic.
+
+They keep the papers' views, classes and boxes and leave what small computers are slow at: many channels at full
+resolution, unpooling by position, dilations wider than the map. Instead: two halvings into a context of residual
+blocks, and back by moving channels to pixels. Channels come in sixteens, the width of a vector register: 24 channels
+took as long as 32. Batch norm disappears into its convolution on export, ReLU into the engine's. Both are distilled
+from the full networks (`edgeperc_export.train.Recipe.distil`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from .pointseg import conv_bn_relu
+from .ssadnet import HEAT_PRIOR
+
+__all__ = ["PointSegEdge", "SSADNetEdge"]
+
+CONTEXT_DILATIONS = ((1, 2), (2, 4))
+"""Of the residual blocks (rows, columns): range images are wide."""
+
+
+class Residual(nn.Module):
+    """Two 3x3 convolutions, the second dilated, beside a shortcut."""
+
+    def __init__(self, channels: int, dilation: tuple[int, int]) -> None:
+        super().__init__()
+        self.first = conv_bn_relu(channels, channels, 3)
+        self.second = nn.Conv2d(channels, channels, 3, padding=dilation, dilation=dilation, bias=False)
+        self.norm = nn.BatchNorm2d(channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(x + self.norm(self.second(self.first(x))))
+
+
+class Trunk(nn.Module):
+    """Encoder, context and decoder, down to an eighth or a quarter of the input and back to the stem's resolution.
+
+    Parameters
+    ----------
+    n_channels, n_classes : int
+    stride : (int, int)
+        Of the stem, (rows, columns).
+    fine, middle, coarse : int
+        Channels at the stem's resolution, at a half and at a quarter of it.
+    """
+
+    def __init__(
+        self, n_channels: int, n_classes: int, stride: tuple[int, int], fine: int, middle: int, coarse: int
+    ) -> None:
+        super().__init__()
+        self.stride = stride
+        self.stem = conv_bn_relu(n_channels, fine, 3, stride=stride)
+        self.down1 = nn.Sequential(conv_bn_relu(fine, middle, 3, stride=(2, 2)), conv_bn_relu(middle, middle, 3))
+        self.down2 = conv_bn_relu(middle, coarse, 3, stride=(2, 2))
+        self.context = nn.Sequential(*(Residual(coarse, dilation) for dilation in CONTEXT_DILATIONS))
+        self.up1 = nn.Conv2d(coarse, middle, 1)
+        self.merge1 = conv_bn_relu(middle, middle, 3)
+        self.up2 = nn.Conv2d(middle, 4 * fine, 1)
+        self.merge2 = conv_bn_relu(fine, fine, 3)
+        self.classifier = nn.Conv2d(fine, n_classes * stride[0] * stride[1], 1)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits (B, n_classes, H, W) and the features at half the stem's resolution."""
+        fine = self.stem(x)
+        middle = self.down1(fine)
+        coarse = self.context(self.down2(middle))
+        up = F.interpolate(self.up1(coarse), size=middle.shape[-2:], mode="nearest")
+        middle = self.merge1(F.relu(up + middle))
+        fine = self.merge2(F.relu(spread(self.up2(middle), (2, 2)) + fine))
+        return spread(self.classifier(fine), self.stride), middle
+
+
+def spread(x: Tensor, block: tuple[int, int]) -> Tensor:
+    """Move channels to pixels: (B, C x rows x columns, H, W) to (B, C, H x rows, W x columns)."""
+    rows, cols = block
+    if rows == cols:
+        return F.pixel_shuffle(x, rows)
+    batch, channels, height, width = x.shape
+    x = x.reshape(batch, channels // (rows * cols), rows, cols, height, width).permute(0, 1, 4, 2, 5, 3)
+    return x.reshape(batch, channels // (rows * cols), height * rows, width * cols)
+
+
+class PointSegEdge(nn.Module):
+    """Label every pixel of a range image, as `PointSeg` does, for 0.9 of its 7.2 GMAC.
+
+    In: (B, 5, 64, 512); any height divisible by 4 and width divisible by 8. Out: logits (B, 4, 64, 512).
+    """
+
+    def __init__(self, *, n_channels: int = 5, n_classes: int = 4) -> None:
+        super().__init__()
+        self.trunk = Trunk(n_channels, n_classes, (1, 2), fine=16, middle=64, coarse=112)
+        initialise(self, self.trunk.classifier)
+
+    def forward(self, x: Tensor) -> Tensor:
+        logits: Tensor = self.trunk(x)[0]
+        return logits
+
+
+class SSADNetEdge(nn.Module):
+    """Label every cell of a top view and box the vehicles, as `SSADNet` with head "dense" does, for 1.5 of 8.9 GMAC.
+
+    In: (B, 3, 400, 200); any height and width divisible by 8. Out: segmentation logits (B, 5, 400, 200) and boxes
+    (B, 9, 100, 50), as `DenseHead` has them.
+    """
+
+    def __init__(self, *, n_channels: int = 3, n_classes: int = 5) -> None:
+        super().__init__()
+        self.trunk = Trunk(n_channels, n_classes, (2, 2), fine=16, middle=64, coarse=112)
+        self.detection = nn.Sequential(conv_bn_relu(64, 64, 3), conv_bn_relu(64, 64, 3))
+        self.predict = nn.Conv2d(64, 9, 1)
+        initialise(self, self.trunk.classifier, self.predict)
+        assert self.predict.bias is not None
+        self.predict.bias.data[0] = -math.log(1.0 / HEAT_PRIOR - 1.0)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        logits, features = self.trunk(x)
+        return logits, self.predict(self.detection(features))
+
+
+def initialise(network: nn.Module, *last: nn.Conv2d) -> None:
+    """He's weights, small ones where the answers come out, and residual blocks that start as nothing but shortcuts."""
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d):
+            nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+    for module in network.modules():
+        if isinstance(module, Residual):
+            nn.init.zeros_(module.norm.weight)
+    for module in last:
+        nn.init.normal_(module.weight, std=0.01)
