@@ -24,9 +24,9 @@ import numpy as np
 from edgeperc import EdgepercError, __version__
 from edgeperc.cli import SHIPPED
 from edgeperc.session import PRECISIONS, PROVIDERS, available_providers
+from edgeperc.settings import fingerprint, settings_path, write_settings
 
 from . import context, loadgen, report
-from .recommendation import write_recommendation
 from .samples import compare, percentile, trend
 from .scenarios import Limits
 from .worker import MEMORY_SAMPLES, Answer, Job, Scenario
@@ -155,7 +155,10 @@ def _parser() -> argparse.ArgumentParser:
     matrix.add_argument(
         "--threads", type=_thread_counts, default=[1, os.cpu_count() or 1], metavar="1,2,4", help="default: 1 and all"
     )
-    matrix.add_argument("--recommend", type=Path, metavar="FILE", help="keep the recommendation in this JSON file")
+    matrix.add_argument(
+        "--recommend", type=Path, nargs="?", const=settings_path(), metavar="FILE",
+        help=f"keep the recommendation where Perceiver(provider='auto') finds it ({settings_path()}), or in FILE",
+    )  # fmt: skip
     matrix.set_defaults(command=_matrix)
 
     scaling = commands.add_parser("scaling", parents=[common, engine], help="how the cost grows")
@@ -254,8 +257,7 @@ def _document(kind: str, arguments: argparse.Namespace) -> Iterator[tuple[dict[s
         "kind": kind,
         "command": arguments.typed,
         "complete": False,
-        "machine": hardware
-        | {"fingerprint": context.fingerprint(hardware), "load_average": context.conditions()["load_average"]},
+        "machine": hardware | {"fingerprint": fingerprint(), "load_average": context.conditions()["load_average"]},
         "software": context.software(),
         "input": None,
         "spoilers": context.standing_spoilers(hardware, context.busiest()),
@@ -449,7 +451,8 @@ def _matrix(arguments: argparse.Namespace) -> int:
         document["recommended"] = _recommended(document)
         if arguments.recommend and document["recommended"]:
             entries = {each["sha256"]: each["entry"] for each in document["recommended"]}
-            write_recommendation(arguments.recommend, document["machine"]["fingerprint"], entries)
+            write_settings(arguments.recommend, document["machine"]["fingerprint"], entries)
+            live.say(f"kept in {arguments.recommend}")
     return 0 if document["recommended"] else 2
 
 

@@ -6,9 +6,7 @@ Everything here is read, nothing is set. What a machine does not expose is None,
 from __future__ import annotations
 
 import datetime
-import hashlib
 import importlib.metadata
-import json
 import os
 import platform
 import time
@@ -17,13 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from edgeperc import MissingExtraError, __version__
+from edgeperc.settings import cpu_model
 
 try:
     import psutil
 except ImportError as exc:
     raise MissingExtraError("psutil", "bench", "Measuring") from exc
 
-__all__ = ["EnergyMeter", "conditions", "fingerprint", "machine", "peak_rss_mb", "rss_mb", "software", "spoilers"]
+__all__ = ["EnergyMeter", "conditions", "machine", "peak_rss_mb", "rss_mb", "software", "spoilers"]
 
 PACKAGES = (
     *("numpy", "numba", "onnxruntime", "onnxruntime-gpu", "onnxruntime-ep-openvino", "onnxruntime-ep-nv-tensorrt-rtx"),
@@ -61,7 +60,7 @@ def machine() -> dict[str, Any]:
     board = _read(Path("/sys/firmware/devicetree/base/model"))
     frequency = psutil.cpu_freq()
     return {
-        "cpu": _cpu_model(),
+        "cpu": cpu_model(),
         "board": board.rstrip("\0") if board else None,
         "architecture": platform.machine(),
         "cores": psutil.cpu_count(logical=False),
@@ -76,14 +75,6 @@ def machine() -> dict[str, Any]:
         "hypervisor": _has_hypervisor(),
         "energy_rails": sorted(EnergyMeter().rails) or None,
     }
-
-
-def _cpu_model() -> str:
-    for line in (_read(Path("/proc/cpuinfo")) or "").splitlines():
-        key, _, value = line.partition(":")
-        if key.strip() in ("model name", "Hardware", "Model"):
-            return value.strip()
-    return platform.processor() or platform.machine()
 
 
 def _has_hypervisor() -> bool | None:
@@ -108,13 +99,6 @@ def software() -> dict[str, Any]:
         "niceness": os.nice(0) if hasattr(os, "nice") else None,
         "taken": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
     }
-
-
-def fingerprint(hardware: Mapping[str, Any]) -> str:
-    """A name for machines that are alike: 16 hexadecimal digits of CPU, board, architecture, cores and their limits."""
-    keys = ("cpu", "board", "architecture", "cores", "logical_cores", "usable_cores", "cpu_quota")
-    text = json.dumps([hardware.get(key) for key in keys])
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def conditions() -> dict[str, Any]:

@@ -396,13 +396,14 @@ def _matrix(document: Mapping[str, Any]) -> Section:
 def _context(document: Mapping[str, Any]) -> list[Section]:
     rows = [["what", "how"]]
     engines = {
-        (e["name"], e["sha256"], e["provider"], str(e["threads"])): e
+        (e["name"], e["sha256"], e["provider"], str(e["options"])): e
         for setting in document.get("settings", ())
         for repeat in setting["repeats"]
         for e in repeat["engines"]
     }
     for e in engines.values():
-        how = f"{e['provider']}, threads: {e['threads']}, spinning: {e['spinning']}, SHA-256 {e['sha256']}"
+        options = ", ".join(f"{key} {value}" for key, value in e["options"].items())
+        how = f"{e['provider']}, {options}, SHA-256 {e['sha256']}"
         rows.append([f"{e['name']} {e['version']}", how])
     rows += (
         [["input", f"{document['input']['source']}; sensor {document['input']['sensor']}"]] if document["input"] else []

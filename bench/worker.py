@@ -168,22 +168,14 @@ def _answer(perceive: Perceive, scan: NDArray[np.float32]) -> Answer:
 def _engines(perceive: Perceiver) -> list[dict[str, Any]]:
     """What really runs, by network."""
     told = []
-    for network in perceive._networks:
-        session = network.session
-        options = session._session.get_session_options()
-        try:
-            spinning = options.get_session_config_entry("session.intra_op.allow_spinning")
-        except Exception:  # onnxruntime's way of saying that nobody set it
-            spinning = "not set (onnxruntime spins)"
+    for session in perceive.sessions:
         told.append(
             {
                 "name": session.card.name,
                 "version": session.card.version,
                 "sha256": session.sha256,
                 "provider": session.provider,
-                "threads": options.intra_op_num_threads or "the provider's choice",
-                "spinning": spinning,
-                "deterministic": bool(options.use_deterministic_compute),
+                "options": session.options,
                 "golden_deviation": None if np.isnan(session.golden_deviation) else session.golden_deviation,
             }
         )

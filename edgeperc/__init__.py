@@ -31,6 +31,7 @@ from .errors import (
     PointsError,
     ProviderError,
     SensorError,
+    SettingsError,
     SplitError,
 )
 
@@ -59,6 +60,7 @@ __all__ = [
     "ProviderError",
     "SensorError",
     "SensorProfile",
+    "SettingsError",
     "SplitError",
     "TopView",
     "__version__",

@@ -5,6 +5,7 @@
     EdgepercError
     ├── PointsError (ValueError)      an array or a sensor file that is no scan
     ├── SensorError (ValueError)      an unknown or impossible sensor profile
+    ├── SettingsError (ValueError)    the file of this computer's settings is unreadable
     ├── SplitError (ValueError)       a model is to be judged by a scan that it was trained on
     ├── FitnessError                  a scan unlike those a model was trained on, and on_mismatch="raise"
     ├── ModelError
@@ -32,6 +33,7 @@ __all__ = [
     "PointsError",
     "ProviderError",
     "SensorError",
+    "SettingsError",
     "SplitError",
 ]
 
@@ -46,6 +48,10 @@ class PointsError(EdgepercError, ValueError):
 
 class SensorError(EdgepercError, ValueError):
     """A sensor profile is unknown or describes no possible sensor."""
+
+
+class SettingsError(EdgepercError, ValueError):
+    """The file that keeps settings of this computer is unreadable or of another schema."""
 
 
 class SplitError(EdgepercError, ValueError):

@@ -81,6 +81,8 @@ class Perceiver:
     Attributes
     ----------
     cards : tuple of ModelCard
+    sessions : tuple of Session
+        The networks as they are loaded; not to be run from outside.
     providers : mapping
         What really runs, by model name.
 
@@ -123,6 +125,7 @@ class Perceiver:
             raise ValueError(
                 f"models {[str(m) for m in given]} have views {views}; expected at least one model, at most one a view"
             )
+        self.sessions: tuple[Session, ...] = tuple(n.session for n in self._networks)
         self.cards: tuple[ModelCard, ...] = tuple(n.session.card for n in self._networks)
         self.providers = MappingProxyType({n.session.card.name: n.session.provider for n in self._networks})
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS

@@ -1,13 +1,16 @@
 """Network input to raw outputs; the only importer of onnxruntime.
 
 A provider asked for is required: where it is absent, or would hand part of the graph to another, construction raises
-`ProviderError`. ``"auto"`` takes the first of `AUTO` that runs the whole model here, and says which.
+`ProviderError`. ``"auto"`` takes the setting that was measured to be the fastest on this computer
+(``edgeperc-bench matrix --recommend``), else the first of `AUTO` that runs the whole model and gives its answers, and
+says which.
 """
 
 from __future__ import annotations
 
 import hashlib
 import importlib
+import importlib.metadata
 import json
 import logging
 from collections.abc import Mapping
@@ -25,7 +28,9 @@ from .errors import (
     MissingExtraError,
     ModelFileError,
     ProviderError,
+    SettingsError,
 )
+from .settings import compiled_folder, fingerprint, read_setting, settings_path
 
 __all__ = ["PROVIDERS", "Session", "available_providers"]
 
@@ -59,6 +64,10 @@ def _onnxruntime() -> Any:
         return importlib.import_module("onnxruntime")
     except ImportError as exc:
         raise MissingExtraError("onnxruntime", "cpu", "Running a model") from exc
+
+
+def _version(package: str) -> str:
+    return importlib.metadata.version(package.replace("_", "-"))
 
 
 def _plugin_devices(ort: Any, short: str) -> list[Any]:
@@ -109,6 +118,8 @@ class Session:
         Of the file.
     provider : str
         What really runs, e.g. ``"CPUExecutionProvider (fp32)"``.
+    options : dict of str to str
+        What was set of onnxruntime's session and of the provider, for reports.
     input : (C, H, W) float32
         Write the network's input here, then `run`.
     outputs : mapping of str to ndarray
@@ -134,15 +145,35 @@ class Session:
         if EXTERNAL_DATA in blob:
             raise ModelFileError(f"{self.path} keeps weights in other files; export it with its weights inside")
         self.sha256 = hashlib.sha256(blob).hexdigest()
-        for candidate in [s for s in AUTO if s in available_providers()] if provider == "auto" else [provider]:
+        candidates = self._measured_best(n_threads) if provider == "auto" else [(provider, n_threads)]
+        for candidate, threads in candidates:
             short, precision = self._choose(candidate)
             try:
-                self._session = self._open(ort, blob, short, precision, n_threads)
+                self._prepare(ort, blob, short, precision, threads)
                 break
-            except ProviderError as exc:
-                if provider != "auto":
+            except (CardMismatchError, InferenceError, ProviderError) as exc:
+                if (candidate, threads) == candidates[-1]:
                     raise
-                logger.warning("auto passes over %s: %s", short, exc)
+                logger.warning("auto passes over %s: %s", candidate, exc)
+
+    def _measured_best(self, n_threads: int | None) -> list[tuple[str, int | None]]:
+        """What "auto" tries, in this order, and the threads of each."""
+        tried: list[tuple[str, int | None]] = [(s, n_threads) for s in AUTO if s in available_providers()]
+        try:
+            setting = read_setting(settings_path(), fingerprint(), self.sha256)
+        except SettingsError as exc:
+            logger.warning("auto knows of no setting measured here: %s", exc)
+            setting = None
+        if setting is None:
+            return tried
+        best = (setting["provider"], setting["n_threads"] if n_threads is None else n_threads)
+        if best[0].partition(":")[0] not in available_providers():
+            logger.warning("auto passes over %s, measured as the fastest: it is not available any more", best[0])
+            return tried
+        return [best, *tried]
+
+    def _prepare(self, ort: Any, blob: bytes, short: str, precision: str, n_threads: int | None) -> None:
+        self._session = self._open(ort, blob, short, precision, n_threads)
         self.provider = f"{PROVIDERS[short]} ({precision})"
         text = self._session.get_modelmeta().custom_metadata_map.get(CARD_KEY)
         if text is None:
@@ -179,17 +210,27 @@ class Session:
         options.use_deterministic_compute = True
         if n_threads is not None:
             options.intra_op_num_threads = n_threads
+        entries = {}
+        # Threads that spin for work between two runs take the cores of the Perceiver's other network: both networks
+        # one after the other took 357 ms with and 290 ms without. Within a run they may spin.
+        entries["session.force_spinning_stop"] = "1"
         if short != "cpu":
             # Part of a graph on another provider is a fall-back too.
-            options.add_session_config_entry("session.disable_cpu_ep_fallback", "1")
+            entries["session.disable_cpu_ep_fallback"] = "1"
+        for key, value in entries.items():
+            options.add_session_config_entry(key, value)
         plugin = _plugin_devices(ort, short) if short in PLUGINS else []
+        settings: dict[str, str] = {}
         try:
             if plugin:
-                settings: dict[str, str] = {}
                 if short == "openvino":
-                    cpu = {"INFERENCE_PRECISION_HINT": PRECISIONS[precision]}
+                    cpu = {"INFERENCE_PRECISION_HINT": PRECISIONS[precision], "PERFORMANCE_HINT": "LATENCY"}
                     if n_threads is not None:
                         cpu["INFERENCE_NUM_THREADS"] = str(n_threads)
+                    engine = f"onnxruntime {ort.__version__}, {_version(PLUGINS[short])}"
+                    compiled = compiled_folder(engine, self.sha256, precision)
+                    if compiled is not None:
+                        cpu["CACHE_DIR"] = str(compiled)
                     settings["load_config"] = json.dumps({"CPU": cpu})
                 options.add_provider_for_devices(plugin[:1], settings)
                 session = ort.InferenceSession(blob, sess_options=options)
@@ -200,6 +241,8 @@ class Session:
             if short == "cpu":
                 raise ModelFileError(f"{self.path}: onnxruntime {ort.__version__} cannot open it: {exc}") from exc
             raise ProviderError(f"{self.path}: provider {short!r} cannot run this model: {exc}") from exc
+        threads = "the provider's choice" if n_threads is None else str(n_threads)
+        self.options = {"threads": threads, "deterministic": "1", **entries, **settings}
         active = session.get_providers()
         if active[0] != PROVIDERS[short]:
             raise ProviderError(f"{self.path}: asked for {PROVIDERS[short]}, onnxruntime made {active} active")
@@ -246,7 +289,6 @@ class Session:
         self.input: NDArray[np.float32] = batch[0]
         first = self._run_unbound(batch)
         self._binding = self._session.io_binding()
-        self._binding.bind_input(card.input.name, "cpu", 0, np.float32, batch.shape, batch.ctypes.data)
         self.outputs: dict[str, NDArray[np.float32]] = {}
         for output, value in zip(card.outputs, first, strict=True):
             expected = self._output_shape(output.kind)
@@ -260,6 +302,7 @@ class Session:
             self._binding.bind_output(output.name, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
             self.outputs[output.kind] = buffer[0]
         self._batch = batch  # the binding holds a bare pointer
+        self._bound_input = (card.input.name, "cpu", 0, np.float32, batch.shape, batch.ctypes.data)
 
     def _run_unbound(self, batch: NDArray[np.float32]) -> list[NDArray[np.float32]]:
         try:
@@ -310,6 +353,8 @@ class Session:
         InferenceError
         """
         try:
+            # Every time: a provider with memory of its own copies the input when it is bound, and never again.
+            self._binding.bind_input(*self._bound_input)
             self._session.run_with_iobinding(self._binding)
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             raise InferenceError(f"{self.path}: a run on {self.provider} failed: {exc}") from exc

@@ -6,7 +6,7 @@ import hashlib
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numba
@@ -42,6 +42,14 @@ def unpack_group(group: str) -> Path:
             assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}{done.stderr}"
             (out / "complete").touch()
     return out / group
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What this computer keeps of real use (settings, compiled models) is nothing to the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture(scope="session")

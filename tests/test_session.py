@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from edgeperc.card import CARD_KEY
 from edgeperc.errors import CardError, CardMismatchError, InferenceError, ModelFileError, ProviderError
 from edgeperc.models import model_path, shipped_models
 from edgeperc.session import PROVIDERS, Session, available_providers, golden_input
+from edgeperc.settings import fingerprint, settings_path, write_settings
 
 
 def edited(tmp_path: Path, name: str, *changes: tuple[bytes, bytes]) -> Path:
@@ -217,6 +220,63 @@ def test_a_failing_run_is_an_inference_error() -> None:
     session._session = Broken()
     with pytest.raises(InferenceError, match="no memory"):
         session.run()
+
+
+def test_the_input_is_bound_for_every_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A provider with memory of its own copies what is bound, when it is bound: plugins answered to the first input."""
+    session = Session(model_path("pointseg"), "cpu")
+    seen: list[float] = []
+
+    class Device:
+        def bind_input(self, *bound: object) -> None:
+            assert bound[-1] == session.input.ctypes.data
+            self.copied = float(session.input[0, 0, 0])
+
+        def run_with_iobinding(self, binding: Device) -> None:
+            seen.append(binding.copied)
+
+    session._session = session._binding = Device()
+    for value in (1.0, 2.0):
+        session.input[:] = value
+        session.run()
+    assert seen == [1.0, 2.0]
+
+
+def test_auto_passes_over_a_provider_that_gives_other_answers(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    warm_up = Session._warm_up
+
+    def wrong(self: Session, limit: float) -> float:
+        if "bf16" in self.provider:
+            raise CardMismatchError("off by far")
+        return warm_up(self, limit)
+
+    monkeypatch.setattr(Session, "_warm_up", wrong)
+    monkeypatch.setattr(session_module, "AUTO", ("cpu:bf16", "cpu"))
+    monkeypatch.setattr(session_module, "available_providers", lambda: ("cpu:bf16", "cpu"))
+    monkeypatch.setattr(Session, "_choose", staticmethod(lambda name: ("cpu", name.partition(":")[2] or "fp32")))
+    assert Session(model_path("pointseg"), "auto").provider == "CPUExecutionProvider (fp32)"
+    assert "auto passes over cpu:bf16: off by far" in caplog.text
+
+
+def test_auto_takes_the_setting_that_was_measured_here(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
+    path = model_path("pointseg")
+    sha = hashlib.sha256(path.read_bytes()).hexdigest()
+    keep = partial(write_settings, settings_path(), fingerprint())
+    keep({sha: {"provider": "cpu", "n_threads": 1}})
+    assert Session(path, "auto").options["threads"] == "1"
+    assert Session(path, "auto", n_threads=2).options["threads"] == "2"
+    assert Session(path, "cpu").options["threads"] == "the provider's choice"
+    keep({sha: {"provider": "tensorrt", "n_threads": 1}})
+    assert Session(path, "auto").options["threads"] == "the provider's choice"
+    assert "tensorrt, measured as the fastest: it is not available any more" in caplog.text
+    settings_path().write_text("{")
+    assert Session(path, "auto").options["threads"] == "the provider's choice"
+    assert "auto knows of no setting measured here" in caplog.text
 
 
 def test_threads_must_be_positive() -> None:

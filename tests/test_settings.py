@@ -1,0 +1,89 @@
+"""What a computer keeps between starts."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from edgeperc import SettingsError, settings
+from edgeperc.settings import (
+    cache_folder,
+    compiled_folder,
+    cpu_model,
+    fingerprint,
+    read_setting,
+    settings_path,
+    write_settings,
+)
+
+
+def test_settings_of_computers_and_models_live_side_by_side(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "settings.json"
+    assert read_setting(path, "m", "s") is None
+    write_settings(path, "m", {"s": {"provider": "cpu", "n_threads": 2}})
+    write_settings(path, "m", {"t": {"provider": "openvino", "n_threads": None}})
+    write_settings(path, "n", {"s": {"provider": "cuda", "n_threads": 1}})
+    write_settings(path, "m", {"s": {"provider": "cpu", "n_threads": 4}})
+    assert read_setting(path, "m", "s") == {"provider": "cpu", "n_threads": 4}
+    assert read_setting(path, "m", "t") == {"provider": "openvino", "n_threads": None}
+    assert read_setting(path, "n", "t") is None
+    assert [*path.parent.iterdir()] == [path]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("[]", "{", '{"schema": 9, "machines": {}}', '{"schema": 1}', '{"schema": 1, "machines": {"m": 3}}'),
+        '{"schema": 1, "machines": {"m": {"s": "cpu"}}}',
+        '{"schema": 1, "machines": {"m": {"s": {"provider": 3}}}}',
+        '{"schema": 1, "machines": {"m": {"s": {"provider": "cpu", "n_threads": 0}}}}',
+    ],
+)
+def test_what_is_no_setting_is_named(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "settings.json"
+    path.write_text(text)
+    with pytest.raises(SettingsError, match=r"settings\.json.*delete it"):
+        read_setting(path, "m", "s")
+
+
+def test_the_folder_is_where_it_is_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "here"))
+    assert cache_folder() == tmp_path / "here"
+    assert settings_path() == tmp_path / "here" / "settings.json"
+    assert not (tmp_path / "here").exists()
+    monkeypatch.delenv("EDGEPERC_CACHE_DIR")
+    if sys.platform.startswith("linux"):
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        assert cache_folder() == tmp_path / "edgeperc"
+
+
+def test_compiled_models_are_found_by_what_they_were_made_of(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
+    asked = [("a 1", "f" * 64, "fp32"), ("a 2", "f" * 64, "fp32"), ("a 1", "e" * 64, "fp32"), ("a 1", "f" * 64, "bf16")]
+    folders = [compiled_folder(*each) for each in asked]
+    assert len(set(folders)) == len(asked)
+    assert all(folder is not None and folder.is_dir() for folder in folders)
+    assert compiled_folder(*asked[0]) == folders[0]
+    monkeypatch.setattr(settings, "fingerprint", lambda: "another computer")
+    assert compiled_folder(*asked[0]) not in folders
+
+
+def test_where_nothing_can_be_written_nothing_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "file" / "below"))
+    assert compiled_folder("a", "f" * 64, "fp32") is None
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert compiled_folder("a", "f" * 64, "fp32") is None
+
+
+def test_alike_computers_have_one_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cpu_model()
+    assert len(fingerprint()) == 16
+    assert fingerprint() == fingerprint()
+    before = fingerprint()
+    monkeypatch.setattr(settings, "cpu_model", lambda: "another")
+    assert fingerprint() != before
