@@ -287,30 +287,34 @@ class Session:
         card = self.card
         batch = np.zeros((1, len(card.input.channels), card.view.height, card.view.width), np.float32)
         self.input: NDArray[np.float32] = batch[0]
-        first = self._run_unbound(batch)
         self._binding = self._session.io_binding()
         self.outputs: dict[str, NDArray[np.float32]] = {}
-        for output, value in zip(card.outputs, first, strict=True):
-            expected = self._output_shape(output.kind)
-            if value.ndim != len(expected) or any(
-                e is not None and s != e for s, e in zip(value.shape, expected, strict=True)
-            ):
-                raise CardMismatchError(
-                    f"{self.path}: {output.name!r} came out with shape {value.shape}, its card says {expected}"
-                )
-            buffer = np.zeros(value.shape, np.float32)
+        for output, shape in zip(card.outputs, self._shapes(batch), strict=True):
+            buffer = np.zeros(shape, np.float32)
             self._binding.bind_output(output.name, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
             self.outputs[output.kind] = buffer[0]
         self._batch = batch  # the binding holds a bare pointer
         self._bound_input = (card.input.name, "cpu", 0, np.float32, batch.shape, batch.ctypes.data)
 
-    def _run_unbound(self, batch: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    def _shapes(self, batch: NDArray[np.float32]) -> list[tuple[int, ...]]:
+        """Of the outputs: as the graph says, or, where it leaves some open, as a run gives them."""
+        declared = {o.name: tuple(o.shape) for o in self._session.get_outputs()}
+        shapes = [declared[o.name] for o in self.card.outputs]
+        if all(isinstance(n, int) for shape in shapes for n in shape):
+            return shapes
         try:
-            names = [o.name for o in self.card.outputs]
-            answers: list[NDArray[np.float32]] = self._session.run(names, {self.card.input.name: batch})
+            answers = self._session.run([o.name for o in self.card.outputs], {self.card.input.name: batch})
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             raise InferenceError(f"{self.path}: the first run on {self.provider} failed: {exc}") from exc
-        return answers
+        for output, answer in zip(self.card.outputs, answers, strict=True):
+            expected = self._output_shape(output.kind)
+            if answer.ndim != len(expected) or any(
+                e is not None and s != e for s, e in zip(answer.shape, expected, strict=True)
+            ):
+                raise CardMismatchError(
+                    f"{self.path}: {output.name!r} came out with shape {answer.shape}, its card says {expected}"
+                )
+        return [answer.shape for answer in answers]
 
     def _warm_up(self, limit: float) -> float:
         golden = self.card.golden
