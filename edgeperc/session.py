@@ -51,7 +51,7 @@ PLUGINS = {"openvino": "onnxruntime_ep_openvino", "tensorrt-rtx": "onnxruntime_e
 PRECISIONS = {"fp32": "f32", "bf16": "bf16", "fp16": "f16"}
 # In standard deviations of an output. The same graph in fp32 was seen to differ by 1e-5 between engines; weights of one
 # layer tripled, by 0.5.
-MAX_GOLDEN_DEVIATION = {"fp32": 0.02, "bf16": 0.5, "fp16": 0.5}
+MAX_GOLDEN_DEVIATION = {"fp32": 0.02, "bf16": 0.5, "fp16": 0.5, "int8": 0.5}
 # Part of the golden values that has to be as near: where max-pooling meets two maxima within a rounding of each other,
 # engines unpool either, and a few pixels differ from then on.
 GOLDEN_SHARE = 0.9
@@ -182,6 +182,9 @@ class Session:
             self.card = ModelCard.from_json(text)
         except CardError as exc:
             raise CardError(f"{self.path}: {exc}") from exc
+        if precision == "fp32" and self.card.training.get("precision") == "int8":
+            precision = "int8"
+            self.provider = f"{PROVIDERS[short]} ({precision})"
         self._check_graph()
         self._bind()
         self.golden_deviation = self._warm_up(MAX_GOLDEN_DEVIATION[precision])

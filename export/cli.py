@@ -24,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     except (EdgepercError, ValueError, OSError) as exc:
         print(f"edgeperc-export: {exc}", file=sys.stderr)
-        return 1 if type(exc).__name__ == "ParityError" else 2
+        return 1 if type(exc).__name__ in ("ParityError", "RefusedError") else 2
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -81,6 +81,25 @@ def _parser() -> argparse.ArgumentParser:
     card.add_argument("card", type=Path, help="the card, as JSON; edgeperc info MODEL --json prints one to start from")
     card.add_argument("out", type=Path, help="the .onnx to write")
     card.set_defaults(run=_card)
+
+    quantize = commands.add_parser("quantize", help="an eight-bit model, where it is faster here and answers as well")
+    quantize.add_argument("model", type=Path, help="the .onnx, with its card")
+    quantize.add_argument("out", type=Path, help="the .onnx to write")
+    quantize.add_argument(
+        "--scans", type=Path, nargs="*", default=[], help="scans, or folders of .bin, to calibrate on"
+    )
+    quantize.add_argument(
+        "--kitti", type=Path, help="KITTI object root: calibrate on training drives, judge on test ones"
+    )
+    quantize.add_argument(
+        "--simulated", type=int, help="scans to simulate for calibration (default 64 if none is named)"
+    )
+    quantize.add_argument(
+        "--judged", type=int, default=48, help="simulated scans both models are judged by (default 48)"
+    )
+    quantize.add_argument("--exclude", nargs="*", default=[], metavar="NODE", help="nodes of the graph to leave alone")
+    quantize.add_argument("--threads", type=int, help="to time both models with")
+    quantize.set_defaults(run=_quantize)
 
     make = commands.add_parser("make", help="a shipped model from nothing: simulate, train, export, judge")
     shipped = ["pointseg", "pointseg-edge", "pointseg-sim", "ssadnet", "ssadnet-edge", "ssadnet-paper", "ssadnet-sim"]
@@ -223,6 +242,28 @@ def _verify(args: argparse.Namespace) -> int:
     from .to_onnx import load, verify
 
     print(json.dumps(verify(load(args.checkpoint)[0], args.model, parity_scans(args.scans))))
+    return 0
+
+
+def _quantize(args: argparse.Namespace) -> int:
+    from .quantize import calibration_scans, quantize
+
+    n_simulated = args.simulated
+    if n_simulated is None:
+        n_simulated = 0 if args.scans or args.kitti else 64
+    scans, hashes = calibration_scans(args.scans, kitti=args.kitti, n_simulated=n_simulated)
+    card = quantize(
+        args.model,
+        args.out,
+        scans=scans,
+        hashes=hashes,
+        kitti=args.kitti,
+        exclude=args.exclude,
+        n_judged=args.judged,
+        n_threads=args.threads,
+    )
+    print(f"{args.out}: {card.name} {card.version}, left alone: {', '.join(card.training['quantized']['left_alone'])}")
+    print(json.dumps(dict(card.parity)))
     return 0
 
 

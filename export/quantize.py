@@ -1,0 +1,434 @@
+"""Eight-bit models: written only where they are faster here and answer as well.
+
+Weights become int8 per channel, activations uint8: of the pairs onnxruntime offers on the CPU, u8s8 is the one with
+fast kernels (u8u8 took twice as long). Scales come from the smallest and largest value of every tensor over the
+calibration scans. What reads or makes the network's own inputs and outputs stays in fp32, and so do the convolutions
+whose rounding moves labels and boxes most.
+"""
+
+from __future__ import annotations
+
+import platform
+import re
+import tempfile
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+from numpy.typing import NDArray
+from onnxruntime.quantization import QDQQuantizer, QuantType, create_calibrator
+from tqdm import tqdm
+
+from edgeperc.card import ModelCard
+from edgeperc.datasets import SEQUENCE_DRIVES, KittiObjects, scan_hash, simulated_scan
+from edgeperc.decode import decode_classes
+from edgeperc.errors import EdgepercError, PointsError, SplitError
+from edgeperc.evaluate import evaluate
+from edgeperc.metrics import BoxEvaluator, Confusion
+from edgeperc.perceiver import decode_top_view
+from edgeperc.points import read_points
+from edgeperc.projection import make_projector
+from edgeperc.session import Session
+from edgeperc.splits import in_split
+
+from .dataset import parity_scans
+from .to_onnx import with_golden, write_card
+
+__all__ = ["RefusedError", "calibration_scans", "quantize"]
+
+# What onnxruntime's CPU provider computes in eight bits. It has no such kernel for ConvTranspose, Elu or Equal.
+ROUNDED_OPS = (
+    *("Add", "Concat", "Conv", "DepthToSpace", "MaxPool", "Mul", "Relu", "Reshape", "Resize", "Sigmoid", "Transpose"),
+)
+FIRST_SEED = 3 * 10**9  # training draws its scenes from 0, proofs from 10**9, judging from 2 * 10**9
+N_PROBES = 8
+# Of labels and boxes with the fp32 network's (`_disagreement`). All of PointSeg's convolutions cost 0.017, all of
+# SSADNet's 0.17, of which 0.16 is one that feeds its unpooling.
+MAX_DISAGREEMENT = 0.02
+MAX_LOSS = 0.01
+N_RUNS = 40
+DRIVE = re.compile(r"\d{4}_\d\d_\d\d_drive_\d{4}")
+
+Race = Callable[[Path, Path, "int | None"], tuple[NDArray[np.float64], NDArray[np.float64]]]
+
+
+class RefusedError(EdgepercError):
+    """An eight-bit model is no faster here, or answers worse; nothing was written."""
+
+
+def calibration_scans(
+    paths: Sequence[Path] = (), *, kitti: Path | None = None, n_simulated: int = 0
+) -> tuple[list[NDArray[np.float32]], list[str]]:
+    """Scans to calibrate on, and the hashes of the real ones.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Scans, or folders of ``.bin`` files.
+    kitti : Path or None
+        Root of a KITTI object set, of whose training drives 64 scans are taken, evenly spread.
+    n_simulated : int
+
+    Raises
+    ------
+    SplitError
+        A scan is of a test drive, as its folders or the ``frames.csv`` above it tell.
+    PointsError
+        There are none.
+    """
+    files = [file for path in paths for file in (sorted(path.rglob("*.bin")) if path.is_dir() else [path])]
+    for file in files:
+        drive = _drive(file)
+        if drive is not None and not in_split(drive, "train"):
+            raise SplitError(f"{file} is of test drive {drive}; calibrate on scans of other drives")
+    real = [read_points(file) for file in files]
+    if kitti is not None:
+        objects = KittiObjects(kitti)
+        names = objects.names("train", grades="AB")
+        real += [objects.frame(name).points for name in names[:: max(1, len(names) // 64)][:64]]
+    scans = [*real, *(simulated_scan(FIRST_SEED + k).points for k in range(n_simulated))]
+    if not scans:
+        asked = f"{len(paths)} paths, KITTI root {kitti}, {n_simulated} simulated scans"
+        raise PointsError(f"no scan to calibrate on in {asked}; name scans, a root with training drives, or simulate")
+    return scans, [scan_hash(points) for points in real]
+
+
+def _drive(file: Path) -> str | None:
+    """The KITTI drive of a scan, where its place tells."""
+    file = file.resolve()
+    if named := DRIVE.search(str(file)):
+        return named[0]
+    if file.parent.parent.parent.name == "sequences":
+        return SEQUENCE_DRIVES.get(file.parent.parent.name)
+    root = file.parent.parent.parent
+    return KittiObjects(root).drives.get(file.stem) if (root / "frames.csv").exists() else None
+
+
+def _saturates() -> bool:
+    """Whether this computer adds pairs of eight-bit products in sixteen bits: x86 without VNNI, or unknown x86."""
+    if platform.machine() not in ("x86_64", "AMD64"):
+        return False
+    flags = Path("/proc/cpuinfo")
+    return not flags.exists() or re.search(r"\b(avx512_vnni|avx_vnni)\b", flags.read_text()) is None
+
+
+def _folded(path: Path) -> onnx.ModelProto:
+    """The graph with its constants computed (weights kept in half precision are floats again) and a name a node."""
+    with tempfile.TemporaryDirectory() as folder:
+        options = onnxruntime.SessionOptions()
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+        options.optimized_model_filepath = f"{folder}/folded.onnx"
+        options.log_severity_level = 3
+        onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+        model = onnx.load(options.optimized_model_filepath)
+    for k, node in enumerate(model.graph.node):
+        node.name = node.name or f"node_{k}"
+    used = {node.domain for node in model.graph.node}
+    kept = [entry for entry in model.opset_import if entry.domain in used]
+    del model.opset_import[:]
+    model.opset_import.extend(kept)
+    return onnx.shape_inference.infer_shapes(model)
+
+
+@dataclass(frozen=True)
+class _Calibrated:
+    """A network in fp32, the range of each of its tensors, and the fp32 answers to some images."""
+
+    card: ModelCard
+    model: onnx.ModelProto
+    ranges: Any
+    images: Sequence[NDArray[np.float32]]
+    answers: Sequence[Mapping[str, NDArray[np.float32]]]
+
+    @classmethod
+    def on(cls, path: Path, card: ModelCard, scans: Sequence[NDArray[np.float32]]) -> _Calibrated:
+        model, projector = _folded(path), make_projector(card.view, card.input)
+        images = [projector.project(np.ascontiguousarray(points)).image[None].copy() for points in scans]
+        with tempfile.TemporaryDirectory() as folder:
+            onnx.save(model, f"{folder}/folded.onnx")
+            augmented = f"{folder}/augmented.onnx"
+            calibrator = create_calibrator(f"{folder}/folded.onnx", [*ROUNDED_OPS], augmented_model_path=augmented)
+            feed = ({card.input.name: image} for image in tqdm(images, desc="calibrating", unit="scan"))
+            calibrator.collect_data(_Reader(feed))
+            ranges = calibrator.compute_data()
+        probes = images[:: max(1, len(images) // N_PROBES)][:N_PROBES]
+        return cls(card, model, ranges, probes, _answers(model, card, probes))
+
+    def rounded(self, convolutions: Collection[str]) -> onnx.ModelProto:
+        """The network with these convolutions, and what lies between them, in eight bits."""
+        names = _between(self.model.graph, convolutions)
+        model = onnx.ModelProto()
+        model.CopyFrom(self.model)
+        if not names:
+            return model
+        quantizer = QDQQuantizer(
+            model, True, _saturates(), QuantType.QInt8, QuantType.QUInt8, self.ranges, [*names], [], [*ROUNDED_OPS], {}
+        )
+        quantizer.quantize_model()
+        rounded: onnx.ModelProto = quantizer.model.model
+        _unround(rounded.graph, names)
+        return rounded
+
+    def loss(self, convolutions: Collection[str]) -> float:
+        return _disagreement(self, _answers(self.rounded(convolutions), self.card, self.images))
+
+
+class _Reader:
+    """What onnxruntime's calibrators take images from."""
+
+    def __init__(self, feed: Iterator[dict[str, NDArray[np.float32]]]) -> None:
+        self.get_next = lambda: next(feed, None)
+
+
+def _between(graph: onnx.GraphProto, convolutions: Collection[str]) -> set[str]:
+    """The convolutions, and the operators all of whose inputs come from what is rounded already."""
+    constants = {"", *(weight.name for weight in graph.initializer)}
+    names: set[str] = set()
+    tensors: set[str] = set()
+    for node in graph.node:
+        inner = node.op_type in ROUNDED_OPS and node.op_type != "Conv"
+        if node.name in convolutions or (inner and set(node.input) - constants <= tensors):
+            names.add(node.name)
+            tensors |= {*node.output}
+    return names
+
+
+def _unround(graph: onnx.GraphProto, rounded: Collection[str]) -> None:
+    """Let operators in fp32 read what operators in fp32 wrote, not its rounding.
+
+    Where SSADNet unpools, it compares a tensor with its maxima: rounding one side leaves few equal.
+    """
+    maker = {output: node for node in graph.node for output in node.output}
+    origin = {}
+    for node in graph.node:
+        if node.op_type == "DequantizeLinear" and (quantize := maker.get(node.input[0])) is not None:
+            made_by = maker.get(quantize.input[0])
+            if made_by is None or made_by.name not in rounded:
+                origin[node.output[0]] = quantize.input[0]
+    for node in graph.node:
+        if node.name not in rounded and node.op_type not in ("QuantizeLinear", "DequantizeLinear"):
+            node.input[:] = [origin.get(name, name) for name in node.input]
+
+
+def _answers(
+    model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]]
+) -> list[dict[str, NDArray[np.float32]]]:
+    """Raw outputs by kind, without the batch axis."""
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    names, kinds = [o.name for o in card.outputs], [o.kind for o in card.outputs]
+    runs = (session.run(names, {card.input.name: image}) for image in images)
+    return [{kind: answer[0] for kind, answer in zip(kinds, run, strict=True)} for run in runs]
+
+
+def _disagreement(fp32: _Calibrated, answers: Sequence[Mapping[str, NDArray[np.float32]]]) -> float:
+    """How far labels and boxes are from the fp32 network's: 1 less mean IoU, or less AP where that is lower."""
+    card, labels, boxes = fp32.card, Confusion(fp32.card.classes), BoxEvaluator(oriented=True)
+    for image, here, there in zip(fp32.images, answers, fp32.answers, strict=True):
+        if card.view.kind == "top_view":
+            (mine, found), (theirs, wanted) = (
+                decode_top_view(card, image[0], outputs, card.score_threshold) for outputs in (here, there)
+            )
+            boxes.update(found, wanted)
+        else:
+            mine, theirs = (decode_classes(next(iter(o.values())), next(iter(o)))[0] for o in (here, there))
+        labels.update(mine, theirs)
+    return 1.0 - float(np.nanmin([labels.mean_iou(), boxes.overall().ap]))
+
+
+def _candidates(graph: onnx.GraphProto, exclude: Collection[str]) -> list[str]:
+    """Convolutions that may be rounded: neither named, nor the first after an input or the last before an output."""
+    unknown = set(exclude) - {node.name for node in graph.node}
+    if unknown:
+        raise ValueError(f"no node is called {', '.join(sorted(unknown))}; expected names of the graph's nodes")
+    inputs, maker = {i.name for i in graph.input}, {output: node for node in graph.node for output in node.output}
+    last, pending = set(), [o.name for o in graph.output]
+    while pending:
+        node = maker.get(pending.pop())
+        if node is not None and node.op_type == "Conv":
+            last.add(node.name)
+        elif node is not None:
+            pending += node.input
+    convolutions = [node for node in graph.node if node.op_type == "Conv" and node.name not in last | set(exclude)]
+    return [node.name for node in convolutions if node.input[0] not in inputs]
+
+
+def _choose(fp32: _Calibrated, candidates: Sequence[str], limit: float) -> tuple[list[str], float]:
+    """The convolutions to round, and their loss: all, or as many as keep below the limit, the harmless ones first.
+
+    Takes at most a trial a convolution, and as many as halve their number down to one.
+    """
+    loss = fp32.loss(candidates)
+    if loss <= limit:
+        return [*candidates], loss
+    alone = {name: fp32.loss([name]) for name in tqdm(candidates, desc="rounding one at a time", unit="layer")}
+    ranked = sorted(candidates, key=lambda name: alone[name])
+    fewest, most, kept = 0, len(ranked), 0.0
+    while most - fewest > 1:
+        middle = (fewest + most) // 2
+        loss = fp32.loss(ranked[:middle])
+        if loss <= limit:
+            fewest, kept = middle, loss
+        else:
+            most = middle
+    return ranked[:fewest], kept
+
+
+def race(
+    one: Path, other: Path, n_threads: int | None, n_runs: int = N_RUNS
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Milliseconds of two networks' runs, by turns; the first of every turn is a warm-up and not counted."""
+    sessions = [Session(path, "cpu", n_threads) for path in (one, other)]
+    times = np.empty((2, n_runs))
+    for run in range(n_runs):
+        for k, session in enumerate(sessions):
+            session.run()
+            start = time.perf_counter()
+            session.run()
+            times[k, run] = 1e3 * (time.perf_counter() - start)
+    return times[0], times[1]
+
+
+def _ratio(one: NDArray[np.float64], other: NDArray[np.float64]) -> tuple[float, float, float]:
+    """The median of paired ratios, and its 95 % interval by order statistics."""
+    ratios = np.sort(other / one)
+    half = int(np.ceil(0.98 * np.sqrt(len(ratios))))
+    middle = len(ratios) // 2
+    least, most = ratios[max(0, middle - half)], ratios[min(len(ratios) - 1, middle + half)]
+    return float(np.median(ratios)), float(least), float(most)
+
+
+def _scores(figures: Mapping[str, Any]) -> dict[str, float]:
+    """Every IoU of points and cells, and the AP of boxes, at all ranges."""
+    scores = {}
+    for block in ("real", "simulated"):
+        of = figures.get(block, {})
+        for name, row in of.get("points", {}).get("all", {}).items():
+            scores[f"{block} {name} IoU"] = row["iou"]
+        for table, bands in of.get("segmentation", {}).items():
+            scores |= {f"{block} {table} {name} IoU": iou for name, iou in bands["all"]["iou"].items()}
+        for kind, bands in of.get("boxes", {}).items():
+            scores[f"{block} {kind} vehicle AP"] = bands["all"]["vehicle"]["ap"]
+    return {name: score for name, score in scores.items() if score is not None and np.isfinite(score)}
+
+
+def quantize(
+    path: Path,
+    out: Path,
+    *,
+    scans: Sequence[NDArray[np.float32]],
+    hashes: Sequence[str] = (),
+    kitti: Path | None = None,
+    exclude: Sequence[str] = (),
+    n_judged: int = 48,
+    n_threads: int | None = None,
+    max_disagreement: float = MAX_DISAGREEMENT,
+    race: Race = race,
+) -> ModelCard:
+    """Write an eight-bit model with its card, judged like the one it was made of.
+
+    Parameters
+    ----------
+    path, out : Path
+        The model in fp32, and the .onnx to write.
+    scans : sequence of (n, 4) float32
+        To calibrate on, from `calibration_scans`.
+    hashes : sequence of str
+        Of the real ones among them: the card lists them, so that the model is never judged on them.
+    kitti : Path or None
+        Root of a KITTI object set, on whose test drives both models are judged, too.
+    exclude : sequence of str
+        Nodes to leave alone.
+    n_judged : int
+        How many simulated scans, none of them calibrated on, both models are judged by.
+    n_threads : int or None
+        To race with; None as many as onnxruntime takes.
+    max_disagreement : float
+        What rounding may cost in agreement with the fp32 labels and boxes before convolutions are left alone.
+    race : callable
+        Of two paths and ``n_threads``: milliseconds of paired runs of both.
+
+    Returns
+    -------
+    ModelCard
+
+    Raises
+    ------
+    RefusedError
+        Not faster by more than the race's noise, or more than a point of IoU or AP lost; ``out`` is left as it was.
+    PointsError, ValueError
+        No scans, or an excluded node that there is none of.
+    """
+    if not scans:
+        raise PointsError("no scan to calibrate on; expected at least one")
+    session = Session(path, "cpu")
+    card = session.card
+    fp32 = _Calibrated.on(path, card, scans)
+    candidates = _candidates(fp32.model.graph, exclude)
+    chosen, disagreement = _choose(fp32, candidates, max_disagreement)
+    model = fp32.rounded(chosen)
+    model.producer_name, model.producer_version = "edgeperc", ""
+    alone = [n.name for n in fp32.model.graph.node if n.op_type == "Conv" and n.name not in chosen]
+    training = dict(card.training)
+    frames = training.get("frames")
+    training |= {
+        "precision": "int8",
+        "frames": {**dict(zip(hashes, hashes, strict=True)), **(frames if isinstance(frames, Mapping) else {})},
+        "quantized": {
+            "from": f"{card.name} {card.version}",
+            "sha256": session.sha256,
+            "calibration": f"{len(hashes)} real and {len(scans) - len(hashes)} simulated scans",
+            "left_alone": alone,
+            "disagreement": disagreement,
+            "reduced_range": _saturates(),
+        },
+    }
+    card = with_golden(model, replace(card, name=f"{card.name}-int8", training=training, parity={}, metrics={}))
+    trial = out.with_name(f".{out.name}.trial.onnx")
+    try:
+        write_card(model, card, trial)
+        told = f"{len(chosen)} of {len(chosen) + len(alone)} convolutions in int8"
+        one, other = race(path, trial, n_threads)
+        ratio, least, most = _ratio(one, other)
+        speed = (
+            f"{np.median(one):.1f} ms in fp32, {np.median(other):.1f} in int8, "
+            f"{ratio:.2f} times as long ({least:.2f} to {most:.2f})"
+        )
+        if most >= 1.0:
+            raise RefusedError(f"{path}: not faster here with {told}: {speed}; the time must be shorter beyond noise")
+        datasets = [*([kitti] if kitti else []), f"simulation:{n_judged}"]
+        figures, before = (evaluate(datasets, [each])[0] for each in (trial, path))
+        mine, theirs = _scores(figures), _scores(before)
+        lost = {name: theirs[name] - mine.get(name, 0.0) for name in theirs}
+        worse = [f"{name} {theirs[name]:.3f} to {mine.get(name, 0.0):.3f}" for name in lost if lost[name] > MAX_LOSS]
+        if worse:
+            raise RefusedError(f"{path}: more than {MAX_LOSS} lost with {told}: {'; '.join(worse)} ({speed})")
+        figures["command"] = " ".join(["edgeperc eval", *(["KITTI"] if kitti else []), datasets[-1]])
+        parity = {**_parity(path, trial), "speed": speed, "largest_loss": max(lost.values(), default=0.0)}
+        card = replace(card, parity=parity, metrics=figures)
+        write_card(model, card, out)
+    finally:
+        trial.unlink(missing_ok=True)
+    return card
+
+
+def _parity(path: Path, rounded: Path) -> dict[str, float]:
+    """Agreement of labels with the fp32 model's on scans that neither was made with."""
+    sessions, scans, agreement = [Session(each, "cpu") for each in (path, rounded)], parity_scans([]), 1.0
+    card = sessions[0].card
+    projector = make_projector(card.view, card.input)
+    for points in scans:
+        image = projector.project(points).image
+        labels = []
+        for session in sessions:
+            session.input[:] = image
+            kind = next(o.kind for o in card.outputs if o.kind.startswith("class_"))
+            labels.append(decode_classes(session.run()[kind], kind)[0])
+        agreement = min(agreement, float((labels[0] == labels[1]).mean()))
+    return {"n_scans": len(scans), "label_agreement": agreement}
