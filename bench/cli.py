@@ -1,4 +1,4 @@
-"""The ``edgeperc-bench`` command: ``run``, ``compare``, ``matrix``, ``scaling`` and ``soak``.
+"""The ``edgeperc-bench`` command: ``run``, ``compare``, ``matrix``, ``scaling``, ``soak`` and ``peers``.
 
 Without a command it is ``run``, or ``matrix`` where ``--providers`` or ``--precisions`` is among the words. Exit codes:
 0 all is well (``compare``: no difference, or faster), 1 ``compare``: slower, 2 nothing could be done or compared,
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-COMMANDS = ("run", "compare", "matrix", "scaling", "soak")
+COMMANDS = ("run", "compare", "matrix", "scaling", "soak", "peers")
 SINGLE_STREAM = "single-stream"
 DEFAULT_SCENARIOS = (SINGLE_STREAM, "paced:10", "paced:20", "offline", "cold-start")
 POINT_COUNTS = (10_000, 20_000, 50_000, 100_000, 200_000, 500_000, 1_000_000, 2_000_000)
@@ -178,6 +178,16 @@ def _parser() -> argparse.ArgumentParser:
     soak.add_argument("--scans", type=_at_least(1000), default=20_000, metavar="N", help="default: %(default)s")
     soak.add_argument("--markdown", type=Path, metavar="FILE")
     soak.set_defaults(command=_soak, html=None)
+
+    peers = commands.add_parser(
+        "peers",
+        parents=[common, scans, engine],
+        help="edgeperc beside torch, other engines and numpy, and the machine's own limits (extra 'peers')",
+    )
+    peers.add_argument(
+        "--rounds", type=_at_least(1), default=25, metavar="N", help="turns of each, all scans (default: %(default)s)"
+    )
+    peers.set_defaults(command=_peers)
     return parser
 
 
@@ -669,6 +679,28 @@ def memory_growth(rss_mb: Sequence[Sequence[float]], settling: int) -> dict[str,
         f"slope {1e3 * line.slope:+.5f} MB per 1,000 scans (+- {1e3 * line.error:.5f}), from {len(mb):,} samples",
     ]
     return told | {"sentences": sentences}
+
+
+# peers
+
+
+def _peers(arguments: argparse.Namespace) -> int:
+    from . import peers
+
+    with _document("peers", arguments) as (document, live), tempfile.TemporaryDirectory() as folder:
+        given = _input(arguments, Path(folder), document, live)
+        peers.run(
+            document,
+            given.files,
+            Path(folder),
+            models=arguments.model or peers.default_models(),
+            provider=arguments.provider,
+            sensor=arguments.sensor,
+            n_threads=arguments.threads or document["machine"]["usable_cores"] or os.cpu_count() or 1,
+            n_rounds=arguments.rounds,
+            say=live.say,
+        )
+    return 0
 
 
 if __name__ == "__main__":

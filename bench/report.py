@@ -1,9 +1,9 @@
 """What was measured, as a document: JSON that holds every sample, and tables and pages made from it.
 
-The JSON (``schema`` 1) has ``kind`` (run, matrix, scaling, soak), ``command``, ``complete``, ``machine``, ``software``,
-``input``, ``spoilers`` and, by kind, ``settings`` (a list: models, provider, threads, ``repeats`` with all samples,
-``accuracy``, ``offline``, ``cold_start``, ``loadgen``), ``skipped``, ``recommended``, ``tables`` or ``soak``. All that
-is shown is computed from it.
+The JSON (``schema`` 1) has ``kind`` (run, matrix, scaling, soak, peers), ``command``, ``complete``, ``machine``,
+``software``, ``input``, ``spoilers`` and, by kind, ``settings`` (a list: models, provider, threads, ``repeats`` with
+all samples, ``accuracy``, ``offline``, ``cold_start``, ``loadgen``), ``skipped``, ``recommended``, ``tables``, ``soak``
+or ``peers`` (by table, of each contender the samples of each round). All that is shown is computed from it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 SCHEMA = 1
-KINDS = ("run", "matrix", "scaling", "soak")
+KINDS = ("run", "matrix", "scaling", "soak", "peers")
 WORDY = 24  # characters from which a column holds words, not numbers
 QUANTILES = ("p50", "p90", "p99", "p99.9", "max")
 
