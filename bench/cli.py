@@ -8,6 +8,7 @@ Without a command it is ``run``, or ``matrix`` where ``--providers`` or ``--prec
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import math
 import os
 import shlex
@@ -169,6 +170,13 @@ def _parser() -> argparse.ArgumentParser:
     scaling.add_argument(
         "--cars", type=_car_counts, default=list(CAR_COUNTS), metavar="N,N", help="objects, 28 at most"
     )
+    scaling.add_argument(
+        "--sizes",
+        type=_sizes,
+        default=[50, 100, 200, 400],
+        metavar="N,N",
+        help="images, in per cent of the model's own, its weights at random (needs the extra 'export')",
+    )
     scaling.add_argument("--processes", type=_thread_counts, metavar="N,N", help="default: 1, 2, 4 .. as cores")
     scaling.add_argument("--plot", type=Path, metavar="FILE", help=".svg or .png (needs the extra 'view')")
     scaling.add_argument("--markdown", type=Path, metavar="FILE")
@@ -221,6 +229,7 @@ def _numbers(least: int, most: float = math.inf) -> Any:
 
 
 _thread_counts, _point_counts, _car_counts = _numbers(1), _numbers(100), _numbers(0, CAR_COUNTS[-1])
+_sizes = _numbers(25, 1600)
 
 
 def _scenario(text: str) -> str:
@@ -577,14 +586,13 @@ def _scaling(arguments: argparse.Namespace) -> int:
                 own = report.stage_medians(setting, scenarios[kind, n].name)
                 beside = sum(took for stage, took in own.items() if stage != "infer")
                 rows.append([f"{n:,}", *(report.number(told[q]) for q in ("p50", "p90")), report.number(beside)])
-            line = trend(np.array(counts) / (1000.0 if kind == "points" else 1.0), ms)
-            words = [f"a line through the medians: {line.intercept:.2f} ms + {line.slope:.4f} ms per {unit}"]
-            words = [] if math.isnan(line.slope) else [f"{words[0]} (+- {line.error:.4f}), R2 {line.r2:.4f}"]
+            words = _line(curves[kind], unit, 1000.0 if kind == "points" else 1.0)
             head = [kind, "p50 ms", "p90 ms", "beside the network ms"]
             document["tables"].append({"title": f"Growth with {kind}", "sentences": words, "head": head, "rows": rows})
+        middle = min(files, key=lambda key: (key[0] != "points", abs(key[1] - 100_000)))
+        curves["pixels %"] = _growth_with_images(document, live, job, arguments, Path(folder), files[middle], limits)
         most = document["machine"]["usable_cores"] or os.cpu_count() or 1
         counts = arguments.processes or sorted({*(2**k for k in range(most.bit_length())), most})
-        middle = min(files, key=lambda key: (key[0] != "points", abs(key[1] - 100_000)))
         for n in counts:
             _offline(setting, job, [files[middle]], n, limits, document, live)
         curves["processes"] = [(told["processes"], told["scans_per_s"] or math.nan) for told in setting["offline"]]
@@ -595,6 +603,50 @@ def _scaling(arguments: argparse.Namespace) -> int:
         if arguments.plot:
             _plot(curves, arguments.plot)
     return 0
+
+
+def _growth_with_images(
+    document: dict[str, Any],
+    live: report.LiveTable,
+    job: Job,
+    arguments: argparse.Namespace,
+    folder: Path,
+    scan: Path,
+    limits: Limits,
+) -> list[tuple[float, float]]:
+    """The same networks, for views of more or fewer pixels."""
+    from .measure import new_setting, repeat
+
+    head = ["pixels %", "p50 ms", "p90 ms", "beside the network ms"]
+    table: dict[str, Any] = {"title": "Growth with image size", "sentences": [], "head": head, "rows": []}
+    document["tables"].append(table)
+    if not all(importlib.util.find_spec(name) for name in ("torch", "onnx")):
+        table["sentences"] = ["not measured: pip install 'edgeperc[export]'"]
+        return []
+    from .peers import resized
+
+    curve = []
+    for percent in arguments.sizes:
+        live.say(f"making networks for {percent} % of the pixels")
+        models = tuple(str(resized(name, percent / 100.0, folder)) for name in job.models)
+        scenario = Scenario(f"{percent} % of the pixels", (scan,), limits)
+        setting = new_setting(own := replace(job, models=models, scenarios=(scenario,)))
+        document["settings"].append(setting)
+        repeat(setting, own, arguments.repeats, document, live)
+        told, stages = report.latency(setting, scenario.name), report.stage_medians(setting, scenario.name)
+        beside = sum(took for stage, took in stages.items() if stage != "infer")
+        table["rows"].append([f"{percent}", *(report.number(told[q]) for q in ("p50", "p90")), report.number(beside)])
+        curve.append((float(percent), float(told["p50"])))
+    table["sentences"] = _line(curve, "per cent of the model's own image")
+    return curve
+
+
+def _line(curve: Sequence[tuple[float, float]], unit: str, per: float = 1.0) -> list[str]:
+    line = trend(*(np.array(curve, np.float64).reshape(-1, 2) / (per, 1.0)).T)
+    if math.isnan(line.slope):
+        return []
+    told = f"{line.intercept:.2f} ms + {line.slope:.4f} ms per {unit} (+- {line.error:.4f}), R2 {line.r2:.4f}"
+    return [f"a line through the medians: {told}"]
 
 
 def _plot(curves: Mapping[str, Sequence[tuple[float, float]]], path: Path) -> None:

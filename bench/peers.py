@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeperc import ModelCard, Perceiver
+from edgeperc import ModelCard, ModelError, Perceiver
+from edgeperc.card import TopViewGeometry
 from edgeperc.cli import SHIPPED
 from edgeperc.models import model_path, shipped_models
 from edgeperc.projection import make_projector
@@ -50,6 +51,7 @@ __all__ = [
     "groups",
     "latency_table",
     "measure",
+    "resized",
     "run",
 ]
 
@@ -396,6 +398,36 @@ def one_or_two(name: str, path: Path, card: ModelCard, folder: Path) -> list[Con
         "detection alone": (detection,),
     }
     return [Contender(words, "network", "onnxruntime", files, image=image) for words, files in parts.items()]
+
+
+def resized(model: str, share: float, folder: Path) -> Path:
+    """A model of the same network for a view of ``share`` times the pixels, its weights at random.
+
+    A range image gets as many times the columns, a top view reaches as many times as far.
+
+    Raises
+    ------
+    ModelError
+        The card does not say how the network was made, or the network does not fit such an image.
+    """
+    from edgeperc_export.to_onnx import to_graph, write_card
+    from edgeperc_export.train import Recipe, build
+
+    path = Path(model) if model.endswith(".onnx") else model_path(model)
+    card = Session(path, "cpu").card
+    recipe = card.training.get("recipe")
+    if not isinstance(recipe, dict):
+        raise ModelError(f"the card of {path} has no training recipe, by which its network could be made again")
+    view: Any = card.view
+    if isinstance(view, TopViewGeometry):
+        near, far = view.x_range_m
+        view = replace(view, x_range_m=(near, near + share * (far - near)))
+    else:
+        view = replace(view, width=round(share * view.width))
+    card = replace(card, view=view, golden=None)
+    made = folder / f"{card.name}-{share:g}.onnx"
+    write_card(to_graph(build(Recipe(**recipe)), card), card, made)
+    return made
 
 
 # What is told

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import importlib.util
 import io
 import json
 import re
@@ -636,18 +637,21 @@ def test_a_matrix_measures_every_setting_and_keeps_the_best(
     assert "recommended for n" in capsys.readouterr().out
 
 
-def test_scaling_tells_points_cars_and_processes(
+def test_scaling_tells_points_cars_sizes_and_processes(
     in_process: list[worker.Job], tmp_path: Path, matplotlib: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["scaling", "--points", "1000,2000,4000", "--cars", "0,2", "--processes", "1,2", "--min-scans", "20"]
+    words = ["scaling", "--points", "1000,2000,4000", "--cars", "0,2", "--sizes", "100", "--processes", "1,2"]
+    words += ["--min-scans", "20"]
     plot = tmp_path / "new" / "growth.svg"
     assert cli.main([*words, "--min-seconds", "0", "--plot", str(plot), "--json", str(tmp_path / "s.json")]) == 0
     tables = report.read_report(tmp_path / "s.json")["tables"]
     assert [[row[0] for row in table["rows"]] for table in tables] == [
         ["1,000", "2,000", "4,000"],
         ["0", "2"],
+        ["100"] if HAS_EXPORT else [],
         ["1", "2"],
     ]
+    assert HAS_EXPORT or "edgeperc[export]" in tables[2]["sentences"][0]
     assert "ms per 1,000 points" in capsys.readouterr().out
     ET.fromstring(plot.read_text())
 
@@ -663,6 +667,7 @@ def test_a_soak_reports_memory(
     assert "Memory over a long run" in capsys.readouterr().out
 
 
+HAS_EXPORT = all(importlib.util.find_spec(name) for name in ("torch", "onnx"))
 FEW = [
     "--model",
     "pointseg",

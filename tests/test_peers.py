@@ -244,6 +244,20 @@ def test_two_networks_give_the_answers_of_one(tmp_path: Path, scan: np.ndarray) 
     assert [a.shape for a in answers[2]] == [a.shape for a in answers[0]]
 
 
+@pytest.mark.parametrize(("name", "shape"), [("pointseg", (64, 256)), ("ssadnet", (200, 200))])
+def test_the_same_network_for_half_the_image(
+    name: str, shape: tuple[int, int], tmp_path: Path, scan: np.ndarray
+) -> None:
+    for package in ("onnx", "onnxscript", "torch", "tqdm"):
+        pytest.importorskip(package)
+    made = peers.resized(name, 0.5, tmp_path)
+    macs, whole = (cost(path).macs for path in (made, model_path(name)))
+    assert macs == pytest.approx(0.5 * whole, rel=0.01)
+    perceive = Perceiver([made], provider="cpu", n_threads=1, on_mismatch="ignore")
+    assert perceive.sessions[0].input.shape[1:] == shape
+    perceive(scan)
+
+
 @pytest.fixture
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing beside onnxruntime and numpy."""
