@@ -40,7 +40,7 @@ class Stage:
 # sees so few scans does not need, and which upsets batch norm.
 SSADNET = Recipe("ssadnet", batch=4, learning_rate=1.5e-3, context_width=64, n_pasted=3.0, dropout=0.0)
 EDGE = Recipe("ssadnet", edge=True, steps=6000, batch=4, learning_rate=3e-3, cooldown=0.2, n_pasted=3.0)
-TAUGHT = replace(EDGE, steps=2400, learning_rate=1e-3, cooldown=0.4, distil=1.0, seen_twice=False)
+TAUGHT = replace(EDGE, steps=1000, learning_rate=1e-3, cooldown=0.4, distil=1.0, seen_twice=False)
 MODELS = {
     "pointseg-sim": Stage(Recipe("pointseg", simulated_share=1.0, steps=1000, learning_rate=2e-3, cooldown=0.3)),
     "pointseg": Stage(Recipe("pointseg", steps=3600, batch=4, learning_rate=1e-3), after="pointseg-sim"),
@@ -51,7 +51,9 @@ MODELS = {
     # A step of a network for small computers takes a quarter of the full one's, a step with its teacher's answers as
     # long: first many on labels alone, then some with both.
     "pointseg-edge-start": Stage(replace(EDGE, network="pointseg", n_pasted=6.0)),
-    "pointseg-edge": Stage(replace(TAUGHT, network="pointseg", n_pasted=6.0), "pointseg-edge-start", "pointseg"),
+    "pointseg-edge": Stage(
+        replace(TAUGHT, network="pointseg", n_pasted=6.0, steps=1600), "pointseg-edge-start", "pointseg"
+    ),
     "ssadnet-edge-start": Stage(EDGE),
     "ssadnet-edge": Stage(TAUGHT, "ssadnet-edge-start", "ssadnet"),
 }
