@@ -301,7 +301,7 @@ def _receive(each: Found, here: Any) -> Any:
 
 def default_models() -> list[str]:
     """The shipped models that are measured unless others are named."""
-    names = [*SHIPPED, *(f"{name}-edge" for name in SHIPPED)]
+    names = [f"{name}{suffix}" for suffix in ("", "-edge", "-edge-int8") for name in SHIPPED]
     return [name for name in names if name in shipped_models()]
 
 
@@ -337,7 +337,7 @@ def groups(models: Sequence[str], provider: str, folder: Path, scan: Path, senso
         for engine in OPENVINO:
             alone.append(Contender(f"OpenVINO API {engine[9:]}, network alone", "network", engine, (path,), (), image))
         peaks = [Contender(f"peak {engine}", "peak", engine) for engine in (*PEAKS, "copy")]
-        full = [model for model in views[card.view.kind] if f"{model[0]}-edge" == name]
+        full = [model for model in views[card.view.kind] if name.startswith(f"{model[0]}-edge") and model[0] in SHIPPED]
         told[f"Scan to answer: {name}"] = [*whole([(name, path, card)], provider), *larger(full), *alone, *peaks]
     for pair in zip(views["range_image"], views["top_view"], strict=False):
         told[f"Scan to answer: {pair[0][0]} and {pair[1][0]}"] = whole(pair, provider)
@@ -356,7 +356,8 @@ def whole(models: Sequence[tuple[str, Path, ModelCard]], provider: str) -> list[
     own = dict.fromkeys((provider, "cpu", *OPENVINO))
     if provider == "auto" and available_providers() == ("cpu",):
         del own["cpu"]  # it is what auto takes
-    rivals = ("onnxruntime", *OPENVINO, *TORCH)
+    rounded = any(card.training.get("precision") == "int8" for _, _, card in models)
+    rivals = ("onnxruntime", *OPENVINO, *(() if rounded else TORCH))  # torch has no such networks
     return [
         *(Contender(f"edgeperc, {name}", "edgeperc", name, paths) for name in own),
         *(Contender(f"numpy + {name}", "rival", name, paths, cards) for name in rivals),
@@ -532,7 +533,7 @@ def floor_table(title: str, found: Sequence[Found]) -> dict[str, Any]:
     if absent(Contender("", "network", "torch")):
         words.append(f"multiplications are not counted: onnx is {INSTALL}")
     else:
-        needs = cost(path)
+        needs, rounded = cost(path), Session(path, "cpu").card.training.get("precision") == "int8"
         words.append(
             f"{needs.macs / 1e9:.2f} GMAC, {needs.padding_macs / 1e9:.2f} of them on padding, which the floor leaves "
             f"out; {needs.weights / 1e6:.1f} M weights; {needs.activations / 1e6:.1f} M activations"
@@ -547,7 +548,7 @@ def floor_table(title: str, found: Sequence[Found]) -> dict[str, Any]:
                 for each in found
                 if each.contender.kind in ("network", "session")
                 and each.ms
-                and precision_of(each.contender) == precision
+                and ("int8" if rounded else precision_of(each.contender)) == precision
             ]
             fastest = min(networks, key=lambda each: each.p50, default=None)
             took = fastest.p50 if fastest else math.nan

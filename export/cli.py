@@ -92,7 +92,11 @@ def _parser() -> argparse.ArgumentParser:
         "--kitti", type=Path, help="KITTI object root: calibrate on training drives, judge on test ones"
     )
     quantize.add_argument(
-        "--simulated", type=int, help="scans to simulate for calibration (default 64 if none is named)"
+        "--simulated", type=int, default=64, metavar="N", help="scans to simulate for calibration (default 64)"
+    )
+    quantize.add_argument("--semantickitti", type=Path, help="root of SemanticKITTI, to judge the road by")
+    quantize.add_argument(
+        "--seven-bits", action="store_true", default=None, help="for any computer, x86 without VNNI among them"
     )
     quantize.add_argument(
         "--judged", type=int, default=48, help="simulated scans both models are judged by (default 48)"
@@ -248,17 +252,16 @@ def _verify(args: argparse.Namespace) -> int:
 def _quantize(args: argparse.Namespace) -> int:
     from .quantize import calibration_scans, quantize
 
-    n_simulated = args.simulated
-    if n_simulated is None:
-        n_simulated = 0 if args.scans or args.kitti else 64
-    scans, hashes = calibration_scans(args.scans, kitti=args.kitti, n_simulated=n_simulated)
+    scans, hashes = calibration_scans(args.scans, kitti=args.kitti, n_simulated=args.simulated)
     card = quantize(
         args.model,
         args.out,
         scans=scans,
         hashes=hashes,
         kitti=args.kitti,
+        semantickitti=args.semantickitti,
         exclude=args.exclude,
+        seven_bits=args.seven_bits,
         n_judged=args.judged,
         n_threads=args.threads,
     )

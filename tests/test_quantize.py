@@ -139,6 +139,17 @@ def test_inner_layers_become_int8_and_the_card_says_so(tmp_path: Path, small: Pa
     assert [p.name for p in tmp_path.iterdir()] == ["small-int8.onnx"]
 
 
+@pytest.mark.parametrize(("seven_bits", "most"), [(True, 64), (False, 127)])
+def test_weights_of_seven_bits_are_for_any_computer(
+    tmp_path: Path, small: Path, scans: list[np.ndarray], seven_bits: bool, most: int
+) -> None:
+    out = tmp_path / "int8.onnx"
+    card = quantize(small, out, scans=scans, n_judged=1, max_disagreement=1.0, seven_bits=seven_bits, race=FASTER)
+    weights = [onnx.numpy_helper.to_array(w) for w in onnx.load(out).graph.initializer]
+    assert max(int(abs(w.astype(int)).max()) for w in weights if w.dtype == np.int8) == most
+    assert card.training["quantized"]["weight_bits"] == (7 if seven_bits else 8)
+
+
 def test_layers_that_rounding_spoils_are_left_alone(tmp_path: Path, scans: list[np.ndarray]) -> None:
     path, out = written(Spoilt(1e4), tmp_path / "spoilt.onnx"), tmp_path / "int8.onnx"
     card = quantize(path, out, scans=scans, n_judged=1, race=FASTER)
@@ -208,7 +219,7 @@ def test_no_scans_is_an_error(tmp_path: Path, small: Path, capsys: pytest.Captur
     with pytest.raises(PointsError, match="no scan to calibrate on"):
         calibration_scans([])
     (tmp_path / "empty").mkdir()
-    words = ["quantize", "m.onnx", str(tmp_path / "o.onnx"), "--scans", str(tmp_path / "empty")]
+    words = ["quantize", "m.onnx", str(tmp_path / "o.onnx"), "--scans", str(tmp_path / "empty"), "--simulated", "0"]
     assert cli.main(words) == 2
     assert "no scan to calibrate on in 1 paths" in capsys.readouterr().err
     with pytest.raises(PointsError, match="expected at least one"):
@@ -257,7 +268,7 @@ def test_the_command_refuses_with_1_and_writes_with_0(
 ) -> None:
     out, scan = tmp_path / "int8.onnx", tmp_path / "scan.bin"
     scans[0].tofile(scan)
-    words = ["quantize", str(small), str(out), "--scans", str(scan), "--judged", "1"]
+    words = ["quantize", str(small), str(out), "--scans", str(scan), "--simulated", "2", "--judged", "1"]
     monkeypatch.setattr(module.quantize, "__kwdefaults__", {**quantize.__kwdefaults__, "race": timed(5.0, 5.0)})
     assert cli.main(words) == 1
     assert "not faster here" in capsys.readouterr().err
