@@ -8,7 +8,10 @@ from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, 
 from edgeperc.sensors import get_sensor
 from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES
 
-__all__ = ["RANGE_IMAGE", "RANGE_IMAGE_INPUT", "TOP_VIEW", "TOP_VIEW_INPUT", "card_of"]
+__all__ = ["LABELS_POINTS", "RANGE_IMAGE", "RANGE_IMAGE_INPUT", "TOP_VIEW", "TOP_VIEW_INPUT", "card_of"]
+
+LABELS_POINTS = ("kulseg", "pointseg", "squeezesegv2")
+"""The networks of the range image, which label pixels and so points; others see the top view."""
 
 TOP_VIEW = TopViewGeometry()
 RANGE_IMAGE = RangeImageGeometry(get_sensor("hdl-64e").elevations_deg)
@@ -26,7 +29,7 @@ RANGE_IMAGE_INPUT = InputSpec(
 def card_of(network: str, head: str = "dense", **facts: Any) -> ModelCard:
     """The card of a network; ``facts`` are whatever else `ModelCard` takes, at least its version."""
     facts = {"name": network, **facts}
-    if network == "pointseg":
+    if network in LABELS_POINTS:
         return ModelCard(
             view=RANGE_IMAGE,
             input=RANGE_IMAGE_INPUT,

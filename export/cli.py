@@ -41,7 +41,7 @@ def _parser() -> argparse.ArgumentParser:
     simulate.set_defaults(run=_simulate)
 
     train = commands.add_parser("train", help="train a network, or go on where a stopped run left off")
-    train.add_argument("network", choices=["ssadnet", "pointseg"])
+    train.add_argument("network", choices=["kulseg", "pointseg", "squeezesegv2", "ssadnet"])
     train.add_argument("out", type=Path, help="folder for checkpoint.pt and log.jsonl")
     train.add_argument("--kitti", type=Path, help="root of a KITTI object set")
     train.add_argument("--simulated", type=Path, help="folder made by: edgeperc-export simulate")
@@ -106,7 +106,8 @@ def _parser() -> argparse.ArgumentParser:
     quantize.set_defaults(run=_quantize)
 
     make = commands.add_parser("make", help="a shipped model from nothing: simulate, train, export, judge")
-    shipped = ["pointseg", "pointseg-edge", "pointseg-sim", "ssadnet", "ssadnet-edge", "ssadnet-paper", "ssadnet-sim"]
+    shipped = ["kulseg", "pointseg", "pointseg-edge", "pointseg-sim"]
+    shipped += ["ssadnet", "ssadnet-edge", "ssadnet-paper", "ssadnet-sim"]
     make.add_argument("name", choices=shipped)
     make.add_argument("out", type=Path, help="folder for scans, checkpoints and the model")
     make.add_argument("--kitti", type=Path, help="root of a KITTI object set")
@@ -205,6 +206,8 @@ def _recipe_options() -> dict[str, type]:
 def _train(args: argparse.Namespace) -> int:
     from .train import PAPER, Recipe, train
 
+    if args.recipe == "paper" and args.network not in PAPER:
+        raise ValueError(f"no recipe of a paper's is kept for {args.network}; expected {' or '.join(PAPER)}")
     given = {f.name: getattr(args, f.name, None) for f in fields(Recipe)}
     start = PAPER[args.network] if args.recipe == "paper" else Recipe(args.network)
     checkpoint = train(

@@ -20,7 +20,7 @@ from edgeperc.points import read_points
 from edgeperc.projection import make_projector
 
 from .augment import SURFACE, LabelledScan, turned
-from .cards import RANGE_IMAGE, RANGE_IMAGE_INPUT
+from .cards import LABELS_POINTS, RANGE_IMAGE, RANGE_IMAGE_INPUT
 
 __all__ = ["pseudo_labelled", "taught", "unlabelled_scans"]
 
@@ -63,8 +63,8 @@ def pseudo_labelled(network: nn.Module, scans: Iterable[LabelledScan], sure: flo
 def taught(network: nn.Module, image: Tensor, kind: str, *, mirror: bool) -> tuple[Tensor, Tensor | None]:
     """What a network says of a batch of inputs: class probabilities (B, C, H, W), and boxes where it finds any.
 
-    With ``mirror`` the probabilities are an average over the scene and its mirror image. ``kind`` is ``"pointseg"``,
-    whose y changes its sign in a mirror, or ``"ssadnet"``.
+    With ``mirror`` the probabilities are an average over the scene and its mirror image. ``kind`` is the network's
+    name; the y of those that label points changes its sign in a mirror.
     """
     with torch.autocast(image.device.type, torch.bfloat16):
         answer = network(image)
@@ -72,7 +72,7 @@ def taught(network: nn.Module, image: Tensor, kind: str, *, mirror: bool) -> tup
         p = logits.float().softmax(1)
         if mirror:
             mirrored = image.flip(-1)
-            if kind == "pointseg":
+            if kind in LABELS_POINTS:
                 mirrored = mirrored.clone()
                 mirrored[:, RANGE_IMAGE_INPUT.channels.index("y")] *= -1.0
             answer = network(mirrored)

@@ -1,4 +1,4 @@
-"""One visible training loop for both networks.
+"""One visible training loop for every network.
 
 Every step draws its samples and its dropout from ``(seed, step)`` alone, so that a run stopped anywhere and resumed
 from its checkpoint ends, bit for bit, where an uninterrupted one ends.
@@ -29,10 +29,12 @@ from edgeperc.projection import make_projector
 from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES
 
 from .augment import LabelledScan, ObjectBank, augmented, swapped
-from .cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT, card_of
+from .cards import LABELS_POINTS, RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT, card_of
 from .losses import box_distillation_loss, dense_targets, distillation_loss, pointseg_loss, slot_targets, ssadnet_loss
 from .networks.edge import PointSegEdge, SSADNetEdge
+from .networks.kulseg import KULSeg
 from .networks.pointseg import PointSeg
+from .networks.squeezesegv2 import SqueezeSegV2
 from .networks.ssadnet import SSADNet
 from .road import sure_surface
 from .selftraining import pseudo_labelled, taught, unlabelled_scans
@@ -51,8 +53,8 @@ VALIDATION_STRIDE = 6
 # Scans whose objects are cut out for pasting; each holds about five.
 BANK_SCANS = 400
 PASTE_ODDS = {
-    "pointseg": {"pedestrian": 0.4, "cyclist": 0.35, "van": 0.15, "truck": 0.1},
-    "ssadnet": {"car": 0.3, "van": 0.4, "truck": 0.3},
+    "points": {"pedestrian": 0.4, "cyclist": 0.35, "van": 0.15, "truck": 0.1},
+    "top_view": {"car": 0.3, "van": 0.4, "truck": 0.3},
 }
 
 
@@ -63,7 +65,8 @@ class Recipe:
     Attributes
     ----------
     network : str
-        ``"ssadnet"`` or ``"pointseg"``.
+        ``"ssadnet"``, which sees the top view, or ``"pointseg"``, ``"squeezesegv2"`` or ``"kulseg"``, which label
+        points.
     head : str
         SSADNet's boxes: ``"slots"`` (the paper's) or ``"dense"``.
     steps, batch : int
@@ -84,7 +87,7 @@ class Recipe:
     swap : float
         Share of scans one sector of which comes from another scan; point labels only.
     paste_cars : float
-        Share of cars among what PointSeg has pasted.
+        Share of cars among what a network that labels points has pasted.
     turn_to_rare : float
         Share of simulated scans turned to a pedestrian or cyclist.
     turn_anywhere : float
@@ -94,7 +97,7 @@ class Recipe:
     class_weights : bool
         Weigh classes in the cross-entropy by how rare they are.
     focal_gamma : float
-        Of PointSeg's cross-entropy.
+        Of the cross-entropy of networks that label points.
     lovasz_weight : float
         Of the Lovasz-softmax loss beside the cross-entropy.
     deep_supervision : float
@@ -106,7 +109,7 @@ class Recipe:
     batch_norm : bool
         In SSADNet's segmentation branch.
     dropout : float
-        SSADNet's spatial dropout, PointSeg's before the last convolution.
+        SSADNet's spatial dropout; before the last convolution of networks that label points.
     distil : float
         Weight of what a teacher's answers are learnt with: cross-entropy towards its class probabilities (Hinton et
         al., 2015), and its dense boxes.
@@ -150,6 +153,11 @@ class Recipe:
     head_only: bool = False
     seed: int = 0
 
+    @property
+    def labels_points(self) -> bool:
+        """Whether the network sees the range image and labels points."""
+        return self.network in LABELS_POINTS
+
 
 EDGE: dict[str, type[nn.Module]] = {"pointseg": PointSegEdge, "ssadnet": SSADNetEdge}
 PLAIN = {
@@ -180,14 +188,20 @@ PAPER = {
 def build(recipe: Recipe) -> nn.Module:
     """The network of a recipe, its weights drawn from the recipe's seed."""
     torch.manual_seed(recipe.seed)
-    if recipe.edge and recipe.network in EDGE:
+    if recipe.edge:
+        if recipe.network not in EDGE:
+            raise ValueError(f"{recipe.network} has no network for small computers; expected {' or '.join(EDGE)}")
         return EDGE[recipe.network]()
     if recipe.network == "pointseg":
         return PointSeg(dropout=recipe.dropout, deep_supervision=recipe.deep_supervision > 0.0)
+    if recipe.network == "squeezesegv2":
+        return SqueezeSegV2(dropout=recipe.dropout)
+    if recipe.network == "kulseg":
+        return KULSeg(dropout=recipe.dropout)
     if recipe.network == "ssadnet":
         width, norm = recipe.context_width, recipe.batch_norm
         return SSADNet(head=recipe.head, context_width=width, batch_norm=norm, dropout=recipe.dropout)
-    raise ValueError(f"network is {recipe.network!r}; expected ssadnet or pointseg")
+    raise ValueError(f"network is {recipe.network!r}; expected ssadnet, pointseg, squeezesegv2 or kulseg")
 
 
 class Samples:
@@ -209,7 +223,7 @@ class Samples:
         if not real and not simulated:
             raise ValueError("no scans to train on; give --kitti, --simulated or both")
         self.recipe, self.real, self.simulated = recipe, real, simulated
-        view = (RANGE_IMAGE, RANGE_IMAGE_INPUT) if recipe.network == "pointseg" else (TOP_VIEW, TOP_VIEW_INPUT)
+        view = (RANGE_IMAGE, RANGE_IMAGE_INPUT) if recipe.labels_points else (TOP_VIEW, TOP_VIEW_INPUT)
         self.projector = make_projector(*view)
         weights = np.asarray(real_weights, np.float64)
         self.real_odds = weights / weights.sum() if len(weights) else weights
@@ -231,7 +245,7 @@ class Samples:
         scan = self._scan(rng)
         if not recipe.augment:
             return scan
-        odds = PASTE_ODDS[recipe.network]
+        odds = PASTE_ODDS["points" if recipe.labels_points else "top_view"]
         if recipe.paste_cars > 0.0:
             others = {name: share * (1.0 - recipe.paste_cars) for name, share in odds.items()}
             odds = {**others, "car": recipe.paste_cars}
@@ -244,7 +258,7 @@ class Samples:
             "weather": recipe.weather,
         }
         scan = augmented(scan, rng, **changes)
-        if recipe.network == "pointseg" and rng.random() < recipe.swap:
+        if recipe.labels_points and rng.random() < recipe.swap:
             scan = swapped(scan, augmented(self._scan(rng), rng, **changes), rng)
         return scan
 
@@ -256,7 +270,7 @@ class Samples:
     def sample(self, scan: LabelledScan) -> tuple[NDArray, ...]:
         """One input (C, H, W) and its targets."""
         points = np.ascontiguousarray(scan.points, np.float32)
-        if self.recipe.network == "pointseg":
+        if self.recipe.labels_points:
             seen = self.projector.project(points)
             truth = np.append(scan.labels, np.uint8(IGNORE))[seen.index]  # an empty pixel's index is -1
             return seen.image, truth
@@ -276,7 +290,7 @@ class Samples:
 
 def loss_of(recipe: Recipe, outputs: Tensor | tuple[Tensor, Tensor], targets: Sequence[Tensor]) -> Tensor:
     """The loss of a recipe."""
-    if recipe.network == "pointseg":
+    if recipe.labels_points:
         weights = torch.tensor(POINT_WEIGHTS, device=targets[0].device) if recipe.class_weights else None
         how = {"focal_gamma": recipe.focal_gamma, "lovasz_weight": recipe.lovasz_weight}
         if not isinstance(outputs, tuple):
@@ -496,14 +510,14 @@ class Watch:
 
     def judge(self, network: nn.Module) -> tuple[float, float, dict[str, float | None]]:
         """The figure that decides (mean IoU of objects, or AP of boxes), the mean loss, and every figure by name."""
-        losses, classes = [], POINT_CLASSES if self.recipe.network == "pointseg" else TOP_VIEW_CLASSES
+        losses, classes = [], POINT_CLASSES if self.recipe.labels_points else TOP_VIEW_CLASSES
         pixels, boxes = Confusion(classes), BoxEvaluator()
         device = next(network.parameters()).device
         for (image, *targets), scan in zip(self.inputs, self.scans, strict=True):
             with torch.no_grad():
                 outputs = network(torch.from_numpy(image[None]).to(device))
             losses.append(float(loss_of(self.recipe, outputs, [torch.from_numpy(t[None]).to(device) for t in targets])))
-            if self.recipe.network == "pointseg":
+            if self.recipe.labels_points:
                 pixels.update(outputs[0].argmax(0).cpu().numpy(), targets[0])
                 continue
             logits, regressed = (output[0].cpu().numpy() for output in outputs)
@@ -512,7 +526,7 @@ class Watch:
             pixels.update(labels, targets[0])
             _update(boxes, found, scan)
         figures = {name: _rounded(iou) for name, iou in zip(classes, pixels.iou(), strict=True)}
-        if self.recipe.network == "pointseg":
+        if self.recipe.labels_points:
             return float(np.nanmean(pixels.iou()[1:])), float(np.mean(losses)), figures
         scores = boxes.overall()
         figures |= {"ap": _rounded(scores.ap), "recall": _rounded(scores.recall)}

@@ -246,6 +246,16 @@ def test_weighted_cross_entropy_with_ignored_pixels(rng, weights, gamma):
     assert loss.item() == pytest.approx(total / share, rel=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("p", "gamma", "expected"),
+    [(0.5, 2.0, 0.25 * np.log(2.0)), (0.9, 2.0, -0.01 * np.log(0.9)), (0.1, 0.5, -(0.9**0.5) * np.log(0.1))],
+)
+def test_the_focal_loss_of_a_pixel_is_its_formula(p, gamma, expected):
+    logits = torch.tensor([np.log(p), np.log(1.0 - p)], dtype=torch.float32).view(1, 2, 1, 1)
+    loss = cross_entropy(logits, torch.zeros((1, 1, 1), dtype=torch.uint8), focal_gamma=gamma)
+    assert loss.item() == pytest.approx(expected, rel=1e-5)
+
+
 @pytest.mark.parametrize("loss", [cross_entropy, lovasz_softmax, lambda x, y: pointseg_loss(x, y, lovasz_weight=1.0)])
 def test_nothing_labelled_costs_nothing(loss):
     logits = torch.randn(2, 4, 3, 3, requires_grad=True)

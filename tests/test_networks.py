@@ -11,7 +11,9 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from edgeperc_export.networks.edge import PointSegEdge, SSADNetEdge, spread
+from edgeperc_export.networks.kulseg import KULSeg
 from edgeperc_export.networks.pointseg import ENLARGEMENT_RATES, Fire, FireDeconv, PointSeg, SqueezeReweight
+from edgeperc_export.networks.squeezesegv2 import ContextAggregation, SqueezeSegV2
 from edgeperc_export.networks.ssadnet import (
     CONTEXT_DILATIONS,
     ELU_GAIN,
@@ -375,6 +377,151 @@ def test_pointseg_adds_its_skips_and_joins_only_the_enlarged():
     agree(got["deconv4"], gave["deconv3"] + gave["fire1"])
     agree(got["classifier"], gave["deconv4"] + gave["skip1"])
     assert torch.equal(gave["classifier"], logits)
+
+
+# --- SqueezeSegV2, KUL-Seg
+
+
+@pytest.mark.parametrize("width", [512, 2048])
+@pytest.mark.parametrize("make", [SqueezeSegV2, KULSeg])
+def test_squeezesegv2_halves_widths_only(make, width):
+    stages = {
+        "fire1": (64, 2),
+        "context1": (64, 2),
+        "fire2": (128, 4),
+        "context2": (128, 4),
+        "context3": (128, 4),
+        "fire5": (256, 8),
+        "fire7": (384, 16),
+        "fire7b": (384, 16),
+        "fire9": (512, 16),
+        "deconv10": (256, 8),
+        "deconv11": (128, 4),
+        "deconv12": (64, 2),
+        "deconv13": (64, 1),
+        "skip1": (64, 1),
+    }
+    logits, seen = run_and_watch(on_meta(make), torch.empty(2, 5, 64, width, device="meta"), *stages)
+    for name, (channels, shrink) in stages.items():
+        assert tuple(seen[name][1].shape) == (2, channels, 64, width // shrink), name
+    assert logits.shape == (2, 4, 64, width)
+
+
+@pytest.mark.parametrize(("height", "width"), [(32, 1024), (5, 16)])
+def test_kulseg_takes_other_sizes(height, width):
+    with torch.inference_mode():
+        logits = KULSeg(n_classes=3).eval()(torch.randn(2, 5, height, width))
+    assert logits.shape == (2, 3, height, width)
+    assert logits.isfinite().all()
+
+
+@pytest.mark.parametrize(("make", "parameters", "gmac"), [(SqueezeSegV2, 915_672, 2.959), (KULSeg, 1_027_128, 3.186)])
+def test_kulseg_costs(make, parameters, gmac):
+    network = on_meta(make)
+    assert n_parameters(network) == parameters
+    assert giga_macs(network, 1, 5, 64, 512) == pytest.approx(gmac, abs=0.001)
+    assert gmac < 0.45 * giga_macs(on_meta(PointSeg), 1, 5, 64, 512)
+
+
+def test_kulseg_is_squeezesegv2_with_a_fire_7b():
+    kulseg, plain = on_meta(KULSeg).state_dict(), on_meta(SqueezeSegV2).state_dict()
+    shape_of = {name: value.shape for name, value in kulseg.items()}
+    added = {name: shape for name, shape in shape_of.items() if name.startswith("fire7b.")}
+    assert {name: value.shape for name, value in plain.items()} == {n: s for n, s in shape_of.items() if n not in added}
+    fire7 = {name: shape for name, shape in shape_of.items() if name.startswith("fire7.")}
+    assert {name.replace("fire7b.", "fire7."): shape for name, shape in added.items()} == fire7
+
+    x = torch.randn(1, 5, 4, 32)
+    _, seen = run_and_watch(KULSeg().eval(), x, "fire7", "fire7b", "fire8")
+    assert seen["fire7b"][0] is seen["fire7"][1]
+    assert seen["fire8"][0] is seen["fire7b"][1]
+    assert not torch.equal(seen["fire7b"][1], seen["fire7"][1])
+    _, seen = run_and_watch(SqueezeSegV2().eval(), x, "fire7", "fire8")
+    assert seen["fire8"][0] is seen["fire7"][1]
+
+
+def test_squeezesegv2_squeezes_as_squeezeseg_does():
+    layers = {name: m for name, m in KULSeg().named_modules() if isinstance(m, (Fire, FireDeconv))}
+    widths = {
+        "fire2": (64, 16, 128),
+        "fire3": (128, 16, 128),
+        "fire4": (128, 32, 256),
+        "fire5": (256, 32, 256),
+        "fire6": (256, 48, 384),
+        "fire7": (384, 48, 384),
+        "fire8": (384, 64, 512),
+        "fire9": (512, 64, 512),
+        "deconv10": (512, 64, 256),
+        "deconv11": (256, 32, 128),
+        "deconv12": (128, 16, 64),
+        "deconv13": (64, 16, 64),
+        "fire7b": (384, 48, 384),
+    }
+    assert {
+        name: (m.squeeze[0].in_channels, m.squeeze[0].out_channels, m.expand1[0].out_channels * 2)
+        for name, m in layers.items()
+    } == widths
+
+
+def test_context_aggregation_scales_by_the_maximum_around():
+    layer = ContextAggregation(32)
+    x = torch.randn(2, 32, 9, 11)
+    with torch.no_grad():
+        actual = layer(x).numpy()
+        w1, b1, w2, b2 = (parameter.squeeze().double().numpy() for parameter in layer.parameters())
+    assert w1.shape == (2, 32)  # a sixteenth
+    for sample, y in zip(x.double().numpy(), actual, strict=True):
+        for row, col in np.ndindex(9, 11):
+            around = sample[:, max(row - 3, 0) : row + 4, max(col - 3, 0) : col + 4].max((1, 2))
+            scale = 1.0 / (1.0 + np.exp(-(w2 @ np.maximum(w1 @ around + b1, 0.0) + b2)))
+            np.testing.assert_allclose(y[:, row, col], sample[:, row, col] * scale, rtol=1e-4, atol=1e-6)
+
+
+def test_context_aggregation_sees_7_by_7():
+    layer = ContextAggregation(16)
+    for parameter in layer.parameters():
+        nn.init.constant_(parameter, 0.1)
+    flat = torch.ones(1, 16, 15, 17)
+    peaked = flat.clone()
+    peaked[0, 0, 7, 8] = 3.0
+    with torch.no_grad():
+        rows, cols = torch.nonzero((layer(peaked) - layer(flat))[0, 1], as_tuple=True)
+    assert (rows.min(), rows.max(), cols.min(), cols.max()) == (4, 10, 5, 11)
+    assert len(rows) == 49
+
+
+def test_squeezesegv2_is_told_where_nothing_returned():
+    x = torch.randn(2, 5, 4, 32)
+    x[0, :, 1, 3:9] = 0.0
+    x[1, 1:, 2, 5] = 0.0  # a return all the same: its x is not 0
+    _, seen = run_and_watch(SqueezeSegV2().eval(), x, "fire1", "skip1")
+    for name in ("fire1", "skip1"):
+        assert torch.equal(seen[name][0][:, :5], x)
+        expected = torch.ones(2, 4, 32)
+        expected[0, 1, 3:9] = 0.0
+        assert torch.equal(seen[name][0][:, 5], expected)
+
+
+def test_squeezesegv2_aggregates_context_three_times_and_adds_its_skips():
+    names = [f"context{i}" for i in (1, 2, 3)] + [f"deconv{i}" for i in (10, 11, 12, 13)]
+    names += ["skip1", "fire1", "fire2", "fire3", "fire4", "fire5", "fire9", "classifier"]
+    logits, seen = run_and_watch(KULSeg().eval(), torch.randn(1, 5, 4, 64), *names)
+    got, gave = ({name: pair[i] for name, pair in seen.items()} for i in (0, 1))
+    assert torch.equal(got["context1"], gave["fire1"])
+    agree(got["fire2"], nn.functional.max_pool2d(gave["context1"], 3, stride=(1, 2), padding=1))
+    assert torch.equal(got["context2"], gave["fire2"])
+    assert torch.equal(got["fire3"], gave["context2"])
+    assert torch.equal(got["context3"], gave["fire3"])
+    agree(got["fire4"], nn.functional.max_pool2d(gave["context3"], 3, stride=(1, 2), padding=1))
+    assert torch.equal(got["deconv10"], gave["fire9"])
+    agree(got["deconv11"], gave["deconv10"] + gave["fire5"])
+    agree(got["deconv12"], gave["deconv11"] + gave["context3"])
+    agree(got["deconv13"], gave["deconv12"] + gave["context1"])
+    agree(got["classifier"], gave["deconv13"] + gave["skip1"])
+    assert torch.equal(gave["classifier"], logits)
+
+
+# --- Networks for small computers
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import math
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .pointseg import conv_bn_relu
+from .pointseg import conv_bn_relu, initialise
 from .ssadnet import HEAT_PRIOR
 
 __all__ = ["PointSegEdge", "SSADNetEdge"]
@@ -31,6 +31,7 @@ class Residual(nn.Module):
         self.first = conv_bn_relu(channels, channels, 3)
         self.second = nn.Conv2d(channels, channels, 3, padding=dilation, dilation=dilation, bias=False)
         self.norm = nn.BatchNorm2d(channels)
+        nn.init.zeros_(self.norm.weight)  # at first nothing but a shortcut
 
     def forward(self, x: Tensor) -> Tensor:
         return F.relu(x + self.norm(self.second(self.first(x))))
@@ -119,17 +120,3 @@ class SSADNetEdge(nn.Module):
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         logits, features = self.trunk(x)
         return logits, self.predict(self.detection(features))
-
-
-def initialise(network: nn.Module, *last: nn.Conv2d) -> None:
-    """He's weights, small ones where the answers come out, and residual blocks that start as nothing but shortcuts."""
-    for module in network.modules():
-        if isinstance(module, nn.Conv2d):
-            nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
-            if module.bias is not None:
-                nn.init.zeros_(module.bias)
-    for module in network.modules():
-        if isinstance(module, Residual):
-            nn.init.zeros_(module.norm.weight)
-    for module in last:
-        nn.init.normal_(module.weight, std=0.01)

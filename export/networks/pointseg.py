@@ -42,13 +42,14 @@ def pool(x: Tensor) -> Tensor:
 
 
 class Fire(nn.Module):
-    """Squeeze to a quarter, expand by 1x1 and 3x3 (section 4.1; Figure 4, left)."""
+    """Squeeze, to a quarter if not told, and expand by 1x1 and 3x3 (section 4.1; Figure 4, left)."""
 
-    def __init__(self, c_in: int, c_out: int) -> None:
+    def __init__(self, c_in: int, c_out: int, c_mid: int | None = None) -> None:
         super().__init__()
-        self.squeeze = conv_bn_relu(c_in, c_in // 4, 1)
-        self.expand1 = conv_bn_relu(c_in // 4, c_out // 2, 1)
-        self.expand3 = conv_bn_relu(c_in // 4, c_out // 2, 3)
+        c_mid = c_in // 4 if c_mid is None else c_mid
+        self.squeeze = conv_bn_relu(c_in, c_mid, 1)
+        self.expand1 = conv_bn_relu(c_mid, c_out // 2, 1)
+        self.expand3 = conv_bn_relu(c_mid, c_out // 2, 3)
 
     def forward(self, x: Tensor) -> Tensor:
         x = self.squeeze(x)
@@ -58,9 +59,9 @@ class Fire(nn.Module):
 class FireDeconv(nn.Module):
     """A fire layer that doubles the width between squeeze and expand (Figure 4, right)."""
 
-    def __init__(self, c_in: int, c_out: int) -> None:
+    def __init__(self, c_in: int, c_out: int, c_mid: int | None = None) -> None:
         super().__init__()
-        c_mid = c_in // 4
+        c_mid = c_in // 4 if c_mid is None else c_mid
         self.squeeze = conv_bn_relu(c_in, c_mid, 1)
         self.deconv = nn.Sequential(
             nn.ConvTranspose2d(c_mid, c_mid, (1, 4), stride=(1, 2), padding=(0, 1), bias=False),
@@ -151,7 +152,7 @@ class PointSeg(nn.Module):
         self.dropout = nn.Dropout2d(dropout)
         self.classifier = nn.Conv2d(64, n_classes, 3, padding=1)
         self.early = nn.Conv2d(128, n_classes, 1) if deep_supervision else None
-        self._initialise()
+        initialise(self, self.classifier)
 
     def forward(self, x: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         skip1 = self.skip1(x)  # (B, 64, 64, 512)
@@ -170,13 +171,16 @@ class PointSeg(nn.Module):
         logits = self.classifier(self.dropout(x))  # (B, 4, 64, 512)
         return logits if early is None else (logits, early)
 
-    def _initialise(self) -> None:
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
-                if module.bias is not None:
-                    nn.init.zeros_(module.bias)
-            elif isinstance(module, nn.ConvTranspose2d):
-                # Of its four taps across, an output pixel meets two.
-                nn.init.normal_(module.weight, std=(2.0 / (2 * module.in_channels)) ** 0.5)
-        nn.init.normal_(self.classifier.weight, std=0.01)
+
+def initialise(network: nn.Module, *last: nn.Conv2d) -> None:
+    """He's weights, and small ones where the answers come out."""
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d):
+            nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+        elif isinstance(module, nn.ConvTranspose2d):
+            # Of its four taps across, an output pixel meets two.
+            nn.init.normal_(module.weight, std=(2.0 / (2 * module.in_channels)) ** 0.5)
+    for module in last:
+        nn.init.normal_(module.weight, std=0.01)
