@@ -151,7 +151,7 @@ def test_openvino_agrees(scan: np.ndarray, right: Answer) -> None:
     assert_agrees(right, answer_of("openvino:fp32", scan))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *(f"{name}-edge" for name in NAMES)])
 def test_torch_has_the_very_network(name: str) -> None:
     torch = pytest.importorskip("torch")
     pytest.importorskip("onnx")
