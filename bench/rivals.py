@@ -181,6 +181,12 @@ def _in_torch(op: str, inputs: Sequence[Any], set_up: Mapping[str, Any]) -> tupl
         _, scales, *sizes = others
         size = sizes[0].tolist()[2:] if sizes else None
         return F.interpolate, [x, size, None if sizes else scales.tolist()[2:], "nearest"]
+    if op == "DepthToSpace" and set_up.get("mode") == b"CRD":
+        return F.pixel_shuffle, [x, set_up["blocksize"]]
+    if op == "Reshape":
+        return torch.reshape, [x, others[0].tolist()]
+    if op == "Transpose":
+        return torch.permute, [x, set_up["perm"]]
     if op == "Cast" and isinstance(x, torch.Tensor):
         return torch.Tensor.float, [x]
     if op == "Cast":  # a mask, by which torch multiplies as it is
