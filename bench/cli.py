@@ -637,7 +637,7 @@ def _growth_with_images(
         beside = sum(took for stage, took in stages.items() if stage != "infer")
         table["rows"].append([f"{percent}", *(report.number(told[q]) for q in ("p50", "p90")), report.number(beside)])
         curve.append((float(percent), float(told["p50"])))
-    table["sentences"] = _line(curve, "per cent of the model's own image")
+    table["sentences"] = ["networks made anew, in fp32", *_line(curve, "per cent of the model's own image")]
     return curve
 
 

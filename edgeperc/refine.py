@@ -343,6 +343,7 @@ def fill_point_labels(
     point_labels : (n,) uint8, overwritten
     """
     height, width = labels.shape
+    ranges = np.full((height, width), -1.0)  # of the pixels, once somebody asks
     # Most hidden points see nothing but background around, and need no vote: 0.5 ms a scan in place of 1.0.
     contested = np.zeros((height, width), dtype=np.bool_)
     for row in range(height):
@@ -379,7 +380,9 @@ def fill_point_labels(
                     c = c % width
                 if index[r, c] < 0:
                     continue
-                gap = abs(distance_to(points, index[r, c]) - own)
+                if ranges[r, c] < 0.0:
+                    ranges[r, c] = distance_to(points, index[r, c])
+                gap = abs(ranges[r, c] - own)
                 if not gap <= MAX_RANGE_GAP_M or (n == N_VOTES and gap >= gaps[n - 1]):
                     continue
                 k = min(n, N_VOTES - 1)
