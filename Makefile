@@ -51,7 +51,7 @@ test-minimal: .venv-minimal/installed
 
 .venv-test/installed: pyproject.toml constraints.txt
 	$(call environment,.venv-test)
-	$(TEST)/pip install --quiet --constraint constraints.txt --editable '.[cpu,openvino,view,peers,test]'
+	$(TEST)/pip install --quiet --constraint constraints.txt --editable '.[cpu,openvino,view,io,peers,test]'
 	@touch $@
 
 .venv-minimal/installed: pyproject.toml constraints.txt

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import Box, PointsError, read_points
-from edgeperc.cli import SCAN_SUFFIXES
+from edgeperc.captures import SCAN_SUFFIXES
 from edgeperc.datasets import simulated_scan
 from edgeperc.evaluate import FIRST_SEED
 from edgeperc.sensors import get_sensor

@@ -36,13 +36,16 @@ from .errors import (
 )
 
 if TYPE_CHECKING:
+    from .captures import read_scans
     from .card import ModelCard
+    from .live import Answer, Stream, stream
     from .perceiver import Perceiver
     from .perception import Box, Perception, PointLabels, TopView
     from .points import read_points
     from .sensors import SensorProfile
 
 __all__ = [
+    "Answer",
     "Box",
     "CardError",
     "CardMismatchError",
@@ -62,22 +65,29 @@ __all__ = [
     "SensorProfile",
     "SettingsError",
     "SplitError",
+    "Stream",
     "TopView",
     "__version__",
     "read_points",
+    "read_scans",
+    "stream",
 ]
 
 __version__ = "0.1.0"
 
 _MODULES = {
+    "Answer": "live",
     "Box": "perception",
     "ModelCard": "card",
     "Perceiver": "perceiver",
     "Perception": "perception",
     "PointLabels": "perception",
     "SensorProfile": "sensors",
+    "Stream": "live",
     "TopView": "perception",
     "read_points": "points",
+    "read_scans": "captures",
+    "stream": "live",
 }
 
 

@@ -16,7 +16,7 @@ import shlex
 import sys
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -25,6 +25,10 @@ from .errors import EdgepercError, MissingExtraError, ModelError, ModelFileError
 
 # What takes long to import (numba's kernels, onnxruntime, matplotlib) is imported where a command needs it.
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from .live import Answer
     from .perceiver import Perceiver
     from .perception import Box, Perception
     from .session import Session
@@ -32,7 +36,6 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 SHIPPED = ("ssadnet", "pointseg")
-SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 # A junction with cars, a truck, pedestrians and a cyclist, most of which are found; far from the seeds that models are
 # trained on.
 DEMO_SCENE = (2_000_000_110, "junction")
@@ -105,7 +108,13 @@ def _parser() -> argparse.ArgumentParser:
         help="perceive scans",
         description="Perceive scans: a line each on the terminal, and the files asked for in DIR.",
     )
-    run.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="scans, or folders of scans")
+    run.add_argument(
+        "paths",
+        nargs="+",
+        type=Path,
+        metavar="PATH",
+        help="scans, folders of scans, or captures: .pcap, .osf, .bag, .mcap, a ROS 2 bag's folder (extra 'io')",
+    )
     run.add_argument("--out", type=Path, metavar="DIR", help="where files go; NAME.png and so on")
     run.add_argument("--json", action="store_true", help="one JSON object a scan on the output, and nothing else there")
     run.add_argument("--png", action="store_true", help="a picture of each scan (needs the extra 'view')")
@@ -118,6 +127,9 @@ def _parser() -> argparse.ArgumentParser:
         default="warn",
         help="a scan unlike those a model was trained on: warn, fail that scan, or say nothing (default: warn)",
     )
+    run.add_argument("--topic", metavar="NAME", help="which topic of a bag, or serial number in an Ouster capture")
+    run.add_argument("--live", action="store_true", help="replay one PATH in its own time; the newest scan wins")
+    run.add_argument("--rate", type=_rate, default=10.0, metavar="HZ", help="scans a second (default: 10)")
     run.set_defaults(command=_run, usage_error=run.error)
 
     info = commands.add_parser(
@@ -163,6 +175,13 @@ def _positive(text: str) -> int:
     return value
 
 
+def _rate(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{value} is no rate; expected scans a second, above 0")
+    return value
+
+
 def _one_line(words: object) -> str:
     return " ".join(str(words).split())
 
@@ -199,19 +218,22 @@ def _perceiver(
 
 def _run(arguments: argparse.Namespace) -> int:
     kinds = [kind for kind in ("png", "html", "labels", "ply") if getattr(arguments, kind)]
+    if arguments.live and (kinds or len(arguments.paths) > 1):
+        arguments.usage_error("--live replays one PATH and writes no files")
     if kinds and arguments.out is None:
         arguments.usage_error(f"--{kinds[0]} writes files; add --out DIR")
     if arguments.out is not None and not kinds:
         arguments.usage_error("--out DIR without anything to write; add --png, --html, --labels or --ply")
     if arguments.png:
         _require_matplotlib()
-    scans, empty = _find_scans(arguments.paths)
+    scans, empty = (arguments.paths, []) if arguments.live else _find_scans(arguments.paths)
     targets = [arguments.out / name for name in _output_names(scans)] if kinds else [Path()] * len(scans)
-    files = [{kind: _file_of(target, kind) for kind in kinds} for target in targets]
     sources = {os.path.realpath(scan) for scan in scans}
-    for file in (file for of_scan in files for file in of_scan.values()):
+    for file in (_file_of(target, kind) for target in targets for kind in kinds):
         if os.path.realpath(file) in sources:
             arguments.usage_error(f"{file} is one of the scans and would be overwritten; choose another --out")
+
+    from .perception import Perception
 
     perceive = _perceiver(arguments, arguments.sensor, arguments.on_mismatch)
     if (arguments.labels or arguments.ply) and not any(card.view.kind == "range_image" for card in perceive.cards):
@@ -220,38 +242,85 @@ def _run(arguments: argparse.Namespace) -> int:
         target.parent.mkdir(parents=True, exist_ok=True)
 
     progress = _Progress(len(scans))
-    n_failed = 0
+    n_told = n_failed = 0
 
-    def fail(source: Path, error: Exception) -> None:
-        nonlocal n_failed
-        n_failed += 1
+    def tell(source: Path, outcome: Perception | Answer | Exception) -> None:
+        nonlocal n_told, n_failed
+        if isinstance(outcome, MissingExtraError):
+            raise outcome
+        n_told += 1
         progress.clear()
-        _complain(f"{source}: {str(error).removeprefix(f'{source}: ')}")
+        if isinstance(outcome, Exception):
+            n_failed += 1
+            _complain(f"{source}: {str(outcome).removeprefix(f'{source}: ')}")
+            if arguments.json:
+                print(json.dumps({"scan": str(source), "error": _one_line(outcome)}), flush=True)
+            return
+        answer, perception = (None, outcome) if isinstance(outcome, Perception) else (outcome, outcome.perception)
+        timing = None if answer is None else _timing(answer)
         if arguments.json:
-            print(json.dumps({"scan": str(source), "error": _one_line(error)}), flush=True)
+            record = {"scan": str(source), "stamp_s": perception.stamp_s, "live": timing, **_record(perception)}
+            print(json.dumps(record, allow_nan=False), flush=True)
+        else:
+            words = "  ".join(f"{key} {value}" for key, value in (timing or {}).items())
+            print(f"{source}  {words}{'  ' * bool(words)}{_summary(perception)}", flush=True)
 
     for folder in empty:
-        fail(folder, PointsError(f"no scan in this folder; expected {', '.join(SCAN_SUFFIXES)}"))
+        tell(folder, PointsError("no scan in this folder; expected scans, captures or a ROS 2 bag's metadata.yaml"))
     started = time.perf_counter()
-    for done, (scan, wanted) in enumerate(zip(scans, files, strict=True), start=1):
-        try:
-            perception = _perceive_file(perceive, scan, wanted)
-        except MissingExtraError:
-            raise
-        except (EdgepercError, OSError) as exc:
-            fail(scan, exc)
-        else:
-            progress.clear()
-            if arguments.json:
-                print(json.dumps({"scan": str(scan), **_record(perception)}, allow_nan=False), flush=True)
-            else:
-                print(f"{scan}  {_summary(perception)}", flush=True)
+    for done, (scan, target) in enumerate(zip(scans, targets, strict=True), start=1):
+        answers = (
+            _live(perceive, scan, arguments) if arguments.live else _each(perceive, scan, target, kinds, arguments)
+        )
+        for source, outcome in answers:
+            tell(source, outcome)
         progress.show(done)
     progress.clear()
-    if len(scans) > 1:
-        each_ms = 1e3 * (time.perf_counter() - started) / len(scans)
-        print(f"{len(scans)} scans, {n_failed} failed, {each_ms:.0f} ms a scan with files", file=sys.stderr)
+    if n_told - len(empty) > 1:
+        each_ms = 1e3 * (time.perf_counter() - started) / (n_told - len(empty))
+        things = "answers" if arguments.live else "scans"
+        print(f"{n_told} {things}, {n_failed} failed, {each_ms:.0f} ms each with files", file=sys.stderr)
     return 1 if n_failed else 0
+
+
+def _each(
+    perceive: Perceiver, path: Path, target: Path, kinds: Sequence[str], arguments: argparse.Namespace
+) -> Iterator[tuple[Path, Perception | Exception]]:
+    """Every scan of a file, those of a capture numbered, and what was perceived or what went wrong."""
+    from .captures import is_capture, read_scans
+
+    try:
+        numbered = is_capture(path)
+        for k, (stamp_s, points) in enumerate(read_scans(path, topic=arguments.topic)):
+            name, file = (path / f"{k:06d}", target / f"{k:06d}") if numbered else (path, target)
+            outcome: Perception | Exception
+            try:
+                outcome = perceive(points, stamp_s)
+                if kinds and numbered:
+                    target.mkdir(exist_ok=True)
+                _write(points, outcome, {kind: _file_of(file, kind) for kind in kinds}, title=str(name))
+            except (EdgepercError, OSError) as exc:
+                outcome = exc
+            yield name, outcome
+    except (EdgepercError, OSError) as exc:
+        yield path, exc
+
+
+def _live(perceive: Perceiver, path: Path, arguments: argparse.Namespace) -> Iterator[tuple[Path, Answer | Exception]]:
+    """Answers of a stream, and what went wrong, as they come."""
+    from .live import stream
+
+    with stream(path, perceive, rate_hz=arguments.rate, topic=arguments.topic) as answers:
+        outcome: Answer | Exception | None
+        while True:
+            try:
+                outcome = answers.take()
+            except StopIteration:
+                return
+            except (EdgepercError, OSError) as exc:
+                outcome = exc
+            assert outcome is not None
+            yield path, outcome
 
 
 def _require_matplotlib() -> None:
@@ -262,17 +331,15 @@ def _require_matplotlib() -> None:
 
 
 def _find_scans(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """Scans in the order given, folders opened and sorted, none twice; and the folders that hold none."""
+    """Scans and captures in the order given, folders opened and sorted, none twice; and the folders that hold none."""
+    from .captures import is_capture, scan_files
+
     scans: dict[str, Path] = {}
     empty = []
     for path in paths:
         found = [path]
-        if path.is_dir():
-            found = sorted(
-                entry
-                for entry in path.iterdir()
-                if entry.suffix.lower() in SCAN_SUFFIXES and not entry.name.startswith(".") and entry.is_file()
-            )
+        if path.is_dir() and not is_capture(path):
+            found = scan_files(path)
             if not found:
                 empty.append(path)
         for scan in found:
@@ -305,21 +372,27 @@ def _file_of(target: Path, kind: str) -> Path:
     return target.with_name(f"{target.name}.{'label' if kind == 'labels' else kind}")
 
 
-def _perceive_file(perceive: Perceiver, scan: Path, wanted: Mapping[str, Path]) -> Perception:
+def _write(points: NDArray[np.float32], perception: Perception, wanted: Mapping[str, Path], title: str) -> None:
     from . import view
-    from .points import read_points
 
-    points = read_points(scan)
-    perception = perceive(points)
     if "png" in wanted:
-        view.draw(points, perception, wanted["png"], title=str(scan))
+        view.draw(points, perception, wanted["png"], title=title)
     if "html" in wanted:
-        view.write_html(points, perception, wanted["html"], title=str(scan))
+        view.write_html(points, perception, wanted["html"], title=title)
     if "labels" in wanted:
         view.write_labels(perception, wanted["labels"])
     if "ply" in wanted:
         view.write_ply(points, perception, wanted["ply"])
-    return perception
+
+
+def _timing(answer: Answer) -> dict[str, Any]:
+    """What `run --live` says of an answer beside what was perceived."""
+    return {
+        "age_ms": round(1e3 * answer.age_s, 3),
+        "health": answer.health,
+        "scans": answer.n_scans,
+        "dropped": answer.n_dropped,
+    }
 
 
 def _record(perception: Perception) -> dict[str, Any]:
@@ -545,13 +618,13 @@ def _nested(name: str, value: Any) -> list[tuple[str, str]]:
 def _scan_rows(path: Path, sensor_name: str) -> list[tuple[str, str]]:
     import numpy as np
 
+    from .captures import read_scans
     from .models import model_path, shipped_models
-    from .points import read_points
     from .sensors import FitnessProfile, check_fitness, get_sensor
     from .session import Session
 
     sensor = get_sensor(sensor_name)
-    points = read_points(path)
+    _, points = next(read_scans(path))  # of several the first
     finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
     rows = [("scan", str(path)), ("points", f"{len(points):,}, of which {len(points) - len(finite):,} are not finite")]
     if len(finite):

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import warnings
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,9 +15,9 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from edgeperc import __version__, cli
+from edgeperc import __version__, captures, cli
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
-from edgeperc.errors import InferenceError, ModelFileError
+from edgeperc.errors import InferenceError, ModelFileError, PointsError
 from edgeperc.perception import Box, Perception, PointLabels, TopView
 
 POINTSEG = ModelCard(
@@ -87,7 +88,7 @@ class FakePerceiver:
             stage_ms={"project": 1.0, "infer": 20.25},
             providers={card.name: "CPUExecutionProvider (fp32)" for card in self.cards},
             fitness=("the scan has 32 beams",) if len(points) == 5 else (),
-            stamp_s=None,
+            stamp_s=stamp_s,
         )
 
 
@@ -220,6 +221,8 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pyte
     assert answers[0] == {"scan": str(bad), "error": "pointseg answered with NaN"}
     assert answers[1] == {
         "scan": str(good),
+        "stamp_s": None,
+        "live": None,
         "n_points": 5,
         "n_dropped": 0,
         "stage_ms": {"project": 1.0, "infer": 20.25},
@@ -264,6 +267,87 @@ def test_folders_are_opened_and_sorted(tmp_path: Path, capsys: pytest.CaptureFix
     assert answers[0]["scan"] == str(bare)
     assert "no scan in this folder" in answers[0]["error"]
     assert answers[1]["n_points"] == 40
+
+
+@pytest.fixture
+def capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A capture of three scans, cut short; the second of them makes the perceiver choke."""
+    path = tmp_path / "drive.pcap"
+    path.write_bytes(b"\xd4\xc3\xb2\xa1")
+
+    def read_scans(source: Path, topic: str | None = None) -> Iterator[tuple[float, np.ndarray]]:
+        if source != path:
+            yield from real(source, topic=topic)
+            return
+        for k in range(3):
+            points = np.full((10 + k, 4), 0.5, np.float32)
+            points[0, 3] = float(k == 1)
+            yield 100.0 + k, points
+        raise PointsError(f"{path}: cut short, topic {topic}")
+
+    real = captures.read_scans
+    monkeypatch.setattr(captures, "read_scans", read_scans)
+    return path
+
+
+def test_the_scans_of_a_capture_are_numbered(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan = write_scan(tmp_path / "in" / "a.bin")
+    out = tmp_path / "out"
+    assert run("run", capture, scan, "--json", "--labels", "--out", out, "--topic", "/left") == 1
+    captured = capsys.readouterr()
+    answers = [json.loads(line) for line in captured.out.splitlines()]
+    names = [*(str(capture / f"{k:06d}") for k in range(3)), str(capture), str(scan)]
+    assert [answer["scan"] for answer in answers] == names
+    assert [answer.get("n_points") for answer in answers] == [10, None, 12, None, 40]
+    assert [answer.get("stamp_s") for answer in answers] == [100.0, None, 102.0, None, None]
+    assert answers[1]["error"] == "pointseg answered with NaN"
+    assert answers[3]["error"].endswith("cut short, topic /left")
+    assert "5 scans, 2 failed" in captured.err
+    written = {file.relative_to(out).as_posix(): file.stat().st_size // 4 for file in out.rglob("*.label")}
+    assert written == {"drive/000000.label": 10, "drive/000002.label": 12, "a.label": 40}
+    assert run("info", capture) == 0
+    assert "10, of which 0 are not finite" in capsys.readouterr().out
+
+
+def test_a_missing_reader_is_said_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n")
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    assert run("run", tmp_path / "drive.bag") == 2
+    assert "pip install 'edgeperc[io]'" in capsys.readouterr().err
+
+
+def test_live(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "scans"
+    for k in range(4):
+        write_scan(folder / f"{k}.bin", 10 + k)
+    assert run("run", folder, "--live", "--rate", 1000, "--json") == 0
+    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert {answer["scan"] for answer in answers} == {str(folder)}
+    assert answers[-1]["n_points"] == 13
+    assert answers[-1]["stamp_s"] == pytest.approx(0.003)
+    last = answers[-1]["live"]
+    assert last["scans"] == 4
+    assert last["dropped"] == 4 - len(answers)
+    assert last["health"] in {"OK", "LATE", "STALE"}
+    assert last["age_ms"] >= 0.0
+    (folder / "4.bin").write_bytes(b"123")
+    assert run("run", folder, "--live", "--rate", 1000) == 1
+    captured = capsys.readouterr()
+    assert "4.bin" in captured.err
+    words = captured.out.splitlines()[-1].split("  ")
+    assert words[0] == str(folder)
+    assert [word.split()[0] for word in words[1:5]] == ["age_ms", "health", "scans", "dropped"]
+    assert words[5] == "13 points"
+
+
+def test_live_goes_on_after_a_scan_that_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_scan(tmp_path / "a.bin", 10, first_remission=1.0)
+    assert run("run", tmp_path, "--live", "--json") == 1
+    (answer,) = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert answer == {"scan": str(tmp_path), "error": "pointseg answered with NaN"}
+    assert run("run", tmp_path / "absent", "--live") == 2
+    assert "there is no such file or folder" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("matplotlib")
@@ -329,6 +413,10 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: t
         (("--png",), "add --out"),
         (("--out", tmp_path / "out"), "add --png"),
         (("--on-mismatch", "explode"), "invalid choice"),
+        (("--rate", "0"), "above 0"),
+        (("--rate", "nan"), "above 0"),
+        (("--live", "--ply", "--out", tmp_path / "out"), "--live replays one PATH"),
+        ((scan, "--live"), "--live replays one PATH"),
     ]:
         assert usage_code("run", scan, *arguments) == 2
         assert words in capsys.readouterr().err

@@ -27,13 +27,15 @@ MAY_IMPORT = {
     "session": {"errors", "settings"} | NOUNS,
     "splits": set(),
     "metrics": {"errors"} | NOUNS,
+    "captures": {"errors", "points"},
     "datasets": {"errors", "points", "simulation", "splits"} | NOUNS,
+    "live": {"captures", "errors", "perception"},
     "figures": {"metrics"},
     "evaluate": {"datasets", "errors", "figures", "metrics", "models", "perceiver", "view"} | NOUNS | STAGES,
     "view": {"errors"} | NOUNS,
     "perceiver": {"errors", "models"} | NOUNS | STAGES,
-    "cli": {"errors", "evaluate", "models", "perceiver", "view"} | NOUNS | STAGES,
-    "__init__": {"errors", "perceiver"} | NOUNS | STAGES,
+    "cli": {"captures", "errors", "evaluate", "live", "models", "perceiver", "view"} | NOUNS | STAGES,
+    "__init__": {"captures", "errors", "live", "perceiver"} | NOUNS | STAGES,
     "__main__": {"cli"},
 }
 

@@ -1,0 +1,310 @@
+"""Scans as they come, answers as fast as they can be had: the newest scan wins, and nothing queues up."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from .captures import read_scans
+from .errors import PointsError
+from .perception import Perception
+
+__all__ = ["Answer", "Health", "Stream", "stream"]
+
+Health = Literal["OK", "LATE", "STALE"]
+
+# How long `Stream.close` waits for a source that is busy reading.
+_PATIENCE_S = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """What is known of the newest scan, and how old that is.
+
+    Attributes
+    ----------
+    points : array_like
+        The scan as it came; ``perception.points.labels`` holds a label for each of its points.
+    perception : Perception
+    tracks : object
+        What the tracker made of the perception; None without one.
+    stamp_s : float
+        The time given with the scan [s]; without one, that of its arrival on this computer's monotonic clock.
+    age_s : float
+        How long ago the scan arrived, when the answer was ready [s].
+    health : {"OK", "LATE", "STALE"}
+        Of this age, see `Stream`.
+    n_scans : int
+        Scans that had come when this one was taken up.
+    n_dropped : int
+        How many of these nobody looked at, as a newer one was there.
+    """
+
+    points: Any
+    perception: Perception
+    tracks: Any
+    stamp_s: float
+    age_s: float
+    health: Health
+    n_scans: int
+    n_dropped: int
+
+
+def stream(
+    source: str | os.PathLike[str] | Iterable[Any],
+    perceiver: Callable[..., Perception],
+    tracker: Callable[[Perception], Any] | None = None,
+    *,
+    rate_hz: float = 10.0,
+    late_after_s: float | None = None,
+    stale_after_s: float | None = None,
+    topic: str | None = None,
+) -> Stream:
+    """Answers to a live source, each to the newest scan there is; reading begins at once.
+
+    Parameters
+    ----------
+    source : iterable, str or path
+        Any iterable of scans, each as points or as a tuple (stamp_s, points); a thread of its own reads it, as fast as
+        it gives, and a scan once given must not be written to. Or a scan, a folder or a capture
+        (`edgeperc.read_scans`), replayed in its own time: by its stamps or, where it has none, at ``rate_hz``.
+    perceiver : callable
+        ``perceiver(points, stamp_s=stamp_s) -> Perception``, such as a `Perceiver`.
+    tracker : callable, optional
+        ``tracker(perception) -> tracks``.
+    rate_hz : float
+        Of the sensor.
+    late_after_s, stale_after_s : float, optional
+        Ages above which what is known is late or stale; by default two and five periods of the sensor.
+    topic : str, optional
+        As in `edgeperc.read_scans`.
+
+    Raises
+    ------
+    PointsError
+        When the source is no iterable, no path, or a path of nothing.
+    ValueError
+        When the rate is not above 0, or not 0 < late_after_s <= stale_after_s.
+
+    Examples
+    --------
+    >>> with stream("drive/velodyne", perceive) as live:        # doctest: +SKIP
+    ...     for answer in live:
+    ...         print(answer.age_s, answer.health, answer.n_dropped, answer.perception.boxes)
+    """
+    if not 0.0 < rate_hz < math.inf:
+        raise ValueError(f"rate_hz is {rate_hz}; expected scans a second, above 0")
+    late_s = 2.0 / rate_hz if late_after_s is None else late_after_s
+    stale_s = max(5.0 / rate_hz, late_s) if stale_after_s is None else stale_after_s
+    if not 0.0 < late_s <= stale_s:
+        raise ValueError(f"late_after_s is {late_s} and stale_after_s {stale_s}; expected 0 < late <= stale")
+    inbox = _Inbox()
+    if isinstance(source, str | os.PathLike):
+        scans: Iterator[Any] = _paced(read_scans(Path(source), topic=topic), rate_hz, inbox.stopped)
+    else:
+        try:
+            scans = iter(source)
+        except TypeError as exc:
+            raise PointsError(f"got a source of type {type(source).__name__}; expected scans or a path") from exc
+    return Stream(inbox, scans, perceiver, tracker, late_s, stale_s)
+
+
+class Stream:
+    """An iterator of `Answer` that reads its source in a thread; made by `stream`.
+
+    Of the scans that came the newest alone is kept. Perceiver and tracker run in the caller's thread, when the next
+    answer is asked for. Their errors arise there, and the scan after can be asked for as ever. So does an error of the
+    source, behind the answer to the last scan before it; then the stream is at its end.
+
+    Health goes by age alone: ``"OK"`` up to ``late_after_s``, ``"LATE"`` up to ``stale_after_s``, then ``"STALE"``. An
+    answer has the health it had when it was ready. That of the stream is the newest answer's now, so it tells when the
+    source has fallen silent, too; any thread may ask, while another waits for an answer.
+
+    Leave the ``with`` block, call `close` or let go of the stream, and reading stops. A source that blocks for ever
+    cannot be interrupted; its thread holds neither perceiver nor results, ends with the next scan that the source
+    gives, and does not keep the process alive.
+
+    Attributes
+    ----------
+    late_after_s, stale_after_s : float
+    """
+
+    def __init__(
+        self,
+        inbox: _Inbox,
+        scans: Iterator[Any],
+        perceiver: Callable[..., Perception],
+        tracker: Callable[[Perception], Any] | None,
+        late_after_s: float,
+        stale_after_s: float,
+    ) -> None:
+        self.late_after_s, self.stale_after_s = late_after_s, stale_after_s
+        self._inbox, self._perceiver, self._tracker = inbox, perceiver, tracker
+        self._newest_s = -math.inf
+        self._thread = threading.Thread(target=_read, args=(scans, inbox), name="edgeperc-source", daemon=True)
+        weakref.finalize(self, inbox.stop)
+        self._thread.start()
+
+    def __iter__(self) -> Stream:
+        return self
+
+    def __next__(self) -> Answer:
+        answer = self.take()
+        assert answer is not None
+        return answer
+
+    def take(self, timeout_s: float | None = None) -> Answer | None:
+        """The answer to the newest scan that has not been looked at, as ``next()`` gives it, but waiting no longer.
+
+        Parameters
+        ----------
+        timeout_s : float, optional
+            How long to wait for a scan; the time to perceive it comes on top.
+
+        Returns
+        -------
+        Answer or None
+            None when no scan came in time.
+
+        Raises
+        ------
+        StopIteration
+            The source is at its end, or the stream is closed.
+        Exception
+            Whatever the source, the perceiver or the tracker raised.
+        """
+        taken = self._inbox.take(timeout_s)
+        if taken is None:
+            return None
+        (points, stamp_s, arrived_s), n_scans, n_dropped = taken
+        perception = self._perceiver(points, stamp_s=stamp_s)
+        tracks = None if self._tracker is None else self._tracker(perception)
+        self._newest_s = arrived_s
+        age_s = time.monotonic() - arrived_s
+        return Answer(points, perception, tracks, stamp_s, age_s, self._health_at(age_s), n_scans, n_dropped)
+
+    @property
+    def age_s(self) -> float:
+        """How long ago the scan arrived that was answered last [s]; infinite before the first."""
+        return time.monotonic() - self._newest_s
+
+    @property
+    def health(self) -> Health:
+        """Of this age."""
+        return self._health_at(self.age_s)
+
+    def _health_at(self, age_s: float) -> Health:
+        if age_s > self.stale_after_s:
+            return "STALE"
+        return "LATE" if age_s > self.late_after_s else "OK"
+
+    @property
+    def n_scans(self) -> int:
+        """Scans that have come."""
+        return self._inbox.n_scans
+
+    @property
+    def n_dropped(self) -> int:
+        """How many of these nobody looked at, as a newer one was there."""
+        return self._inbox.n_dropped
+
+    def close(self) -> None:
+        """Stop reading; whoever waits for an answer gets none. Waits for the thread unless its source blocks."""
+        self._inbox.stop()
+        self._thread.join(_PATIENCE_S)
+
+    def __enter__(self) -> Stream:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class _Inbox:
+    """The newest scan, between the thread that reads and the one that answers."""
+
+    def __init__(self) -> None:
+        self.stopped = threading.Event()
+        self.n_scans = self.n_dropped = 0
+        self._changed = threading.Condition()
+        self._scan: tuple[Any, float, float] | None = None
+        self._ended = False
+        self._error: BaseException | None = None
+
+    def put(self, points: Any, stamp_s: float | None) -> None:
+        arrived_s = time.monotonic()
+        with self._changed:
+            self.n_scans += 1
+            self.n_dropped += self._scan is not None
+            self._scan = points, arrived_s if stamp_s is None else stamp_s, arrived_s
+            self._changed.notify()
+
+    def end(self, error: BaseException | None) -> None:
+        with self._changed:
+            self._ended, self._error = True, error
+            self._changed.notify_all()
+
+    def stop(self) -> None:
+        with self._changed:
+            self.stopped.set()
+            self._changed.notify_all()
+
+    def take(self, timeout_s: float | None) -> tuple[tuple[Any, float, float], int, int] | None:
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._scan or self._ended or self.stopped.is_set(), timeout_s):
+                return None
+            if self.stopped.is_set():
+                raise StopIteration
+            scan, self._scan = self._scan, None
+            if scan is not None:
+                return scan, self.n_scans, self.n_dropped
+            error, self._error = self._error, None
+        if error is not None:
+            raise error
+        raise StopIteration
+
+
+def _read(scans: Iterator[Any], inbox: _Inbox) -> None:
+    """Run in the thread: every scan into the inbox, and at last the end or the error."""
+    error: BaseException | None = None
+    try:
+        for scan in scans:
+            if inbox.stopped.is_set():
+                break
+            inbox.put(*_stamped(scan))
+    except BaseException as exc:  # handed to whoever asks for the next answer
+        error = exc
+    inbox.end(error)
+
+
+def _stamped(scan: Any) -> tuple[Any, float | None]:
+    if not isinstance(scan, tuple):
+        return scan, None
+    try:
+        stamp_s, points = scan
+        return points, None if stamp_s is None else float(stamp_s)
+    except (TypeError, ValueError) as exc:
+        raise PointsError(f"got a tuple that is no scan ({exc}); expected points or (stamp_s, points)") from exc
+
+
+def _paced(
+    scans: Iterator[tuple[float | None, Any]], rate_hz: float, stopped: threading.Event
+) -> Iterator[tuple[float, Any]]:
+    """Recorded scans when they are due: by their stamps or, without, at the sensor's rate; a late one comes at once."""
+    started_s = time.monotonic()
+    first_s: float | None = None
+    for k, (stamp_s, points) in enumerate(scans):
+        moment_s = k / rate_hz if stamp_s is None else stamp_s
+        if first_s is None:
+            # The first scan is read, and whatever reads it imported, before the clock starts.
+            started_s, first_s = time.monotonic(), moment_s
+        if stopped.wait(max(0.0, started_s + moment_s - first_s - time.monotonic())):
+            return
+        yield moment_s, points

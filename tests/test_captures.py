@@ -1,0 +1,661 @@
+"""Captures become scans, or `PointsError` says why not: synthetic ones made here, and real ones where there are any."""
+
+from __future__ import annotations
+
+import random
+import struct
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import edgeperc
+from edgeperc.captures import cloud_points, is_capture, read_scans, scan_files
+from edgeperc.errors import MissingExtraError, PointsError
+
+POINTS = np.array(
+    [[12.5, -3.25, -1.75, 0.25], [40.0, 8.5, 2.0, 99.0], [np.nan, 1.0, 1.0, 0.5], [5.0, np.inf, 0.0, 255.0]], np.float32
+)
+
+
+def error_of(path: Path, **options: Any) -> str:
+    """What is said of a capture of which nothing can be read."""
+    with pytest.raises(PointsError) as caught:
+        next(read_scans(path, **options))
+    assert str(path) in str(caught.value)
+    return str(caught.value)
+
+
+def read_until_error(path: Path) -> tuple[list[Any], str]:
+    scans: list[Any] = []
+    with pytest.raises(PointsError) as caught:
+        scans.extend(read_scans(path))
+    return scans, str(caught.value)
+
+
+# --- point clouds of ROS ---------------------------------------------------------------------------------------------
+
+FLOATS = (("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"))
+TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+
+def field(name: str, offset: int, kind: str, count: int = 1) -> SimpleNamespace:
+    return SimpleNamespace(name=name, offset=offset, datatype=TYPES[kind], count=count)
+
+
+def cloud(
+    points: np.ndarray,
+    layout: Sequence[tuple[str, str]] = FLOATS,
+    *,
+    order: str = "<",
+    padding: int = 0,
+    height: int = 1,
+    row_padding: int = 0,
+) -> SimpleNamespace:
+    """A message's attributes, its bytes packed by struct, field by field."""
+    columns = {"x": 0, "y": 1, "z": 2, "intensity": 3}
+    codes = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
+    fields, offset = [], 0
+    for name, kind in layout:
+        fields.append(field(name, offset, kind))
+        offset += int(kind[1])
+    step = offset + padding
+    width = len(points) // height
+    data = bytearray()
+    for k, point in enumerate(points):
+        for name, kind in layout:
+            value = point[columns[name]] if name in columns else 7
+            data += struct.pack(order + codes[kind], value if kind[0] == "f" else int(value))
+        data += b"\xab" * padding
+        if (k + 1) % width == 0:
+            data += b"\xcd" * row_padding
+    return SimpleNamespace(
+        height=height,
+        width=width,
+        fields=fields,
+        is_bigendian=order == ">",
+        point_step=step,
+        row_step=width * step + row_padding,
+        data=bytes(data),
+        is_dense=False,
+    )
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("remission", [*TYPES])
+@pytest.mark.parametrize("coordinate", ["f4", "f8"])
+def test_clouds_of_any_type(order: str, remission: str, coordinate: str) -> None:
+    points = POINTS.copy()
+    points[:, 3] = [0, 1, 100, 127]
+    layout = (("ring", "u2"), ("intensity", remission), ("z", coordinate), ("t", "f8"), ("x", coordinate), ("y", "f4"))
+    got = cloud_points(cloud(points, layout, order=order, padding=5))
+    assert got.dtype == np.float32
+    assert got.flags.c_contiguous
+    np.testing.assert_array_equal(got, points)
+
+
+def test_clouds_of_whole_numbers() -> None:
+    points = np.array([[1, -2, 3, 4], [-500, 600, -7, 8]], np.float32)
+    layout = (("x", "i2"), ("y", "i4"), ("z", "i2"), ("intensity", "u1"))
+    np.testing.assert_array_equal(cloud_points(cloud(points, layout)), points)
+
+
+@pytest.mark.parametrize("row_padding", [0, 3, 16])
+def test_organised_clouds_are_read_row_by_row(row_padding: int) -> None:
+    message = cloud(POINTS, FLOATS, padding=4, height=2, row_padding=row_padding)
+    np.testing.assert_array_equal(cloud_points(message), POINTS)
+    message.data = message.data[: len(message.data) - row_padding]  # the last row's padding may be left out
+    np.testing.assert_array_equal(cloud_points(message), POINTS)
+
+
+def test_other_kinds_of_bytes_and_fields() -> None:
+    message = cloud(POINTS, FLOATS, padding=12)
+    message.fields += [field("descriptor", 16, "f4", count=3), field("x", 0, "f4", count=0)]
+    for data in (message.data, bytearray(message.data), np.frombuffer(message.data, np.uint8)):
+        message.data = data
+        np.testing.assert_array_equal(cloud_points(message), POINTS)
+    message.row_step = 0  # as some drivers write where there is one row
+    np.testing.assert_array_equal(cloud_points(message), POINTS)
+
+
+def test_the_remission_is_the_field_asked_for() -> None:
+    message = cloud(POINTS, (*FLOATS, ("reflectivity", "u2")))
+    assert cloud_points(message, remission_field="reflectivity")[:, 3].tolist() == [7.0] * 4
+    np.testing.assert_array_equal(cloud_points(message)[:, 3], POINTS[:, 3])
+    assert cloud_points(cloud(POINTS, FLOATS[:3]))[:, 3].tolist() == [0.0] * 4
+    with pytest.raises(PointsError, match="no number field 'echo'"):
+        cloud_points(message, remission_field="echo")
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (1, 0), (0, 7)])
+def test_a_cloud_of_no_points_is_a_scan(shape: tuple[int, int]) -> None:
+    message = cloud(POINTS)
+    message.height, message.width = shape
+    message.data = b""
+    assert cloud_points(message).shape == (0, 4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"data": b"\0" * 63}, "holds 63 bytes; expected 64"),
+        ({"width": 5}, "expected 80"),
+        ({"width": -1}, "declares 1 x -1 points"),
+        ({"height": 3, "row_step": 8}, "in rows of 8"),
+        ({"width": 2**60}, "holds 64 bytes"),
+        ({"point_step": 8}, "layout is impossible"),
+        ({"point_step": 0}, "layout is impossible"),
+        ({"fields": []}, "no number field x, y, z"),
+        ({"fields": [field("x", 0, "f4"), field("y", 4, "f4")]}, "no number field z among x, y"),
+        ({"fields": [field("x", 0, "f4", 2), field("y", 4, "f4"), field("z", 8, "f4")]}, "no number field x"),
+        ({"fields": [field("x", 2**40, "f4")]}, "layout is impossible"),
+        ({"fields": [field("x", -4, "f4")]}, "layout is impossible"),
+        ({"fields": None}, "layout is impossible"),
+        ({"data": None}, "layout is impossible"),
+        ({"height": "many"}, "layout is impossible"),
+    ],
+)
+def test_clouds_that_are_none(changes: dict[str, Any], words: str) -> None:
+    message = cloud(POINTS)
+    vars(message).update(changes)
+    with pytest.raises(PointsError, match=words):
+        cloud_points(message)
+    with pytest.raises(PointsError, match="layout is impossible"):
+        cloud_points(object())
+
+
+# --- bags ------------------------------------------------------------------------------------------------------------
+
+LIDAR, OTHER = "/lidar/points", "/imu/words"
+
+
+def messages(typesys: Any, ros: int) -> tuple[Any, list[tuple[str, str, int, Any]]]:
+    """A type store, and (topic, type, time of recording [ns], message): three clouds and a word between."""
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if ros == 1 else typesys.Stores.ROS2_HUMBLE)
+    types = store.types
+    told = []
+    for k in range(3):
+        source = cloud(POINTS + np.float32(k), order="<>"[k % 2], padding=2)
+        stamp = (
+            types["builtin_interfaces/msg/Time"](100 + k, 500_000_000)
+            if k < 2
+            else types["builtin_interfaces/msg/Time"](0, 0)
+        )
+        header = types["std_msgs/msg/Header"](*([k] if ros == 1 else []), stamp, "lidar")
+        fields = [types["sensor_msgs/msg/PointField"](f.name, f.offset, f.datatype, f.count) for f in source.fields]
+        message = types["sensor_msgs/msg/PointCloud2"](
+            header,
+            source.height,
+            source.width,
+            fields,
+            source.is_bigendian,
+            source.point_step,
+            source.row_step,
+            np.frombuffer(source.data, np.uint8),
+            False,
+        )
+        told.append((LIDAR, "sensor_msgs/msg/PointCloud2", (200 + k) * 10**9, message))
+        told.append((OTHER, "std_msgs/msg/String", (200 + k) * 10**9 + 1, types["std_msgs/msg/String"]("word")))
+    return store, told
+
+
+def write_bag1(path: Path, renamed: Callable[[int, str], str] = lambda k, topic: topic) -> Path:
+    typesys, rosbag1 = pytest.importorskip("rosbags.typesys"), pytest.importorskip("rosbags.rosbag1")
+    store, told = messages(typesys, 1)
+    with rosbag1.Writer(path) as bag:
+        connections: dict[str, Any] = {}
+        for k, (name, kind, stamp_ns, message) in enumerate(told):
+            topic = renamed(k, name)
+            if topic not in connections:
+                connections[topic] = bag.add_connection(topic, kind, typestore=store)
+            bag.write(connections[topic], stamp_ns, store.serialize_ros1(message, kind))
+    return path
+
+
+def write_bag2(folder: Path) -> Path:
+    typesys, rosbag2 = pytest.importorskip("rosbags.typesys"), pytest.importorskip("rosbags.rosbag2")
+    store, told = messages(typesys, 2)
+    newer = {"version": 8} if hasattr(rosbag2, "StoragePlugin") else {}
+    with rosbag2.Writer(folder, **newer) as bag:
+        connections = {
+            topic: bag.add_connection(topic, kind, typestore=store)
+            for topic, kind in dict.fromkeys((topic, kind) for topic, kind, _, _ in told)
+        }
+        for topic, kind, stamp_ns, message in told:
+            bag.write(connections[topic], stamp_ns, store.serialize_cdr(message, kind))
+    return folder
+
+
+def sized(content: bytes) -> bytes:
+    return struct.pack("<I", len(content)) + content
+
+
+def record(opcode: int, content: bytes) -> bytes:
+    return bytes([opcode]) + struct.pack("<Q", len(content)) + content
+
+
+def write_mcap(path: Path, profile: bytes = b"ros2") -> Path:
+    """MCAP by its specification: header, schemas, channels and messages, without chunks or an index."""
+    typesys = pytest.importorskip("rosbags.typesys")
+    store, told = messages(typesys, 2)
+    magic = b"\x89MCAP0\r\n"
+    content = magic + record(1, sized(profile) + sized(b"test"))
+    channels = [*dict.fromkeys((topic, kind) for topic, kind, _, _ in told)]
+    for k, (topic, kind) in enumerate(channels, start=1):
+        definition, _ = store.generate_msgdef(kind, ros_version=2)
+        content += record(
+            3, struct.pack("<H", k) + sized(kind.encode()) + sized(b"ros2msg") + sized(definition.encode())
+        )
+        content += record(4, struct.pack("<HH", k, k) + sized(topic.encode()) + sized(b"cdr") + sized(b""))
+    for n, (topic, kind, stamp_ns, message) in enumerate(told):
+        header = struct.pack("<HIQQ", channels.index((topic, kind)) + 1, n, stamp_ns, stamp_ns)
+        content += record(5, header + bytes(store.serialize_cdr(message, kind)))
+    content += record(15, bytes(4)) + record(2, bytes(20)) + magic
+    path.write_bytes(content)
+    return path
+
+
+def write_mcap_folder(folder: Path) -> Path:
+    folder.mkdir()
+    write_mcap(folder / "bag_0.mcap")
+    topics = "".join(
+        f"""
+  - message_count: 3
+    topic_metadata: {{name: {topic}, type: {kind}, serialization_format: cdr, offered_qos_profiles: ''}}"""
+        for topic, kind in ((LIDAR, "sensor_msgs/msg/PointCloud2"), (OTHER, "std_msgs/msg/String"))
+    )
+    (folder / "metadata.yaml").write_text(
+        f"""rosbag2_bagfile_information:
+  version: 5
+  storage_identifier: mcap
+  duration: {{nanoseconds: 2000000001}}
+  starting_time: {{nanoseconds_since_epoch: 200000000000}}
+  message_count: 6
+  compression_format: ''
+  compression_mode: ''
+  relative_file_paths: [bag_0.mcap]
+  topics_with_message_count:{topics}
+"""
+    )
+    return folder
+
+
+BAGS = {"ros1.bag": write_bag1, "ros2": write_bag2, "one.mcap": write_mcap, "mcap": write_mcap_folder}
+
+
+@pytest.mark.parametrize("name", [*BAGS])
+def test_bags(tmp_path: Path, name: str) -> None:
+    """Three clouds of alternating byte order; the last has no stamp of its own, and the recorder's stands in."""
+    path = BAGS[name](tmp_path / name)
+    assert is_capture(path)
+    for topic in (None, LIDAR):
+        scans = list(edgeperc.read_scans(str(path), topic=topic))
+        assert [stamp for stamp, _ in scans] == pytest.approx([100.5, 101.5, 202.0])
+        for k, (_, points) in enumerate(scans):
+            np.testing.assert_array_equal(points, POINTS + np.float32(k))
+    words = error_of(path, topic="/camera/points")
+    assert f"no topic of type sensor_msgs/PointCloud2 '/camera/points'; there are {LIDAR}" in words
+    assert f"of other types {OTHER} (std_msgs/msg/String)" in words
+
+
+def test_a_bag_with_several_lidars_asks_which(tmp_path: Path) -> None:
+    path = write_bag1(tmp_path / "two.bag", lambda k, topic: "/rear/points" if k == 2 else topic)
+    words = error_of(path)
+    assert f"expected one topic of type sensor_msgs/PointCloud2, there are {LIDAR}, /rear/points" in words
+    assert "topic=" in words
+    assert [stamp for stamp, _ in read_scans(path, topic="/rear/points")] == pytest.approx([101.5])
+    assert len(list(read_scans(path, topic=LIDAR))) == 2
+
+
+def test_a_bag_without_lidar_says_what_it_holds(tmp_path: Path) -> None:
+    typesys, rosbag1 = pytest.importorskip("rosbags.typesys"), pytest.importorskip("rosbags.rosbag1")
+    store, told = messages(typesys, 1)
+    path = tmp_path / "words.bag"
+    with rosbag1.Writer(path) as bag:
+        connection = bag.add_connection(OTHER, "std_msgs/msg/String", typestore=store)
+        bag.write(connection, 1, store.serialize_ros1(told[1][3], "std_msgs/msg/String"))
+    words = error_of(path)
+    assert "expected one topic of type sensor_msgs/PointCloud2, there is none" in words
+    assert f"{OTHER} (std_msgs/msg/String)" in words
+    empty = tmp_path / "empty.bag"
+    with rosbag1.Writer(empty) as bag:
+        bag.add_connection(LIDAR, "sensor_msgs/msg/PointCloud2", typestore=store)
+    assert "damaged" in (words := error_of(empty)) or "no message" in words
+
+
+@pytest.mark.parametrize("name", ["ros1.bag", "one.mcap"])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.7, 0.99])
+def test_bags_that_are_cut_short(tmp_path: Path, name: str, share: float) -> None:
+    path = BAGS[name](tmp_path / name)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    assert "damaged or cut short" in error_of(path)
+
+
+def test_a_database_that_is_cut_short(tmp_path: Path) -> None:
+    folder = write_bag2(tmp_path / "bag")
+    (database,) = folder.glob("*.db3")
+    assert "read with the folder it lies in" in error_of(database)
+    content = database.read_bytes()
+    for share in (0.0, 0.2, 0.8):
+        database.write_bytes(content[: int(share * len(content))])
+        scans, words = read_until_error(folder)
+        assert len(scans) < 3
+        assert str(folder) in words
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
+    error_of(folder)
+
+
+def test_an_mcap_of_another_profile(tmp_path: Path) -> None:
+    assert "cannot be read" in error_of(write_mcap(tmp_path / "other.mcap", profile=b"protobuf"))
+
+
+# --- packets ---------------------------------------------------------------------------------------------------------
+
+
+def write_pcap(path: Path, payloads: Sequence[bytes], endian: str = "<") -> Path:
+    """UDP in IPv4 in Ethernet, 1 ms apart."""
+    content = struct.pack(endian + "IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
+    for k, payload in enumerate(payloads):
+        udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
+        ip = struct.pack(">BBHHHBBHII", 0x45, 0, 20 + len(udp), k % 65536, 0, 64, 17, 0, 0xC0A80001, 0xFFFFFFFF) + udp
+        frame = bytes(12) + b"\x08\x00" + ip
+        content += struct.pack(endian + "IIII", 1000 + k // 1000, 1000 * (k % 1000), len(frame), len(frame)) + frame
+    path.write_bytes(content)
+    return path
+
+
+def vlp16_packets(n_turns: float, metres: float = 10.0, intensity: int = 77) -> list[bytes]:
+    """A VLP-16 in a sphere: 12 blocks of two firings of 16 lasers a packet, 0.4 degrees from block to block."""
+    hundredths = np.arange(int(n_turns * 900)) * 40
+    returns = struct.pack("<HB", round(metres / 0.002), intensity) * 32
+    packets = []
+    for k in range(0, len(hundredths) - 11, 12):
+        blocks = b"".join(b"\xff\xee" + struct.pack("<H", h % 36000) + returns for h in hundredths[k : k + 12])
+        packets.append(blocks + struct.pack("<IBB", 1_000_000 + 1327 * (k // 12), 0x37, 0x22))
+    return packets
+
+
+@pytest.mark.parametrize("endian", ["<", ">"])
+def test_a_velodyne_capture(tmp_path: Path, endian: str) -> None:
+    pytest.importorskip("velodyne_decoder")
+    gps = b"$GPRMC".ljust(512, b"\0")
+    packets = vlp16_packets(2.5)
+    path = write_pcap(tmp_path / "vlp16.pcap", [gps, *packets, gps], endian)
+    scans = list(read_scans(path))
+    assert sum(len(points) for _, points in scans) == len(packets) * 12 * 32
+    assert len(scans) == 3  # two turns, and half a one
+    assert 28_000 < len(scans[0][1]) <= len(scans[1][1]) + 400
+    stamps = [stamp for stamp, _ in scans]
+    assert stamps == sorted({*stamps})
+    for _, points in scans:
+        assert points.dtype == np.float32
+        assert points.shape[1] == 4
+        np.testing.assert_allclose(np.linalg.norm(points[:, :3], axis=1), 10.0, atol=0.06)  # lasers sit off the origin
+        assert {*points[:, 3].tolist()} == {77.0}
+    elevation = np.degrees(np.arcsin(scans[1][1][:, 2] / 10.0))
+    assert (elevation.min(), elevation.max()) == pytest.approx((-15.0, 15.0), abs=0.2)
+    # Clockwise from straight ahead, as Velodyne counts, and y is to the left.
+    first = scans[0][1]
+    azimuth = np.degrees(np.arctan2(first[:3000, 1], first[:3000, 0]))
+    assert azimuth[0] == pytest.approx(0.0, abs=0.5)
+    assert azimuth[-1] == pytest.approx(-3000 / 32 * 0.4, abs=1.0)
+
+
+def test_an_hdl_64e_is_scaled_as_kitti_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    velodyne = pytest.importorskip("velodyne_decoder")
+    path = write_pcap(tmp_path / "hdl64.pcap", vlp16_packets(0.1))
+
+    found: list[Any] = []
+
+    def read_pcap(file: str, config: Any) -> Iterator[Any]:
+        config.model = found[-1]
+        yield SimpleNamespace(device=1.0), np.full((2, 8), 51.0, np.float32)
+
+    monkeypatch.setattr(velodyne, "read_pcap", read_pcap)
+    for model, remission in ((velodyne.Model.HDL64E_S2, 0.2), (velodyne.Model.VLP32C, 51.0), (None, 51.0)):
+        found.append(model)
+        ((_, points),) = list(read_scans(path))
+        assert points[:, 3].tolist() == pytest.approx([remission] * 2)
+        assert points[0, :3].tolist() == [51.0] * 3
+
+
+def test_a_velodyne_capture_that_is_cut_short(tmp_path: Path) -> None:
+    """What came before the cut is read; velodyne-decoder alone would say nothing."""
+    pytest.importorskip("velodyne_decoder")
+    path = write_pcap(tmp_path / "cut.pcap", vlp16_packets(1.8))
+    path.write_bytes(path.read_bytes()[:-300])
+    scans, words = read_until_error(path)
+    assert len(scans) == 2
+    assert "the file ends inside packet 135" in words
+
+
+@pytest.fixture(scope="module")
+def ouster(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with sphere.pcap, its metadata and sphere.osf: three turns of 64 x 512, every other column empty."""
+    core, pcap = pytest.importorskip("ouster.sdk.core"), pytest.importorskip("ouster.sdk.pcap")
+    osf = pytest.importorskip("ouster.sdk.osf")
+    folder = tmp_path_factory.mktemp("ouster")
+    info = core.SensorInfo.from_default(core.LidarMode._512x10)
+    info.sn = 991
+    info.format.udp_profile_lidar = core.UDPProfileLidar.RNG19_RFL8_SIG16_NIR16
+    info.config.udp_port_lidar, info.config.udp_port_imu = 7502, 7503
+    frames = []
+    for k in range(3):
+        frame = core.LidarFrame(info)
+        frame.frame_id = k + 1
+        frame.field("RANGE")[:, 1::2] = 10_000  # mm
+        frame.field("REFLECTIVITY")[:] = 40 + k
+        frame.field("SIGNAL")[:] = 4000 + k
+        frame.timestamp[:] = np.arange(512) * 195_312 + (5 + k) * 10**9
+        frame.measurement_id[:] = np.arange(512)
+        frame.packet_timestamp[:] = 10**18
+        frame.status[:] = 1
+        frames.append(frame)
+    layout = core.PacketFormat(info)
+    packets = [p for frame in frames for p in core.frame_to_packets(frame, layout, info.init_id, info.sn)]
+    assert pcap.record(packets, str(folder / "sphere.pcap")) == len(packets)
+    (folder / "sphere.json").write_text(info.to_json_string())
+    with osf.Writer(str(folder / "sphere.osf"), info) as writer:
+        for frame in frames:
+            writer.save(0, frame)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["sphere.pcap", "sphere.osf"])
+def test_an_ouster_capture(ouster: Path, name: str) -> None:
+    scans = list(read_scans(ouster / name))
+    assert [stamp for stamp, _ in scans] == pytest.approx([5.0998, 6.0998, 7.0998], abs=1e-4)  # of the last column
+    for k, (_, points) in enumerate(scans):
+        assert points.dtype == np.float32
+        assert points.shape == (64 * 256, 4)  # what did not return is left out
+        np.testing.assert_allclose(np.linalg.norm(points[:, :3] - [0, 0, 0.036], axis=1), 10.0, atol=0.05)
+        assert {*points[:, 3].tolist()} == {40.0 + k}
+    # A turn begins behind the sensor's back, clockwise: first to the left.
+    assert scans[0][1][:8, 0].max() < -9.0
+    assert (scans[0][1][2:40, 1] > 0.0).all()
+    signal = [points[0, 3] for _, points in read_scans(ouster / name, remission_field="signal")]
+    assert signal == [4000.0, 4001.0, 4002.0]
+    assert "no field 'ECHO' for the remission" in error_of(ouster / name, remission_field="echo")
+    assert "no sensor '17'; there are 991" in error_of(ouster / name, topic="17")
+    assert len(list(read_scans(ouster / name, topic="991"))) == 3
+
+
+def test_an_ouster_capture_without_its_metadata(ouster: Path, tmp_path: Path) -> None:
+    path = tmp_path / "alone.pcap"
+    path.write_bytes((ouster / "sphere.pcap").read_bytes())
+    words = error_of(path)
+    assert "metadata" in words
+    assert ".json whose name begins alike" in words
+    (tmp_path / "alone.json").write_text("{}")
+    assert "cannot be read" in error_of(path)
+
+
+def test_an_ouster_capture_that_is_cut_short(ouster: Path, tmp_path: Path) -> None:
+    path = tmp_path / "cut.pcap"
+    content = (ouster / "sphere.pcap").read_bytes()
+    path.write_bytes(content[: int(0.6 * len(content))])
+    (tmp_path / "cut.json").write_text((ouster / "sphere.json").read_text())
+    scans, words = read_until_error(path)
+    assert len(scans) == 2
+    assert len(scans[0][1]) == 64 * 256 > len(scans[1][1]) > 0
+    assert "cut short or damaged: the file ends inside packet" in words
+
+
+def test_a_damaged_osf_is_refused_before_it_can_do_harm(ouster: Path, tmp_path: Path) -> None:
+    """The SDK ends the process on some of these."""
+    path, content = tmp_path / "damaged.osf", (ouster / "sphere.osf").read_bytes()
+    chance = random.Random(0)
+    for _ in range(60):
+        damaged = bytearray(content)
+        for _ in range(chance.choice((1, 3, 200))):
+            at = chance.randrange(len(damaged))
+            damaged[at] ^= chance.randrange(1, 256)
+        path.write_bytes(damaged)
+        error_of(path)
+    at = 0
+    while at < len(content):  # cut between blocks
+        path.write_bytes(content[:at])
+        error_of(path)
+        path.write_bytes(content[: at + 6])
+        error_of(path)
+        at += 8 + struct.unpack_from("<I", content, at)[0]
+
+
+def test_packets_of_no_lidar(tmp_path: Path, ouster: Path) -> None:
+    path = write_pcap(tmp_path / "other.pcap", [b"name server" * 9] * 7)
+    assert "no Velodyne's packets" in error_of(path)
+    path.with_suffix(".json").write_text((ouster / "sphere.json").read_text())
+    assert "of its 7 packets none is a LiDAR's" in error_of(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("empty.pcap", b"", "cut short: 0 bytes"),
+        ("header.pcap", struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1), "0 packets|cannot be read"),
+        ("half.pcap", b"\xd4\xc3\xb2\xa1\x02\0\x04\0", "cut short: 8 bytes"),
+        ("words.pcap", b"no capture at all, but words", "no pcap file by its first bytes"),
+        ("new.pcapng", b"\n\r\r\n" + bytes(40), "editcap -F pcap"),
+        ("new.pcap", b"\n\r\r\n" + bytes(40), "editcap -F pcap"),
+        ("words.bag", b"no bag at all", "damaged"),
+        ("empty.bag", b"", "damaged"),
+        ("words.mcap", b"no capture at all", "damaged"),
+        ("words.osf", b"no capture at all", "damaged"),
+        ("empty.osf", b"", "damaged"),
+        ("words.db3", b"no database", "folder it lies in"),
+    ],
+)
+def test_files_that_are_no_captures(tmp_path: Path, name: str, content: bytes, words: str) -> None:
+    for module in ("rosbags.highlevel", "ouster.sdk.pcap", "velodyne_decoder"):
+        pytest.importorskip(module)
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(PointsError, match=words):
+        next(read_scans(path))
+
+
+@pytest.mark.parametrize(
+    ("name", "modules"),
+    [
+        ("vlp16.pcap", ("velodyne_decoder",)),
+        ("other.pcap", ("ouster", "ouster.sdk", "ouster.sdk.pcap")),
+        ("frames.osf", ("ouster", "ouster.sdk", "ouster.sdk.osf")),
+        ("drive.bag", ("rosbags", "rosbags.highlevel")),
+        ("drive.mcap", ("rosbags", "rosbags.highlevel")),
+    ],
+)
+def test_without_the_extra_the_line_that_installs_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, modules: Sequence[str]
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(b"#ROSBAG V2.0\n")
+    if path.suffix == ".pcap":
+        write_pcap(path, vlp16_packets(0.1) if name == "vlp16.pcap" else [b"other"])
+    for module in modules:
+        monkeypatch.setitem(sys.modules, module, None)
+    if name == "frames.osf":
+        path.write_bytes(b"")
+    with pytest.raises(MissingExtraError, match=r"pip install 'edgeperc\[io\]'"):
+        next(read_scans(path))
+
+
+# --- folders and files -----------------------------------------------------------------------------------------------
+
+
+def test_a_scan_file_is_one_scan(tmp_path: Path) -> None:
+    POINTS.tofile(tmp_path / "a.bin")
+    ((stamp, points),) = list(read_scans(tmp_path / "a.bin"))
+    assert stamp is None
+    np.testing.assert_array_equal(points, POINTS)
+    assert not is_capture(tmp_path / "a.bin")
+    assert not is_capture(tmp_path)
+    assert not is_capture(tmp_path / "absent")
+    with pytest.raises(PointsError, match="there is no such file or folder"):
+        read_scans(tmp_path / "absent.pcap")
+
+
+def test_a_folder_is_read_by_name(tmp_path: Path) -> None:
+    for k, name in enumerate(("b.npy", "a.NPY", ".hidden.npy", "c.npy")):
+        with (tmp_path / name).open("wb") as file:
+            np.save(file, np.full((k + 1, 4), k, np.float32))
+    (tmp_path / "notes.txt").write_text("no scan")
+    (tmp_path / "folder.bin").mkdir()
+    assert [file.name for file in scan_files(tmp_path)] == ["a.NPY", "b.npy", "c.npy"]
+    assert [len(points) for _, points in read_scans(tmp_path)] == [2, 1, 4]
+    (tmp_path / "b.npy").write_bytes(b"damaged")
+    scans, words = read_until_error(tmp_path)
+    assert len(scans) == 1
+    assert "b.npy" in words
+    with pytest.raises(PointsError, match="no scan in this folder"):
+        next(read_scans(tmp_path / "folder.bin"))
+
+
+def test_what_a_file_begins_with_decides(tmp_path: Path) -> None:
+    path = write_bag1(tmp_path / "drive.bag").rename(tmp_path / "drive.bag.1")
+    assert is_capture(path)
+    assert "there is none" not in error_of(path, topic="/nowhere")
+
+
+# --- real captures ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "sizes", "beams", "most"),
+    [
+        ("velodyne/sample_velodyne_hdl32.pcap", [58169, 58078, 30458], (-31.0, 11.0), 255.0),
+        ("velodyne/sample_velodyne_vlp16_gps.pcap", [18790, 18701, 18678, 17317], (-15.5, 15.5), 190.0),
+        ("ouster/OS-0-128-U1_v2.3.0_1024x10.pcap", [97299], (-47.0, 47.0), 255.0),
+        ("ouster/OS-1-64_1024x10_fw20.pcap", [16749], (-19.0, 19.0), 255.0),
+    ],
+)
+def test_real_captures(
+    data_root: Callable[[str], Path], name: str, sizes: list[int], beams: tuple[float, float], most: float
+) -> None:
+    path = data_root("other_sensors") / name
+    pytest.importorskip("velodyne_decoder" if name.startswith("velodyne") else "ouster.sdk.pcap")
+    scans = list(read_scans(path))
+    assert [len(points) for _, points in scans] == sizes
+    assert max(points[:, 3].max() for _, points in scans) == most
+    for _, points in scans:
+        assert np.isfinite(points).all()
+        distance = np.linalg.norm(points[:, :3], axis=1)
+        far = distance > 1.0  # nearer, a laser's own place in the housing shows in its elevation
+        elevation = np.degrees(np.arcsin(points[far, 2] / distance[far]))
+        assert beams[0] < elevation.min() < elevation.max() < beams[1]
+    stamps = np.array([stamp for stamp, _ in scans], np.float64)
+    assert ((np.diff(stamps) > 0.04) & (np.diff(stamps) < 0.13)).all()
+
+
+def test_real_metadata_that_is_malformed(data_root: Callable[[str], Path], tmp_path: Path) -> None:
+    pytest.importorskip("ouster.sdk.pcap")
+    folder = data_root("other_sensors") / "ouster"
+    path = tmp_path / "os0.pcap"
+    path.write_bytes((folder / "OS-0-128-U1_v2.3.0_1024x10.pcap").read_bytes())
+    for metadata in sorted((folder / "metadata_malformed").glob("*.json")):
+        path.with_suffix(".json").write_bytes(metadata.read_bytes())
+        assert "LiDAR" in (words := error_of(path)) or "cannot be read" in words
