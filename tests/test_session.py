@@ -33,7 +33,8 @@ def edited(tmp_path: Path, name: str, *changes: tuple[bytes, bytes]) -> Path:
 def test_a_shipped_model_gives_the_exporters_answers(name: str) -> None:
     session = Session(model_path(name), "cpu")
     assert session.card.name == name
-    assert session.provider == "CPUExecutionProvider (fp32)"
+    precision = "int8" if name.endswith("-int8") else "fp32"
+    assert session.provider == f"CPUExecutionProvider ({precision})"
     assert session.golden_deviation < 0.01
     assert len(session.sha256) == 64
 
