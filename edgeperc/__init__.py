@@ -33,6 +33,8 @@ from .errors import (
     SensorError,
     SettingsError,
     SplitError,
+    StampError,
+    TrackingError,
 )
 
 if TYPE_CHECKING:
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
     from .perception import Box, Perception, PointLabels, TopView
     from .points import read_points
     from .sensors import SensorProfile
+    from .tracking import Track, Tracker, Tracks
 
 __all__ = [
     "Answer",
@@ -65,8 +68,13 @@ __all__ = [
     "SensorProfile",
     "SettingsError",
     "SplitError",
+    "StampError",
     "Stream",
     "TopView",
+    "Track",
+    "Tracker",
+    "TrackingError",
+    "Tracks",
     "__version__",
     "read_points",
     "read_scans",
@@ -85,6 +93,9 @@ _MODULES = {
     "SensorProfile": "sensors",
     "Stream": "live",
     "TopView": "perception",
+    "Track": "tracking",
+    "Tracker": "tracking",
+    "Tracks": "tracking",
     "read_points": "points",
     "read_scans": "captures",
     "stream": "live",

@@ -1,4 +1,4 @@
-"""The ``edgeperc`` command: ``demo``, ``run``, ``info`` and ``eval``.
+"""The ``edgeperc`` command: ``demo``, ``run``, ``info``, ``eval`` and ``eval tracking``.
 
 Exit codes: 0 all is well, 1 some scans failed (each is reported, the others are done), 2 nothing could be done
 (usage, model, provider, a missing extra), 130 interrupted, 141 the reader of the output went away.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import itertools
 import json
 import math
 import os
@@ -16,7 +17,7 @@ import shlex
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from .perceiver import Perceiver
     from .perception import Box, Perception
     from .session import Session
+    from .tracking.tracker import Tracks
 
 __all__ = ["main"]
 
@@ -55,7 +57,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code; wrong usage leaves by argparse's ``SystemExit(2)``.
     """
     words = sys.argv[1:] if argv is None else list(argv)
-    arguments = _parser().parse_args(words, argparse.Namespace(typed=shlex.join(["edgeperc", *words])))
+    # argparse knows no commands of a command that takes paths, too; a data set called so is given as ./tracking.
+    spelled = ["eval-tracking", *words[2:]] if words[:2] == ["eval", "tracking"] else words
+    arguments = _parser().parse_args(spelled, argparse.Namespace(typed=shlex.join(["edgeperc", *words])))
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names need not fit the terminal's encoding
     try:
@@ -121,6 +125,8 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--html", action="store_true", help="a page with the labelled points in 3-D, for a browser")
     run.add_argument("--labels", action="store_true", help="NAME.label: a uint32 a point, SemanticKITTI's layout")
     run.add_argument("--ply", action="store_true", help="the points with their labels and colours")
+    run.add_argument("--track", action="store_true", help="follow the boxes from scan to scan: the scans are a drive")
+    run.add_argument("--gif", action="store_true", help="tracks.gif: the tracks from above (needs the extra 'view')")
     run.add_argument(
         "--on-mismatch",
         choices=("warn", "raise", "ignore"),
@@ -129,7 +135,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--topic", metavar="NAME", help="which topic of a bag, or serial number in an Ouster capture")
     run.add_argument("--live", action="store_true", help="replay one PATH in its own time; the newest scan wins")
-    run.add_argument("--rate", type=_rate, default=10.0, metavar="HZ", help="scans a second (default: 10)")
+    run.add_argument(
+        "--rate", type=_rate, default=10.0, metavar="HZ", help="scans a second, where they bear no stamps (default: 10)"
+    )
     run.set_defaults(command=_run, usage_error=run.error)
 
     info = commands.add_parser(
@@ -165,6 +173,34 @@ def _parser() -> argparse.ArgumentParser:
     judge.add_argument("--worst", type=Path, metavar="PNG", help="a picture of the scans with most mistakes")
     judge.add_argument("--provider", default="cpu", metavar="P", help="as in run (default: cpu)")
     judge.set_defaults(command=_eval)
+
+    follow = commands.add_parser(
+        "eval-tracking",
+        prog="edgeperc eval tracking",
+        help="the tracking figures on KITTI's sequences; also written: eval tracking",
+        description="Track the given detections of KITTI's sequences, without ego poses, and hold the tracks against "
+        "the labels: CLEAR-MOT at the score with the best MOTA, its averages over forty recalls, HOTA.",
+    )
+    follow.add_argument("root", type=Path, metavar="ROOT", help="holds label_02, calib and detections/DETECTOR_CLASS")
+    follow.add_argument("--sequences", nargs="+", metavar="SEQ", help="such as 0000 0002 (default: all with labels)")
+    follow.add_argument(
+        "--classes",
+        nargs="+",
+        choices=("car", "pedestrian", "cyclist", "vehicle"),
+        default=["car", "pedestrian", "cyclist"],
+        metavar="CLASS",
+        help="of car, pedestrian, cyclist (all three by default) and vehicle: cars, vans and trucks (with --boxes)",
+    )
+    follow.add_argument(
+        "--boxes",
+        type=Path,
+        metavar="FILE",
+        help="boxes to track in place of the detections: what run --json printed of the one sequence's scans",
+    )
+    follow.add_argument("--iou", type=float, default=0.25, metavar="X", help="3-D overlap of a match (default: 0.25)")
+    follow.add_argument("--json", type=Path, metavar="FILE", help="every figure")
+    follow.add_argument("--gif", type=Path, metavar="FILE", help="the first sequence's tracks from above")
+    follow.set_defaults(command=_eval_tracking, usage_error=follow.error)
     return parser
 
 
@@ -218,14 +254,18 @@ def _perceiver(
 
 def _run(arguments: argparse.Namespace) -> int:
     kinds = [kind for kind in ("png", "html", "labels", "ply") if getattr(arguments, kind)]
-    if arguments.live and (kinds or len(arguments.paths) > 1):
+    if arguments.live and (kinds or arguments.gif or len(arguments.paths) > 1):
         arguments.usage_error("--live replays one PATH and writes no files")
-    if kinds and arguments.out is None:
-        arguments.usage_error(f"--{kinds[0]} writes files; add --out DIR")
-    if arguments.out is not None and not kinds:
-        arguments.usage_error("--out DIR without anything to write; add --png, --html, --labels or --ply")
+    if (kinds or arguments.gif) and arguments.out is None:
+        arguments.usage_error(f"--{[*kinds, 'gif'][0]} writes files; add --out DIR")
+    if arguments.out is not None and not kinds and not arguments.gif:
+        arguments.usage_error("--out DIR without anything to write; add --png, --html, --labels, --ply or --gif")
+    if arguments.gif and not arguments.track:
+        arguments.usage_error("--gif shows tracks; add --track")
     if arguments.png:
         _require_matplotlib()
+    if arguments.gif:
+        _require_pillow()
     scans, empty = (arguments.paths, []) if arguments.live else _find_scans(arguments.paths)
     targets = [arguments.out / name for name in _output_names(scans)] if kinds else [Path()] * len(scans)
     sources = {os.path.realpath(scan) for scan in scans}
@@ -240,11 +280,13 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ModelError("--labels and --ply need a class for every point; add a range-image model: --model pointseg")
     for target in targets if kinds else ():
         target.parent.mkdir(parents=True, exist_ok=True)
+    follow = _follower(arguments.rate) if arguments.track else None
+    followed: list[Tracks] = []
 
     progress = _Progress(len(scans))
     n_told = n_failed = 0
 
-    def tell(source: Path, outcome: Perception | Answer | Exception) -> None:
+    def tell(source: Path, outcome: Perception | Answer | Exception, tracks: Tracks | None = None) -> None:
         nonlocal n_told, n_failed
         if isinstance(outcome, MissingExtraError):
             raise outcome
@@ -258,24 +300,34 @@ def _run(arguments: argparse.Namespace) -> int:
             return
         answer, perception = (None, outcome) if isinstance(outcome, Perception) else (outcome, outcome.perception)
         timing = None if answer is None else _timing(answer)
+        if tracks is not None and arguments.gif:
+            followed.append(tracks)
         if arguments.json:
-            record = {"scan": str(source), "stamp_s": perception.stamp_s, "live": timing, **_record(perception)}
+            record = {"scan": str(source), "stamp_s": perception.stamp_s, "live": timing, **_record(perception, tracks)}
             print(json.dumps(record, allow_nan=False), flush=True)
         else:
             words = "  ".join(f"{key} {value}" for key, value in (timing or {}).items())
-            print(f"{source}  {words}{'  ' * bool(words)}{_summary(perception)}", flush=True)
+            tail = "" if tracks is None else f"  tracks: {_many(len(tracks), 'object')}"
+            print(f"{source}  {words}{'  ' * bool(words)}{_summary(perception)}{tail}", flush=True)
 
     for folder in empty:
         tell(folder, PointsError("no scan in this folder; expected scans, captures or a ROS 2 bag's metadata.yaml"))
     started = time.perf_counter()
     for done, (scan, target) in enumerate(zip(scans, targets, strict=True), start=1):
         answers = (
-            _live(perceive, scan, arguments) if arguments.live else _each(perceive, scan, target, kinds, arguments)
+            _live(perceive, follow, scan, arguments)
+            if arguments.live
+            else _each(perceive, follow, scan, target, kinds, arguments)
         )
-        for source, outcome in answers:
-            tell(source, outcome)
+        for told in answers:
+            tell(*told)
         progress.show(done)
     progress.clear()
+    if arguments.gif and followed:
+        from .view import draw_tracks
+
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        draw_tracks(followed, arguments.out / "tracks.gif")
     if n_told - len(empty) > 1:
         each_ms = 1e3 * (time.perf_counter() - started) / (n_told - len(empty))
         things = "answers" if arguments.live else "scans"
@@ -283,9 +335,30 @@ def _run(arguments: argparse.Namespace) -> int:
     return 1 if n_failed else 0
 
 
+Follow = Callable[["Perception"], "Tracks"]
+
+
+def _follower(rate_hz: float) -> Follow:
+    """What tells the tracks after a scan, of one without a stamp as after the next of a drive."""
+    from .tracking.tracker import Tracker
+
+    tracker, counted = Tracker(), itertools.count(1)
+
+    def follow(perception: Perception) -> Tracks:
+        k = next(counted)
+        return tracker.update(perception.boxes, k / rate_hz if perception.stamp_s is None else perception.stamp_s)
+
+    return follow
+
+
 def _each(
-    perceive: Perceiver, path: Path, target: Path, kinds: Sequence[str], arguments: argparse.Namespace
-) -> Iterator[tuple[Path, Perception | Exception]]:
+    perceive: Perceiver,
+    follow: Follow | None,
+    path: Path,
+    target: Path,
+    kinds: Sequence[str],
+    arguments: argparse.Namespace,
+) -> Iterator[tuple[Path, Perception | Exception, Tracks | None]]:
     """Every scan of a file, those of a capture numbered, and what was perceived or what went wrong."""
     from .captures import is_capture, read_scans
 
@@ -293,34 +366,37 @@ def _each(
         numbered = is_capture(path)
         for k, (stamp_s, points) in enumerate(read_scans(path, topic=arguments.topic)):
             name, file = (path / f"{k:06d}", target / f"{k:06d}") if numbered else (path, target)
-            outcome: Perception | Exception
             try:
-                outcome = perceive(points, stamp_s)
+                perception = perceive(points, stamp_s)
+                tracks = None if follow is None else follow(perception)
                 if kinds and numbered:
                     target.mkdir(exist_ok=True)
-                _write(points, outcome, {kind: _file_of(file, kind) for kind in kinds}, title=str(name))
+                _write(points, perception, {kind: _file_of(file, kind) for kind in kinds}, title=str(name))
             except (EdgepercError, OSError) as exc:
-                outcome = exc
-            yield name, outcome
+                yield name, exc, None
+            else:
+                yield name, perception, tracks
     except (EdgepercError, OSError) as exc:
-        yield path, exc
+        yield path, exc, None
 
 
-def _live(perceive: Perceiver, path: Path, arguments: argparse.Namespace) -> Iterator[tuple[Path, Answer | Exception]]:
+def _live(
+    perceive: Perceiver, follow: Follow | None, path: Path, arguments: argparse.Namespace
+) -> Iterator[tuple[Path, Answer | Exception, Tracks | None]]:
     """Answers of a stream, and what went wrong, as they come."""
     from .live import stream
 
-    with stream(path, perceive, rate_hz=arguments.rate, topic=arguments.topic) as answers:
-        outcome: Answer | Exception | None
+    with stream(path, perceive, follow, rate_hz=arguments.rate, topic=arguments.topic) as answers:
         while True:
             try:
-                outcome = answers.take()
+                answer = answers.take()
             except StopIteration:
                 return
             except (EdgepercError, OSError) as exc:
-                outcome = exc
-            assert outcome is not None
-            yield path, outcome
+                yield path, exc, None
+            else:
+                assert answer is not None
+                yield path, answer, answer.tracks
 
 
 def _require_matplotlib() -> None:
@@ -328,6 +404,13 @@ def _require_matplotlib() -> None:
         import matplotlib  # noqa: F401
     except ImportError as exc:
         raise MissingExtraError("matplotlib", "view", "Drawing a picture") from exc
+
+
+def _require_pillow() -> None:
+    try:
+        import PIL  # noqa: F401
+    except ImportError as exc:
+        raise MissingExtraError("pillow", "view", "Drawing an animation") from exc
 
 
 def _find_scans(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
@@ -395,26 +478,38 @@ def _timing(answer: Answer) -> dict[str, Any]:
     }
 
 
-def _record(perception: Perception) -> dict[str, Any]:
+def _box_record(box: Box) -> dict[str, Any]:
+    return {
+        "label": box.label,
+        "score": round(float(box.score), 4),
+        "center": [round(float(v), 4) for v in box.center],
+        "size": [round(float(v), 4) for v in box.size],
+        "yaw": round(float(box.yaw), 5),
+    }
+
+
+def _record(perception: Perception, tracks: Tracks | None = None) -> dict[str, Any]:
     """What `run --json` says of a scan. Keys are always all there; null where no model of that kind took part."""
     return {
         "n_points": perception.n_points,
         "n_dropped": perception.n_dropped,
         "stage_ms": {name: round(ms, 3) for name, ms in perception.stage_ms.items()},
         "providers": dict(perception.providers),
-        "boxes": [
-            {
-                "label": box.label,
-                "score": round(float(box.score), 4),
-                "center": [round(float(v), 4) for v in box.center],
-                "size": [round(float(v), 4) for v in box.size],
-                "yaw": round(float(box.yaw), 5),
-            }
-            for box in perception.boxes
-        ],
+        "boxes": [_box_record(box) for box in perception.boxes],
         "drivable_area_m2": None if perception.top_view is None else round(perception.top_view.drivable_area_m2, 2),
         "point_counts": None if perception.points is None else perception.points.counts(),
-        "tracks": [],
+        "tracks": [
+            {
+                "id": track.id,
+                **_box_record(track.box),
+                "velocity": [round(float(v), 3) for v in track.velocity],
+                "age_s": round(track.age_s, 3),
+                "hits": track.hits,
+                "coasting": track.coasting,
+                "modes": {name: round(share, 4) for name, share in track.modes.items()},
+            }
+            for track in tracks or ()
+        ],
         "fitness": list(perception.fitness),
     }
 
@@ -697,6 +792,72 @@ def _eval(arguments: argparse.Namespace) -> int:
         models = ", ".join(f"{name} {version}" for name, version in figures["models"].items())
         draw_mistakes(mistakes, arguments.worst, title=f"the {len(mistakes)} scans with most mistakes: {models}")
     return 0
+
+
+def _eval_tracking(arguments: argparse.Namespace) -> int:
+    if arguments.gif is not None:
+        _require_pillow()
+    if arguments.boxes is not None and len(arguments.sequences or ()) != 1:
+        arguments.usage_error("--boxes are of one drive; add --sequences SEQ")
+    for file in filter(None, (arguments.json, arguments.gif)):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    from .tracking.kitti import evaluate_kitti, read_boxes, read_sequence, track_sequence
+
+    progress: list[_Progress] = []
+
+    def on_sequence(done: int, total: int) -> None:
+        progress[:] = progress or [_Progress(total)]
+        progress[0].show(done)
+
+    boxes = {} if arguments.boxes is None else {arguments.sequences[0]: read_boxes(arguments.boxes)}
+    figures = evaluate_kitti(
+        arguments.root,
+        sequences=arguments.sequences,
+        classes=arguments.classes,
+        boxes=boxes,
+        iou_threshold=arguments.iou,
+        on_sequence=on_sequence,
+    )
+    for bar in progress:
+        bar.clear()
+    print("\n".join(_tracking_lines(figures)))
+    if arguments.json is not None:
+        text = json.dumps({"command": arguments.typed, **_without_nan(figures)}, indent=1, allow_nan=False)
+        arguments.json.write_text(text + "\n", encoding="utf-8")
+    if arguments.gif is not None:
+        from .view import draw_tracks
+
+        name = figures["sequences"][0]
+        sequence = read_sequence(arguments.root, name, arguments.classes, boxes.get(name))
+        draw_tracks(track_sequence(sequence)[0], arguments.gif, title=f"sequence {sequence.name}")
+    return 0
+
+
+_AVERAGE_COLUMNS = (
+    *(("sAMOTA", "samota"), ("AMOTA", "amota"), ("AMOTP", "amotp"), ("MOTA", "mota"), ("MOTP", "motp")),
+    *(("HOTA", "hota"), ("DetA", "deta"), ("AssA", "assa"), ("fragments", "n_fragments")),
+)
+_COUNT_COLUMNS = (
+    *(("frames", "n_frames"), ("objects", "n_objects"), ("boxes", "n_truth"), ("false alarms", "n_false")),
+    *(("missed", "n_missed"), ("ID switches", "n_switches")),
+)
+
+
+def _tracking_lines(figures: Mapping[str, Any]) -> list[str]:
+    rows = [(("", name), _without_nan({**of, **of["best"], **of["hota"]})) for name, of in figures["classes"].items()]
+    return [
+        f"{_many(len(figures['sequences']), 'sequence')}, 3-D IoU {figures['iou_threshold']}; "
+        f"{figures['frames_per_s']:,.0f} scans a second in the tracker; shares in per cent",
+        *_table("over forty recalls; at the best MOTA", _AVERAGE_COLUMNS, rows),
+        *_table("counts at the best MOTA", _COUNT_COLUMNS, rows),
+    ]
+
+
+def _without_nan(value: Any) -> Any:
+    """The same with None for every number that is none, as JSON has it."""
+    if isinstance(value, Mapping):
+        return {key: _without_nan(of) for key, of in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 # Columns of the tables: heading and key. Shares are printed in per cent.

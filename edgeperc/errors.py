@@ -7,6 +7,8 @@
     ├── SensorError (ValueError)      an unknown or impossible sensor profile
     ├── SettingsError (ValueError)    the file of this computer's settings is unreadable
     ├── SplitError (ValueError)       a model is to be judged by a scan that it was trained on
+    ├── TrackingError (ValueError)    boxes or a pose that no tracker can follow
+    │   └── StampError                a scan that is no later than the one before it
     ├── FitnessError                  a scan unlike those a model was trained on, and on_mismatch="raise"
     ├── ModelError
     │   ├── ModelFileError            missing, or onnxruntime cannot open it
@@ -35,6 +37,8 @@ __all__ = [
     "SensorError",
     "SettingsError",
     "SplitError",
+    "StampError",
+    "TrackingError",
 ]
 
 
@@ -56,6 +60,14 @@ class SettingsError(EdgepercError, ValueError):
 
 class SplitError(EdgepercError, ValueError):
     """A model is to be judged by a scan that it was trained on."""
+
+
+class TrackingError(EdgepercError, ValueError):
+    """Boxes or a pose that cannot be tracked, or frames that do not belong together."""
+
+
+class StampError(TrackingError):
+    """A scan's time is not finite, or no later than that of the scan before it."""
 
 
 class FitnessError(EdgepercError):

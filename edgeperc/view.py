@@ -1,7 +1,7 @@
 """Pictures of a perception, and files that other viewers read.
 
-`draw` and `draw_mistakes` need the extra ``view``; `write_html`, `write_ply` and `write_labels` need numpy alone. One
-set of colours serves them all.
+`draw`, `draw_mistakes` and `draw_tracks` need the extra ``view``; `write_html`, `write_ply` and `write_labels` need
+numpy alone. One set of colours serves them all.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +25,16 @@ from numpy.typing import NDArray
 from .errors import MissingExtraError, PointsError
 from .perception import Box, Perception
 
+if TYPE_CHECKING:
+    from .tracking.tracker import Tracks
+
 __all__ = [
     "CLASS_COLOURS",
     "SEMANTICKITTI_IDS",
     "Mistakes",
     "draw",
     "draw_mistakes",
+    "draw_tracks",
     "write_html",
     "write_labels",
     "write_ply",
@@ -273,6 +277,90 @@ def _draw_mistakes_of(axes: Any, scan: Mistakes) -> None:
             text = _say(axes, box.center[1], above, words, color=colour, fontsize=8.5, ha="center", zorder=6)
             text.set(va="bottom", clip_on=True, fontweight="bold")
             _lift_clear(text, taken, 0.5)
+
+
+def draw_tracks(
+    scans: Sequence[Tracks],
+    path: str | Path | None = None,
+    *,
+    title: str = "",
+    tail_s: float = 2.0,
+    range_m: tuple[float, float] = (70.0, 30.0),
+) -> bytes:
+    """Draw tracks from above, scan by scan: footprints, where each goes in the next second, and where it was.
+
+    Parameters
+    ----------
+    scans : sequence of Tracks
+        In order; one of them a picture, shown for as long as it lasted.
+    path : str or Path, optional
+        Where to write the animation as well; an existing file is replaced whole.
+    title : str
+    tail_s : float
+        How long a track's way behind it is shown [s].
+    range_m : tuple of 2 float
+        How far ahead, and how far to each side, is shown [m].
+
+    Returns
+    -------
+    gif : bytes
+        Empty where there is no scan.
+
+    Raises
+    ------
+    MissingExtraError
+        pillow is not installed.
+    OSError
+        The file cannot be written.
+    """
+    try:
+        from PIL import Image, ImageDraw
+    except ImportError as exc:
+        raise MissingExtraError("pillow", "view", "Drawing an animation") from exc
+    px_per_m, behind_m = 8.0, 10.0
+    size = round(2.0 * range_m[1] * px_per_m), round((range_m[0] + behind_m) * px_per_m)
+
+    def pixels(places: NDArray[np.float64]) -> list[tuple[float, float]]:
+        """x, y in the sensor's frame -> pixels: ahead is up, left is left."""
+        return [((range_m[1] - y) * px_per_m, (range_m[0] - x) * px_per_m) for x, y in places[:, :2].tolist()]
+
+    pictures: list[Any] = []
+    ways: dict[int, list[tuple[float, float, float, float]]] = {}
+    for tracks in scans:
+        picture = Image.new("RGB", size, _PANEL)
+        pen = ImageDraw.Draw(picture)
+        (middle,) = pixels(np.zeros((1, 2)))
+        for ring_m in (20.0, 40.0, 60.0):
+            reach = ring_m * px_per_m
+            pen.ellipse([middle[0] - reach, middle[1] - reach, middle[0] + reach, middle[1] + reach], outline="#2a343f")
+        pen.polygon(pixels(np.array([[1.5, 0.0], [-1.5, 0.9], [-1.5, -0.9]])), outline=_FAINT)
+        R, t = tracks.T_world_sensor[:3, :3], tracks.T_world_sensor[:3, 3]
+        here = {track.id for track in tracks}
+        ways = {name: way for name, way in ways.items() if name in here or way[-1][3] > tracks.stamp_s - tail_s}
+        for track in tracks:
+            ways.setdefault(track.id, []).append((*track.world_box.center, tracks.stamp_s))
+            way = ways[track.id] = [place for place in ways[track.id] if place[3] > tracks.stamp_s - tail_s]
+            colour = _colour(track.label)
+            if len(way) > 1:
+                pen.line(pixels((np.array(way)[:, :3] - t) @ R), fill=colour)
+            pen.polygon(pixels(track.box.corners()), outline=colour, width=1 if track.coasting else 2)
+            ahead = np.array([track.box.center[:2], np.array(track.box.center[:2]) + track.velocity])
+            pen.line(pixels(ahead), fill=_INK)
+            x, y = pixels(ahead[:1])[0]
+            pen.text((x + 10.0, y - 6.0), f"{track.id} {3.6 * math.hypot(*track.velocity):.0f} km/h", fill=_INK)
+        pen.text((10.0, 8.0), f"{title}  {tracks.stamp_s:.1f} s  {len(tracks)} tracks".strip(), fill=_INK)
+        pictures.append(picture.quantize(64))
+    if not pictures:
+        return b""
+    stamps = [tracks.stamp_s for tracks in scans]
+    lasted = [round(1e3 * (b - a)) for a, b in zip(stamps, [*stamps[1:], stamps[-1] + 1.0], strict=True)]
+    stream = io.BytesIO()
+    pictures[0].save(
+        stream, "GIF", save_all=True, append_images=pictures[1:], duration=[max(20, ms) for ms in lasted], loop=0
+    )
+    if path is not None:
+        _write(path, stream.getvalue())
+    return stream.getvalue()
 
 
 def write_html(points: NDArray[np.float32], perception: Perception, path: str | Path, *, title: str = "") -> None:

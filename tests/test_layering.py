@@ -32,10 +32,30 @@ MAY_IMPORT = {
     "live": {"captures", "errors", "perception"},
     "figures": {"metrics"},
     "evaluate": {"datasets", "errors", "figures", "metrics", "models", "perceiver", "view"} | NOUNS | STAGES,
-    "view": {"errors"} | NOUNS,
+    "tracking.egomotion": set(),
+    "tracking.imm": set(),
+    "tracking.jpda": set(),
+    "tracking.ukf": set(),
+    "tracking.tracker": {"errors", "tracking.egomotion", "tracking.imm", "tracking.jpda", "tracking.ukf"} | NOUNS,
+    "tracking.metrics": {"errors"} | NOUNS,
+    "tracking.kitti": {"datasets", "errors", "tracking.metrics", "tracking.tracker"} | NOUNS,
+    "tracking.__init__": {"tracking.tracker"},
+    "view": {"errors", "tracking.tracker"} | NOUNS,
     "perceiver": {"errors", "models"} | NOUNS | STAGES,
-    "cli": {"captures", "errors", "evaluate", "live", "models", "perceiver", "view"} | NOUNS | STAGES,
-    "__init__": {"captures", "errors", "live", "perceiver"} | NOUNS | STAGES,
+    "cli": {
+        "captures",
+        "errors",
+        "evaluate",
+        "live",
+        "models",
+        "perceiver",
+        "tracking.kitti",
+        "tracking.tracker",
+        "view",
+    }
+    | NOUNS
+    | STAGES,
+    "__init__": {"captures", "errors", "live", "perceiver", "tracking.__init__"} | NOUNS | STAGES,
     "__main__": {"cli"},
 }
 
@@ -49,24 +69,33 @@ def modules() -> dict[str, Path]:
     return found | {"models": REPOSITORY / "models" / "__init__.py"}
 
 
-def imported(tree: ast.AST) -> Iterator[str]:
-    """Absolute dotted names of everything imported anywhere below ``tree``, inside functions too."""
+def imported(tree: ast.AST, package: str = "edgeperc") -> Iterator[str]:
+    """Absolute dotted names of everything that a module of ``package`` imports, inside functions too."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert node.level <= 1, f"line {node.lineno}: a relative import that leaves its package"
-            origin = ".".join(filter(None, ["edgeperc" if node.level else "", node.module]))
+            above = package.split(".")[: 1 - node.level or None] if node.level else []
+            assert above or not node.level, f"line {node.lineno}: a relative import that leaves edgeperc"
+            origin = ".".join(filter(None, [*above, node.module]))
             yield from ([f"{origin}.{alias.name}" for alias in node.names] if origin == "edgeperc" else [origin])
         elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
             yield from (str(name.value) for name in node.args if isinstance(name, ast.Constant))
 
 
+def package_of(path: Path) -> str:
+    """``edgeperc`` or ``edgeperc.tracking``: what a file's relative imports start from."""
+    inside = path.parent.relative_to(RUNTIME).parts if path.is_relative_to(RUNTIME) else ()
+    return ".".join(("edgeperc", *inside))
+
+
 def imported_of_edgeperc(path: Path) -> set[str]:
     """Modules of edgeperc that a file imports, without the package's name."""
-    names = {
-        name.split(".")[1] for name in imported(ast.parse(path.read_text("utf-8"))) if name.startswith("edgeperc.")
-    }
+    names = set()
+    for dotted in imported(ast.parse(path.read_text("utf-8")), package_of(path)):
+        if dotted.startswith("edgeperc."):
+            name = dotted.removeprefix("edgeperc.")
+            names.add(f"{name}.__init__" if f"{name}.__init__" in modules() else name)
     return names - {"__version__"}
 
 
@@ -99,13 +128,13 @@ def test_no_module_needs_itself() -> None:
 
 @pytest.mark.parametrize("name", sorted(modules()))
 def test_the_runtime_is_light(name: str) -> None:
-    tree = ast.parse(modules()[name].read_text("utf-8"))
-    packages = {dotted.partition(".")[0] for dotted in imported(tree)}
+    tree, package = ast.parse(modules()[name].read_text("utf-8")), package_of(modules()[name])
+    packages = {dotted.partition(".")[0] for dotted in imported(tree, package)}
     assert not packages & NEVER
     assert name == "session" or "onnxruntime" not in packages, "edgeperc.session alone talks to onnxruntime"
     for statement in at_import(tree):
         if isinstance(statement, ast.Import | ast.ImportFrom):
-            packages = {dotted.partition(".")[0] for dotted in imported(statement)}
+            packages = {dotted.partition(".")[0] for dotted in imported(statement, package)}
             assert not packages & ONLY_IN_FUNCTIONS, f"line {statement.lineno}: import {packages} where it is used"
 
 

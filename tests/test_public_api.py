@@ -18,7 +18,7 @@ from edgeperc.errors import ModelFileError
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 MODULES = sorted(
-    f"edgeperc.{found.name}" for found in pkgutil.iter_modules(edgeperc.__path__) if found.name != "__main__"
+    found.name for found in pkgutil.walk_packages(edgeperc.__path__, "edgeperc.") if not found.name.endswith("__main__")
 )
 
 

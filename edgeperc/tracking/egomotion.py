@@ -1,0 +1,182 @@
+"""The sensor's own motion, from what stands still around it: a robust rigid fit on the ground.
+
+Where nobody gives poses, tracked objects are the landmarks. What the fit yields is the motion that carries most of the
+detections onto the places their tracks predict; objects that move otherwise have little say.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["fit_motion"]
+
+MAX_ROUNDS = 12
+MAX_PROPOSALS = 256
+
+
+@njit(cache=True, nogil=True)
+def fit_motion(
+    landmarks: NDArray[np.float64],
+    detections: NDArray[np.float64],
+    prior: NDArray[np.float64],
+    prior_variances: NDArray[np.float64],
+    motion: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+) -> int:
+    """Fit the rigid motion that lays detections onto the predicted places of tracks.
+
+    Parameters
+    ----------
+    landmarks : (n, 4) float64
+        x, y [m] of tracks as predicted, in the sensor's frame of the scan before, the variance of either coordinate
+        [m2], and the group of classes that may be taken for one another.
+    detections : (m, 4) float64
+        Likewise, in the sensor's frame of now.
+    prior : (3,) float64
+        Motion expected: x, y [m], turn [rad] of the sensor now, in its frame of before.
+    prior_variances : (3,) float64
+    motion : (3,) float64, overwritten
+        The fit; the prior where no detection fits any track.
+    covariance : (3, 3) float64, overwritten
+        Of the fit.
+
+    Returns
+    -------
+    n_pairs : int
+        Tracks that were laid onto a detection.
+
+    Notes
+    -----
+    Every pair proposes the shift and the turn that lay the one onto the other, if within three standard deviations of
+    the prior, at most 256 in all; the proposal that fits best as a whole (`support`) starts Gauss and Newton's
+    iteration, in which each track follows its nearest detection with the weight of Geman and McClure,
+    1 / (1 + r2 / 9)^2, r the distance in standard deviations.
+    """
+    motion[:] = prior
+    best = support(landmarks, detections, prior, prior_variances, motion)
+    proposal = np.empty(3)
+    cos, sin = math.cos(prior[2]), math.sin(prior[2])
+    reach = 3.0 * math.sqrt(prior_variances[0] + prior_variances[1])
+    n_proposals = 0
+    for i in range(len(landmarks)):
+        for j in range(len(detections)):
+            x, y = detections[j, 0], detections[j, 1]
+            if landmarks[i, 3] != detections[j, 3]:
+                continue
+            # A shift alone or a turn alone: far away a turn moves a landmark by more than any drive does.
+            shift_x = landmarks[i, 0] - prior[0] - (cos * x - sin * y)
+            shift_y = landmarks[i, 1] - prior[1] - (sin * x + cos * y)
+            turn = math.atan2(landmarks[i, 1] - prior[1], landmarks[i, 0] - prior[0]) - math.atan2(y, x) - prior[2]
+            turn -= 2.0 * math.pi * math.floor(turn / (2.0 * math.pi) + 0.5)
+            for by_turn in (False, True):
+                proposal[:] = prior
+                if by_turn:
+                    proposal[2] += turn
+                    near = abs(turn) < 3.0 * math.sqrt(prior_variances[2])
+                else:
+                    proposal[0] += shift_x
+                    proposal[1] += shift_y
+                    near = math.hypot(shift_x, shift_y) < reach + 3.0 * math.sqrt(landmarks[i, 2])
+                if near and n_proposals < MAX_PROPOSALS:
+                    n_proposals += 1
+                    fit = support(landmarks, detections, prior, prior_variances, proposal)
+                    if fit > best:
+                        best = fit
+                        motion[:] = proposal
+
+    information = np.empty((3, 3))
+    slope = np.empty(3)
+    n_pairs = 0
+    for _ in range(MAX_ROUNDS):
+        n_pairs = 0
+        information[:] = 0.0
+        for a in range(3):
+            information[a, a] = 1.0 / prior_variances[a]
+            slope[a] = (prior[a] - motion[a]) / prior_variances[a]
+        cos, sin = math.cos(motion[2]), math.sin(motion[2])
+        for i in range(len(landmarks)):
+            nearest, squared = nearest_detection(landmarks[i], detections, motion)
+            if nearest < 0 or squared > 25.0:
+                continue
+            n_pairs += 1
+            x, y = detections[nearest, 0], detections[nearest, 1]
+            turned_x, turned_y = cos * x - sin * y, sin * x + cos * y
+            weight = 1.0 / (1.0 + squared / 9.0) ** 2 / (landmarks[i, 2] + detections[nearest, 2])
+            off_x = landmarks[i, 0] - motion[0] - turned_x
+            off_y = landmarks[i, 1] - motion[1] - turned_y
+            # Derivatives of the detection's place by x, y and turn: (1, 0), (0, 1), (-turned_y, turned_x).
+            slope[0] += weight * off_x
+            slope[1] += weight * off_y
+            slope[2] += weight * (off_y * turned_x - off_x * turned_y)
+            information[0, 0] += weight
+            information[1, 1] += weight
+            information[0, 2] -= weight * turned_y
+            information[1, 2] += weight * turned_x
+            information[2, 2] += weight * (turned_x * turned_x + turned_y * turned_y)
+        information[2, 0], information[2, 1] = information[0, 2], information[1, 2]
+        fill_inverse(information, covariance)
+        step = 0.0
+        for a in range(3):
+            change = covariance[a, 0] * slope[0] + covariance[a, 1] * slope[1] + covariance[a, 2] * slope[2]
+            motion[a] += change
+            step = max(step, abs(change))
+        if step < 1e-9:
+            break
+    return n_pairs
+
+
+@njit(cache=True, nogil=True)
+def support(
+    landmarks: NDArray[np.float64],
+    detections: NDArray[np.float64],
+    prior: NDArray[np.float64],
+    prior_variances: NDArray[np.float64],
+    motion: NDArray[np.float64],
+) -> float:
+    """How well a motion fits: minus its departure from the prior and the robust distances of all tracks.
+
+    The robust distance is Geman and McClure's r2 / (1 + r2 / 9) / 2, at most 4.5; a track without detection has that.
+    """
+    total = 0.0
+    for a in range(3):
+        total -= 0.5 * (motion[a] - prior[a]) ** 2 / prior_variances[a]
+    for i in range(len(landmarks)):
+        nearest, squared = nearest_detection(landmarks[i], detections, motion)
+        total -= 4.5 if nearest < 0 else 0.5 * squared / (1.0 + squared / 9.0)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def nearest_detection(
+    landmark: NDArray[np.float64], detections: NDArray[np.float64], motion: NDArray[np.float64]
+) -> tuple[int, float]:
+    """The detection nearest to a landmark under a motion, and their squared distance in variances; -1 for none."""
+    cos, sin = math.cos(motion[2]), math.sin(motion[2])
+    nearest, smallest = -1, np.inf
+    for j in range(len(detections)):
+        if landmark[3] != detections[j, 3]:
+            continue
+        off_x = landmark[0] - motion[0] - (cos * detections[j, 0] - sin * detections[j, 1])
+        off_y = landmark[1] - motion[1] - (sin * detections[j, 0] + cos * detections[j, 1])
+        squared = (off_x * off_x + off_y * off_y) / (landmark[2] + detections[j, 2])
+        if squared < smallest:
+            nearest, smallest = j, squared
+    return nearest, smallest
+
+
+@njit(cache=True, nogil=True)
+def fill_inverse(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> None:
+    """Invert a symmetric positive definite (3, 3) matrix by its cofactors."""
+    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
+    d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    inverse[0, 0] = (d * f - e * e) / determinant
+    inverse[1, 1] = (a * f - c * c) / determinant
+    inverse[2, 2] = (a * d - b * b) / determinant
+    inverse[0, 1] = inverse[1, 0] = (c * e - b * f) / determinant
+    inverse[0, 2] = inverse[2, 0] = (b * e - c * d) / determinant
+    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) / determinant

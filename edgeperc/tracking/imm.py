@@ -1,0 +1,143 @@
+"""The interacting multiple model: interaction, mode probabilities, combination (KUL-Seg, section 6 and Figure 10)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["fill_combined", "fill_interaction", "fill_mode_probabilities"]
+
+
+@njit(cache=True, nogil=True)
+def fill_interaction(
+    states: NDArray[np.float64],
+    covariances: NDArray[np.float64],
+    probabilities: NDArray[np.float64],
+    stay: NDArray[np.float64],
+    mixed: NDArray[np.float64],
+    mixed_covariances: NDArray[np.float64],
+    prior: NDArray[np.float64],
+) -> None:
+    """Mix the motions' estimates by a Markov chain (KUL-Seg's "interaction").
+
+    Parameters
+    ----------
+    states : (n, k, s) float64
+        Of k motions.
+    covariances : (n, k, s, s) float64
+    probabilities : (n, k) float64
+        Of each motion after the last update.
+    stay : (n,) float64
+        Probability that a track keeps its motion; the others share the rest.
+    mixed : (n, k, s) float64, overwritten
+        Where each motion's filter starts from: x0_j = sum_i w_ij x_i with w_ij = p_ij mu_i / prior_j.
+    mixed_covariances : (n, k, s, s) float64, overwritten
+        sum_i w_ij (P_i + (x_i - x0_j)(x_i - x0_j)')
+    prior : (n, k) float64, overwritten
+        prior_j = sum_i p_ij mu_i
+    """
+    n, k, s = states.shape
+    for t in range(n):
+        leave = (1.0 - stay[t]) / (k - 1)
+        for j in range(k):
+            prior[t, j] = 0.0
+            for i in range(k):
+                prior[t, j] += (stay[t] if i == j else leave) * probabilities[t, i]
+            mixed[t, j] = 0.0
+            mixed_covariances[t, j] = 0.0
+            for i in range(k):
+                weight = (stay[t] if i == j else leave) * probabilities[t, i] / prior[t, j]
+                for a in range(s):
+                    mixed[t, j, a] += weight * states[t, i, a]
+            for i in range(k):
+                weight = (stay[t] if i == j else leave) * probabilities[t, i] / prior[t, j]
+                for a in range(s):
+                    for b in range(s):
+                        off = (states[t, i, a] - mixed[t, j, a]) * (states[t, i, b] - mixed[t, j, b])
+                        mixed_covariances[t, j, a, b] += weight * (covariances[t, i, a, b] + off)
+
+
+@njit(cache=True, nogil=True)
+def fill_mode_probabilities(
+    prior: NDArray[np.float64],
+    likelihoods: NDArray[np.float64],
+    beta: NDArray[np.float64],
+    shares: NDArray[np.float64],
+    probabilities: NDArray[np.float64],
+) -> None:
+    """Share the association among the motions, and weigh the motions by it (KUL-Seg's "mode probability update").
+
+    Bayes' rule for motion j and detection d together: P(j, d) = beta_d prior_j L_jd / sum_i prior_i L_id. Its sums
+    over d are the motions' probabilities, its shares within a motion the association that the motion's filter sees.
+
+    Parameters
+    ----------
+    prior : (n, k) float64
+        From `fill_interaction`.
+    likelihoods : (n, k, m) float64
+        Of each detection under each motion; 0 out of the gate.
+    beta : (n, m + 1) float64
+        Probability that the track was not detected, and that each detection is the track's.
+    shares : (n, k, m + 1) float64, overwritten
+        Of each motion, summing to 1.
+    probabilities : (n, k) float64, overwritten
+    """
+    n, k, m = likelihoods.shape
+    for t in range(n):
+        for j in range(k):
+            shares[t, j, 0] = beta[t, 0] * prior[t, j]
+        for d in range(m):
+            total = 0.0
+            for j in range(k):
+                total += prior[t, j] * likelihoods[t, j, d]
+            for j in range(k):
+                shares[t, j, d + 1] = 0.0
+                if beta[t, d + 1] > 0.0 and total > 0.0:
+                    shares[t, j, d + 1] = beta[t, d + 1] * prior[t, j] * likelihoods[t, j, d] / total
+        for j in range(k):
+            total = 0.0
+            for d in range(m + 1):
+                total += shares[t, j, d]
+            if total > 0.0:
+                for d in range(m + 1):
+                    shares[t, j, d] /= total
+            else:
+                shares[t, j, 0] = 1.0
+            # A motion that no longer has any weight could never come back, and its share would be 0 / 0.
+            probabilities[t, j] = max(total, 1e-12)
+        probabilities[t] /= probabilities[t].sum()
+
+
+@njit(cache=True, nogil=True)
+def fill_combined(
+    states: NDArray[np.float64],
+    covariances: NDArray[np.float64],
+    probabilities: NDArray[np.float64],
+    state: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+) -> None:
+    """Join the motions' estimates into one a track (KUL-Seg's "combination").
+
+    Parameters
+    ----------
+    states : (n, k, s) float64
+    covariances : (n, k, s, s) float64
+    probabilities : (n, k) float64
+    state : (n, s) float64, overwritten
+        x = sum_j mu_j x_j
+    covariance : (n, s, s) float64, overwritten
+        sum_j mu_j (P_j + (x_j - x)(x_j - x)')
+    """
+    n, k, s = states.shape
+    state[:] = 0.0
+    covariance[:] = 0.0
+    for t in range(n):
+        for j in range(k):
+            for a in range(s):
+                state[t, a] += probabilities[t, j] * states[t, j, a]
+        for j in range(k):
+            for a in range(s):
+                for b in range(s):
+                    off = (states[t, j, a] - state[t, a]) * (states[t, j, b] - state[t, b])
+                    covariance[t, a, b] += probabilities[t, j] * (covariances[t, j, a, b] + off)

@@ -1,0 +1,270 @@
+"""Joint probabilistic data association: which detection is of which track (KUL-Seg, section 6).
+
+Tracks that share no detection in their gates are solved apart. A cluster of few joint events is solved by going through
+all of them, a larger one by loopy belief propagation (Williams and Lau, "Approximate evaluation of marginal association
+probabilities with belief propagation", IEEE Trans. AES 2014), so the time a frame takes is bounded.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["MAX_EVENTS", "fill_association", "fill_likelihoods"]
+
+MAX_EVENTS = 4096
+MAX_ROUNDS = 200
+TOLERANCE = 1e-6
+LARGEST_WEIGHT = 1e15  # surer than sure; keeps the products of a cluster finite
+
+
+@njit(cache=True, nogil=True)
+def fill_likelihoods(
+    means: NDArray[np.float64],
+    predicted: NDArray[np.float64],
+    sigmas: NDArray[np.float64],
+    prior: NDArray[np.float64],
+    odds: NDArray[np.float64],
+    groups: NDArray[np.int64],
+    detections: NDArray[np.float64],
+    detection_groups: NDArray[np.int64],
+    gates: NDArray[np.float64],
+    likelihoods: NDArray[np.float64],
+    weights: NDArray[np.float64],
+) -> None:
+    """Write the likelihood of every detection under every motion of every track, and what it weighs in all.
+
+    Parameters
+    ----------
+    means : (n, 3, 5) float64
+    predicted : (n, 3, 5, 5) float64
+        Of x, y, v, heading, turn rate.
+    sigmas : (n, 3) float64
+        Standard deviations of a detection along and across the heading [m] and of the heading [rad].
+    prior : (n, 3) float64
+        Probability of each motion.
+    odds : (n,) float64
+        P_D / ((1 - P_D) lambda) [m2 rad]: detection probability, density of clutter.
+    groups : (n,) int64
+        Classes that may be mistaken for one another; others never meet.
+    detections : (m, 3) float64
+        x, y [m], heading [rad].
+    detection_groups : (m,) int64
+    gates : (n,) float64
+        Largest Mahalanobis distance of the place from the nearest of the motions.
+    likelihoods : (n, 3, m) float64, overwritten
+        [1/(m2 rad)]; 0 for all motions out of the gate.
+    weights : (n, m) float64, overwritten
+        odds_t sum_k prior_tk L_tkj, as `fill_association` takes them.
+
+    Notes
+    -----
+    A heading counts modulo pi, for a box looks the same from behind. Detectors are at times wrong by a right angle, so
+    a deviation of more than three standard deviations counts as three.
+    """
+    n, m = len(groups), len(detection_groups)
+    likelihoods[:] = 0.0
+    weights[:] = 0.0
+    for i in range(n):
+        reach = 0.0
+        for mode in range(3):
+            cov = predicted[i, mode]
+            reach = max(reach, cov[0, 0] + cov[1, 1])
+        gate = gates[i]
+        reach = gate * math.sqrt(reach + sigmas[i, 0] ** 2 + sigmas[i, 1] ** 2)
+        for j in range(m):
+            dx = detections[j, 0] - means[i, 0, 0]
+            dy = detections[j, 1] - means[i, 0, 1]
+            apart = 0.0
+            for mode in range(1, 3):
+                apart = max(apart, math.hypot(means[i, mode, 0] - means[i, 0, 0], means[i, mode, 1] - means[i, 0, 1]))
+            if groups[i] != detection_groups[j] or dx * dx + dy * dy > (reach + apart) ** 2:
+                continue
+            inside = False
+            for mode in range(3):
+                mean, cov = means[i, mode], predicted[i, mode]
+                cos, sin = math.cos(mean[3]), math.sin(mean[3])
+                along, across = sigmas[i, 0] * sigmas[i, 0], sigmas[i, 1] * sigmas[i, 1]
+                a = cov[0, 0] + along * cos * cos + across * sin * sin
+                b = cov[0, 1] + (along - across) * cos * sin
+                d = cov[1, 1] + along * sin * sin + across * cos * cos
+                c, e = cov[0, 3], cov[1, 3]
+                f = cov[3, 3] + sigmas[i, 2] * sigmas[i, 2]
+                place = a * d - b * b
+                dx = detections[j, 0] - mean[0]
+                dy = detections[j, 1] - mean[1]
+                squared = (d * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / place
+                inside = inside or squared <= gate * gate
+                # The heading given the place: its mean and its variance.
+                pull_x = (c * d - e * b) / place
+                pull_y = (e * a - c * b) / place
+                turn = detections[j, 2] - mean[3]
+                turn -= math.pi * math.floor(turn / math.pi + 0.5)
+                limit = 3.0 * math.sqrt(f)
+                turn = min(max(turn, -limit), limit) - pull_x * dx - pull_y * dy
+                left = f - pull_x * c - pull_y * e
+                squared += turn * turn / left
+                likelihoods[i, mode, j] = math.exp(-0.5 * squared) / math.sqrt((2.0 * math.pi) ** 3 * place * left)
+            for mode in range(3):
+                if not inside:
+                    likelihoods[i, mode, j] = 0.0
+                weights[i, j] += odds[i] * prior[i, mode] * likelihoods[i, mode, j]
+            weights[i, j] = min(weights[i, j], LARGEST_WEIGHT)
+
+
+@njit(cache=True, nogil=True)
+def fill_association(weights: NDArray[np.float64], max_events: int, beta: NDArray[np.float64]) -> int:
+    """Write the marginal association probabilities.
+
+    A joint event gives each track one detection or none and each detection to one track at most; its probability is in
+    proportion to the product of the weights of its pairs.
+
+    Parameters
+    ----------
+    weights : (n, m) float64
+        How much likelier it is that the track made the detection than that the track was missed and the detection is
+        clutter; 0 out of the gate.
+    max_events : int
+        A cluster that may have more joint events than this is solved by belief propagation.
+    beta : (n, m + 1) float64, overwritten
+        Column 0: the track was not detected. Rows sum to 1.
+
+    Returns
+    -------
+    n_approximated : int
+        Tracks solved by belief propagation.
+    """
+    n, m = weights.shape
+    beta[:] = 0.0
+    done = np.zeros(n, np.bool_)
+    taken = np.zeros(m, np.bool_)
+    rows = np.empty(n, np.int64)
+    columns = np.empty(m, np.int64)
+    n_approximated = 0
+    for first in range(n):
+        if done[first]:
+            continue
+        # The cluster: everything that can be reached from here over gated pairs.
+        done[first] = True
+        rows[0] = first
+        n_rows, n_columns, at = 1, 0, 0
+        events = 1.0
+        while at < n_rows:
+            choices = 1.0
+            for j in range(m):
+                if weights[rows[at], j] <= 0.0:
+                    continue
+                choices += 1.0
+                if not taken[j]:
+                    taken[j] = True
+                    columns[n_columns] = j
+                    n_columns += 1
+                    for i in range(n):
+                        if not done[i] and weights[i, j] > 0.0:
+                            done[i] = True
+                            rows[n_rows] = i
+                            n_rows += 1
+            events *= choices
+            at += 1
+        if events <= max_events:
+            fill_by_events(weights, rows[:n_rows], columns[:n_columns], beta)
+        else:
+            n_approximated += n_rows
+            fill_by_propagation(weights, rows[:n_rows], columns[:n_columns], beta)
+    return n_approximated
+
+
+@njit(cache=True, nogil=True)
+def fill_by_events(
+    weights: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArray[np.int64], beta: NDArray[np.float64]
+) -> None:
+    """Go through every joint event of one cluster, depth first.
+
+    Parameters
+    ----------
+    weights : (n, m) float64
+    rows, columns : (r,), (c,) int64
+        Tracks and detections of the cluster.
+    beta : (n, m + 1) float64
+        The rows of the cluster are overwritten.
+    """
+    n = len(rows)
+    choice = np.full(n, -2, np.int64)  # -2: not begun; -1: missed; else a place in columns
+    used = np.zeros(len(columns), np.bool_)
+    product = np.ones(n + 1)
+    total = 0.0
+    depth = 0
+    while depth >= 0:
+        i = rows[depth]
+        if choice[depth] >= 0:
+            used[choice[depth]] = False
+        choice[depth] += 1
+        while choice[depth] >= 0 and choice[depth] < len(columns):
+            if not used[choice[depth]] and weights[i, columns[choice[depth]]] > 0.0:
+                break
+            choice[depth] += 1
+        if choice[depth] == len(columns):
+            choice[depth] = -2
+            depth -= 1
+            continue
+        product[depth + 1] = product[depth]
+        if choice[depth] >= 0:
+            used[choice[depth]] = True
+            product[depth + 1] *= weights[i, columns[choice[depth]]]
+        if depth < n - 1:
+            depth += 1
+            continue
+        total += product[n]
+        for k in range(n):
+            column = columns[choice[k]] + 1 if choice[k] >= 0 else 0
+            beta[rows[k], column] += product[n]
+    for k in range(n):
+        beta[rows[k]] /= total
+
+
+@njit(cache=True, nogil=True)
+def fill_by_propagation(
+    weights: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArray[np.int64], beta: NDArray[np.float64]
+) -> None:
+    """Approximate the marginals of one cluster by messages between tracks and detections.
+
+    mu_ij = w_ij / (1 + sum_j' w_ij' nu_j'i) over the other detections, nu_ji = 1 / (1 + sum_i' mu_i'j) over the other
+    tracks, until no nu changes by more than 1e-6, at most 200 rounds; beta_ij is in proportion to w_ij nu_ji.
+
+    Parameters
+    ----------
+    weights, rows, columns, beta
+        As in `fill_by_events`.
+    """
+    n, m = len(rows), len(columns)
+    to_track = np.ones((n, m))
+    to_detection = np.zeros((n, m))
+    for _ in range(MAX_ROUNDS):
+        for i in range(n):
+            total = 1.0
+            for j in range(m):
+                total += weights[rows[i], columns[j]] * to_track[i, j]
+            for j in range(m):
+                weight = weights[rows[i], columns[j]]
+                to_detection[i, j] = weight / max(total - weight * to_track[i, j], 1.0)
+        change = 0.0
+        for j in range(m):
+            total = 1.0
+            for i in range(n):
+                total += to_detection[i, j]
+            for i in range(n):
+                message = 1.0 / max(total - to_detection[i, j], 1.0)
+                change = max(change, abs(message - to_track[i, j]))
+                to_track[i, j] = message
+        if change < TOLERANCE:
+            break
+    for i in range(n):
+        total = 1.0
+        for j in range(m):
+            total += weights[rows[i], columns[j]] * to_track[i, j]
+        beta[rows[i], 0] = 1.0 / total
+        for j in range(m):
+            beta[rows[i], columns[j] + 1] = weights[rows[i], columns[j]] * to_track[i, j] / total

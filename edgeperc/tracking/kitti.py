@@ -1,0 +1,305 @@
+"""KITTI's tracking sequences: labels and detections in, the tables of AB3DMOT's protocol and KUL-Seg's Table 7 out."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..datasets import IMAGE_SIZE, Calibration
+from ..errors import TrackingError
+from ..perception import Box
+from .metrics import FrameTracks, FrameTruth, evaluate_tracks
+from .tracker import ClassParameters, Tracker, Tracks
+
+__all__ = ["CLASSES", "KINDS", "TrackingSequence", "evaluate_kitti", "read_boxes", "read_sequence", "track_sequence"]
+
+CLASSES = ("car", "pedestrian", "cyclist")
+# What counts as each class; KUL-Seg's Table 7 knows vehicles alone.
+KINDS = {**{of: (of,) for of in CLASSES}, "vehicle": ("car", "van", "truck")}
+# KITTI's evaluation: what may be taken for each class unpunished, and what is too hidden or too small to be asked for.
+NEIGHBOURS = {"car": ("van",), "pedestrian": ("person", "person_sitting"), "cyclist": (), "vehicle": ("tram", "misc")}
+MAX_OCCLUSION, MAX_TRUNCATION, MIN_HEIGHT_PX, MIN_UNLABELLED = 2, 0, 25.0, 0.5
+FRAME_S = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackingSequence:
+    """One sequence: what was detected, and what there is.
+
+    Attributes
+    ----------
+    name : str
+    detections : tuple of tuple of Box
+        By frame, of all classes asked for, in the sensor's frame. Scores are in 0..1.
+    truth : mapping of str to tuple of FrameTruth
+        By class and frame.
+    unlabelled : tuple of (k, 4) float64
+        By frame: image rectangles (left, top, right, bottom) in which nothing was labelled (DontCare).
+    calibration : Calibration
+    """
+
+    name: str
+    detections: tuple[tuple[Box, ...], ...]
+    truth: Mapping[str, tuple[FrameTruth, ...]]
+    unlabelled: tuple[NDArray[np.float64], ...]
+    calibration: Calibration
+
+
+def read_sequence(
+    root: Path | str, name: str, classes: Sequence[str] = CLASSES, boxes: Sequence[Sequence[Box]] | None = None
+) -> TrackingSequence:
+    """Read ``label_02/NAME.txt``, ``calib/NAME.txt`` and ``detections/DETECTOR_CLASS/NAME.txt`` below ``root``.
+
+    Parameters
+    ----------
+    root : str or Path
+    name : str
+        Such as ``"0000"``.
+    classes : sequence of str
+        Of `KINDS`.
+    boxes : sequence of sequence of Box, optional
+        By frame: detections to take in place of the files.
+
+    Returns
+    -------
+    TrackingSequence
+
+    Raises
+    ------
+    TrackingError
+        A file is not laid out as KITTI's are, a class has no folder of detections, or there are not as many frames of
+        boxes as of labels.
+    OSError
+        A file cannot be read.
+    """
+    root = Path(root)
+    calibration = Calibration.read(root / "calib" / f"{name}.txt")
+    label_path = root / "label_02" / f"{name}.txt"
+    labels = [line.split() for line in label_path.read_text().splitlines() if line.strip()]
+    try:
+        values = np.array([[*words[:2], *words[3:17]] for words in labels], np.float64).reshape(-1, 16)
+    except ValueError as exc:
+        raise TrackingError(f"{label_path} holds no KITTI tracking labels; expected 17 columns") from exc
+    kinds = np.array([words[2].lower() for words in labels], np.str_)
+    n_frames = 1 + int(values[:, 0].max(initial=-1.0))
+    if boxes is None:
+        detections = _read_detections(root, name, classes, calibration, n_frames)
+    elif len(boxes) < n_frames:
+        raise TrackingError(f"got boxes of {len(boxes)} frames for {n_frames} of {label_path}; pass one line a frame")
+    else:
+        detections = [list(of_frame) for of_frame in boxes]
+    n_frames = len(detections)
+    placed = _sensor_boxes(values[:, 9:16], calibration)
+    ignored = (values[:, 2] > MAX_TRUNCATION) | (values[:, 3] > MAX_OCCLUSION)
+    truth: dict[str, tuple[FrameTruth, ...]] = {}
+    for of in classes:
+        mine = np.isin(kinds, [*KINDS[of], *NEIGHBOURS[of]])
+        excused = ignored | ~np.isin(kinds, KINDS[of])
+        in_frame = [np.flatnonzero(mine & (values[:, 0] == k)) for k in range(n_frames)]
+        truth[of] = tuple(
+            FrameTruth(values[rows, 1].astype(np.int64), placed[rows], excused[rows]) for rows in in_frame
+        )
+    unlabelled = kinds == "dontcare"
+    return TrackingSequence(
+        name=name,
+        detections=tuple(tuple(of_frame) for of_frame in detections),
+        truth=truth,
+        unlabelled=tuple(values[unlabelled & (values[:, 0] == k), 5:9] for k in range(n_frames)),
+        calibration=calibration,
+    )
+
+
+def _read_detections(
+    root: Path, name: str, classes: Sequence[str], calibration: Calibration, n_frames: int
+) -> list[list[Box]]:
+    """By frame; columns: frame, type, left, top, right, bottom, logit, height, width, length, x, y, z, turn, alpha."""
+    detections: list[list[Box]] = [[] for _ in range(n_frames)]
+    for of in classes:
+        folders = sorted((root / "detections").glob(f"*_{of.capitalize()}"))
+        if not folders:
+            raise TrackingError(f"{root}/detections has no folder *_{of.capitalize()}; expected one for every class")
+        path = folders[0] / f"{name}.txt"
+        try:
+            lines = [line.split(",") for line in path.read_text().splitlines() if line.strip()]
+            rows = np.array(lines, np.float64).reshape(-1, 15)
+        except ValueError as exc:
+            raise TrackingError(f"{path} holds no detections; expected 15 comma-separated columns") from exc
+        detections += [[] for _ in range(len(detections), 1 + int(rows[:, 0].max(initial=-1.0)))]
+        scores = 1.0 / (1.0 + np.exp(-rows[:, 6]))
+        placed = _sensor_boxes(rows[:, 7:14], calibration)
+        for frame, score, row in zip(rows[:, 0].astype(np.int64), scores.tolist(), placed.tolist(), strict=True):
+            detections[frame].append(Box(of, score, (row[0], row[1], row[2]), (row[3], row[4], row[5]), row[6]))
+    return detections
+
+
+def read_boxes(path: Path | str) -> list[list[Box]]:
+    """Read the boxes of a drive, a line a scan, as ``edgeperc run --json`` prints them.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    list of list of Box
+
+    Raises
+    ------
+    TrackingError
+        A line is no such record.
+    OSError
+        The file cannot be read.
+    """
+    try:
+        return [
+            [Box(of["label"], of["score"], tuple(of["center"]), tuple(of["size"]), of["yaw"]) for of in line["boxes"]]
+            for line in map(json.loads, Path(path).read_text(encoding="utf-8").splitlines())
+        ]
+    except (KeyError, TypeError, ValueError) as exc:
+        raise TrackingError(f"{path} holds no boxes ({exc}); expected what edgeperc run --json printed") from exc
+
+
+def _sensor_boxes(rows: NDArray[np.float64], calibration: Calibration) -> NDArray[np.float64]:
+    """KITTI's height, width, length, x, y, z, turn in the camera's frame -> rows of a box in the sensor's frame."""
+    T_velo_cam = np.linalg.inv(calibration.T_cam_velo)
+    height, width, length, x, y, z, turn = rows.T
+    # KITTI gives the middle of the bottom face; y points down in the camera frame.
+    middles = np.stack([x, y - height / 2.0, z], axis=1) @ T_velo_cam[:3, :3].T + T_velo_cam[:3, 3]
+    ahead = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], axis=1) @ T_velo_cam[:3, :3].T
+    return np.column_stack([middles, length, width, height, np.arctan2(ahead[:, 1], ahead[:, 0])])
+
+
+def track_sequence(
+    sequence: TrackingSequence, parameters: Mapping[str, ClassParameters] | None = None
+) -> tuple[list[Tracks], float]:
+    """Run a new `edgeperc.Tracker` over a sequence, without poses.
+
+    Parameters
+    ----------
+    sequence : TrackingSequence
+    parameters : mapping of str to ClassParameters, optional
+
+    Returns
+    -------
+    tracks : list of Tracks
+        A frame each.
+    seconds : float
+        Spent in the tracker.
+    """
+    # The labels and these detections cover what the left colour camera sees.
+    (fx, _, cx), width_px = sequence.calibration.P2[0, :3], IMAGE_SIZE[0]
+    edges = math.degrees(math.atan(cx / fx)), -math.degrees(math.atan((width_px - cx) / fx))
+    tracker = Tracker(parameters, field_of_view_deg=edges)
+    tracks = []
+    start = time.perf_counter()
+    for k, boxes in enumerate(sequence.detections):
+        tracks.append(tracker.update(boxes, k * FRAME_S))
+    return tracks, time.perf_counter() - start
+
+
+def judged(sequence: TrackingSequence, tracks: Sequence[Tracks], of: str) -> list[FrameTracks]:
+    """The tracks of one class as the metrics take them, by frame; which are excused is said by the image."""
+    frames = []
+    for told, unlabelled in zip(tracks, sequence.unlabelled, strict=True):
+        mine = np.flatnonzero([label in KINDS[of] for label in told.labels])
+        boxes = told.boxes[mine]
+        excused = _excused(boxes, unlabelled, sequence.calibration)
+        with np.errstate(divide="ignore"):  # log odds, as the detections have them: shares near 1 lie too close
+            scores = np.log(told.scores[mine]) - np.log1p(-told.scores[mine])
+        frames.append(FrameTracks(told.ids[mine], boxes, np.clip(scores, -36.0, 36.0), excused))
+    return frames
+
+
+def _excused(
+    boxes: NDArray[np.float64], unlabelled: NDArray[np.float64], calibration: Calibration
+) -> NDArray[np.bool_]:
+    """Boxes that look no larger than 25 pixels, or lie by more than half in a region where nothing was labelled."""
+    signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
+    local = signs[None] * boxes[:, None, 3:6]
+    cos, sin = np.cos(boxes[:, 6])[:, None], np.sin(boxes[:, 6])[:, None]
+    x = boxes[:, :1] + cos * local[..., 0] - sin * local[..., 1]
+    y = boxes[:, 1:2] + sin * local[..., 0] + cos * local[..., 1]
+    corners = np.stack([x, y, boxes[:, 2:3] + local[..., 2]], axis=-1)
+    pixel, depth = calibration.to_image(corners.reshape(-1, 3))
+    pixel, depth = pixel.reshape(-1, 8, 2), depth.reshape(-1, 8)
+    ahead = depth > 0.1  # a corner beside or behind the camera has no pixel
+    low = np.where(ahead[..., None], pixel, np.inf).min(axis=1).clip(0.0, IMAGE_SIZE)
+    high = np.where(ahead[..., None], pixel, -np.inf).max(axis=1).clip(0.0, IMAGE_SIZE)
+    size = np.maximum(high - low, 0.0)
+    hidden = (size[:, 1] <= MIN_HEIGHT_PX) | (size[:, 0] <= 0.0)
+    for left, top, right, bottom in unlabelled:
+        shared = np.minimum(high, [right, bottom]) - np.maximum(low, [left, top])
+        inside = np.where((shared > 0.0).all(axis=1), shared.prod(axis=1), 0.0)
+        hidden |= inside > MIN_UNLABELLED * np.maximum(size.prod(axis=1), 1e-9)
+    return hidden
+
+
+def evaluate_kitti(
+    root: Path | str,
+    *,
+    sequences: Sequence[str] | None = None,
+    classes: Sequence[str] = CLASSES,
+    parameters: Mapping[str, ClassParameters] | None = None,
+    boxes: Mapping[str, Sequence[Sequence[Box]]] | None = None,
+    iou_threshold: float = 0.25,
+    on_sequence: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Track KITTI's sequences and hold the tracks against the labels.
+
+    One tracker follows all classes together; no ego poses are used.
+
+    Parameters
+    ----------
+    root : str or Path
+        Holds ``label_02``, ``calib`` and ``detections``.
+    sequences : sequence of str, optional
+        By default all that have labels.
+    classes : sequence of str
+    parameters : mapping of str to ClassParameters, optional
+    boxes : mapping of str to sequence of sequence of Box, optional
+        By sequence and frame: detections to take in place of the files.
+    iou_threshold : float
+        3-D overlap that makes a match.
+    on_sequence : callable, optional
+        Called with sequences done and sequences there are.
+
+    Returns
+    -------
+    dict
+        ``sequences``, ``iou_threshold``, ``frames_per_s``, and by class the figures of `TrackingScores`. Numbers and
+        strings alone, fit for JSON.
+
+    Raises
+    ------
+    TrackingError
+        There is no such data, or a file cannot be understood.
+    """
+    root = Path(root)
+    names = list(sequences or sorted(path.stem for path in (root / "label_02").glob("*.txt")))
+    if not names:
+        raise TrackingError(f"{root} holds no label_02/*.txt; pass the root of KITTI's tracking sequences")
+    pairs: dict[str, list[tuple[Sequence[FrameTruth], Sequence[FrameTracks]]]] = {of: [] for of in classes}
+    n_frames, seconds = 0, 0.0
+    Tracker(parameters).update([Box("car", 0.5, (9.0, 0.0, 0.0), (4.0, 2.0, 1.5), 0.0)], 0.0)  # loads the kernels
+    for done, name in enumerate(names, start=1):
+        sequence = read_sequence(root, name, classes, (boxes or {}).get(name))
+        tracks, took = track_sequence(sequence, parameters)
+        n_frames, seconds = n_frames + len(tracks), seconds + took
+        for of in classes:
+            pairs[of].append((sequence.truth[of], judged(sequence, tracks, of)))
+        if on_sequence is not None:
+            on_sequence(done, len(names))
+    return {
+        "sequences": names,
+        "iou_threshold": iou_threshold,
+        "frames_per_s": n_frames / seconds,
+        "classes": {of: asdict(evaluate_tracks(pairs[of], iou_threshold)) for of in classes},
+    }

@@ -1,0 +1,277 @@
+"""Unscented filters of three motions (KUL-Seg, section 6 and Figure 10: prediction and measurement update).
+
+The state is ``x, y, v, heading, turn rate`` [m, m, m/s, rad, rad/s]; v is along the heading and may be negative. A
+measurement is ``x, y, heading``. Constant velocity, constant turn rate and velocity (CTRV) and random motion share
+both.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["CONSTANT_VELOCITY", "CTRV", "MODES", "RANDOM_MOTION", "fill_predictions", "fill_updates"]
+
+CONSTANT_VELOCITY, CTRV, RANDOM_MOTION = 0, 1, 2
+MODES = ("constant_velocity", "constant_turn", "random_motion")
+
+# n + kappa of the unscented transform. With kappa = 1 every weight is positive, so no covariance can lose its rank.
+SPREAD = 6.0
+STRAIGHT_RAD_S = 1e-4  # below this turn rate the arc and its tangent differ by less than rounding does
+
+
+@njit(cache=True, nogil=True)
+def fill_predictions(
+    states: NDArray[np.float64],
+    covariances: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    dt: float,
+    means: NDArray[np.float64],
+    predicted: NDArray[np.float64],
+) -> None:
+    """Predict every motion of every track by its sigma points (KUL-Seg's "prediction").
+
+    Parameters
+    ----------
+    states : (n, 3, 5) float64
+        Of constant velocity, CTRV and random motion.
+    covariances : (n, 3, 5, 5) float64
+    noise : (n, 5) float64
+        Standard deviations: acceleration [m/s2], turn acceleration [rad/s2], random walk of the place [m/s^0.5], of the
+        heading [rad/s^0.5], and speed of random motion [m/s].
+    dt : float
+        [s], not negative.
+    means : (n, 3, 5) float64, overwritten
+    predicted : (n, 3, 5, 5) float64, overwritten
+        Additive process noise included.
+
+    Notes
+    -----
+    Sigma points x and x +- columns of the Cholesky root of (n + kappa) P, weights kappa / (n + kappa) and
+    1 / (2 (n + kappa)), with n = 5 and kappa = 1.
+    """
+    points = np.empty((11, 5))
+    root = np.empty((5, 5))
+    process = np.empty((5, 5))
+    for i in range(states.shape[0]):
+        for mode in range(3):
+            fill_cholesky(covariances[i, mode], root)
+            for k in range(11):
+                for a in range(5):
+                    points[k, a] = states[i, mode, a]
+                    if k > 0:
+                        points[k, a] += (math.sqrt(SPREAD) if k < 6 else -math.sqrt(SPREAD)) * root[a, (k - 1) % 5]
+                move(mode, points[k], dt)
+            mean, cov = means[i, mode], predicted[i, mode]
+            mean[:] = 0.0
+            for k in range(11):
+                for a in range(5):
+                    mean[a] += points[k, a] * (1.0 / SPREAD if k == 0 else 0.5 / SPREAD)
+            fill_process_noise(mode, states[i, mode, 3], noise[i], dt, process)
+            for a in range(5):
+                for b in range(a + 1):
+                    total = process[a, b]
+                    for k in range(11):
+                        weight = 1.0 / SPREAD if k == 0 else 0.5 / SPREAD
+                        total += weight * (points[k, a] - mean[a]) * (points[k, b] - mean[b])
+                    cov[a, b] = total
+                    cov[b, a] = total
+
+
+@njit(cache=True, nogil=True)
+def move(mode: int, state: NDArray[np.float64], dt: float) -> None:
+    """Move one state (5,) on by ``dt`` [s], in place; neither random motion nor a straight line keeps a turn rate."""
+    v, heading, turn = state[2], state[3], state[4]
+    if mode == CONSTANT_VELOCITY:
+        state[0] += v * math.cos(heading) * dt
+        state[1] += v * math.sin(heading) * dt
+        state[4] = 0.0
+    elif mode == RANDOM_MOTION:
+        state[2] = 0.0
+        state[4] = 0.0
+    else:
+        after = heading + turn * dt
+        if abs(turn) < STRAIGHT_RAD_S:
+            middle = heading + 0.5 * turn * dt
+            state[0] += v * math.cos(middle) * dt
+            state[1] += v * math.sin(middle) * dt
+        else:
+            state[0] += v / turn * (math.sin(after) - math.sin(heading))
+            state[1] += v / turn * (math.cos(heading) - math.cos(after))
+        state[3] = after
+
+
+@njit(cache=True, nogil=True)
+def fill_process_noise(
+    mode: int, heading: float, noise: NDArray[np.float64], dt: float, process: NDArray[np.float64]
+) -> None:
+    """Write the process noise (5, 5) of one motion: white accelerations, and walks of place and heading.
+
+    Parameters
+    ----------
+    mode : int
+    heading : float
+        [rad] before the motion.
+    noise : (5,) float64
+        As in `fill_predictions`.
+    dt : float
+    process : (5, 5) float64, overwritten
+    """
+    process[:] = 0.0
+    acceleration, turn, walk, wander, speed = noise[0], noise[1], noise[2], noise[3], noise[4]
+    process[3, 3] = wander * wander * dt
+    if mode == RANDOM_MOTION:
+        process[0, 0] = process[1, 1] = walk * walk * dt
+        process[2, 2] = speed * speed
+    else:
+        # Hundredfold below random motion: what the road and the sensor's own estimated motion add.
+        process[0, 0] = process[1, 1] = 0.01 * walk * walk * dt
+        push = np.zeros(5)
+        push[0] = 0.5 * dt * dt * math.cos(heading)
+        push[1] = 0.5 * dt * dt * math.sin(heading)
+        push[2] = dt
+        for a in range(3):
+            for b in range(3):
+                process[a, b] += push[a] * push[b] * acceleration * acceleration
+    if mode == CTRV:
+        process[3, 3] += 0.25 * dt**4 * turn * turn
+        process[3, 4] = process[4, 3] = 0.5 * dt**3 * turn * turn
+        process[4, 4] = dt * dt * turn * turn
+    else:
+        process[4, 4] = 0.01 * turn * turn  # what a turn rate may be when turning begins
+
+
+@njit(cache=True, nogil=True)
+def fill_updates(
+    means: NDArray[np.float64],
+    predicted: NDArray[np.float64],
+    detections: NDArray[np.float64],
+    sigmas: NDArray[np.float64],
+    beta: NDArray[np.float64],
+    states: NDArray[np.float64],
+    covariances: NDArray[np.float64],
+) -> None:
+    """Update every motion of every track with its share of every detection: a PDA filter each.
+
+    Parameters
+    ----------
+    means, predicted
+        What `fill_predictions` wrote.
+    detections : (m, 3) float64
+        x, y [m], heading [rad], in the frame of the states.
+    sigmas : (n, 3) float64
+        Standard deviations of a detection along and across its heading [m] and of the heading [rad].
+    beta : (n, 3, m + 1) float64
+        Probability, by motion, that the track was not detected, and that each detection is the track's.
+    states : (n, 3, 5) float64, overwritten
+    covariances : (n, 3, 5, 5) float64, overwritten
+
+    Notes
+    -----
+    The measurement is a part of the state, for which the unscented sums of the cross-covariance and of the innovation's
+    covariance are exact: they are columns and a block of the predicted covariance. A heading counts modulo pi, and a
+    deviation of more than three standard deviations counts as three (see `edgeperc.tracking.jpda`).
+    """
+    innovation = np.empty((3, 3))
+    inverse = np.empty((3, 3))
+    gain = np.empty((5, 3))
+    cross = np.empty((5, 3))
+    for i in range(means.shape[0]):
+        for mode in range(3):
+            mean, cov = means[i, mode], predicted[i, mode]
+            fill_innovation(mean[3], cov, sigmas[i], innovation)
+            fill_inverse(innovation, inverse)
+            for a in range(5):
+                cross[a, 0], cross[a, 1], cross[a, 2] = cov[a, 0], cov[a, 1], cov[a, 3]
+                for b in range(3):
+                    gain[a, b] = 0.0
+                for b in range(3):
+                    for c in range(3):
+                        gain[a, c] += cross[a, b] * inverse[b, c]
+            shift = np.zeros(3)
+            spread = np.zeros((3, 3))
+            limit = 3.0 * math.sqrt(innovation[2, 2])
+            for j in range(detections.shape[0]):
+                share = beta[i, mode, j + 1]
+                if share == 0.0:
+                    continue
+                d0 = detections[j, 0] - mean[0]
+                d1 = detections[j, 1] - mean[1]
+                d2 = min(max(half_turn(detections[j, 2] - mean[3]), -limit), limit)
+                shift[0] += share * d0
+                shift[1] += share * d1
+                shift[2] += share * d2
+                spread[0, 0] += share * d0 * d0
+                spread[0, 1] += share * d0 * d1
+                spread[0, 2] += share * d0 * d2
+                spread[1, 1] += share * d1 * d1
+                spread[1, 2] += share * d1 * d2
+                spread[2, 2] += share * d2 * d2
+            detected = 1.0 - beta[i, mode, 0]
+            for a in range(3):
+                for b in range(a, 3):
+                    # Gain times (spread - detected * innovation) times gain joins the PDA filter's three terms.
+                    spread[a, b] -= shift[a] * shift[b] + detected * innovation[a, b]
+                    spread[b, a] = spread[a, b]
+            for a in range(5):
+                states[i, mode, a] = mean[a] + gain[a, 0] * shift[0] + gain[a, 1] * shift[1] + gain[a, 2] * shift[2]
+                for b in range(a + 1):
+                    total = cov[a, b]
+                    for c in range(3):
+                        for d in range(3):
+                            total += gain[a, c] * spread[c, d] * gain[b, d]
+                    covariances[i, mode, a, b] = total
+                    covariances[i, mode, b, a] = total
+
+
+@njit(cache=True, nogil=True)
+def fill_innovation(
+    heading: float, cov: NDArray[np.float64], sigmas: NDArray[np.float64], innovation: NDArray[np.float64]
+) -> None:
+    """Write the covariance (3, 3) of a detection about its prediction; its noise lies along and across the heading."""
+    cos, sin = math.cos(heading), math.sin(heading)
+    along, across, turn = sigmas[0] * sigmas[0], sigmas[1] * sigmas[1], sigmas[2] * sigmas[2]
+    innovation[0, 0] = cov[0, 0] + along * cos * cos + across * sin * sin
+    innovation[1, 1] = cov[1, 1] + along * sin * sin + across * cos * cos
+    innovation[2, 2] = cov[3, 3] + turn
+    innovation[0, 1] = innovation[1, 0] = cov[0, 1] + (along - across) * cos * sin
+    innovation[0, 2] = innovation[2, 0] = cov[0, 3]
+    innovation[1, 2] = innovation[2, 1] = cov[1, 3]
+
+
+@njit(cache=True, nogil=True)
+def fill_inverse(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> None:
+    """Invert a symmetric positive definite (3, 3) matrix by its cofactors."""
+    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
+    d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    inverse[0, 0] = (d * f - e * e) / determinant
+    inverse[1, 1] = (a * f - c * c) / determinant
+    inverse[2, 2] = (a * d - b * b) / determinant
+    inverse[0, 1] = inverse[1, 0] = (c * e - b * f) / determinant
+    inverse[0, 2] = inverse[2, 0] = (b * e - c * d) / determinant
+    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) / determinant
+
+
+@njit(cache=True, nogil=True)
+def fill_cholesky(matrix: NDArray[np.float64], root: NDArray[np.float64]) -> None:
+    """Write the lower root (5, 5) of a covariance; a direction that rounding left without variance gets none."""
+    root[:] = 0.0
+    for a in range(5):
+        for b in range(a + 1):
+            total = matrix[a, b]
+            for c in range(b):
+                total -= root[a, c] * root[b, c]
+            if a == b:
+                root[a, a] = math.sqrt(max(total, 0.0))
+            elif root[b, b] > 0.0:
+                root[a, b] = total / root[b, b]
+
+
+@njit(cache=True, nogil=True)
+def half_turn(angle: float) -> float:
+    """The angle modulo pi, in -pi/2..pi/2: a box looks the same from behind."""
+    return angle - math.pi * math.floor(angle / math.pi + 0.5)
