@@ -1,4 +1,4 @@
-"""The ``edgeperc`` command: ``demo``, ``run``, ``info``, ``eval`` and ``eval tracking``.
+"""The ``edgeperc`` command: ``demo``, ``run``, ``info``, ``adapt``, ``eval``, ``eval sensors`` and ``eval tracking``.
 
 Exit codes: 0 all is well, 1 some scans failed (each is reported, the others are done), 2 nothing could be done
 (usage, model, provider, a missing extra), 130 interrupted, 141 the reader of the output went away.
@@ -58,7 +58,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = sys.argv[1:] if argv is None else list(argv)
     # argparse knows no commands of a command that takes paths, too; a data set called so is given as ./tracking.
-    spelled = ["eval-tracking", *words[2:]] if words[:2] == ["eval", "tracking"] else words
+    spelled = (
+        [f"eval-{words[1]}", *words[2:]]
+        if words[:1] == ["eval"] and words[1:2] in (["sensors"], ["tracking"])
+        else words
+    )
     arguments = _parser().parse_args(spelled, argparse.Namespace(typed=shlex.join(["edgeperc", *words])))
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names need not fit the terminal's encoding
@@ -91,7 +95,12 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
     sensing = argparse.ArgumentParser(add_help=False)
-    sensing.add_argument("--sensor", default="hdl-64e", metavar="NAME", help="what took the scans (default: hdl-64e)")
+    sensing.add_argument(
+        "--sensor",
+        default="hdl-64e",
+        metavar="NAME",
+        help="what took the scans: a built-in name, or a .json file of edgeperc adapt fit (default: hdl-64e)",
+    )
     running = argparse.ArgumentParser(add_help=False)
     running.add_argument(
         "--model",
@@ -138,6 +147,12 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--rate", type=_rate, default=10.0, metavar="HZ", help="scans a second, where they bear no stamps (default: 10)"
     )
+    run.add_argument(
+        "--adapt",
+        choices=("both", "remission", "interpolation", "neither"),
+        default="both",
+        help="of a sensor unlike the models': render its remission, fill between its beams (default: both)",
+    )
     run.set_defaults(command=_run, usage_error=run.error)
 
     info = commands.add_parser(
@@ -148,6 +163,20 @@ def _parser() -> argparse.ArgumentParser:
     info.add_argument("things", nargs="+", metavar="MODEL|SCAN", help="a shipped model's name, an .onnx, or a scan")
     info.add_argument("--json", action="store_true", help="print a model's card as it is, one line of JSON a model")
     info.set_defaults(command=_info)
+
+    adapting = commands.add_parser("adapt", help="make a sensor known: fit its remission to another's")
+    fits = adapting.add_subparsers(required=True, metavar="fit")
+    fit = fits.add_parser(
+        "fit",
+        help="write a sensor profile for --sensor",
+        description="Fit a function that renders a sensor's remission as another's, from scans of any streets, the "
+        "more the better: equal shares of the points of both sensors are taken to be equally bright.",
+    )
+    fit.add_argument("scans", nargs="+", type=Path, metavar="SCAN", help="scans, or folders of scans")
+    fit.add_argument("--sensor", required=True, metavar="NAME", help="what took them: a built-in name or a .json file")
+    fit.add_argument("--to", default="hdl-64e", metavar="NAME", help="whose remission to render (default: hdl-64e)")
+    fit.add_argument("--out", type=Path, required=True, metavar="FILE", help="the profile, a .json file")
+    fit.set_defaults(command=_adapt_fit)
 
     judge = commands.add_parser(
         "eval",
@@ -201,6 +230,24 @@ def _parser() -> argparse.ArgumentParser:
     follow.add_argument("--json", type=Path, metavar="FILE", help="every figure")
     follow.add_argument("--gif", type=Path, metavar="FILE", help="the first sequence's tracks from above")
     follow.set_defaults(command=_eval_tracking, usage_error=follow.error)
+
+    other = commands.add_parser(
+        "eval-sensors",
+        prog="edgeperc eval sensors",
+        help="IoU on other sensors, without and with adaptation; also written: eval sensors",
+        description="What a model is worth on scans of another sensor: with remission rendered, with interpolation, "
+        "with both and with neither.",
+    )
+    other.add_argument(
+        "datasets",
+        nargs="+",
+        metavar="SENSOR=SOURCE",
+        help="simulation:N; a folder with velodyne/NAME.bin and label/NAME.txt; a folder of labelled range images",
+    )
+    other.add_argument("--model", default="pointseg", metavar="NAME", help="as in run (default: pointseg)")
+    other.add_argument("--provider", default="cpu", metavar="P", help="as in run (default: cpu)")
+    other.add_argument("--json", type=Path, metavar="FILE", help="every figure")
+    other.set_defaults(command=_eval_sensors)
     return parser
 
 
@@ -231,7 +278,10 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__
 
 
 def _perceiver(
-    arguments: argparse.Namespace, sensor: str, on_mismatch: Literal["warn", "raise", "ignore"]
+    arguments: argparse.Namespace,
+    sensor: str,
+    on_mismatch: Literal["warn", "raise", "ignore"],
+    adapt: Literal["both", "remission", "interpolation", "neither"] = "both",
 ) -> Perceiver:
     from .perceiver import Perceiver
 
@@ -242,6 +292,7 @@ def _perceiver(
             provider=arguments.provider,
             n_threads=arguments.threads,
             on_mismatch=on_mismatch,
+            adapt=adapt,
         )
     except EdgepercError:
         raise
@@ -275,7 +326,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
     from .perception import Perception
 
-    perceive = _perceiver(arguments, arguments.sensor, arguments.on_mismatch)
+    perceive = _perceiver(arguments, arguments.sensor, arguments.on_mismatch, arguments.adapt)
     if (arguments.labels or arguments.ply) and not any(card.view.kind == "range_image" for card in perceive.cards):
         raise ModelError("--labels and --ply need a class for every point; add a range-image model: --model pointseg")
     for target in targets if kinds else ():
@@ -713,6 +764,7 @@ def _nested(name: str, value: Any) -> list[tuple[str, str]]:
 def _scan_rows(path: Path, sensor_name: str) -> list[tuple[str, str]]:
     import numpy as np
 
+    from .adapt import render
     from .captures import read_scans
     from .models import model_path, shipped_models
     from .sensors import FitnessProfile, check_fitness, get_sensor
@@ -732,8 +784,12 @@ def _scan_rows(path: Path, sensor_name: str) -> list[tuple[str, str]]:
         rows.append(("elevation", f"{low:.1f} .. {high:.1f} deg (99 % of the points)"))
         quantiles = np.percentile(finite[:, 3], [0, 5, 50, 95, 100])
         rows.append(("remission", "least {:g}, 5 % {:g}, median {:g}, 95 % {:g}, most {:g}".format(*quantiles)))
-    points = points.copy()
-    points[:, 3] = (points[:, 3] + np.float32(sensor.remission_offset)) * np.float32(sensor.remission_scale)
+    if sensor.remission is not None:
+        points = render(points, sensor)
+        rows.append(("", f"rendered as the {sensor.remission.to}'s by a {sensor.remission.kind}"))
+    else:
+        points = points.copy()
+        points[:, 3] = (points[:, 3] + np.float32(sensor.remission_offset)) * np.float32(sensor.remission_scale)
     if not len(finite):
         return rows
     measured = FitnessProfile.from_scans([points])
@@ -755,7 +811,62 @@ def _scan_rows(path: Path, sensor_name: str) -> list[tuple[str, str]]:
     return rows
 
 
+# adapt
+
+
+def _adapt_fit(arguments: argparse.Namespace) -> int:
+    from .adapt import fit_sensor
+    from .captures import read_scans
+    from .sensors import get_sensor
+
+    paths, empty = _find_scans(arguments.scans)
+    if empty:
+        raise PointsError(f"{empty[0]}: no scan in this folder; expected scans or captures")
+    if arguments.out.suffix != ".json":
+        raise SensorError(f"{arguments.out}: a profile's name ends in .json, so that --sensor knows it for a file")
+    scans = [points for path in paths for _, points in read_scans(path)]
+    profile, functions = fit_sensor(scans, get_sensor(arguments.sensor), arguments.to)
+    assert profile.remission is not None
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(profile.to_json() + "\n", encoding="utf-8")
+    rows = [
+        (f.kind, f"RMSE {f.rmse:.4f}; coefficients {', '.join(f'{c:.5g}' for c in f.coefficients)}") for f in functions
+    ]
+    _print_rows([*rows, ("written", f"{arguments.out}: {profile.name} with the {profile.remission.kind}")])
+    return 0
+
+
 # eval
+
+
+def _eval_sensors(arguments: argparse.Namespace) -> int:
+    from .transfer import compare
+
+    progress: list[_Progress] = []
+
+    def on_scan(done: int, total: int) -> None:
+        progress[:] = progress or [_Progress(total)]
+        progress[0].show(done)
+
+    figures = compare(arguments.datasets, arguments.model, provider=arguments.provider, on_scan=on_scan)
+    for bar in progress:
+        bar.clear()
+    lines = [f"{arguments.model}; IoU of points in per cent, mIoU over the classes shown"]
+    for name, told in figures.items():
+        rows = [
+            ((kind, ""), {**told[kind]["iou"], "mean": told[kind]["mean_iou"]})
+            for kind in ("neither", "remission", "interpolation", "both")
+        ]
+        there = ", ".join(f"{count:,} {label}" for label, count in told["both"]["n_points"].items())
+        columns = [(label, label) for label in told["both"]["iou"] if label != "background"]
+        title = f"{name}: {_many(told['n_scans'], 'scan')}, {there}; remission: {told['function'] or 'no function'}"
+        lines += _table(title, (*columns, ("mIoU", "mean")), rows)
+    print("\n".join(lines))
+    if arguments.json is not None:
+        arguments.json.parent.mkdir(parents=True, exist_ok=True)
+        text = json.dumps({"command": arguments.typed, **figures}, indent=1, allow_nan=False)
+        arguments.json.write_text(text + "\n", encoding="utf-8")
+    return 0
 
 
 def _eval(arguments: argparse.Namespace) -> int:

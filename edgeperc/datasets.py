@@ -20,6 +20,7 @@ from .card import TopViewGeometry
 from .errors import PointsError
 from .perception import Box
 from .points import read_points
+from .sensors import SensorProfile
 from .simulation import SimulatedScan, random_scene, scene_from_boxes, sensor_pose, simulate
 from .splits import TEST_DRIVES, in_split
 
@@ -320,7 +321,9 @@ class SemanticKitti:
         return RoadFrame(name, self.drives[name], points, np.where(raw == 0, IGNORE, labels).astype(np.uint8))
 
 
-def simulated_scan(seed: int, sensor: str = "hdl-64e", boxes: Sequence[Box] | None = None) -> SimulatedScan:
+def simulated_scan(
+    seed: int, sensor: str | SensorProfile = "hdl-64e", boxes: Sequence[Box] | None = None
+) -> SimulatedScan:
     """One scan of a scene of its own, the vehicle a little off its lane, pitched and rolled as on a real road.
 
     ``boxes`` gives the scene a real layout; without, everything is drawn from the seed.

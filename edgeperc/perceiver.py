@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .adapt import Interpolator, render
 from .card import ModelCard, RangeImageGeometry, TopViewGeometry
 from .decode import decode_classes, decode_dense, decode_slots
 from .errors import FitnessError
@@ -30,6 +31,8 @@ from .session import Session
 __all__ = ["Perceiver"]
 
 STAGES = ("check", "project", "infer", "decode", "refine")
+Adaptation = Literal["both", "remission", "interpolation", "neither"]
+ADAPTATIONS: tuple[Adaptation, ...] = ("neither", "remission", "interpolation", "both")
 # A wrong set-up shows in any scan; a few are looked at, as one may be taken in a tunnel or a depot.
 CHECKED_SCANS = 5
 
@@ -43,7 +46,7 @@ class _Stopwatch:
 
     def lap(self, stage: str) -> None:
         now = time.perf_counter()
-        self.ms[stage] += 1e3 * (now - self._last)
+        self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (now - self._last)
         self._last = now
 
 
@@ -53,6 +56,7 @@ class _Network:
     projector: TopViewProjector | RangeImageProjector
     index: NDArray[np.int32]
     fitness: FitnessProfile | None
+    interpolator: Interpolator | None
 
 
 class Perceiver:
@@ -67,8 +71,9 @@ class Perceiver:
     models : str, Path or sequence of these
         Names of shipped models (``"ssadnet"``, ``"pointseg"``) or paths of .onnx files with a card; at most one model
         a view.
-    sensor : str or SensorProfile
-        Where the points come from; says how raw remissions map to 0..1. See `edgeperc.sensors.SENSORS`.
+    sensor : str, Path or SensorProfile
+        Where the points come from: a built-in name (`edgeperc.sensors.SENSORS`), a file that ``edgeperc adapt fit``
+        wrote, or a profile. Says how raw remissions map to 0..1, and how they are rendered as the training sensor's.
     provider : str
         ``"auto"``, ``"cpu"``, ``"openvino"``, ... A provider asked for is required (`edgeperc.session.PROVIDERS`).
     n_threads : int or None
@@ -77,6 +82,10 @@ class Perceiver:
         What to do when one of the first scans is unlike those the model was trained on. ``"ignore"`` skips the check.
     score_threshold : float or None
         Least score of a box; None takes the card's.
+    adapt : {"both", "remission", "interpolation", "neither"}
+        What is done about another sensor than the models were trained on: its remission is rendered, where its profile
+        has a function, and a range image is filled between its beams and columns, where it has fewer. Nothing where
+        the sensor is the same.
 
     Attributes
     ----------
@@ -105,12 +114,15 @@ class Perceiver:
         self,
         models: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
         *,
-        sensor: str | SensorProfile = "hdl-64e",
+        sensor: str | os.PathLike[str] | SensorProfile = "hdl-64e",
         provider: str = "auto",
         n_threads: int | None = None,
         on_mismatch: Literal["warn", "raise", "ignore"] = "warn",
         score_threshold: float | None = None,
+        adapt: Adaptation = "both",
     ) -> None:
+        if adapt not in ADAPTATIONS:
+            raise ValueError(f"adapt is {adapt!r}; expected one of {', '.join(ADAPTATIONS)}")
         if on_mismatch not in ("warn", "raise", "ignore"):
             raise ValueError(f"on_mismatch is {on_mismatch!r}; expected warn, raise or ignore")
         if score_threshold is not None and not 0.0 <= score_threshold <= 1.0:
@@ -118,6 +130,10 @@ class Perceiver:
         self.sensor = get_sensor(sensor)
         self.on_mismatch = on_mismatch
         self.score_threshold = score_threshold
+        self._interpolates = adapt in ("both", "interpolation")
+        self._renders = self.sensor.remission is not None and adapt in ("both", "remission")
+        # Rendered remissions lie in 0..1 already.
+        self._remission = (0.0, 1.0) if self._renders else (self.sensor.remission_offset, self.sensor.remission_scale)
         given = [models] if isinstance(models, (str, os.PathLike)) else list(models)
         self._networks = [self._load(_resolve(m), provider, n_threads) for m in given]
         views = [n.session.card.view.kind for n in self._networks]
@@ -135,15 +151,18 @@ class Perceiver:
         warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
         self._perceive(warm_up, None, check=self._to_check > 0, infer=False)
 
-    @staticmethod
-    def _load(path: Path, provider: str, n_threads: int | None) -> _Network:
+    def _load(self, path: Path, provider: str, n_threads: int | None) -> _Network:
         session = Session(path, provider, n_threads)
         card = session.card
+        interpolator = None
+        if self._interpolates and isinstance(card.view, RangeImageGeometry):
+            interpolator = Interpolator(card.view, self.sensor)
         return _Network(
             session=session,
             projector=make_projector(card.view, card.input),
             index=np.empty((card.view.height, card.view.width), np.int32),
             fitness=None if card.fitness is None else FitnessProfile.from_dict(card.fitness),
+            interpolator=interpolator if interpolator is not None and interpolator.needed else None,
         )
 
     def __call__(self, points: ArrayLike, stamp_s: float | None = None) -> Perception:
@@ -175,6 +194,10 @@ class Perceiver:
         finite = np.isfinite(scan)
         # Reducing rows of four costs ten times the count, and nearly every scan is finite throughout.
         n_dropped = 0 if finite.all() else len(scan) - int(np.count_nonzero(finite.all(axis=1)))
+        watch.lap("check")
+        if self._renders:
+            scan = render(scan, self.sensor)
+            watch.lap("adapt")
         fitness = self._check(scan) if check else ()
         watch.lap("check")
         points: PointLabels | None = None
@@ -199,7 +222,7 @@ class Perceiver:
 
     def _check(self, scan: NDArray[np.float32]) -> tuple[str, ...]:
         found: dict[str, None] = {}
-        offset, scale = np.float32(self.sensor.remission_offset), np.float32(self.sensor.remission_scale)
+        offset, scale = (np.float32(value) for value in self._remission)
         scaled = scan
         if (offset, scale) != (0.0, 1.0):
             scaled = scan.copy()
@@ -213,8 +236,7 @@ class Perceiver:
         pixel = np.empty(len(scan), np.int32)
         network.projector.fill(
             scan,
-            self.sensor.remission_offset,
-            self.sensor.remission_scale,
+            *self._remission,
             network.session.input,
             network.index,
             pixel,
@@ -245,6 +267,12 @@ class Perceiver:
         assert isinstance(card.view, RangeImageGeometry)
         pixel = self._project(network, scan)
         watch.lap("project")
+        if network.interpolator is not None:
+            assert isinstance(network.projector, RangeImageProjector)
+            # Points between are in the image alone; from here on there are only those that came.
+            dense, filled = network.interpolator.fill(scan, network.index)
+            network.projector.fill_image(dense, *self._remission, filled, network.session.input)
+            watch.lap("adapt")
         outputs = network.session.run() if infer else network.session.outputs
         watch.lap("infer")
         ((kind, raw),) = outputs.items()

@@ -442,8 +442,20 @@ class RangeImageProjector:
         mark_range_image(
             points, self._wedge, *self._rows, *self._cols, np.int32(self.shape[2]), self._winner, flat_index, pixel
         )
+        self.fill_image(points, remission_offset, remission_scale, index, image)
+
+    def fill_image(
+        self,
+        points: NDArray[np.float32],
+        remission_offset: float,
+        remission_scale: float,
+        index: NDArray[np.int32],
+        image: NDArray[np.float32],
+    ) -> None:
+        """Write the image of an ``index`` that is known already; arguments and errors as in `TopViewProjector.fill`."""
+        points = _checked(self.shape, points, remission_offset, remission_scale, image, index)
         fill_image(
-            points, flat_index, np.float32(remission_offset), np.float32(remission_scale),
+            points, index.reshape(-1), np.float32(remission_offset), np.float32(remission_scale),
             self._channels, self._mean, self._std, image.reshape(self.shape[0], -1),
         )  # fmt: skip
 
@@ -559,7 +571,7 @@ def _checked(
     remission_scale: float,
     image: NDArray[np.float32],
     index: NDArray[np.int32],
-    pixel: NDArray[np.int32],
+    pixel: NDArray[np.int32] | None = None,
 ) -> NDArray[np.float32]:
     """The points as a read-only view, so that every scan runs the same compiled kernel; raises PointsError."""
     _check_points(points)
@@ -568,6 +580,8 @@ def _checked(
         ("index", index, shape[1:], np.int32),
         ("pixel", pixel, points.shape[:1], np.int32),
     ):
+        if buffer is None:
+            continue
         if buffer.shape != expected or buffer.dtype != dtype or not buffer.flags.carray:
             raise PointsError(
                 f"{name} buffer is {buffer.shape} {buffer.dtype}; expected {expected} {np.dtype(dtype)}, "

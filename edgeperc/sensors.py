@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -15,7 +18,68 @@ from numpy.typing import NDArray
 
 from .errors import CardError, PointsError, SensorError
 
-__all__ = ["SENSORS", "FitnessProfile", "SensorProfile", "check_fitness", "get_sensor"]
+__all__ = ["SENSORS", "FitnessProfile", "RemissionFunction", "SensorProfile", "check_fitness", "get_sensor"]
+
+SCHEMA = 1  # of a sensor profile's file
+REMISSION_KINDS = {"linear": 2, "polynomial": 3, "logarithm": 2}  # and how many coefficients each has
+
+
+@dataclass(frozen=True)
+class RemissionFunction:
+    """One sensor's remission as another sensor would report it (KUL-Seg 5).
+
+    With ``x = full_scale * remission``, where remission is scaled to 0..1 by the profile's ``remission_range``, the
+    other sensor's remission in 0..1 is a + b x (linear), a + b x + c x^2 (polynomial) or a + b ln(1 + x) (logarithm),
+    cut off at 0 and 1. `edgeperc.adapt` fits and applies it.
+
+    Attributes
+    ----------
+    kind : str
+        ``"linear"``, ``"polynomial"`` or ``"logarithm"``.
+    coefficients : tuple of float
+        a, b and, of a polynomial, c.
+    full_scale : float
+        Raw values in the sensor's remission range when the function was fitted, 255 for a byte.
+    to : str
+        The sensor whose remission comes out.
+    rmse : float
+        Root mean square error on samples held back, in shares of the other sensor's full scale.
+    source : str
+        What it was fitted to.
+
+    Raises
+    ------
+    SensorError
+        When the values describe no such function.
+    """
+
+    kind: str
+    coefficients: tuple[float, ...]
+    full_scale: float
+    to: str
+    rmse: float
+    source: str
+
+    def __post_init__(self) -> None:
+        try:
+            object.__setattr__(self, "coefficients", tuple(float(c) for c in self.coefficients))
+            object.__setattr__(self, "full_scale", float(self.full_scale))
+            object.__setattr__(self, "rmse", float(self.rmse))
+        except (TypeError, ValueError, OverflowError) as exc:
+            raise SensorError(f"remission function: a value is no number ({exc})") from exc
+        if self.kind not in REMISSION_KINDS:
+            raise SensorError(f"remission function of kind {self.kind!r}; expected one of {', '.join(REMISSION_KINDS)}")
+        if len(self.coefficients) != REMISSION_KINDS[self.kind] or not all(map(math.isfinite, self.coefficients)):
+            raise SensorError(
+                f"a {self.kind} remission function has {REMISSION_KINDS[self.kind]} finite coefficients, "
+                f"got {self.coefficients!r}"
+            )
+        if not 0.0 < self.full_scale < math.inf or not 0.0 <= self.rmse < math.inf:
+            raise SensorError(
+                f"full_scale {self.full_scale!r} must be above 0 and rmse {self.rmse!r} not below, finite"
+            )
+        if not isinstance(self.to, str) or not self.to or not isinstance(self.source, str):
+            raise SensorError(f"remission function to {self.to!r} from {self.source!r}; expected two str")
 
 
 @dataclass(frozen=True)
@@ -40,6 +104,9 @@ class SensorProfile:
         Height of the sensor above the road.
     min_range_m, max_range_m : float
         Nearest and farthest return to expect.
+    remission : RemissionFunction or None
+        How this sensor's remission is rendered as that of the sensor that models were trained on; None where nothing
+        is known: it is then scaled by ``remission_range`` alone.
 
     Raises
     ------
@@ -54,6 +121,7 @@ class SensorProfile:
     mount_height_m: float = 1.73
     min_range_m: float = 0.9
     max_range_m: float = 120.0
+    remission: RemissionFunction | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -85,6 +153,35 @@ class SensorProfile:
                 f"sensor {self.name!r}: 0 <= min_range_m < max_range_m must hold, "
                 f"got {self.min_range_m!r} and {self.max_range_m!r}"
             )
+        if self.remission is not None and not isinstance(self.remission, RemissionFunction):
+            raise SensorError(f"sensor {self.name!r}: remission is a RemissionFunction or None, got {self.remission!r}")
+
+    def to_json(self) -> str:
+        """For a file that `get_sensor` reads."""
+        return json.dumps({"schema": SCHEMA, **asdict(self)}, indent=1, ensure_ascii=False, allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> SensorProfile:
+        """Read what `to_json` wrote.
+
+        Raises
+        ------
+        SensorError
+            No JSON, another schema, an entry that is missing, unknown or of another type.
+        """
+        try:
+            document = json.loads(text)
+        except (RecursionError, ValueError) as exc:
+            raise SensorError(f"the sensor profile is no JSON ({exc}); write it again with edgeperc adapt fit") from exc
+        if not isinstance(document, dict) or document.get("schema") != SCHEMA:
+            found = document.get("schema") if isinstance(document, dict) else None
+            raise SensorError(f"the sensor profile has schema {found!r}, this edgeperc reads {SCHEMA}")
+        _check_entries(document, {"schema", *(field.name for field in fields(cls))}, "sensor profile")
+        del document["schema"]
+        if document["remission"] is not None:
+            _check_entries(document["remission"], {field.name for field in fields(RemissionFunction)}, "remission")
+            document["remission"] = RemissionFunction(**document["remission"])
+        return cls(**document)
 
     @classmethod
     def uniform(
@@ -99,6 +196,7 @@ class SensorProfile:
         mount_height_m: float = 1.73,
         min_range_m: float = 0.9,
         max_range_m: float = 120.0,
+        remission: RemissionFunction | None = None,
     ) -> SensorProfile:
         """A sensor with evenly spaced beams, the top one at ``fov_up_deg``, the bottom one at ``fov_down_deg``."""
         if isinstance(n_beams, bool) or not isinstance(n_beams, int | np.integer) or not 1 <= n_beams <= 4096:
@@ -114,6 +212,7 @@ class SensorProfile:
             mount_height_m,
             min_range_m,
             max_range_m,
+            remission,
         )
 
     @property
@@ -189,19 +288,38 @@ def _ouster(model: str, half_fov_deg: float, min_range_m: float, max_range_m: fl
 
 
 _BYTE = (0.0, 255.0)
+# `edgeperc adapt fit`, from unlabelled scans. The logarithm was the best of three each time.
+_OF_NUSCENES = RemissionFunction(
+    "logarithm", (-0.2949, 0.1832), 255.0, "hdl-64e", 0.0209, "13 nuScenes scans, quantiles by range and incidence"
+)
+_OF_PANDASET = RemissionFunction(
+    "logarithm", (-0.0483, 0.1482), 255.0, "hdl-64e", 0.0353, "4 PandaSet scans, quantiles by range and incidence"
+)
+# Velodyne calibrates these to one scale: 0 to 100 diffuse, above that retro-reflectors. Measured on the HDL-32E alone.
+_OF_VELODYNE = replace(_OF_NUSCENES, source=f"the hdl-32e's, calibrated to the same scale: {_OF_NUSCENES.source}")
 _BUILT_IN = (
     # KITTI, where a turn has up to 2,160 returns a laser; its files hold remission / 255.
     SensorProfile("hdl-64e", _HDL_64E, 2083, (0.0, 1.0), 1.73, 0.9, 120.0),
     # nuScenes (20 Hz, on the roof).
     SensorProfile.uniform(
-        "hdl-32e", 32, 10.67, -30.67, columns=1084, remission_range=_BYTE, mount_height_m=1.84, max_range_m=105.0
+        "hdl-32e",
+        32,
+        10.67,
+        -30.67,
+        columns=1084,
+        remission_range=_BYTE,
+        mount_height_m=1.84,
+        max_range_m=105.0,
+        remission=_OF_NUSCENES,
     ),
-    SensorProfile.uniform("vlp-16", 16, 15.0, -15.0, remission_range=_BYTE, min_range_m=0.5, max_range_m=105.0),
-    SensorProfile("vlp-32c", _VLP_32C, 1800, _BYTE, 1.73, 1.0, 200.0),
+    SensorProfile.uniform(
+        "vlp-16", 16, 15.0, -15.0, remission_range=_BYTE, min_range_m=0.5, max_range_m=105.0, remission=_OF_VELODYNE
+    ),
+    SensorProfile("vlp-32c", _VLP_32C, 1800, _BYTE, 1.73, 1.0, 200.0, _OF_VELODYNE),
     *_ouster("os0", 45.0, 0.3, 75.0),
     *_ouster("os1", 22.5 - 1.25, 0.3, 170.0),
     *_ouster("os2", 11.25, 0.8, 350.0),
-    SensorProfile("pandar64", _PANDAR_64, 1800, _BYTE, 1.73, 0.3, 200.0),
+    SensorProfile("pandar64", _PANDAR_64, 1800, _BYTE, 1.73, 0.3, 200.0, _OF_PANDASET),
     SensorProfile.uniform("pandarxt-32", 32, 15.0, -16.0, columns=2000, remission_range=_BYTE, min_range_m=0.05),
 )
 
@@ -209,22 +327,45 @@ SENSORS: Mapping[str, SensorProfile] = MappingProxyType({profile.name: profile f
 """The built-in profiles by name."""
 
 
-def get_sensor(sensor: str | SensorProfile) -> SensorProfile:
-    """The built-in profile of that name, or the profile itself.
+def _check_entries(document: object, names: set[str], what: str) -> None:
+    if not isinstance(document, dict) or set(document) != names:
+        found = ", ".join(sorted(map(str, document))) if isinstance(document, dict) else repr(document)
+        raise SensorError(f"a {what} file holds exactly {', '.join(sorted(names))}; got {found}")
+    numbers = {name: value for name, value in document.items() if name not in ("name", "kind", "to", "source")}
+    listed = [v for value in numbers.values() for v in (value if isinstance(value, list) else [value])]
+    if any(isinstance(v, (str, bool)) for v in listed):
+        raise SensorError(f"a {what} file has a text or truth value where a number belongs: {numbers!r}")
+
+
+def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
+    """The built-in profile of that name, the one in a file, or the profile itself.
+
+    Parameters
+    ----------
+    sensor : str, Path or SensorProfile
+        A str that ends in ``.json`` and every Path is a file, as ``edgeperc adapt fit`` or `SensorProfile.to_json`
+        writes it.
 
     Raises
     ------
     SensorError
-        When no built-in profile has that name.
+        When no built-in profile has that name, or the file holds none.
     """
     if isinstance(sensor, SensorProfile):
         return sensor
+    if isinstance(sensor, os.PathLike) or (isinstance(sensor, str) and sensor.endswith(".json")):
+        try:
+            return SensorProfile.from_json(Path(sensor).read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError) as exc:
+            raise SensorError(f"{os.fspath(sensor)}: the sensor profile cannot be read ({exc})") from exc
+        except SensorError as exc:
+            raise SensorError(f"{os.fspath(sensor)}: {exc}") from exc
     try:
         return SENSORS[sensor]
     except (KeyError, TypeError):
         raise SensorError(
             f"no sensor {sensor!r} is built in; known are {', '.join(SENSORS)}. "
-            "Write down another with SensorProfile(...) or SensorProfile.uniform(...)."
+            "Write down another with SensorProfile(...) or SensorProfile.uniform(...), or name a .json file."
         ) from None
 
 
@@ -730,6 +871,6 @@ def _remission_findings(scan: _Measures, profile: FitnessProfile, sensor: Sensor
     if not darkest / 4.0 <= scan.remission_median <= brightest * 2.5:
         return [
             f"The median remission is {scan.remission_median:.2f} of full scale, in training it was {darkest:.2f} to "
-            f"{brightest:.2f}: sensors differ in this; if labels look wrong, adjust remission_range."
+            f"{brightest:.2f}: sensors differ in this; fit a profile to it with edgeperc adapt fit."
         ]
     return []

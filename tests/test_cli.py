@@ -53,7 +53,9 @@ class FakePerceiver:
 
     made: ClassVar[list[FakePerceiver]] = []
 
-    def __init__(self, models, *, sensor="hdl-64e", provider="auto", n_threads=None, on_mismatch="warn") -> None:
+    def __init__(
+        self, models, *, sensor="hdl-64e", provider="auto", n_threads=None, on_mismatch="warn", adapt="both"
+    ) -> None:
         self.given = (list(models), sensor, provider, n_threads, on_mismatch)
         known = {"pointseg": POINTSEG, "ssadnet": SSADNET}
         for name in models:

@@ -15,7 +15,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 RUNTIME = REPOSITORY / "edgeperc"
 
 NOUNS = {"card", "geometry", "perception", "sensors"}
-STAGES = {"decode", "points", "projection", "refine", "session", "simulation"}
+STAGES = {"adapt", "decode", "points", "projection", "refine", "session", "simulation"}
 
 # What each module may import of edgeperc. A new module gets its line here, or the tests below fail.
 MAY_IMPORT = {
@@ -40,6 +40,7 @@ MAY_IMPORT = {
     "tracking.metrics": {"errors"} | NOUNS,
     "tracking.kitti": {"datasets", "errors", "tracking.metrics", "tracking.tracker"} | NOUNS,
     "tracking.__init__": {"tracking.tracker"},
+    "transfer": {"datasets", "errors", "metrics", "perceiver"} | NOUNS | STAGES,
     "view": {"errors", "tracking.tracker"} | NOUNS,
     "perceiver": {"errors", "models"} | NOUNS | STAGES,
     "cli": {
@@ -51,6 +52,7 @@ MAY_IMPORT = {
         "perceiver",
         "tracking.kitti",
         "tracking.tracker",
+        "transfer",
         "view",
     }
     | NOUNS
