@@ -319,7 +319,8 @@ _BUILT_IN = (
     *_ouster("os0", 45.0, 0.3, 75.0),
     *_ouster("os1", 22.5 - 1.25, 0.3, 170.0),
     *_ouster("os2", 11.25, 0.8, 350.0),
-    SensorProfile("pandar64", _PANDAR_64, 1800, _BYTE, 1.73, 0.3, 200.0, _OF_PANDASET),
+    # PandaSet, whose files have their origin on the road: the beams meet 2.1 m above it.
+    SensorProfile("pandar64", _PANDAR_64, 1800, _BYTE, 2.1, 0.3, 200.0, _OF_PANDASET),
     SensorProfile.uniform("pandarxt-32", 32, 15.0, -16.0, columns=2000, remission_range=_BYTE, min_range_m=0.05),
 )
 

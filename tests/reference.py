@@ -692,6 +692,63 @@ def updated_shapes(state, beta, detections, shapes, sigmas, walk, shape, varianc
     return shape + gain * (beta[:, 1:] @ shapes - detected * shape), variance * (1 - gain * detected), front
 
 
+def lives(tracks, classes, beta, hidden, logits, kinds, dt, most_hidden, expected, most):
+    """Twin of `edgeperc.tracking.tracker.update_lives`: the tracks as they are then."""
+    tracks = tracks.copy()
+    hit = beta[:, 0] < 0.5
+    best = np.argmax(beta[hit, 1:], axis=1) if hit.any() else np.zeros(0, int)
+    existence = tracks["existence"] + np.log1p(-classes["detection"] * (1 - most_hidden * hidden))
+    again = np.maximum(tracks["existence"][hit], -classes["sure_logit"][hit])
+    existence[hit] = np.minimum(again + np.maximum(logits[best], 0) + expected, most)
+    tracks["existence"] = existence
+    tracks["scans"] += 1
+    tracks["age_s"] += dt
+    tracks["hits"] += hit
+    tracks["misses"] = np.where(hit, 0, tracks["misses"] + 1)
+    tracks["missed_s"] = np.where(hit, 0, tracks["missed_s"] + dt)
+    tracks["logit_sum"][hit] += logits[best]
+    weight = tracks["label_weight"][hit] + np.where(tracks["label"][hit] == kinds[best], 1, -1)
+    tracks["label"][hit] = np.where(weight < 0, kinds[best], tracks["label"][hit])
+    tracks["label_weight"][hit] = np.minimum(np.abs(weight), 20)
+    return tracks
+
+
+def newborn(first_id, kinds, classes, detections, shapes, logits, ranges, most, dtype):
+    """Twin of `edgeperc.tracking.tracker.fill_newborn`."""
+    tracks = np.zeros(len(kinds), dtype)
+    for track, kind, of, detection, shape, logit, distance in zip(
+        tracks, kinds, classes, detections, shapes, logits, ranges, strict=True
+    ):
+        farther = 1 + distance / of["range_m"]
+        turned = np.array(
+            [[math.cos(detection[2]), -math.sin(detection[2])], [math.sin(detection[2]), math.cos(detection[2])]]
+        )
+        spread = np.zeros((5, 5))
+        spread[:2, :2] = turned @ np.diag((of["sigmas"][:2] * farther) ** 2) @ turned.T
+        spread[[2, 3, 4], [2, 3, 4]] = of["birth"][0] ** 2, (of["sigmas"][2] * farther) ** 2, of["birth"][1] ** 2
+        track["label"], track["group"], track["label_weight"], track["front"] = kind, of["group"], 1, 1
+        track["states"][:, [0, 1, 3]] = detection
+        track["covariances"] = spread
+        track["covariances"][2, 2, 2] = of["still_mps"] ** 2
+        track["modes"] = 1 / 3
+        track["state"], track["covariance"] = combination(track["states"], track["covariances"], track["modes"])
+        track["shape"], track["shape_variance"] = shape, (of["shape"] * farther) ** 2
+        track["logit_sum"], track["scans"], track["hits"] = logit, 1, 1
+        track["existence"] = min(logit - of["sure_logit"], most)
+    tracks["id"] = first_id + np.arange(len(tracks))
+    return tracks
+
+
+def in_view(tracks, pose, left, right):
+    """Twin of `edgeperc.tracking.tracker.mark_out_of_view`, of tracks that were not detected."""
+    along = 0.5 * tracks["shape"][:, 1:2] * [1, -1, -1, 1]
+    across = 0.5 * tracks["shape"][:, 2:3] * [1, 1, -1, -1]
+    corners = (along + 1j * across) * np.exp(1j * tracks["state"][:, 3:4]) + tracks["state"][:, 0:1]
+    corners = corners + 1j * tracks["state"][:, 1:2] - (pose[0, 3] + 1j * pose[1, 3])
+    azimuth = np.angle(corners / (pose[0, 0] + 1j * pose[1, 0]))
+    return ((azimuth <= left) & (azimuth >= right)).all(axis=1)
+
+
 def rivals(state, shape, strength, told):
     """Twin of `edgeperc.tracking.tracker.mark_rivals`: which are told of."""
     kept = []

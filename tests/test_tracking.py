@@ -31,7 +31,19 @@ from edgeperc.tracking.metrics import (
     fill_pairs,
     recall_thresholds,
 )
-from edgeperc.tracking.tracker import PARAMETERS, fill_hidden, mark_rivals, update_shapes
+from edgeperc.tracking.tracker import (
+    _TRACK,
+    EXPECTED,
+    MOST_EXISTENCE,
+    MOST_HIDDEN,
+    PARAMETERS,
+    fill_hidden,
+    fill_newborn,
+    mark_out_of_view,
+    mark_rivals,
+    update_lives,
+    update_shapes,
+)
 from edgeperc.tracking.ukf import CONSTANT_VELOCITY, CTRV, fill_predictions, fill_updates
 from edgeperc_bench.tracking import crossing
 
@@ -722,6 +734,38 @@ def test_shapes_hiding_and_rivals_are_those_of_the_twins(n: int, m: int) -> None
     assert np.flatnonzero(told).tolist() == wanted_rows
 
 
+@pytest.mark.parametrize(("n", "m"), [(0, 0), (1, 0), (0, 2), (6, 4)])
+def test_births_lives_and_views_are_those_of_the_twins(n: int, m: int) -> None:
+    rng = rng_of(7 * n + m)
+    tracker = Tracker()
+    kinds = tracker._kinds(["car", "pedestrian", "cyclist"])[rng.integers(0, 3, n)]
+    of = tracker._classes[kinds]
+    detections, shapes = rng.normal(0.0, 9.0, (n, 3)), rng.uniform(0.5, 4.0, (n, 4))
+    born = kinds, of, detections, shapes, rng.normal(0.0, 3.0, n), rng.uniform(0.0, 60.0, n)
+    wanted = reference.newborn(5, *born, MOST_EXISTENCE, _TRACK)
+    tracks = np.zeros(n, _TRACK)
+    fill_newborn(5, *born, tracks)
+    assert_same_tracks(tracks, wanted)
+
+    for _ in range(4):
+        beta = rng.dirichlet(np.full(m + 1, 0.2), n)
+        seen = beta, rng.random(n), rng.normal(0.0, 3.0, m), rng.integers(0, 3, m), 0.1
+        wanted = reference.lives(tracks, of, *seen, MOST_HIDDEN, EXPECTED, MOST_EXISTENCE)
+        update_lives(tracks, of, *seen)
+        assert_same_tracks(tracks, wanted)
+
+    pose = np.array([[0.8, -0.6, 0, 3.0], [0.6, 0.8, 0, -4.0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    told = rng.random(n) < 0.8
+    stays = told & ((tracks["misses"] == 0) | reference.in_view(tracks, pose, 0.9, -0.7))
+    mark_out_of_view(tracks, pose, 0.9, -0.7, told)
+    assert told.tolist() == stays.tolist()
+
+
+def assert_same_tracks(tracks: np.ndarray, wanted: np.ndarray) -> None:
+    for name in tracks.dtype.names:
+        np.testing.assert_allclose(tracks[name], wanted[name], atol=1e-9, err_msg=name)
+
+
 # --- the figures -----------------------------------------------------------------------------------------------------
 
 
@@ -971,6 +1015,41 @@ def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixt
     assert figures["command"].startswith("edgeperc eval tracking")
     assert cli.main(["eval-tracking", str(kitti / "calib")]) == 2
     assert "no label_02" in capsys.readouterr().err
+
+
+def test_a_models_boxes_are_judged(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What run --json prints takes the place of the detections, which need not be there."""
+    detections = read_sequence(kitti, "0000").detections
+    lines = [{"scan": "x", "boxes": [cli._box_record(replace(one, label="van")) for one in of]} for of in detections]
+    for of in ("Car", "Pedestrian", "Cyclist"):
+        (kitti / f"detections/pointrcnn_{of}/0000.txt").unlink()
+    boxes = kitti / "boxes.jsonl"
+    boxes.write_text("\n".join(map(json.dumps, lines)))
+    arguments = [
+        "eval",
+        "tracking",
+        str(kitti),
+        "--sequences",
+        "0000",
+        "--boxes",
+        str(boxes),
+        "--classes",
+        "vehicle",
+        "car",
+    ]
+    assert cli.main([*arguments, "--json", str(kitti / "figures.json")]) == 0
+    figures = json.loads((kitti / "figures.json").read_text())["classes"]
+    assert figures["vehicle"]["best"]["mota"] > 0.9  # the car and the van
+    assert figures["vehicle"]["best"]["n_truth"] == 40
+    assert figures["car"]["best"]["n_missed"] == 20  # all were told to be vans
+    boxes.write_text("\n".join(map(json.dumps, lines[:-1])))
+    assert cli.main(arguments) == 2
+    assert "19 frames for 20" in capsys.readouterr().err
+    boxes.write_text('{"scan": "x"}')
+    assert cli.main(arguments) == 2
+    assert "holds no boxes" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        cli.main([*arguments[:3], "--boxes", str(boxes)])
 
 
 def test_real_sequences_are_tracked_well(data_root) -> None:

@@ -164,7 +164,7 @@ _CLASS = np.dtype(
         ("memory_s", np.float64),
     ]
 )
-LARGEST_LOGIT = 30.0
+SMALLEST_SHARE = 1e-13  # scores of 0 and 1 are no surer than that
 DOUBT = 10.0
 # Existence, as log odds: a track is told of above 0 and given up below the least. A detection counts by its score, and
 # for lying where it was expected; without a most, what was long there would be told of long after it is gone.
@@ -175,7 +175,7 @@ SHAPE_WALK_M = np.array([0.5, 0.1, 0.05, 0.05])  # of middle height, length, wid
 # A vehicle begins anywhere up to motorway speed, and straight ahead; then its speed and turn rate walk.
 FIRST_TWIST = np.array([15.0, 1.0, 0.3])
 TWIST_WALK = np.array([4.0, 0.5, 0.5])  # in a second
-TWIST_MEMORY_S = np.array([math.inf, 1.0, 1.0])  # a turn that nothing speaks for any longer ends
+TURN_MEMORY_S = 2.0  # a turn that nothing speaks for any longer ends
 MAX_LANDMARKS = 48
 
 
@@ -503,33 +503,29 @@ class Tracker:
         hidden = np.zeros(n)
         fill_hidden(tracks["state"], tracks["shape"], beta[:, 0] < 0.5, pose[:2, 3], hidden)
         logits = _logit(given[:, 7])
-        _update_lives(tracks, of, beta, hidden, logits, kinds, dt)
+        update_lives(tracks, of, beta, hidden, logits, kinds, dt)
 
-        unused = (1.0 - beta[:, 1:].sum(axis=0) > 0.5) & (logits >= classes["birth_logit"])
-        ranges = np.hypot(given[:, 0], given[:, 1])
-        tracks, n_born = self._with_newborn(tracks, detections, shapes, logits, kinds, classes, ranges, unused)
+        # A detection that is most likely nobody's begins a track.
+        own = np.flatnonzero((beta[:, 1:].sum(axis=0) < 0.5) & (logits >= classes["birth_logit"]))
+        if len(own):
+            ranges = np.hypot(given[own, 0], given[own, 1])
+            joined = np.zeros(n + len(own), _TRACK)  # concatenate takes ten times as long over named fields
+            joined[:n] = tracks
+            fill_newborn(
+                self._next_id, kinds[own], classes[own], detections[own], shapes[own], logits[own], ranges, joined[n:]
+            )
+            tracks = joined
         tracks = self._living(tracks)
 
         self._posed, self._stamp_s, self._tracks, self._T_world_sensor = posed, stamp_s, tracks, pose
-        self._next_id += n_born
+        self._next_id += len(own)
         self._twist, self._twist_variances = twist, twist_variances
         told = tracks["existence"] > 0.0
-        coasting = np.flatnonzero(told & (tracks["misses"] > 0))
-        if len(coasting):
-            told[coasting] = self._in_view(tracks[coasting], pose)
+        mark_out_of_view(tracks, pose, self._left, self._right, told)
         mark_rivals(tracks["state"], tracks["shape"], _strength(tracks), told)
         return Tracks(
             tracks[told], self._labels, stamp_s, pose.copy(), int(len(tracks) - np.count_nonzero(told)), n_approximated
         )
-
-    def _in_view(self, tracks: NDArray[np.void], pose: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether all four corners of each footprint lie in the field of view."""
-        heading, half = tracks["state"][:, 3:4], 0.5 * tracks["shape"]
-        along, across = half[:, 1:2] * [1.0, -1.0, -1.0, 1.0], half[:, 2:3] * [1.0, 1.0, -1.0, -1.0]
-        x = tracks["state"][:, 0:1] + along * np.cos(heading) - across * np.sin(heading) - pose[0, 3]
-        y = tracks["state"][:, 1:2] + along * np.sin(heading) + across * np.cos(heading) - pose[1, 3]
-        azimuth = np.arctan2(x * pose[0, 1] + y * pose[1, 1], x * pose[0, 0] + y * pose[1, 0])
-        return np.asarray(((azimuth <= self._left) & (azimuth >= self._right)).all(axis=1))
 
     def _kinds(self, names: Sequence[str]) -> NDArray[np.int64]:
         """Row of each box's class, which is made when it is first met."""
@@ -565,60 +561,26 @@ class Tracker:
         """Where the sensor is by now, how it moves (x, y [m/s], turn [rad/s]) and with what variances."""
         if dt == 0.0:
             return self._T_world_sensor, self._twist, self._twist_variances
-        R, t = self._T_world_sensor[:2, :2], self._T_world_sensor[:2, 3]
-        variances = 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1])
-        seen = tracks["misses"] == 0
-        landmarks = np.column_stack([(state[:, :2] - t) @ R, variances, tracks["group"]])[seen]
+        seen = np.flatnonzero(tracks["misses"] == 0)
+        landmarks = np.empty((len(seen), 4))
+        landmarks[:, :2] = (state[seen, :2] - self._T_world_sensor[:2, 3]) @ self._T_world_sensor[:2, :2]
+        landmarks[:, 2] = 0.5 * (covariance[seen, 0, 0] + covariance[seen, 1, 1])
+        landmarks[:, 3] = tracks["group"][seen]
         if len(landmarks) > MAX_LANDMARKS:
             landmarks = landmarks[np.argsort(landmarks[:, 2], kind="stable")[:MAX_LANDMARKS]]
-        sigmas = classes["sigmas"][:, 0] * (1.0 + np.hypot(given[:, 0], given[:, 1]) / classes["range_m"])
-        detections = np.column_stack([given[:, :2], sigmas**2, classes["group"]])
+        detections = np.empty((len(given), 4))
+        detections[:, :2], detections[:, 3] = given[:, :2], classes["group"]
+        farther = 1.0 + np.hypot(given[:, 0], given[:, 1]) / classes["range_m"]
+        detections[:, 2] = (classes["sigmas"][:, 0] * farther) ** 2
         if len(detections) > 2 * MAX_LANDMARKS:
             detections = detections[np.argsort(detections[:, 2], kind="stable")[: 2 * MAX_LANDMARKS]]
-        kept = np.exp(-dt / TWIST_MEMORY_S)
+        kept = np.array([1.0, 1.0, math.exp(-dt / TURN_MEMORY_S)])
         prior_variances = (self._twist_variances * kept**2 + TWIST_WALK**2 * dt) * dt**2
         motion, spread = np.empty(3), np.empty((3, 3))
         fit_motion(landmarks, detections, self._twist * kept * dt, prior_variances, motion, spread)
         cos, sin = math.cos(motion[2]), math.sin(motion[2])
         step = np.array([[cos, -sin, 0, motion[0]], [sin, cos, 0, motion[1]], [0, 0, 1, 0], [0, 0, 0, 1]])
         return self._T_world_sensor @ step, motion / dt, np.minimum(np.diag(spread) / dt**2, FIRST_TWIST**2)
-
-    def _with_newborn(
-        self,
-        tracks: NDArray[np.void],
-        detections: NDArray[np.float64],
-        shapes: NDArray[np.float64],
-        logits: NDArray[np.float64],
-        kinds: NDArray[np.int64],
-        classes: NDArray[np.void],
-        ranges: NDArray[np.float64],
-        chosen: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.void], int]:
-        """One track more for each chosen detection, and their number; it stands still until the next scan."""
-        if not chosen.any():
-            return tracks, 0
-        of, farther = classes[chosen], 1.0 + ranges[chosen] / classes["range_m"][chosen]
-        joined = np.zeros(len(tracks) + len(of), _TRACK)  # concatenate takes ten times as long over named fields
-        joined[: len(tracks)] = tracks
-        new = joined[len(tracks) :]
-        new["id"] = np.arange(self._next_id, self._next_id + len(of))
-        new["label"], new["group"], new["label_weight"] = kinds[chosen], of["group"], 1.0
-        new["states"][:, :, [0, 1, 3]] = detections[chosen][:, None, :]
-        heading, sigmas = detections[chosen, 2], of["sigmas"] * farther[:, None]
-        ahead = np.stack([np.cos(heading), np.sin(heading)], axis=1) * sigmas[:, :1]
-        aside = np.stack([-np.sin(heading), np.cos(heading)], axis=1) * sigmas[:, 1:2]
-        place = ahead[:, :, None] * ahead[:, None, :] + aside[:, :, None] * aside[:, None, :]
-        new["covariances"][:, :, :2, :2] = place[:, None]
-        new["covariances"][:, :, 3, 3] = sigmas[:, 2:] ** 2
-        new["covariances"][:, :, 2, 2] = of["birth"][:, :1] ** 2
-        new["covariances"][:, 2, 2, 2] = of["still_mps"] ** 2
-        new["covariances"][:, :, 4, 4] = of["birth"][:, 1:] ** 2
-        new["modes"] = 1.0 / 3.0
-        fill_combined(new["states"], new["covariances"], new["modes"], new["state"], new["covariance"])
-        new["shape"], new["shape_variance"] = shapes[chosen], (of["shape"] * farther[:, None]) ** 2
-        new["front"], new["logit_sum"], new["scans"], new["hits"] = 1.0, logits[chosen], 1, 1
-        new["existence"] = np.minimum(logits[chosen] - of["sure_logit"], MOST_EXISTENCE)
-        return joined, len(of)
 
     def _living(self, tracks: NDArray[np.void]) -> NDArray[np.void]:
         """Tracks that are not given up; of too many, the likeliest."""
@@ -629,6 +591,97 @@ class Tracker:
             rank = np.argsort(-tracks["existence"], kind="stable")
             tracks = tracks[np.sort(rank[: self._max_tracks])]
         return tracks
+
+
+@njit(cache=True, nogil=True)
+def fill_newborn(
+    first_id: int,
+    kinds: NDArray[np.int64],
+    classes: NDArray[np.void],
+    detections: NDArray[np.float64],
+    shapes: NDArray[np.float64],
+    logits: NDArray[np.float64],
+    ranges: NDArray[np.float64],
+    tracks: NDArray[np.void],
+) -> None:
+    """Begin a track with each detection; it stands still until the next scan.
+
+    Parameters
+    ----------
+    first_id : int
+    kinds : (n,) int64
+        Labels.
+    classes : (n,) record
+        Parameters of each detection's class.
+    detections : (n, 3) float64
+        x, y [m], heading [rad].
+    shapes : (n, 4) float64
+        Height of the middle, length, width, height [m].
+    logits : (n,) float64
+        Scores.
+    ranges : (n,) float64
+        Distances from the sensor [m].
+    tracks : (n,) record, overwritten
+        All fields 0 beforehand.
+    """
+    for i in range(len(tracks)):
+        track, of = tracks[i], classes[i]
+        farther = 1.0 + ranges[i] / of["range_m"]
+        x, y, heading = detections[i, 0], detections[i, 1], detections[i, 2]
+        cos, sin = math.cos(heading), math.sin(heading)
+        along, across, turn = of["sigmas"][0] * farther, of["sigmas"][1] * farther, of["sigmas"][2] * farther
+        track["id"], track["label"], track["group"] = first_id + i, kinds[i], of["group"]
+        track["hits"], track["scans"], track["front"], track["label_weight"] = 1, 1, 1.0, 1.0
+        track["logit_sum"] = logits[i]
+        track["existence"] = min(logits[i] - of["sure_logit"], MOST_EXISTENCE)
+        for a in range(4):
+            track["shape"][a] = shapes[i, a]
+            track["shape_variance"][a] = (of["shape"][a] * farther) ** 2
+        for mode in range(3):
+            track["modes"][mode] = 1.0 / 3.0
+            state, spread = track["states"][mode], track["covariances"][mode]
+            state[0], state[1], state[3] = x, y, heading
+            spread[0, 0] = (along * cos) ** 2 + (across * sin) ** 2
+            spread[1, 1] = (along * sin) ** 2 + (across * cos) ** 2
+            spread[0, 1] = spread[1, 0] = (along**2 - across**2) * cos * sin
+            spread[2, 2] = of["birth"][0] ** 2 if mode < 2 else of["still_mps"] ** 2
+            spread[3, 3] = turn**2
+            spread[4, 4] = of["birth"][1] ** 2
+            for a in range(5):
+                track["state"][a] = state[a]
+                for b in range(5):
+                    track["covariance"][a, b] += spread[a, b] / 3.0
+
+
+@njit(cache=True, nogil=True)
+def mark_out_of_view(
+    tracks: NDArray[np.void], pose: NDArray[np.float64], left: float, right: float, told: NDArray[np.bool_]
+) -> None:
+    """Leave out tracks that were not detected and of whose footprint a corner lies beyond the field of view.
+
+    Parameters
+    ----------
+    tracks : (n,) record
+    pose : (4, 4) float64
+        T_world_sensor.
+    left, right : float
+        Azimuths of the edges [rad].
+    told : (n,) bool
+        Those left out become False.
+    """
+    for i in range(len(tracks)):
+        if not told[i] or tracks[i]["misses"] == 0:
+            continue
+        state, shape = tracks[i]["state"], tracks[i]["shape"]
+        cos, sin = math.cos(state[3]), math.sin(state[3])
+        for corner in range(4):
+            along = 0.5 * shape[1] * (1.0 if corner < 2 else -1.0)
+            across = 0.5 * shape[2] * (1.0 if corner % 2 == 0 else -1.0)
+            x = state[0] + along * cos - across * sin - pose[0, 3]
+            y = state[1] + along * sin + across * cos - pose[1, 3]
+            azimuth = math.atan2(x * pose[0, 1] + y * pose[1, 1], x * pose[0, 0] + y * pose[1, 0])
+            if not right <= azimuth <= left:
+                told[i] = False
 
 
 @njit(cache=True, nogil=True)
@@ -760,35 +813,55 @@ def update_shapes(
             variance[i, a] *= 1.0 - gain * detected
 
 
-def _update_lives(
+@njit(cache=True, nogil=True)
+def update_lives(
     tracks: NDArray[np.void],
-    of: NDArray[np.void],
+    classes: NDArray[np.void],
     beta: NDArray[np.float64],
     hidden: NDArray[np.float64],
     logits: NDArray[np.float64],
     kinds: NDArray[np.int64],
     dt: float,
 ) -> None:
-    """Count hits and misses, take the label of the majority, weigh how likely each is still there."""
-    tracks["age_s"] += dt
-    hit = beta[:, 0] < 0.5
-    best = np.argmax(beta[hit, 1:], axis=1) if hit.any() else np.zeros(0, np.int64)
-    tracks["misses"] = np.where(hit, 0, tracks["misses"] + 1)
-    tracks["missed_s"] = np.where(hit, 0.0, tracks["missed_s"] + dt)
-    tracks["hits"] += hit
-    tracks["scans"] += 1
-    tracks["logit_sum"][hit] += logits[best]
-    # Boyer and Moore's vote: a label goes when the others have outnumbered it.
-    weight = tracks["label_weight"][hit] + np.where(tracks["label"][hit] == kinds[best], 1.0, -1.0)
-    tracks["label"][hit] = np.where(weight < 0.0, kinds[best], tracks["label"][hit])
-    tracks["label_weight"][hit] = np.minimum(np.abs(weight), 20.0)
-    # A miss divides the odds by how likely it is if nothing is there, which is 1, and if something is.
-    existence = tracks["existence"] + np.log1p(-of["detection"] * (1.0 - MOST_HIDDEN * hidden))
-    # What is seen again is worth no less than what is seen for the first time.
-    existence[hit] = (
-        np.maximum(tracks["existence"][hit], -of["sure_logit"][hit]) + np.maximum(logits[best], 0.0) + EXPECTED
-    )
-    tracks["existence"] = np.minimum(existence, MOST_EXISTENCE)
+    """Count hits and misses, take the label of the majority, weigh how likely each is still there; in place.
+
+    Parameters
+    ----------
+    tracks : (n,) record
+    classes : (n,) record
+        Parameters of each track's class.
+    beta : (n, m + 1) float64
+        Probability that the track was not detected, and that each detection is the track's.
+    hidden : (n,) float64
+        From `fill_hidden`.
+    logits : (m,) float64
+        Scores of the detections.
+    kinds : (m,) int64
+        Their labels.
+    dt : float
+    """
+    for i in range(len(tracks)):
+        track, of = tracks[i], classes[i]
+        track["scans"] += 1
+        track["age_s"] += dt
+        if beta[i, 0] >= 0.5:
+            track["misses"] += 1
+            track["missed_s"] += dt
+            # The odds go by how likely a miss is if something is there, over 1 if nothing is.
+            track["existence"] += math.log(1.0 - of["detection"] * (1.0 - MOST_HIDDEN * hidden[i]))
+            continue
+        best = np.argmax(beta[i, 1:])
+        track["misses"], track["missed_s"] = 0, 0.0
+        track["hits"] += 1
+        track["logit_sum"] += logits[best]
+        # Boyer and Moore's vote: a label goes when the others have outnumbered it.
+        weight = track["label_weight"] + (1.0 if track["label"] == kinds[best] else -1.0)
+        if weight < 0.0:
+            track["label"] = kinds[best]
+        track["label_weight"] = min(abs(weight), 20.0)
+        # What is seen again is worth no less than what is seen for the first time.
+        existence = max(track["existence"], -of["sure_logit"]) + max(logits[best], 0.0) + EXPECTED
+        track["existence"] = min(existence, MOST_EXISTENCE)
 
 
 def _checked_boxes(boxes: Iterable[Box]) -> tuple[NDArray[np.float64], list[str]]:
@@ -836,8 +909,8 @@ def _box(label: str, score: float, row: NDArray[np.float64]) -> Box:
 
 
 def _logit(scores: NDArray[np.float64] | float) -> NDArray[np.float64]:
-    with np.errstate(divide="ignore"):  # 0 and 1 are as far from even as LARGEST_LOGIT
-        return np.clip(np.log(scores) - np.log1p(-np.asarray(scores)), -LARGEST_LOGIT, LARGEST_LOGIT)
+    inside = np.clip(scores, SMALLEST_SHARE, 1.0 - SMALLEST_SHARE)
+    return np.log(inside) - np.log1p(-inside)
 
 
 def _strength(tracks: NDArray[np.void]) -> NDArray[np.float64]:
