@@ -102,7 +102,7 @@ def fill_likelihoods(
                 pull_x = (c * d - e * b) / place
                 pull_y = (e * a - c * b) / place
                 turn = detections[j, 2] - mean[3]
-                turn -= math.pi * math.floor(turn / math.pi + 0.5)
+                turn -= math.pi * np.floor(turn / math.pi + 0.5)  # not math.floor, which NaN makes raise
                 limit = 3.0 * math.sqrt(f)
                 turn = min(max(turn, -limit), limit) - pull_x * dx - pull_y * dy
                 left = f - pull_x * c - pull_y * e
@@ -239,32 +239,40 @@ def fill_by_propagation(
     weights, rows, columns, beta
         As in `fill_by_events`.
     """
-    n, m = len(rows), len(columns)
-    to_track = np.ones((n, m))
-    to_detection = np.zeros((n, m))
+    # Gated pairs alone: in a large cluster they are few of all.
+    n_pairs = 0
+    for i in range(len(rows)):
+        for j in range(len(columns)):
+            n_pairs += weights[rows[i], columns[j]] > 0.0
+    row, column = np.empty(n_pairs, np.int64), np.empty(n_pairs, np.int64)
+    n_pairs = 0
+    for i in rows:
+        for j in columns:
+            if weights[i, j] > 0.0:
+                row[n_pairs], column[n_pairs] = i, j
+                n_pairs += 1
+    to_track, to_detection = np.ones(n_pairs), np.empty(n_pairs)
+    of_row, of_column = np.empty(weights.shape[0]), np.empty(weights.shape[1])
     for _ in range(MAX_ROUNDS):
-        for i in range(n):
-            total = 1.0
-            for j in range(m):
-                total += weights[rows[i], columns[j]] * to_track[i, j]
-            for j in range(m):
-                weight = weights[rows[i], columns[j]]
-                to_detection[i, j] = weight / max(total - weight * to_track[i, j], 1.0)
+        of_row[:] = 1.0
+        for k in range(n_pairs):
+            of_row[row[k]] += weights[row[k], column[k]] * to_track[k]
+        of_column[:] = 1.0
+        for k in range(n_pairs):
+            weight = weights[row[k], column[k]]
+            to_detection[k] = weight / max(of_row[row[k]] - weight * to_track[k], 1.0)
+            of_column[column[k]] += to_detection[k]
         change = 0.0
-        for j in range(m):
-            total = 1.0
-            for i in range(n):
-                total += to_detection[i, j]
-            for i in range(n):
-                message = 1.0 / max(total - to_detection[i, j], 1.0)
-                change = max(change, abs(message - to_track[i, j]))
-                to_track[i, j] = message
+        for k in range(n_pairs):
+            message = 1.0 / max(of_column[column[k]] - to_detection[k], 1.0)
+            change = max(change, abs(message - to_track[k]))
+            to_track[k] = message
         if change < TOLERANCE:
             break
-    for i in range(n):
-        total = 1.0
-        for j in range(m):
-            total += weights[rows[i], columns[j]] * to_track[i, j]
-        beta[rows[i], 0] = 1.0 / total
-        for j in range(m):
-            beta[rows[i], columns[j] + 1] = weights[rows[i], columns[j]] * to_track[i, j] / total
+    of_row[:] = 1.0
+    for k in range(n_pairs):
+        of_row[row[k]] += weights[row[k], column[k]] * to_track[k]
+    for i in rows:
+        beta[i, 0] = 1.0 / of_row[i]
+    for k in range(n_pairs):
+        beta[row[k], column[k] + 1] = weights[row[k], column[k]] * to_track[k] / of_row[row[k]]

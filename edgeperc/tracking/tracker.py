@@ -801,6 +801,8 @@ def update_shapes(
         vote = 0.5 * math.tanh(state[i, 2] / 3.0)
         seen = np.zeros(4)
         for j in range(len(detections)):
+            if beta[i, j + 1] == 0.0:
+                continue
             vote += beta[i, j + 1] * math.cos(detections[j, 2] - state[i, 3])
             for a in range(4):
                 seen[a] += beta[i, j + 1] * shapes[j, a]
