@@ -205,12 +205,19 @@ def _parser() -> argparse.ArgumentParser:
 
     follow = commands.add_parser(
         "eval-tracking",
+        parents=[sensing, running],
         prog="edgeperc eval tracking",
         help="the tracking figures on KITTI's sequences; also written: eval tracking",
         description="Track the given detections of KITTI's sequences, without ego poses, and hold the tracks against "
-        "the labels: CLEAR-MOT at the score with the best MOTA, its averages over forty recalls, HOTA.",
+        "the labels: CLEAR-MOT at the score with the best MOTA, its averages over forty recalls, HOTA. With --model, "
+        "and where there are no detections, the scans are perceived, and what is found in them is tracked.",
     )
-    follow.add_argument("root", type=Path, metavar="ROOT", help="holds label_02, calib and detections/DETECTOR_CLASS")
+    follow.add_argument(
+        "root",
+        type=Path,
+        metavar="ROOT",
+        help="holds label_02, calib, and detections/DETECTOR_CLASS or velodyne; or an object set with track_id",
+    )
     follow.add_argument("--sequences", nargs="+", metavar="SEQ", help="such as 0000 0002 (default: all with labels)")
     follow.add_argument(
         "--classes",
@@ -224,7 +231,13 @@ def _parser() -> argparse.ArgumentParser:
         "--boxes",
         type=Path,
         metavar="FILE",
-        help="boxes to track in place of the detections: what run --json printed of the one sequence's scans",
+        help="boxes to track in place of either: what run --json printed of the one sequence's scans",
+    )
+    follow.add_argument(
+        "--adapt",
+        choices=("both", "remission", "interpolation", "neither"),
+        default="both",
+        help="as in run (default: both)",
     )
     follow.add_argument("--iou", type=float, default=0.25, metavar="X", help="3-D overlap of a match (default: 0.25)")
     follow.add_argument("--json", type=Path, metavar="FILE", help="every figure")
@@ -912,7 +925,7 @@ def _eval_tracking(arguments: argparse.Namespace) -> int:
         arguments.usage_error("--boxes are of one drive; add --sequences SEQ")
     for file in filter(None, (arguments.json, arguments.gif)):
         file.parent.mkdir(parents=True, exist_ok=True)
-    from .tracking.kitti import evaluate_kitti, read_boxes, read_sequence, track_sequence
+    from .tracking.kitti import evaluate_kitti, read_boxes, read_sequence, sequence_names, track_sequence
 
     progress: list[_Progress] = []
 
@@ -920,10 +933,16 @@ def _eval_tracking(arguments: argparse.Namespace) -> int:
         progress[:] = progress or [_Progress(total)]
         progress[0].show(done)
 
-    boxes = {} if arguments.boxes is None else {arguments.sequences[0]: read_boxes(arguments.boxes)}
-    figures = evaluate_kitti(
+    names = arguments.sequences or sequence_names(arguments.root)
+    of = "given detections"
+    boxes: dict[str, list[list[Box]]] = {}
+    if arguments.boxes is not None:
+        boxes, of = {names[0]: read_boxes(arguments.boxes)}, f"boxes of {arguments.boxes}"
+    elif arguments.model or not (arguments.root / "detections").is_dir():
+        boxes, of = _perceived(arguments, names)
+    figures = {"of": of} | evaluate_kitti(
         arguments.root,
-        sequences=arguments.sequences,
+        sequences=names,
         classes=arguments.classes,
         boxes=boxes,
         iou_threshold=arguments.iou,
@@ -944,6 +963,24 @@ def _eval_tracking(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _perceived(arguments: argparse.Namespace, names: Sequence[str]) -> tuple[dict[str, list[list[Box]]], str]:
+    """By sequence and frame, what the models find in the scans; and their names."""
+    from .evaluate import perceive_drive
+    from .tracking.kitti import sequence_scans
+
+    scans = {name: sequence_scans(arguments.root, name) for name in names}
+    for name, of in scans.items():
+        if not of:
+            raise PointsError(f"{arguments.root} has no scans of {name}; expected velodyne/{name}/*.bin, or detections")
+    perceive = _perceiver(arguments, arguments.sensor, "ignore", arguments.adapt)
+    progress, counted = _Progress(sum(map(len, scans.values()))), itertools.count(1)
+    boxes = {
+        name: perceive_drive(perceive, of, name, lambda: progress.show(next(counted))) for name, of in scans.items()
+    }
+    progress.clear()
+    return boxes, "boxes of " + " and ".join(f"{card.name} {card.version}" for card in perceive.cards)
+
+
 _AVERAGE_COLUMNS = (
     *(("sAMOTA", "samota"), ("AMOTA", "amota"), ("AMOTP", "amotp"), ("MOTA", "mota"), ("MOTP", "motp")),
     *(("HOTA", "hota"), ("DetA", "deta"), ("AssA", "assa"), ("fragments", "n_fragments")),
@@ -956,11 +993,13 @@ _COUNT_COLUMNS = (
 
 def _tracking_lines(figures: Mapping[str, Any]) -> list[str]:
     rows = [(("", name), _without_nan({**of, **of["best"], **of["hota"]})) for name, of in figures["classes"].items()]
+    told = [(("", name), _without_nan({**of, **of["told"]})) for name, of in figures["classes"].items()]
     return [
-        f"{_many(len(figures['sequences']), 'sequence')}, 3-D IoU {figures['iou_threshold']}; "
+        f"{_many(len(figures['sequences']), 'sequence')}, {figures['of']}, 3-D IoU {figures['iou_threshold']}; "
         f"{figures['frames_per_s']:,.0f} scans a second in the tracker; shares in per cent",
         *_table("over forty recalls; at the best MOTA", _AVERAGE_COLUMNS, rows),
         *_table("counts at the best MOTA", _COUNT_COLUMNS, rows),
+        *_table("counts of all tracks, whatever their score", _COUNT_COLUMNS, told),
     ]
 
 

@@ -40,12 +40,13 @@ from .metrics import BoxEvaluator, ProbabilitySweep
 from .models import model_path
 from .perceiver import Perceiver
 from .perception import Box, Perception, PointLabels, TopView
+from .points import read_points
 from .projection import make_projector
 from .session import Session
 from .simulation import POINT_CLASSES, TOP_VIEW_CLASSES
 from .view import Mistakes
 
-__all__ = ["Judge", "Truth", "evaluate"]
+__all__ = ["Judge", "Truth", "check_unseen", "evaluate", "perceive_drive", "training_scans_of"]
 
 SHIPPED = ("ssadnet", "pointseg")
 FEWEST_RETURNS = 3  # no network could tell an object of fewer from clutter
@@ -163,7 +164,7 @@ class Judge:
             if any((card.name, card.version) == (own.name, own.version) for own in cards):
                 raise ModelError(f"{card.name} {card.version} cannot draw its own truth; name another model")
             cards.append(card)
-        self.trained_on = {} if training_scans else {f"{c.name} {c.version}": _training_hashes(c) for c in cards}
+        self.trained_on = {} if training_scans else training_scans_of(cards)
 
     def kitti(self, frame: Frame) -> Truth:
         """Boxes, and the points and cells in the camera's view outside DontCare.
@@ -173,7 +174,7 @@ class Judge:
         SplitError
             A model was trained on this scan.
         """
-        self._check(frame.name, frame.drive, frame.points)
+        check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
         cells: Cells = {}
         if isinstance(self.view, TopViewGeometry):
             vehicles, unnamed = np.zeros((2, self.view.height, self.view.width), np.uint8)
@@ -203,7 +204,7 @@ class Judge:
         SplitError
             A model was trained on this scan.
         """
-        self._check(frame.name, frame.drive, frame.points)
+        check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
         cells: Cells = {}
         if isinstance(self.view, TopViewGeometry):
             cells[OBSERVED] = ROAD_CLASSES, frame.top_view(self.view)
@@ -219,15 +220,6 @@ class Judge:
         return Truth(
             name, name, scan.points, labels_by_boxes(scan), scan.boxes, scan.box_points, _everywhere, cells, road
         )
-
-    def _check(self, name: str, drive: str, points: NDArray[np.float32]) -> None:
-        digest = scan_hash(points)
-        for model, hashes in self.trained_on.items():
-            if digest in hashes:
-                raise SplitError(
-                    f"{model} was trained on scan {name} of drive {drive}, so its figures there say nothing; judge the "
-                    "test split or a model trained without this drive, or ask for split 'train' to see training scans"
-                )
 
     def record(self, truth: Truth) -> tuple[Record, Mistakes | None]:
         """Judge one scan; the mistakes are None where no objects are known."""
@@ -345,10 +337,56 @@ def _perceiver(models: Sequence[str | Path], provider: str) -> Perceiver:
         raise ModelError(str(exc)) from exc
 
 
-def _training_hashes(card: ModelCard) -> set[str]:
-    """The first 16 hexadecimal digits of the SHA-256 of every real scan that a model was trained on."""
-    frames = card.training.get("frames", {})
-    return set(frames.values()) if isinstance(frames, Mapping) else set()
+def training_scans_of(cards: Sequence[ModelCard]) -> dict[str, set[str]]:
+    """By name and version: `edgeperc.datasets.scan_hash` of every real scan that a model was trained on."""
+    frames = {f"{card.name} {card.version}": card.training.get("frames", {}) for card in cards}
+    return {name: set(of.values()) if isinstance(of, Mapping) else set() for name, of in frames.items()}
+
+
+def check_unseen(trained_on: Mapping[str, set[str]], name: str, drive: str, points: NDArray[np.float32]) -> None:
+    """Raise `SplitError` where one of the models was trained on this scan (`training_scans_of`)."""
+    digest = scan_hash(points)
+    for model, hashes in trained_on.items():
+        if digest in hashes:
+            raise SplitError(
+                f"{model} was trained on scan {name} of drive {drive}, so its figures there say nothing; judge the "
+                "test split or a model trained without this drive, or ask for split 'train' to see training scans"
+            )
+
+
+def perceive_drive(
+    perceive: Perceiver, scans: Mapping[int, Path], drive: str, on_scan: Callable[[], None] = lambda: None
+) -> list[list[Box]]:
+    """Boxes that a perceiver finds in the scans of a drive, by frame.
+
+    Parameters
+    ----------
+    perceive : Perceiver
+    scans : mapping of int to Path
+        By frame; a frame without a scan has no boxes.
+    drive : str
+    on_scan : callable
+        Called after each.
+
+    Returns
+    -------
+    list of list of Box
+
+    Raises
+    ------
+    SplitError
+        A model was trained on one of the scans.
+    PointsError
+        A scan cannot be read.
+    """
+    trained_on = training_scans_of(perceive.cards)
+    found: list[list[Box]] = [[] for _ in range(1 + max(scans, default=-1))]
+    for frame, path in scans.items():
+        points = read_points(path)
+        check_unseen(trained_on, path.stem, drive, points)
+        found[frame] = list(perceive(points).boxes)
+        on_scan()
+    return found
 
 
 def _everywhere(places: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -299,7 +299,7 @@ def draw_tracks(
     tail_s : float
         How long a track's way behind it is shown [s].
     range_m : tuple of 2 float
-        How far ahead, and how far to each side, is shown [m].
+        How far ahead, and how far to each side, is shown [m]; behind, as far as there are tracks, 10 to 40 m.
 
     Returns
     -------
@@ -317,7 +317,9 @@ def draw_tracks(
         from PIL import Image, ImageDraw
     except ImportError as exc:
         raise MissingExtraError("pillow", "view", "Drawing an animation") from exc
-    px_per_m, behind_m = 8.0, 10.0
+    px_per_m = 8.0
+    # A detector that looks all around has tracks behind; of others nothing is to be seen there.
+    behind_m = min(max([10.0, *(5.0 - float(tracks.boxes[:, 0].min()) for tracks in scans if len(tracks))]), 40.0)
     size = round(2.0 * range_m[1] * px_per_m), round((range_m[0] + behind_m) * px_per_m)
 
     def pixels(places: NDArray[np.float64]) -> list[tuple[float, float]]:
@@ -333,6 +335,7 @@ def draw_tracks(
         for ring_m in (20.0, 40.0, 60.0):
             reach = ring_m * px_per_m
             pen.ellipse([middle[0] - reach, middle[1] - reach, middle[0] + reach, middle[1] + reach], outline="#2a343f")
+            pen.text((middle[0] + 3.0, middle[1] - reach), f"{ring_m:.0f} m", fill=_FAINT)
         pen.polygon(pixels(np.array([[1.5, 0.0], [-1.5, 0.9], [-1.5, -0.9]])), outline=_FAINT)
         R, t = tracks.T_world_sensor[:3, :3], tracks.T_world_sensor[:3, 3]
         here = {track.id for track in tracks}
@@ -346,9 +349,16 @@ def draw_tracks(
             pen.polygon(pixels(track.box.corners()), outline=colour, width=1 if track.coasting else 2)
             ahead = np.array([track.box.center[:2], np.array(track.box.center[:2]) + track.velocity])
             pen.line(pixels(ahead), fill=_INK)
-            x, y = pixels(ahead[:1])[0]
-            pen.text((x + 10.0, y - 6.0), f"{track.id} {3.6 * math.hypot(*track.velocity):.0f} km/h", fill=_INK)
-        pen.text((10.0, 8.0), f"{title}  {tracks.stamp_s:.1f} s  {len(tracks)} tracks".strip(), fill=_INK)
+        for track in tracks:  # names last, on a ground of their own, or neighbours' could not be told apart
+            x, y = pixels(np.array([track.box.center]))[0]
+            speed = math.hypot(*track.velocity)
+            name = f"#{track.id}" + (f" {3.6 * speed:.0f} km/h" if speed > 1.0 else "")
+            pen.rectangle(pen.textbbox((x + 10.0, y - 6.0), name), fill=_PANEL)
+            pen.text((x + 10.0, y - 6.0), name, fill=_INK)
+        told = f"{title}  {tracks.stamp_s:.1f} s  {len(tracks)} track{'s' * (len(tracks) != 1)}"
+        pen.text((10.0, 8.0), told.strip(), fill=_INK)
+        for line, label in enumerate(sorted({*tracks.labels})):
+            pen.text((10.0, 24.0 + 14.0 * line), label, fill=_colour(label))
         pictures.append(picture.quantize(64))
     if not pictures:
         return b""

@@ -701,7 +701,7 @@ def lives(tracks, classes, beta, hidden, logits, kinds, dt, most_hidden, expecte
     again = np.maximum(tracks["existence"][hit], -classes["sure_logit"][hit])
     existence[hit] = np.minimum(again + np.maximum(logits[best], 0) + expected, most)
     tracks["existence"] = existence
-    tracks["scans"] += 1
+    tracks["chances"] += np.where(hit, 1, 1 - most_hidden * hidden)
     tracks["age_s"] += dt
     tracks["hits"] += hit
     tracks["misses"] = np.where(hit, 0, tracks["misses"] + 1)
@@ -733,7 +733,7 @@ def newborn(first_id, kinds, classes, detections, shapes, logits, ranges, most, 
         track["modes"] = 1 / 3
         track["state"], track["covariance"] = combination(track["states"], track["covariances"], track["modes"])
         track["shape"], track["shape_variance"] = shape, (of["shape"] * farther) ** 2
-        track["logit_sum"], track["scans"], track["hits"] = logit, 1, 1
+        track["logit_sum"], track["chances"], track["hits"] = logit, 1, 1
         track["existence"] = min(logit - of["sure_logit"], most)
     tracks["id"] = first_id + np.arange(len(tracks))
     return tracks

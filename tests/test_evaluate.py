@@ -514,7 +514,7 @@ def test_no_shipped_model_was_trained_on_a_test_scan(kitti_root: Path, semantick
     tested = {hashlib.sha256(points.tobytes()).hexdigest()[:16] for points in scans}
     for name in shipped_models():
         card = Session(model_path(name), "cpu").card
-        trained_on = evaluate._training_hashes(card)
+        (trained_on,) = evaluate.training_scans_of([card]).values()
         only_simulated = card.training["recipe"]["simulated_share"] == 1.0
         assert len(trained_on) > 100 or only_simulated, f"{name} does not say what it was trained on"
         assert name.endswith("-sim") == only_simulated == (not trained_on)

@@ -7,6 +7,7 @@ import math
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,11 +17,13 @@ from hypothesis import strategies as st
 import edgeperc
 import reference
 from edgeperc import Box, StampError, Tracker, TrackingError, cli
+from edgeperc.datasets import scan_hash
 from edgeperc.perception import Perception
+from edgeperc.sensors import get_sensor
 from edgeperc.tracking.egomotion import fit_motion, nearest_detection, support
 from edgeperc.tracking.imm import fill_combined, fill_interaction, fill_mode_probabilities
 from edgeperc.tracking.jpda import MAX_EVENTS, fill_association, fill_by_propagation, fill_likelihoods
-from edgeperc.tracking.kitti import evaluate_kitti, read_sequence, track_sequence
+from edgeperc.tracking.kitti import evaluate_kitti, read_sequence, sequence_names, sequence_scans, track_sequence
 from edgeperc.tracking.metrics import (
     FrameTracks,
     FrameTruth,
@@ -45,7 +48,7 @@ from edgeperc.tracking.tracker import (
     update_shapes,
 )
 from edgeperc.tracking.ukf import CONSTANT_VELOCITY, CTRV, fill_predictions, fill_updates
-from edgeperc_bench.tracking import crossing
+from edgeperc_bench.tracking import crossing, every_second_beam
 
 NOISE = np.array([2.0, 0.4, 0.3, 0.1, 0.2])
 SIGMAS = np.array([0.2, 0.1, 0.08])
@@ -493,6 +496,18 @@ def test_what_is_hidden_is_told_of_for_longer() -> None:
         assert len(tracks) == 1 + (0 if k == 0 else 2 if k < 11 else 1)
     assert walking[0].id == 2
     assert walking[0].box.center[1] == pytest.approx(y, abs=0.2)
+
+
+def test_a_track_is_worth_more_hidden_than_overlooked() -> None:
+    scores = []
+    for x in (10.0, 30.0):  # before the pedestrian, and behind
+        tracker = Tracker()
+        for k in range(12):
+            boxes = [box("car", x, 0.0, score=0.99)]
+            boxes += [box("pedestrian", 14.0, 0.0)] if k < 9 else []
+            tracks = tracker.update(boxes, 0.1 * k, STANDING)
+        scores.append(tracks.scores[tracks.labels.index("pedestrian")])
+    assert scores[0] > scores[1] + 0.02
 
 
 def test_a_sure_detection_is_told_of_at_once_and_a_doubtful_one_begins_nothing() -> None:
@@ -1006,7 +1021,7 @@ def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixt
     arguments = ["eval", "tracking", str(kitti), "--json", str(kitti / "out/figures.json")]
     assert cli.main(arguments) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("1 sequence, 3-D IoU 0.25;")
+    assert lines[0].startswith("1 sequence, given detections, 3-D IoU 0.25;")
     words = [line.split() for line in lines]
     assert ["car", "100.0"] in [line[:1] + line[4:5] for line in words if len(line) > 8]
     assert any(line[:7] == ["sAMOTA", "AMOTA", "AMOTP", "MOTA", "MOTP", "HOTA", "DetA"] for line in words)
@@ -1050,6 +1065,91 @@ def test_a_models_boxes_are_judged(kitti: Path, capsys: pytest.CaptureFixture[st
     assert "holds no boxes" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         cli.main([*arguments[:3], "--boxes", str(boxes)])
+
+
+@pytest.fixture
+def drive_root(kitti: Path, tmp_path: Path) -> Path:
+    """The same sequence as an object set with track ids: a label and a scan a frame, of two drives."""
+    root = tmp_path / "objects"
+    for folder in ("label_2", "track_id", "calib", "velodyne"):
+        (root / "training" / folder).mkdir(parents=True)
+    by_frame: dict[int, list[list[str]]] = {}
+    for line in (kitti / "label_02/0000.txt").read_text().splitlines():
+        words = line.split()
+        by_frame.setdefault(int(words[0]), []).append(words)
+    rows = ["name,drive"]
+    for k, labels in by_frame.items():
+        name = f"{100 + k:06}"
+        rows.append(f"{name},my_drive")
+        (root / f"training/label_2/{name}.txt").write_text("".join(" ".join(words[2:]) + "\n" for words in labels))
+        (root / f"training/track_id/{name}.txt").write_text("".join(words[1] + "\n" for words in labels))
+        (root / f"training/calib/{name}.txt").write_text(CALIBRATION)
+        (root / f"training/velodyne/{name}.bin").write_bytes(np.full((3, 4), 0.5 + k, np.float32).tobytes())
+    (root / "frames.csv").write_text("\n".join([*rows, "000000,unlabelled_drive"]) + "\n")
+    return root
+
+
+def test_an_object_set_with_track_ids_is_the_same_sequence(kitti: Path, drive_root: Path) -> None:
+    assert sequence_names(drive_root) == ["my_drive"]
+    scans = sequence_scans(drive_root, "my_drive")
+    assert [path.stem for path in scans.values()] == [f"{100 + k:06}" for k in range(20)]
+    given = read_sequence(kitti, "0000")
+    same = read_sequence(drive_root, "my_drive", boxes=given.detections)
+    for of in ("car", "pedestrian"):
+        for a, b in zip(given.truth[of], same.truth[of], strict=True):
+            np.testing.assert_array_equal(a.ids, b.ids)
+            np.testing.assert_array_equal(a.boxes, b.boxes)
+            np.testing.assert_array_equal(a.ignored, b.ignored)
+    (drive_root / "training/track_id/000103.txt").write_text("1\n")
+    with pytest.raises(TrackingError, match="3 labels, and 1 track ids"):
+        read_sequence(drive_root, "my_drive", boxes=given.detections)
+
+
+def test_a_drive_is_perceived_and_tracked(
+    kitti: Path, drive_root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From scans to the table in one command; a scan that a model was trained on is refused."""
+    found = read_sequence(kitti, "0000").detections
+    card = SimpleNamespace(name="seer", version="1.0", training={})
+
+    def perceive(points: np.ndarray) -> SimpleNamespace:
+        return SimpleNamespace(boxes=found[int(points[0, 0])])
+
+    perceive.cards = (card,)
+    monkeypatch.setattr(cli, "_perceiver", lambda *_: perceive)
+    arguments = ["eval", "tracking", str(drive_root), "--classes", "car", "--json", str(drive_root / "f.json")]
+    assert cli.main(arguments) == 0
+    assert "1 sequence, boxes of seer 1.0" in capsys.readouterr().out
+    best = json.loads((drive_root / "f.json").read_text())["classes"]["car"]["best"]
+    assert (best["n_truth"], best["n_missed"], best["n_false"]) == (20, 0, 0)
+
+    # Beside KITTI's own sequences, --model takes the place of the detections that are there.
+    assert cli.main(["eval", "tracking", str(kitti), "--model", "seer"]) == 2
+    assert "no scans of 0000" in capsys.readouterr().err
+    (kitti / "velodyne/0000").mkdir(parents=True)
+    for k, path in sequence_scans(drive_root, "my_drive").items():
+        (kitti / f"velodyne/0000/{k:06}.bin").write_bytes(path.read_bytes())
+    (kitti / "velodyne/0000/000003.bin").unlink()  # as in KITTI's sequence 0001
+    assert cli.main(["eval", "tracking", str(kitti), "--model", "seer", "--classes", "car"]) == 0
+
+    card.training = {"frames": {"x": scan_hash(np.full((3, 4), 4.5, np.float32))}}
+    assert cli.main(arguments) == 2
+    assert "seer 1.0 was trained on scan 000104" in capsys.readouterr().err
+
+
+def test_a_coarser_sensors_drive_has_every_second_beam(drive_root: Path, tmp_path: Path) -> None:
+    turn = np.radians(np.arange(0.5, 360.0, 30.0))
+    beams = [np.column_stack([9.0 * np.cos(turn), 9.0 * np.sin(turn), 0 * turn - k, 0 * turn + 0.5]) for k in range(5)]
+    for path in sequence_scans(drive_root, "my_drive").values():
+        np.concatenate(beams).astype(np.float32).tofile(path)
+    every_second_beam(drive_root, tmp_path / "coarse")
+    scans = sequence_scans(tmp_path / "coarse", "my_drive")
+    assert len(scans) == 20
+    points = np.fromfile(scans[7], np.float32).reshape(-1, 4)
+    assert points[:, 2].tolist() == [0.0] * 12 + [-2.0] * 12 + [-4.0] * 12
+    assert (points[:, 3] == 63.75).all()
+    sensor = get_sensor(tmp_path / "coarse/sensor.json")
+    assert (len(sensor.elevations_deg), sensor.remission_range) == (32, (0.0, 255.0))
 
 
 def test_real_sequences_are_tracked_well(data_root) -> None:

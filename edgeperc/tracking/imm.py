@@ -87,13 +87,16 @@ def fill_mode_probabilities(
     for t in range(n):
         for j in range(k):
             shares[t, j, 0] = beta[t, 0] * prior[t, j]
+            for d in range(m):
+                shares[t, j, d + 1] = 0.0
         for d in range(m):
+            if beta[t, d + 1] == 0.0:  # as nearly all are
+                continue
             total = 0.0
             for j in range(k):
                 total += prior[t, j] * likelihoods[t, j, d]
             for j in range(k):
-                shares[t, j, d + 1] = 0.0
-                if beta[t, d + 1] > 0.0 and total > 0.0:
+                if total > 0.0:
                     shares[t, j, d + 1] = beta[t, d + 1] * prior[t, j] * likelihoods[t, j, d] / total
         for j in range(k):
             total = 0.0

@@ -68,49 +68,55 @@ def fill_likelihoods(
     n, m = len(groups), len(detection_groups)
     likelihoods[:] = 0.0
     weights[:] = 0.0
+    # Of each motion: the covariance of the place, the heading's pull by the place, its variance, limit and norm. Pairs
+    # that are out of the gate, as most are, cost no sine, root or exponential.
+    forms = np.empty((3, 9))
     for i in range(n):
-        reach = 0.0
+        gate, reach, apart = gates[i], 0.0, 0.0
         for mode in range(3):
-            cov = predicted[i, mode]
-            reach = max(reach, cov[0, 0] + cov[1, 1])
-        gate = gates[i]
-        reach = gate * math.sqrt(reach + sigmas[i, 0] ** 2 + sigmas[i, 1] ** 2)
+            mean, cov, form = means[i, mode], predicted[i, mode], forms[mode]
+            cos, sin = math.cos(mean[3]), math.sin(mean[3])
+            along, across = sigmas[i, 0] * sigmas[i, 0], sigmas[i, 1] * sigmas[i, 1]
+            a = cov[0, 0] + along * cos * cos + across * sin * sin
+            b = cov[0, 1] + (along - across) * cos * sin
+            d = cov[1, 1] + along * sin * sin + across * cos * cos
+            c, e = cov[0, 3], cov[1, 3]
+            f = cov[3, 3] + sigmas[i, 2] * sigmas[i, 2]
+            place = a * d - b * b
+            # The heading given the place: its mean and its variance.
+            pull_x = (c * d - e * b) / place
+            pull_y = (e * a - c * b) / place
+            left = f - pull_x * c - pull_y * e
+            form[0], form[1], form[2], form[3] = a, b, d, place
+            form[4], form[5], form[6], form[7] = pull_x, pull_y, left, 3.0 * math.sqrt(f)
+            form[8] = 1.0 / math.sqrt((2.0 * math.pi) ** 3 * place * left)
+            reach = max(reach, a + d)
+            apart = max(apart, math.hypot(mean[0] - means[i, 0, 0], mean[1] - means[i, 0, 1]))
+        reach = (gate * math.sqrt(reach) + apart) ** 2
         for j in range(m):
             dx = detections[j, 0] - means[i, 0, 0]
             dy = detections[j, 1] - means[i, 0, 1]
-            apart = 0.0
-            for mode in range(1, 3):
-                apart = max(apart, math.hypot(means[i, mode, 0] - means[i, 0, 0], means[i, mode, 1] - means[i, 0, 1]))
-            if groups[i] != detection_groups[j] or dx * dx + dy * dy > (reach + apart) ** 2:
+            if groups[i] != detection_groups[j] or dx * dx + dy * dy > reach:
                 continue
             inside = False
             for mode in range(3):
-                mean, cov = means[i, mode], predicted[i, mode]
-                cos, sin = math.cos(mean[3]), math.sin(mean[3])
-                along, across = sigmas[i, 0] * sigmas[i, 0], sigmas[i, 1] * sigmas[i, 1]
-                a = cov[0, 0] + along * cos * cos + across * sin * sin
-                b = cov[0, 1] + (along - across) * cos * sin
-                d = cov[1, 1] + along * sin * sin + across * cos * cos
-                c, e = cov[0, 3], cov[1, 3]
-                f = cov[3, 3] + sigmas[i, 2] * sigmas[i, 2]
-                place = a * d - b * b
-                dx = detections[j, 0] - mean[0]
-                dy = detections[j, 1] - mean[1]
-                squared = (d * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / place
-                inside = inside or squared <= gate * gate
-                # The heading given the place: its mean and its variance.
-                pull_x = (c * d - e * b) / place
-                pull_y = (e * a - c * b) / place
-                turn = detections[j, 2] - mean[3]
-                turn -= math.pi * np.floor(turn / math.pi + 0.5)  # not math.floor, which NaN makes raise
-                limit = 3.0 * math.sqrt(f)
-                turn = min(max(turn, -limit), limit) - pull_x * dx - pull_y * dy
-                left = f - pull_x * c - pull_y * e
-                squared += turn * turn / left
-                likelihoods[i, mode, j] = math.exp(-0.5 * squared) / math.sqrt((2.0 * math.pi) ** 3 * place * left)
+                a, b, d, place = forms[mode, 0], forms[mode, 1], forms[mode, 2], forms[mode, 3]
+                dx = detections[j, 0] - means[i, mode, 0]
+                dy = detections[j, 1] - means[i, mode, 1]
+                inside = inside or d * dx * dx - 2.0 * b * dx * dy + a * dy * dy <= gate * gate * place
+            if not inside:
+                continue
             for mode in range(3):
-                if not inside:
-                    likelihoods[i, mode, j] = 0.0
+                a, b, d, place = forms[mode, 0], forms[mode, 1], forms[mode, 2], forms[mode, 3]
+                dx = detections[j, 0] - means[i, mode, 0]
+                dy = detections[j, 1] - means[i, mode, 1]
+                squared = (d * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / place
+                limit = forms[mode, 7]
+                turn = detections[j, 2] - means[i, mode, 3]
+                turn -= math.pi * np.floor(turn / math.pi + 0.5)  # not math.floor, which NaN makes raise
+                turn = min(max(turn, -limit), limit) - forms[mode, 4] * dx - forms[mode, 5] * dy
+                squared += turn * turn / forms[mode, 6]
+                likelihoods[i, mode, j] = math.exp(-0.5 * squared) * forms[mode, 8]
                 weights[i, j] += odds[i] * prior[i, mode] * likelihoods[i, mode, j]
             weights[i, j] = min(weights[i, j], LARGEST_WEIGHT)
 

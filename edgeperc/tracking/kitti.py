@@ -13,13 +13,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets import IMAGE_SIZE, Calibration
+from ..datasets import IMAGE_SIZE, Calibration, KittiObjects
 from ..errors import TrackingError
 from ..perception import Box
 from .metrics import FrameTracks, FrameTruth, evaluate_tracks
 from .tracker import ClassParameters, Tracker, Tracks
 
-__all__ = ["CLASSES", "KINDS", "TrackingSequence", "evaluate_kitti", "read_boxes", "read_sequence", "track_sequence"]
+__all__ = [
+    "CLASSES",
+    "KINDS",
+    "TrackingSequence",
+    "evaluate_kitti",
+    "read_boxes",
+    "read_sequence",
+    "sequence_names",
+    "sequence_scans",
+    "track_sequence",
+]
 
 CLASSES = ("car", "pedestrian", "cyclist")
 # What counts as each class; KUL-Seg's Table 7 knows vehicles alone.
@@ -53,14 +63,86 @@ class TrackingSequence:
     calibration: Calibration
 
 
-def read_sequence(
-    root: Path | str, name: str, classes: Sequence[str] = CLASSES, boxes: Sequence[Sequence[Box]] | None = None
-) -> TrackingSequence:
-    """Read ``label_02/NAME.txt``, ``calib/NAME.txt`` and ``detections/DETECTOR_CLASS/NAME.txt`` below ``root``.
+def sequence_names(root: Path | str) -> list[str]:
+    """What can be judged below ``root``: KITTI's tracking sequences, or drives of an object set with track ids.
 
     Parameters
     ----------
     root : str or Path
+        Holds ``label_02/NAME.txt``, or ``training/label_2``, ``training/track_id`` (a line for each label's) and
+        ``frames.csv`` (`edgeperc.datasets.KittiObjects`).
+
+    Returns
+    -------
+    list of str
+
+    Raises
+    ------
+    TrackingError
+        There is neither.
+    """
+    root = Path(root)
+    names = sorted(path.stem for path in (root / "label_02").glob("*.txt"))
+    if not names and (root / "training/track_id").is_dir():
+        drives = KittiObjects(root).drives
+        names = sorted({drives[path.stem] for path in (root / "training/track_id").glob("*.txt")})
+    if not names:
+        raise TrackingError(
+            f"{root} holds no label_02/*.txt and no training/track_id/*.txt; pass the root of KITTI's tracking "
+            "sequences, or of an object set with track ids"
+        )
+    return names
+
+
+def sequence_scans(root: Path | str, name: str) -> dict[int, Path]:
+    """Files of a sequence's scans by frame, ``velodyne/NAME/FRAME.bin`` below ``root`` or those of the drive.
+
+    Parameters
+    ----------
+    root : str or Path
+    name : str
+        Of `sequence_names`.
+
+    Returns
+    -------
+    dict of int to Path
+        Empty where there are none.
+    """
+    root = Path(root)
+    if (root / "label_02").is_dir():
+        return {int(path.stem): path for path in sorted((root / "velodyne" / name).glob("*.bin"))}
+    training = root / "training"
+    names = [of for of, drive in KittiObjects(root).drives.items() if drive == name]
+    told = (of for of in names if (training / "track_id" / f"{of}.txt").exists())
+    return {frame: training / "velodyne" / f"{of}.bin" for frame, of in enumerate(told)}
+
+
+def _labels(root: Path, name: str) -> tuple[Path, list[list[str]], Calibration]:
+    """Where the labels are, the words of KITTI's 17 columns, and the calibration."""
+    path = root / "label_02" / f"{name}.txt"
+    if path.parent.is_dir():
+        lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
+        return path, lines, Calibration.read(root / "calib" / f"{name}.txt")
+    path, lines, stem = root / "training/label_2", [], ""
+    for frame, scan in sequence_scans(root, name).items():
+        stem = scan.stem
+        labels = (path / f"{stem}.txt").read_text().splitlines()
+        ids = (root / "training/track_id" / f"{stem}.txt").read_text().split()
+        if len(ids) != len(labels):
+            raise TrackingError(f"{path}/{stem}.txt has {len(labels)} labels, and {len(ids)} track ids; pass one each")
+        lines += [[str(frame), one, *label.split()] for one, label in zip(ids, labels, strict=True)]
+    return path, lines, Calibration.read(root / "training/calib" / f"{stem}.txt")
+
+
+def read_sequence(
+    root: Path | str, name: str, classes: Sequence[str] = CLASSES, boxes: Sequence[Sequence[Box]] | None = None
+) -> TrackingSequence:
+    """Read a sequence's labels, calibration and ``detections/DETECTOR_CLASS/NAME.txt`` below ``root``.
+
+    Parameters
+    ----------
+    root : str or Path
+        As `sequence_names` takes it.
     name : str
         Such as ``"0000"``.
     classes : sequence of str
@@ -81,9 +163,7 @@ def read_sequence(
         A file cannot be read.
     """
     root = Path(root)
-    calibration = Calibration.read(root / "calib" / f"{name}.txt")
-    label_path = root / "label_02" / f"{name}.txt"
-    labels = [line.split() for line in label_path.read_text().splitlines() if line.strip()]
+    label_path, labels, calibration = _labels(root, name)
     try:
         values = np.array([[*words[:2], *words[3:17]] for words in labels], np.float64).reshape(-1, 16)
     except ValueError as exc:
@@ -259,7 +339,7 @@ def evaluate_kitti(
     Parameters
     ----------
     root : str or Path
-        Holds ``label_02``, ``calib`` and ``detections``.
+        As `sequence_names` takes it, with ``detections`` or with ``boxes``.
     sequences : sequence of str, optional
         By default all that have labels.
     classes : sequence of str
@@ -283,9 +363,7 @@ def evaluate_kitti(
         There is no such data, or a file cannot be understood.
     """
     root = Path(root)
-    names = list(sequences or sorted(path.stem for path in (root / "label_02").glob("*.txt")))
-    if not names:
-        raise TrackingError(f"{root} holds no label_02/*.txt; pass the root of KITTI's tracking sequences")
+    names = list(sequences or sequence_names(root))
     pairs: dict[str, list[tuple[Sequence[FrameTruth], Sequence[FrameTracks]]]] = {of: [] for of in classes}
     n_frames, seconds = 0, 0.0
     Tracker(parameters).update([Box("car", 0.5, (9.0, 0.0, 0.0), (4.0, 2.0, 1.5), 0.0)], 0.0)  # loads the kernels

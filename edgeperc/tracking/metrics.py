@@ -129,6 +129,8 @@ class TrackingScores:
     samota, amota, amotp : float
         Means over forty recalls of the scaled MOTA, of MOTA and of MOTP (AB3DMOT); recalls that are never reached
         count as 0.
+    told : Clear
+        Of every track, whatever its score: what a user of the tracker sees.
     best : Clear
         At the score threshold with the highest MOTA.
     hota : Hota
@@ -140,6 +142,7 @@ class TrackingScores:
     samota: float
     amota: float
     amotp: float
+    told: Clear
     best: Clear
     hota: Hota
     n_frames: int
@@ -242,6 +245,7 @@ def evaluate_tracks(
         samota=samota,
         amota=amota,
         amotp=amotp,
+        told=everything,
         best=best,
         hota=_hota(packed, best.threshold),
         n_frames=sum(len(of.shapes) for of in packed),
