@@ -127,7 +127,12 @@ def absent(contender: Contender) -> str:
 
 def make_perceiver(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
     perceive = Perceiver(
-        list(contender.paths), sensor=sensor, provider=contender.engine, n_threads=n_threads, on_mismatch="ignore"
+        list(contender.paths),
+        sensor=sensor,
+        provider=contender.engine,
+        n_threads=n_threads,
+        on_mismatch="ignore",
+        boxes_from="network",  # as the rivals
     )
     return [lambda scan=scan: perceive(scan) for scan in scans]  # type: ignore[misc]
 

@@ -68,6 +68,11 @@ class TopViewGeometry:
         """Columns, along y."""
         return round((self.y_range_m[1] - self.y_range_m[0]) / self.cell_m)
 
+    def holds(self, x: float, y: float) -> bool:
+        """Whether a place is in view."""
+        (near, far), (right, left) = self.x_range_m, self.y_range_m
+        return near <= x < far and right <= y < left
+
     def cell_centres(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """x (rows, 1) and y (1, cols) of the middles of the cells [m]."""
         # numpy's own float64: older stubs take a product with Python's float for any float

@@ -110,6 +110,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     running.add_argument("--provider", default="auto", metavar="P", help="cpu, openvino, cuda, ... (default: auto)")
     running.add_argument("--threads", type=_positive, metavar="N", help="threads inside a model (default: its choice)")
+    running.add_argument(
+        "--boxes-from",
+        choices=("both", "network", "clusters"),
+        default="both",
+        help="boxes of the top-view model, those around clusters of labelled points, or both (default: both)",
+    )
+    running.add_argument(
+        "--all-around", action="store_true", help="run a range-image model on every part of the turn, not ahead alone"
+    )
 
     demo = commands.add_parser("demo", parents=[running], help="perceive the bundled scene: a table and a picture")
     demo.add_argument("--out", type=Path, default=Path("edgeperc-demo"), metavar="DIR", help="default: edgeperc-demo")
@@ -197,6 +206,9 @@ def _parser() -> argparse.ArgumentParser:
     judge.add_argument("--fold", type=int, choices=(0, 1, 2), help="the drives held back by this fold of the training")
     judge.add_argument(
         "--road-by", metavar="NAME", help="another top-view model whose drivable cells count as true on KITTI"
+    )
+    judge.add_argument(
+        "--boxes-from", choices=("network", "clusters", "both"), default="network", help="as in run (default: network)"
     )
     judge.add_argument("--json", type=Path, metavar="FILE", help="every figure, also those without a table")
     judge.add_argument("--worst", type=Path, metavar="PNG", help="a picture of the scans with most mistakes")
@@ -306,10 +318,12 @@ def _perceiver(
             n_threads=arguments.threads,
             on_mismatch=on_mismatch,
             adapt=adapt,
+            boxes_from=arguments.boxes_from,
+            all_around=arguments.all_around,
         )
     except EdgepercError:
         raise
-    except ValueError as exc:  # two models of one view
+    except ValueError as exc:  # two models of one view; no labels to cluster by
         raise ModelError(str(exc)) from exc
 
 
@@ -589,9 +603,9 @@ def _summary(perception: Perception) -> str:
     words = [f"{perception.n_points:,} points", f"{sum(perception.stage_ms.values()):.1f} ms"]
     if perception.top_view is not None:
         words.append(f"drivable {perception.top_view.drivable_area_m2:.1f} m2")
-        labels = [box.label for box in perception.boxes]
-        boxes = ", ".join(f"{labels.count(label)} {label}" for label in dict.fromkeys(labels))
-        words.append(f"boxes: {boxes or 'none'}")
+    labels = [box.label for box in perception.boxes]
+    boxes = ", ".join(f"{labels.count(label)} {label}" for label in dict.fromkeys(labels))
+    words.append(f"boxes: {boxes or 'none'}")
     if perception.points is not None:
         words.append(f"points: {_tally(perception)}")
     return "  ".join(words)
@@ -639,8 +653,8 @@ def _demo(arguments: argparse.Namespace) -> int:
     if perception.top_view is not None:
         area_m2 = perception.top_view.drivable_area_m2
         rows.append(("drivable", f"{area_m2:.0f} m2 of the {_extent(perception)} ahead"))
-        found = [_box_words(box) for box in perception.boxes] or ["none"]
-        rows += [("boxes" if k == 0 else "", words) for k, words in enumerate(found)]
+    found = [_box_words(box) for box in perception.boxes] or ["none"]
+    rows += [("boxes" if k == 0 else "", words) for k, words in enumerate(found)]
     if perception.points is not None:
         there = np.bincount(scan.labels[perception.points.in_view], minlength=len(perception.points.classes))
         for k, (name, count) in enumerate(perception.points.counts().items()):
@@ -675,7 +689,7 @@ def _box_words(box: Box) -> str:
     length, width, height = box.size
     side = f"{abs(y):4.1f} m {'left' if y >= 0 else 'right'}"
     return (
-        f"{box.label:<6}{box.score:5.2f}   {math.hypot(x, y):5.1f} m away: {x:5.1f} m ahead, {side:<13}"
+        f"{box.label:<10}{box.score:5.2f}   {math.hypot(x, y):5.1f} m away: {x:5.1f} m ahead, {side:<13}"
         f"{length:.1f} x {width:.1f} x {height:.1f} m, heading {round(math.degrees(box.yaw)):4d} deg"
     )
 
@@ -901,6 +915,7 @@ def _eval(arguments: argparse.Namespace) -> int:
         split=arguments.split,
         fold=arguments.fold,
         road_by=arguments.road_by,
+        boxes_from=arguments.boxes_from,
         provider=arguments.provider,
         on_scan=on_scan,
     )

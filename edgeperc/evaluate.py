@@ -38,7 +38,7 @@ from .figures import BANDS, VEHICLES, Record, banded, figures, within
 from .geometry import draw_footprints
 from .metrics import BoxEvaluator, ProbabilitySweep
 from .models import model_path
-from .perceiver import Perceiver
+from .perceiver import BoxesFrom, Perceiver
 from .perception import Box, Perception, PointLabels, TopView
 from .points import read_points
 from .projection import make_projector
@@ -135,6 +135,8 @@ class Judge:
         A top-view model whose drivable cells count as the truth of real scans with boxes (SSADNet 3.1.2 takes LoDNN's).
     training_scans : bool
         Judge scans that a model was trained on, too.
+    boxes_from : {"network", "clusters", "both"}
+        As `Perceiver` has it. Boxes of clusters are judged wherever the truth is known, a top-view model's in its view.
     """
 
     def __init__(
@@ -144,12 +146,14 @@ class Judge:
         provider: str = "cpu",
         road_by: str | Path | None = None,
         training_scans: bool = False,
+        boxes_from: BoxesFrom = "network",
     ) -> None:
-        self.perceive = _perceiver(models, provider)
+        self.perceive = _perceiver(models, provider, boxes_from)
         networks = [_Network(model, provider) for model in models]
         self.from_sensor = next((n for n in networks if n.card.view.kind == "range_image"), None)
         self.from_above = next((n for n in networks if n.card.view.kind == "top_view"), None)
-        self.box_classes = self.from_above.card.box_classes if self.from_above else ()
+        self.box_classes = self.from_above.card.box_classes if self.from_above and boxes_from != "clusters" else ()
+        self.cluster_classes = self.from_sensor.card.classes[1:] if self.from_sensor and boxes_from != "network" else ()
         self.view = self.from_above.card.view if self.from_above else None
         if isinstance(self.view, TopViewGeometry):
             x, y = np.broadcast_arrays(*self.view.cell_centres())
@@ -230,7 +234,7 @@ class Judge:
             x, y = truth.points[:, 0], truth.points[:, 1]
             shown = (x > -2.0) & (x < 52.0) & (np.abs(y) < 27.0)
             mistakes = Mistakes(truth.name, truth.drive, truth.points[shown], np.zeros(int(shown.sum()), np.uint8))
-            if self.box_classes:
+            if self.box_classes or self.cluster_classes:
                 mistakes = self._count_boxes(tallies, truth, found, mistakes)
             if found.points is not None:
                 mistakes = self._count_points(tallies, truth, found.points, mistakes, shown)
@@ -243,7 +247,7 @@ class Judge:
     ) -> Mistakes:
         predicted, wanted, ignored = self._judged_boxes(truth, found)
         for kind in ("upright", "oriented"):
-            evaluator = tallies["boxes", kind] = BoxEvaluator(oriented=kind == "oriented")
+            evaluator = tallies["boxes", kind] = BoxEvaluator(oriented=kind == "oriented", together=VEHICLES)
             pairs = evaluator.update(predicted, wanted, ignored=ignored)
         returns = dict(zip(map(id, truth.boxes), truth.returns, strict=True))
         return replace(
@@ -313,27 +317,27 @@ class Judge:
     def _judged_boxes(self, truth: Truth, found: Perception) -> tuple[list[Box], list[Box], list[Box]]:
         """Predictions where truth is known, the boxes to find, and those that need not be found.
 
-        To be found is every vehicle whose centre lies in the top view and which `FEWEST_RETURNS` or more came from.
+        To be found is whatever `FEWEST_RETURNS` or more came from and is of a class that clusters are of, or a vehicle
+        whose centre lies in the top view.
         """
-        assert isinstance(self.view, TopViewGeometry)
-        (near, far), (right, left) = self.view.x_range_m, self.view.y_range_m
         centres = np.array([box.center for box in found.boxes], np.float64).reshape(-1, 3)
         predicted = [box for box, known in zip(found.boxes, truth.known(centres), strict=True) if known]
         wanted: list[Box] = []
         ignored: list[Box] = []
         for box, returns in zip(truth.boxes, truth.returns, strict=True):
-            seen = near <= box.center[0] < far and right <= box.center[1] < left
-            counts = box.label in self.box_classes and seen and returns >= FEWEST_RETURNS
-            (wanted if counts else ignored).append(box)
+            counts = box.label in self.cluster_classes
+            if box.label in self.box_classes and isinstance(self.view, TopViewGeometry):
+                counts |= self.view.holds(*box.center[:2])
+            (wanted if counts and returns >= FEWEST_RETURNS else ignored).append(box)
         return predicted, wanted, ignored
 
 
-def _perceiver(models: Sequence[str | Path], provider: str) -> Perceiver:
+def _perceiver(models: Sequence[str | Path], provider: str, boxes_from: BoxesFrom = "network") -> Perceiver:
     try:
-        return Perceiver(list(models), sensor="hdl-64e", provider=provider, on_mismatch="ignore")
+        return Perceiver(list(models), sensor="hdl-64e", provider=provider, on_mismatch="ignore", boxes_from=boxes_from)
     except EdgepercError:
         raise
-    except ValueError as exc:  # two models of one view
+    except ValueError as exc:  # two models of one view; no labels to cluster by
         raise ModelError(str(exc)) from exc
 
 
@@ -408,6 +412,7 @@ def evaluate(
     fold: int | None = None,
     road_by: str | Path | None = None,
     provider: str = "cpu",
+    boxes_from: BoxesFrom = "network",
     n_resamples: int = 1000,
     on_scan: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[dict[str, Any], list[Mistakes]]:
@@ -417,7 +422,7 @@ def evaluate(
     ----------
     datasets : sequence of str or Path
         Roots of a KITTI object set or of SemanticKITTI, or ``"simulation:N"`` for N simulated scans (24 without).
-    models, road_by, provider
+    models, road_by, provider, boxes_from
         As `Judge` has them.
     split : str or None
         ``"test"``, ``"train"``, ``"validation"`` or ``"all"`` of the real scans (`edgeperc.splits`); None takes the
@@ -444,7 +449,7 @@ def evaluate(
         A model was trained on a scan, and ``split`` is not ``"train"``.
     """
     split = split or ("test" if fold is None else "validation")
-    judge = Judge(models, provider=provider, road_by=road_by, training_scans=split == "train")
+    judge = Judge(models, provider=provider, road_by=road_by, training_scans=split == "train", boxes_from=boxes_from)
     scans = [scan for dataset in datasets for scan in _scans(judge, dataset, split, fold)]
     records: dict[str, list[Record]] = {}
     worst: dict[str, list[Mistakes]] = {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -263,6 +263,8 @@ class BoxEvaluator:
         Overlap of footprints, seen from above, that makes a hit.
     oriented : bool
         Compare the footprints as they stand; False compares their axis-aligned bounds, as SSADNet has them.
+    together : collection of str, optional
+        Classes that `overall` puts together; all by default.
 
     Raises
     ------
@@ -270,11 +272,14 @@ class BoxEvaluator:
         The threshold does not lie above 0 and up to 1.
     """
 
-    def __init__(self, iou_threshold: float = 0.5, *, oriented: bool = True) -> None:
+    def __init__(
+        self, iou_threshold: float = 0.5, *, oriented: bool = True, together: Collection[str] | None = None
+    ) -> None:
         if not 0.0 < iou_threshold <= 1.0:
             raise PointsError(f"iou_threshold is {iou_threshold}; expected a number above 0 and up to 1")
         self.iou_threshold = iou_threshold
         self.oriented = oriented
+        self.together = together
         self._classes: dict[str, _Matches] = {}
         self._all = _Matches()
 
@@ -310,11 +315,9 @@ class BoxEvaluator:
         excused |= _share_inside(_rectangles(guesses), np.asarray(ignored_regions, dtype=np.float64)) >= 0.5
         for label in dict.fromkeys(box.label for box in (*guesses, *rights)):
             matches = self._classes.setdefault(label, _Matches())
-            rows = [i for i, box in enumerate(guesses) if box.label == label]
-            columns = [j for j, box in enumerate(rights) if box.label == label]
-            of_class = [guesses[i] for i in rows], [rights[j] for j in columns]
-            self._match(matches, *of_class, overlap[np.ix_(rows, columns)], excused[rows])
-        return self._match(self._all, guesses, rights, overlap, excused)
+            self._match(matches, guesses, rights, overlap, excused, {label})
+        self._match(self._all, guesses, rights, overlap, excused, self.together)
+        return self._match(_Matches(), guesses, rights, overlap, excused)
 
     def __add__(self, other: BoxEvaluator) -> BoxEvaluator:
         """What updating with one's scans and then with the other's would have given."""
@@ -323,7 +326,7 @@ class BoxEvaluator:
                 f"got boxes matched at {self.iou_threshold} (oriented: {self.oriented}) and at {other.iou_threshold} "
                 f"(oriented: {other.oriented}); expected the same"
             )
-        both = BoxEvaluator(self.iou_threshold, oriented=self.oriented)
+        both = BoxEvaluator(self.iou_threshold, oriented=self.oriented, together=self.together)
         for label in dict.fromkeys((*self._classes, *other._classes)):
             both._classes[label] = self._classes.get(label, _Matches()) + other._classes.get(label, _Matches())
         both._all = self._all + other._all
@@ -338,7 +341,7 @@ class BoxEvaluator:
         return {label: self._scores(matches, within_m) for label, matches in self._classes.items()}
 
     def overall(self, within_m: tuple[float, float] = EVERYWHERE) -> BoxScores:
-        """Scores of all boxes, whatever their classes."""
+        """Scores of all boxes, or of those of ``together``, as if they were of one class."""
         return self._scores(self._all, within_m)
 
     def mean_ap(self, within_m: tuple[float, float] = EVERYWHERE) -> float:
@@ -356,7 +359,13 @@ class BoxEvaluator:
         rights: list[Box],
         overlap: NDArray[np.float64],
         excused: NDArray[np.bool_],
+        labels: Collection[str] | None = None,
     ) -> list[tuple[Box | None, Box | None]]:
+        if labels is not None:
+            rows = [i for i, box in enumerate(guesses) if box.label in labels]
+            columns = [j for j, box in enumerate(rights) if box.label in labels]
+            guesses, rights = [guesses[i] for i in rows], [rights[j] for j in columns]
+            overlap, excused = overlap[np.ix_(rows, columns)], excused[rows]
         free = overlap.copy()
         missed = dict(enumerate(rights))
         pairs: list[tuple[Box | None, Box | None]] = []

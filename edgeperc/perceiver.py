@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import time
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
@@ -17,9 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from .adapt import Interpolator, render
 from .card import ModelCard, RangeImageGeometry, TopViewGeometry
+from .cluster import MIN_SCORE, join_boxes, objects_from_points
 from .decode import decode_classes, decode_dense, decode_slots
 from .errors import FitnessError
 from .geometry import draw_footprints
+from .ground import find_ground
 from .models import model_path
 from .perception import Box, Perception, PointLabels, TopView
 from .points import as_points
@@ -30,8 +34,9 @@ from .session import Session
 
 __all__ = ["Perceiver"]
 
-STAGES = ("check", "project", "infer", "decode", "refine")
+STAGES = ("check", "project", "infer", "decode", "refine", "cluster")
 Adaptation = Literal["both", "remission", "interpolation", "neither"]
+BoxesFrom = Literal["both", "network", "clusters"]
 ADAPTATIONS: tuple[Adaptation, ...] = ("neither", "remission", "interpolation", "both")
 # A wrong set-up shows in any scan; a few are looked at, as one may be taken in a tunnel or a depot.
 CHECKED_SCANS = 5
@@ -81,11 +86,19 @@ class Perceiver:
     on_mismatch : {"warn", "raise", "ignore"}
         What to do when one of the first scans is unlike those the model was trained on. ``"ignore"`` skips the check.
     score_threshold : float or None
-        Least score of a box; None takes the card's.
+        Least score of a box; None takes the card's, and 0.3 of a cluster's.
     adapt : {"both", "remission", "interpolation", "neither"}
         What is done about another sensor than the models were trained on: its remission is rendered, where its profile
         has a function, and a range image is filled between its beams and columns, where it has fewer. Nothing where
         the sensor is the same.
+    boxes_from : {"both", "network", "clusters"}
+        ``"network"``: the boxes of a top-view model, vehicles ahead. ``"clusters"``: those around what stands on the
+        ground and carries a range-image model's labels, of every class and as far as that model sees
+        (`edgeperc.cluster.objects_from_points`). ``"both"``: whichever the models allow; a cluster's box goes where
+        there is a network's, and where a network looks for that class.
+    all_around : bool
+        Where a range-image model sees a part of the turn, run it for every part, four times for the shipped ones: then
+        every point has a class, and there are boxes beside and behind the vehicle.
 
     Attributes
     ----------
@@ -120,11 +133,15 @@ class Perceiver:
         on_mismatch: Literal["warn", "raise", "ignore"] = "warn",
         score_threshold: float | None = None,
         adapt: Adaptation = "both",
+        boxes_from: BoxesFrom = "both",
+        all_around: bool = False,
     ) -> None:
         if adapt not in ADAPTATIONS:
             raise ValueError(f"adapt is {adapt!r}; expected one of {', '.join(ADAPTATIONS)}")
         if on_mismatch not in ("warn", "raise", "ignore"):
             raise ValueError(f"on_mismatch is {on_mismatch!r}; expected warn, raise or ignore")
+        if boxes_from not in ("both", "network", "clusters"):
+            raise ValueError(f"boxes_from is {boxes_from!r}; expected both, network or clusters")
         if score_threshold is not None and not 0.0 <= score_threshold <= 1.0:
             raise ValueError(f"score_threshold is {score_threshold}; expected a number in 0..1")
         self.sensor = get_sensor(sensor)
@@ -134,6 +151,11 @@ class Perceiver:
         self._renders = self.sensor.remission is not None and adapt in ("both", "remission")
         # Rendered remissions lie in 0..1 already.
         self._remission = (0.0, 1.0) if self._renders else (self.sensor.remission_offset, self.sensor.remission_scale)
+        self.boxes_from = boxes_from
+        self.all_around = all_around
+        gaps_deg = [upper - lower for upper, lower in pairwise(self.sensor.elevations_deg)]
+        # Neighbouring beams and columns meet on one object, with one missing between them.
+        self._distance_per_m = 2.0 * math.radians(max(np.median(gaps_deg or [0.0]), 360.0 / self.sensor.columns))
         given = [models] if isinstance(models, (str, os.PathLike)) else list(models)
         self._networks = [self._load(_resolve(m), provider, n_threads) for m in given]
         views = [n.session.card.view.kind for n in self._networks]
@@ -141,6 +163,8 @@ class Perceiver:
             raise ValueError(
                 f"models {[str(m) for m in given]} have views {views}; expected at least one model, at most one a view"
             )
+        if boxes_from == "clusters" and "range_image" not in views:
+            raise ValueError("boxes_from is 'clusters', which takes a class for every point; add a range-image model")
         self.sessions: tuple[Session, ...] = tuple(n.session for n in self._networks)
         self.cards: tuple[ModelCard, ...] = tuple(n.session.card for n in self._networks)
         self.providers = MappingProxyType({n.session.card.name: n.session.provider for n in self._networks})
@@ -150,6 +174,8 @@ class Perceiver:
         # networks have run already, on their golden inputs; the answers to those will do.
         warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
         self._perceive(warm_up, None, check=self._to_check > 0, infer=False)
+        if boxes_from != "network" and "range_image" in views:
+            self._find_objects(*self._post_on_floor())
 
     def _load(self, path: Path, provider: str, n_threads: int | None) -> _Network:
         session = Session(path, provider, n_threads)
@@ -192,8 +218,13 @@ class Perceiver:
     ) -> Perception:
         watch = _Stopwatch()
         finite = np.isfinite(scan)
+        n_dropped = 0
         # Reducing rows of four costs ten times the count, and nearly every scan is finite throughout.
-        n_dropped = 0 if finite.all() else len(scan) - int(np.count_nonzero(finite.all(axis=1)))
+        if not finite.all():
+            dropped = ~finite.all(axis=1)
+            n_dropped = int(np.count_nonzero(dropped))
+            scan = scan.copy()
+            scan[dropped] = np.nan  # a point without a remission is nowhere, for every stage
         watch.lap("check")
         if self._renders:
             scan = render(scan, self.sensor)
@@ -207,7 +238,11 @@ class Perceiver:
             if isinstance(network.session.card.view, TopViewGeometry):
                 top_view, boxes = self._see_from_above(network, scan, watch, infer)
             else:
-                points = self._see_from_sensor(network, scan, watch, infer)
+                points = (self._look_around if self.all_around else self._see_from_sensor)(network, scan, watch, infer)
+        if points is not None and self.boxes_from != "network":
+            clustered = self._find_objects(scan, points)
+            boxes = join_boxes(boxes, self._new_to_networks(clustered)) if self.boxes_from == "both" else clustered
+            watch.lap("cluster")
         return Perception(
             n_points=len(scan),
             n_dropped=n_dropped,
@@ -283,6 +318,55 @@ class Perceiver:
         labelled = label_points(scan, pixel, network.index, cleaned, full_turn=full_turn)
         watch.lap("refine")
         return PointLabels(labelled, pixel >= 0, card.classes)
+
+    def _look_around(self, network: _Network, scan: NDArray[np.float32], watch: _Stopwatch, infer: bool) -> PointLabels:
+        """What a network that looks ahead sees as the scan is turned; where two views meet, the earlier counts."""
+        view = network.session.card.view
+        assert isinstance(view, RangeImageGeometry)
+        width_deg = view.azimuth_left_deg - view.azimuth_right_deg
+        ahead = self._see_from_sensor(network, scan, watch, infer)
+        labels, in_view = ahead.labels, ahead.in_view
+        for k in range(1, math.ceil(360.0 / width_deg)):
+            cos, sin = math.cos(math.radians(k * width_deg)), math.sin(math.radians(k * width_deg))
+            turned = scan.copy()
+            turned[:, 0] = cos * scan[:, 0] + sin * scan[:, 1]
+            turned[:, 1] = cos * scan[:, 1] - sin * scan[:, 0]
+            aside = self._see_from_sensor(network, turned, watch, infer)
+            labels = np.where(in_view, labels, aside.labels)
+            in_view = in_view | aside.in_view
+        return PointLabels(labels, in_view, ahead.classes)
+
+    def _post_on_floor(self) -> tuple[NDArray[np.float32], PointLabels]:
+        """Nine points of a car on a floor, enough for every kernel of `_find_objects` to be compiled."""
+        x, y = np.meshgrid(np.arange(-8.0, 8.0), np.arange(-8.0, 8.0))
+        scan = np.zeros((x.size + 9, 4), np.float32)
+        scan[:-9, 0], scan[:-9, 1], scan[:-9, 2] = x.ravel(), y.ravel(), -self.sensor.mount_height_m
+        scan[-9:, 0], scan[-9:, 1] = 5.0, np.linspace(-0.2, 0.2, 9)
+        labels = (np.arange(len(scan)) >= x.size).astype(np.uint8)
+        return scan, PointLabels(labels, np.ones(len(scan), np.bool_), ("background", "car"))
+
+    def _find_objects(self, scan: NDArray[np.float32], points: PointLabels) -> tuple[Box, ...]:
+        """KUL-Seg 5.2: boxes around what stands on the ground, in clusters that one class prevails in.
+
+        Points out of the network's view take part, as background: what the view's edge cuts gets a whole box, or none.
+        """
+        ground = find_ground(scan, mount_height_m=self.sensor.mount_height_m)
+        return objects_from_points(
+            scan,
+            points.labels,
+            points.classes,
+            among=~ground.mask,
+            height_m=ground.height_m,
+            distance_per_m=self._distance_per_m,
+            min_score=MIN_SCORE if self.score_threshold is None else self.score_threshold,
+        )
+
+    def _new_to_networks(self, boxes: tuple[Box, ...]) -> list[Box]:
+        """Those that no network looks for: of another class, or out of its view."""
+        looking = [(c.view, c.box_classes) for c in self.cards if isinstance(c.view, TopViewGeometry)]
+        return [
+            b for b in boxes if not any(b.label in classes and view.holds(*b.center[:2]) for view, classes in looking)
+        ]
 
 
 def decode_top_view(

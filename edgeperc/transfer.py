@@ -113,7 +113,14 @@ def compare(
     for name, sensor, n_scans, read in sets:
         counts = {}
         for adaptation in ADAPTATIONS:
-            perceive = Perceiver(model, sensor=sensor, provider=provider, on_mismatch="ignore", adapt=adaptation)
+            perceive = Perceiver(
+                model,
+                sensor=sensor,
+                provider=provider,
+                on_mismatch="ignore",
+                adapt=adaptation,
+                boxes_from="network",  # points alone are judged
+            )
             parts = []
             for scan in read():
                 parts.append(_judged(perceive, scan))

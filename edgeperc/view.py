@@ -649,6 +649,8 @@ def _draw_top_view(axes: Any, points: NDArray[np.float32], perception: Perceptio
         front = footprint[[0, 3]].mean(axis=0)
         tip = front + 0.25 * (front - np.asarray(box.center[:2]))
         axes.plot([box.center[1], tip[1]], [box.center[0], tip[0]], color=colour, linewidth=2.0, zorder=5)
+        if not (x_near <= box.center[0] <= x_far and y_right <= box.center[1] <= y_left):
+            continue  # beside or behind what is drawn
         # Beside the box, on the side with more room.
         room_right = box.center[1] - y_right >= y_left - box.center[1]
         side = footprint[:, 1].min() - 0.25 if room_right else footprint[:, 1].max() + 0.25

@@ -49,6 +49,14 @@ def test_geometries_know_their_shape() -> None:
     assert RANGE_CARD.view.height == 3
 
 
+def test_a_top_view_holds_what_lies_in_its_cells() -> None:
+    view = TopViewGeometry()
+    for place in ((6.0, -10.0), (45.99, 9.99), (20.0, 0.0)):
+        assert view.holds(*place)
+    for place in ((5.99, 0.0), (46.0, 0.0), (20.0, 10.0), (20.0, -10.01), (-20.0, 0.0)):
+        assert not view.holds(*place)
+
+
 def test_unknown_keys_are_ignored() -> None:
     document = json.loads(TOP_VIEW_CARD.to_json()) | {"from_the_future": [1, 2]}
     assert ModelCard.from_json(json.dumps(document)) == TOP_VIEW_CARD

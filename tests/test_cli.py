@@ -54,9 +54,10 @@ class FakePerceiver:
     made: ClassVar[list[FakePerceiver]] = []
 
     def __init__(
-        self, models, *, sensor="hdl-64e", provider="auto", n_threads=None, on_mismatch="warn", adapt="both"
+        self, models, *, sensor="hdl-64e", provider="auto", n_threads=None, on_mismatch="warn", **more
     ) -> None:
         self.given = (list(models), sensor, provider, n_threads, on_mismatch)
+        self.more = more
         known = {"pointseg": POINTSEG, "ssadnet": SSADNET}
         for name in models:
             if name not in known:
@@ -207,6 +208,11 @@ def test_run_prints_a_line_a_scan(
     assert "boxes: 1 car" in lines[1]
     assert "car 600, pedestrian 0, cyclist 0" in lines[1]
     assert fake.made[0].given == (["ssadnet", "pointseg"], "os1-64", "cpu", 2, "ignore")
+    assert run("run", scans[0], "--boxes-from", "clusters", "--all-around") == 0
+    assert [one.more for one in fake.made] == [
+        {"adapt": "both", "boxes_from": "both", "all_around": False},
+        {"adapt": "both", "boxes_from": "clusters", "all_around": True},
+    ]
 
 
 def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

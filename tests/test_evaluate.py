@@ -74,7 +74,7 @@ class World:
                 n_dropped=0,
                 points=labels if "range_image" in kinds else None,
                 top_view=view if "top_view" in kinds else None,
-                boxes=self.boxes if "top_view" in kinds else (),
+                boxes=self.boxes,
                 stage_ms={},
                 providers={},
                 fitness=(),
@@ -184,6 +184,31 @@ def test_boxes_by_hand(world: World) -> None:
             for band, rows in table[kind].items()
         }
         assert counts == {"all": [3, 3, 4], "0-15 m": [1, 1, 1], "15-30 m": [1, 1, 1], "30-46 m": [1, 1, 2]}
+
+
+def test_boxes_of_clusters_by_hand(world: World) -> None:
+    car, van, beside, far = box(10, 0), box(20, 4, "van"), box(30, -13), box(60, 0)
+    person = replace(box(20, -5, "pedestrian"), size=(0.8, 0.6, 1.7))
+    points = [p for each in (car, van, person, beside, far) for p in hits(each, 3)]
+    frame_of_all = frame(car, van, person, beside, far, points=points)
+    world.boxes = (
+        box(10, 0, score=0.9),
+        replace(person, score=0.8),
+        box(30, -13, score=0.7),
+        box(20, 4, score=0.6),
+    )
+    # Nobody told points of a van from those of a car: the box of one need not be found, and may be.
+    table = judged(Judge(["pointseg"], boxes_from="clusters"), frame_of_all)["boxes"]["oriented"]["all"]
+    counts = {name: [table[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in ("car", "pedestrian")}
+    assert counts == {"car": [3, 2, 2], "pedestrian": [1, 1, 1]}
+    # Beside a top-view model's they are, within its view.
+    table = judged(Judge(["pointseg", "ssadnet"], boxes_from="both"), frame_of_all)["boxes"]["oriented"]["all"]
+    counts = {
+        name: [table[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in ("car", "van", "pedestrian")
+    }
+    assert counts == {"car": [3, 3, 2], "van": [1, 0, 0], "pedestrian": [1, 1, 1]}
+    assert [table["vehicle"][k] for k in ("n_truth", "n_predicted", "n_hits")] == [4, 3, 3]  # nobody on foot
+    assert "boxes" not in judged(Judge(["pointseg"]), frame_of_all)
 
 
 def test_cells_under_boxes(world: World) -> None:

@@ -15,7 +15,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 RUNTIME = REPOSITORY / "edgeperc"
 
 NOUNS = {"card", "geometry", "perception", "sensors"}
-STAGES = {"adapt", "decode", "points", "projection", "refine", "session", "simulation"}
+STAGES = {"adapt", "cluster", "decode", "ground", "points", "projection", "refine", "session", "simulation"}
 
 # What each module may import of edgeperc. A new module gets its line here, or the tests below fail.
 MAY_IMPORT = {

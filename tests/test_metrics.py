@@ -271,6 +271,15 @@ def test_evaluators_put_together_say_what_one_says(scans, split, oriented):
         both + BoxEvaluator(0.7, oriented=oriented)
 
 
+def test_overall_puts_together_what_it_is_told_to():
+    truth = [box(10.0, 0.0, "van"), box(20.0, 0.0, "pedestrian"), box(30.0, 0.0, "car")]
+    evaluator = BoxEvaluator(0.5, together=("car", "van"))
+    pairs = evaluator.update([box(10.0, 0.0), box(20.0, 0.0), box(30.0, 0.0, "pedestrian")], truth)
+    assert [(guess is not None, right is not None) for guess, right in pairs] == [(True, True)] * 3
+    for scores in (evaluator.overall(), (evaluator + BoxEvaluator(0.5, together=("car", "van"))).overall()):
+        assert (scores.n_truth, scores.n_predicted, scores.n_hits) == (2, 2, 1)
+
+
 def test_better_scores_choose_first_and_take_what_fits_best():
     truth = [box(10.0, 0.0), box(11.0, 0.0)]
     evaluator = BoxEvaluator(0.5)

@@ -34,7 +34,7 @@ def scan() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def right(scan: np.ndarray) -> Answer:
-    found = Perceiver(NAMES, provider="cpu", on_mismatch="ignore")(scan)
+    found = Perceiver(NAMES, provider="cpu", on_mismatch="ignore", boxes_from="network")(scan)
     return Answer(found.points, found.top_view, found.boxes)
 
 

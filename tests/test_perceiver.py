@@ -13,9 +13,12 @@ import pytest
 from numpy.typing import NDArray
 
 import edgeperc
-from edgeperc import FitnessError, Perceiver, Perception, PointsError
+from edgeperc import Box, FitnessError, Perceiver, Perception, PointsError, cluster, ground
 from edgeperc.card import RangeImageGeometry
+from edgeperc.datasets import inside
+from edgeperc.geometry import oriented_iou
 from edgeperc.models import model_path, shipped_models
+from edgeperc.perception import PointLabels
 from edgeperc.sensors import get_sensor
 from edgeperc.simulation import SimulatedScan, random_scene, simulate
 
@@ -80,16 +83,14 @@ def test_the_rest_of_the_perception(perception: Perception, perceive: Perceiver)
     assert perception.top_view.labels.shape == (400, 200)
     assert perception.top_view.classes == ("background", "drivable", "car", "van", "truck")
     assert perception.top_view.to_metres(399, 0) == pytest.approx((6.05, 9.95))
-    assert set(perception.stage_ms) == {"check", "project", "infer", "decode", "refine"}
+    assert set(perception.stage_ms) == {"check", "project", "infer", "decode", "refine", "cluster"}
     assert all(v >= 0.0 for v in perception.stage_ms.values())
     assert perception.providers == {n: "CPUExecutionProvider (fp32)" for n in ("ssadnet", "pointseg")}
     assert [c.name for c in perceive.cards] == ["ssadnet", "pointseg"]
     scores = [b.score for b in perception.boxes]
     assert scores == sorted(scores, reverse=True)
     for box in perception.boxes:
-        assert box.label in ("car", "van", "truck")
-        assert 6.0 <= box.center[0] <= 46.0
-        assert abs(box.center[1]) <= 10.0
+        assert box.label in ("car", "van", "truck", "pedestrian", "cyclist")
         assert -np.pi <= box.yaw <= np.pi
 
 
@@ -315,6 +316,7 @@ def test_two_models_of_one_view_are_refused() -> None:
         ({"on_mismatch": "panic"}, "on_mismatch is 'panic'"),
         ({"score_threshold": 2.0}, "score_threshold is 2.0"),
         ({"sensor": "radar"}, "hdl-64e"),
+        ({"boxes_from": "thin air"}, "boxes_from is 'thin air'"),
     ],
 )
 def test_wrong_arguments_are_named(arguments: dict[str, object], words: str) -> None:
@@ -352,3 +354,108 @@ def test_real_scans_are_answered_and_fit(kitti_root: Path) -> None:
         assert answer.points.labels.shape == (len(points),)
         assert answer.top_view is not None
         assert answer.top_view.drivable_area_m2 > 50.0
+
+
+# --- boxes of networks and of clusters -------------------------------------------------------------------------------
+
+
+def overlaps(first: tuple[Box, ...], second: tuple[Box, ...]) -> NDArray[np.float64]:
+    rows = [[(*box.center[:2], *box.size[:2], box.yaw) for box in boxes] for boxes in (first, second)]
+    return oriented_iou(*rows)
+
+
+def test_a_networks_boxes_are_vehicles_ahead(perceive: Perceiver, scan: SimulatedScan) -> None:
+    boxes = Perceiver(["ssadnet", "pointseg"], provider="cpu", boxes_from="network")(scan.points).boxes
+    assert boxes
+    for box in boxes:
+        assert box.label in ("car", "van", "truck")
+        assert 6.0 <= box.center[0] <= 46.0
+        assert abs(box.center[1]) <= 10.0
+    assert boxes == Perceiver("ssadnet", provider="cpu")(scan.points).boxes
+    assert Perceiver("pointseg", provider="cpu", boxes_from="network")(scan.points).boxes == ()
+
+
+def test_boxes_of_labelled_points_are_around_them(scan: SimulatedScan) -> None:
+    perceive = Perceiver("pointseg", provider="cpu")
+    answer = perceive(scan.points)
+    assert answer.points is not None
+    assert answer.boxes
+    assert answer.stage_ms["cluster"] > 0.0
+    for box in answer.boxes:
+        number = answer.points.classes.index(box.label)
+        own = answer.points.labels[inside(box, scan.points, 0.05)]
+        assert np.count_nonzero(own == number) >= 5
+    assert answer.boxes == perceive(scan.points).boxes
+
+
+def test_what_a_network_boxed_is_not_boxed_twice(scan: SimulatedScan, perception: Perception) -> None:
+    networks = Perceiver("ssadnet", provider="cpu")(scan.points).boxes
+    clusters = Perceiver("pointseg", provider="cpu")(scan.points).boxes
+    assert overlaps(clusters, networks).max() > 0.5  # both find some
+    assert set(networks) < set(perception.boxes) <= {*networks, *clusters}
+    others = tuple(box for box in perception.boxes if box not in networks)
+    assert overlaps(others, networks).max() < 0.1
+    # Where the network looks, nobody else boxes vehicles: that costs it precision.
+    for box in others:
+        ahead = 6.0 <= box.center[0] < 46.0 and abs(box.center[1]) < 10.0
+        assert box.label in ("pedestrian", "cyclist") or not ahead
+
+
+@pytest.mark.parametrize(("seen", "n_boxes"), [(1.0, 1), (0.8, 1), (0.5, 0)])
+def test_a_car_that_the_views_edge_cuts_gets_a_whole_box_or_none(seen: float, n_boxes: int) -> None:
+    perceive = Perceiver("pointseg", provider="cpu", n_threads=1)
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(-20.0, 20.0, 0.4), np.arange(-20.0, 20.0, 0.4)))
+    floor = np.column_stack([x, y, np.full(x.size, -1.73)])
+    along, up = (v.ravel() for v in np.meshgrid(np.arange(0.0, 4.01, 0.1), np.arange(-1.4, -0.3, 0.2)))
+    flank = np.column_stack([4.0 + along, np.full(along.size, 6.0), up])
+    scan = np.zeros((len(floor) + len(flank), 4), np.float32)
+    scan[:, :3] = np.concatenate([floor, flank])
+    labels = np.zeros(len(scan), np.uint8)
+    labels[len(floor) :] = along >= 4.0 * (1.0 - seen) - 0.01
+    boxes = perceive._find_objects(
+        scan, PointLabels(labels, labels > 0, ("background", "car", "pedestrian", "cyclist"))
+    )
+    assert len(boxes) == n_boxes
+    for box in boxes:
+        np.testing.assert_allclose(box.center[0], 6.0, atol=0.05)
+        np.testing.assert_allclose(box.size[0], 4.0, atol=0.05)
+
+
+def test_boxes_all_around(scan: SimulatedScan) -> None:
+    ahead = Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore")
+    around = Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore", all_around=True)
+    seen, every = ahead(scan.points), around(scan.points)
+    assert seen.points is not None
+    assert every.points is not None
+    in_view = seen.points.in_view
+    np.testing.assert_array_equal(every.points.labels[in_view], seen.points.labels[in_view])
+    elevation = np.degrees(np.arcsin(scan.points[:, 2] / np.linalg.norm(scan.points[:, :3], axis=1)))
+    assert every.points.in_view[(elevation < 2.0) & (elevation > -23.0)].mean() > 0.98
+    # A quarter turn of the scan is a quarter turn of the answer.
+    behind = scan.points[:, [1, 0, 2, 3]] * np.array([1, -1, 1, 1], np.float32)  # what is left is ahead
+    left = ahead(behind).points
+    assert left is not None
+    fresh = left.in_view & ~in_view
+    np.testing.assert_array_equal(every.points.labels[fresh], left.labels[fresh])
+    assert any(box.center[0] < 0.0 for box in every.boxes)
+
+
+def test_a_perceiver_meets_no_uncompiled_kernel(scan: SimulatedScan) -> None:
+    """The first call would wait for numba: construction has to compile what stands behind boxes of clusters, too."""
+    kernels = [
+        kernel
+        for module in (cluster, ground)
+        for kernel in vars(module).values()
+        if hasattr(kernel, "signatures") and kernel.__module__ == module.__name__
+    ]
+    if not kernels:
+        pytest.skip("numba compiles nothing")
+    perceive = Perceiver("pointseg", provider="cpu")
+    compiled = [list(kernel.signatures) for kernel in kernels]
+    perceive(scan.points)
+    assert [list(kernel.signatures) for kernel in kernels] == compiled
+
+
+def test_clusters_want_a_class_for_every_point() -> None:
+    with pytest.raises(ValueError, match="range-image model"):
+        Perceiver("ssadnet", provider="cpu", boxes_from="clusters")

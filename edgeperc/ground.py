@@ -1,0 +1,502 @@
+"""Which points are ground, and how high the others stand: RANSAC in every region of the street.
+
+One plane fits a car park; a street climbs, leans and has kerbs. `find_ground` lays a grid over the scan and keeps the
+lowest return of every cell. RANSAC fits a plane to these in each region, from the vehicle outwards, so that what is
+known nearby says where to look next; where the lowest returns of a few cells agree on a step off the plane, such as a
+pavement's, the ground follows them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from .errors import PointsError
+
+__all__ = ["Ground", "find_ground"]
+
+# Cells of half a metre, 256 x 256 of them; regions of 16 x 16 cells, 16 x 16 of them. Farther out hardly a ray meets
+# the ground.
+CELL_M = 0.5
+N_CELLS = 256
+CELLS_A_REGION = 16
+N_REGIONS = N_CELLS // CELLS_A_REGION
+REGION_M = CELL_M * CELLS_A_REGION
+REACH_M = 0.5 * CELL_M * N_CELLS
+
+# The plane around the vehicle. The sensor may lean, and stand on another vehicle than its profile says.
+FIRST_REACH_M = 20.0
+MAX_SLOPE = 0.3
+MAX_MOUNT_ERROR_M = 0.5
+MIN_FIRST_SUPPORT = 30  # cells
+N_FIRST_HYPOTHESES = 100
+
+# The planes of the regions, each against the one that its neighbours lead to expect.
+MAX_BEND = 0.12  # change of slope
+MAX_SHIFT_M = 0.5
+BAND_M = 0.8  # cells farther off take no part
+MIN_SUPPORT = 6  # cells
+N_HYPOTHESES = 24
+PRIOR_CELLS = 4  # what the expected slope weighs in the least squares
+
+TOLERANCE_M = 0.1
+MIN_AREA_M2 = 1.0  # twice the triangle of a hypothesis, seen from above
+MAX_TESTED = 1024  # cells a hypothesis is tested on
+
+# Steps: 5 x 5 cells; recall and precision rose by 0.007 and 0.001 on simulated scans, 0.027 and 0.002 on HDL-32E ones.
+WINDOW = 2
+MAX_STEP_M = 0.3
+MAX_DEPTH_M = 0.5  # what lies deeper was reflected
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """What `find_ground` found.
+
+    Attributes
+    ----------
+    mask : (n,) bool
+        Points on the ground, in input order.
+    height_m : (n,) float32
+        Height of every point above the ground at its place [m]; NaN for points that are not finite.
+    plane : tuple of 3 float, or None
+        a, b, c of z = a x + b y + c [m] around the vehicle. None where no ground was found: then no point is ground,
+        and heights are those above a level plane at the mounting height.
+    """
+
+    mask: NDArray[np.bool_]
+    height_m: NDArray[np.float32]
+    plane: tuple[float, float, float] | None
+
+
+def find_ground(
+    points: NDArray[np.float32],
+    *,
+    mount_height_m: float = 1.73,
+    max_height_m: float = 0.125,
+    regions: bool = True,
+) -> Ground:
+    """Tell the ground from what stands on it.
+
+    Parameters
+    ----------
+    points : (n, 3 or more) float32
+        x, y, z [m] in the sensor frame.
+    mount_height_m : float
+        Height of the sensor above the ground, right to half a metre (`SensorProfile.mount_height_m`).
+    max_height_m : float
+        Points up to this above the ground are ground, and those down to 0.5 m below it.
+    regions : bool
+        False fits the one plane around the vehicle, and nothing else.
+
+    Returns
+    -------
+    Ground
+        The same scan gives the same answer. An empty scan, or one without ground such as a wall's, is no error:
+        ``plane`` is None then.
+
+    Raises
+    ------
+    PointsError
+        ``points`` has another shape, or a height is not above 0.
+
+    Notes
+    -----
+    KUL-Seg (section 5.2) removes the ground by RANSAC and says no more; this is ours. A hypothesis is the plane through
+    the lowest returns of three cells. For it speaks every cell whose lowest return lies within 0.1 m of it, against it
+    every one whose lowest return lies below: nothing is seen under the ground, so hedges or a row of car roofs win only
+    where they hide more than two thirds of the cells. The first plane is sought within 20 m of the sensor, near the
+    mounting height. Each region of 8 x 8 m then starts from the mean of its solved neighbours, bends by 0.12 at most,
+    and is refined by least squares, with the neighbours' slope as a weak prior: far out, a region may hold a single
+    ring of returns. Between the middles of regions heights are interpolated. Last, the ground moves to the mean of the
+    lowest returns in 5 x 5 cells, as far as they are within 0.3 m: so it follows kerbs and banks.
+
+    All of this was chosen on simulated HDL-64E and VLP-16 scans and on HDL-32E scans of nuScenes. On 16 scans of
+    SemanticKITTI (ground: road, parking, pavement, other ground, terrain, lane marking; vegetation left out, for its
+    grass may be either) recall is 0.998 and precision 0.983; Patchwork++'s are 0.996 and 0.977.
+    """
+    if points.ndim != 2 or points.shape[1] < 3:
+        raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
+    if not (0.0 < mount_height_m < math.inf and 0.0 < max_height_m < math.inf):
+        raise PointsError(
+            f"got mount_height_m={mount_height_m} and max_height_m={max_height_m}; expected metres above 0"
+        )
+    rows = np.ascontiguousarray(points, dtype=np.float32)
+    cell = np.empty(len(rows), dtype=np.int32)
+    lowest = np.empty((N_CELLS, N_CELLS), dtype=np.int32)
+    fill_lowest(rows, cell, lowest)
+    plane = np.array([0.0, 0.0, -mount_height_m])
+    found = fit_first_plane(rows, lowest, plane)
+    height = np.empty(len(rows), dtype=np.float32)
+    mask = np.empty(len(rows), dtype=np.bool_)
+    if found and regions:
+        planes = np.empty((N_REGIONS, N_REGIONS, 3))
+        fill_planes(rows, lowest, plane, planes)
+        level = np.empty((N_CELLS, N_CELLS), dtype=np.float32)
+        fill_levels(rows, lowest, planes, level)
+        fill_heights(rows, cell, level, planes, max_height_m, height, mask)
+    else:
+        fill_heights_above_plane(rows, plane, max_height_m, height, mask)
+        mask &= found
+    return Ground(mask, height, (float(plane[0]), float(plane[1]), float(plane[2])) if found else None)
+
+
+@njit(cache=True, nogil=True)
+def fill_lowest(points: NDArray[np.float32], cell: NDArray[np.int32], lowest: NDArray[np.int32]) -> None:
+    """Write every point's cell and every cell's lowest point.
+
+    Parameters
+    ----------
+    points : (n, 3 or more) float32, C-contiguous
+    cell : (n,) int32, overwritten
+        Flat cell, x by y; -1 for points that are not finite or out of the grid.
+    lowest : (N_CELLS, N_CELLS) int32, overwritten
+        Row of ``points``, the earlier of two equally low; -1 where there is none.
+    """
+    lowest[:] = -1
+    lowest_z = np.full(N_CELLS * N_CELLS, np.float32(math.inf), dtype=np.float32)
+    flat = lowest.reshape(-1)
+    reach = np.float32(REACH_M)
+    cells_per_m = np.float32(1.0 / CELL_M)  # a power of two: no rounding
+    # Backwards, for most sensors' lowest beam comes last: fewer points are the lowest so far, which saves a fifth.
+    for i in range(points.shape[0] - 1, -1, -1):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if not (abs(x) < reach and abs(y) < reach and abs(z) < math.inf):
+            cell[i] = -1
+            continue
+        # Rounding may carry the last float below the edge onto it.
+        row = min(int((x + reach) * cells_per_m), N_CELLS - 1)
+        col = min(int((y + reach) * cells_per_m), N_CELLS - 1)
+        at = row * N_CELLS + col
+        cell[i] = at
+        if z <= lowest_z[at]:
+            lowest_z[at] = z
+            flat[at] = i
+
+
+@njit(cache=True, nogil=True)
+def fit_first_plane(points: NDArray[np.float32], lowest: NDArray[np.int32], plane: NDArray[np.float64]) -> bool:
+    """Replace ``plane`` (3,), the expected a, b, c, by the one around the vehicle; False where there is none."""
+    size = 2 * int(FIRST_REACH_M / CELL_M)
+    start = (N_CELLS - size) // 2
+    residuals = np.empty((size * size, 3))
+    fitted = np.empty(3)
+    n = fill_residuals(points, lowest, start, start, size, 0.0, 0.0, plane, MAX_MOUNT_ERROR_M, MAX_SLOPE, residuals)
+    find_plane(residuals, n, MAX_SLOPE, MAX_MOUNT_ERROR_M, N_FIRST_HYPOTHESES, 1, fitted)
+    if refine_plane(residuals, n, 0.0, MAX_SLOPE, MAX_MOUNT_ERROR_M, fitted) < MIN_FIRST_SUPPORT:
+        return False
+    plane += fitted
+    return True
+
+
+@njit(cache=True, nogil=True)
+def fill_planes(
+    points: NDArray[np.float32],
+    lowest: NDArray[np.int32],
+    first: NDArray[np.float64],
+    planes: NDArray[np.float64],
+) -> None:
+    """Fit every region's plane, from the middle outwards.
+
+    Parameters
+    ----------
+    points : (n, 3 or more) float32, C-contiguous
+    lowest : (N_CELLS, N_CELLS) int32
+    first : (3,) float64
+        a, b, c around the vehicle.
+    planes : (N_REGIONS, N_REGIONS, 3) float64, overwritten
+        Slopes along x and y, and height in the region's middle [m]; the expected one where too few cells agree.
+    """
+    solved = np.zeros((N_REGIONS, N_REGIONS))  # 1 and the cells that agree
+    residuals = np.empty((CELLS_A_REGION * CELLS_A_REGION, 3))
+    expected = np.empty(3)
+    fitted = np.empty(3)
+    prior = PRIOR_CELLS * REGION_M * REGION_M / 12.0
+    half = N_REGIONS // 2
+    for ring in range(half):
+        low, high = half - 1 - ring, half + ring
+        for r in range(low, high + 1):
+            for q in range(low, high + 1, 1 if r in (low, high) else high - low):
+                middle_x = (r + 0.5) * REGION_M - REACH_M
+                middle_y = (q + 0.5) * REGION_M - REACH_M
+                total = 0.0
+                expected[:] = 0.0
+                for near_r in range(max(r - 1, 0), min(r + 2, N_REGIONS)):
+                    for near_q in range(max(q - 1, 0), min(q + 2, N_REGIONS)):
+                        weight = solved[near_r, near_q]
+                        if weight > 0.0:
+                            a, b, height = planes[near_r, near_q]
+                            total += weight
+                            expected[0] += weight * a
+                            expected[1] += weight * b
+                            expected[2] += weight * (height + REGION_M * (a * (r - near_r) + b * (q - near_q)))
+                if total > 0.0:
+                    expected /= total
+                else:
+                    expected[:] = first
+                    expected[2] += first[0] * middle_x + first[1] * middle_y
+                row, col = r * CELLS_A_REGION, q * CELLS_A_REGION
+                n = fill_residuals(
+                    points, lowest, row, col, CELLS_A_REGION, middle_x, middle_y, expected, BAND_M, 0.0, residuals
+                )
+                planes[r, q] = expected
+                solved[r, q] = 1.0
+                if n >= MIN_SUPPORT:
+                    find_plane(residuals, n, MAX_BEND, MAX_SHIFT_M, N_HYPOTHESES, r * N_REGIONS + q, fitted)
+                    support = refine_plane(residuals, n, prior, MAX_BEND, MAX_SHIFT_M, fitted)
+                    if support >= MIN_SUPPORT:
+                        planes[r, q] += fitted
+                        solved[r, q] += support
+
+
+@njit(cache=True, nogil=True)
+def fill_residuals(
+    points: NDArray[np.float32],
+    lowest: NDArray[np.int32],
+    first_row: int,
+    first_col: int,
+    size: int,
+    middle_x: float,
+    middle_y: float,
+    expected: NDArray[np.float64],
+    band: float,
+    cone: float,
+    residuals: NDArray[np.float64],
+) -> int:
+    """Write x, y about the middle and z above the expected plane for the lowest returns of size x size cells.
+
+    Those farther from the plane than ``band``, and ``cone`` for every metre from the middle, are left out. Returns how
+    many were written.
+    """
+    n = 0
+    for row in range(first_row, first_row + size):
+        for col in range(first_col, first_col + size):
+            i = lowest[row, col]
+            if i < 0:
+                continue
+            x = np.float64(points[i, 0]) - middle_x
+            y = np.float64(points[i, 1]) - middle_y
+            z = np.float64(points[i, 2]) - (expected[0] * x + expected[1] * y + expected[2])
+            if abs(z) <= band + cone * math.sqrt(x * x + y * y):
+                residuals[n, 0], residuals[n, 1], residuals[n, 2] = x, y, z
+                n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def find_plane(
+    residuals: NDArray[np.float64],
+    n: int,
+    max_slope: float,
+    max_shift: float,
+    n_hypotheses: int,
+    draw: int,
+    plane: NDArray[np.float64],
+) -> None:
+    """Write the best hypothesis' a, b, c into ``plane`` (3,); the expected plane, 0, 0, 0, is the first of them."""
+    plane[:] = 0.0
+    if n == 0:
+        return
+    step = (n + MAX_TESTED - 1) // MAX_TESTED
+    n_tested = (n + step - 1) // step
+    most = count_support(residuals, n, step, 0.0, 0.0, 0.0)
+    corners = np.empty(3, dtype=np.int64)
+    for _ in range(n_hypotheses):
+        for corner in range(3):
+            draw = (draw * 1103515245 + 12345) & 0x7FFFFFFF
+            corners[corner] = step * ((draw * n_tested) >> 31)
+        origin = residuals[corners[0]]
+        x1, y1, z1 = residuals[corners[1]] - origin
+        x2, y2, z2 = residuals[corners[2]] - origin
+        area = x1 * y2 - x2 * y1
+        if abs(area) < MIN_AREA_M2:
+            continue
+        a = (z1 * y2 - z2 * y1) / area
+        b = (x1 * z2 - x2 * z1) / area
+        c = origin[2] - a * origin[0] - b * origin[1]
+        if abs(a) > max_slope or abs(b) > max_slope or abs(c) > max_shift:
+            continue
+        support = count_support(residuals, n, step, a, b, c)
+        if support > most:
+            most = support
+            plane[0], plane[1], plane[2] = a, b, c
+
+
+@njit(cache=True, nogil=True)
+def count_support(residuals: NDArray[np.float64], n: int, step: int, a: float, b: float, c: float) -> int:
+    """Cells on the plane less the cells below it."""
+    support = 0
+    for k in range(0, n, step):
+        gap = residuals[k, 2] - a * residuals[k, 0] - b * residuals[k, 1] - c
+        if gap < -TOLERANCE_M:
+            support -= 1
+        elif gap <= TOLERANCE_M:
+            support += 1
+    return support
+
+
+@njit(cache=True, nogil=True)
+def refine_plane(
+    residuals: NDArray[np.float64], n: int, prior: float, max_slope: float, max_shift: float, plane: NDArray[np.float64]
+) -> int:
+    """Replace ``plane`` by the least squares of the cells on it, and return how many there are; 0 without a plane.
+
+    ``prior`` [m2] is what no slope at all weighs.
+    """
+    count = 0
+    sx, sy, sz = 0.0, 0.0, 0.0
+    xx, xy, yy, xz, yz = prior, 0.0, prior, 0.0, 0.0
+    for k in range(n):
+        x, y, z = residuals[k]
+        if abs(z - plane[0] * x - plane[1] * y - plane[2]) <= TOLERANCE_M:
+            count += 1
+            sx += x
+            sy += y
+            sz += z
+            xx += x * x
+            xy += x * y
+            yy += y * y
+            xz += x * z
+            yz += y * z
+    if count == 0:
+        return 0
+    xx -= sx * sx / count
+    xy -= sx * sy / count
+    yy -= sy * sy / count
+    xz -= sx * sz / count
+    yz -= sy * sz / count
+    determinant = xx * yy - xy * xy
+    if determinant < 1e-3 * xx * yy or xx * yy == 0.0:  # the cells lie in a line
+        return 0
+    a = (xz * yy - yz * xy) / determinant
+    b = (yz * xx - xz * xy) / determinant
+    c = (sz - a * sx - b * sy) / count
+    if abs(a) <= max_slope and abs(b) <= max_slope and abs(c) <= max_shift:
+        plane[0], plane[1], plane[2] = a, b, c
+    return count
+
+
+@njit(cache=True, nogil=True)
+def fill_levels(
+    points: NDArray[np.float32], lowest: NDArray[np.int32], planes: NDArray[np.float64], level: NDArray[np.float32]
+) -> None:
+    """Write the height of the ground in the middle of every cell that holds a point.
+
+    Parameters
+    ----------
+    points : (n, 3 or more) float32, C-contiguous
+    lowest : (N_CELLS, N_CELLS) int32
+    planes : (N_REGIONS, N_REGIONS, 3) float64
+    level : (N_CELLS, N_CELLS) float32, overwritten
+        z [m]; NaN where no point is.
+    """
+    # Zeros, and room around them, spare the sums below every question: half the time.
+    step = np.zeros((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), dtype=np.float32)
+    counts = np.zeros((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), dtype=np.float32)
+    for row in range(N_CELLS):
+        u = min(max((row + 0.5) / CELLS_A_REGION - 0.5, 0.0), N_REGIONS - 1.0)
+        r = min(int(u), N_REGIONS - 2)
+        u -= r
+        x = (row + 0.5) * CELL_M - REACH_M
+        for col in range(N_CELLS):
+            i = lowest[row, col]
+            if i < 0:
+                level[row, col] = math.nan
+                continue
+            v = min(max((col + 0.5) / CELLS_A_REGION - 0.5, 0.0), N_REGIONS - 1.0)
+            q = min(int(v), N_REGIONS - 2)
+            v -= q
+            y = (col + 0.5) * CELL_M - REACH_M
+            ground = 0.0
+            slope_x = 0.0
+            slope_y = 0.0
+            for near_r in range(r, r + 2):
+                for near_q in range(q, q + 2):
+                    weight = (u if near_r > r else 1.0 - u) * (v if near_q > q else 1.0 - v)
+                    a, b, height = planes[near_r, near_q]
+                    dx = x - ((near_r + 0.5) * REGION_M - REACH_M)
+                    dy = y - ((near_q + 0.5) * REGION_M - REACH_M)
+                    ground += weight * (height + a * dx + b * dy)
+                    slope_x += weight * a
+                    slope_y += weight * b
+            level[row, col] = ground
+            off = points[i, 2] - ground - slope_x * (points[i, 0] - x) - slope_y * (points[i, 1] - y)
+            if abs(off) <= MAX_STEP_M:
+                step[row + WINDOW, col + WINDOW] = off
+                counts[row + WINDOW, col + WINDOW] = 1.0
+    for row in range(N_CELLS):
+        for col in range(N_CELLS):
+            if lowest[row, col] < 0:
+                continue
+            count = np.float32(0.0)
+            total = np.float32(0.0)
+            for near_row in range(row, row + 2 * WINDOW + 1):
+                for near_col in range(col, col + 2 * WINDOW + 1):
+                    count += counts[near_row, near_col]
+                    total += step[near_row, near_col]
+            if count >= 3.0:
+                level[row, col] += total / (count + 1.0)  # the plane counts as one
+
+
+@njit(cache=True, nogil=True)
+def fill_heights(
+    points: NDArray[np.float32],
+    cell: NDArray[np.int32],
+    level: NDArray[np.float32],
+    planes: NDArray[np.float64],
+    max_height: float,
+    height: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+) -> None:
+    """Write every point's height above the ground, and whether it is on it.
+
+    Parameters
+    ----------
+    points : (n, 3 or more) float32, C-contiguous
+    cell : (n,) int32
+    level : (N_CELLS, N_CELLS) float32
+    planes : (N_REGIONS, N_REGIONS, 3) float64
+    height : (n,) float32, overwritten
+        Out of the grid above the nearest region's plane; NaN for points that are not finite.
+    mask : (n,) bool, overwritten
+    """
+    for i in range(points.shape[0]):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        if cell[i] >= 0:
+            row, col = cell[i] // N_CELLS, cell[i] % N_CELLS
+            r, q = row // CELLS_A_REGION, col // CELLS_A_REGION
+            dx = x - ((row + 0.5) * CELL_M - REACH_M)
+            dy = y - ((col + 0.5) * CELL_M - REACH_M)
+            ground = np.float64(level[row, col])
+        elif abs(x) < math.inf and abs(y) < math.inf and abs(z) < math.inf:
+            r = int(min(max((x + REACH_M) / REGION_M, 0.0), N_REGIONS - 1.0))
+            q = int(min(max((y + REACH_M) / REGION_M, 0.0), N_REGIONS - 1.0))
+            dx = x - ((r + 0.5) * REGION_M - REACH_M)
+            dy = y - ((q + 0.5) * REGION_M - REACH_M)
+            ground = planes[r, q, 2]
+        else:
+            height[i] = math.nan
+            mask[i] = False
+            continue
+        height[i] = z - ground - planes[r, q, 0] * dx - planes[r, q, 1] * dy
+        mask[i] = -MAX_DEPTH_M <= height[i] <= max_height
+
+
+@njit(cache=True, nogil=True)
+def fill_heights_above_plane(
+    points: NDArray[np.float32],
+    plane: NDArray[np.float64],
+    max_height: float,
+    height: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+) -> None:
+    """Write every point's height above z = a x + b y + c, NaN where it is not finite, and whether it is on it."""
+    for i in range(points.shape[0]):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        above = z - plane[0] * x - plane[1] * y - plane[2]
+        height[i] = above if abs(x) < math.inf and abs(y) < math.inf and abs(z) < math.inf else math.nan
+        mask[i] = -MAX_DEPTH_M <= height[i] <= max_height

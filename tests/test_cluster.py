@@ -1,0 +1,295 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import reference
+from edgeperc import cluster
+from edgeperc.cluster import OBJECT_SIZE_M, cluster_labels, find_clusters, objects_from_points
+from edgeperc.errors import PointsError
+from edgeperc.geometry import oriented_iou
+
+CLASSES = ("background", "car", "pedestrian", "cyclist")
+
+
+def as_points(xyz):
+    return np.column_stack([xyz, np.zeros(len(xyz))]).astype(np.float32)
+
+
+def side(start, end, z=(-1.5, -0.3), spacing=0.1):
+    """Points on an upright rectangle between two places, as a spinning sensor leaves them."""
+    n = max(round(math.dist(start, end) / spacing), 1) + 1
+    line = np.linspace(start, end, n)
+    return np.array([[x, y, height] for height in np.linspace(z[1], z[0], 6) for x, y in line])
+
+
+def car_points(x, y, yaw, *, front=True, flank=True, size=(3.89, 1.63)):
+    """The sides of a car that are turned to the sensor at the origin, and the place of its middle."""
+    along, across = size[0] / 2, size[1] / 2
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    corners = np.array([[along, across], [-along, across], [-along, -across], [along, -across]])
+    corners = corners @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
+    edges = [(corners[k], corners[(k + 1) % 4], k % 2 == 0) for k in range(4)]  # even: flanks
+    seen = []
+    for start, end, is_flank in edges:
+        outward = (start + end) / 2 - (x, y)
+        if outward @ ((start + end) / 2) < 0 and (flank if is_flank else front):
+            seen.append(side(start, end))
+    return np.concatenate(seen)
+
+
+# --- clusters
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("per_m", [0.0, 0.02, 0.1])
+def test_clusters_are_those_of_every_pair_looked_at(seed, per_m):
+    rng = np.random.default_rng(seed)
+    centers = rng.uniform(-30, 30, (25, 3)) * [1, 1, 0.1]
+    points = as_points(centers[rng.integers(0, 25, 700)] + rng.normal(0, 0.1 * (seed + 1), (700, 3)))
+    points[rng.integers(0, 700, 9), rng.integers(0, 3, 9)] = [np.nan, np.inf, -np.inf] * 3
+    among = rng.random(700) > 0.1
+    found = find_clusters(
+        points, among=among, min_distance_m=0.5, distance_per_m=per_m, max_range_m=28.0, min_points=seed % 3 + 1
+    )
+    assert found.dtype == np.int32
+    np.testing.assert_array_equal(found, reference.clusters(points, among, 0.5, per_m, 28.0, seed % 3 + 1))
+
+
+# Multiples of the distance's parts, so that points lie on edges of columns and pairs exactly at the distance.
+places = st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0, 0.3, -0.2, 0.35, 5.0, -7.5, 99.9, 100.0, 200.0, np.nan, np.inf])
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.tuples(places, places, places), max_size=30), st.sampled_from([0.0, 0.05]), st.integers(1, 3))
+def test_whatever_comes_the_twin_agrees(rows, per_m, min_points):
+    points = as_points(np.array(rows).reshape(-1, 3))
+    among = np.ones(len(points), bool)
+    found = find_clusters(points, min_distance_m=0.5, distance_per_m=per_m, min_points=min_points)
+    np.testing.assert_array_equal(found, reference.clusters(points, among, 0.5, per_m, 100.0, min_points))
+
+
+@pytest.mark.parametrize("spread", [0.02, 0.5, 20.0])
+def test_a_tall_column_in_any_order_is_the_twins(spread):
+    rng = np.random.default_rng(0)
+    points = as_points(np.column_stack([rng.uniform(0, 0.6, (300, 2)), rng.uniform(0, spread * 10, 300)]))
+    np.testing.assert_array_equal(
+        find_clusters(points, min_distance_m=0.4, min_points=1),
+        reference.clusters(points, np.ones(300, bool), 0.4, 0.015, 100.0, 1),
+    )
+
+
+def test_the_twin_is_dbscan_of_one_sample():
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    rng = np.random.default_rng(1)
+    points = as_points(rng.uniform(-6, 6, (800, 3)) * [1, 1, 0.3])
+    tree = cKDTree(points[:, :3].astype(np.float64))
+    graph = tree.sparse_distance_matrix(tree, 0.5, output_type="coo_matrix")
+    _, components = connected_components(graph)
+    first = [np.flatnonzero(components == component)[0] for component in components]
+    found = find_clusters(points, distance_per_m=0.0, min_points=1)
+    np.testing.assert_array_equal([np.flatnonzero(found == number)[0] for number in found], first)
+
+
+def test_far_points_may_be_farther_apart():
+    pairs = as_points([[5, 0, 0], [5, 0.8, 0], [60, 0, 0], [60, 0.8, 0]])
+    assert find_clusters(pairs, min_points=1).tolist() == [0, 1, 2, 2]
+    assert find_clusters(pairs, min_points=1, distance_per_m=0.0).tolist() == [0, 1, 2, 3]
+
+
+def test_clusters_are_numbered_by_their_first_points():
+    rng = np.random.default_rng(2)
+    points = as_points(np.repeat(rng.uniform(-50, 50, (40, 3)), 6, axis=0))
+    order = rng.permutation(len(points))
+    found = find_clusters(points[order])
+    assert found.max() == 39
+    assert [np.flatnonzero(found == k)[0] for k in range(40)] == sorted(
+        np.flatnonzero(found == k)[0] for k in range(40)
+    )
+    renamed = find_clusters(points)[order]
+    assert len({*zip(found.tolist(), renamed.tolist(), strict=True)}) == 40
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 4)), np.full((7, 4), np.nan), np.full((3, 4), np.inf)])
+def test_nothing_is_in_no_cluster(points):
+    assert (find_clusters(points.astype(np.float32), min_points=1) == -1).all()
+    assert objects_from_points(points.astype(np.float32), np.zeros(len(points), np.uint8), CLASSES) == ()
+
+
+def test_one_point_is_a_cluster_if_that_is_enough():
+    point = as_points([[3.0, 1.0, 0.0]])
+    assert find_clusters(point, min_points=1).tolist() == [0]
+    assert find_clusters(point).tolist() == [-1]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"min_distance_m": 0.0},
+        {"min_distance_m": np.nan},
+        {"min_distance_m": 0.001},
+        {"distance_per_m": -0.1},
+        {"max_range_m": np.inf},
+        {"max_range_m": 0.0},
+        {"among": np.ones(3, bool)},
+    ],
+)
+def test_impossible_options_are_refused(options):
+    with pytest.raises(PointsError, match="expected"):
+        find_clusters(np.zeros((2, 4), np.float32), **options)
+
+
+def test_a_wrong_shape_is_refused():
+    with pytest.raises(PointsError, match="expected"):
+        find_clusters(np.zeros((2, 2), np.float32))
+
+
+# --- the class of a cluster
+
+
+def test_a_cluster_is_kept_when_more_than_the_share_carries_one_class():
+    clusters = np.repeat(np.array([0, 1, 2, 3, -1], np.int32), 10)
+    labels = np.array([1] * 8 + [0] * 2 + [1] * 7 + [0] * 3 + [2] * 5 + [3] * 5 + [0] * 10 + [1] * 10, np.uint8)
+    classes, shares = cluster_labels(clusters, labels)
+    assert classes.tolist() == [1, 0, 0, 0]
+    np.testing.assert_allclose(shares, [0.8, 0.7, 0.5, 0.0])
+    assert cluster_labels(clusters, labels, min_share=0.4)[0].tolist() == [1, 1, 2, 0]
+
+
+def test_no_cluster_has_no_class():
+    for clusters in (np.zeros(0, np.int32), np.full(4, -1, np.int32)):
+        classes, shares = cluster_labels(clusters, np.zeros(len(clusters), np.uint8))
+        assert classes.shape == shares.shape == (0,)
+
+
+def test_labels_of_another_scan_are_refused():
+    with pytest.raises(PointsError, match="expected the same"):
+        cluster_labels(np.zeros(3, np.int32), np.zeros(4, np.uint8))
+
+
+# --- boxes
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 700), st.integers(0, 2**31), st.booleans())
+def test_rectangles_are_the_twins(n, seed, l_shaped):
+    rng = np.random.default_rng(seed)
+    turn = rng.uniform(0, np.pi)
+    members = (
+        rng.uniform(-1, 1, (n, 2))
+        * [2.0, 0.8]
+        @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    )
+    members += rng.uniform(-30, 30, 2)
+    rectangle = np.empty(5)
+    cluster.fill_rectangle(members, l_shaped, rectangle)
+    np.testing.assert_allclose(rectangle, reference.rectangle(members, l_shaped), atol=1e-8)
+
+
+@pytest.mark.parametrize("where", [(12.0, 5.0), (-9.0, 7.0), (-15.0, -4.0), (8.0, -20.0)])
+@pytest.mark.parametrize("yaw", [0.0, 0.5, 1.2, -0.9])
+def test_a_car_gets_its_box_all_around_the_vehicle(where, yaw):
+    points = as_points(car_points(*where, yaw))
+    (box,) = objects_from_points(points, np.ones(len(points), np.uint8), CLASSES)
+    assert box.label == "car"
+    truth = (*where, 3.89, 1.63, yaw)
+    assert oriented_iou([truth], [(*box.center[:2], *box.size[:2], box.yaw)])[0, 0] > 0.9
+    assert -math.pi / 2 <= box.yaw <= math.pi / 2
+
+
+@pytest.mark.parametrize("part", [{"flank": False}, {"front": False}])
+@pytest.mark.parametrize("x", [15.0, -15.0])
+def test_the_side_that_was_not_seen_is_made_as_long_as_usual(part, x):
+    points = as_points(car_points(x, 6.0, 0.0, **part))
+    (box,) = objects_from_points(points, np.ones(len(points), np.uint8), CLASSES)
+    np.testing.assert_allclose(box.size[:2], OBJECT_SIZE_M["car"][:2], atol=0.06)
+    np.testing.assert_allclose(box.center[:2], (x, 6.0), atol=0.06)
+    assert abs(box.yaw) < 0.03
+
+
+def test_what_is_longer_than_usual_stays_so():
+    points = as_points(car_points(12.0, 6.0, 0.0, size=(11.0, 2.5)))
+    (box,) = objects_from_points(points, np.ones(len(points), np.uint8), CLASSES)
+    np.testing.assert_allclose(box.size[:2], (11.0, 2.5), atol=0.05)
+
+
+def test_boxes_stand_on_the_ground():
+    points = as_points(car_points(12.0, 6.0, 0.0))
+    height = points[:, 2] + np.float32(1.73)
+    (box,) = objects_from_points(points, np.ones(len(points), np.uint8), CLASSES, height_m=height)
+    assert box.center[2] - box.size[2] / 2 == pytest.approx(-1.73, abs=1e-5)
+    assert box.size[2] == pytest.approx(OBJECT_SIZE_M["car"][2])
+
+
+def test_the_ground_does_not_join_what_stands_on_it():
+    cars = [car_points(12.0, y, 0.0) for y in (5.0, 9.0)]
+    x, y = np.meshgrid(np.arange(5.0, 20.0, 0.3), np.arange(0.0, 15.0, 0.3))
+    floor = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -1.73)])
+    points = as_points(np.concatenate([*cars, floor]))
+    on_ground = np.arange(len(points)) >= len(points) - len(floor)
+    labels = np.where(on_ground, 0, 1).astype(np.uint8)
+    assert len(objects_from_points(points, labels, CLASSES, among=~on_ground)) == 2
+    assert objects_from_points(points, labels, CLASSES) == ()
+
+
+def test_pieces_of_one_object_are_one_box():
+    points = car_points(20.0, 6.0, 0.0)
+    points = as_points(points[(points[:, 0] < 19.6) | (points[:, 0] > 20.4)])  # a pole in front
+    assert find_clusters(points).max() == 1
+    assert len(objects_from_points(points, np.ones(len(points), np.uint8), CLASSES)) == 1
+
+
+def test_every_class_has_boxes_and_better_ones_come_first():
+    person = side((8.0, -6.0), (8.0, -5.5), z=(-1.7, 0.0))
+    points = as_points(np.concatenate([person, car_points(12.0, 6.0, 0.0)]))
+    labels = np.array([2] * len(person) + [1] * (len(points) - len(person)), np.uint8)
+    boxes = objects_from_points(points, labels, CLASSES)
+    assert [box.label for box in boxes] == ["car", "pedestrian"]
+    assert 1.0 > boxes[0].score > boxes[1].score > 0.0
+    np.testing.assert_allclose(boxes[1].size[:2], OBJECT_SIZE_M["pedestrian"][:2], atol=0.01)
+    assert objects_from_points(points, labels, CLASSES) == boxes
+
+
+def test_what_lies_under_the_ground_is_nothing():
+    points = as_points(side((8.0, -6.0), (8.0, -5.5), z=(-3.5, -2.5)))
+    height = points[:, 2] + np.float32(1.73)
+    for label in (1, 2):
+        assert objects_from_points(points, np.full(len(points), label, np.uint8), CLASSES, height_m=height) == ()
+
+
+def test_a_pole_is_less_of_a_person_than_a_person():
+    def score(top, label):
+        points = as_points(side((8.0, -6.0), (8.0, -5.3), z=(-1.7, top)))
+        boxes = objects_from_points(points, np.full(len(points), label, np.uint8), CLASSES, min_score=0.0)
+        return boxes[0].score
+
+    for person in (2, 3):
+        assert score(0.0, person) > 1.3 * score(0.5, person) > 1.3 * score(0.7, person) > 0.0
+    assert score(0.0, 1) == score(0.7, 1)  # as tall as a van
+
+
+def test_a_class_without_usual_size_is_as_large_as_it_is_seen():
+    points = as_points(side((8.0, -6.0), (8.0, -4.0), z=(-1.7, 0.0)))
+    (box,) = objects_from_points(points, np.ones(len(points), np.uint8), ("background", "sign"))
+    np.testing.assert_allclose(box.size, (2.0, cluster.MIN_SIDE_M, 1.7), atol=1e-5)
+    assert abs(box.yaw) == pytest.approx(math.pi / 2)
+
+
+@pytest.mark.parametrize(
+    ("labels", "options", "words"),
+    [
+        (np.zeros(3, np.uint8), {}, "one a point"),
+        (np.full(4, 9, np.uint8), {}, "label 9 for 4 classes"),
+        (np.zeros(4, np.uint8), {"among": np.zeros(3, bool)}, "among"),
+        (np.zeros(4, np.uint8), {"height_m": np.zeros(5, np.float32)}, "height_m"),
+    ],
+)
+def test_arrays_of_another_scan_are_refused(labels, options, words):
+    with pytest.raises(PointsError, match=words):
+        objects_from_points(np.zeros((4, 4), np.float32), labels, CLASSES, **options)
