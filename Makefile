@@ -51,7 +51,7 @@ test-minimal: .venv-minimal/installed
 
 .venv-test/installed: pyproject.toml constraints.txt
 	$(call environment,.venv-test)
-	$(TEST)/pip install --quiet --constraint constraints.txt --editable '.[cpu,openvino,view,io,peers,test]'
+	$(TEST)/pip install --quiet --constraint constraints.txt --editable '.[cpu,openvino,view,io,peers,database,ray,test]'
 	@touch $@
 
 .venv-minimal/installed: pyproject.toml constraints.txt

@@ -15,7 +15,7 @@ from edgeperc.datasets import IGNORE
 
 from .augment import SURFACE
 
-__all__ = ["ground_plane", "sure_surface"]
+__all__ = ["ground_plane", "sure_surface", "with_road"]
 
 RISE_M = 0.3
 LANE_HALF_WIDTH_M = 1.2
@@ -84,6 +84,17 @@ def sure_surface(points: NDArray[np.float32]) -> NDArray[np.uint8]:
         surface.reshape(-1)[cell[lane]] = 1
     surface.reshape(-1)[cell[risen]] = 0
     return surface
+
+
+def with_road(surface: NDArray[np.uint8], road: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Surface truth over `SURFACE` with a drawn road's (400, 200) where that reaches."""
+    from .topview_database import VIEW
+
+    x, y = SURFACE.cell_centres()
+    row = np.floor((VIEW.x_range_m[1] - x) / VIEW.cell_m).astype(np.int64)
+    col = np.floor((VIEW.y_range_m[1] - y) / VIEW.cell_m).astype(np.int64)
+    drawn = (row >= 0) & (row < VIEW.height) & (col >= 0) & (col < VIEW.width)
+    return np.where(drawn, road[row % VIEW.height, col % VIEW.width], surface).astype(np.uint8)
 
 
 def _boxed(values: NDArray, reach: int = 3) -> NDArray:

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -315,6 +315,24 @@ def _distilled(recipe: Recipe, teacher: nn.Module, x: Tensor, outputs: Tensor | 
     return loss
 
 
+class RealScans(NamedTuple):
+    """Real scans that somebody labelled otherwise than KITTI does, as with roads drawn by hand.
+
+    Attributes
+    ----------
+    scans : list of LabelledScan
+        To train on.
+    hashes : dict of str to str
+        The name of each and its `edgeperc.datasets.scan_hash`, for the card.
+    watched : list of LabelledScan
+        To stop and to lower the learning rate by.
+    """
+
+    scans: list[LabelledScan]
+    hashes: dict[str, str]
+    watched: list[LabelledScan]
+
+
 def real_scans(kitti: KittiObjects, names: Sequence[str]) -> tuple[list[LabelledScan], list[float], dict[str, str]]:
     """Labelled scans, how often to draw each, and the SHA-256 of each file."""
     scans, weights, hashes = [], [], {}
@@ -334,6 +352,7 @@ def train(
     *,
     kitti: Path | None,
     simulated: Path | None,
+    given: RealScans | None = None,
     fold: int | None = None,
     start_from: Path | None = None,
     teacher: Path | None = None,
@@ -353,6 +372,8 @@ def train(
         ``simulated_share`` is 1.
     simulated : Path or None
         Folder of scans from ``edgeperc-export simulate``.
+    given : RealScans, optional
+        In place of ``kitti``'s.
     fold : int, optional
         Fold of the training drives that is not trained on but watched: every ``checkpoint_every`` steps the averaged
         network is judged on it, and the best is kept (early stopping). Without real scans to train on, all training
@@ -378,13 +399,12 @@ def train(
         torch.set_num_threads(n_threads)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     objects = KittiObjects(kitti) if kitti else None
-    watched: list[str] = []
-    real: list[LabelledScan] = []
-    weights: list[float] = []
-    hashes: dict[str, str] = {}
+    real, hashes, watched = given or RealScans([], {}, [])
+    weights = [1.0] * len(real)
     if objects:
         only_simulated = recipe.simulated_share == 1.0
-        watched = objects.names("train") if only_simulated else objects.names("validation", fold=fold)
+        names = objects.names("train") if only_simulated else objects.names("validation", fold=fold)
+        watched = [LabelledScan.from_frame(objects.frame(n), sure_surface) for n in names[::VALIDATION_STRIDE]]
         real, weights, hashes = real_scans(objects, [] if only_simulated else objects.names("train", fold=fold))
     if recipe.distil > 0.0 and teacher is None:
         raise ValueError(f"the recipe distils ({recipe.distil:g}) from no teacher; give --teacher")
@@ -394,7 +414,7 @@ def train(
         real = pseudo_labelled(tutor.cpu(), [*real, *extra])
         weights += [len(extra) ** -0.5] * len(extra)
     samples = Samples(recipe, real, weights, sorted(simulated.glob("*.npz")) if simulated else [])
-    watch = Watch(recipe, samples, objects, watched[::VALIDATION_STRIDE]) if objects and watched else None
+    watch = Watch(recipe, samples, watched) if watched else None
 
     network = build(recipe)
     before: list[dict[str, object]] = []
@@ -497,14 +517,12 @@ class Watch:
     recipe : Recipe
     samples : Samples
         Makes the inputs.
-    objects : KittiObjects
-    names : sequence of str
-        Frames to judge.
+    scans : sequence of LabelledScan
+        What to judge by.
     """
 
-    def __init__(self, recipe: Recipe, samples: Samples, objects: KittiObjects, names: Sequence[str]) -> None:
+    def __init__(self, recipe: Recipe, samples: Samples, scans: Sequence[LabelledScan]) -> None:
         self.recipe, self.card = recipe, card_of(recipe.network, recipe.head, version="0")
-        scans = [LabelledScan.from_frame(objects.frame(name), sure_surface) for name in names]
         self.inputs = [samples.sample(scan) for scan in scans]
         self.scans = scans
 

@@ -978,3 +978,21 @@ def rectangle(members, l_shaped):
     low, high = p.min(axis=0), p.max(axis=0)
     x, y = turned((low + high)[None] / 2, -angle)[0]
     return np.array([x, y, *(high - low), angle])
+
+
+# --- export.topview_database -----------------------------------------------------------------------------------------
+
+
+def picture(points):
+    """Twin of `edgeperc_export.topview_database.picture`, point by point: round, clamp, keep the highest."""
+    image, highest = np.zeros((400, 200, 3), np.uint8), {}
+    for x, y, z, remission in points.astype(np.float64):
+        if not (6 <= x <= 46 and -10 <= y <= 10 and -2.5 <= z <= 2.5 and np.isfinite(remission)):
+            continue
+        row = 399 - min(max(math.floor((x - 6) / 0.1 + 0.5), 0), 399)
+        col = 199 - min(max(math.floor((y + 10) / 0.1 + 0.5), 0), 199)
+        if z > highest.get((row, col), -math.inf):
+            highest[row, col] = z
+            shares = (math.hypot(x, y) / math.hypot(46, 10), (z + 2.5) / 5, min(max(remission, 0.0), 1.0))
+            image[row, col] = [round(255 * share) for share in shares]
+    return image
