@@ -40,6 +40,7 @@ from .errors import (
 if TYPE_CHECKING:
     from .captures import read_scans
     from .card import ModelCard
+    from .drivable import RoadAhead, road_ahead
     from .live import Answer, Stream, stream
     from .perceiver import Perceiver
     from .perception import Box, Perception, PointLabels, TopView
@@ -64,6 +65,7 @@ __all__ = [
     "PointLabels",
     "PointsError",
     "ProviderError",
+    "RoadAhead",
     "SensorError",
     "SensorProfile",
     "SettingsError",
@@ -78,6 +80,7 @@ __all__ = [
     "__version__",
     "read_points",
     "read_scans",
+    "road_ahead",
     "stream",
 ]
 
@@ -90,6 +93,7 @@ _MODULES = {
     "Perceiver": "perceiver",
     "Perception": "perception",
     "PointLabels": "perception",
+    "RoadAhead": "drivable",
     "SensorProfile": "sensors",
     "Stream": "live",
     "TopView": "perception",
@@ -98,6 +102,7 @@ _MODULES = {
     "Tracks": "tracking",
     "read_points": "points",
     "read_scans": "captures",
+    "road_ahead": "drivable",
     "stream": "live",
 }
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from .live import Answer
     from .perceiver import Perceiver
-    from .perception import Box, Perception
+    from .perception import Box, Perception, TopView
     from .session import Session
     from .tracking.tracker import Tracks
 
@@ -566,6 +566,17 @@ def _box_record(box: Box) -> dict[str, Any]:
     }
 
 
+def _road_record(top_view: TopView) -> dict[str, Any]:
+    from .drivable import road_ahead
+
+    road = road_ahead(top_view)
+    widths = {"free_ahead_m": road.free_ahead_m(), "lane_width_m": road.lane_width_m}
+    return {
+        "outline": [[round(float(v), 2) for v in corner] for corner in road.outline],
+        **{name: None if math.isnan(value) else round(value, 2) for name, value in widths.items()},
+    }
+
+
 def _record(perception: Perception, tracks: Tracks | None = None) -> dict[str, Any]:
     """What `run --json` says of a scan. Keys are always all there; null where no model of that kind took part."""
     return {
@@ -575,6 +586,7 @@ def _record(perception: Perception, tracks: Tracks | None = None) -> dict[str, A
         "providers": dict(perception.providers),
         "boxes": [_box_record(box) for box in perception.boxes],
         "drivable_area_m2": None if perception.top_view is None else round(perception.top_view.drivable_area_m2, 2),
+        "road": None if perception.top_view is None else _road_record(perception.top_view),
         "point_counts": None if perception.points is None else perception.points.counts(),
         "tracks": [
             {
@@ -1034,8 +1046,8 @@ _BOX_COLUMNS = (
 )
 _MAP_COLUMNS = (("ACC", "accuracy"), ("mAP", "mean_ap"), ("mIoU", "mean_iou"), ("95 %", "mean_iou_interval"))
 _ROAD_COLUMNS = (
-    *(("IoU", "iou"), ("PRE", "precision"), ("REC", "recall"), ("F1", "f1"), ("95 %", "f1_interval")),
-    *(("ACC", "accuracy"), ("MaxF", "max_f1"), ("AP", "ap"), ("cells", "n_cells")),
+    *(("F1", "f1"), ("95 %", "f1_interval"), ("AP", "ap"), ("ACC", "accuracy"), ("PRE", "precision")),
+    *(("REC", "recall"), ("IoU", "iou"), ("MaxF", "max_f1"), ("cells", "n_cells")),
 )
 _BLOCKS = {"real": "real scans with boxes", "semantickitti": "SemanticKITTI", "simulated": "simulated scans"}
 
@@ -1066,6 +1078,13 @@ def _figure_lines(figures: Mapping[str, Any]) -> list[str]:
             lines += _table(f"top view, {kind}; the classes' columns are IoU", columns, rows)
         rows = [((band, ""), row) for band, row in told.get("road", {}).items() if row["n_cells"]]
         lines += _table("road", _ROAD_COLUMNS, rows)
+        for (band, _), row in rows[:1]:  # of all of them
+            titles = ("no road", "road")
+            shares = [
+                ((band, f"is {name}"), dict(zip(titles, part, strict=True)))
+                for name, part in zip(titles, row["confusion"], strict=True)
+            ]
+            lines += _table("road, confusion in shares of all cells", [(f"taken for {t}", t) for t in titles], shares)
     return lines
 
 

@@ -300,6 +300,10 @@ class Judge:
     def _count_cells(self, tallies: dict[tuple[str, ...], Any], truth: Truth, found: TopView) -> None:
         assert self.from_above is not None
         for table, (classes, right) in truth.cells.items():
+            if not self.box_classes:
+                classes, right = _without_vehicles(classes, right)
+            if len(classes) < 2:
+                continue
             labels = _renamed(found.labels, found.classes, classes)
             tallies |= banded(("segmentation", table), classes, labels, right, self.cell_range_m)
         if truth.road is None or "drivable" not in found.classes:
@@ -395,6 +399,14 @@ def perceive_drive(
 
 def _everywhere(places: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.ones(len(places), np.bool_)
+
+
+def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
+    """Classes and truth of a table as a model without vehicles is judged: where one stands is no road."""
+    kept = tuple(name for name in classes if name not in (*VEHICLES, "vehicle"))
+    number = np.full(256, IGNORE, np.uint8)
+    number[: len(classes)] = [kept.index(name) if name in kept else 0 for name in classes]
+    return kept, number[right]
 
 
 def _renamed(labels: NDArray[np.uint8], names: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:

@@ -144,7 +144,10 @@ def _map_row(confusion: Confusion) -> dict[str, Any]:
 
 
 def _road_row(sweep: ProbabilitySweep, decision: Confusion) -> dict[str, Any]:
-    """As the model decides, and the best F1 and the average precision over thresholds of its probability."""
+    """As the model decides, and the best F1 and the average precision over thresholds of its probability.
+
+    ``"confusion"`` holds shares of all cells, rows the truth (Figure 21 of the top-view database's paper).
+    """
     (_, false), (missed, hits) = decision.counts.tolist()
     return {
         "iou": float(decision.iou()[1]),
@@ -154,6 +157,7 @@ def _road_row(sweep: ProbabilitySweep, decision: Confusion) -> dict[str, Any]:
         "accuracy": decision.accuracy(),
         "max_f1": sweep.max_f1(),
         "ap": sweep.average_precision(),
+        "confusion": (decision.counts / max(int(decision.counts.sum()), 1)).tolist(),
         "n_cells": int(decision.counts.sum()),
         "n_road": hits + missed,
     }

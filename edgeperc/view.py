@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .drivable import road_ahead
 from .errors import MissingExtraError, PointsError
 from .perception import Box, Perception
 
@@ -641,6 +642,12 @@ def _draw_top_view(axes: Any, points: NDArray[np.float32], perception: Perceptio
         axes.axhline(at, color=_INK, alpha=0.13, linewidth=0.8, zorder=3)
     axes.set_xlim(y_left, y_right)
     axes.set_ylim(x_near, x_far)
+    road = road_ahead(top_view)
+    for ring in (road.outline, *road.holes):
+        edge = Polygon(ring[:, ::-1], closed=True, fill=False, edgecolor=_colour("drivable"), linewidth=1.2, zorder=3)
+        axes.add_patch(edge)
+    free = np.where(road.free_m > x_near, road.free_m, np.nan)
+    axes.plot(road.y_m, free, color=_INK, linewidth=1.0, alpha=0.7, drawstyle="steps-mid", zorder=4)
     taken: list[Any] = []
     for box in perception.boxes:
         colour = _colour(box.label)

@@ -1,7 +1,7 @@
 """What each part of the data and of the training is worth, on drives that the run has not seen.
 
-Every variant is the same short run from the same simulation-only weights, with one thing changed, judged on a fold of
-the training drives; test drives take no part.
+Every variant is the same short run from the same simulation-only weights (LoDNN's from nothing), with one thing
+changed, judged on a fold of the training drives; test drives take no part, and no teacher, which would know the fold.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 from .recipes import MODELS
 from .train import PAPER, Recipe, train
 
-__all__ = ["VARIANTS", "ablate"]
+__all__ = ["VARIANTS", "ablate", "plot"]
 
 VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "pointseg": {
@@ -52,6 +52,13 @@ VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "weights not averaged": {"ema": 0.0},
         "the paper's slots": {"head": "slots"},
     },
+    # What LoDNN-I was searched by (Electronics 12, 3165, Figure 16).
+    "lodnn": {
+        "as shipped": {},
+        **{f"learning rate {rate:g}": {"learning_rate": rate} for rate in (1e-4, 3e-4, 1e-3, 1e-2, 3e-2)},
+        **{f"scans times {share:g}": {"scans": share} for share in (0.25, 0.5, 2.0)},
+        **{f"batches of {batch}": {"batch": batch} for batch in (1, 2, 8, 16)},
+    },
 }  # fmt: skip
 PAPERS = "the paper's recipe, from nothing, as many scans"
 
@@ -62,7 +69,7 @@ def ablate(
     *,
     kitti: Path,
     simulated: Path,
-    start_from: Path,
+    start_from: Path | None,
     fold: int,
     steps: int,
     variants: Sequence[str] = (),
@@ -73,11 +80,11 @@ def ablate(
     Parameters
     ----------
     network : str
-        ``"pointseg"`` or ``"ssadnet"``.
+        ``"pointseg"``, ``"ssadnet"`` or ``"lodnn"``.
     out : Path
     kitti, simulated : Path
-    start_from : Path
-        Checkpoint of the network's ``-sim`` model.
+    start_from : Path or None
+        Checkpoint of the network's ``-sim`` model; None where it has none.
     fold, steps : int
     variants : sequence of str
         Names in `VARIANTS`, or `PAPERS`; all of them by default.
@@ -92,17 +99,18 @@ def ablate(
     path = out / "ablation.json"
     rows: list[dict[str, Any]] = json.loads(path.read_text()) if path.exists() else []
     done = {(row["network"], row["variant"], row["fold"], row["steps"]) for row in rows}
-    shipped = replace(MODELS[network].recipe, steps=steps)
+    shipped = replace(MODELS[network].recipe, steps=steps, distil=0.0)
     for variant in variants or [*VARIANTS[network], PAPERS]:
         if (network, variant, fold, steps) in done:
             continue
         changes = dict(VARIANTS[network].get(variant, {}))
         teacher = start_from if changes.pop("teacher", False) else None
+        n_scans = steps * shipped.batch * changes.pop("scans", 1.0)
         recipe: Recipe = replace(shipped, **changes)
         start: Path | None = start_from
         if variant == PAPERS:
             recipe, start = replace(PAPER[network], context_width=shipped.context_width), None
-        recipe = replace(recipe, steps=max(1, steps * shipped.batch // recipe.batch))  # as many scans
+        recipe = replace(recipe, steps=max(1, int(n_scans) // recipe.batch))  # as many scans
         folder = out / f"{network}-{fold}-{steps}-{'-'.join(variant.split())}"
         train(
             recipe, folder, kitti=kitti, simulated=simulated, fold=fold, start_from=start, teacher=teacher,
@@ -121,3 +129,35 @@ def ablate(
         )
         path.write_text(json.dumps(rows, indent=1) + "\n")
     return rows
+
+
+def plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draw what the search for LoDNN's learning rate, number of scans and batch found, as the paper's Figure 16."""
+    from matplotlib.figure import Figure
+
+    rows = [row for row in rows if row["network"] == "lodnn"]
+    if not rows:
+        raise ValueError("no run of lodnn to draw; run: edgeperc-export ablate lodnn OUT")
+    (shipped,) = [row for row in rows if row["variant"] == "as shipped"]
+    recipe = MODELS["lodnn"].recipe
+    usual = {"learning rate": recipe.learning_rate, "scans times": 1.0, "batches of": float(recipe.batch)}
+    titles = {
+        "learning rate": "learning rate",
+        "scans times": f"scans drawn, times {shipped['scans']}",
+        "batches of": f"scans in a batch, {shipped['scans']} in all",
+    }
+    figure = Figure(figsize=(10.0, 3.2), layout="constrained")
+    for axes, (prefix, title) in zip(figure.subplots(1, 3, sharey=True), titles.items(), strict=True):
+        found = [(float(r["variant"].rsplit(" ", 1)[1]), r) for r in rows if r["variant"].startswith(prefix)]
+        found = sorted([*found, (usual[prefix], shipped)], key=lambda each: each[0])
+        values = [value for value, _ in found]
+        axes.plot(values, [100.0 * row["figures"]["drivable"] for _, row in found], "o-", color="#009e73")
+        axes.plot([usual[prefix]], [100.0 * shipped["figures"]["drivable"]], "o", color="#202020", label="as shipped")
+        axes.set_xscale("log")
+        axes.set_xticks(values, labels=[f"{value:g}" for value in values], minor=False)
+        axes.set_xticks([], minor=True)
+        axes.set_xlabel(title)
+        axes.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("IoU of the road [%]")
+    figure.axes[0].legend(frameon=False)
+    figure.savefig(path, dpi=110, metadata={"Software": None})

@@ -8,10 +8,13 @@ from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, 
 from edgeperc.sensors import get_sensor
 from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES
 
-__all__ = ["LABELS_POINTS", "RANGE_IMAGE", "RANGE_IMAGE_INPUT", "TOP_VIEW", "TOP_VIEW_INPUT", "card_of"]
+__all__ = ["LABELS_POINTS", "RANGE_IMAGE", "RANGE_IMAGE_INPUT", "ROAD_CLASSES", "TOP_VIEW", "TOP_VIEW_INPUT", "card_of"]
 
 LABELS_POINTS = ("kulseg", "pointseg", "squeezesegv2")
 """The networks of the range image, which label pixels and so points; others see the top view."""
+
+ROAD_CLASSES = TOP_VIEW_CLASSES[:2]
+"""What LoDNN tells apart; a vehicle's footprint is background, for nobody drives there."""
 
 TOP_VIEW = TopViewGeometry()
 RANGE_IMAGE = RangeImageGeometry(get_sensor("hdl-64e").elevations_deg)
@@ -37,6 +40,9 @@ def card_of(network: str, head: str = "dense", **facts: Any) -> ModelCard:
             classes=POINT_CLASSES,
             **facts,
         )
+    if network == "lodnn":
+        outputs = (OutputSpec("segmentation", "class_logits"),)
+        return ModelCard(view=TOP_VIEW, input=TOP_VIEW_INPUT, outputs=outputs, classes=ROAD_CLASSES, **facts)
     return ModelCard(
         view=TOP_VIEW,
         input=TOP_VIEW_INPUT,

@@ -44,7 +44,7 @@ def _parser() -> argparse.ArgumentParser:
     simulate.set_defaults(run=_simulate)
 
     train = commands.add_parser("train", help="train a network, or go on where a stopped run left off")
-    train.add_argument("network", choices=["kulseg", "pointseg", "squeezesegv2", "ssadnet"])
+    train.add_argument("network", choices=["kulseg", "lodnn", "pointseg", "squeezesegv2", "ssadnet"])
     train.add_argument("out", type=Path, help="folder for checkpoint.pt and log.jsonl")
     train.add_argument("--kitti", type=Path, help="root of a KITTI object set")
     train.add_argument("--simulated", type=Path, help="folder made by: edgeperc-export simulate")
@@ -109,7 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     quantize.set_defaults(run=_quantize)
 
     make = commands.add_parser("make", help="a shipped model from nothing: simulate, train, export, judge")
-    shipped = ["kulseg", "pointseg", "pointseg-edge", "pointseg-sim"]
+    shipped = ["kulseg", "lodnn", "pointseg", "pointseg-edge", "pointseg-sim"]
     shipped += ["ssadnet", "ssadnet-edge", "ssadnet-paper", "ssadnet-sim"]
     make.add_argument("name", choices=shipped)
     make.add_argument("out", type=Path, help="folder for scans, checkpoints and the model")
@@ -124,15 +124,16 @@ def _parser() -> argparse.ArgumentParser:
     make.set_defaults(run=_make)
 
     ablate = commands.add_parser("ablate", help="what each part of the training is worth, on a fold left out")
-    ablate.add_argument("network", choices=["ssadnet", "pointseg"])
+    ablate.add_argument("network", choices=["ssadnet", "pointseg", "lodnn"])
     ablate.add_argument("out", type=Path, help="folder for the runs and ablation.json")
     ablate.add_argument("--kitti", type=Path, required=True)
     ablate.add_argument("--simulated", type=Path, required=True)
-    ablate.add_argument("--start-from", type=Path, required=True, help="checkpoint of the -sim model")
+    ablate.add_argument("--start-from", type=Path, help="checkpoint of the -sim model (lodnn: none)")
     ablate.add_argument("--fold", type=int, default=0)
     ablate.add_argument("--steps", type=int, default=150)
     ablate.add_argument("--variant", action="append", default=[], help="one of them; again for more (default: all)")
     ablate.add_argument("--threads", type=int)
+    ablate.add_argument("--plot", type=Path, metavar="PNG", help="draw what was found (lodnn)")
     ablate.set_defaults(run=_ablate)
 
     database = commands.add_parser(
@@ -274,8 +275,10 @@ def _make(args: argparse.Namespace) -> int:
 
 
 def _ablate(args: argparse.Namespace) -> int:
-    from .ablation import ablate
+    from .ablation import ablate, plot
 
+    if args.network != "lodnn" and args.start_from is None:
+        raise ValueError(f"{args.network} starts from its -sim model; give --start-from")
     rows = ablate(
         args.network,
         args.out,
@@ -289,6 +292,8 @@ def _ablate(args: argparse.Namespace) -> int:
     )
     for row in rows:
         print(f"{row['network']}, fold {row['fold']}, {row['steps']} steps, {row['variant']}: {row['figures']}")
+    if args.plot is not None:
+        plot(rows, args.plot)
     return 0
 
 
@@ -315,6 +320,7 @@ def _recipe_options() -> dict[str, type]:
         "--class-weights": bool, "--focal-gamma": float, "--lovasz-weight": float, "--deep-supervision": float,
         "--ema": float, "--context-width": int, "--batch-norm": bool, "--dropout": float, "--distil": float,
         "--seen-twice": bool, "--paste-cars": float, "--turn-anywhere": float, "--head-only": bool, "--edge": bool,
+        "--drawn-roads": bool,
         "--seed": int,
     }  # fmt: skip
 

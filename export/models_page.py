@@ -138,9 +138,9 @@ def _ablations(rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
         "",
         "## What each part is worth",
         "",
-        "Short runs from the simulation-only weights, each with one thing changed, judged on a fold of the training",
-        "drives that the run has not seen (`edgeperc-export ablate`): IoU of pixel labels, and AP50 of all vehicles as",
-        "one class.",
+        "Short runs from the simulation-only weights (LoDNN's from nothing), each with one thing changed, judged on a",
+        "fold of the training drives that the run has not seen (`edgeperc-export ablate`): IoU of pixel labels, and",
+        "AP50 of all vehicles as one class.",
     )
     for network, fold, steps in sorted({(r["network"], r["fold"], r["steps"]) for r in rows}):
         here = [r for r in rows if (r["network"], r["fold"], r["steps"]) == (network, fold, steps)]

@@ -43,6 +43,18 @@ KULSEG = Recipe("kulseg", steps=4500, batch=4, focal_gamma=2.0, distil=1.0, seen
 SSADNET = Recipe("ssadnet", batch=4, learning_rate=1.5e-3, context_width=64, n_pasted=3.0, dropout=0.0)
 EDGE = Recipe("ssadnet", edge=True, steps=6000, batch=4, learning_rate=3e-3, cooldown=0.2, n_pasted=3.0)
 TAUGHT = replace(EDGE, steps=1000, learning_rate=1e-3, cooldown=0.4, distil=1.0, seen_twice=False)
+# LoDNN-I's plan at a quarter of the resolution, with the answers of the network that draws roads best from the start.
+LODNN = Recipe(
+    "lodnn",
+    edge=True,
+    steps=4500,
+    batch=4,
+    learning_rate=3e-3,
+    n_pasted=3.0,
+    distil=1.0,
+    seen_twice=False,
+    drawn_roads=True,
+)
 MODELS = {
     "pointseg-sim": Stage(Recipe("pointseg", simulated_share=1.0, steps=1000, learning_rate=2e-3, cooldown=0.3)),
     "pointseg": Stage(Recipe("pointseg", steps=3600, batch=4, learning_rate=1e-3), after="pointseg-sim"),
@@ -57,6 +69,7 @@ MODELS = {
     "pointseg-edge": Stage(
         replace(TAUGHT, network="pointseg", n_pasted=6.0, steps=1600), "pointseg-edge-start", "pointseg"
     ),
+    "lodnn": Stage(LODNN, teacher="ssadnet-edge"),
     "ssadnet-edge-start": Stage(EDGE),
     "ssadnet-edge": Stage(TAUGHT, "ssadnet-edge-start", "ssadnet"),
 }
@@ -163,7 +176,8 @@ def finish(
     datasets = {"KITTI": kitti, "SEMANTICKITTI": semantickitti if fold is None else None, "simulation": "simulation"}
     datasets = {word: where for word, where in datasets.items() if where is not None}
     # The paper's way to a road where nobody labelled one: another network's (SSADNet 3.1.2).
-    draws = "ssadnet-sim" if stage.recipe.network == "ssadnet" and stage.after else None
+    sees_road = stage.recipe.network in ("lodnn", "ssadnet") and (stage.after or stage.teacher)
+    draws = "ssadnet-sim" if sees_road else None
     road_by = path.with_name(f"{draws}.onnx") if draws and kitti else None
     figures, _ = evaluate([*datasets.values()], [path], fold=fold, road_by=road_by)
     words = ["edgeperc eval", *datasets, f"--model {name}"]

@@ -8,14 +8,22 @@ are learnt from simulation.
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc.datasets import IGNORE
+from edgeperc.errors import MissingExtraError
 
 from .augment import SURFACE
 
-__all__ = ["ground_plane", "sure_surface", "with_road"]
+__all__ = ["DRAWN", "drawn_roads", "ground_plane", "sure_surface", "with_road"]
+
+DRAWN = Path(__file__).with_name("kitti_roads.coco.json")
+"""Roads of some training scans of KITTI, drawn over them seen from above, as ``edgeperc-export database label`` keeps
+them: polygons, no scan."""
 
 RISE_M = 0.3
 LANE_HALF_WIDTH_M = 1.2
@@ -84,6 +92,29 @@ def sure_surface(points: NDArray[np.float32]) -> NDArray[np.uint8]:
         surface.reshape(-1)[cell[lane]] = 1
     surface.reshape(-1)[cell[risen]] = 0
     return surface
+
+
+def drawn_roads(path: Path = DRAWN) -> dict[str, NDArray[np.uint8]]:
+    """Roads drawn by hand: hash of the scan (`edgeperc.datasets.scan_hash`) -> mask (400, 200) uint8, 1 road.
+
+    By its hash and not by its name, for names of scans differ from one copy of KITTI to the next. A COCO file keeps it
+    as ``scan`` of its images.
+
+    Raises
+    ------
+    DatabaseError
+        No COCO file of roads.
+    MissingExtraError
+        Nothing that reads COCO files is installed.
+    """
+    try:
+        from .road_polygons import mask_of, read_coco
+
+        drawn = read_coco([path])
+    except ModuleNotFoundError as exc:
+        raise MissingExtraError(exc.name or "a package", "database", "a road drawn by hand") from exc
+    hashes = {Path(image["file_name"]).stem: image["scan"] for image in json.loads(path.read_text())["images"]}
+    return {hashes[name]: mask_of(polygons, f"{path}: {name}") for name, polygons in drawn.items()}
 
 
 def with_road(surface: NDArray[np.uint8], road: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -237,6 +237,11 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pyte
         "providers": {"ssadnet": "CPUExecutionProvider (fp32)", "pointseg": "CPUExecutionProvider (fp32)"},
         "boxes": [{"label": "car", "score": 0.9123, "center": [20.0, -3.0, -0.9], "size": [4.2, 1.8, 1.6], "yaw": 0.3}],
         "drivable_area_m2": 100.0,
+        "road": {
+            "outline": [[36.0, 0.0], [46.0, 0.0], [46.0, 10.0], [36.0, 10.0]],
+            "free_ahead_m": 6.0,
+            "lane_width_m": None,
+        },
         "point_counts": {"background": 3, "car": 2, "pedestrian": 0, "cyclist": 0},
         "tracks": [],
         "fitness": ["the scan has 32 beams"],
@@ -253,6 +258,7 @@ def test_json_of_one_model_says_null_for_the_other(tmp_path: Path, capsys: pytes
     assert run("run", scan, "--json", "--model", "pointseg") == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["drivable_area_m2"] is None
+    assert answer["road"] is None
     assert answer["boxes"] == []
     assert run("run", scan, "--json", "--model", "ssadnet") == 0
     assert json.loads(capsys.readouterr().out)["point_counts"] is None

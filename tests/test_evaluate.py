@@ -292,12 +292,33 @@ def test_road_by_hand(world: World) -> None:
         [2 / 3, 2 / 4, 2 / 5, 4 / 7], abs=1e-4
     )
     assert road["accuracy"] == pytest.approx(5 / 8)
+    assert road["confusion"] == [[3 / 8, 1 / 8], [2 / 8, 2 / 8]]  # shares of all, rows the truth
     # By falling probability: road, road, other, road, road. With all four taken: 4 of 5 right.
     assert road["max_f1"] == pytest.approx(8 / 9, abs=1e-4)
     assert road["ap"] == pytest.approx((6 * 1.0 + 5 * 4 / 5) / 11, abs=1e-4)
     cells = told["segmentation"]["observed cells"]["all"]
     assert cells["iou"] == {"other": pytest.approx(1 / 5), "road": 0.4, "vehicle": 0.5}
     assert cells["n_cells_of"] == {"other": 3, "road": 4, "vehicle": 1}
+
+
+def test_a_model_of_the_road_alone_is_not_asked_for_vehicles(world: World) -> None:
+    y = 5.05 - np.arange(5)
+    points = np.stack([np.full(5, 20.05), y, np.full(5, -1.7), np.zeros(5)], axis=1).astype(np.float32)
+    scan = RoadFrame("00/000000", "b", points, np.array([1, 1, 2, 0, IGNORE], np.uint8))
+    world.cards["lodnn"] = card("lodnn", classes=CELLS[:2], box_classes=(), outputs=card("pointseg").outputs)
+    cols = np.floor((10.0 - y) / 0.1).astype(int)
+    world.cells["lodnn"][259, cols[[0, 2]]] = 1
+    judge = Judge(["lodnn"])
+    record, _ = judge.record(judge.semantickitti(scan))
+    told = figures([record])
+    cells = told["segmentation"]["observed cells"]["all"]
+    assert cells["iou"] == {"other": pytest.approx(1 / 3, abs=1e-4), "road": pytest.approx(1 / 3, abs=1e-4)}
+    assert told["road"]["all"]["confusion"] == [[0.25, 0.25], [0.25, 0.25]]
+    record, mistakes = judge.record(judge.kitti(frame(box(10, 0), points=hits(box(10, 0), 10))))
+    assert record.tallies == {}  # boxes say nothing of the road
+    assert mistakes is not None
+    record, _ = judge.record(judge.simulated(FIRST_SEED))
+    assert [*figures([record])["segmentation"]["every cell"]["all"]["iou"]] == ["background", "drivable"]
 
 
 # --- drives ----------------------------------------------------------------------------------------------------------

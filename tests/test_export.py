@@ -20,22 +20,36 @@ from torch import Tensor, nn
 
 from edgeperc import Perceiver
 from edgeperc.card import CARD_KEY, InputSpec, ModelCard, OutputSpec, RangeImageGeometry
-from edgeperc.datasets import IGNORE, KittiObjects, simulated_scan
+from edgeperc.datasets import IGNORE, KittiObjects, scan_hash, simulated_scan
 from edgeperc.errors import CardMismatchError
 from edgeperc.evaluate import evaluate
 from edgeperc.sensors import FitnessProfile
 from edgeperc.session import Session
+from edgeperc.splits import fold_of
 from edgeperc_export import recipes
-from edgeperc_export.ablation import PAPERS, VARIANTS, ablate
+from edgeperc_export.ablation import PAPERS, VARIANTS, ablate, plot
 from edgeperc_export.augment import LabelledScan
-from edgeperc_export.cards import LABELS_POINTS
+from edgeperc_export.cards import LABELS_POINTS, TOP_VIEW
 from edgeperc_export.cli import _parser, main
 from edgeperc_export.dataset import parity_scans, simulate
 from edgeperc_export.models_page import models_page
 from edgeperc_export.recipes import MODELS, Stage
+from edgeperc_export.road import DRAWN, drawn_roads
 from edgeperc_export.selftraining import pseudo_labelled, taught, unlabelled_scans
 from edgeperc_export.to_onnx import ParityError, export, load, to_graph, verify, write_card
-from edgeperc_export.train import PAPER, Recipe, Samples, Watch, _optimizer, _schedule, _start, build, loss_of, train
+from edgeperc_export.train import (
+    PAPER,
+    Recipe,
+    Samples,
+    Watch,
+    _optimizer,
+    _schedule,
+    _start,
+    build,
+    loss_of,
+    real_scans,
+    train,
+)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +87,9 @@ def weights(path: Path) -> dict[str, Tensor]:
     return torch.load(path, weights_only=True)["averaged"]
 
 
-@pytest.mark.parametrize(("network", "head"), [("pointseg", "dense"), ("ssadnet", "dense"), ("ssadnet", "slots")])
+@pytest.mark.parametrize(
+    ("network", "head"), [("lodnn", "dense"), ("pointseg", "dense"), ("ssadnet", "dense"), ("ssadnet", "slots")]
+)
 def test_a_resumed_run_ends_where_an_uninterrupted_one_does(
     tmp_path: Path, simulated: Path, network: str, head: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -168,6 +184,13 @@ def test_the_papers_recipes_are_theirs() -> None:
     for recipe in (ssadnet, pointseg):
         assert not recipe.augment
         assert recipe.n_pasted == recipe.swap == recipe.ema == recipe.lovasz_weight == recipe.simulated_share == 0.0
+    lodnn = PAPER["lodnn"]
+    assert (lodnn.optimizer, lodnn.learning_rate, lodnn.batch, lodnn.context_width) == ("adam", 1e-3, 16, 128)
+    assert lodnn.steps == 22 * 300 * 8 // 16  # epochs, scenes, variations
+    assert lodnn.drawn_roads
+    assert lodnn.augment
+    assert lodnn.n_pasted == lodnn.ema == lodnn.lovasz_weight == lodnn.simulated_share == lodnn.distil == 0.0
+    assert not any(isinstance(m, nn.BatchNorm2d) for m in build(lodnn).modules())
     assert not any(isinstance(m, nn.BatchNorm2d) for m in build(ssadnet).segmentation.modules())  # type: ignore[union-attr, operator]
     optimizer = _optimizer(pointseg, build(pointseg))
     assert type(optimizer) is torch.optim.Adagrad
@@ -201,7 +224,7 @@ def kitti(tmp_path_factory: pytest.TempPathFactory, scans: list[np.ndarray]) -> 
     return root
 
 
-@pytest.mark.parametrize("network", ["kulseg", "pointseg", "ssadnet"])
+@pytest.mark.parametrize("network", ["kulseg", "lodnn", "pointseg", "ssadnet"])
 def test_a_fold_is_watched_and_not_trained_on(tmp_path: Path, kitti: Path, simulated: Path, network: str) -> None:
     arguments = {"kitti": kitti, "simulated": simulated, "fold": 1, "n_threads": 1, "checkpoint_every": 1}
     checkpoint = train(small(network, steps=2, n_pasted=0.0), tmp_path, **arguments)
@@ -216,6 +239,53 @@ def test_a_fold_is_watched_and_not_trained_on(tmp_path: Path, kitti: Path, simul
     assert notes["curve"] == curve
     for name, value in network_.state_dict().items():
         assert torch.equal(value, state["best"][name])
+
+
+def test_drawn_roads_are_of_training_drives() -> None:
+    pytest.importorskip("faster_coco_eval")
+    images = json.loads(DRAWN.read_text())["images"]
+    assert len(images) == len({image["scan"] for image in images}) >= 8
+    assert all(fold_of(image["drive"]) is not None for image in images)
+    masks = drawn_roads()
+    assert masks.keys() == {image["scan"] for image in images}
+    for mask in masks.values():
+        assert 0.1 < mask.mean() < 0.8
+        assert mask[390:, 95:105].all()  # the vehicle stands on it
+
+
+def test_a_drawn_road_is_the_truth_of_its_scan(kitti: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    objects, road = KittiObjects(kitti), np.zeros((400, 200), np.uint8)
+    road[100:, 60:150] = 1
+    digest = scan_hash(objects.frame("000000").points)
+    monkeypatch.setattr("edgeperc_export.train.drawn_roads", lambda: {digest: road})
+    (scan, other), weights, hashes = real_scans(objects, ["000000", "000001"], drawn=True)
+    assert weights == [1.0, 1.0]
+    assert hashes["000000"] == digest
+    ((plain, _), _, _) = real_scans(objects, ["000000", "000001"])
+    truth, told = scan.top_view_truth(TOP_VIEW), plain.top_view_truth(TOP_VIEW)
+    known = np.isin(truth, (0, 1)) & (told < 2)
+    assert (truth[known] == road[known]).mean() > 0.99  # cells of 0.2 m, half a cell aside
+    assert np.isin(truth, (0, 1, IGNORE)).mean() > 0.9
+    assert (told == IGNORE).mean() > (truth == IGNORE).mean() + 0.1
+    np.testing.assert_array_equal(other.surface, real_scans(objects, ["000001"])[0][0].surface)
+    # Beyond the drawing stays what is sure.
+    np.testing.assert_array_equal(scan.surface[:20], plain.surface[:20])
+
+
+def test_lodnn_learns_road_alone(simulated: Path) -> None:
+    recipe = small("lodnn", edge=True)
+    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    scan = LabelledScan.load(samples.simulated[0])
+    image, truth = samples.sample(scan)
+    assert image.shape == (3, 400, 200)
+    whole = scan.top_view_truth(TOP_VIEW)
+    np.testing.assert_array_equal(truth == 1, whole == 1)
+    np.testing.assert_array_equal(truth == IGNORE, whole == IGNORE)
+    assert (truth[(whole > 1) & (whole != IGNORE)] == 0).all()
+    labels = torch.from_numpy(truth[None])
+    right = torch.stack([labels == 0, labels == 1], dim=1).float() * 20.0
+    assert loss_of(recipe, right, [labels]) < 1e-3
+    assert loss_of(recipe, -right, [labels]) > 10.0
 
 
 def test_only_simulated_means_no_real_frame(tmp_path: Path, kitti: Path, simulated: Path) -> None:
@@ -303,6 +373,8 @@ def test_a_teacher_looks_twice() -> None:
         ("pointseg", True, "pointseg"),
         ("kulseg", False, "pointseg"),
         ("ssadnet", True, "ssadnet"),
+        ("lodnn", False, "ssadnet"),
+        ("lodnn", True, "ssadnet"),
     ],
 )
 def test_a_network_distils_from_another(tmp_path: Path, simulated: Path, network: str, edge: bool, tutor: str) -> None:
@@ -323,8 +395,8 @@ def test_an_ablation_changes_what_it_says(tmp_path: Path, kitti: Path, simulated
     for network, variants in VARIANTS.items():
         whole = MODELS[network].recipe
         for name, changes in variants.items():
-            changed = replace(whole, **{k: v for k, v in changes.items() if k != "teacher"})
-            assert name == "as shipped" or "teacher" in changes or changed != whole
+            changed = replace(whole, **{k: v for k, v in changes.items() if k not in ("teacher", "scans")})
+            assert name == "as shipped" or changes.keys() & {"teacher", "scans"} or changed != whole
     start = untrained("pointseg", tmp_path)
     arguments = {"kitti": kitti, "simulated": simulated, "start_from": start, "fold": 1, "steps": 1, "n_threads": 1}
     asked = ["nothing pasted", PAPERS]
@@ -332,6 +404,14 @@ def test_an_ablation_changes_what_it_says(tmp_path: Path, kitti: Path, simulated
     assert [row["variant"] for row in rows] == asked
     assert ablate("pointseg", tmp_path / "out", **arguments, variants=asked) == rows
     assert all(row["figures"].keys() == {"background", "car", "pedestrian", "cyclist"} for row in rows)
+    asked = ["as shipped", "learning rate 0.001", "scans times 2", "batches of 2"]
+    rows = ablate("lodnn", tmp_path / "lodnn", **{**arguments, "start_from": None}, variants=asked)
+    assert [row["scans"] for row in rows] == [4, 4, 8, 4]
+    pytest.importorskip("matplotlib")
+    plot(rows, tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").read_bytes()[:4] == b"\x89PNG"
+    with pytest.raises(ValueError, match="no run of lodnn to draw"):
+        plot([], tmp_path / "none.png")
 
 
 def test_one_command_makes_a_model_and_what_it_starts_from(
@@ -422,7 +502,8 @@ def test_simulated_scans_resume_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("network", "head"), [("kulseg", "dense"), ("pointseg", "dense"), ("ssadnet", "dense"), ("ssadnet", "slots")]
+    ("network", "head"),
+    [("kulseg", "dense"), ("lodnn", "dense"), ("pointseg", "dense"), ("ssadnet", "dense"), ("ssadnet", "slots")],
 )
 def test_an_export_proves_itself(tmp_path: Path, scans: Sequence[np.ndarray], network: str, head: str) -> None:
     checkpoint = untrained(network, tmp_path, head=head)
@@ -438,7 +519,11 @@ def test_an_export_proves_itself(tmp_path: Path, scans: Sequence[np.ndarray], ne
     assert str(tmp_path).encode() not in blob
     assert b"site-packages" not in blob
     answer = Perceiver(path, provider="cpu", on_mismatch="ignore")(scans[0])
-    assert (answer.points is None) == (network == "ssadnet")
+    assert (answer.points is None) == (network in ("lodnn", "ssadnet"))
+    if network == "lodnn":
+        assert answer.top_view is not None
+        assert answer.top_view.classes == ("background", "drivable")
+        assert answer.boxes == ()
     if network == "kulseg":  # batch norm is gone, and nothing is there that engines have no kernel for
         plain = {"Add", "Cast", "Concat", "Conv", "ConvTranspose", "MaxPool", "Mul", "Relu", "Sigmoid"}
         mask = {"Abs", "ReduceMax", "Greater"}
@@ -563,8 +648,10 @@ def test_every_model_has_its_command() -> None:
 
 def test_wrong_usage_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "kulseg", str(tmp_path), "--recipe", "paper"]) == 2
-    assert "no recipe of a paper's is kept for kulseg; expected ssadnet or pointseg" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="kulseg has no network for small computers; expected pointseg or ssadnet"):
+    assert "no recipe of a paper's is kept for kulseg; expected ssadnet or pointseg or lodnn" in capsys.readouterr().err
+    with pytest.raises(
+        ValueError, match="kulseg has no network for small computers; expected lodnn or pointseg or ssadnet"
+    ):
         build(small("kulseg", edge=True))
     assert main(["train", "pointseg", str(tmp_path)]) == 2
     assert "no scans to train on" in capsys.readouterr().err

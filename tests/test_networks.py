@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from edgeperc_export.networks.edge import PointSegEdge, SSADNetEdge, spread
 from edgeperc_export.networks.kulseg import KULSeg
+from edgeperc_export.networks.lodnn import EDGE_DILATIONS, LoDNN, LoDNNEdge
 from edgeperc_export.networks.pointseg import ENLARGEMENT_RATES, Fire, FireDeconv, PointSeg, SqueezeReweight
 from edgeperc_export.networks.squeezesegv2 import ContextAggregation, SqueezeSegV2
 from edgeperc_export.networks.ssadnet import (
@@ -558,3 +561,64 @@ def test_spreading_moves_channels_to_pixels(block):
     for row in range(rows):
         for col in range(cols):
             assert torch.equal(out[:, :, row::rows, col::cols], x[:, row * cols + col :: rows * cols])
+
+
+# --- LoDNN
+
+
+@pytest.mark.parametrize(("n_channels", "n_expected"), [(6, 947_458), (3, 946_594)])
+def test_lodnn_has_the_papers_layers(n_channels, n_expected):
+    """LoDNN, Table 1, whose context module SSADNet took over: 128 channels, 32 of the 1x1; 32 on either side."""
+    network = on_meta(lambda: LoDNN(n_channels=n_channels))
+    convolutions = [m for m in network.modules() if isinstance(m, nn.Conv2d)]
+    channels = [n_channels, 32, 32, *[128] * 7, 32, 32, 2]
+    assert [(conv.in_channels, conv.out_channels) for conv in convolutions] == [*pairwise(channels)]
+    dilations = [(1, 1)] * 2 + [dilation for dilation, _ in TABLE_1] + [(1, 1)] * 3
+    assert [conv.dilation[::-1] for conv in convolutions] == dilations
+    assert [conv.kernel_size for conv in convolutions] == [(3, 3)] * 9 + [(1, 1)] + [(3, 3)] * 2
+    kernels = [3] * 9 + [1] + [3] * 2
+    by_hand = sum((k * k * a + 1) * b for (a, b), k in zip(pairwise(channels), kernels, strict=True))
+    assert n_parameters(network) == by_hand == n_expected
+
+
+def test_lodnn_halves_once_and_returns():
+    names = ["encoder", "context.dilated", "context", "decoder"]
+    logits, seen = run_and_watch(LoDNN(context_width=8).eval(), torch.randn(1, 3, 400, 200), *names)
+    assert logits.shape == (1, 2, 400, 200)
+    shapes = {name: (tuple(given.shape[1:]), tuple(made.shape[1:])) for name, (given, made) in seen.items()}
+    assert shapes == {
+        "encoder": ((3, 400, 200), (32, 400, 200)),
+        "context.dilated": ((32, 200, 100), (8, 200, 100)),
+        "context": ((32, 200, 100), (32, 200, 100)),
+        "decoder": ((32, 400, 200), (32, 400, 200)),
+    }
+    assert (seen["decoder"][0] != 0).float().mean() <= 0.25  # unpooled: a cell of four
+
+
+def test_lodnn_keeps_the_signal_and_learns_from_nothing():
+    network = LoDNN(context_width=32).eval()
+    _, seen = run_and_watch(network, torch.randn(1, 3, 200, 100), *(f"context.dilated.{k}" for k in range(2, 21, 3)))
+    sizes = [float(made.pow(2).mean().sqrt()) for _, made in seen.values()]
+    assert all(0.2 < size < 3.0 for size in sizes)
+
+
+def test_lodnn_edge_sees_as_far_for_a_twenty_seventh():
+    network = on_meta(LoDNNEdge)
+    cells = receptive_fields(EDGE_DILATIONS)[-1]
+    whole = receptive_fields()[-1]
+    assert [0.4 * n for n in cells] == pytest.approx([0.2 * n for n in whole], abs=0.3)  # metres
+    shape = (1, 3, 400, 200)
+    assert network(torch.empty(shape, device="meta")).shape == (1, 2, 400, 200)
+    small, full = giga_macs(network, *shape), giga_macs(on_meta(LoDNN), *shape)
+    assert 27 < full / small < 28
+    assert small < 0.6 * giga_macs(on_meta(SSADNetEdge), *shape)
+    dilations = [block.conv.dilation for block in network.context]
+    assert dilations == [(height, width) for width, height in EDGE_DILATIONS]
+
+
+def test_lodnn_edge_begins_as_a_shortcut():
+    network = LoDNNEdge().eval()
+    x = torch.rand(1, 48, 20, 10)
+    agree(network.context(x), x)
+    logits, _ = run_and_watch(network, torch.rand(1, 3, 40, 20))
+    assert logits.abs().max() < 1.0

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import edgeperc
 from edgeperc import Box, FitnessError, Perceiver, Perception, PointsError, cluster, ground
-from edgeperc.card import RangeImageGeometry
+from edgeperc.card import RangeImageGeometry, TopViewGeometry
 from edgeperc.datasets import inside
 from edgeperc.geometry import oriented_iou
 from edgeperc.models import model_path, shipped_models
@@ -303,6 +303,19 @@ def test_one_model_answers_its_part() -> None:
     above = Perceiver(model_path("ssadnet"), provider="cpu")(points)
     assert above.points is None
     assert above.top_view is not None
+
+
+def test_the_road_alone(scan: SimulatedScan) -> None:
+    found = Perceiver("lodnn", provider="cpu", n_threads=1)(scan.points)
+    assert found.points is None
+    assert found.boxes == ()
+    assert found.top_view is not None
+    assert found.top_view.classes == ("background", "drivable")
+    road = scan.top_view_labels(TopViewGeometry()) == 1
+    assert (found.top_view.drivable & road).sum() > 0.85 * (found.top_view.drivable | road).sum()
+    ahead = edgeperc.road_ahead(found.top_view)
+    assert ahead.free_ahead_m() > 40.0
+    assert ahead.lane_width_m == pytest.approx(3.2, abs=0.5)
 
 
 def test_two_models_of_one_view_are_refused() -> None:

@@ -1,0 +1,368 @@
+"""What a planner asks of a top view: the road as a polygon, how far it is free, how wide a lane is.
+
+Everything is in the sensor frame, metres: x forward, y left. A cell is road or it is not: what the sensor did not see
+is what the network took it for, and what lies beyond the view is unknown.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from .errors import PointsError
+from .perception import TopView
+
+__all__ = ["RoadAhead", "road_ahead"]
+
+USUAL_LANE_M = 3.25
+"""Lanes of towns and country roads are 2.75 to 3.75 m wide; a road has as many as come nearest to this."""
+LANE_RANGE_M = 20.0
+BESIDE_M = 2.0
+"""As far to the side of the sensor's axis the road is looked for."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoadAhead:
+    """The road in a top view, in the sensor frame [m].
+
+    Attributes
+    ----------
+    outline : (k, 2) float64
+        Corners x, y of the road that is nearest to the sensor, counter-clockwise seen from above, the first not
+        repeated. Cells that share no more than a corner are not connected. (0, 2) where no cell is drivable.
+    holes : tuple of (k, 2) float64
+        What lies inside the outline and is no road, vehicles among it; clockwise.
+    y_m : (columns,) float64
+        Middles of the top view's columns, leftmost first.
+    free_m : (columns,) float64
+        How far ahead of the sensor (x) each column is drivable without a gap, from the near edge of the view on. The
+        near edge itself where the nearest cell is not drivable, the far edge where all are: it is never less known
+        than that, and says nothing of what lies beyond the view.
+    x_m : (rows,) float64
+        Middles of the top view's rows, nearest first.
+    left_m, right_m : (rows,) float64
+        y of the edges of the corridor ahead: in every row the drivable cells without a gap that go on from the row
+        before. NaN before the corridor begins and after it ends, and everywhere where none begins within 2 m of the
+        sensor's axis.
+    lane_width_m : float
+        Estimate: the corridor's width across its direction, median of the nearest 20 m of view, divided into as many
+        lanes as come nearest to 3.25 m each, at least one. A map without markings tells no more. NaN where both edges
+        are nowhere in view.
+    """
+
+    outline: NDArray[np.float64]
+    holes: tuple[NDArray[np.float64], ...]
+    y_m: NDArray[np.float64]
+    free_m: NDArray[np.float64]
+    x_m: NDArray[np.float64]
+    left_m: NDArray[np.float64]
+    right_m: NDArray[np.float64]
+    lane_width_m: float
+
+    @property
+    def width_m(self) -> NDArray[np.float64]:
+        """Width of the corridor along y in every row, (rows,); NaN where there is none."""
+        return self.left_m - self.right_m
+
+    def free_ahead_m(self, half_width_m: float = 1.0) -> float:
+        """How far ahead (x) a strip as wide as a vehicle is free: the least of `free_m` so near to the sensor's axis.
+
+        NaN where the view has no column as near.
+        """
+        near = np.abs(self.y_m) <= half_width_m
+        return float(self.free_m[near].min()) if near.any() else math.nan
+
+
+def road_ahead(top_view: TopView, *, tolerance_m: float = 0.1) -> RoadAhead:
+    """Road polygon, free distance and lane width of a top view, of whatever model.
+
+    Parameters
+    ----------
+    top_view : TopView
+    tolerance_m : float
+        How far the polygon may leave the edges of the cells (Douglas and Peucker, 1973); 0 keeps every corner. The
+        default is a cell of the shipped models, which takes the steps out of a slanting edge. Of rings simplified by
+        more than a cell, edges may cross.
+
+    Raises
+    ------
+    PointsError
+        The tolerance is negative or no number.
+
+    Examples
+    --------
+    >>> road = road_ahead(perceive(points).top_view)        # doctest: +SKIP
+    >>> road.free_ahead_m(), road.lane_width_m              # doctest: +SKIP
+    (31.4, 3.1)
+    """
+    if not tolerance_m >= 0.0:
+        raise PointsError(f"tolerance_m is {tolerance_m}; expected 0 or more metres")
+    drivable = np.ascontiguousarray(top_view.drivable)
+    height, width = drivable.shape
+    cell_m, (x_near, x_far), y_left = top_view.cell_m, top_view.x_range_m, top_view.y_range_m[1]
+    y_m = y_left - (np.arange(width, dtype=np.float64) + 0.5) * np.float64(cell_m)
+    x_m = x_far - (np.arange(height, dtype=np.float64)[::-1] + 0.5) * np.float64(cell_m)
+
+    free_rows = np.empty(width, np.int64)
+    fill_free(drivable, free_rows)
+    free_m = np.where(free_rows == height, x_far, x_near + free_rows * cell_m)
+
+    bounds = np.empty((height, 2), np.int64)
+    axis = y_left / cell_m  # the column where y is 0
+    fill_corridor(drivable, axis - BESIDE_M / cell_m, axis + BESIDE_M / cell_m, bounds)
+    bounds = bounds[::-1]
+    there = bounds[:, 0] >= 0
+    left_m = np.where(there, y_left - bounds[:, 0] * cell_m, np.nan)
+    right_m = np.where(there, y_left - bounds[:, 1] * cell_m, np.nan)
+    whole = there & (bounds[:, 0] > 0) & (bounds[:, 1] < width) & (x_m < x_near + LANE_RANGE_M)
+
+    rings = [
+        _simplified(np.column_stack([x_far - ring[:, 0] * cell_m, y_left - ring[:, 1] * cell_m]), tolerance_m)
+        for ring in _rings(_nearest_part(drivable, y_m, x_m[::-1]))
+    ]
+    # One ring goes round the part and everything else in it; walked with the road to the left, it alone is positive.
+    areas = [_area(ring) for ring in rings]
+    outer = int(np.argmax(areas)) if rings else -1
+    return RoadAhead(
+        outline=rings[outer] if rings else np.empty((0, 2)),
+        holes=tuple(ring for k, ring in enumerate(rings) if k != outer),
+        y_m=y_m,
+        free_m=free_m,
+        x_m=x_m,
+        left_m=left_m,
+        right_m=right_m,
+        lane_width_m=_lane_width(x_m[whole], left_m[whole], right_m[whole]),
+    )
+
+
+def _lane_width(x: NDArray[np.float64], left: NDArray[np.float64], right: NDArray[np.float64]) -> float:
+    if len(x) == 0:
+        return math.nan
+    # A road at an angle is narrower than it is along y. Its slope is a median, which what stands on it does not move.
+    half = len(x) // 2
+    middle = 0.5 * (left + right)
+    slope = float(np.median((middle[-half:] - middle[:half]) / (x[-half:] - x[:half]))) if half else 0.0
+    width = float(np.median(left - right)) / math.hypot(1.0, slope)
+    return width / max(1, round(width / USUAL_LANE_M))
+
+
+def _nearest_part(drivable: NDArray[np.bool_], y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """The connected drivable cells around the one nearest to the sensor."""
+    part = np.zeros(drivable.shape, np.bool_)
+    rows, cols = np.nonzero(drivable)
+    if len(rows):
+        nearest = int(np.argmin(np.hypot(x[rows], y[cols])))
+        mark_connected(drivable, int(rows[nearest]), int(cols[nearest]), part)
+    return part
+
+
+def _rings(part: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+    """Rings of corners (row, column) around some cells, those to the left."""
+    padded = np.pad(part, 1)
+    n_sides = sum(int(np.count_nonzero(padded & ~np.roll(padded, shift, axis))) for axis in (0, 1) for shift in (1, -1))
+    corners, ends = np.empty((n_sides, 2), np.int64), np.empty(n_sides // 4 + 1, np.int64)
+    n_rings = fill_rings(padded, corners, ends)
+    return [ring - 1 for ring in np.split(corners, ends[:n_rings])[:n_rings]]
+
+
+def _simplified(ring: NDArray[np.float64], tolerance_m: float) -> NDArray[np.float64]:
+    kept = np.empty(len(ring), np.bool_)
+    mark_kept(ring, tolerance_m, kept)
+    # Of fewer than three corners there is no ring.
+    return ring[kept] if np.count_nonzero(kept) >= 3 else ring
+
+
+def _area(ring: NDArray[np.float64]) -> float:
+    x, y = ring[:, 0], ring[:, 1]
+    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+
+
+@njit(cache=True, nogil=True)
+def fill_free(drivable: NDArray[np.bool_], free: NDArray[np.int64]) -> None:
+    """Count the drivable cells of each column, from the last row up to the first gap.
+
+    Parameters
+    ----------
+    drivable : (rows, columns) bool
+    free : (columns,) int64, overwritten
+    """
+    height, width = drivable.shape
+    for col in range(width):
+        n = 0
+        while n < height and drivable[height - 1 - n, col]:
+            n += 1
+        free[col] = n
+
+
+@njit(cache=True, nogil=True)
+def fill_corridor(drivable: NDArray[np.bool_], first: float, last: float, bounds: NDArray[np.int64]) -> None:
+    """Follow the drivable cells ahead, row by row from the last one up.
+
+    Parameters
+    ----------
+    drivable : (rows, columns) bool
+    first, last : float
+        Columns between which the corridor has to begin.
+    bounds : (rows, 2) int64, overwritten
+        First column of the corridor in each row, and one past its last; -1, -1 in rows without.
+
+    Notes
+    -----
+    It begins in the last row that has a run of drivable cells between ``first`` and ``last``, and goes on with the run
+    that shares most columns with the row before, of equal ones the left one. It ends where none shares any.
+    """
+    height, width = drivable.shape
+    bounds[:] = -1
+    begun = False
+    low, high = first, last
+    for row in range(height - 1, -1, -1):
+        most = 0.0
+        col = 0
+        while col < width:
+            if not drivable[row, col]:
+                col += 1
+                continue
+            start = col
+            while col < width and drivable[row, col]:
+                col += 1
+            shared = min(np.float64(col), high) - max(np.float64(start), low)
+            if shared > most:
+                most = shared
+                bounds[row, 0] = start
+                bounds[row, 1] = col
+        if most > 0.0:
+            begun = True
+            low, high = np.float64(bounds[row, 0]), np.float64(bounds[row, 1])
+        elif begun:
+            return
+
+
+@njit(cache=True, nogil=True)
+def mark_connected(cells: NDArray[np.bool_], row: int, col: int, part: NDArray[np.bool_]) -> None:
+    """Mark the cells that a walk over shared sides reaches.
+
+    Parameters
+    ----------
+    cells : (rows, columns) bool
+    row, col : int
+        Where the walk begins; a marked cell of ``cells``.
+    part : (rows, columns) bool, overwritten
+    """
+    height, width = cells.shape
+    part[:] = False
+    pending = np.empty((height * width, 2), np.int32)
+    pending[0, 0], pending[0, 1] = row, col
+    part[row, col] = True
+    n = 1
+    while n > 0:
+        n -= 1
+        r, c = pending[n, 0], pending[n, 1]
+        for k in range(4):
+            dr = -1 if k == 0 else 1 if k == 1 else 0
+            dc = -1 if k == 2 else 1 if k == 3 else 0
+            if 0 <= r + dr < height and 0 <= c + dc < width and cells[r + dr, c + dc] and not part[r + dr, c + dc]:
+                part[r + dr, c + dc] = True
+                pending[n, 0], pending[n, 1] = r + dr, c + dc
+                n += 1
+
+
+@njit(cache=True, nogil=True)
+def fill_rings(cells: NDArray[np.bool_], corners: NDArray[np.int64], ends: NDArray[np.int64]) -> int:
+    """Walk along the edges of some cells, with the cells to the left.
+
+    Parameters
+    ----------
+    cells : (rows, columns) bool
+        None marked along the border.
+    corners : (n, 2) int64, overwritten
+        Row and column of the corners where the walk turns, ring after ring; a cell's upper left corner has its row and
+        column. ``n`` is at least the number of the cells' sides that face no other.
+    ends : (m,) int64, overwritten
+        Where each ring ends in ``corners``; ``m`` at least a quarter of ``n``.
+
+    Returns
+    -------
+    n_rings : int
+    """
+    height, width = cells.shape
+    walked = np.zeros((height, width), np.bool_)  # lower sides
+    n_corners, n_rings = 0, 0
+    for top in range(height - 1):
+        for left in range(width):
+            if not cells[top, left] or cells[top + 1, left] or walked[top, left]:
+                continue
+            row, col, heading = top + 1, left, 0  # to the right along the lower side of the cell
+            begun = False
+            while not begun or row != top + 1 or col != left or heading != 0:
+                begun = True
+                if heading == 0:
+                    walked[row - 1, col] = True
+                    col += 1
+                    ahead_left, ahead_right = cells[row - 1, col], cells[row, col]
+                elif heading == 1:  # up
+                    row -= 1
+                    ahead_left, ahead_right = cells[row - 1, col - 1], cells[row - 1, col]
+                elif heading == 2:  # left
+                    col -= 1
+                    ahead_left, ahead_right = cells[row, col - 1], cells[row - 1, col - 1]
+                else:  # down
+                    row += 1
+                    ahead_left, ahead_right = cells[row, col], cells[row, col - 1]
+                turn = 1 if not ahead_left else -1 if ahead_right else 0
+                if turn != 0:
+                    corners[n_corners, 0], corners[n_corners, 1] = row, col
+                    n_corners += 1
+                    heading = (heading + turn) % 4
+            ends[n_rings] = n_corners
+            n_rings += 1
+    return n_rings
+
+
+@njit(cache=True, nogil=True)
+def mark_kept(ring: NDArray[np.float64], tolerance: float, kept: NDArray[np.bool_]) -> None:
+    """Mark the corners that a simplified ring needs (Douglas and Peucker).
+
+    Parameters
+    ----------
+    ring : (n, 2) float64
+        At least one corner; the first is not repeated.
+    tolerance : float
+        Every corner left out lies within it of the edge in its place.
+    kept : (n,) bool, overwritten
+    """
+    n = ring.shape[0]
+    kept[:] = False
+    # The ring is two lines: from its first corner to the farthest from it, and back.
+    farthest, most = 0, 0.0
+    for k in range(n):
+        apart = math.hypot(ring[k, 0] - ring[0, 0], ring[k, 1] - ring[0, 1])
+        if apart > most:
+            farthest, most = k, apart
+    kept[0] = True
+    kept[farthest] = True
+    pending = np.empty((n + 2, 2), np.int64)
+    pending[0, 0], pending[0, 1] = 0, farthest
+    pending[1, 0], pending[1, 1] = farthest, n
+    n_pending = 2
+    while n_pending > 0:
+        n_pending -= 1
+        begin, end = pending[n_pending, 0], pending[n_pending, 1]
+        x, y = ring[begin, 0], ring[begin, 1]
+        dx, dy = ring[end % n, 0] - x, ring[end % n, 1] - y
+        length2 = dx * dx + dy * dy
+        worst, most = -1, tolerance
+        for k in range(begin + 1, end):
+            ux, uy = ring[k, 0] - x, ring[k, 1] - y
+            along = min(max((ux * dx + uy * dy) / length2, 0.0), 1.0) if length2 > 0.0 else 0.0
+            off = math.hypot(ux - along * dx, uy - along * dy)
+            if off > most:
+                worst, most = k, off
+        if worst >= 0:
+            kept[worst] = True
+            pending[n_pending, 0], pending[n_pending, 1] = begin, worst
+            pending[n_pending + 1, 0], pending[n_pending + 1, 1] = worst, end
+            n_pending += 2

@@ -1,0 +1,239 @@
+"""Roads as polygons, free distances and lane widths: kernels against their twins, and roads whose answers are known."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from numpy.typing import NDArray
+from shapely import Point, Polygon
+
+import edgeperc
+import reference
+from edgeperc import PointsError, TopView
+from edgeperc.drivable import (
+    _rings,
+    _simplified,
+    fill_corridor,
+    fill_free,
+    fill_rings,
+    mark_connected,
+    mark_kept,
+    road_ahead,
+)
+
+CLASSES = ("background", "drivable", "car", "van", "truck")
+# The first example compiles a kernel.
+patient = settings(deadline=None)
+MASKS = npst.arrays(np.bool_, npst.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9))
+
+
+def view(drivable: NDArray[np.bool_], classes: tuple[str, ...] = CLASSES[:2]) -> TopView:
+    rows, cols = drivable.shape
+    y = 0.1 * cols / 2.0
+    return TopView(drivable.astype(np.uint8), classes, 0.1, (6.0, 6.0 + 0.1 * rows), (-y, y))
+
+
+def blank() -> NDArray[np.bool_]:
+    return np.zeros((400, 200), np.bool_)
+
+
+# --- kernels against their twins -------------------------------------------------------------------------------------
+
+
+@patient
+@given(MASKS)
+def test_free_cells_are_counted_from_the_near_edge(cells: NDArray[np.bool_]) -> None:
+    free = np.full(cells.shape[1], 99)
+    fill_free(cells, free)
+    assert free.tolist() == reference.free_cells(cells)
+
+
+@patient
+@given(MASKS, st.floats(-3.0, 9.0), st.floats(0.5, 9.0))
+def test_the_corridor_follows_the_largest_overlap(cells: NDArray[np.bool_], first: float, width: float) -> None:
+    bounds = np.full((len(cells), 2), 99)
+    fill_corridor(cells, first, first + width, bounds)
+    np.testing.assert_array_equal(bounds, reference.corridor(cells, first, first + width))
+
+
+@patient
+@given(MASKS, st.data())
+def test_connected_cells_share_sides(cells: NDArray[np.bool_], data: st.DataObject) -> None:
+    row, col = (data.draw(st.integers(0, n - 1)) for n in cells.shape)
+    cells[row, col] = True
+    part = np.ones_like(cells)
+    mark_connected(cells, row, col, part)
+    np.testing.assert_array_equal(part, reference.connected(cells, row, col))
+
+
+@patient
+@given(MASKS)
+def test_rings_walk_every_side_once_with_the_cells_to_the_left(cells: NDArray[np.bool_]) -> None:
+    padded = np.pad(cells, 1)
+    sides = reference.sides(padded)
+    corners, ends = np.empty((len(sides), 2), np.int64), np.empty(len(sides) // 4 + 1, np.int64)
+    n_rings = fill_rings(padded, corners, ends)
+    walked: list[tuple[tuple[int, int], tuple[int, int]]] = []
+    begin = 0
+    for end in ends[:n_rings].tolist():
+        ring = corners[begin:end].tolist()
+        begin = end
+        assert len(ring) >= 4
+        for (row, col), (to_row, to_col) in zip(ring, ring[1:] + ring[:1], strict=True):
+            assert (row == to_row) != (col == to_col)
+            steps = abs(to_row - row) + abs(to_col - col)
+            way = ((to_row - row) // steps, (to_col - col) // steps)
+            walked += [
+                ((row + k * way[0], col + k * way[1]), (row + (k + 1) * way[0], col + (k + 1) * way[1]))
+                for k in range(steps)
+            ]
+    assert len(walked) == len(sides)
+    assert set(walked) == sides
+
+
+@patient
+@given(npst.arrays(np.float64, st.tuples(st.integers(1, 12), st.just(2)), elements=st.integers(-5, 5)), st.floats(0, 4))
+def test_simplifying_keeps_what_its_twin_keeps(ring: NDArray[np.float64], tolerance: float) -> None:
+    kept = np.ones(len(ring), np.bool_)
+    mark_kept(ring, tolerance, kept)
+    apart = [math.hypot(x - ring[0, 0], y - ring[0, 1]) for x, y in ring]
+    far = apart.index(max(apart))
+    line = [*map(tuple, ring.tolist()), tuple(ring[0].tolist())]
+    there = reference.simplified(line[: far + 1], tolerance) if far else [0]
+    back = [far + k for k in reference.simplified(line[far:], tolerance)]
+    assert np.flatnonzero(kept).tolist() == sorted({k % len(ring) for k in (*there, *back)})
+
+
+# --- the polygon -----------------------------------------------------------------------------------------------------
+
+
+@patient
+@given(npst.arrays(np.bool_, npst.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12)))
+def test_the_polygon_is_the_part_nearest_to_the_sensor(cells: NDArray[np.bool_]) -> None:
+    top_view = view(cells)
+    road = road_ahead(top_view, tolerance_m=0.0)
+    if not cells.any():
+        assert road.outline.shape == (0, 2)
+        assert road.holes == ()
+        return
+    polygon = Polygon(road.outline, road.holes)
+    centres = {(row, col): top_view.to_metres(row, col) for row, col in np.argwhere(cells).tolist()}
+    nearest = min(centres, key=lambda cell: math.hypot(*centres[cell]))
+    part = reference.connected(cells, *nearest)
+    for row in range(cells.shape[0]):
+        for col in range(cells.shape[1]):
+            inside = polygon.buffer(1e-6).contains(Point(top_view.to_metres(row, col)))
+            assert inside == part[row, col] or math.hypot(*centres.get((row, col), (0, 0))) == pytest.approx(
+                math.hypot(*centres[nearest])
+            )
+    if polygon.is_valid:  # one that touches itself at a corner is not, to shapely
+        assert polygon.exterior.is_ccw
+        assert all(not Polygon(hole).exterior.is_ccw for hole in road.holes)
+
+
+def test_a_simplified_polygon_stays_within_its_tolerance() -> None:
+    rows, cols = np.indices((400, 200))
+    cells = np.abs(cols - 100 - 30 * np.sin(rows / 90.0)) < 35
+    cells[120:160, 120:140] = False
+    exact = road_ahead(view(cells), tolerance_m=0.0)
+    road = road_ahead(view(cells))
+    assert len(road.outline) < len(exact.outline) / 5
+    assert len(road.holes) == len(exact.holes) == 1
+    edge = Polygon(road.outline).exterior
+    assert max(edge.distance(Point(corner)) for corner in exact.outline) <= 0.1 + 1e-9
+    polygon = Polygon(road.outline, road.holes)
+    assert polygon.is_valid
+    assert polygon.exterior.is_ccw
+    assert polygon.area == pytest.approx(0.01 * np.count_nonzero(cells), rel=0.01)
+    assert {tuple(corner) for corner in road.outline} <= {tuple(corner) for corner in exact.outline}
+
+
+def test_a_ring_of_one_cell_stays_a_ring() -> None:
+    (ring,) = _rings(np.ones((1, 1), np.bool_))
+    assert ring.tolist() == [[1, 1], [0, 1], [0, 0], [1, 0]]
+    assert len(_simplified(0.1 * ring, 5.0)) == 4
+
+
+# --- what a planner asks ---------------------------------------------------------------------------------------------
+
+
+def test_a_road_by_hand() -> None:
+    labels = blank().astype(np.uint8)
+    labels[:, 65:130] = 1  # y from 3.5 to -3.0: 6.5 m
+    labels[200:240, 90:110] = 2  # a car from x = 22.0 to 26.0
+    road = road_ahead(TopView(labels, CLASSES, 0.1, (6.0, 46.0), (-10.0, 10.0)))
+    assert road.free_m[100] == pytest.approx(22.0)
+    assert road.free_m[64] == 6.0
+    assert road.free_m[65] == 46.0
+    assert road.y_m[0] == pytest.approx(9.95)
+    assert road.free_ahead_m() == pytest.approx(22.0)
+    assert road.free_ahead_m(0.06) == pytest.approx(22.0)
+    assert road.x_m[0] == pytest.approx(6.05)
+    assert road.left_m[0] == pytest.approx(3.5)
+    assert road.right_m[0] == pytest.approx(-3.0)
+    np.testing.assert_allclose(road.width_m[:160], 6.5)
+    assert road.lane_width_m == pytest.approx(3.25)
+    assert {tuple(np.round(c, 6)) for c in road.outline} == {(6.0, 3.5), (6.0, -3.0), (46.0, -3.0), (46.0, 3.5)}
+    (hole,) = road.holes
+    assert {tuple(np.round(c, 6)) for c in hole} == {(22.0, 1.0), (22.0, -1.0), (26.0, 1.0), (26.0, -1.0)}
+    # Past the car the corridor is the wider of the two ways, of equally wide ones the left.
+    assert road.left_m[170] == pytest.approx(3.5)
+    assert road.right_m[170] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("slope", "width", "lanes"), [(0.0, 3.0, 1), (0.3, 7.2, 2), (-0.2, 9.9, 3), (0.1, 1.4, 1)])
+def test_lanes_of_a_slanting_road(slope: float, width: float, lanes: int) -> None:
+    x, y = (46.0 - 0.1 * (np.arange(400)[:, None] + 0.5)), 10.0 - 0.1 * (np.arange(200)[None, :] + 0.5)
+    cells = np.abs(y - slope * (x - 12.0)) / math.hypot(1.0, slope) < width / 2.0
+    road = road_ahead(view(cells))
+    assert road.lane_width_m * lanes == pytest.approx(width, abs=0.12)
+
+
+def test_nothing_drivable() -> None:
+    for road in (
+        road_ahead(view(blank())),
+        road_ahead(TopView(np.ones((4, 2), np.uint8), CLASSES[::2], 0.1, (6, 7), (0, 1))),
+    ):
+        assert road.outline.shape == (0, 2)
+        assert (road.free_m == 6.0).all()
+        assert np.isnan(road.left_m).all()
+        assert np.isnan(road.width_m).all()
+        assert math.isnan(road.lane_width_m)
+    assert road_ahead(view(blank())).free_ahead_m() == 6.0
+
+
+def test_everything_drivable() -> None:
+    road = road_ahead(view(~blank()))
+    assert (road.free_m == 46.0).all()
+    assert len(road.outline) == 4
+    assert math.isnan(road.lane_width_m)  # neither edge is in view
+    np.testing.assert_allclose(road.width_m, 20.0)
+
+
+def test_a_road_that_begins_farther_on_is_not_free() -> None:
+    cells = blank()
+    cells[:300, 80:120] = True
+    road = road_ahead(view(cells))
+    assert (road.free_m == 6.0).all()
+    assert np.isnan(road.left_m[:100]).all()
+    assert road.left_m[100] == pytest.approx(2.0)
+    aside = blank()
+    aside[:, :70] = True  # begins 3 m to the left
+    assert np.isnan(road_ahead(view(aside)).left_m).all()
+
+
+def test_results_are_frozen_and_refusals_say_why() -> None:
+    road = road_ahead(view(~blank()))
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        road.lane_width_m = 3.0  # type: ignore[misc]
+    for tolerance_m in (-0.1, math.nan):
+        with pytest.raises(PointsError, match=f"tolerance_m is {tolerance_m}; expected 0 or more"):
+            road_ahead(view(blank()), tolerance_m=tolerance_m)
+    assert math.isnan(road.free_ahead_m(0.01))
+    assert edgeperc.road_ahead is road_ahead
