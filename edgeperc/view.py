@@ -671,7 +671,7 @@ def _draw_top_view(axes: Any, points: NDArray[np.float32], perception: Perceptio
     _say(axes, y_right + 5.4, below, "5 m", ha="right", va="center")
     axes.set_yticks(metres, labels=[f"{at:.0f} m" for at in metres])
     axes.tick_params(left=False, colors=_FAINT, labelsize=9.5, labelfontfamily="DejaVu Sans")
-    _say(axes, 0.0, 1.008, "top view", color=_FAINT, transform=axes.transAxes, va="bottom")
+    _say(axes, 0.0, 1.008, "top view; the line: free ahead", color=_FAINT, transform=axes.transAxes, va="bottom")
 
 
 def _draw_range_image(

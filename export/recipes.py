@@ -37,7 +37,7 @@ class Stage:
 
 
 # From nothing, and with its teacher's answers from the first step on: the focal loss is SqueezeSegV2's.
-KULSEG = Recipe("kulseg", steps=4500, batch=4, focal_gamma=2.0, distil=1.0, seen_twice=False)
+KULSEG = Recipe("kulseg", steps=3600, batch=4, focal_gamma=2.0, distil=1.0, seen_twice=False)
 # Batches of four: for as many scans twice the steps, and better figures. SSADNet without dropout, which a network that
 # sees so few scans does not need, and which upsets batch norm.
 SSADNET = Recipe("ssadnet", batch=4, learning_rate=1.5e-3, context_width=64, n_pasted=3.0, dropout=0.0)
@@ -58,7 +58,11 @@ LODNN = Recipe(
 MODELS = {
     "pointseg-sim": Stage(Recipe("pointseg", simulated_share=1.0, steps=1000, learning_rate=2e-3, cooldown=0.3)),
     "pointseg": Stage(Recipe("pointseg", steps=3600, batch=4, learning_rate=1e-3), after="pointseg-sim"),
-    "kulseg": Stage(KULSEG, teacher="pointseg"),
+    "kulseg-start": Stage(KULSEG, teacher="pointseg"),
+    # Trained on without the focal loss, which on top of class weights makes too many pixels a pedestrian's.
+    "kulseg": Stage(
+        replace(KULSEG, steps=1500, learning_rate=1e-3, cooldown=0.6, focal_gamma=0.0), "kulseg-start", "pointseg"
+    ),
     "ssadnet-sim": Stage(replace(SSADNET, simulated_share=1.0, steps=1300, cooldown=0.3)),
     "ssadnet": Stage(replace(SSADNET, steps=2000), after="ssadnet-sim"),
     # On the very segmentation branch of ssadnet, so that the heads can be compared.
