@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from fractions import Fraction
 from itertools import pairwise
 
 import numpy as np
@@ -788,18 +789,18 @@ def breaks(truth, ids, ignored):
 
 
 def thresholds_by_walking(scores, n_truth):
-    """Twin of `edgeperc.tracking.metrics.recall_thresholds`: KITTI's walk down the scores."""
-    found, wanted = [], 0.0
+    """Twin of `edgeperc.tracking.metrics.recall_thresholds`: KITTI's walk down the scores, in fractions for ties."""
+    found, wanted = [], Fraction(0)
     scores = sorted(scores, reverse=True)
     for k, score in enumerate(scores):
-        here, following = (k + 1) / n_truth, (k + 2) / n_truth
+        here, following = Fraction(k + 1, n_truth), Fraction(k + 2, n_truth)
         if k < len(scores) - 1 and following - wanted < wanted - here:
             continue
         found.append((score, wanted))
-        wanted += 1 / 40
-        if wanted > 1 + 1e-9:
+        wanted += Fraction(1, 40)
+        if wanted > 1:
             break
-    return [score for score, _ in found[1:]], [recall for _, recall in found[1:]]
+    return [score for score, _ in found[1:]], [float(recall) for _, recall in found[1:]]
 
 
 # --- ground ----------------------------------------------------------------------------------------------------------
