@@ -157,12 +157,18 @@ def _database_parser(parser: argparse.ArgumentParser) -> None:
     build.add_argument("--polygons", type=Path, nargs="+", default=[], help="COCO files of roads drawn by hand")
     build.add_argument(
         "--road-by",
-        default="ssadnet-edge",
+        default="lodnn",
         metavar="NAME|PATH|train",
-        help="what finds the other roads: a shipped model (default ssadnet-edge), an .onnx with a card, or train: a "
+        help="what finds the other roads: a shipped model (default lodnn), an .onnx with a card, or train: a "
         "LoDNN for every fold, taught by the roads drawn in the other folds",
     )
-    build.add_argument("--road-steps", type=int, help="training steps a fold of --road-by train (default: the paper's)")
+    build.add_argument(
+        "--road-recipe",
+        choices=("paper", "small"),
+        default="paper",
+        help="of --road-by train: LoDNN-I as published, or the network of the model lodnn, in a thirtieth of the time",
+    )
+    build.add_argument("--road-steps", type=int, help="steps a fold of --road-by train (default: the recipe's)")
     build.add_argument("--provider", default="cpu", help="what runs it, as in edgeperc run (default cpu)")
     build.add_argument("--sensor", default="hdl-64e")
     build.add_argument("--test-drive", action="append", default=[], help="a drive to set apart; again for more")
@@ -195,10 +201,16 @@ def _database_build(args: argparse.Namespace) -> int:
     if args.variations < 0 or (args.workers is not None and args.workers < 1):
         raise ValueError(f"--variations {args.variations} --workers {args.workers}; expected 0 or more, 1 or more")
     recipe = None
-    if args.road_steps is not None:
+    if args.road_by == "train":
+        args.extra = "export"  # what is missing now is torch
+        from .recipes import MODELS
         from .train import PAPER
 
-        recipe = replace(PAPER["lodnn"], steps=args.road_steps)
+        # What lodnn also learnt from, other scans, their objects and a teacher, is not there.
+        small = replace(MODELS["lodnn"].recipe, simulated_share=0.0, n_pasted=0.0, distil=0.0)
+        recipe = {"paper": PAPER["lodnn"], "small": small}[args.road_recipe]
+        if args.road_steps is not None:
+            recipe = replace(recipe, steps=args.road_steps)
     plan = Plan(args.kitti, args.out, args.road_by, args.sensor, args.provider, args.variations)
     report = build(
         plan,

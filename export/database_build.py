@@ -101,7 +101,7 @@ class Plan:
 
     kitti: Path
     out: Path
-    road_by: str = "ssadnet-edge"
+    road_by: str = "lodnn"
     sensor: str = "hdl-64e"
     provider: str = "cpu"
     variations: int = 8
@@ -174,7 +174,7 @@ class RoadModel:
         if not isinstance(view, TopViewGeometry) or "drivable" not in card.classes:
             raise CardMismatchError(
                 f"{model} is a {view.kind} model of {', '.join(card.classes)}; expected a top_view model with a "
-                "class drivable, such as ssadnet-edge"
+                "class drivable, such as lodnn"
             )
         self.path = model
         self._shift = np.array([view.x_range_m[1] - VIEW.x_range_m[1], view.y_range_m[1] - VIEW.y_range_m[1], 0, 0])

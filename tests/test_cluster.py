@@ -83,15 +83,13 @@ def test_a_tall_column_in_any_order_is_the_twins(spread):
     )
 
 
-def test_the_twin_is_dbscan_of_one_sample():
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
+def test_clusters_are_those_of_dbscan_with_one_sample():
+    csgraph, spatial = pytest.importorskip("scipy.sparse.csgraph"), pytest.importorskip("scipy.spatial")
     rng = np.random.default_rng(1)
     points = as_points(rng.uniform(-6, 6, (800, 3)) * [1, 1, 0.3])
-    tree = cKDTree(points[:, :3].astype(np.float64))
+    tree = spatial.cKDTree(points[:, :3].astype(np.float64))
     graph = tree.sparse_distance_matrix(tree, 0.5, output_type="coo_matrix")
-    _, components = connected_components(graph)
+    _, components = csgraph.connected_components(graph)
     first = [np.flatnonzero(components == component)[0] for component in components]
     found = find_clusters(points, distance_per_m=0.0, min_points=1)
     np.testing.assert_array_equal([np.flatnonzero(found == number)[0] for number in found], first)
