@@ -566,10 +566,10 @@ def _box_record(box: Box) -> dict[str, Any]:
     }
 
 
-def _road_record(top_view: TopView) -> dict[str, Any]:
+def _road_record(top_view: TopView, boxes: Sequence[Box]) -> dict[str, Any]:
     from .drivable import road_ahead
 
-    road = road_ahead(top_view)
+    road = road_ahead(top_view, boxes)
     widths = {"free_ahead_m": road.free_ahead_m(), "lane_width_m": road.lane_width_m}
     return {
         "outline": [[round(float(v), 2) for v in corner] for corner in road.outline],
@@ -586,7 +586,7 @@ def _record(perception: Perception, tracks: Tracks | None = None) -> dict[str, A
         "providers": dict(perception.providers),
         "boxes": [_box_record(box) for box in perception.boxes],
         "drivable_area_m2": None if perception.top_view is None else round(perception.top_view.drivable_area_m2, 2),
-        "road": None if perception.top_view is None else _road_record(perception.top_view),
+        "road": None if perception.top_view is None else _road_record(perception.top_view, perception.boxes),
         "point_counts": None if perception.points is None else perception.points.counts(),
         "tracks": [
             {

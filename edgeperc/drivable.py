@@ -7,14 +7,17 @@ is what the network took it for, and what lies beyond the view is unknown.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from .card import TopViewGeometry
 from .errors import PointsError
-from .perception import TopView
+from .geometry import draw_footprints
+from .perception import Box, TopView
 
 __all__ = ["RoadAhead", "road_ahead"]
 
@@ -77,12 +80,14 @@ class RoadAhead:
         return float(self.free_m[near].min()) if near.any() else math.nan
 
 
-def road_ahead(top_view: TopView, *, tolerance_m: float = 0.1) -> RoadAhead:
+def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: float = 0.1) -> RoadAhead:
     """Road polygon, free distance and lane width of a top view, of whatever model.
 
     Parameters
     ----------
     top_view : TopView
+    boxes : iterable of Box
+        What stands in the way, whatever the map says, such as `Perception.boxes`: a top view knows no pedestrians.
     tolerance_m : float
         How far the polygon may leave the edges of the cells (Douglas and Peucker, 1973); 0 keeps every corner. The
         default is a cell of the shipped models, which takes the steps out of a slanting edge. Of rings simplified by
@@ -95,13 +100,20 @@ def road_ahead(top_view: TopView, *, tolerance_m: float = 0.1) -> RoadAhead:
 
     Examples
     --------
-    >>> road = road_ahead(perceive(points).top_view)        # doctest: +SKIP
+    >>> found = perceive(points)                            # doctest: +SKIP
+    >>> road = road_ahead(found.top_view, found.boxes)      # doctest: +SKIP
     >>> road.free_ahead_m(), road.lane_width_m              # doctest: +SKIP
     (31.4, 3.1)
     """
     if not tolerance_m >= 0.0:
         raise PointsError(f"tolerance_m is {tolerance_m}; expected 0 or more metres")
     drivable = np.ascontiguousarray(top_view.drivable)
+    standing = list(boxes)
+    if standing:
+        view = TopViewGeometry(top_view.x_range_m, top_view.y_range_m, cell_m=top_view.cell_m)
+        taken = np.zeros(drivable.shape, np.uint8)
+        draw_footprints(taken, standing, view, ("free", *{box.label for box in standing}))
+        drivable &= taken == 0
     height, width = drivable.shape
     cell_m, (x_near, x_far), y_left = top_view.cell_m, top_view.x_range_m, top_view.y_range_m[1]
     y_m = y_left - (np.arange(width, dtype=np.float64) + 0.5) * np.float64(cell_m)

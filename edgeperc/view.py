@@ -642,7 +642,7 @@ def _draw_top_view(axes: Any, points: NDArray[np.float32], perception: Perceptio
         axes.axhline(at, color=_INK, alpha=0.13, linewidth=0.8, zorder=3)
     axes.set_xlim(y_left, y_right)
     axes.set_ylim(x_near, x_far)
-    road = road_ahead(top_view)
+    road = road_ahead(top_view, perception.boxes)
     for ring in (road.outline, *road.holes):
         edge = Polygon(ring[:, ::-1], closed=True, fill=False, edgecolor=_colour("drivable"), linewidth=1.2, zorder=3)
         axes.add_patch(edge)

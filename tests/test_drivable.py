@@ -15,7 +15,7 @@ from shapely import Point, Polygon
 
 import edgeperc
 import reference
-from edgeperc import PointsError, TopView
+from edgeperc import Box, PointsError, TopView
 from edgeperc.drivable import (
     _rings,
     _simplified,
@@ -206,6 +206,17 @@ def test_nothing_drivable() -> None:
         assert np.isnan(road.width_m).all()
         assert math.isnan(road.lane_width_m)
     assert road_ahead(view(blank())).free_ahead_m() == 6.0
+
+
+def test_what_is_boxed_stands_in_the_way() -> None:
+    pedestrian = Box("pedestrian", 0.9, (20.0, 0.0, -0.9), (0.8, 0.6, 1.8), 0.3)
+    beside = Box("car", 0.9, (30.0, 15.0, -0.9), (4.0, 1.8, 1.5), 0.0)
+    top_view = view(~blank())
+    road = road_ahead(top_view, [pedestrian, beside])
+    assert 19.3 <= road.free_ahead_m() <= 19.7
+    assert len(road.holes) == 1
+    assert (road.free_m[np.abs(road.y_m) > 0.6] == 46.0).all()
+    assert top_view.drivable.all()  # the map itself is as it was
 
 
 def test_everything_drivable() -> None:
