@@ -154,7 +154,7 @@ def plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         axes.plot(values, [100.0 * row["figures"]["drivable"] for _, row in found], "o-", color="#009e73")
         axes.plot([usual[prefix]], [100.0 * shipped["figures"]["drivable"]], "o", color="#202020", label="as shipped")
         axes.set_xscale("log")
-        axes.set_xticks(values, labels=[f"{value:g}" for value in values], minor=False)
+        axes.set_xticks(values, labels=[f"{value:g}" for value in values], minor=False, fontsize=8)
         axes.set_xticks([], minor=True)
         axes.set_xlabel(title)
         axes.grid(alpha=0.3)
