@@ -24,7 +24,6 @@ from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from time import perf_counter_ns
 from types import ModuleType
 
 import numba
@@ -37,11 +36,12 @@ from edgeperc.points import read_points
 from edgeperc.sensors import get_sensor
 from edgeperc.simulation import random_scene, simulate
 
+from .projection import measure
+
 __all__ = ["main"]
 
 SENSOR = get_sensor("hdl-64e")
 DISTANCE_M = 0.5
-N_WARM_UP = 2
 # SemanticKITTI: road, parking, pavement, other ground, lane marking, terrain; unlabelled, outlier, vegetation.
 GROUND_IDS, UNJUDGED_IDS = (40, 44, 48, 49, 60, 72), (0, 1, 70)
 # Nearer to the simulator's ground than this is ground, [m].
@@ -130,18 +130,6 @@ def canonical(clusters: NDArray) -> NDArray[np.int64]:
     """Clusters by their first points, so that numbering does not matter."""
     _, first, inverse = np.unique(clusters, return_index=True, return_inverse=True)
     return first[inverse]
-
-
-def measure(calls: Calls, n_rounds: int) -> dict[str, NDArray[np.float64]]:
-    """Milliseconds of each call in each round."""
-    took = {name: np.empty(N_WARM_UP + n_rounds) for name in calls}
-    rng = np.random.default_rng(0)
-    for k in range(N_WARM_UP + n_rounds):
-        for name in rng.permutation(list(calls)):
-            start = perf_counter_ns()
-            calls[name]()
-            took[name][k] = (perf_counter_ns() - start) / 1e6
-    return {name: ms[N_WARM_UP:] for name, ms in took.items()}
 
 
 def read_truth(scan: Path, n: int) -> Truth | None:

@@ -7,6 +7,7 @@ Exit codes: 0 all is well, 1 some scans failed (each is reported, the others are
 from __future__ import annotations
 
 import argparse
+import contextlib
 import io
 import itertools
 import json
@@ -120,13 +121,21 @@ def _parser() -> argparse.ArgumentParser:
         "--all-around", action="store_true", help="run a range-image model on every part of the turn, not ahead alone"
     )
 
+    adapted = argparse.ArgumentParser(add_help=False)
+    adapted.add_argument(
+        "--adapt",
+        choices=("both", "remission", "interpolation", "neither"),
+        default="both",
+        help="of a sensor unlike the models': render its remission, fill between its beams (default: both)",
+    )
+
     demo = commands.add_parser("demo", parents=[running], help="perceive the bundled scene: a table and a picture")
     demo.add_argument("--out", type=Path, default=Path("edgeperc-demo"), metavar="DIR", help="default: edgeperc-demo")
     demo.set_defaults(command=_demo)
 
     run = commands.add_parser(
         "run",
-        parents=[sensing, running],
+        parents=[sensing, running, adapted],
         help="perceive scans",
         description="Perceive scans: a line each on the terminal, and the files asked for in DIR.",
     )
@@ -155,12 +164,6 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--live", action="store_true", help="replay one PATH in its own time; the newest scan wins")
     run.add_argument(
         "--rate", type=_rate, default=10.0, metavar="HZ", help="scans a second, where they bear no stamps (default: 10)"
-    )
-    run.add_argument(
-        "--adapt",
-        choices=("both", "remission", "interpolation", "neither"),
-        default="both",
-        help="of a sensor unlike the models': render its remission, fill between its beams (default: both)",
     )
     run.set_defaults(command=_run, usage_error=run.error)
 
@@ -217,7 +220,7 @@ def _parser() -> argparse.ArgumentParser:
 
     follow = commands.add_parser(
         "eval-tracking",
-        parents=[sensing, running],
+        parents=[sensing, running, adapted],
         prog="edgeperc eval tracking",
         help="the tracking figures on KITTI's sequences; also written: eval tracking",
         description="Track the given detections of KITTI's sequences, without ego poses, and hold the tracks against "
@@ -244,12 +247,6 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="FILE",
         help="boxes to track in place of either: what run --json printed of the one sequence's scans",
-    )
-    follow.add_argument(
-        "--adapt",
-        choices=("both", "remission", "interpolation", "neither"),
-        default="both",
-        help="as in run (default: both)",
     )
     follow.add_argument("--iou", type=float, default=0.25, metavar="X", help="3-D overlap of a match (default: 0.25)")
     follow.add_argument("--json", type=Path, metavar="FILE", help="every figure")
@@ -647,6 +644,20 @@ class _Progress:
             sys.stderr.flush()
 
 
+@contextlib.contextmanager
+def _counted() -> Iterator[Callable[[int, int], None]]:
+    """What shows how many are done, of how many: a bar that learns the latter when it is first called."""
+    bars: list[_Progress] = []
+
+    def show(done: int, total: int) -> None:
+        bars[:] = bars or [_Progress(total)]
+        bars[0].show(done)
+
+    yield show
+    for bar in bars:
+        bar.clear()
+
+
 # demo
 
 
@@ -878,18 +889,19 @@ def _adapt_fit(arguments: argparse.Namespace) -> int:
 # eval
 
 
+def _write_figures(arguments: argparse.Namespace, figures: Mapping[str, Any]) -> None:
+    """Every figure, and the command that gave them, where ``--json`` says."""
+    if arguments.json is not None:
+        arguments.json.parent.mkdir(parents=True, exist_ok=True)
+        text = json.dumps({"command": arguments.typed, **figures}, indent=1, allow_nan=False)
+        arguments.json.write_text(text + "\n", encoding="utf-8")
+
+
 def _eval_sensors(arguments: argparse.Namespace) -> int:
     from .transfer import compare
 
-    progress: list[_Progress] = []
-
-    def on_scan(done: int, total: int) -> None:
-        progress[:] = progress or [_Progress(total)]
-        progress[0].show(done)
-
-    figures = compare(arguments.datasets, arguments.model, provider=arguments.provider, on_scan=on_scan)
-    for bar in progress:
-        bar.clear()
+    with _counted() as on_scan:
+        figures = compare(arguments.datasets, arguments.model, provider=arguments.provider, on_scan=on_scan)
     lines = [f"{arguments.model}; IoU of points in per cent, mIoU over the classes shown"]
     for name, told in figures.items():
         rows = [
@@ -901,10 +913,7 @@ def _eval_sensors(arguments: argparse.Namespace) -> int:
         title = f"{name}: {_many(told['n_scans'], 'scan')}, {there}; remission: {told['function'] or 'no function'}"
         lines += _table(title, (*columns, ("mIoU", "mean")), rows)
     print("\n".join(lines))
-    if arguments.json is not None:
-        arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        text = json.dumps({"command": arguments.typed, **figures}, indent=1, allow_nan=False)
-        arguments.json.write_text(text + "\n", encoding="utf-8")
+    _write_figures(arguments, figures)
     return 0
 
 
@@ -915,28 +924,19 @@ def _eval(arguments: argparse.Namespace) -> int:
         file.parent.mkdir(parents=True, exist_ok=True)
     from .evaluate import evaluate
 
-    progress: list[_Progress] = []
-
-    def on_scan(done: int, total: int) -> None:
-        progress[:] = progress or [_Progress(total)]
-        progress[0].show(done)
-
-    figures, mistakes = evaluate(
-        arguments.datasets,
-        arguments.model or SHIPPED,
-        split=arguments.split,
-        fold=arguments.fold,
-        road_by=arguments.road_by,
-        boxes_from=arguments.boxes_from,
-        provider=arguments.provider,
-        on_scan=on_scan,
-    )
-    for bar in progress:
-        bar.clear()
+    with _counted() as on_scan:
+        figures, mistakes = evaluate(
+            arguments.datasets,
+            arguments.model or SHIPPED,
+            split=arguments.split,
+            fold=arguments.fold,
+            road_by=arguments.road_by,
+            boxes_from=arguments.boxes_from,
+            provider=arguments.provider,
+            on_scan=on_scan,
+        )
     print("\n".join(_figure_lines(figures)))
-    if arguments.json is not None:
-        text = json.dumps({"command": arguments.typed, **figures}, indent=1, allow_nan=False)
-        arguments.json.write_text(text + "\n", encoding="utf-8")
+    _write_figures(arguments, figures)
     if arguments.worst is not None:
         from .view import draw_mistakes
 
@@ -954,12 +954,6 @@ def _eval_tracking(arguments: argparse.Namespace) -> int:
         file.parent.mkdir(parents=True, exist_ok=True)
     from .tracking.kitti import evaluate_kitti, read_boxes, read_sequence, sequence_names, track_sequence
 
-    progress: list[_Progress] = []
-
-    def on_sequence(done: int, total: int) -> None:
-        progress[:] = progress or [_Progress(total)]
-        progress[0].show(done)
-
     names = arguments.sequences or sequence_names(arguments.root)
     of = "given detections"
     boxes: dict[str, list[list[Box]]] = {}
@@ -967,20 +961,17 @@ def _eval_tracking(arguments: argparse.Namespace) -> int:
         boxes, of = {names[0]: read_boxes(arguments.boxes)}, f"boxes of {arguments.boxes}"
     elif arguments.model or not (arguments.root / "detections").is_dir():
         boxes, of = _perceived(arguments, names)
-    figures = {"of": of} | evaluate_kitti(
-        arguments.root,
-        sequences=names,
-        classes=arguments.classes,
-        boxes=boxes,
-        iou_threshold=arguments.iou,
-        on_sequence=on_sequence,
-    )
-    for bar in progress:
-        bar.clear()
+    with _counted() as on_sequence:
+        figures = {"of": of} | evaluate_kitti(
+            arguments.root,
+            sequences=names,
+            classes=arguments.classes,
+            boxes=boxes,
+            iou_threshold=arguments.iou,
+            on_sequence=on_sequence,
+        )
     print("\n".join(_tracking_lines(figures)))
-    if arguments.json is not None:
-        text = json.dumps({"command": arguments.typed, **_without_nan(figures)}, indent=1, allow_nan=False)
-        arguments.json.write_text(text + "\n", encoding="utf-8")
+    _write_figures(arguments, _without_nan(figures))
     if arguments.gif is not None:
         from .view import draw_tracks
 

@@ -88,6 +88,15 @@ class Calibration:
         with np.errstate(divide="ignore", invalid="ignore"):
             return image[:, :2] / depth[:, None], depth
 
+    def sensor_boxes(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """KITTI's height, width, length, x, y, z, turn in the camera's frame -> x, y, z, length, width, height, yaw."""
+        T_velo_cam = np.linalg.inv(self.T_cam_velo)
+        height, width, length, x, y, z, turn = rows.T
+        # KITTI gives the middle of the bottom face; y points down in the camera frame.
+        middles = np.stack([x, y - height / 2.0, z], axis=1) @ T_velo_cam[:3, :3].T + T_velo_cam[:3, 3]
+        ahead = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], axis=1) @ T_velo_cam[:3, :3].T
+        return np.column_stack([middles, length, width, height, np.arctan2(ahead[:, 1], ahead[:, 0])])
+
     def in_image(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """Which points the camera sees, (n,) bool."""
         pixel, depth = self.to_image(points)
@@ -142,8 +151,7 @@ class Frame:
 
 def read_objects(label_path: Path, calibration: Calibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
     """Boxes of a KITTI label file in the sensor frame, and its DontCare rectangles (SSADNet 3.1.1)."""
-    boxes, unlabelled = [], []
-    T_velo_cam = np.linalg.inv(calibration.T_cam_velo)
+    kinds, rows, unlabelled = [], [], []
     for line in label_path.read_text().splitlines():
         values = line.split()
         if not values:
@@ -152,20 +160,14 @@ def read_objects(label_path: Path, calibration: Calibration) -> tuple[tuple[Box,
         if kind == "DontCare":
             unlabelled.append(numbers[3:7])
             continue
-        height, width, length, x, y, z, turn = numbers[7:14]
-        # KITTI gives the middle of the bottom face; y points down in the camera frame.
-        center = T_velo_cam[:3, :3] @ np.array([x, y - height / 2.0, z]) + T_velo_cam[:3, 3]
-        heading = T_velo_cam[:3, :3] @ np.array([np.cos(turn), 0.0, -np.sin(turn)])
-        boxes.append(
-            Box(
-                label=kind.lower(),
-                score=1.0,
-                center=(float(center[0]), float(center[1]), float(center[2])),
-                size=(length, width, height),
-                yaw=float(np.arctan2(heading[1], heading[0])),
-            )
-        )
-    return tuple(boxes), np.array(unlabelled, np.float64).reshape(-1, 4)
+        kinds.append(kind.lower())
+        rows.append(numbers[7:14])
+    placed = calibration.sensor_boxes(np.array(rows, np.float64).reshape(-1, 7))
+    boxes = tuple(
+        Box(kind, 1.0, (x, y, z), (length, width, height), yaw)
+        for kind, (x, y, z, length, width, height, yaw) in zip(kinds, placed.tolist(), strict=True)
+    )
+    return boxes, np.array(unlabelled, np.float64).reshape(-1, 4)
 
 
 def scan_hash(points: NDArray[np.float32]) -> str:

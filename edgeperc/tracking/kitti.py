@@ -177,7 +177,7 @@ def read_sequence(
     else:
         detections = [list(of_frame) for of_frame in boxes]
     n_frames = len(detections)
-    placed = _sensor_boxes(values[:, 9:16], calibration)
+    placed = calibration.sensor_boxes(values[:, 9:16])
     ignored = (values[:, 2] > MAX_TRUNCATION) | (values[:, 3] > MAX_OCCLUSION)
     truth: dict[str, tuple[FrameTruth, ...]] = {}
     for of in classes:
@@ -214,7 +214,7 @@ def _read_detections(
             raise TrackingError(f"{path} holds no detections; expected 15 comma-separated columns") from exc
         detections += [[] for _ in range(len(detections), 1 + int(rows[:, 0].max(initial=-1.0)))]
         scores = 1.0 / (1.0 + np.exp(-rows[:, 6]))
-        placed = _sensor_boxes(rows[:, 7:14], calibration)
+        placed = calibration.sensor_boxes(rows[:, 7:14])
         for frame, score, row in zip(rows[:, 0].astype(np.int64), scores.tolist(), placed.tolist(), strict=True):
             detections[frame].append(Box(of, score, (row[0], row[1], row[2]), (row[3], row[4], row[5]), row[6]))
     return detections
@@ -245,16 +245,6 @@ def read_boxes(path: Path | str) -> list[list[Box]]:
         ]
     except (KeyError, TypeError, ValueError) as exc:
         raise TrackingError(f"{path} holds no boxes ({exc}); expected what edgeperc run --json printed") from exc
-
-
-def _sensor_boxes(rows: NDArray[np.float64], calibration: Calibration) -> NDArray[np.float64]:
-    """KITTI's height, width, length, x, y, z, turn in the camera's frame -> rows of a box in the sensor's frame."""
-    T_velo_cam = np.linalg.inv(calibration.T_cam_velo)
-    height, width, length, x, y, z, turn = rows.T
-    # KITTI gives the middle of the bottom face; y points down in the camera frame.
-    middles = np.stack([x, y - height / 2.0, z], axis=1) @ T_velo_cam[:3, :3].T + T_velo_cam[:3, 3]
-    ahead = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], axis=1) @ T_velo_cam[:3, :3].T
-    return np.column_stack([middles, length, width, height, np.arctan2(ahead[:, 1], ahead[:, 0])])
 
 
 def track_sequence(
