@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from edgeperc.card import TopViewGeometry
-from edgeperc.datasets import IGNORE, labels_by_boxes
-from edgeperc.evaluate import FEWEST_RETURNS
-from edgeperc.figures import VEHICLES
-from edgeperc.metrics import BoxEvaluator, Confusion
-from edgeperc.simulation import POINT_CLASSES, TOP_VIEW_CLASSES, SimulatedScan
+from edgeperc.evaluation.judge import FEWEST_RETURNS
+from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
+from edgeperc.evaluation.tables import VEHICLES
+from edgeperc.simulation.samples import IGNORE, labels_by_boxes
+from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES, SimulatedScan
 
 from .worker import Answer
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from edgeperc import MissingExtraError, __version__
-from edgeperc.settings import cpu_model
+from edgeperc.tuning import cpu_model
 
 try:
     import psutil

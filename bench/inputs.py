@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import Box, PointsError, read_points
-from edgeperc.captures import SCAN_SUFFIXES
-from edgeperc.datasets import simulated_scan
-from edgeperc.evaluate import FIRST_SEED
+from edgeperc.readers.captures import SCAN_SUFFIXES
 from edgeperc.sensors import get_sensor
-from edgeperc.simulation import SimulatedScan
+from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
+from edgeperc.simulation.scene import SimulatedScan
 
 __all__ = ["Input", "crowd", "read", "simulate", "sized"]
 

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from edgeperc.simulation import SimulatedScan
+from edgeperc.simulation.scene import SimulatedScan
 
 from .accuracy import agreement, agrees, correctness
 from .context import conditions, spoilers

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Clock", "Limits", "Samples", "back_to_back", "paced", "throughput"]
+__all__ = ["Clock", "KeepGoing", "Limits", "Perceive", "Samples", "back_to_back", "paced", "throughput"]
 
 Perceive = Callable[[NDArray[np.float32]], Any]
 

@@ -29,7 +29,7 @@ from .context import EnergyMeter, conditions, peak_rss_mb, rss_mb
 from .loadgen import single_stream
 from .scenarios import Limits, Perceive, Samples, back_to_back, paced
 
-__all__ = ["Answer", "Job", "Scenario", "WorkerError", "measure"]
+__all__ = ["MEMORY_SAMPLES", "Answer", "Job", "OnTick", "Scenario", "WorkerError", "measure"]
 
 TICK_S = 0.25
 MEMORY_SAMPLES = 500  # at most, in a scenario: a longer list would itself be growth

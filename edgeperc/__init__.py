@@ -38,13 +38,13 @@ from .errors import (
 )
 
 if TYPE_CHECKING:
-    from .captures import read_scans
     from .card import ModelCard
     from .drivable import RoadAhead, road_ahead
     from .live import Answer, Stream, stream
     from .perceiver import Perceiver
     from .perception import Box, Perception, PointLabels, TopView
-    from .points import read_points
+    from .readers.captures import read_scans
+    from .readers.files import read_points
     from .sensors import SensorProfile
     from .tracking import Track, Tracker, Tracks
 
@@ -100,8 +100,8 @@ _MODULES = {
     "Track": "tracking",
     "Tracker": "tracking",
     "Tracks": "tracking",
-    "read_points": "points",
-    "read_scans": "captures",
+    "read_points": "readers.files",
+    "read_scans": "readers.captures",
     "road_ahead": "drivable",
     "stream": "live",
 }

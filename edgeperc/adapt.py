@@ -8,278 +8,21 @@ beams and columns of a coarser sensor; the points in them are for the network's 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
-from types import MappingProxyType
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from .card import RangeImageGeometry
 from .errors import PointsError, SensorError
-from .sensors import REMISSION_KINDS, RemissionFunction, SensorProfile
+from .sensors import SensorProfile
 
-__all__ = ["REFERENCES", "Interpolator", "fit_functions", "fit_sensor", "match_quantiles", "render"]
+__all__ = ["Interpolator", "render"]
 
 KIND_CODES = {"linear": 0, "polynomial": 1, "logarithm": 2}
 
-# --- remission -------------------------------------------------------------------------------------------------------
-
-# Strata in which remissions of similar streets are compared: by range [m], then by the cosine of the incidence, last
-# what is no surface (leaves, single beams). Quantiles at the middles of even shares stand for their share of a stratum.
-RANGE_EDGES_M = (3.0, 10.0, 25.0, 60.0)
-COSINE_EDGES = (0.0, 0.35, 1.0)
-N_STRATA = (len(RANGE_EDGES_M) - 1) * len(COSINE_EDGES)
-N_SHARES = 20
-FEWEST = 200  # points in a stratum
-FOLDS = 10
-
-# fmt: off
-REFERENCES: Mapping[str, tuple[tuple[float, tuple[float, ...]], ...]] = MappingProxyType(
-    {
-        # 28 scans of 13 KITTI drives that are trained on.
-        "hdl-64e": (
-            (0.272, (0.00, 0.00, 0.05, 0.10, 0.16, 0.18, 0.19, 0.21, 0.23, 0.25,
-                     0.27, 0.28, 0.29, 0.30, 0.31, 0.32, 0.34, 0.36, 0.38, 0.45)),
-            (0.166, (0.00, 0.00, 0.02, 0.09, 0.16, 0.18, 0.21, 0.25, 0.27, 0.28,
-                     0.29, 0.30, 0.32, 0.33, 0.34, 0.36, 0.38, 0.39, 0.43, 0.52)),
-            (0.107, (0.00, 0.00, 0.00, 0.00, 0.04, 0.11, 0.16, 0.19, 0.23, 0.25,
-                     0.28, 0.29, 0.31, 0.33, 0.34, 0.36, 0.38, 0.41, 0.46, 0.57)),
-            (0.095, (0.00, 0.00, 0.09, 0.16, 0.18, 0.20, 0.22, 0.25, 0.27, 0.28,
-                     0.29, 0.30, 0.31, 0.32, 0.34, 0.36, 0.38, 0.40, 0.43, 0.50)),
-            (0.061, (0.00, 0.00, 0.16, 0.22, 0.26, 0.29, 0.31, 0.32, 0.34, 0.35,
-                     0.36, 0.37, 0.38, 0.40, 0.41, 0.43, 0.46, 0.49, 0.54, 0.63)),
-            (0.179, (0.00, 0.00, 0.11, 0.16, 0.18, 0.20, 0.22, 0.24, 0.26, 0.28,
-                     0.29, 0.31, 0.32, 0.34, 0.36, 0.38, 0.41, 0.45, 0.50, 0.60)),
-            (0.007, (0.00, 0.00, 0.00, 0.00, 0.12, 0.15, 0.17, 0.18, 0.20, 0.22,
-                     0.23, 0.25, 0.27, 0.29, 0.30, 0.31, 0.32, 0.35, 0.38, 0.45)),
-            (0.031, (0.00, 0.00, 0.00, 0.09, 0.14, 0.18, 0.20, 0.22, 0.25, 0.26,
-                     0.28, 0.29, 0.30, 0.32, 0.32, 0.34, 0.35, 0.37, 0.39, 0.46)),
-            (0.082, (0.00, 0.00, 0.00, 0.00, 0.00, 0.00, 0.00, 0.00, 0.09, 0.12,
-                     0.15, 0.17, 0.19, 0.21, 0.24, 0.27, 0.29, 0.32, 0.36, 0.46)),
-        )
-    }
-)
 # fmt: on
-"""By sensor that models are trained on: share of the points and remissions (0..1), stratum by stratum."""
-
-
-def _terms(kind: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    if kind == "linear":
-        return np.stack([np.ones_like(x), x], axis=1)
-    if kind == "polynomial":
-        return np.stack([np.ones_like(x), x, x * x], axis=1)
-    return np.stack([np.ones_like(x), np.log1p(np.maximum(x, 0.0))], axis=1)
-
-
-def _least_squares(kind: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    terms = _terms(kind, x)
-    size = np.abs(terms).max(axis=0) + 1e-30  # x^2 of 16-bit values beside 1 would lose digits
-    return np.asarray(np.linalg.lstsq(terms / size, y, rcond=None)[0] / size, np.float64)
-
-
-def fit_functions(
-    raw: ArrayLike,
-    wanted: ArrayLike,
-    *,
-    full_scale: float,
-    to: str,
-    source: str,
-) -> tuple[RemissionFunction, ...]:
-    """Fit a line, a parabola and a logarithm to pairs of remissions, the best first.
-
-    Parameters
-    ----------
-    raw : (n,) array_like
-        Remission of the sensor at hand, from 0 (the lower end of its ``remission_range``).
-    wanted : (n,) array_like
-        Remission of the other sensor at the same places, 0..1.
-    full_scale : float
-        Upper end of the raw values, e.g. 255.
-    to, source : str
-        Of the functions.
-
-    Returns
-    -------
-    tuple of RemissionFunction
-        By ``rmse`` on pairs held back, every tenth in turn. On the pairs it was fitted to, a parabola is never behind
-        a line; on others it is what the paper found it to be, the worst (KUL-Seg, Table 5).
-
-    Raises
-    ------
-    SensorError
-        Fewer than four finite pairs, or raw values that are all alike.
-    """
-    x, y = np.asarray(raw, np.float64).ravel(), np.asarray(wanted, np.float64).ravel()
-    if len(x) != len(y):
-        raise SensorError(f"got {len(x)} raw values and {len(y)} wanted ones; expected as many of each")
-    good = np.isfinite(x) & np.isfinite(y)
-    order = np.argsort(x[good], kind="stable")
-    x, y = x[good][order], y[good][order]
-    if len(x) < 4 or np.ptp(x) == 0.0:
-        raise SensorError(
-            f"{len(x)} finite pairs of {len(np.unique(x))} raw values; expected 4 or more pairs whose raw values differ"
-        )
-    fold = np.arange(len(x)) % FOLDS
-    found = []
-    for kind in REMISSION_KINDS:
-        errors = np.empty(len(x))
-        for held in (fold == k for k in range(min(len(x), FOLDS))):
-            errors[held] = _terms(kind, x[held]) @ _least_squares(kind, x[~held], y[~held]) - y[held]
-        rmse = math.sqrt(float(np.mean(errors**2)))
-        best = tuple(float(c) for c in _least_squares(kind, x, y))
-        found.append(RemissionFunction(kind, best, full_scale, to, rmse, source))
-    return tuple(sorted(found, key=lambda function: function.rmse))
-
-
-def incidences(points: NDArray[np.float32], cell_m: float = 0.8) -> NDArray[np.float64]:
-    """Cosine between each ray and the normal of the surface around its point, (n,) float64.
-
-    NaN where fewer than six returns lie in the cell of ``cell_m``, or these are no surface (leaves).
-    """
-    xyz = np.asarray(points[:, :3], np.float64)
-    cosines = np.full(len(xyz), np.nan)
-    finite = np.flatnonzero(np.isfinite(xyz).all(axis=1) & (np.abs(xyz) < 1e5).all(axis=1))
-    if not len(finite):
-        return cosines
-    p = xyz[finite]
-    cells = np.floor(p / cell_m).astype(np.int64)
-    _, cell = np.unique(cells @ np.array([1 << 40, 1 << 20, 1]), return_inverse=True)
-    cell = cell.ravel()
-    count = np.bincount(cell).astype(np.float64)
-    mean = np.stack([np.bincount(cell, p[:, k]) for k in range(3)], axis=1) / count[:, None]
-    off = p - mean[cell]
-    spread = np.empty((len(count), 3, 3))
-    for i in range(3):
-        for j in range(3):
-            spread[:, i, j] = np.bincount(cell, off[:, i] * off[:, j]) / count
-    values, vectors = np.linalg.eigh(spread)
-    # The middle extent tells a surface from one beam's line, the least one from leaves.
-    flat = (count >= 6) & (values[:, 1] > 0.0025) & (values[:, 0] < 0.1 * values[:, 1])
-    range_m = np.linalg.norm(p, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        cosine = np.abs((p * vectors[cell, :, 0]).sum(axis=1)) / range_m
-    cosines[finite] = np.where(flat[cell], cosine, np.nan)
-    return cosines
-
-
-def remission_strata(scans: Iterable[NDArray[np.float32]]) -> list[tuple[float, tuple[float, ...]]]:
-    """Share of the points and `N_SHARES` quantiles of their remission, stratum by stratum, as in `REFERENCES`.
-
-    A stratum of fewer than 200 points has a share of 0 and no quantiles.
-
-    Raises
-    ------
-    PointsError
-        An array is no scan.
-    """
-    strata, remissions = [np.empty(0, np.int64)], [np.empty(0)]
-    for scan in scans:
-        if scan.ndim != 2 or scan.shape[1] != 4:
-            raise PointsError(f"got an array of shape {scan.shape}; expected (n, 4): x, y, z, remission")
-        range_m = np.linalg.norm(scan[:, :3].astype(np.float64), axis=1)
-        known = (range_m >= RANGE_EDGES_M[0]) & (range_m < RANGE_EDGES_M[-1]) & np.isfinite(scan[:, 3])
-        cosine = np.nan_to_num(incidences(scan), nan=np.inf)
-        by_range = np.searchsorted(RANGE_EDGES_M, range_m, side="right") - 1
-        by_cosine = np.searchsorted(COSINE_EDGES[1:], cosine, side="left")
-        strata.append((by_range * len(COSINE_EDGES) + by_cosine)[known])
-        remissions.append(scan[known, 3].astype(np.float64))
-    stratum, remission = np.concatenate(strata), np.concatenate(remissions)
-    shares = (np.arange(N_SHARES) + 0.5) / N_SHARES
-    found: list[tuple[float, tuple[float, ...]]] = []
-    for k in range(N_STRATA):
-        own = remission[stratum == k]
-        enough = len(own) >= FEWEST
-        quantiles = tuple(float(v) for v in np.quantile(own, shares)) if enough else ()
-        found.append((len(own) / len(remission) if enough else 0.0, quantiles))
-    return found
-
-
-def match_quantiles(
-    strata: Sequence[tuple[float, Sequence[float]]], reference: Sequence[tuple[float, Sequence[float]]]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pairs of remissions without a place in common: the same share of both sensors' points is as dark.
-
-    Both are taken to see the same mix of strata, each stratum as often as the one that sees it less, so that a wider
-    road or a sensor that looks higher up counts for nothing. Matching within each stratum was tried: a least-squares
-    curve through strata that lie beside one another is too flat, and car IoU on PandaSet 0.44 in place of 0.56.
-
-    Parameters
-    ----------
-    strata, reference : sequence of (share, quantiles)
-        Of `remission_strata`, of scans and of another sensor in similar streets.
-
-    Returns
-    -------
-    raw, wanted : (k,) float64
-        Rising; empty where no stratum is known of both.
-    """
-    both = [
-        (min(share, other_share), own, other)
-        for (share, own), (other_share, other) in zip(strata, reference, strict=True)
-        if share > 0.0 and other_share > 0.0
-    ]
-    if not both:
-        return np.empty(0), np.empty(0)
-    weights = np.repeat([weight for weight, _, _ in both], N_SHARES)
-    raw, wanted = (_mixed(np.concatenate([row[side] for row in both]), weights) for side in (1, 2))
-    return raw, wanted
-
-
-def _mixed(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quantiles of weighted values at the middles of even shares."""
-    order = np.argsort(values, kind="stable")
-    total = np.cumsum(weights[order])
-    shares = (np.arange(N_SHARES) + 0.5) / N_SHARES
-    return np.asarray(values[order][np.searchsorted(total, shares * total[-1])], np.float64)
-
-
-def fit_sensor(
-    scans: Sequence[NDArray[np.float32]], sensor: SensorProfile, to: str = "hdl-64e", *, source: str = ""
-) -> tuple[SensorProfile, tuple[RemissionFunction, ...]]:
-    """A profile whose remission is rendered as another sensor's, from scans of any street.
-
-    Parameters
-    ----------
-    scans : sequence of (n, 4) float32
-        With raw remissions.
-    sensor : SensorProfile
-        What took them.
-    to : str
-        Of `REFERENCES`.
-    source : str
-        What the scans are; by default how many.
-
-    Returns
-    -------
-    profile : SensorProfile
-        ``sensor`` with the best function; no parabola that turns down before full scale.
-    functions : tuple of RemissionFunction
-        All that were tried, best first.
-
-    Raises
-    ------
-    SensorError
-        No reference of that name, or the scans hold too few points.
-    PointsError
-        An array is no scan.
-    """
-    if to not in REFERENCES:
-        raise SensorError(f"no reference remissions of {to!r}; known are {', '.join(REFERENCES)}")
-    low, high = sensor.remission_range
-    raw, wanted = match_quantiles(remission_strata(scans), REFERENCES[to])
-    told = source or f"quantiles by range and incidence of {len(scans)} scans"
-    functions = fit_functions(raw - low, wanted, full_scale=high - low, to=to, source=told)
-    best = next(f for f in functions if f.kind != "polynomial" or _rises(f))  # quantiles rise, so a line does
-    return replace(sensor, remission=best), functions
-
-
-def _rises(parabola: RemissionFunction) -> bool:
-    """Whether brighter stays brighter up to full scale: it may turn down beyond the samples."""
-    _, b, c = parabola.coefficients
-    return b >= 0.0 and b + 2.0 * c * parabola.full_scale >= 0.0
 
 
 def render(points: NDArray[np.float32], sensor: SensorProfile) -> NDArray[np.float32]:
@@ -383,10 +126,12 @@ def rendered_at(x: float, kind: int, coefficients: NDArray[np.float64]) -> float
 # than 0.3 m from what a ray there meets; with steps up to 2 m, 8 to 13 %.
 MIN_ANGLE_DEG = 5.0
 MAX_STEP_M = 0.5
+
 # Neighbouring rings on the road are metres apart: both near the ground, and the line between them level.
 GROUND_M = 0.3
 GROUND_PER_M = 0.02  # of range; the sensor is not quite level, nor is the road
 GROUND_SLOPE = 0.1
+
 # A sensor's spacing up to this many pixels leaves no gaps between neighbours.
 NO_GAP = 1.1
 

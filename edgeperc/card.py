@@ -202,7 +202,7 @@ class ModelCard:
     mount_height_m : float
         Height of the training sensor above the road [m].
     fitness : mapping or None
-        What the training scans looked like (`edgeperc.sensors.FitnessProfile`), or None where nobody measured.
+        What the training scans looked like (`edgeperc.fitness.FitnessProfile`), or None where nobody measured.
     training : mapping
         Data, licence, recipe, seed, frames' hashes: whatever whoever trained it says of it.
     metrics : mapping

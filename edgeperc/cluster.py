@@ -19,7 +19,7 @@ from .errors import PointsError
 from .geometry import oriented_iou
 from .perception import Box
 
-__all__ = ["OBJECT_SIZE_M", "cluster_labels", "find_clusters", "join_boxes", "objects_from_points"]
+__all__ = ["MIN_SCORE", "OBJECT_SIZE_M", "cluster_labels", "find_clusters", "join_boxes", "objects_from_points"]
 
 # Mean length, width and height [m] of KITTI's labelled objects.
 OBJECT_SIZE_M: Mapping[str, tuple[float, float, float]] = MappingProxyType(
@@ -230,8 +230,8 @@ def objects_from_points(
     beside it. So is the height, upwards. A longer side stays. Of boxes that overlap by more than 0.1, or of which one
     has more than half its footprint in the other, the better stays: they are pieces of one object.
 
-    All of this was chosen on KITTI's training drives (`edgeperc.splits.FOLDS`), by labels of networks that had not seen
-    them. ``bench/RESULTS.md`` has what comes of it on the test drives.
+    All of this was chosen on KITTI's training drives (`evaluation.splits.FOLDS`), by labels of networks
+    that had not seen them. ``bench/RESULTS.md`` has what comes of it on the test drives.
     """
     if labels.shape != (len(points),):
         raise PointsError(f"got labels of shape {labels.shape} for {len(points)} points; expected one a point")

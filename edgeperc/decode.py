@@ -9,12 +9,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .card import TopViewGeometry
+from .card import ModelCard, TopViewGeometry
 from .errors import CardMismatchError, InferenceError
-from .geometry import suppress_overlaps
+from .geometry import draw_footprints, suppress_overlaps
 from .perception import Box
 
-__all__ = ["decode_classes", "decode_dense", "decode_slots"]
+__all__ = ["decode_classes", "decode_dense", "decode_slots", "decode_top_view"]
 
 STRIDE = 4  # cells of the top view behind one cell of a box_dense output, along each axis
 MIN_EXTENT_M = 0.5  # a slot below this holds no vehicle
@@ -461,3 +461,51 @@ def add_probabilities(
         total += pixel[c]
     for c in range(n_classes):
         sums[c] += pixel[c] / total if are_logits else pixel[c]
+
+
+def decode_top_view(
+    card: ModelCard, image: NDArray[np.float32], outputs: Mapping[str, NDArray[np.float32]], score_threshold: float
+) -> tuple[NDArray[np.uint8], list[Box]]:
+    """Labels (rows, cols) and boxes from a top-view network's input (C, rows, cols) and its raw outputs, by kind.
+
+    A dense head's boxes are drawn into the labels, as boxes are in the truth (SSADNet 3.1.2). Outside them a cell keeps
+    a box class only where something returned, else it is background, which nobody drives on. On simulated scans that
+    took the IoU of cars from 0.41 to 0.54 and of vans from 0.14 to 0.35: few cells of a vehicle hold a return.
+    """
+    assert isinstance(card.view, TopViewGeometry)
+    kind = next(k for k in outputs if k.startswith("class_"))
+    labels, scores = decode_classes(outputs[kind], kind, model=card.name)
+    found: list[Box] = []
+    if "box_dense" in outputs:
+        found = decode_dense(
+            outputs["box_dense"],
+            outputs[kind],
+            kind,
+            card.view,
+            card.classes,
+            card.box_classes,
+            box_size_priors=card.box_size_priors,
+            box_size_spreads=card.box_size_spreads,
+            score_threshold=score_threshold,
+            iou_threshold=card.nms_iou,
+            model=card.name,
+        )
+        is_box = np.array([name in card.box_classes for name in card.classes])
+        boxed = np.flatnonzero(is_box[labels])  # few cells of many
+        empty = (image.reshape(len(image), -1)[:, boxed] == 0.0).all(axis=0)  # 0 in every channel
+        labels.reshape(-1)[boxed[empty]] = 0
+        draw_footprints(labels, found, card.view, card.classes)
+    elif "box_slots" in outputs:
+        found = decode_slots(
+            outputs["box_slots"],
+            labels,
+            scores,
+            card.view,
+            card.classes,
+            card.box_classes,
+            card.box_size_priors,
+            card.mount_height_m,
+            model=card.name,
+        )
+        found = [b for b in found if b.score >= score_threshold]
+    return labels, found

@@ -19,7 +19,7 @@ from .errors import PointsError
 from .geometry import draw_footprints
 from .perception import Box, TopView
 
-__all__ = ["RoadAhead", "road_ahead"]
+__all__ = ["RoadAhead", "fill_corridor", "fill_free", "fill_rings", "mark_connected", "mark_kept", "road_ahead"]
 
 USUAL_LANE_M = 3.25
 """Lanes of towns and country roads are 2.75 to 3.75 m wide; a road has as many as come nearest to this."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -17,7 +18,7 @@ from .card import TopViewGeometry
 from .errors import PointsError
 from .perception import Box
 
-__all__ = ["bounding_rectangles", "draw_footprints", "oriented_iou", "suppress_overlaps"]
+__all__ = ["bounding_rectangles", "draw_footprints", "inside", "oriented_iou", "suppress_overlaps"]
 
 
 def draw_footprints(
@@ -236,3 +237,13 @@ def pair_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     # Rounding leaves a sliver's area below zero, and that of equal rectangles above their own.
     shared = min(max(0.5 * twice, 0.0), area_a, area_b)
     return float(shared / (area_a + area_b - shared))
+
+
+def inside(box: Box, points: NDArray[Any], margin_m: float = 0.0) -> NDArray[np.bool_]:
+    """Points (n, 3+) within a box grown by a margin, (n,) bool."""
+    offset = points[:, :3] - np.asarray(box.center, np.float32)
+    cos, sin = np.cos(box.yaw), np.sin(box.yaw)
+    along = offset[:, 0] * cos + offset[:, 1] * sin
+    across = offset[:, 1] * cos - offset[:, 0] * sin
+    half = np.asarray(box.size) / 2.0 + margin_m
+    return (np.abs(along) <= half[0]) & (np.abs(across) <= half[1]) & (np.abs(offset[:, 2]) <= half[2])

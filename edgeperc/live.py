@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from .captures import read_scans
 from .errors import PointsError
 from .perception import Perception
+from .readers.captures import read_scans
 
 __all__ = ["Answer", "Health", "Stream", "stream"]
 

@@ -7,7 +7,7 @@ import os
 import threading
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -20,24 +20,25 @@ from numpy.typing import ArrayLike, NDArray
 from .adapt import Interpolator, render
 from .card import ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, join_boxes, objects_from_points
-from .decode import decode_classes, decode_dense, decode_slots
+from .decode import decode_classes, decode_top_view
 from .errors import FitnessError
-from .geometry import draw_footprints
+from .fitness import FitnessProfile, check_fitness
 from .ground import find_ground
-from .models import model_path
+from .models import resolve
 from .perception import Box, Perception, PointLabels, TopView
 from .points import as_points
 from .projection import RangeImageProjector, TopViewProjector, make_projector
 from .refine import label_points, remove_outliers
-from .sensors import FitnessProfile, SensorProfile, check_fitness, get_sensor
+from .sensors import SensorProfile, get_sensor
 from .session import Session
 
-__all__ = ["Perceiver"]
+__all__ = ["ADAPTATIONS", "BoxesFrom", "Perceiver"]
 
 STAGES = ("check", "project", "infer", "decode", "refine", "cluster")
 Adaptation = Literal["both", "remission", "interpolation", "neither"]
 BoxesFrom = Literal["both", "network", "clusters"]
 ADAPTATIONS: tuple[Adaptation, ...] = ("neither", "remission", "interpolation", "both")
+
 # A wrong set-up shows in any scan; a few are looked at, as one may be taken in a tunnel or a depot.
 CHECKED_SCANS = 5
 
@@ -157,7 +158,7 @@ class Perceiver:
         # Neighbouring beams and columns meet on one object, with one missing between them.
         self._distance_per_m = 2.0 * math.radians(max(np.median(gaps_deg or [0.0]), 360.0 / self.sensor.columns))
         given = [models] if isinstance(models, (str, os.PathLike)) else list(models)
-        self._networks = [self._load(_resolve(m), provider, n_threads) for m in given]
+        self._networks = [self._load(resolve(m), provider, n_threads) for m in given]
         views = [n.session.card.view.kind for n in self._networks]
         if not views or len(views) != len(set(views)):
             raise ValueError(
@@ -367,58 +368,3 @@ class Perceiver:
         return [
             b for b in boxes if not any(b.label in classes and view.holds(*b.center[:2]) for view, classes in looking)
         ]
-
-
-def decode_top_view(
-    card: ModelCard, image: NDArray[np.float32], outputs: Mapping[str, NDArray[np.float32]], score_threshold: float
-) -> tuple[NDArray[np.uint8], list[Box]]:
-    """Labels (rows, cols) and boxes from a top-view network's input (C, rows, cols) and its raw outputs, by kind.
-
-    A dense head's boxes are drawn into the labels, as boxes are in the truth (SSADNet 3.1.2). Outside them a cell keeps
-    a box class only where something returned, else it is background, which nobody drives on. On simulated scans that
-    took the IoU of cars from 0.41 to 0.54 and of vans from 0.14 to 0.35: few cells of a vehicle hold a return.
-    """
-    assert isinstance(card.view, TopViewGeometry)
-    kind = next(k for k in outputs if k.startswith("class_"))
-    labels, scores = decode_classes(outputs[kind], kind, model=card.name)
-    found: list[Box] = []
-    if "box_dense" in outputs:
-        found = decode_dense(
-            outputs["box_dense"],
-            outputs[kind],
-            kind,
-            card.view,
-            card.classes,
-            card.box_classes,
-            box_size_priors=card.box_size_priors,
-            box_size_spreads=card.box_size_spreads,
-            score_threshold=score_threshold,
-            iou_threshold=card.nms_iou,
-            model=card.name,
-        )
-        is_box = np.array([name in card.box_classes for name in card.classes])
-        boxed = np.flatnonzero(is_box[labels])  # few cells of many
-        empty = (image.reshape(len(image), -1)[:, boxed] == 0.0).all(axis=0)  # 0 in every channel
-        labels.reshape(-1)[boxed[empty]] = 0
-        draw_footprints(labels, found, card.view, card.classes)
-    elif "box_slots" in outputs:
-        found = decode_slots(
-            outputs["box_slots"],
-            labels,
-            scores,
-            card.view,
-            card.classes,
-            card.box_classes,
-            card.box_size_priors,
-            card.mount_height_m,
-            model=card.name,
-        )
-        found = [b for b in found if b.score >= score_threshold]
-    return labels, found
-
-
-def _resolve(model: str | os.PathLike[str]) -> Path:
-    """A shipped name, or anything that looks like a file, as a path."""
-    if isinstance(model, str) and Path(model).suffix != ".onnx":
-        return model_path(model)
-    return Path(model)

@@ -19,7 +19,15 @@ from numpy.typing import NDArray
 from .card import InputSpec, RangeImageGeometry, TopViewGeometry
 from .errors import CardError, PointsError
 
-__all__ = ["Projection", "RangeImageProjector", "TopViewProjector", "make_projector"]
+__all__ = [
+    "Projection",
+    "RangeImageProjector",
+    "TopViewProjector",
+    "column_edges",
+    "make_projector",
+    "row_edges",
+    "tabulate",
+]
 
 # What a channel holds, as the kernels know it. "height" is z and "distance" the range within the x-y plane.
 CHANNEL_CODES = {"x": 0, "y": 1, "z": 2, "height": 2, "remission": 3, "distance": 4, "range": 5}

@@ -30,9 +30,9 @@ from .errors import (
     ProviderError,
     SettingsError,
 )
-from .settings import compiled_folder, fingerprint, read_setting, settings_path
+from .tuning import compiled_folder, fingerprint, read_setting, settings_path
 
-__all__ = ["PROVIDERS", "Session", "available_providers"]
+__all__ = ["PRECISIONS", "PROVIDERS", "Session", "available_providers", "golden_input"]
 
 logger = logging.getLogger(__name__)
 

@@ -12,10 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from .recipes import MODELS
-from .train import PAPER, Recipe, train
+from .recipe import MODELS, PAPER, Recipe
+from .train import train
 
-__all__ = ["VARIANTS", "ablate", "plot"]
+__all__ = ["PAPERS", "VARIANTS", "ablate", "plot"]
 
 VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "pointseg": {

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import sys
-import webbrowser
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
 from edgeperc import __version__
 from edgeperc.errors import EdgepercError, MissingExtraError
+
+from .database.cli import database_parser
+
+__all__ = ["main"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -54,7 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--teacher", type=Path, help="a checkpoint to learn from: see the recipe's distil")
     train.add_argument("--threads", type=int)
     train.add_argument("--compile", action="store_true", help="through torch.compile, which needs a C++ compiler")
-    recipe = train.add_argument_group("recipe", "see edgeperc_export.train.Recipe")
+    recipe = train.add_argument_group("recipe", "see edgeperc_export.recipe.Recipe")
     for option, of in _recipe_options().items():
         how = {"action": argparse.BooleanOptionalAction} if of is bool else {"type": of}
         recipe.add_argument(option, **how)
@@ -139,7 +141,7 @@ def _parser() -> argparse.ArgumentParser:
     database = commands.add_parser(
         "database", help="scans as top-view images, labels and maps: make, draw roads, export"
     )
-    _database_parser(database)
+    database_parser(database)
 
     models = commands.add_parser("models", help="write MODELS.md from the cards of a folder's models")
     models.add_argument("folder", type=Path)
@@ -147,128 +149,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _database_parser(parser: argparse.ArgumentParser) -> None:
-    parser.set_defaults(extra="database")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    build = commands.add_parser("build", help="make a database of a KITTI object set, or go on where a build stopped")
-    build.add_argument("kitti", type=Path, help="root of a KITTI object set")
-    build.add_argument("out", type=Path, help="folder for the database")
-    build.add_argument("--polygons", type=Path, nargs="+", default=[], help="COCO files of roads drawn by hand")
-    build.add_argument(
-        "--road-by",
-        default="lodnn",
-        metavar="NAME|PATH|train",
-        help="what finds the other roads: a shipped model (default lodnn), an .onnx with a card, or train: a "
-        "LoDNN for every fold, taught by the roads drawn in the other folds",
-    )
-    build.add_argument(
-        "--road-recipe",
-        choices=("paper", "small"),
-        default="paper",
-        help="of --road-by train: LoDNN-I as published, or the network of the model lodnn, in a thirtieth of the time",
-    )
-    build.add_argument("--road-steps", type=int, help="steps a fold of --road-by train (default: the recipe's)")
-    build.add_argument("--provider", default="cpu", help="what runs it, as in edgeperc run (default cpu)")
-    build.add_argument("--sensor", default="hdl-64e")
-    build.add_argument("--test-drive", action="append", default=[], help="a drive to set apart; again for more")
-    build.add_argument("--variations", type=int, default=8, help="of each drawn training scene (default 8)")
-    build.add_argument("--engine", choices=["local", "ray"], default="local")
-    build.add_argument("--workers", type=int, help="scenes made side by side (default: one a core)")
-    build.set_defaults(run=_database_build)
-
-    label = commands.add_parser("label", help="draw roads in a browser, over the images of a database")
-    label.add_argument("out", type=Path, help="the database")
-    label.add_argument("--polygons", type=Path, help="COCO file to go on with and write (default OUT/road.coco.json)")
-    label.add_argument("--kitti", type=Path, help="root of the KITTI object set, for training/image_2's pictures")
-    label.add_argument("--port", type=int, default=8117, help="0 takes any free one (default 8117)")
-    label.add_argument("--no-browser", action="store_true", help="say the address and open nothing")
-    label.set_defaults(run=_database_label)
-
-    coco = commands.add_parser("coco", help="write a database's vehicles and roads as a COCO file")
-    coco.add_argument("out", type=Path, help="the database")
-    coco.add_argument("file", type=Path, help="the COCO file to write")
-    coco.set_defaults(run=_database_coco)
-
-    check = commands.add_parser("check", help="hold every file of a database against its hash")
-    check.add_argument("out", type=Path, help="the database")
-    check.set_defaults(run=_database_check)
-
-
-def _database_build(args: argparse.Namespace) -> int:
-    from .database_build import Plan, build
-
-    if args.variations < 0 or (args.workers is not None and args.workers < 1):
-        raise ValueError(f"--variations {args.variations} --workers {args.workers}; expected 0 or more, 1 or more")
-    recipe = None
-    if args.road_by == "train":
-        args.extra = "export"  # what is missing now is torch
-        from .recipes import MODELS
-        from .train import PAPER
-
-        # What lodnn also learnt from, other scans, their objects and a teacher, is not there.
-        small = replace(MODELS["lodnn"].recipe, simulated_share=0.0, n_pasted=0.0, distil=0.0)
-        recipe = {"paper": PAPER["lodnn"], "small": small}[args.road_recipe]
-        if args.road_steps is not None:
-            recipe = replace(recipe, steps=args.road_steps)
-    plan = Plan(args.kitti, args.out, args.road_by, args.sensor, args.provider, args.variations)
-    report = build(
-        plan,
-        polygons=args.polygons,
-        test_drives=args.test_drive,
-        recipe=recipe,
-        engine=args.engine,
-        workers=args.workers,
-    )
-    for line in report.notes:
-        print(f"edgeperc-export: {line}", file=sys.stderr)
-    for name, reason in report.skipped.items():
-        print(f"edgeperc-export: left out {name}: {reason}", file=sys.stderr)
-    for split, scores in report.scores.items():
-        figures = ", ".join(f"{name} {value:.2%}" for name, value in scores.items() if value is not None)
-        print(f"{args.out}: the road model against the roads drawn in {split} scenes: {figures}")
-    print(f"{args.out}: {report.scenes} scenes, {report.made} made, {report.kept} kept, {len(report.skipped)} left out")
-    return 1 if report.skipped else 0
-
-
-def _database_label(args: argparse.Namespace) -> int:
-    from .label_page import LabelServer
-
-    polygons = args.polygons or args.out / "road.coco.json"
-    with LabelServer(args.out, polygons, kitti=args.kitti, port=args.port) as server:
-        print(f"{server.url} draws into {polygons}; stop with Ctrl+C", flush=True)
-        if not args.no_browser:
-            webbrowser.open(server.url)
-        with contextlib.suppress(KeyboardInterrupt):
-            server.serve_forever()
-    return 0
-
-
-def _database_coco(args: argparse.Namespace) -> int:
-    from .road_polygons import write_database_coco
-    from .topview_database import TopViewDatabase
-
-    aside = args.file.with_name(f".{args.file.name}.part")
-    with aside.open("w") as file:
-        n = write_database_coco(TopViewDatabase(args.out), file)
-    aside.replace(args.file)
-    print(f"{args.file}: {n} annotations")
-    return 0
-
-
-def _database_check(args: argparse.Namespace) -> int:
-    from .topview_database import TopViewDatabase
-
-    database = TopViewDatabase(args.out)
-    damaged = database.damaged()
-    for path in damaged:
-        print(f"edgeperc-export: {path} is missing or damaged; delete it and build again", file=sys.stderr)
-    print(f"{args.out}: {len(database)} scenes, {len(damaged)} files missing or damaged")
-    return 1 if damaged else 0
-
-
 def _make(args: argparse.Namespace) -> int:
-    from .recipes import make
+    from .make import make
 
     path = make(
         args.name,
@@ -317,7 +199,7 @@ def _models(args: argparse.Namespace) -> int:
 
 
 def _simulate(args: argparse.Namespace) -> int:
-    from .dataset import simulate
+    from .simulate import simulate
 
     simulate(args.out, args.n, first=args.first, layouts_root=args.layouts, sensor=args.sensor)
     return 0
@@ -338,7 +220,8 @@ def _recipe_options() -> dict[str, type]:
 
 
 def _train(args: argparse.Namespace) -> int:
-    from .train import PAPER, Recipe, train
+    from .recipe import PAPER, Recipe
+    from .train import train
 
     if args.recipe == "paper" and args.network not in PAPER:
         raise ValueError(f"no recipe of a paper's is kept for {args.network}; expected {' or '.join(PAPER)}")
@@ -360,7 +243,7 @@ def _train(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    from .dataset import fitness_of, parity_scans
+    from .simulate import fitness_of, parity_scans
     from .to_onnx import export
 
     metrics = json.loads(args.metrics.read_text()) if args.metrics else None
@@ -379,7 +262,7 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    from .dataset import parity_scans
+    from .simulate import parity_scans
     from .to_onnx import load, verify
 
     print(json.dumps(verify(load(args.checkpoint)[0], args.model, parity_scans(args.scans))))

@@ -2,158 +2,31 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from edgeperc.card import TopViewGeometry
-from edgeperc.datasets import IGNORE
+from edgeperc.simulation.samples import IGNORE
+
+from .targets import REGRESSED_FROM
 
 __all__ = [
+    "GEOMETRY_WEIGHTS",
     "box_distillation_loss",
     "cross_entropy",
     "dense_loss",
-    "dense_targets",
     "distillation_loss",
     "lovasz_softmax",
     "pointseg_loss",
     "road_loss",
-    "slot_targets",
     "slots_loss",
     "ssadnet_loss",
 ]
 
-STRIDE = 4
-"""Top-view cells along the edge of an output cell of head "dense"."""
-
-REGRESSED_FROM = 0.5
-"""Cells whose heat is at least this learn the box's geometry, weighted by the heat. The peak found may be a neighbour
-of the true one, whose geometry must then be right too."""
 
 # Offsets, log sizes and the doubled angle err by about as much in an untrained head; height above ground, which no
 # metric here looks at, counts half.
 GEOMETRY_WEIGHTS = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.5, 0.5)
-
-
-# --- Targets ---------------------------------------------------------------------------------------------------------
-
-
-def slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> NDArray[np.float32]:
-    """Upright boxes around rotated footprints, nearest first (SSADNet 3.1.1).
-
-    Parameters
-    ----------
-    boxes : (m, 7) array_like
-        x, y, z of the centre, length, width, height [m], yaw [rad], in the sensor frame.
-    view : TopViewGeometry
-    n_slots : int
-        The nearest this many are kept.
-
-    Returns
-    -------
-    (n_slots, 4) float32
-        Centre column, centre row, width and height as shares of the image's width and height; zeros in empty slots.
-        Boxes whose centre is outside the view are left out.
-
-    Raises
-    ------
-    ValueError
-        A length, width or height is not positive.
-    """
-    boxes, rows, cols = _boxes_in_view(boxes, view)
-    length, width, yaw = boxes[:, 3], boxes[:, 4], boxes[:, 6]
-    across = np.abs(length * np.sin(yaw)) + np.abs(width * np.cos(yaw))
-    along = np.abs(length * np.cos(yaw)) + np.abs(width * np.sin(yaw))
-    found = np.stack(
-        [cols / view.width, rows / view.height, across / view.cell_m / view.width, along / view.cell_m / view.height],
-        axis=1,
-    )
-    nearest = np.argsort(-rows, kind="stable")[:n_slots]
-    target = np.zeros((n_slots, 4), np.float32)
-    target[: len(nearest)] = found[nearest]
-    return target
-
-
-def dense_targets(
-    boxes: ArrayLike,
-    view: TopViewGeometry,
-    *,
-    labelled: NDArray[np.bool_] | None = None,
-    unsure: ArrayLike | None = None,
-) -> NDArray[np.float32]:
-    """Heat map and geometry for head "dense".
-
-    Parameters
-    ----------
-    boxes : (m, 7) array_like
-        As for `slot_targets`.
-    view : TopViewGeometry
-        Height and width divisible by 4.
-    labelled : (height, width) bool, optional
-        False where a box would not have been labelled, as outside the camera's view.
-    unsure : (k, 7) array_like, optional
-        Boxes that are neither to be found nor to be missed, such as those without a single point in them.
-
-    Returns
-    -------
-    (9, height/4, width/4) float32
-        Channel 0: 1 in the output cell that holds a box's centre, falling off as a Gaussian shaped like the box (its
-        edges are three standard deviations away); -1 where nothing is to be learned. Channels 1 to 8: the geometry of
-        the box with the highest heat, in the format of box_dense, where that heat is at least `REGRESSED_FROM`; else 0.
-    """
-    height, width = view.height // STRIDE, view.width // STRIDE
-    target = np.zeros((9, height, width), np.float32)
-    heat = target[0]
-
-    boxes, rows, cols = _boxes_in_view(boxes, view)
-    for box, row, col in zip(boxes, rows / STRIDE, cols / STRIDE, strict=True):
-        bump = _gaussian(box, row, col, (height, width), view.cell_m * STRIDE)
-        cell_rows, cell_cols = np.nonzero((bump > heat) & (bump >= REGRESSED_FROM))
-        double_yaw = 2.0 * box[6]
-        target[1, cell_rows, cell_cols] = row - (cell_rows + 0.5)
-        target[2, cell_rows, cell_cols] = col - (cell_cols + 0.5)
-        target[3:, cell_rows, cell_cols] = np.array(
-            [np.log(box[3]), np.log(box[4]), np.sin(double_yaw), np.cos(double_yaw), box[2], np.log(box[5])]
-        )[:, None]
-        np.maximum(heat, bump, out=heat)
-
-    unlearned = np.zeros((height, width), bool)
-    if labelled is not None:
-        unlearned |= ~labelled.reshape(height, STRIDE, width, STRIDE).all((1, 3))
-    if unsure is not None:
-        boxes, rows, cols = _boxes_in_view(unsure, view)
-        for box, row, col in zip(boxes, rows / STRIDE, cols / STRIDE, strict=True):
-            unlearned |= _gaussian(box, row, col, (height, width), view.cell_m * STRIDE) > 0.1
-    heat[unlearned & (heat < REGRESSED_FROM)] = -1.0
-    return target
-
-
-def _boxes_in_view(
-    boxes: ArrayLike, view: TopViewGeometry
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Boxes whose centre is in the view, and the row and column [cells, from the far left corner] of those centres."""
-    boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
-    if not (boxes[:, 3:6] > 0.0).all():
-        raise ValueError("a box is without extent; expected length, width and height above 0 m")
-    rows = (view.x_range_m[1] - boxes[:, 0]) / view.cell_m
-    cols = (view.y_range_m[1] - boxes[:, 1]) / view.cell_m
-    inside = (rows >= 0) & (rows < view.height) & (cols >= 0) & (cols < view.width)
-    return boxes[inside], rows[inside], cols[inside]
-
-
-def _gaussian(
-    box: NDArray[np.float64], row: float, col: float, shape: tuple[int, int], cell_m: float
-) -> NDArray[np.float32]:
-    """A bump of height 1 in the output cell that holds (row, col), as long and wide as the box."""
-    forward = int(row) - np.arange(shape[0])[:, None]  # rows grow backwards, columns to the right
-    left = int(col) - np.arange(shape[1])[None, :]
-    cos, sin = np.cos(box[6]), np.sin(box[6])
-    along, across = cos * forward + sin * left, cos * left - sin * forward
-    # No narrower than half a cell, or a bump would be one cell and hard to hit.
-    sigma_along, sigma_across = max(box[3] / cell_m / 6.0, 0.5), max(box[4] / cell_m / 6.0, 0.5)
-    return np.exp(-0.5 * ((along / sigma_along) ** 2 + (across / sigma_across) ** 2)).astype(np.float32)
 
 
 # --- Losses ----------------------------------------------------------------------------------------------------------

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from edgeperc.card import ModelCard, TopViewGeometry
-from edgeperc.figures import BANDS
+from edgeperc.evaluation.splits import FOLDS, TEST_DRIVES
+from edgeperc.evaluation.tables import BANDS
 from edgeperc.session import Session
-from edgeperc.splits import FOLDS, TEST_DRIVES
 
 __all__ = ["models_page"]
 

@@ -28,18 +28,18 @@ from onnxruntime.quantization import CalibrationMethod, QDQQuantizer, QuantType,
 from tqdm import tqdm
 
 from edgeperc.card import ModelCard
-from edgeperc.datasets import SEQUENCE_DRIVES, KittiObjects, scan_hash, simulated_scan
-from edgeperc.decode import decode_classes
+from edgeperc.decode import decode_classes, decode_top_view
 from edgeperc.errors import EdgepercError, PointsError, SplitError
-from edgeperc.evaluate import evaluate
-from edgeperc.metrics import BoxEvaluator, Confusion
-from edgeperc.perceiver import decode_top_view
-from edgeperc.points import read_points
+from edgeperc.evaluation.datasets import SEQUENCE_DRIVES, KittiObjects, scan_hash
+from edgeperc.evaluation.evaluate import evaluate
+from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
+from edgeperc.evaluation.splits import in_split
 from edgeperc.projection import make_projector
+from edgeperc.readers.files import read_points
 from edgeperc.session import Session
-from edgeperc.splits import in_split
+from edgeperc.simulation.samples import simulated_scan
 
-from .dataset import parity_scans
+from .simulate import parity_scans
 from .to_onnx import with_golden, write_card
 
 __all__ = ["RefusedError", "calibration_scans", "quantize"]

@@ -21,17 +21,17 @@ from numpy.typing import NDArray
 from torch import nn
 
 from edgeperc.card import CARD_KEY, Golden, ModelCard
-from edgeperc.decode import decode_classes
+from edgeperc.decode import decode_classes, decode_top_view
 from edgeperc.errors import EdgepercError
-from edgeperc.perceiver import decode_top_view
+from edgeperc.fitness import FitnessProfile
 from edgeperc.projection import make_projector
-from edgeperc.sensors import FitnessProfile
 from edgeperc.session import Session, golden_input
 
 from .cards import card_of
-from .train import Recipe, build
+from .networks import build
+from .recipe import Recipe
 
-__all__ = ["ParityError", "export", "verify", "write_card"]
+__all__ = ["ParityError", "export", "load", "to_graph", "verify", "with_golden", "write_card"]
 
 OPSET = 18
 # fp32 convolutions summed in another order were seen to differ by 1e-4 of the outputs' deviation; a wrong operator

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from importlib import resources
 from pathlib import Path
 
 from edgeperc.errors import ModelFileError
 
-__all__ = ["model_path", "shipped_models"]
+__all__ = ["SHIPPED", "model_path", "resolve", "shipped_models"]
 
 
 def shipped_models() -> tuple[str, ...]:
@@ -39,3 +40,13 @@ def model_path(name: str) -> Path:
         known = ", ".join(shipped) or "none in this installation"
         raise ModelFileError(f"no model is called {name!r}. Shipped: {known}. Or give the path of an .onnx file.")
     return Path(str(resources.files(__name__).joinpath(f"{name}.onnx")))
+
+
+SHIPPED = ("ssadnet", "pointseg")
+
+
+def resolve(model: str | os.PathLike[str]) -> Path:
+    """A shipped name, or anything that looks like a file, as a path."""
+    if isinstance(model, str) and Path(model).suffix != ".onnx":
+        return model_path(model)
+    return Path(model)

@@ -13,7 +13,7 @@ import numpy as np
 
 
 def unpack_lzf(packed, size):
-    """Twin of `edgeperc.points.fill_unpacked_lzf`: the bytes, or None where the data is damaged."""
+    """Twin of `edgeperc.readers.pcd.fill_unpacked_lzf`: the bytes, or None where the data is damaged."""
     packed, out = list(packed), []
     try:
         while packed:
@@ -44,7 +44,7 @@ def unpack_lzf(packed, size):
 
 
 def scan_sums(points, step, beam_step, view_right, view_left):
-    """Twin of `edgeperc.sensors.fill_scan_sums`: its outputs in their order, but ``rows`` as eight lists."""
+    """Twin of `edgeperc.fitness.fill_scan_sums`: its outputs in their order, but ``rows`` as eight lists."""
 
     def finite(rows):
         return rows[np.isfinite(rows).all(axis=1)].astype(np.float64)
@@ -427,7 +427,7 @@ def uniform_draw(bits: int) -> float:
 
 
 def crossing(primitive: np.ndarray, direction: np.ndarray) -> tuple[float, float] | None:
-    """Where a ray from the origin enters and leaves one primitive of `edgeperc.simulation`."""
+    """Where a ray from the origin enters and leaves one primitive of `edgeperc.simulation.raycast`."""
     kind, matrix = int(primitive[0]), primitive[7:16].reshape(3, 3)
     front, rear, side = primitive[16:19] / 2.0
     start, way = matrix @ -primitive[4:7], matrix @ direction
@@ -669,7 +669,7 @@ def motion_support(landmarks, detections, prior, spread, motion):
 
 
 def hidden(state, shape, seen, sensor):
-    """Twin of `edgeperc.tracking.tracker.fill_hidden`."""
+    """Twin of `edgeperc.tracking.lives.fill_hidden`."""
     off = state[:, :2] - sensor
     azimuth, distance = np.arctan2(off[:, 1], off[:, 0]), np.hypot(off[:, 0], off[:, 1])
     turned = state[:, 3] - azimuth
@@ -684,7 +684,7 @@ def hidden(state, shape, seen, sensor):
 
 
 def updated_shapes(state, beta, detections, shapes, sigmas, walk, shape, variance, front):
-    """Twin of `edgeperc.tracking.tracker.update_shapes`: the new shape, variance and front."""
+    """Twin of `edgeperc.tracking.lives.update_shapes`: the new shape, variance and front."""
     variance = variance + walk**2
     detected = 1 - beta[:, :1]
     gain = variance / (variance + sigmas**2)
@@ -694,7 +694,7 @@ def updated_shapes(state, beta, detections, shapes, sigmas, walk, shape, varianc
 
 
 def lives(tracks, classes, beta, hidden, logits, kinds, dt, most_hidden, expected, most):
-    """Twin of `edgeperc.tracking.tracker.update_lives`: the tracks as they are then."""
+    """Twin of `edgeperc.tracking.lives.update_lives`: the tracks as they are then."""
     tracks = tracks.copy()
     hit = beta[:, 0] < 0.5
     best = np.argmax(beta[hit, 1:], axis=1) if hit.any() else np.zeros(0, int)
@@ -715,7 +715,7 @@ def lives(tracks, classes, beta, hidden, logits, kinds, dt, most_hidden, expecte
 
 
 def newborn(first_id, kinds, classes, detections, shapes, logits, ranges, most, dtype):
-    """Twin of `edgeperc.tracking.tracker.fill_newborn`."""
+    """Twin of `edgeperc.tracking.lives.fill_newborn`."""
     tracks = np.zeros(len(kinds), dtype)
     for track, kind, of, detection, shape, logit, distance in zip(
         tracks, kinds, classes, detections, shapes, logits, ranges, strict=True
@@ -741,7 +741,7 @@ def newborn(first_id, kinds, classes, detections, shapes, logits, ranges, most, 
 
 
 def in_view(tracks, pose, left, right):
-    """Twin of `edgeperc.tracking.tracker.mark_out_of_view`, of tracks that were not detected."""
+    """Twin of `edgeperc.tracking.lives.mark_out_of_view`, of tracks that were not detected."""
     along = 0.5 * tracks["shape"][:, 1:2] * [1, -1, -1, 1]
     across = 0.5 * tracks["shape"][:, 2:3] * [1, 1, -1, -1]
     corners = (along + 1j * across) * np.exp(1j * tracks["state"][:, 3:4]) + tracks["state"][:, 0:1]
@@ -751,7 +751,7 @@ def in_view(tracks, pose, left, right):
 
 
 def rivals(state, shape, strength, told):
-    """Twin of `edgeperc.tracking.tracker.mark_rivals`: which are told of."""
+    """Twin of `edgeperc.tracking.lives.mark_rivals`: which are told of."""
     kept = []
     for i in sorted(np.flatnonzero(told), key=lambda i: -strength[i]):
         for j in kept:
@@ -770,7 +770,7 @@ def rivals(state, shape, strength, told):
 
 
 def breaks(truth, ids, ignored):
-    """Twin of `edgeperc.tracking.metrics.count_breaks`: ID switches and fragments, as KITTI counts them."""
+    """Twin of `edgeperc.evaluation.tracking_metrics.count_breaks`: ID switches and fragments, as KITTI counts them."""
     switches = fragments = 0
     for one in {*truth.tolist()}:
         own, hidden = ids[truth == one].tolist(), ignored[truth == one].tolist()
@@ -789,7 +789,7 @@ def breaks(truth, ids, ignored):
 
 
 def thresholds_by_walking(scores, n_truth):
-    """Twin of `edgeperc.tracking.metrics.recall_thresholds`: KITTI's walk down the scores, in fractions for ties."""
+    """Twin of `tracking_metrics.recall_thresholds`: KITTI's walk down the scores, in fractions for ties."""
     found, wanted = [], Fraction(0)
     scores = sorted(scores, reverse=True)
     for k, score in enumerate(scores):
@@ -985,7 +985,7 @@ def rectangle(members, l_shaped):
 
 
 def picture(points):
-    """Twin of `edgeperc_export.topview_database.picture`, point by point: round, clamp, keep the highest."""
+    """Twin of `edgeperc_export.database.files.picture`, point by point: round, clamp, keep the highest."""
     image, highest = np.zeros((400, 200, 3), np.uint8), {}
     for x, y, z, remission in points.astype(np.float64):
         if not (6 <= x <= 46 and -10 <= y <= 10 and -2.5 <= z <= 2.5 and np.isfinite(remission)):

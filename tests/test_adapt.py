@@ -14,25 +14,26 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import reference
-from edgeperc import Perceiver, cli
-from edgeperc.adapt import (
+from edgeperc import Perceiver
+from edgeperc.adapt import Interpolator, render
+from edgeperc.card import InputSpec, RangeImageGeometry
+from edgeperc.cli import main as cli
+from edgeperc.errors import PointsError, SensorError
+from edgeperc.evaluation.transfer import compare
+from edgeperc.projection import RangeImageProjector
+from edgeperc.sensor_fit import (
     N_SHARES,
     N_STRATA,
     REFERENCES,
-    Interpolator,
     fit_functions,
     fit_sensor,
     incidences,
     match_quantiles,
     remission_strata,
-    render,
 )
-from edgeperc.card import InputSpec, RangeImageGeometry
-from edgeperc.errors import PointsError, SensorError
-from edgeperc.projection import RangeImageProjector
 from edgeperc.sensors import SENSORS, RemissionFunction, SensorProfile, get_sensor
-from edgeperc.simulation import random_scene, simulate
-from edgeperc.transfer import compare
+from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.scene import simulate
 
 HDL = get_sensor("hdl-64e")
 VIEW = RangeImageGeometry(HDL.elevations_deg)

@@ -12,19 +12,11 @@ from hypothesis import strategies as st
 
 pytest.importorskip("tqdm")
 
-from edgeperc.datasets import IGNORE, POINT_CLASS_OF, inside, simulated_scan
+from edgeperc.geometry import inside
 from edgeperc.perception import Box
-from edgeperc_export.augment import (
-    SURFACE,
-    LabelledScan,
-    ObjectBank,
-    augmented,
-    facing,
-    pasted,
-    swapped,
-    turned,
-    weathered,
-)
+from edgeperc.simulation.samples import IGNORE, POINT_CLASS_OF, simulated_scan
+from edgeperc_export.augment import ObjectBank, augmented, facing, pasted, swapped, weathered
+from edgeperc_export.scans import SURFACE, LabelledScan, turned
 
 GROUND_M = -1.73
 

@@ -20,12 +20,17 @@ import pytest
 
 pytest.importorskip("psutil")
 
-from edgeperc import settings
-from edgeperc.datasets import simulated_scan
+from edgeperc import tuning as settings
 from edgeperc.errors import MissingExtraError, ModelFileError, PointsError
 from edgeperc.perception import Box, PointLabels, TopView
-from edgeperc.simulation import TOP_VIEW_CLASSES
-from edgeperc_bench import accuracy, cli, context, inputs, loadgen, measure, report, worker
+from edgeperc.simulation.samples import simulated_scan
+from edgeperc.simulation.scene import TOP_VIEW_CLASSES
+from edgeperc_bench import accuracy, cli, context, inputs, loadgen, measure, render, report, worker
+from edgeperc_bench.commands.matrix import _recommended, settings_to_try
+from edgeperc_bench.commands.soak import memory_growth
+from edgeperc_bench.document import ReportError, read_report, write_report
+from edgeperc_bench.plots import pictures
+from edgeperc_bench.render import LiveTable, html_page, markdown
 from edgeperc_bench.samples import compare, noise_floor, percentile, summary, supported, trend
 from edgeperc_bench.scenarios import Clock, Limits, Samples, back_to_back, paced, throughput
 
@@ -116,7 +121,7 @@ def test_a_trends_error_grows_where_neighbours_are_alike() -> None:
 def test_a_soak_tells_growth_from_noise(slope: float, verdict: str) -> None:
     done = np.linspace(0, 18_000, 500)
     mb = 300.0 + slope * done + np.random.default_rng(2).normal(0.0, 0.3, 500)
-    told = cli.memory_growth(np.stack([done, mb], axis=1).tolist(), 2000)
+    told = memory_growth(np.stack([done, mb], axis=1).tolist(), 2000)
     assert told["verdict"] == verdict
     assert told["growth_mb"] == pytest.approx(slope * 18_000, abs=0.3)
 
@@ -124,8 +129,8 @@ def test_a_soak_tells_growth_from_noise(slope: float, verdict: str) -> None:
 def test_a_soak_may_be_undecided() -> None:
     done = np.linspace(0, 18_000, 8)
     mb = [300.0, 310.0, 295.0, 305.0, 300.0, 312.0, 296.0, 303.0]
-    assert cli.memory_growth(np.stack([done, mb], axis=1).tolist(), 0)["verdict"] == "undecided"
-    assert cli.memory_growth([[10, 300.0]], 0)["verdict"] == "undecided"
+    assert memory_growth(np.stack([done, mb], axis=1).tolist(), 0)["verdict"] == "undecided"
+    assert memory_growth([[10, 300.0]], 0)["verdict"] == "undecided"
 
 
 # scenarios
@@ -381,12 +386,12 @@ def plain(value: Any) -> Any:
 
 def test_json_comes_back_as_it_went(tmp_path: Path) -> None:
     written = plain(document(20.0, 20.1))
-    report.write_report(written, tmp_path / "a.json")
-    assert report.read_report(tmp_path / "a.json") == written
+    write_report(written, tmp_path / "a.json")
+    assert read_report(tmp_path / "a.json") == written
     for k, text in enumerate(("nonsense", "[]", '{"schema": 99, "kind": "run"}')):
         (tmp_path / f"{k}.json").write_text(text)
-        with pytest.raises(report.ReportError, match=rf"{k}\.json"):
-            report.read_report(tmp_path / f"{k}.json")
+        with pytest.raises(ReportError, match=rf"{k}\.json"):
+            read_report(tmp_path / f"{k}.json")
 
 
 def test_figures_of_a_scenario_are_of_all_repeats() -> None:
@@ -404,7 +409,7 @@ def test_figures_of_a_scenario_are_of_all_repeats() -> None:
 
 def test_a_page_is_well_formed_and_needs_nothing_from_elsewhere(matplotlib: None) -> None:
     told = document(20.0, 20.1)
-    page = report.html_page(report.sections(told), "<title>", report.pictures(told))
+    page = html_page(report.sections(told), "<title>", pictures(told))
     root = ET.fromstring(page.partition("\n")[2])
     assert len([element for element in root.iter() if element.tag.endswith("svg")]) == 1
     assert "A <fast> & quiet CPU" in "".join(root.itertext())
@@ -425,16 +430,16 @@ def test_a_page_is_well_formed_and_needs_nothing_from_elsewhere(matplotlib: None
 
 def test_words_and_tables_hold_what_was_measured() -> None:
     parts = report.sections(document(20.0, 20.1))
-    shown = report.text(parts)
+    shown = render.text(parts)
     assert "disturbed: others | are busy" in shown
     assert "single-stream" in shown
     assert "paced:10" in shown
-    written = report.markdown(parts, "a | b")
+    written = markdown(parts, "a | b")
     assert written.startswith("# a \\| b\n")
     for block in re.findall(r"(?:^\|.*\n)+", written, flags=re.M):
         counts = {len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}
         assert len(counts) == 1
-    interrupted = report.text(report.sections(document(20.0) | {"complete": False}))
+    interrupted = render.text(report.sections(document(20.0) | {"complete": False}))
     assert "interrupted" in interrupted
 
 
@@ -443,7 +448,7 @@ def test_a_live_table_replaces_itself_on_a_terminal_only() -> None:
         def isatty(self) -> bool:
             return True
 
-    live, file = report.LiveTable(Terminal()), report.LiveTable(io.StringIO())
+    live, file = LiveTable(Terminal()), LiveTable(io.StringIO())
     for table in (live, file):
         table("single-stream", [3.0] * 30)
         table.say("next")
@@ -460,7 +465,7 @@ def test_a_live_table_replaces_itself_on_a_terminal_only() -> None:
 @pytest.fixture
 def reports(tmp_path: Path) -> Any:
     def written(name: str, *medians: float, **changes: Any) -> str:
-        report.write_report(plain(document(*medians, **changes)), tmp_path / name)
+        write_report(plain(document(*medians, **changes)), tmp_path / name)
         return str(tmp_path / name)
 
     return written
@@ -504,12 +509,12 @@ def test_wrong_words_are_refused(words: list[str], capsys: pytest.CaptureFixture
 
 
 def test_the_matrix_skips_nothing_silently() -> None:
-    settings, skipped = cli.settings_to_try(["all"], ["fp32", "bf16"], ("openvino", "cpu"))
+    settings, skipped = settings_to_try(["all"], ["fp32", "bf16"], ("openvino", "cpu"))
     assert settings == ["openvino:fp32", "openvino:bf16", "cpu"]
     told = "\n".join(skipped)
     assert "cuda: not available" in told
     assert "cpu in bf16" in told
-    assert cli.settings_to_try(["cpu"], ["bf16"], ("cpu",))[0] == []
+    assert settings_to_try(["cpu"], ["bf16"], ("cpu",))[0] == []
 
 
 def test_the_matrix_recommends_the_fastest_that_agrees() -> None:
@@ -518,13 +523,13 @@ def test_the_matrix_recommends_the_fastest_that_agrees() -> None:
         (setting,) = document(median, median + 0.1)["settings"]
         settings.append(setting | {"provider": provider, "accuracy": {"agrees": agrees}})
     told = {"settings": settings, "machine": {"cpu": "c"}, "software": {"onnxruntime": "1", "taken": "t"}}
-    (found,) = cli._recommended(told)
+    (found,) = _recommended(told)
     assert found["entry"]["provider"] == "openvino:fp32"
     assert found["sha256"] == "f" * 64
     assert "is slower" in found["words"]
     for setting in settings:
         setting["accuracy"] = {"agrees": False}
-    assert cli._recommended(told) == []
+    assert _recommended(told) == []
 
 
 def test_scans_are_sized_and_crowded(tmp_path: Path) -> None:
@@ -615,12 +620,12 @@ def in_process(no_wait: None, monkeypatch: pytest.MonkeyPatch) -> list[worker.Jo
 def test_a_matrix_measures_every_setting_and_keeps_the_best(
     in_process: list[worker.Job], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(cli, "available_providers", lambda: ("openvino", "cpu"))
+    monkeypatch.setattr("edgeperc_bench.commands.matrix.available_providers", lambda: ("openvino", "cpu"))
     np.save(tmp_path / "own.npy", np.ones((50, 4), np.float32))
     words = ["--model", "pointseg", "--providers", "all", "--precisions", "fp32,bf16", "--threads", "1,2"]
     words += ["--min-scans", "20", "--min-seconds", "0", "--input", str(tmp_path / "own.npy")]
     assert cli.main([*words, "--recommend", str(tmp_path / "r.json"), "--json", str(tmp_path / "m.json")]) == 0
-    told = report.read_report(tmp_path / "m.json")
+    told = read_report(tmp_path / "m.json")
     assert [(s["provider"], s["n_threads"]) for s in told["settings"]] == [
         ("openvino:fp32", 1),
         ("openvino:fp32", 2),
@@ -644,7 +649,7 @@ def test_scaling_tells_points_cars_sizes_and_processes(
     words += ["--min-scans", "20"]
     plot = tmp_path / "new" / "growth.svg"
     assert cli.main([*words, "--min-seconds", "0", "--plot", str(plot), "--json", str(tmp_path / "s.json")]) == 0
-    tables = report.read_report(tmp_path / "s.json")["tables"]
+    tables = read_report(tmp_path / "s.json")["tables"]
     assert [[row[0] for row in table["rows"]] for table in tables] == [
         ["1,000", "2,000", "4,000"],
         ["0", "2"],
@@ -660,7 +665,7 @@ def test_a_soak_reports_memory(
     in_process: list[worker.Job], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["soak", "--scans", "1000", "--json", str(tmp_path / "s.json")]) == 0
-    told = report.read_report(tmp_path / "s.json")
+    told = read_report(tmp_path / "s.json")
     samples = told["settings"][0]["repeats"][0]["scenarios"]["soak"]
     assert (samples["n"], len(samples["warm_up_ms"]), len(samples["ms"])) == (900, 100, 450)
     assert told["soak"]["verdict"] in ("level", "grows", "undecided")
@@ -694,7 +699,7 @@ def test_a_run_from_scans_to_files(no_wait: None, tmp_path: Path, capsys: pytest
     files = ["--json", str(tmp_path / "a.json"), "--markdown", str(tmp_path / "a.md")]
     wanted = ["--scenario", "single-stream", "--scenario", "paced:20", "--min-scans", "3"]
     assert cli.main(["run", *FEW, *wanted, *files, "--input", str(tmp_path / "own.bin")]) == 0
-    told = report.read_report(tmp_path / "a.json")
+    told = read_report(tmp_path / "a.json")
     assert told["complete"]
     (setting,) = told["settings"]
     (only,) = setting["repeats"]
@@ -715,16 +720,16 @@ def test_an_interrupted_run_writes_what_it_has(
 
     told_once = []
 
-    def interrupt(live: report.LiveTable, name: str, ms: Sequence[float]) -> None:
+    def interrupt(live: LiveTable, name: str, ms: Sequence[float]) -> None:
         if not told_once:  # a second Ctrl-C would end it at once
             told_once.append(name)
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(report.LiveTable, "__call__", interrupt)
+    monkeypatch.setattr(LiveTable, "__call__", interrupt)
     given = ["--input", str(tmp_path / "own.npy"), "--json", str(tmp_path / "a.json")]
     # Far more scans than anybody has time for: without the interruption this would not end.
     assert cli.main(["run", *FEW, *given, "--scenario", "single-stream", "--min-scans", "1000000000"]) == 130
-    told = report.read_report(tmp_path / "a.json")
+    told = read_report(tmp_path / "a.json")
     assert not told["complete"]
     assert told["settings"][0]["repeats"][0]["interrupted"]
     assert "interrupted: what follows" in capsys.readouterr().out

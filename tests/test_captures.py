@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import edgeperc
-from edgeperc.captures import cloud_points, is_capture, read_scans, scan_files
 from edgeperc.errors import MissingExtraError, PointsError
+from edgeperc.readers.captures import cloud_points, is_capture, read_scans, scan_files
 
 POINTS = np.array(
     [[12.5, -3.25, -1.75, 0.25], [40.0, 8.5, 2.0, 99.0], [np.nan, 1.0, 1.0, 0.5], [5.0, np.inf, 0.0, 255.0]], np.float32

@@ -15,10 +15,16 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from edgeperc import __version__, captures, cli
+from edgeperc import __version__
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.cli import main as cli
+from edgeperc.cli.eval import _figure_lines
+from edgeperc.cli.output import Progress
+from edgeperc.cli.run import _output_names
 from edgeperc.errors import InferenceError, ModelFileError, PointsError
+from edgeperc.fitness import FitnessProfile
 from edgeperc.perception import Box, Perception, PointLabels, TopView
+from edgeperc.readers import captures
 
 POINTSEG = ModelCard(
     name="pointseg",
@@ -184,7 +190,7 @@ def test_tables_of_figures() -> None:
             "boxes": {"upright": {"all": {"mean_ap": 1.0, "car": boxes, "vehicle": boxes}}},
         },
     }
-    lines = cli._figure_lines(figures)
+    lines = _figure_lines(figures)
     assert lines[0].startswith("pointseg 1.2.3; validation drives, fold 1")
     assert lines[2] == "== SemanticKITTI: 1 scan, 1 drive =="
     words = [line.split() for line in lines[3:]]
@@ -408,7 +414,7 @@ def test_scans_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
     ],
 )
 def test_output_names(given: list[str], names: list[str]) -> None:
-    assert [name.as_posix() for name in cli._output_names([Path(scan) for scan in given])] == names
+    assert [name.as_posix() for name in _output_names([Path(scan) for scan in given])] == names
 
 
 def test_a_scan_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -519,14 +525,14 @@ def test_progress_bar_only_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> Non
     terminal = io.StringIO()
     terminal.isatty = lambda: True  # type: ignore[method-assign]
     monkeypatch.setattr(sys, "stderr", terminal)
-    progress = cli._Progress(4)
+    progress = Progress(4)
     progress.show(2)
     assert f"[{'#' * 15}{' ' * 15}] 2/4" in terminal.getvalue()
     progress.clear()
     assert terminal.getvalue().endswith("\r\x1b[K")
-    assert not cli._Progress(1).live
+    assert not Progress(1).live
     monkeypatch.setattr(sys, "stderr", io.StringIO())
-    cli._Progress(4).show(1)
+    Progress(4).show(1)
     assert sys.stderr.getvalue() == ""
 
 
@@ -535,7 +541,8 @@ def fake_street(monkeypatch: pytest.MonkeyPatch) -> None:
     points = np.random.default_rng(0).uniform(-20.0, 20.0, (1000, 4)).astype(np.float32)
     street = SimpleNamespace(points=points, labels=np.ones(1000, np.uint8))
     made = SimpleNamespace(random_scene=lambda seed, environment: seed, simulate=lambda scene, sensor, seed: street)
-    monkeypatch.setitem(sys.modules, "edgeperc.simulation", made)
+    monkeypatch.setitem(sys.modules, "edgeperc.simulation.drawn", made)
+    monkeypatch.setitem(sys.modules, "edgeperc.simulation.scene", made)
 
 
 @pytest.mark.usefixtures("fake_street", "matplotlib")
@@ -612,7 +619,6 @@ def test_info_of_a_model(thing: str, tmp_path: Path, capsys: pytest.CaptureFixtu
 
 @pytest.mark.usefixtures("fake_models")
 def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    from edgeperc import sensors
 
     checked = []
 
@@ -620,8 +626,8 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
         checked.append((points, profile, sensor.name))
         return ("it has 32 beams",)
 
-    monkeypatch.setattr(sensors, "check_fitness", check_fitness)
-    monkeypatch.setattr(sensors.FitnessProfile, "from_dict", dict)
+    monkeypatch.setattr("edgeperc.fitness.check_fitness", check_fitness)
+    monkeypatch.setattr(FitnessProfile, "from_dict", dict)
     monkeypatch.setattr(sys.modules[__name__], "POINTSEG", replace(POINTSEG, fitness={"n_beams": 64}))
     points = np.array([[3, 4, 0, 10], [0, 10, 10, 255], [-6, 0, 8, 51], [np.nan, 0, 0, 0]], np.float32)
     np.save(tmp_path / "scan.npy", points)

@@ -39,19 +39,15 @@ from shapely import Polygon
 import reference
 from edgeperc import Perceiver
 from edgeperc.card import CARD_KEY, InputSpec, ModelCard, OutputSpec, TopViewGeometry
-from edgeperc.datasets import IGNORE, simulated_scan
 from edgeperc.errors import CardMismatchError, MissingExtraError
 from edgeperc.perception import Box
 from edgeperc.projection import make_projector
-from edgeperc_export import database_build
+from edgeperc.simulation.samples import IGNORE, simulated_scan
 from edgeperc_export.cli import main
-from edgeperc_export.database_build import Plan, build, folds
-from edgeperc_export.label_page import LabelServer
-from edgeperc_export.road_polygons import draft, mask_of, read_coco, varied, write_coco
-from edgeperc_export.topview_database import (
-    CLASSES,
-    VIEW,
-    DatabaseError,
+from edgeperc_export.database import build as database_build
+from edgeperc_export.database.build import build, folds
+from edgeperc_export.database.coco import draft, varied
+from edgeperc_export.database.files import (
     TopViewDatabase,
     picture,
     read_labels,
@@ -59,6 +55,9 @@ from edgeperc_export.topview_database import (
     vehicles,
     write_labels,
 )
+from edgeperc_export.database.label_page import LabelServer
+from edgeperc_export.database.scenes import Plan
+from edgeperc_export.roads import CLASSES, VIEW, DatabaseError, mask_of, read_coco, write_coco
 
 DRIVES = ("0005", "0005", "0005", "0048", "0029", "0013", "0014", "0011")
 TRAPEZIUM = [[40.0, 399.5], [90.0, 10.0], [120.0, 10.0], [160.0, 399.5]]
@@ -378,7 +377,7 @@ def test_a_variation_moves_image_and_mask_together() -> None:
 
 def test_torch_reads_it(out: Path) -> None:
     torch = pytest.importorskip("torch")
-    from edgeperc_export.topview_dataset import TopViewDataset
+    from edgeperc_export.database.torch import TopViewDataset
 
     samples = TopViewDataset(out, "train", 0)
     images, maps = next(iter(torch.utils.data.DataLoader(samples, batch_size=2)))
@@ -458,7 +457,7 @@ def test_every_fold_has_a_road_model_that_did_not_see_it(
 ) -> None:
     """Roads of scenes 0, 3 and 7 are drawn; their names in a model's card say whether it was taught by them."""
     torch = pytest.importorskip("torch")
-    from edgeperc_export.train import Recipe
+    from edgeperc_export.recipe import Recipe
 
     torch.set_num_threads(1)
     recipe = Recipe("ssadnet", edge=True, steps=1, batch=1, augment=False, n_pasted=0.0, weather=0.0)
@@ -532,7 +531,7 @@ KILLED = """
 import sys
 from pathlib import Path
 from edgeperc_export import database_build
-from edgeperc_export.database_build import Plan, build
+from edgeperc_export.database.build import Plan, build
 
 def told(path, content, write=database_build.write_aside):
     print(path.name, flush=True)

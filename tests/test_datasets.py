@@ -13,25 +13,24 @@ import pytest
 pytest.importorskip("tqdm")
 
 from edgeperc.card import TopViewGeometry
-from edgeperc.datasets import (
-    IGNORE,
+from edgeperc.errors import PointsError
+from edgeperc.evaluation.datasets import (
     Calibration,
     Frame,
     KittiObjects,
     RoadFrame,
     SemanticKitti,
-    inside,
     layouts,
     read_objects,
-    simulated_scan,
 )
-from edgeperc.errors import PointsError
-from edgeperc.geometry import draw_footprints
+from edgeperc.evaluation.splits import FOLDS, TEST_DRIVES, fold_of, in_split
+from edgeperc.geometry import draw_footprints, inside
 from edgeperc.perception import Box
-from edgeperc.simulation import TOP_VIEW_CLASSES
-from edgeperc.splits import FOLDS, TEST_DRIVES, fold_of, in_split
-from edgeperc_export.augment import SURFACE, LabelledScan, augmented, mirrored, turned
-from edgeperc_export.road import ground_plane, sure_surface
+from edgeperc.simulation.samples import IGNORE, simulated_scan
+from edgeperc.simulation.scene import TOP_VIEW_CLASSES
+from edgeperc_export.augment import augmented
+from edgeperc_export.roads import ground_plane, sure_surface
+from edgeperc_export.scans import SURFACE, LabelledScan, mirrored, turned
 
 VIEW = TopViewGeometry()
 # The camera looks along the sensor's x axis: camera x is -y, camera y is -z, camera z is x; 0.27 m ahead of it.

@@ -9,10 +9,9 @@ import pytest
 import reference
 from edgeperc import decode
 from edgeperc.card import TopViewGeometry
-from edgeperc.decode import decode_classes, decode_dense, decode_slots
+from edgeperc.decode import decode_classes, decode_dense, decode_slots, decode_top_view
 from edgeperc.errors import CardMismatchError, InferenceError
 from edgeperc.geometry import draw_footprints
-from edgeperc.perceiver import decode_top_view
 from edgeperc_export.cards import card_of
 
 CLASSES = ("background", "drivable", "car", "van", "truck")

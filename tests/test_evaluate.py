@@ -16,16 +16,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgeperc import cli, evaluate
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
-from edgeperc.datasets import IGNORE, Calibration, Frame, KittiObjects, RoadFrame, SemanticKitti
+from edgeperc.cli import main as cli
 from edgeperc.errors import ModelError, PointsError, SplitError
-from edgeperc.evaluate import FIRST_SEED, Judge
-from edgeperc.figures import BANDS, Record, banded, figures
-from edgeperc.metrics import BoxEvaluator, Confusion
+from edgeperc.evaluation import evaluate
+from edgeperc.evaluation.datasets import Calibration, Frame, KittiObjects, RoadFrame, SemanticKitti
+from edgeperc.evaluation.judge import Judge
+from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
+from edgeperc.evaluation.tables import BANDS, Record, banded, figures
+from edgeperc.evaluation.unseen import training_scans_of
 from edgeperc.models import model_path, shipped_models
 from edgeperc.perception import Box, Perception, PointLabels, TopView
 from edgeperc.session import Session
+from edgeperc.simulation.samples import FIRST_SEED, IGNORE
 
 VIEW = TopViewGeometry()
 POINTS = ("background", "car", "pedestrian", "cyclist")
@@ -95,8 +98,8 @@ class World:
 @pytest.fixture
 def world(monkeypatch: pytest.MonkeyPatch) -> World:
     made = World()
-    monkeypatch.setattr(evaluate, "Perceiver", made.perceiver)
-    monkeypatch.setattr(evaluate, "_Network", made.network)
+    monkeypatch.setattr("edgeperc.evaluation.judge.Perceiver", made.perceiver)
+    monkeypatch.setattr("edgeperc.evaluation.judge._Network", made.network)
     return made
 
 
@@ -560,7 +563,7 @@ def test_no_shipped_model_was_trained_on_a_test_scan(kitti_root: Path, semantick
     tested = {hashlib.sha256(points.tobytes()).hexdigest()[:16] for points in scans}
     for name in shipped_models():
         card = Session(model_path(name), "cpu").card
-        (trained_on,) = evaluate.training_scans_of([card]).values()
+        (trained_on,) = training_scans_of([card]).values()
         only_simulated = card.training["recipe"]["simulated_share"] == 1.0
         assert len(trained_on) > 100 or only_simulated, f"{name} does not say what it was trained on"
         assert name.endswith("-sim") == only_simulated == (not trained_on)

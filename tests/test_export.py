@@ -20,36 +20,29 @@ from torch import Tensor, nn
 
 from edgeperc import Perceiver
 from edgeperc.card import CARD_KEY, InputSpec, ModelCard, OutputSpec, RangeImageGeometry
-from edgeperc.datasets import IGNORE, KittiObjects, scan_hash, simulated_scan
 from edgeperc.errors import CardMismatchError
-from edgeperc.evaluate import evaluate
-from edgeperc.sensors import FitnessProfile
+from edgeperc.evaluation.datasets import KittiObjects, scan_hash
+from edgeperc.evaluation.evaluate import evaluate
+from edgeperc.evaluation.splits import fold_of
+from edgeperc.fitness import FitnessProfile
 from edgeperc.session import Session
-from edgeperc.splits import fold_of
-from edgeperc_export import recipes
+from edgeperc.simulation.samples import IGNORE, simulated_scan
+from edgeperc_export import make as recipes
 from edgeperc_export.ablation import PAPERS, VARIANTS, ablate, plot
-from edgeperc_export.augment import LabelledScan
 from edgeperc_export.cards import LABELS_POINTS, TOP_VIEW
 from edgeperc_export.cli import _parser, main
-from edgeperc_export.dataset import parity_scans, simulate
 from edgeperc_export.models_page import models_page
-from edgeperc_export.recipes import MODELS, Stage
-from edgeperc_export.road import DRAWN, drawn_roads
-from edgeperc_export.selftraining import pseudo_labelled, taught, unlabelled_scans
+from edgeperc_export.networks import build
+from edgeperc_export.objective import loss_of
+from edgeperc_export.recipe import MODELS, PAPER, Recipe, Stage
+from edgeperc_export.roads import DRAWN, drawn_roads
+from edgeperc_export.samples import Samples, real_scans
+from edgeperc_export.scans import LabelledScan
+from edgeperc_export.simulate import parity_scans, simulate
+from edgeperc_export.teacher import pseudo_labelled, taught, unlabelled_scans
 from edgeperc_export.to_onnx import ParityError, export, load, to_graph, verify, write_card
-from edgeperc_export.train import (
-    PAPER,
-    Recipe,
-    Samples,
-    Watch,
-    _optimizer,
-    _schedule,
-    _start,
-    build,
-    loss_of,
-    real_scans,
-    train,
-)
+from edgeperc_export.train import _optimizer, _schedule, _start, train
+from edgeperc_export.watch import Watch
 
 
 @pytest.fixture(scope="module")
@@ -257,7 +250,7 @@ def test_a_drawn_road_is_the_truth_of_its_scan(kitti: Path, monkeypatch: pytest.
     objects, road = KittiObjects(kitti), np.zeros((400, 200), np.uint8)
     road[100:, 60:150] = 1
     digest = scan_hash(objects.frame("000000").points)
-    monkeypatch.setattr("edgeperc_export.train.drawn_roads", lambda: {digest: road})
+    monkeypatch.setattr("edgeperc_export.samples.drawn_roads", lambda: {digest: road})
     (scan, other), weights, hashes = real_scans(objects, ["000000", "000001"], drawn=True)
     assert weights == [1.0, 1.0]
     assert hashes["000000"] == digest

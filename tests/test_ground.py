@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 import reference
 from edgeperc.errors import PointsError
 from edgeperc.ground import find_ground
-from edgeperc.simulation import random_scene, simulate
+from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.scene import simulate
 
 
 def street(rng, n=4000, slope_x=0.0, slope_y=0.0, kerb=0.0, reach=30.0, mount=1.73):

@@ -11,21 +11,19 @@ torch = pytest.importorskip("torch")
 
 from edgeperc.card import TopViewGeometry
 from edgeperc.decode import decode_dense, decode_slots
+from edgeperc.simulation.samples import IGNORE
 from edgeperc_export.losses import (
     GEOMETRY_WEIGHTS,
-    IGNORE,
-    REGRESSED_FROM,
     box_distillation_loss,
     cross_entropy,
     dense_loss,
-    dense_targets,
     distillation_loss,
     lovasz_softmax,
     pointseg_loss,
-    slot_targets,
     slots_loss,
     ssadnet_loss,
 )
+from edgeperc_export.targets import REGRESSED_FROM, dense_targets, slot_targets
 
 VIEW = TopViewGeometry()  # x 6..46 m, y -10..10 m, 0.1 m cells
 CAR = (26.0, 2.0, -1.0, 4.0, 1.6, 1.5, 0.0)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgeperc.errors import PointsError
-from edgeperc.metrics import BoxEvaluator, Confusion, ProbabilitySweep, average_precision
+from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, ProbabilitySweep, average_precision
 from edgeperc.perception import Box
 
 

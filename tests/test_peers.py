@@ -11,16 +11,20 @@ import pytest
 pytest.importorskip("psutil")
 
 from edgeperc import Perceiver
-from edgeperc.datasets import simulated_scan
-from edgeperc.evaluate import FIRST_SEED
 from edgeperc.models import model_path
 from edgeperc.perception import Box
 from edgeperc.sensors import get_sensor
 from edgeperc.session import Session, golden_input
-from edgeperc_bench import cli, peers
+from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
+from edgeperc_bench import cli
 from edgeperc_bench.accuracy import agreement
-from edgeperc_bench.arithmetic import PRODUCT_SIZE, cost, matrix_product, n_met
-from edgeperc_bench.rivals import Rival, open_engine, overlap, torch_network
+from edgeperc_bench.peers import contenders as peers
+from edgeperc_bench.peers.arithmetic import PRODUCT_SIZE, cost, matrix_product, n_met
+from edgeperc_bench.peers.engines import open_engine, torch_network
+from edgeperc_bench.peers.networks import resized
+from edgeperc_bench.peers.numpy_pipeline import Rival, overlap
+from edgeperc_bench.peers.projection import measure
+from edgeperc_bench.peers.tables import floor_table, latency_table
 from edgeperc_bench.worker import Answer
 from reference import oriented_iou
 
@@ -194,7 +198,7 @@ def test_ratios_are_to_the_first_row() -> None:
         found("numpy + openvino:bf16", "rival", "openvino:bf16", 0.0, why_not=peers.INSTALL),
         found("peak numpy:fp32", "peak", "numpy:fp32", 1.0),
     ]
-    table = peers.latency_table("Scan to answer: pointseg", rows, 2)
+    table = latency_table("Scan to answer: pointseg", rows, 2)
     column = dict(zip(table["head"], zip(*table["rows"], strict=True), strict=True))
     assert column["x edgeperc"] == ("1.00", "8.00", "0.80", "-")
     assert column["p50"] == ("10.00", "80.00", "8.00", "-")
@@ -212,7 +216,7 @@ def test_the_floor_is_arithmetic_over_peak() -> None:
         found("peak torch:fp32", "peak", "torch:fp32", 30.0),
         found("peak copy", "peak", "copy", 20.0),
     ]
-    table = peers.floor_table("Scan to answer: pointseg", rows)
+    table = floor_table("Scan to answer: pointseg", rows)
     fp32, bf16, int8 = table["rows"]
     floor = (needs.macs - needs.padding_macs) * 30.0 / PRODUCT_SIZE**3
     assert fp32[2:4] == ["torch", f"{floor:.2f}"]
@@ -250,7 +254,7 @@ def test_the_same_network_for_half_the_image(
 ) -> None:
     for package in ("onnx", "onnxscript", "torch", "tqdm"):
         pytest.importorskip(package)
-    made = peers.resized(name, 0.5, tmp_path)
+    made = resized(name, 0.5, tmp_path)
     macs, whole = (cost(path).macs for path in (made, model_path(name)))
     assert macs == pytest.approx(0.5 * whole, rel=0.01)
     perceive = Perceiver([made], provider="cpu", n_threads=1, on_mismatch="ignore")
@@ -306,6 +310,6 @@ def test_a_contender_that_fails_does_not_stop_the_others(tmp_path: Path) -> None
     np.save(tmp_path / "scan.npy", np.zeros((2, 4), np.float32))
     broken = peers.Contender("broken", "session", "cpu", (tmp_path / "broken.onnx",), image=tmp_path / "scan.npy")
     peak = peers.Contender("peak", "peak", "numpy:fp32")
-    first, second = peers.measure([broken, peak], [tmp_path / "scan.npy"], say=lambda words: None)
+    first, second = measure([broken, peak], [tmp_path / "scan.npy"], say=lambda words: None)
     assert first.why_not.startswith("failed: ")
     assert len(second.ms) == 2

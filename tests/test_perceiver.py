@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 import edgeperc
 from edgeperc import Box, FitnessError, Perceiver, Perception, PointsError, cluster, ground
 from edgeperc.card import RangeImageGeometry, TopViewGeometry
-from edgeperc.datasets import inside
-from edgeperc.geometry import oriented_iou
+from edgeperc.geometry import inside, oriented_iou
 from edgeperc.models import model_path, shipped_models
 from edgeperc.perception import PointLabels
 from edgeperc.sensors import get_sensor
-from edgeperc.simulation import SimulatedScan, random_scene, simulate
+from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.scene import SimulatedScan, simulate
 
 
 @pytest.fixture(scope="module")

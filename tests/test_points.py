@@ -14,7 +14,9 @@ from hypothesis.extra import numpy as hnp
 
 import reference
 from edgeperc.errors import PointsError
-from edgeperc.points import as_points, fill_unpacked_lzf, read_points
+from edgeperc.points import as_points
+from edgeperc.readers.files import read_points
+from edgeperc.readers.pcd import fill_unpacked_lzf
 
 POINTS = np.array(
     [[12.5, -3.25, -1.75, 0.25], [40.0, 8.5, 2.0, 0.99], [np.nan, 1.0, 1.0, 0.5], [5.0, np.inf, 0.0, 0.0]], np.float32

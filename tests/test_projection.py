@@ -13,7 +13,7 @@ from edgeperc.card import InputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.errors import CardError, PointsError
 from edgeperc.projection import column_edges, make_projector, row_edges, tabulate
 from edgeperc.sensors import get_sensor
-from edgeperc_bench.projection import contenders
+from edgeperc_bench.peers.projection import contenders
 
 KERNELS = ("mark_top_view", "mark_range_image", "fill_image")
 UNEVEN = (2.0, 1.7, 1.3, 0.2, -0.1, -4.0, -4.4, -11.0, -24.8)

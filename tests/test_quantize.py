@@ -15,11 +15,12 @@ onnx = pytest.importorskip("onnx")
 from torch import Tensor, nn
 
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry
-from edgeperc.datasets import KittiObjects, simulated_scan
 from edgeperc.errors import PointsError, SplitError
+from edgeperc.evaluation.datasets import KittiObjects
+from edgeperc.evaluation.splits import in_split
 from edgeperc.session import Session
-from edgeperc.simulation import POINT_CLASSES
-from edgeperc.splits import in_split
+from edgeperc.simulation.samples import simulated_scan
+from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc_export import cli
 from edgeperc_export import quantize as module
 from edgeperc_export.quantize import RefusedError, calibration_scans, quantize

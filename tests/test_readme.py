@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 import edgeperc
-from edgeperc.simulation import random_scene, simulate
+from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.scene import simulate
 
 README = (Path(__file__).resolve().parent.parent / "README.md").read_text(encoding="utf-8")
 

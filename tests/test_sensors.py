@@ -15,8 +15,9 @@ from hypothesis.extra import numpy as hnp
 
 import reference
 from edgeperc.errors import CardError, PointsError, SensorError
-from edgeperc.points import read_points
-from edgeperc.sensors import SENSORS, FitnessProfile, SensorProfile, check_fitness, fill_scan_sums, get_sensor
+from edgeperc.fitness import FitnessProfile, check_fitness, fill_scan_sums
+from edgeperc.readers.files import read_points
+from edgeperc.sensors import SENSORS, SensorProfile, get_sensor
 
 # --- profiles --------------------------------------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ from edgeperc.card import CARD_KEY
 from edgeperc.errors import CardError, CardMismatchError, InferenceError, ModelFileError, ProviderError
 from edgeperc.models import model_path, shipped_models
 from edgeperc.session import PROVIDERS, Session, available_providers, golden_input
-from edgeperc.settings import fingerprint, settings_path, write_settings
+from edgeperc.tuning import fingerprint, settings_path, write_settings
 
 
 def edited(tmp_path: Path, name: str, *changes: tuple[bytes, bytes]) -> Path:

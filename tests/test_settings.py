@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from edgeperc import SettingsError, settings
-from edgeperc.settings import (
+from edgeperc import SettingsError
+from edgeperc import tuning as settings
+from edgeperc.tuning import (
     cache_folder,
     compiled_folder,
     cpu_model,

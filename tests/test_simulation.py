@@ -11,22 +11,25 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import reference
-from edgeperc import simulation
 from edgeperc.card import TopViewGeometry
 from edgeperc.errors import PointsError
 from edgeperc.perception import Box
 from edgeperc.sensors import SensorProfile
-from edgeperc.simulation import (
-    ENVIRONMENTS,
+from edgeperc.simulation import raycast as simulation
+from edgeperc.simulation.drawn import ENVIRONMENTS, random_scene
+from edgeperc.simulation.layouts import scene_from_boxes
+from edgeperc.simulation.raycast import FACADE, LEAVES, POROUS, ROUGH, ground_at
+from edgeperc.simulation.scene import (
+    TOP_VIEW_CLASSES,
     Scene,
     SceneObject,
     SimulatedScan,
-    random_scene,
-    scene_from_boxes,
     sensor_pose,
     simulate,
     simulate_sequence,
 )
+from edgeperc.simulation.shapes import SIZES, block
+from edgeperc.simulation.street import Street
 
 SMALL = SensorProfile.uniform("small", 24, 4.0, -24.0, columns=240)
 TALL = SensorProfile.uniform("tall", 48, 20.0, -24.0, columns=360)
@@ -55,7 +58,7 @@ def box(label: str, x: float, y: float, yaw: float = 0.0) -> Box:
 def plate(
     x: float, size: tuple[float, float, float], z: float = 0.0, material: int = 0, density: float = 1.0
 ) -> np.ndarray:
-    return np.array(simulation._block(material, 0.4, (x, 0.0, z), size, density=density))
+    return np.array(block(material, 0.4, (x, 0.0, z), size, density=density))
 
 
 def in_box(points: np.ndarray, each: Box, grown: float) -> np.ndarray:
@@ -95,7 +98,7 @@ def test_cast_equals_brute_force(seed: int, tilt: float) -> None:
     near = np.hypot(*scene.primitives[:, 4:6].T) < 40.0
     scene = replace(scene, primitives=scene.primitives[near | (scene.primitives[:, 19] >= 0)][::2].copy())
     # Tufts of grass between two samples of the kernel are missed; that is meant.
-    scene.terrain[simulation._ROUGH] = 0.0
+    scene.terrain[ROUGH] = 0.0
     rng = np.random.default_rng(seed)
     n_columns = 20
     azimuths = np.arange(n_columns) * 2 * np.pi / n_columns
@@ -122,9 +125,7 @@ def test_bounds_hold_every_ray_that_hits(seed: int, kind: int) -> None:
     rng = np.random.default_rng(seed)
     center, size = rng.normal(0, 6, 3), rng.uniform(0.05, 8, 3)
     taper = tuple(rng.uniform(0, 0.9, 3)) if kind == 0 else (0.0, 0.0, 0.0)
-    row = np.array(
-        [simulation._block(0, 0.4, tuple(center), tuple(size), yaw=rng.uniform(-4, 4), taper=taper, kind=kind)]
-    )
+    row = np.array([block(0, 0.4, tuple(center), tuple(size), yaw=rng.uniform(-4, 4), taper=taper, kind=kind)])
     bounds = np.empty((1, 5))
     simulation.fill_bounds(row, bounds)
     first, width, low, high, near = bounds[0]
@@ -147,7 +148,7 @@ def test_ground_equals_twin() -> None:
     for seed in range(6):
         scene = random_scene(seed)
         xy = rng.uniform(-60, 60, (300, 2))
-        fast = np.array([simulation._ground_at(scene.strips, scene.terrain, scene.tile, x, y)[:2] for x, y in xy])
+        fast = np.array([ground_at(scene.strips, scene.terrain, scene.tile, x, y)[:2] for x, y in xy])
         slow = np.stack(reference.ground(scene, xy[:, 0], xy[:, 1]), axis=1)
         np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-9)
 
@@ -196,7 +197,7 @@ def test_a_scan_is_consistent(environment: str) -> None:
     st.integers(0, 99),
 )
 def test_shapes_fill_their_boxes(label: str, a: float, b: float, c: float, yaw: float, seed: int) -> None:
-    mean, spread = simulation._SIZES[label]
+    mean, spread = SIZES[label]
     size = tuple(m + 2 * s * v for m, s, v in zip(mean, spread, (a, b, c), strict=True))
     # Its end is never so near that it fills the view.
     each = Box(label, 1.0, (7.0 + size[0] / 2, 2.0, size[2] / 2 - 1.73), size, yaw)
@@ -243,7 +244,7 @@ def test_nothing_is_seen_through_a_wall() -> None:
     assert len(hidden.boxes) == 1  # there all the same
 
 
-@pytest.mark.parametrize(("material", "density"), [(simulation._LEAVES, 0.3), (simulation._POROUS, 0.4)])
+@pytest.mark.parametrize(("material", "density"), [(LEAVES, 0.3), (POROUS, 0.4)])
 def test_leaves_and_fences_let_some_rays_through(material: int, density: float) -> None:
     scene = flat(street(box("van", 15, 0)))
     seen = simulate(scene, SMALL, 0, noise=False).box_points[0]
@@ -337,7 +338,7 @@ def test_top_view_labels() -> None:
             expected = int(reference.ground(scan.scene, np.array([x]), np.array([y]))[1][0] < 0)
             for each in (car, truck):
                 if in_box(here, replace(each, center=(*each.center[:2], 0.0)), 0.0)[0]:
-                    expected = simulation.TOP_VIEW_CLASSES.index(each.label)
+                    expected = TOP_VIEW_CLASSES.index(each.label)
             assert labels[row, col] == expected
     cells = np.count_nonzero(labels == 2) * view.cell_m**2
     assert cells == pytest.approx(3.9 * 1.6, rel=0.03)
@@ -348,7 +349,7 @@ def test_bays_are_not_drivable() -> None:
     scene = flat(street())
     bay = (*scene.strips[0, :5], 20.0, 25.0, 10.0, 20.0, 1.0)
     scene = replace(scene, strips=np.vstack([scene.strips[:1], bay]))
-    x, y, _ = simulation._Street(np.random.default_rng(0), list(scene.strips), scene.terrain).on_strip(15.0, 22.0)
+    x, y, _ = Street(np.random.default_rng(0), list(scene.strips), scene.terrain).on_strip(15.0, 22.0)
     assert not scene.on_road(x, y)
     assert scene.on_road(5.0, 0.0)
 
@@ -390,7 +391,7 @@ def test_layout_keeps_its_boxes() -> None:
 def test_roadside_stands_clear_of_objects_and_roads() -> None:
     for seed in range(4):
         scene = random_scene(seed, "urban")
-        solid = scene.primitives[(scene.primitives[:, 19] < 0) & (scene.primitives[:, 1] == simulation._FACADE)]
+        solid = scene.primitives[(scene.primitives[:, 19] < 0) & (scene.primitives[:, 1] == FACADE)]
         for x, y in solid[:, 4:6]:
             assert not scene.on_road(x, y)
             assert all(math.hypot(x - o.center[0], y - o.center[1]) > 1.0 for o in scene.objects)

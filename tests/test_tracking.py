@@ -16,15 +16,11 @@ from hypothesis import strategies as st
 
 import edgeperc
 import reference
-from edgeperc import Box, StampError, Tracker, TrackingError, cli
-from edgeperc.datasets import scan_hash
-from edgeperc.perception import Perception
-from edgeperc.sensors import get_sensor
-from edgeperc.tracking.egomotion import fit_motion, nearest_detection, support
-from edgeperc.tracking.imm import fill_combined, fill_interaction, fill_mode_probabilities
-from edgeperc.tracking.jpda import MAX_EVENTS, fill_association, fill_by_propagation, fill_likelihoods
-from edgeperc.tracking.kitti import evaluate_kitti, read_sequence, sequence_names, sequence_scans, track_sequence
-from edgeperc.tracking.metrics import (
+from edgeperc import Box, StampError, Tracker, TrackingError
+from edgeperc.cli import main as cli
+from edgeperc.evaluation.datasets import scan_hash
+from edgeperc.evaluation.tracking import evaluate_kitti, read_sequence, sequence_names, sequence_scans, track_sequence
+from edgeperc.evaluation.tracking_metrics import (
     FrameTracks,
     FrameTruth,
     box_iou,
@@ -34,12 +30,17 @@ from edgeperc.tracking.metrics import (
     fill_pairs,
     recall_thresholds,
 )
-from edgeperc.tracking.tracker import (
-    _TRACK,
+from edgeperc.perception import Perception
+from edgeperc.records import _box_record
+from edgeperc.sensors import get_sensor
+from edgeperc.tracking.egomotion import fit_motion, nearest_detection, support
+from edgeperc.tracking.imm import fill_combined, fill_interaction, fill_mode_probabilities
+from edgeperc.tracking.jpda import MAX_EVENTS, fill_association, fill_by_propagation, fill_likelihoods
+from edgeperc.tracking.lives import (
     EXPECTED,
     MOST_EXISTENCE,
     MOST_HIDDEN,
-    PARAMETERS,
+    TRACK,
     fill_hidden,
     fill_newborn,
     mark_out_of_view,
@@ -47,8 +48,9 @@ from edgeperc.tracking.tracker import (
     update_lives,
     update_shapes,
 )
+from edgeperc.tracking.tracks import PARAMETERS
 from edgeperc.tracking.ukf import CONSTANT_VELOCITY, CTRV, fill_predictions, fill_updates
-from edgeperc_bench.tracking import crossing, every_second_beam
+from edgeperc_bench.peers.tracking import crossing, every_second_beam
 
 NOISE = np.array([2.0, 0.4, 0.3, 0.1, 0.2])
 SIGMAS = np.array([0.2, 0.1, 0.08])
@@ -757,8 +759,8 @@ def test_births_lives_and_views_are_those_of_the_twins(n: int, m: int) -> None:
     of = tracker._classes[kinds]
     detections, shapes = rng.normal(0.0, 9.0, (n, 3)), rng.uniform(0.5, 4.0, (n, 4))
     born = kinds, of, detections, shapes, rng.normal(0.0, 3.0, n), rng.uniform(0.0, 60.0, n)
-    wanted = reference.newborn(5, *born, MOST_EXISTENCE, _TRACK)
-    tracks = np.zeros(n, _TRACK)
+    wanted = reference.newborn(5, *born, MOST_EXISTENCE, TRACK)
+    tracks = np.zeros(n, TRACK)
     fill_newborn(5, *born, tracks)
     assert_same_tracks(tracks, wanted)
 
@@ -1035,7 +1037,7 @@ def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixt
 def test_a_models_boxes_are_judged(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What run --json prints takes the place of the detections, which need not be there."""
     detections = read_sequence(kitti, "0000").detections
-    lines = [{"scan": "x", "boxes": [cli._box_record(replace(one, label="van")) for one in of]} for of in detections]
+    lines = [{"scan": "x", "boxes": [_box_record(replace(one, label="van")) for one in of]} for of in detections]
     for of in ("Car", "Pedestrian", "Cyclist"):
         (kitti / f"detections/pointrcnn_{of}/0000.txt").unlink()
     boxes = kitti / "boxes.jsonl"
@@ -1116,7 +1118,7 @@ def test_a_drive_is_perceived_and_tracked(
         return SimpleNamespace(boxes=found[int(points[0, 0])])
 
     perceive.cards = (card,)
-    monkeypatch.setattr(cli, "_perceiver", lambda *_: perceive)
+    monkeypatch.setattr("edgeperc.cli.eval.make_perceiver", lambda *_: perceive)
     arguments = ["eval", "tracking", str(drive_root), "--classes", "car", "--json", str(drive_root / "f.json")]
     assert cli.main(arguments) == 0
     assert "1 sequence, boxes of seer 1.0" in capsys.readouterr().out
@@ -1165,7 +1167,7 @@ def test_real_sequences_are_tracked_well(data_root) -> None:
 
 def test_tracks_are_animated(kitti: Path, tmp_path: Path) -> None:
     image = pytest.importorskip("PIL.Image")
-    from edgeperc.view import draw_tracks
+    from edgeperc.view.tracks import draw_tracks
 
     tracks, _ = track_sequence(read_sequence(kitti, "0000"))
     content = draw_tracks(tracks, tmp_path / "tracks.gif", title="a drive")

@@ -12,9 +12,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edgeperc import view
 from edgeperc.errors import MissingExtraError, PointsError
+from edgeperc.evaluation.mistakes import Mistakes
 from edgeperc.perception import Box, Perception, PointLabels, TopView
+from edgeperc.simulation.shapes import _paint
+from edgeperc.view import picture as view
+from edgeperc.view.colours import CLASS_COLOURS, FALSE, FOUND, MISSED
+from edgeperc.view.files import write_labels, write_ply
+from edgeperc.view.mistakes import draw_mistakes
+from edgeperc.view.page import write_html
 
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
 TOP_CLASSES = ("background", "drivable", "car", "van", "truck")
@@ -71,7 +77,7 @@ def pixels(png: bytes) -> np.ndarray:
 
 
 def near(picture: np.ndarray, name: str, tolerance: int = 12) -> np.ndarray:
-    wanted = [int(view.CLASS_COLOURS[name][k : k + 2], 16) for k in (1, 3, 5)]
+    wanted = [int(CLASS_COLOURS[name][k : k + 2], 16) for k in (1, 3, 5)]
     return (np.abs(picture - wanted) <= tolerance).all(axis=2)
 
 
@@ -126,9 +132,9 @@ def test_tiny_scans(n: int, tmp_path, scan: np.ndarray) -> None:
         labels = PointLabels(np.zeros(n, np.uint8), np.zeros(n, bool), POINT_CLASSES)
         perception = replace(whole, n_points=n, points=labels, stage_ms={}, providers={}, fitness=())
         assert pixels(view.draw(points, perception)).shape == (1000, 1600, 3)
-        view.write_html(points, perception, tmp_path / "page.html")
-        view.write_ply(points, perception, tmp_path / "points.ply")
-        view.write_labels(perception, tmp_path / "points.label")
+        write_html(points, perception, tmp_path / "page.html")
+        write_ply(points, perception, tmp_path / "points.ply")
+        write_labels(perception, tmp_path / "points.label")
         assert (tmp_path / "points.label").stat().st_size == 4 * n
 
 
@@ -138,12 +144,12 @@ def test_strange_titles_and_classes(scan: np.ndarray, perception: Perception, tm
     classes = (*POINT_CLASSES[:3], "</script> & tram\nelement vertex 3")
     perception = replace(perception, points=replace(perception.points, classes=classes))
     assert pixels(view.draw(scan, perception, title=strange)).shape == (1000, 1600, 3)
-    view.write_html(scan, perception, tmp_path / "page.html", title=strange)
+    write_html(scan, perception, tmp_path / "page.html", title=strange)
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert text.count("<script") == 2
     assert text.count("</script>") == 2
     assert "&lt;script&gt;alert(1)" in text
-    view.write_ply(scan, perception, tmp_path / "points.ply")
+    write_ply(scan, perception, tmp_path / "points.ply")
     header = (tmp_path / "points.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
     assert [line for line in header if line.startswith("element")] == [f"element vertex {len(scan)}"]
 
@@ -159,13 +165,13 @@ def test_file_is_replaced_whole(scan: np.ndarray, perception: Perception, tmp_pa
     folder = tmp_path / "scan.label"
     folder.mkdir()
     with pytest.raises(OSError, match=r"scan\.label"):
-        view.write_labels(perception, folder)
+        write_labels(perception, folder)
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["scan.label", "scan.png"]
 
 
 def test_html_holds_every_finite_point_and_no_address(scan: np.ndarray, perception: Perception, tmp_path) -> None:
     bright = scan * np.array([1, 1, 1, 200], dtype=np.float32)
-    view.write_html(bright, perception, tmp_path / "page.html", title="a scan")
+    write_html(bright, perception, tmp_path / "page.html", title="a scan")
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert not re.search(r"https?:|src=|@@", text)
     scene = json.loads(re.search(r'type="application/json">(.*?)</script>', text, re.DOTALL).group(1))
@@ -194,13 +200,13 @@ def test_html_holds_every_finite_point_and_no_address(scan: np.ndarray, percepti
 def test_leaves_above_the_road_are_not_road(perception: Perception) -> None:
     points = np.array([[20.0, 0.0, -1.7, 0.1]] * 60 + [[20.0, 0.0, 2.0, 0.1]], dtype=np.float32)
     bare = PointLabels(np.zeros(61, np.uint8), np.ones(61, bool), POINT_CLASSES)
-    names, painted = view._paint(points, replace(perception, n_points=61, points=bare))
+    names, painted = _paint(points, replace(perception, n_points=61, points=bare))
     assert (painted[:60] == names.index("drivable")).all()
     assert painted[60] == 0
 
 
 def test_ply_reads_back(scan: np.ndarray, perception: Perception, tmp_path) -> None:
-    view.write_ply(scan, perception, tmp_path / "points.ply")
+    write_ply(scan, perception, tmp_path / "points.ply")
     header, body = (tmp_path / "points.ply").read_bytes().split(b"end_header\n", 1)
     kinds = {"float": "<f4", "uchar": "u1"}
     properties = re.findall(r"property (\w+) (\w+)", header.decode("ascii"))
@@ -211,13 +217,13 @@ def test_ply_reads_back(scan: np.ndarray, perception: Perception, tmp_path) -> N
         np.testing.assert_array_equal(rows[name], scan[:, k])
     np.testing.assert_array_equal(rows["label"], perception.points.labels)
     car = rows[rows["label"] == 1][0]
-    assert "#{:02x}{:02x}{:02x}".format(*(car[c] for c in ("red", "green", "blue"))) == view.CLASS_COLOURS["car"]
+    assert "#{:02x}{:02x}{:02x}".format(*(car[c] for c in ("red", "green", "blue"))) == CLASS_COLOURS["car"]
 
 
 def test_labels_are_semantickitti_ids(scan: np.ndarray, perception: Perception, tmp_path) -> None:
     labels = np.arange(len(scan), dtype=np.uint8) % 4
     named = replace(perception.points, labels=labels, classes=("background", "car", "cyclist", "tram"))
-    view.write_labels(replace(perception, points=named), tmp_path / "scan.label")
+    write_labels(replace(perception, points=named), tmp_path / "scan.label")
     raw = np.fromfile(tmp_path / "scan.label", dtype="<u4")
     np.testing.assert_array_equal(raw, np.array([0, 10, 31, 99])[labels])
 
@@ -225,10 +231,10 @@ def test_labels_are_semantickitti_ids(scan: np.ndarray, perception: Perception, 
 def test_refusals(scan: np.ndarray, perception: Perception, tmp_path) -> None:
     top_alone = replace(perception, points=None)
     with pytest.raises(PointsError, match="pointseg"):
-        view.write_labels(top_alone, tmp_path / "a.label")
+        write_labels(top_alone, tmp_path / "a.label")
     with pytest.raises(PointsError, match="pointseg"):
-        view.write_ply(scan, top_alone, tmp_path / "a.ply")
-    for writer in (view.write_html, view.write_ply, view.draw):
+        write_ply(scan, top_alone, tmp_path / "a.ply")
+    for writer in (write_html, write_ply, view.draw):
         with pytest.raises(PointsError, match="expected the scan that was perceived"):
             writer(scan[1:], perception, tmp_path / "a")
         with pytest.raises(PointsError, match=r"\(n, 4\)"):
@@ -244,7 +250,7 @@ def test_missing_matplotlib_names_the_line(scan: np.ndarray, perception: Percept
 
 
 def test_import_loads_no_matplotlib() -> None:
-    code = "import edgeperc.view, sys; sys.exit(any(m.startswith(('matplotlib', 'PIL')) for m in sys.modules))"
+    code = "import edgeperc.view.picture, sys; sys.exit(any(m.startswith(('matplotlib', 'PIL')) for m in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
@@ -255,8 +261,8 @@ def test_drawing_uses_no_pyplot(scan: np.ndarray, perception: Perception) -> Non
     assert ("matplotlib.pyplot" in sys.modules) == before
 
 
-def some_mistakes(points: np.ndarray, **given) -> view.Mistakes:
-    return view.Mistakes("000123", "drive_0011", points, np.zeros(len(points), np.uint8), **given)
+def some_mistakes(points: np.ndarray, **given) -> Mistakes:
+    return Mistakes("000123", "drive_0011", points, np.zeros(len(points), np.uint8), **given)
 
 
 def amount(picture: np.ndarray, colour: str) -> int:
@@ -278,29 +284,29 @@ def test_mistakes_are_drawn(scan: np.ndarray, tmp_path) -> None:
     missed = some_mistakes(scan, found=(CAR,), missed=((VAN, 300),))
     false = some_mistakes(scan, found=(CAR, VAN), false=(replace(CAR, center=(40.0, -12.0, -1.0)),))
     points = replace(right, wrong=np.where(np.arange(len(scan)) < 3000, 1, 0).astype(np.uint8))
-    png = view.draw_mistakes([right, missed, false, points], tmp_path / "worst.png", title="a title", columns=2)
+    png = draw_mistakes([right, missed, false, points], tmp_path / "worst.png", title="a title", columns=2)
     assert (tmp_path / "worst.png").read_bytes() == png
     picture = pixels(png)
     assert picture.shape == (80 + 2 * 520, 2 * 470, 3)
     panels = [picture[80 + 520 * k : 600 + 520 * k, 470 * m : 470 * m + 470] for k in (0, 1) for m in (0, 1)]
-    red, orange = ([amount(panel, colour) for panel in panels] for colour in (view._MISSED, view._FALSE))
+    red, orange = ([amount(panel, colour) for panel in panels] for colour in (MISSED, FALSE))
     assert red[0] == red[2] == 0
     assert red[1] > 50
     blended = panels[3][..., 0] - panels[3][..., 1] > 100  # points are smaller than pixels
     assert np.count_nonzero(blended) > 500
     assert orange[0] == orange[1] == orange[3] == 0
     assert orange[2] > 50
-    assert all(amount(panel, view._FOUND) > 50 for panel in panels)
+    assert all(amount(panel, FOUND) > 50 for panel in panels)
 
 
 @pytest.mark.usefixtures("matplotlib")
 def test_no_mistakes_to_draw(scan: np.ndarray) -> None:
-    assert pixels(view.draw_mistakes([], title="none")).ndim == 3
-    assert pixels(view.draw_mistakes([some_mistakes(scan[:0])])).ndim == 3
+    assert pixels(draw_mistakes([], title="none")).ndim == 3
+    assert pixels(draw_mistakes([some_mistakes(scan[:0])])).ndim == 3
 
 
 def test_mistakes_need_matplotlib(monkeypatch: pytest.MonkeyPatch, scan: np.ndarray) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     monkeypatch.setitem(sys.modules, "matplotlib.backends.backend_agg", None)
     with pytest.raises(MissingExtraError, match=r"edgeperc\[view\]"):
-        view.draw_mistakes([some_mistakes(scan)])
+        draw_mistakes([some_mistakes(scan)])

@@ -7,6 +7,7 @@ which detection is of which track, `egomotion` finds the sensor's own motion whe
 
 from __future__ import annotations
 
-from .tracker import ClassParameters, Track, Tracker, Tracks
+from .tracker import Tracker
+from .tracks import ClassParameters, Track, Tracks
 
 __all__ = ["ClassParameters", "Track", "Tracker", "Tracks"]

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["fit_motion"]
+__all__ = ["fit_motion", "nearest_detection", "support"]
 
 MAX_ROUNDS = 12
 MAX_PROPOSALS = 256

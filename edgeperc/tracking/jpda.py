@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["MAX_EVENTS", "fill_association", "fill_likelihoods"]
+__all__ = ["MAX_EVENTS", "fill_association", "fill_by_propagation", "fill_likelihoods"]
 
 MAX_EVENTS = 4096
 MAX_ROUNDS = 200

@@ -4,7 +4,7 @@ They keep the papers' views, classes and boxes and leave what small computers ar
 resolution, unpooling by position, dilations wider than the map. Instead: two halvings into a context of residual
 blocks, and back by moving channels to pixels. Channels come in sixteens, the width of a vector register: 24 channels
 took as long as 32. Batch norm disappears into its convolution on export, ReLU into the engine's. Both are distilled
-from the full networks (`edgeperc_export.train.Recipe.distil`).
+from the full networks (`edgeperc_export.recipe.Recipe.distil`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from .pointseg import conv_bn_relu, initialise
 from .ssadnet import HEAT_PRIOR
 
-__all__ = ["PointSegEdge", "SSADNetEdge"]
+__all__ = ["PointSegEdge", "SSADNetEdge", "spread"]
 
 CONTEXT_DILATIONS = ((1, 2), (2, 4))
 """Of the residual blocks (rows, columns): range images are wide."""

@@ -22,15 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .pointseg import conv_bn_relu, initialise
-from .ssadnet import (
-    CONTEXT_DILATIONS,
-    ELU_GAIN,
-    ContextModule,
-    conv_bn_elu,
-    conv_elu,
-    max_pool_with_mask,
-    max_unpool,
-)
+from .ssadnet import CONTEXT_DILATIONS, ELU_GAIN, ContextModule, conv_bn_elu, conv_elu, max_pool_with_mask, max_unpool
 
 __all__ = ["EDGE_DILATIONS", "LoDNN", "LoDNNEdge"]
 

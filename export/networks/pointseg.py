@@ -20,7 +20,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-__all__ = ["ENLARGEMENT_RATES", "PointSeg"]
+__all__ = [
+    "ENLARGEMENT_RATES",
+    "Fire",
+    "FireDeconv",
+    "PointSeg",
+    "SqueezeReweight",
+    "conv_bn_relu",
+    "initialise",
+    "pool",
+]
 
 ENLARGEMENT_RATES = (6, 9, 12)
 

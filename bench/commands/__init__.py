@@ -1,0 +1,1 @@
+"""The commands of `edgeperc-bench`, one file each."""

@@ -1,0 +1,1 @@
+"""What edgeperc is measured beside: other engines, numpy, and the limits of the machine."""

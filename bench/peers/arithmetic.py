@@ -1,0 +1,153 @@
+"""What a network costs at least, and what this machine can do at most: the floor under every latency.
+
+A network's multiplications are those of its convolutions and matrix products, counted one by one from the ONNX graph;
+taps that meet nothing but padding are told apart, for nobody has to compute them. What a machine can do is measured
+where the networks are, and by the libraries that are there: large matrix products, and a copy of more memory than any
+cache holds. The floor holds for direct convolution: Winograd's takes fewer multiplications and more of everything else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edgeperc import ModelError
+
+__all__ = ["COPY_BYTES", "PRODUCT_SIZE", "Cost", "cost", "matrix_product", "memory_copy", "openvino_request"]
+
+PRODUCT_SIZE = 1536
+COPY_BYTES = 1 << 28
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a network takes, in numbers, not bytes.
+
+    Attributes
+    ----------
+    macs : int
+        Multiply-accumulates, padding included, as networks are usually compared.
+    padding_macs : int
+        Those of them that meet nothing but padding.
+    weights, activations : int
+        Read, and read and written, by convolutions and matrix products; all else can be fused into these.
+    """
+
+    macs: int
+    padding_macs: int
+    weights: int
+    activations: int
+
+
+def cost(model: Path | Any) -> Cost:
+    """Count a network's multiplications and traffic.
+
+    Parameters
+    ----------
+    model : Path or onnx.ModelProto
+
+    Raises
+    ------
+    ModelError
+        A shape is not known beforehand, or padding is left to the engine.
+    """
+    import onnx
+
+    loaded = onnx.load(model) if isinstance(model, Path) else model
+    graph = onnx.shape_inference.infer_shapes(loaded, data_prop=True).graph
+    shapes = {v.name: tuple(d.dim_value for d in v.type.tensor_type.shape.dim) for v in (*graph.input, *graph.output)}
+    shapes |= {v.name: tuple(d.dim_value for d in v.type.tensor_type.shape.dim) for v in graph.value_info}
+    shapes |= {t.name: tuple(t.dims) for t in graph.initializer}
+    constant = {t.name for t in graph.initializer}
+    macs = inside = weights = activations = 0
+    for node in graph.node:
+        if all(name in constant for name in node.input):  # weights on their way from half precision or int8
+            constant.update(node.output)
+        if node.op_type not in ("Conv", "ConvTranspose", "Gemm", "MatMul"):
+            continue
+        if not all(math.prod(shapes.get(name, (0,))) for name in (*filter(None, node.input), *node.output)):
+            raise ModelError(f"{node.op_type} {node.name}: a shape is not known beforehand; export with fixed shapes")
+        set_up = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
+        x, w, y = shapes[node.input[0]], shapes[node.input[1]], shapes[node.output[0]]
+        if node.op_type in ("Conv", "ConvTranspose"):
+            if set_up.get("auto_pad", b"NOTSET") != b"NOTSET":
+                raise ModelError(f"{node.op_type} {node.name} pads as the engine likes; export with explicit pads")
+            # Seen from where a tap is multiplied once: a convolution's outputs, a transposed one's inputs.
+            here, there = (y, x) if node.op_type == "Conv" else (x, y)
+            axes = range(len(w) - 2)
+            strides, dilations = (set_up.get(name, [1 for _ in axes]) for name in ("strides", "dilations"))
+            pads = set_up.get("pads", [0 for _ in axes])
+            met = [n_met(here[2 + k], there[2 + k], w[2 + k], strides[k], pads[k], dilations[k]) for k in axes]
+            channels = here[0] * here[1] * w[1]
+            macs += channels * math.prod(here[2:]) * math.prod(w[2:])
+            inside += channels * math.prod(met)
+        else:
+            depth = x[0] if set_up.get("transA") else x[-1]
+            macs += math.prod(y) * depth
+            inside += math.prod(y) * depth
+        weights += sum(math.prod(shapes[name]) for name in node.input if name in constant)
+        activations += sum(math.prod(shapes[name]) for name in node.input if name and name not in constant)
+        activations += math.prod(y)
+    return Cost(macs, macs - inside, weights, activations)
+
+
+def n_met(n_here: int, n_there: int, kernel: int, stride: int, pad: int, dilation: int) -> int:
+    """Pairs of a position and a tap, along one axis, that meet a position on the other side and no padding."""
+    at = np.arange(n_here)[:, None] * stride - pad + np.arange(kernel) * dilation
+    return int(np.count_nonzero((at >= 0) & (at < n_there)))
+
+
+def matrix_product(library: str, precision: str, n_threads: int) -> Callable[[], object]:
+    """A square matrix product of `PRODUCT_SIZE` ** 3 multiplications, by numpy, torch or openvino.
+
+    numpy's threads are set in the environment of the process, before it starts.
+    """
+    n = PRODUCT_SIZE
+    a, b = np.random.default_rng(0).standard_normal((2, n, n), np.float32)
+    if library == "numpy":
+        out = np.empty_like(a)
+        return lambda: np.matmul(a, b, out=out)
+    if library == "openvino":
+        import openvino
+        from openvino import opset13
+
+        left, right = opset13.parameter([n, n], np.float32), opset13.parameter([n, n], np.float32)
+        model = openvino.Model([opset13.matmul(left, right, False, False)], [left, right])
+        request = openvino_request(model, precision, n_threads)
+        for k, matrix in enumerate((a, b)):
+            request.set_input_tensor(k, openvino.Tensor(matrix))
+        return request.infer
+    import torch
+
+    torch.set_num_threads(n_threads)
+    if precision == "int8":
+        left, right = (torch.from_numpy(np.clip(32.0 * m, -127.0, 127.0).astype(np.int8)) for m in (a, b))
+        return lambda: torch._int_mm(left, right)
+    left, right = (torch.from_numpy(m).to({"fp32": torch.float32, "bf16": torch.bfloat16}[precision]) for m in (a, b))
+    return lambda: torch.mm(left, right)
+
+
+def openvino_request(model: Any, precision: str, n_threads: int) -> Any:
+    """A model in OpenVINO's own API, set up for the least latency on the CPU."""
+    import openvino
+
+    settings = {
+        "PERFORMANCE_HINT": "LATENCY",
+        "INFERENCE_NUM_THREADS": n_threads,
+        "INFERENCE_PRECISION_HINT": {"fp32": "f32", "bf16": "bf16"}[precision],
+    }
+    return openvino.Core().compile_model(model, "CPU", settings).create_infer_request()
+
+
+def memory_copy(n_threads: int) -> Callable[[], object]:
+    """Copy `COPY_BYTES`, every thread its part."""
+    source, target = np.ones(COPY_BYTES // 8), np.zeros(COPY_BYTES // 8)
+    parts: Sequence[Any] = list(zip(np.array_split(target, n_threads), np.array_split(source, n_threads), strict=True))
+    pool = ThreadPoolExecutor(n_threads)
+    return lambda: list(pool.map(lambda part: np.copyto(*part), parts))

@@ -1,0 +1,177 @@
+"""The networks in other engines: torch and OpenVINO's own API."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeperc import ModelError
+
+from .arithmetic import openvino_request
+
+__all__ = ["Engine", "open_engine", "torch_network"]
+
+
+@dataclass(frozen=True)
+class Engine:
+    """A network ready to run.
+
+    Attributes
+    ----------
+    input : (C, H, W) float32
+        Write here, then `run`.
+    run : callable
+        Answers by the names of the graph's outputs, without the batch axis.
+    """
+
+    input: NDArray[np.float32]
+    run: Callable[[], Mapping[str, NDArray[np.float32]]]
+
+
+def open_engine(name: str, path: Path, n_threads: int) -> Engine:
+    """A model in an engine.
+
+    Parameters
+    ----------
+    name : str
+        ``"onnxruntime"`` (its stock CPU provider), ``"openvino:fp32"``, ``"openvino:bf16"``, ``"torch:fp32"``,
+        ``"torch:bf16"`` (autocast), or ``"torch.compile:"`` and a precision.
+    path : Path
+    n_threads : int
+    """
+    library, _, precision = name.partition(":")
+    if library == "onnxruntime":
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = n_threads
+        # As edgeperc has it: without it, the threads of one network go on spinning while another's want the cores, and
+        # two small networks took 77 ms that take 25 one at a time.
+        options.add_session_config_entry("session.force_spinning_stop", "1")
+        session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        (entry,) = session.get_inputs()
+        names, batch = [o.name for o in session.get_outputs()], np.zeros(entry.shape, np.float32)
+
+        def by_onnxruntime() -> dict[str, NDArray[np.float32]]:
+            return {n: a[0] for n, a in zip(names, session.run(names, {entry.name: batch}), strict=True)}
+
+        return Engine(batch[0], by_onnxruntime)
+    if library == "openvino":
+        import openvino
+
+        model = openvino.Core().read_model(path)
+        request = openvino_request(model, precision, n_threads)
+        batch = np.zeros(list(model.input(0).shape), np.float32)
+        request.set_input_tensor(openvino.Tensor(batch, shared_memory=True))
+
+        def by_openvino() -> dict[str, NDArray[np.float32]]:
+            request.infer()
+            return {o.any_name: request.get_tensor(o).data[0] for o in request.model_outputs}
+
+        return Engine(batch[0], by_openvino)
+    import torch
+
+    torch.set_num_threads(n_threads)
+    network, shape, names = torch_network(path)
+    if library == "torch.compile":
+        import torch._inductor.config as inductor
+
+        inductor.compile_threads = 1  # no pool of processes that would outlive this one
+        network = torch.compile(network)
+    tensor = torch.zeros(shape)
+
+    def by_torch() -> dict[str, NDArray[np.float32]]:
+        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
+            answers = network(tensor)
+        return {n: a[0].float().numpy() for n, a in zip(names, answers, strict=True)}
+
+    return Engine(tensor.numpy()[0], by_torch)
+
+
+def torch_network(path: Path) -> tuple[Any, tuple[int, ...], list[str]]:
+    """A model's graph as a torch module, the shape of its input, and the names of its outputs.
+
+    Raises
+    ------
+    ModelError
+        The graph has an operator that none of this project's float networks has.
+    """
+    import onnx
+    import torch
+
+    graph = onnx.load(path).graph
+    root, traced = torch.nn.Module(), torch.fx.Graph()
+    # Constants are tensors, all else nodes of the traced graph.
+    values: dict[str, Any] = {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in graph.initializer}
+    (entry,) = graph.input
+    values[entry.name] = traced.placeholder("x")
+    for k, node in enumerate(graph.node):
+        set_up = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
+        inputs = [values[name] if name else None for name in node.input]
+        function, arguments = _in_torch(node.op_type, inputs, set_up)
+        if all(isinstance(value, torch.Tensor) for value in inputs):
+            values[node.output[0]] = function(*arguments)
+            continue
+        for j, value in enumerate(arguments):
+            if isinstance(value, torch.Tensor):
+                root.register_buffer(f"constant_{k}_{j}", value)
+                arguments[j] = traced.get_attr(f"constant_{k}_{j}")
+        values[node.output[0]] = traced.call_function(function, tuple(arguments))
+    traced.output(tuple(values[o.name] for o in graph.output))
+    shape = tuple(d.dim_value for d in entry.type.tensor_type.shape.dim)
+    return torch.fx.GraphModule(root, traced).eval(), shape, [o.name for o in graph.output]
+
+
+def _in_torch(op: str, inputs: Sequence[Any], set_up: Mapping[str, Any]) -> tuple[Callable[..., Any], list[Any]]:
+    """The function of torch that does what an ONNX operator does, and its arguments in order."""
+    import torch
+    import torch.nn.functional as F
+
+    x, *others = inputs
+    pads = set_up.get("pads", [0, 0, 0, 0])
+    if pads[:2] != pads[2:]:
+        raise ModelError(f"{op} pads {pads}, other before than behind; no torch function does")
+    plain = {
+        "Add": torch.add, "Equal": torch.eq, "Mul": torch.mul, "Relu": torch.relu, "Sigmoid": torch.sigmoid,
+        "Where": torch.where,
+    }  # fmt: skip
+    if op in plain:
+        return plain[op], list(inputs)
+    if op == "Conv":
+        bias = others[1] if len(others) > 1 else None
+        return F.conv2d, [x, others[0], bias, set_up["strides"], pads[:2], set_up["dilations"], set_up["group"]]
+    if op == "ConvTranspose":
+        bias = others[1] if len(others) > 1 else None
+        extra = set_up.get("output_padding", [0, 0])
+        last = [extra, set_up.get("group", 1), set_up.get("dilations", [1, 1])]
+        return F.conv_transpose2d, [x, others[0], bias, set_up["strides"], pads[:2], *last]
+    if op == "Elu":
+        return F.elu, [x, set_up.get("alpha", 1.0)]
+    if op == "MaxPool" and not set_up.get("ceil_mode") and set(set_up.get("dilations", [1])) == {1}:
+        return F.max_pool2d, [x, set_up["kernel_shape"], set_up["strides"], pads[:2]]
+    if op == "Concat":
+        return torch.cat, [list(inputs), set_up["axis"]]
+    if op == "ReduceMean":
+        return torch.mean, [x, others[0].tolist(), bool(set_up.get("keepdims", 1))]
+    if op == "Expand":
+        return torch.Tensor.expand, [x, [-1 if n == 1 else n for n in others[0].tolist()]]
+    if op == "Resize" and set_up.get("mode") == b"nearest":
+        _, scales, *sizes = others
+        size = sizes[0].tolist()[2:] if sizes else None
+        return F.interpolate, [x, size, None if sizes else scales.tolist()[2:], "nearest"]
+    if op == "DepthToSpace" and set_up.get("mode") == b"CRD":
+        return F.pixel_shuffle, [x, set_up["blocksize"]]
+    if op == "Reshape":
+        return torch.reshape, [x, others[0].tolist()]
+    if op == "Transpose":
+        return torch.permute, [x, set_up["perm"]]
+    if op == "Cast" and isinstance(x, torch.Tensor):
+        return torch.Tensor.float, [x]
+    if op == "Cast":  # a mask, by which torch multiplies as it is
+        return torch.Tensor.contiguous, [x]
+    raise ModelError(f"operator {op} has no translation to torch here")

@@ -1,0 +1,167 @@
+"""The whole way from scan to answer as one would write it without edgeperc: numpy around a network in some engine.
+
+Projections are those of `projection`. Labels are an argmax; boxes are peaks of the heat map, decoded, thinned
+out by their overlap and classified; hidden points vote among their neighbours: all on whole arrays at once. PointSeg's
+removal of outliers is left out, for searching components point by point is no work for numpy: rivals do less.
+
+Engines are onnxruntime, OpenVINO's own API, and torch, whose network is the model's own graph, translated: the same
+weights, batch norm folded in, as good as a network written by hand.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeperc import Box, PointLabels, TopView
+from edgeperc.card import ModelCard, TopViewGeometry
+from edgeperc.geometry import draw_footprints
+from edgeperc.sensors import SensorProfile
+
+from ..worker import Answer
+from .engines import Engine
+from .projection import NumpyRangeImage, NumpyTopView
+
+__all__ = ["Rival"]
+
+STRIDE, MAX_BOXES = 4, 100
+WINDOW, N_VOTES, MAX_RANGE_GAP_M = 2, 5, 1.0
+
+
+class Rival:
+    """`edgeperc.Perceiver` without edgeperc's stages.
+
+    Parameters
+    ----------
+    cards : sequence of ModelCard
+        The front quarter as a range image, or a top view with dense boxes.
+    engines : sequence of Engine
+        As many.
+    sensor : SensorProfile
+    """
+
+    def __init__(self, cards: Sequence[ModelCard], engines: Sequence[Engine], sensor: SensorProfile) -> None:
+        self.sensor = sensor
+        self.networks = []
+        for card, engine in zip(cards, engines, strict=True):
+            projector = NumpyTopView if isinstance(card.view, TopViewGeometry) else NumpyRangeImage
+            index = np.empty(engine.input.shape[1:], np.int32)
+            self.networks.append((card, engine, projector(card.view, card.input), index))
+
+    def __call__(self, points: NDArray[np.float32]) -> Answer:
+        """Labels and boxes of a scan (n, 4)."""
+        scale, offset = np.float32(self.sensor.remission_scale), np.float32(self.sensor.remission_offset)
+        if (scale, offset) != (1.0, 0.0):
+            points = np.column_stack((points[:, :3], (points[:, 3] + offset) * scale))
+        labelled, top_view, boxes = None, None, ()
+        for card, engine, projector, index in self.networks:
+            pixel = np.empty(len(points), np.int32)
+            projector.fill(points, engine.input, index, pixel)
+            answers = engine.run()
+            outputs = {o.kind: answers[o.name] for o in card.outputs}
+            logits = next(v for kind, v in outputs.items() if kind.startswith("class_"))
+            labels = logits.argmax(axis=0).astype(np.uint8)
+            if isinstance(card.view, TopViewGeometry):
+                boxes = tuple(dense_boxes(card, logits, outputs["box_dense"]))
+                boxed = np.isin(labels, [card.classes.index(name) for name in card.box_classes])
+                labels[boxed & (engine.input == 0.0).all(axis=0)] = 0
+                draw_footprints(labels, boxes, card.view, card.classes)
+                top_view = TopView(labels, card.classes, card.view.cell_m, card.view.x_range_m, card.view.y_range_m)
+            else:
+                found = vote(points, pixel, index, labels, len(card.classes))
+                labelled = PointLabels(found, pixel >= 0, card.classes)
+        return Answer(labelled, top_view, boxes)
+
+
+def vote(
+    points: NDArray[np.float32],
+    pixel: NDArray[np.int32],
+    index: NDArray[np.int32],
+    labels: NDArray[np.uint8],
+    n_classes: int,
+) -> NDArray[np.uint8]:
+    """`edgeperc.refine.label_points` of a view that is no full turn, in numpy."""
+    found = np.where(pixel >= 0, labels.reshape(-1)[pixel], 0).astype(np.uint8)
+    hidden = np.flatnonzero((pixel >= 0) & (index.reshape(-1)[pixel] != np.arange(len(points))))
+    distance = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
+    ranges = np.pad(np.where(index >= 0, distance[index], np.inf), WINDOW, constant_values=np.inf)
+    around = np.pad(labels, WINDOW)
+    row, col = np.divmod(pixel[hidden], labels.shape[1])
+    d_row, d_col = np.mgrid[: 2 * WINDOW + 1, : 2 * WINDOW + 1].reshape(2, -1)
+    at = row[:, None] + d_row, col[:, None] + d_col
+    gaps = np.abs(ranges[at] - distance[hidden, None])
+    nearest = np.argsort(gaps, axis=1, kind="stable")[:, :N_VOTES]
+    votes = np.take_along_axis(around[at], nearest, axis=1).astype(np.int64)
+    votes[np.take_along_axis(gaps, nearest, axis=1) > MAX_RANGE_GAP_M] = n_classes
+    same = (votes[:, :, None] == votes[:, None, :]).sum(axis=2) * (votes < n_classes)
+    winner = np.take_along_axis(votes, same.argmax(axis=1)[:, None], axis=1)[:, 0]
+    found[hidden] = np.where(winner < n_classes, winner, 0)
+    return found
+
+
+def dense_boxes(card: ModelCard, logits: NDArray[np.float32], dense: NDArray[np.float32]) -> list[Box]:
+    """`edgeperc.decode.decode_dense` in numpy."""
+    view = card.view
+    assert isinstance(view, TopViewGeometry)
+    heat = dense[0]
+    height, width = heat.shape
+    padded = np.pad(heat, 1, constant_values=-np.inf)
+    highest = np.max([padded[r : r + height, c : c + width] for r in range(3) for c in range(3)], axis=0)
+    threshold = math.log(card.score_threshold / (1.0 - card.score_threshold))
+    rows, cols = np.nonzero((heat == highest) & (heat >= threshold))
+    best = np.argsort(-heat[rows, cols], kind="stable")[:MAX_BOXES]
+    rows, cols = rows[best], cols[best]
+    score, d_row, d_col, log_l, log_w, sin, cos, z, log_h = dense[:, rows, cols].astype(np.float64)
+    cell_m = STRIDE * view.cell_m
+    x, y = view.x_range_m[1] - (rows + 0.5 + d_row) * cell_m, view.y_range_m[1] - (cols + 0.5 + d_col) * cell_m
+    sizes, yaw = np.exp([log_l, log_w, log_h]).T, 0.5 * np.arctan2(sin, cos)
+    boxes: list[Box] = []
+    all_x, all_y = (centres.reshape(-1) for centres in view.cell_centres())
+    for k in range(len(rows)):
+        place, size = (float(x[k]), float(y[k]), float(z[k])), tuple(sizes[k].tolist())
+        box = Box("", float(1.0 / (1.0 + math.exp(-score[k]))), place, size, float(yaw[k]))
+        if any(overlap(box, kept) > card.nms_iou for kept in boxes):
+            continue
+        reach = math.hypot(*size[:2]) / 2.0
+        near_rows, near_cols = np.flatnonzero(abs(all_x - x[k]) < reach), np.flatnonzero(abs(all_y - y[k]) < reach)
+        dx, dy = all_x[near_rows, None] - x[k], all_y[None, near_cols] - y[k]
+        inside = abs(dx * np.cos(yaw[k]) + dy * np.sin(yaw[k])) <= size[0] / 2.0
+        inside &= abs(dy * np.cos(yaw[k]) - dx * np.sin(yaw[k])) <= size[1] / 2.0
+        shares = np.exp(logits[:, near_rows[:, None], near_cols].astype(np.float64))
+        sums = (shares / shares.sum(axis=0))[:, inside].sum(axis=1)
+        evidence = [_evidence(card, name, sums[card.classes.index(name)], size) for name in card.box_classes]
+        label = card.box_classes[int(np.argmax(evidence))]
+        boxes.append(Box(label, box.score, place, size, box.yaw))
+    return boxes
+
+
+def _evidence(card: ModelCard, name: str, share: float, size: Sequence[float]) -> float:
+    if not card.box_size_spreads:
+        return float(share)
+    spread = np.array(card.box_size_spreads[name])
+    off = np.log(size) - np.log(card.box_size_priors[name])
+    return float(np.log(max(share, 1e-300)) - 0.5 * ((off / spread) ** 2).sum() - np.log(spread).sum())
+
+
+def overlap(a: Box, b: Box) -> float:
+    """Intersection over union of two footprints: one polygon clipped by the other's sides."""
+    reach = math.hypot(*a.size[:2]) / 2.0 + math.hypot(*b.size[:2]) / 2.0
+    if math.hypot(a.center[0] - b.center[0], a.center[1] - b.center[1]) >= reach:
+        return 0.0
+    polygon, clip = a.corners().tolist(), b.corners().tolist()
+    for (x0, y0), (x1, y1) in zip(clip, clip[1:] + clip[:1], strict=True):
+        sides = [(x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) for x, y in polygon]
+        kept = []
+        for k, (x, y) in enumerate(polygon):
+            (last_x, last_y), last, side = polygon[k - 1], sides[k - 1], sides[k]
+            if (side >= 0.0) != (last >= 0.0):
+                share = last / (last - side)
+                kept.append([last_x + share * (x - last_x), last_y + share * (y - last_y)])
+            if side >= 0.0:
+                kept.append([x, y])
+        polygon = kept
+    shared = 0.5 * sum(polygon[k - 1][0] * y - x * polygon[k - 1][1] for k, (x, y) in enumerate(polygon))
+    return shared / (a.size[0] * a.size[1] + b.size[0] * b.size[1] - shared)

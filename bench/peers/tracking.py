@@ -1,0 +1,257 @@
+"""How many scans a second the tracker follows, and Stone Soup's JPDA on the same boxes.
+
+Run as ``python -m edgeperc_bench.peers.tracking [ROOT] [--sequence SEQ]``. ROOT holds KITTI's tracking sequences with
+detections (``label_02``, ``calib``, ``detections/DETECTOR_CLASS``); without it, a street of parked and moving cars is
+drawn from a seed. What is timed is one thread in `Tracker.update` alone, boxes in and tracks out, over whole sequences:
+
+- every class for itself, and all classes together; the kernels compile before the first scan that counts
+- one sequence of cars (``--sequence``) by the tracker and by Stone Soup, the same boxes for both, those whose score is
+  above ``--score``. Stone Soup's is a JPDA over unscented filters of one motion, constant velocity, in x and y; it runs
+  for at most ``--seconds``, and what it did by then counts
+- ``--crossing N``: N scans of 200 targets (``--targets``) that cross and hide one another among half as many false
+  alarms, what a scan takes at the worst, and whether memory grows
+- ``--every-second-beam OUT``: nothing is timed; from ROOT, here an object set with track ids, the same drives as a
+  coarser sensor with another remission would have seen them, for ``edgeperc adapt fit`` and ``eval tracking --adapt``
+
+The table shows wall time and the time that the processor spent, which a busy computer stretches less.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import platform
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeperc import Box, Tracker
+from edgeperc.evaluation.tracking import CLASSES, FRAME_S, read_sequence, sequence_names, sequence_scans
+from edgeperc.sensors import get_sensor
+
+__all__ = ["crossing", "every_second_beam", "main"]
+
+Scans = Sequence[Sequence[Box]]
+
+
+def drawn_street(n_scans: int = 400, seed: int = 0) -> list[list[Box]]:
+    """Boxes of 30 parked and 6 driving cars around a sensor that drives at 10 m/s, with false alarms."""
+    rng = np.random.default_rng(seed)
+    parked = np.column_stack([rng.uniform(0.0, 450.0, 90), rng.choice([-6.0, 6.0, 9.0], 90)])
+    driving, speed = rng.uniform(0.0, 200.0, 6), rng.uniform(5.0, 14.0, 6)
+    scans = []
+    for k in range(n_scans):
+        ahead = np.column_stack([driving + FRAME_S * k * speed, np.full(6, -2.0)])
+        here = np.array([k * FRAME_S * 10.0, 0.0])
+        there = np.vstack([parked - here, ahead - here, rng.uniform(-50.0, 50.0, (2, 2))])
+        there += rng.normal(0.0, 0.1, there.shape)
+        seen = (np.abs(there[:, 0]) < 50.0) & (rng.random(len(there)) < 0.93)
+        scans.append([Box("car", 0.99, (x, y, -0.9), (4.2, 1.8, 1.5), 0.0) for x, y in there[seen].tolist()])
+    return scans
+
+
+def crossing(
+    n_scans: int, n_targets: int = 200, n_false: int = 100, seed: int = 0
+) -> Iterator[tuple[list[Box], NDArray[np.float64]]]:
+    """Boxes, and true places (n_targets, 2), of cars that cross in 120 m by 120 m and turn round at its edges.
+
+    Every other one is overlooked in three scans of ten; false alarms lie anywhere.
+    """
+    rng = np.random.default_rng(seed)
+    places, heading = rng.uniform(-60.0, 60.0, (n_targets, 2)), rng.uniform(-math.pi, math.pi, n_targets)
+    speed, shown = rng.uniform(3.0, 12.0, n_targets), np.where(np.arange(n_targets) % 2, 0.7, 0.97)
+    for _ in range(n_scans):
+        places += FRAME_S * speed[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+        out = (np.abs(places) > 60.0).any(axis=1)
+        heading[out] = np.arctan2(-places[out, 1], -places[out, 0]) + rng.uniform(-0.7, 0.7, np.count_nonzero(out))
+        seen = rng.random(n_targets) < shown
+        rows = [*np.column_stack([places + rng.normal(0.0, 0.08, places.shape), heading])[seen].tolist()]
+        boxes = [Box("car", 0.95, (x, y, -0.9), (4.2, 1.8, 1.5), yaw) for x, y, yaw in rows]
+        for x, y, yaw in rng.uniform([-90.0, -90.0, -3.0], [90.0, 90.0, 3.0], (n_false, 3)).tolist():
+            boxes.append(Box("car", 0.55, (x, y, -0.9), (4.2, 1.8, 1.5), yaw))
+        yield boxes, places.copy()
+
+
+def every_second_beam(root: Path, out: Path) -> None:
+    """Write the drives of an HDL-64E as if it had half the beams and told the square of its remission, as a byte.
+
+    Parameters
+    ----------
+    root : Path
+        An object set with track ids; its scans hold one beam after the other, each a turn from ahead, as KITTI's do.
+    out : Path
+        Becomes an object set; ``sensor.json`` in it is the imagined sensor, whose remission nobody has fitted.
+    """
+    for folder in ("label_2", "track_id", "calib"):
+        shutil.copytree(root / "training" / folder, out / "training" / folder)
+    shutil.copy(root / "frames.csv", out)
+    (out / "training/velodyne").mkdir()
+    for path in [path for name in sequence_names(root) for path in sequence_scans(root, name).values()]:
+        points = np.fromfile(path, np.float32).reshape(-1, 4)
+        azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2.0 * np.pi)
+        beam = np.concatenate([[0], np.cumsum(np.diff(azimuth) < -np.pi)])
+        kept = points[beam % 2 == 0]
+        kept[:, 3] = 255.0 * kept[:, 3] ** 2
+        kept.tofile(out / "training/velodyne" / path.name)
+    whole = get_sensor("hdl-64e")
+    half = replace(
+        whole,
+        name="every second beam",
+        elevations_deg=whole.elevations_deg[::2],
+        remission_range=(0.0, 255.0),
+        remission=None,
+    )
+    (out / "sensor.json").write_text(half.to_json(), encoding="utf-8")
+
+
+def endurance(n_scans: int, n_targets: int) -> str:
+    """What a scan of crossing targets takes, and how much memory grows from a tenth of the scans on."""
+    from ..context import rss_mb  # of the extra 'bench'
+
+    ours([drawn_street(30)])  # the kernels load before the first scan that counts
+    tracker, took, early = Tracker(), np.empty(n_scans), 0.0
+    for k, (boxes, _) in enumerate(crossing(n_scans, n_targets, n_targets // 2)):
+        start = time.perf_counter()
+        tracker.update(boxes, k * FRAME_S, np.eye(4))
+        took[k] = 1e3 * (time.perf_counter() - start)
+        if k == n_scans // 10:
+            early = rss_mb()
+    median, late, worst = np.quantile(took, [0.5, 0.99, 1.0])
+    return (
+        f"{n_scans:,} scans of {n_targets} crossing targets and {n_targets // 2} false alarms: median {median:.2f} ms, "
+        f"99 % {late:.2f} ms, worst {worst:.2f} ms; "
+        f"memory {early:.1f} MB after {n_scans // 10:,} scans, {rss_mb():.1f} MB at the end"
+    )
+
+
+def timed(run: Callable[[], int]) -> tuple[int, float, float]:
+    """Scans done, seconds on the wall, seconds of the processor."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    done = run()
+    return done, time.perf_counter() - wall, time.process_time() - cpu
+
+
+def ours(sequences: Sequence[Scans]) -> int:
+    for scans in sequences:
+        tracker = Tracker()
+        for k, boxes in enumerate(scans):
+            tracker.update(boxes, k * FRAME_S)
+    return sum(map(len, sequences))
+
+
+def stone_soup(scans: Scans, seconds: float) -> int:
+    """Scans done before the time was up."""
+    from stonesoup.dataassociator.neighbour import NearestNeighbour
+    from stonesoup.dataassociator.probability import JPDA
+    from stonesoup.deleter.time import UpdateTimeStepsDeleter
+    from stonesoup.hypothesiser.distance import DistanceHypothesiser
+    from stonesoup.hypothesiser.probability import PDAHypothesiser
+    from stonesoup.initiator.simple import MultiMeasurementInitiator
+    from stonesoup.measures import Mahalanobis
+    from stonesoup.models.measurement.linear import LinearGaussian
+    from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
+    from stonesoup.predictor.kalman import UnscentedKalmanPredictor
+    from stonesoup.tracker.simple import MultiTargetMixtureTracker
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.state import GaussianState
+    from stonesoup.updater.kalman import UnscentedKalmanUpdater
+
+    sensor = LinearGaussian(4, (0, 2), np.diag([0.2, 0.2]) ** 2)
+    begin = datetime(2000, 1, 1)
+    stop = time.perf_counter() + seconds
+
+    def detections() -> Iterator[tuple[datetime, set[Detection]]]:
+        for k, boxes in enumerate(scans):
+            if time.perf_counter() > stop:
+                return
+            at = begin + timedelta(seconds=k * FRAME_S)
+            yield (
+                at,
+                {Detection(np.array([box.center[:2]]).T, timestamp=at, measurement_model=sensor) for box in boxes},
+            )
+
+    predictor = UnscentedKalmanPredictor(
+        CombinedLinearGaussianTransitionModel([ConstantVelocity(1.0), ConstantVelocity(1.0)])
+    )
+    updater = UnscentedKalmanUpdater(sensor)
+
+    associator = JPDA(PDAHypothesiser(predictor, updater, 1e-3, prob_detect=0.9, prob_gate=0.95))
+    nearest = NearestNeighbour(DistanceHypothesiser(predictor, updater, Mahalanobis(), missed_distance=3.0))
+    prior = GaussianState(np.zeros((4, 1)), np.diag([0.04, 64.0, 0.04, 64.0]), timestamp=begin)
+    deleter = UpdateTimeStepsDeleter(5)
+    initiator = MultiMeasurementInitiator(prior, deleter, nearest, updater, sensor, min_points=2)
+    tracker = MultiTargetMixtureTracker(initiator, deleter, detections(), associator, updater)
+    return sum(1 for _ in tracker)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m edgeperc_bench.peers.tracking", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument("root", nargs="?", type=Path, help="KITTI's tracking sequences; default: a drawn street")
+    parser.add_argument("--sequence", default="0004", metavar="SEQ", help="the one for both (default: %(default)s)")
+    parser.add_argument("--score", type=float, default=0.5, help="boxes for both have more (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=60.0, help="Stone Soup's time (default: %(default)s)")
+    parser.add_argument("--crossing", type=int, metavar="N", help="scans of crossing targets, instead of all else")
+    parser.add_argument("--targets", type=int, default=200, metavar="N", help="that cross (default: %(default)s)")
+    parser.add_argument(
+        "--every-second-beam", type=Path, metavar="OUT", help="make a coarser sensor's drives of ROOT's"
+    )
+    arguments = parser.parse_args()
+    if arguments.crossing:
+        print(endurance(arguments.crossing, arguments.targets))
+        return
+    if arguments.every_second_beam:
+        if arguments.root is None:
+            parser.error("--every-second-beam needs ROOT, an object set with track ids")
+        every_second_beam(arguments.root, arguments.every_second_beam)
+        return
+
+    if arguments.root is None:
+        of_class = {"car (drawn)": [drawn_street()]}
+        shared = of_class["car (drawn)"][0]
+    else:
+        names = sorted(path.stem for path in (arguments.root / "label_02").glob("*.txt"))
+        read = {name: read_sequence(arguments.root, name).detections for name in names}
+        of_class = {
+            of: [[[box for box in scan if box.label == of] for scan in scans] for scans in read.values()]
+            for of in CLASSES
+        }
+        of_class["all together"] = [list(scans) for scans in read.values()]
+        shared = of_class["car"][names.index(arguments.sequence)]
+    shared = [[box for box in scan if box.score > arguments.score] for scan in shared]
+
+    ours([drawn_street(30)])
+    print(f"numba {numba.__version__}, Python {platform.python_version()}, {platform.machine()}, one thread")
+    print(f"{'':24}{'scans':>8}{'boxes/scan':>12}{'scans/s':>10}{'by processor time':>20}")
+
+    def line(name: str, scans: int, boxes: float, wall: float, cpu: float) -> None:
+        print(f"{name:24}{scans:>8,}{boxes:>12.1f}{scans / wall:>10,.0f}{scans / cpu:>20,.0f}")
+
+    for name, sequences in of_class.items():
+        done, wall, cpu = timed(lambda sequences=sequences: ours(sequences))
+        line(name, done, sum(len(scan) for scans in sequences for scan in scans) / done, wall, cpu)
+
+    each = sum(map(len, shared)) / len(shared)
+    done, wall, cpu = timed(lambda: ours([shared] * 5))
+    line(f"one sequence, score > {arguments.score}", done, each, wall, cpu)
+    try:
+        import stonesoup
+    except ImportError:
+        print("Stone Soup's JPDA is not installed. Run: pip install 'edgeperc[peers]'")
+        return
+    done, theirs_wall, theirs_cpu = timed(lambda: stone_soup(shared, arguments.seconds))
+    line(f"Stone Soup {stonesoup.__version__} JPDA", done, each, theirs_wall, theirs_cpu)
+    times = theirs_cpu / max(done, 1) / (cpu / (5 * len(shared)))
+    print(f"Stone Soup takes {times:,.0f} times as long a scan" if math.isfinite(times) else "")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""``edgeperc demo``: the bundled scene."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from typing import TYPE_CHECKING
+
+from ..errors import MissingExtraError
+from .output import one_line, print_rows
+from .run import make_perceiver
+
+if TYPE_CHECKING:
+    from ..perception import Box, Perception
+
+__all__ = ["demo_command"]
+
+# A junction with cars, a truck, pedestrians and a cyclist, most of which are found; far from the seeds that models are
+# trained on.
+DEMO_SCENE = (2_000_000_110, "junction")
+
+
+# demo
+
+
+def demo_command(arguments: argparse.Namespace) -> int:
+    """``edgeperc demo``: perceive the bundled scene, print a table and write a picture and a page."""
+    import numpy as np
+
+    from .. import view
+    from ..simulation.drawn import random_scene
+    from ..simulation.scene import simulate
+
+    perceive = make_perceiver(arguments, "hdl-64e", "ignore")
+    scan = simulate(random_scene(*DEMO_SCENE), "hdl-64e", DEMO_SCENE[0])
+    perceive(scan.points)  # the first pass over a whole scan meets cold caches
+    perception = perceive(scan.points)
+
+    rows = [("scene", f"{perception.n_points:,} points, a simulated hdl-64e in a street that is known to the cell")]
+    if perception.top_view is not None:
+        area_m2 = perception.top_view.drivable_area_m2
+        rows.append(("drivable", f"{area_m2:.0f} m2 of the {_extent(perception)} ahead"))
+    found = [_box_words(box) for box in perception.boxes] or ["none"]
+    rows += [("boxes" if k == 0 else "", words) for k, words in enumerate(found)]
+    if perception.points is not None:
+        there = np.bincount(scan.labels[perception.points.in_view], minlength=len(perception.points.classes))
+        for k, (name, count) in enumerate(perception.points.counts().items()):
+            rows.append(("points" if k == 0 else "", f"{name:<12}{count:>9,}   (there are {there[k]:,})"))
+    total_ms = sum(perception.stage_ms.values())
+    rows.append(("time", f"{total_ms:.1f} ms: " + ", ".join(f"{k} {ms:.1f}" for k, ms in perception.stage_ms.items())))
+    for k, (name, provider) in enumerate(perception.providers.items()):
+        rows.append(("ran on" if k == 0 else "", f"{name}: {provider}"))
+
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    page, picture = arguments.out / "scene.html", arguments.out / "scene.png"
+    title = "edgeperc demo: a simulated street"
+    view.write_html(scan.points, perception, page, title=title)
+    try:
+        view.draw(scan.points, perception, picture, title=title)
+        rows.append(("picture", str(picture)))
+    except MissingExtraError as exc:
+        rows.append(("picture", one_line(exc)))
+    rows.append(("3-D page", f"{page} (open it in a browser)"))
+    print_rows(rows)
+    return 0
+
+
+def _extent(perception: Perception) -> str:
+    assert perception.top_view is not None
+    (x_near, x_far), (y_right, y_left) = perception.top_view.x_range_m, perception.top_view.y_range_m
+    return f"{x_far - x_near:.0f} x {y_left - y_right:.0f} m"
+
+
+def _box_words(box: Box) -> str:
+    x, y, _ = box.center
+    length, width, height = box.size
+    side = f"{abs(y):4.1f} m {'left' if y >= 0 else 'right'}"
+    return (
+        f"{box.label:<10}{box.score:5.2f}   {math.hypot(x, y):5.1f} m away: {x:5.1f} m ahead, {side:<13}"
+        f"{length:.1f} x {width:.1f} x {height:.1f} m, heading {round(math.degrees(box.yaw)):4d} deg"
+    )

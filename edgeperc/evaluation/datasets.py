@@ -1,0 +1,307 @@
+"""Labelled real scans, and the truth that SSADNet and PointSeg are trained on and judged by.
+
+Labels cover the left colour camera's field of view only: outside it, truth is unknown, not background.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..card import TopViewGeometry
+from ..errors import PointsError
+from ..geometry import inside
+from ..perception import Box
+from ..readers.files import read_points
+from ..simulation.samples import IGNORE, POINT_CLASS_OF
+from .splits import TEST_DRIVES, in_split
+
+__all__ = [
+    "IMAGE_SIZE",
+    "ROAD_CLASSES",
+    "SEQUENCE_DRIVES",
+    "Calibration",
+    "Frame",
+    "KittiObjects",
+    "RoadFrame",
+    "SemanticKitti",
+    "layouts",
+    "read_objects",
+    "scan_hash",
+]
+
+IMAGE_SIZE = (1242, 375)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Where the camera is, and how it sees.
+
+    Attributes
+    ----------
+    T_cam_velo : (4, 4) float64
+        Sensor frame to rectified camera frame.
+    P2 : (3, 4) float64
+        Rectified camera frame to the left colour image.
+    """
+
+    T_cam_velo: NDArray[np.float64]
+    P2: NDArray[np.float64]
+
+    @classmethod
+    def read(cls, path: Path) -> Calibration:
+        """Read a KITTI object or tracking calibration file."""
+        values = {}
+        for line in path.read_text().splitlines():
+            key, _, numbers = line.replace(":", " ", 1).partition(" ")
+            if numbers.strip():
+                values[key] = np.array([float(v) for v in numbers.split()])
+        rectify, from_velo = np.eye(4), np.eye(4)
+        try:
+            rectify[:3, :3] = values["R0_rect" if "R0_rect" in values else "R_rect"].reshape(3, 3)
+            from_velo[:3] = values["Tr_velo_to_cam" if "Tr_velo_to_cam" in values else "Tr_velo_cam"].reshape(3, 4)
+            return cls(rectify @ from_velo, values["P2"].reshape(3, 4))
+        except (KeyError, ValueError) as exc:
+            raise PointsError(f"{path} holds no KITTI calibration; expected P2, R0_rect and Tr_velo_to_cam") from exc
+
+    def to_image(self, points: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pixels (n, 2) and depth (n,) [m] of points (n, 3+) in the sensor frame."""
+        cam = np.asarray(points[:, :3], np.float64) @ self.T_cam_velo[:3, :3].T + self.T_cam_velo[:3, 3]
+        image = cam @ self.P2[:, :3].T + self.P2[:, 3]
+        depth = image[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return image[:, :2] / depth[:, None], depth
+
+    def sensor_boxes(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """KITTI's height, width, length, x, y, z, turn in the camera's frame -> x, y, z, length, width, height, yaw."""
+        T_velo_cam = np.linalg.inv(self.T_cam_velo)
+        height, width, length, x, y, z, turn = rows.T
+        # KITTI gives the middle of the bottom face; y points down in the camera frame.
+        middles = np.stack([x, y - height / 2.0, z], axis=1) @ T_velo_cam[:3, :3].T + T_velo_cam[:3, 3]
+        ahead = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], axis=1) @ T_velo_cam[:3, :3].T
+        return np.column_stack([middles, length, width, height, np.arctan2(ahead[:, 1], ahead[:, 0])])
+
+    def in_image(self, points: NDArray[Any]) -> NDArray[np.bool_]:
+        """Which points the camera sees, (n,) bool."""
+        pixel, depth = self.to_image(points)
+        return (depth > 0.1) & (pixel >= 0).all(axis=1) & (pixel[:, 0] < IMAGE_SIZE[0]) & (pixel[:, 1] < IMAGE_SIZE[1])
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One scan with everything labelled in it.
+
+    Attributes
+    ----------
+    name, drive : str
+    grade : str
+        ``"A"`` where the boxes were checked to fit the scan.
+    points : (n, 4) float32
+    boxes : tuple of Box
+        In the sensor frame, labels in lower case (car, van, truck, pedestrian, person_sitting, cyclist, tram, misc).
+    unlabelled : (k, 4) float64
+        Image rectangles (left, top, right, bottom) whose objects nobody labelled (DontCare).
+    calibration : Calibration
+    """
+
+    name: str
+    drive: str
+    grade: str
+    points: NDArray[np.float32]
+    boxes: tuple[Box, ...]
+    unlabelled: NDArray[np.float64]
+    calibration: Calibration
+
+    @cached_property
+    def judged(self) -> NDArray[np.bool_]:
+        """Points whose truth is known, (n,) bool: seen by the camera, outside DontCare."""
+        return self.judges(self.points)
+
+    def judges(self, points: NDArray[Any]) -> NDArray[np.bool_]:
+        """Whether truth is known at each of these places (n, 3+), sensor frame."""
+        known = self.calibration.in_image(points)
+        pixel, _ = self.calibration.to_image(points)
+        for left, top, right, bottom in self.unlabelled:
+            known &= ~((pixel[:, 0] >= left) & (pixel[:, 0] <= right) & (pixel[:, 1] >= top) & (pixel[:, 1] <= bottom))
+        return known
+
+    def point_labels(self) -> NDArray[np.uint8]:
+        """PointSeg's truth, (n,) uint8: a point in a box has the box's class, `IGNORE` where nobody labelled."""
+        labels = np.where(self.judged, 0, IGNORE).astype(np.uint8)
+        for box in self.boxes:
+            labels[inside(box, self.points)] = POINT_CLASS_OF.get(box.label, IGNORE)
+        return labels
+
+
+def read_objects(label_path: Path, calibration: Calibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
+    """Boxes of a KITTI label file in the sensor frame, and its DontCare rectangles (SSADNet 3.1.1)."""
+    kinds, rows, unlabelled = [], [], []
+    for line in label_path.read_text().splitlines():
+        values = line.split()
+        if not values:
+            continue
+        kind, numbers = values[0], [float(v) for v in values[1:15]]
+        if kind == "DontCare":
+            unlabelled.append(numbers[3:7])
+            continue
+        kinds.append(kind.lower())
+        rows.append(numbers[7:14])
+    placed = calibration.sensor_boxes(np.array(rows, np.float64).reshape(-1, 7))
+    boxes = tuple(
+        Box(kind, 1.0, (x, y, z), (length, width, height), yaw)
+        for kind, (x, y, z, length, width, height, yaw) in zip(kinds, placed.tolist(), strict=True)
+    )
+    return boxes, np.array(unlabelled, np.float64).reshape(-1, 4)
+
+
+def scan_hash(points: NDArray[np.float32]) -> str:
+    """What a card calls a scan that its model was trained on: the first 16 digits of its SHA-256."""
+    return hashlib.sha256(points.tobytes()).hexdigest()[:16]
+
+
+class KittiObjects:
+    """The labelled scans below a KITTI root (``training/velodyne``, ``label_2``, ``calib``), by drive.
+
+    A ``frames.csv`` beside ``training`` says which drive each scan is of (columns ``name``, ``drive`` and, where there
+    are any, ``grade``, ``crop``); without one, each scan counts as a drive of its own and nothing is held back.
+    """
+
+    def __init__(self, root: Path | str) -> None:
+        self.root = Path(root)
+        table = self.root / "frames.csv"
+        if table.exists():
+            with table.open(newline="") as file:
+                rows = list(csv.DictReader(file))
+        else:
+            rows = [{"name": p.stem, "drive": p.stem} for p in sorted((self.root / "training/label_2").glob("*.txt"))]
+        self.drives = {r["name"]: r["drive"] for r in rows}
+        self.rows = [r for r in rows if (self.root / "training/label_2" / f"{r['name']}.txt").exists()]
+        if not self.rows:
+            raise PointsError(f"{self.root} holds no training/label_2/*.txt; expected the root of a KITTI object set")
+
+    def names(self, split: str, *, fold: int | None = None, grades: str = "A") -> list[str]:
+        """Names of the frames of a split (`splits.in_split`) whose boxes are of one of the ``grades``."""
+        return [r["name"] for r in self.rows if in_split(r["drive"], split, fold) and r.get("grade", "A") in grades]
+
+    def unlabelled(self, split: str, *, fold: int | None = None) -> list[str]:
+        """Names of the scans of a split that have no label file."""
+        labelled = {r["name"] for r in self.rows}
+        names = [name for name, drive in self.drives.items() if name not in labelled and in_split(drive, split, fold)]
+        return [name for name in names if (self.root / "training/velodyne" / f"{name}.bin").exists()]
+
+    def frame(self, name: str) -> Frame:
+        """Read one frame whole."""
+        row = next(r for r in self.rows if r["name"] == name)
+        calibration = Calibration.read(self.root / "training/calib" / f"{name}.txt")
+        boxes, unlabelled = read_objects(self.root / "training/label_2" / f"{name}.txt", calibration)
+        points = read_points(self.root / "training/velodyne" / f"{name}.bin")
+        return Frame(name, row["drive"], row.get("grade", "A"), points, boxes, unlabelled, calibration)
+
+
+def layouts(root: Path | str) -> Iterator[tuple[Box, ...]]:
+    """Boxes of every KITTI label file below ``root`` that is of no test drive: real scenes to simulate."""
+    root = Path(root)
+    with (root / "frames.csv").open(newline="") as file:
+        names = [r["name"] for r in csv.DictReader(file) if r["drive"] not in TEST_DRIVES]
+    for name in names:
+        calibration = Calibration.read(root / "calib" / f"{name}.txt")
+        yield read_objects(root / "label_2" / f"{name}.txt", calibration)[0]
+
+
+ROAD_CLASSES = ("other", "road", "vehicle")
+
+# SemanticKITTI's raw ids: road and lane marking; car, bus, truck, other vehicle, and those that move.
+ROAD_IDS = (40, 60)
+VEHICLE_IDS = (10, 13, 18, 20, 252, 257, 258, 259)
+
+# KITTI's odometry sequences with labels are raw drives too.
+SEQUENCE_DRIVES = {
+    "00": "2011_10_03_drive_0027",
+    "01": "2011_10_03_drive_0042",
+    "02": "2011_10_03_drive_0034",
+    "03": "2011_09_26_drive_0067",
+    "04": "2011_09_30_drive_0016",
+    "05": "2011_09_30_drive_0018",
+    "06": "2011_09_30_drive_0020",
+    "07": "2011_09_30_drive_0027",
+    "08": "2011_09_30_drive_0028",
+    "09": "2011_09_30_drive_0033",
+    "10": "2011_09_30_drive_0034",
+}
+
+
+@dataclass(frozen=True)
+class RoadFrame:
+    """A SemanticKITTI scan whose road and vehicles are known.
+
+    Attributes
+    ----------
+    name, drive : str
+    points : (n, 4) float32
+    labels : (n,) uint8
+        Index into `ROAD_CLASSES`, `IGNORE` where unlabelled.
+    """
+
+    name: str
+    drive: str
+    points: NDArray[np.float32]
+    labels: NDArray[np.uint8]
+
+    def top_view(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
+        """Truth of the observed cells, (rows, cols) uint8: road or vehicle where most labelled returns are, else other.
+
+        `IGNORE` where no labelled return fell: what the sensor did not see, nobody can call right or wrong.
+        """
+        p, known = self.points, self.labels != IGNORE
+        row = np.floor((geometry.x_range_m[1] - p[:, 0]) / geometry.cell_m).astype(np.int64)
+        col = np.floor((geometry.y_range_m[1] - p[:, 1]) / geometry.cell_m).astype(np.int64)
+        known &= (row >= 0) & (row < geometry.height) & (col >= 0) & (col < geometry.width)
+        known &= (p[:, 2] >= geometry.z_range_m[0]) & (p[:, 2] <= geometry.z_range_m[1])
+        cell = row[known] * geometry.width + col[known]
+        size = geometry.height * geometry.width
+        counts = [np.bincount(cell, weights=self.labels[known] == k, minlength=size) for k in range(len(ROAD_CLASSES))]
+        total = np.sum(counts, axis=0)
+        truth = np.where(total == 0, IGNORE, 0).astype(np.uint8)
+        for k in (1, 2):
+            truth[2 * counts[k] > total] = k
+        return truth.reshape(geometry.height, geometry.width)
+
+
+class SemanticKitti:
+    """The scans with point labels below a SemanticKITTI root (``sequences/00/velodyne``, ``labels``), by drive."""
+
+    def __init__(self, root: Path | str) -> None:
+        self.root = Path(root)
+        found = sorted(self.root.glob("sequences/*/labels/*.label"))
+        if not found:
+            raise PointsError(
+                f"{self.root} holds no sequences/*/labels/*.label; expected the root of a SemanticKITTI set"
+            )
+        self.drives = {
+            f"{path.parts[-3]}/{path.stem}": SEQUENCE_DRIVES.get(path.parts[-3], path.parts[-3]) for path in found
+        }
+
+    def names(self, split: str, *, fold: int | None = None) -> list[str]:
+        """Names, ``"00/000123"``, of the scans of a split (`edgeperc.evaluation.splits.in_split`)."""
+        return [name for name, drive in self.drives.items() if in_split(drive, split, fold)]
+
+    def frame(self, name: str) -> RoadFrame:
+        """Read one scan and its labels."""
+        sequence, stem = name.split("/")
+        points = read_points(self.root / "sequences" / sequence / "velodyne" / f"{stem}.bin")
+        path = self.root / "sequences" / sequence / "labels" / f"{stem}.label"
+        raw = np.fromfile(path, np.uint32) & 0xFFFF  # above is the instance
+        if len(raw) != len(points):
+            raise PointsError(
+                f"{path} holds {len(raw)} labels for a scan of {len(points)} points; expected one a point"
+            )
+        labels = np.where(np.isin(raw, ROAD_IDS), 1, np.where(np.isin(raw, VEHICLE_IDS), 2, 0))
+        return RoadFrame(name, self.drives[name], points, np.where(raw == 0, IGNORE, labels).astype(np.uint8))

@@ -1,0 +1,118 @@
+"""The papers' tables on labelled scans: points (PointSeg 5.1), boxes and top view (SSADNet 3.3, appendix A), road.
+
+Everything goes through `edgeperc.Perceiver`, as it would in a vehicle: what is judged is what a user gets. One pass
+makes a small `Record` of each scan; every figure is computed from records put together, so that an interval is the
+same figures over drives drawn anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ..errors import PointsError
+from ..models import SHIPPED
+from ..perceiver import BoxesFrom
+from ..simulation.samples import FIRST_SEED
+from .datasets import KittiObjects, SemanticKitti
+from .judge import Judge, Truth
+from .mistakes import Mistakes
+from .tables import Record, figures
+
+__all__ = ["evaluate"]
+
+N_WORST = 20
+
+
+def evaluate(
+    datasets: Sequence[str | Path],
+    models: Sequence[str | Path] = SHIPPED,
+    *,
+    split: str | None = None,
+    fold: int | None = None,
+    road_by: str | Path | None = None,
+    provider: str = "cpu",
+    boxes_from: BoxesFrom = "network",
+    n_resamples: int = 1000,
+    on_scan: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[dict[str, Any], list[Mistakes]]:
+    """Figures of models on labelled scans.
+
+    Parameters
+    ----------
+    datasets : sequence of str or Path
+        Roots of a KITTI object set or of SemanticKITTI, or ``"simulation:N"`` for N simulated scans (24 without).
+    models, road_by, provider, boxes_from
+        As `Judge` has them.
+    split : str or None
+        ``"test"``, ``"train"``, ``"validation"`` or ``"all"`` of the real scans (`edgeperc.splits`); None takes the
+        validation drives where there is a ``fold`` and the test drives where there is none.
+    fold : int or None
+    n_resamples : int
+        For the intervals.
+    on_scan : callable
+        Told after every scan how many are done, of how many.
+
+    Returns
+    -------
+    figures : dict
+        ``"models"``, ``"split"``, ``"fold"``, and `figures` of ``"real"``, ``"semantickitti"`` and ``"simulated"``
+        scans, whichever there are.
+    mistakes : list of Mistakes
+        The twenty scans with most mistakes, worst first; of real ones where there are any.
+
+    Raises
+    ------
+    PointsError
+        A dataset is none, or has no scans of the split.
+    SplitError
+        A model was trained on a scan, and ``split`` is not ``"train"``.
+    """
+    split = split or ("test" if fold is None else "validation")
+    judge = Judge(models, provider=provider, road_by=road_by, training_scans=split == "train", boxes_from=boxes_from)
+    scans = [scan for dataset in datasets for scan in _scans(judge, dataset, split, fold)]
+    records: dict[str, list[Record]] = {}
+    worst: dict[str, list[Mistakes]] = {}
+    for done, (block, read) in enumerate(scans, start=1):
+        record, mistakes = judge.record(read())
+        records.setdefault(block, []).append(record)
+        if mistakes is not None:
+            ranked = sorted([*worst.get(block, ()), mistakes], key=lambda each: -each.n_errors)
+            worst[block] = ranked[:N_WORST]
+        on_scan(done, len(scans))
+    told: dict[str, Any] = {"models": {card.name: card.version for card in judge.perceive.cards}}
+    told |= {"split": split, "fold": fold}
+    told |= {block: figures(of_block, n_resamples) for block, of_block in records.items()}
+    return told, worst.get("real") or worst.get("simulated", [])
+
+
+def _scans(judge: Judge, dataset: str | Path, split: str, fold: int | None) -> list[tuple[str, Callable[[], Truth]]]:
+    """The scans of a dataset, yet to be read, each with the block of figures that it belongs to."""
+    word, _, number = str(dataset).partition(":")
+    if word == "simulation":
+        if not (number or "24").isdecimal() or number == "0":
+            raise PointsError(f"got {dataset!r}; expected simulation, or simulation:N with a number of scans from 1")
+        return [("simulated", partial(judge.simulated, FIRST_SEED + k)) for k in range(int(number or 24))]
+    root = Path(dataset)
+    if (root / "training" / "label_2").is_dir():
+        objects = KittiObjects(root)
+        names = objects.names(split, fold=fold)
+        scans = [("real", _later(judge.kitti, objects.frame, name)) for name in names]
+    elif any(root.glob("sequences/*/labels")):
+        sequences = SemanticKitti(root)
+        names = sequences.names(split, fold=fold)
+        scans = [("semantickitti", _later(judge.semantickitti, sequences.frame, name)) for name in names]
+    else:
+        raise PointsError(
+            f"{dataset} holds no labelled scans; expected the root of a KITTI object set (training/label_2 below it), "
+            "of SemanticKITTI (sequences/*/labels below it), or the word simulation"
+        )
+    if not scans:
+        raise PointsError(f"{dataset} holds no scans of the {split} drives (fold: {fold}); name another, or 'all'")
+    return scans
+
+
+def _later(judge: Callable[[Any], Truth], read: Callable[[str], Any], name: str) -> Callable[[], Truth]:
+    return lambda: judge(read(name))

@@ -1,0 +1,219 @@
+"""Records of judged scans -> the papers' figures, with intervals over drives.
+
+A figure is computed from the counts of all its scans put together. For its interval, drives are drawn anew and the same
+figure is computed again: frames of one drive look alike, so that it is drives that differ by chance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import reduce
+from operator import add
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .metrics import BoxEvaluator, Confusion, ProbabilitySweep
+
+__all__ = ["BANDS", "VEHICLES", "Record", "banded", "figures", "within"]
+
+VEHICLES = ("car", "van", "truck")
+
+# Horizontal distances [m] of points, of cells' centres and of boxes' centres.
+BANDS = {
+    "all": (0.0, math.inf),
+    "0-15 m": (0.0, 15.0),
+    "15-30 m": (15.0, 30.0),
+    "30-46 m": (30.0, 46.0),
+}
+Tallies = Mapping[tuple[str, ...], Any]
+
+
+@dataclass(frozen=True)
+class Record:
+    """What judging one scan left: counts that add up, by the place of their figures in the result."""
+
+    name: str
+    drive: str
+    tallies: Tallies
+
+
+def within(range_m: Any, within_m: tuple[float, float]) -> Any:
+    """Whether distances lie in a band, the nearer bound included."""
+    return (range_m >= within_m[0]) & (range_m < within_m[1])
+
+
+def banded(
+    table: tuple[str, ...],
+    classes: tuple[str, ...],
+    labels: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    range_m: NDArray[Any],
+) -> dict[tuple[str, ...], Confusion]:
+    """A confusion of each band, by ``table`` and band. Labels where the truth is 255 are not counted."""
+    known = right != 255
+    labels, right, range_m = labels[known], right[known], range_m[known]
+    confusions: dict[tuple[str, ...], Confusion] = {}
+    for band, within_m in BANDS.items():
+        kept = within(range_m, within_m)
+        confusion = Confusion(classes)
+        confusion.update(labels[kept], right[kept])
+        confusions |= {(*table, band): confusion}
+    return confusions
+
+
+def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any]:
+    """Every figure of some records, and how many scans and drives they are of.
+
+    Parameters
+    ----------
+    records : iterable of Record
+    n_resamples : int
+        How often the drives are drawn anew, with replacement, for the 95 % intervals (``"iou_interval"`` beside
+        ``"iou"``); None in place of an interval where fewer than two drives have what is judged.
+    """
+    by_drive: dict[str, list[Tallies]] = {}
+    for record in records:
+        by_drive.setdefault(record.drive, []).append(record.tallies)
+    drives = [_together(tallies) for tallies in by_drive.values()]
+    whole = _figures(_together(drives))
+    draws = np.random.default_rng(0).integers(len(drives), size=(n_resamples if len(drives) > 1 else 0, len(drives)))
+    # Three drives can be drawn in ten ways only.
+    different, times = np.unique(np.sort(draws, axis=1), axis=0, return_counts=True)
+    samples = [_figures(_together([drives[k] for k in draw])) for draw in different]
+    _add_intervals(whole, [_figures(drive) for drive in drives], samples, times)
+    return _plain(whole) | {"n_frames": sum(map(len, by_drive.values())), "n_drives": len(drives)}
+
+
+def _together(parts: Sequence[Tallies]) -> Tallies:
+    keys = dict.fromkeys(key for part in parts for key in part)
+    return {key: reduce(add, [part[key] for part in parts if key in part]) for key in keys}
+
+
+def _figures(tallies: Tallies) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, tally in tallies.items():
+        group, band = key[0], key[-1]
+        if group in ("points", "pixels"):
+            found.setdefault(group, {})[band] = _point_rows(tally, tallies["objects", band])
+        elif group == "boxes":
+            rows = {name: _box_rows(tally, within_m) for name, within_m in BANDS.items()}
+            found.setdefault(group, {})[key[1]] = rows
+        elif group == "segmentation":
+            found.setdefault(group, {}).setdefault(key[1], {})[band] = _map_row(tally)
+        elif group == "road":
+            found.setdefault(group, {})[band] = _road_row(tally, tallies["decision", band])
+    return found
+
+
+def _point_rows(confusion: Confusion, n_objects: Counter[str]) -> dict[str, Any]:
+    rates = {"precision": confusion.precision(), "recall": confusion.recall(), "iou": confusion.iou()}
+    rows = {}
+    for k, name in enumerate(confusion.classes):
+        row = {rate: float(values[k]) for rate, values in rates.items()}
+        rows[name] = row | {"n_points": int(confusion.counts[k].sum()), "n_objects": n_objects[name]}
+    return rows
+
+
+def _box_rows(evaluator: BoxEvaluator, within_m: tuple[float, float]) -> dict[str, Any]:
+    scores = {**evaluator.per_class(within_m), "vehicle": evaluator.overall(within_m)}
+    return {"mean_ap": evaluator.mean_ap(within_m)} | {name: asdict(row) for name, row in scores.items()}
+
+
+def _map_row(confusion: Confusion) -> dict[str, Any]:
+    """Accuracy, mAP (its meaning is SSADNet's table 3) and mIoU; van and car put together in ``"vehicle"`` only."""
+    classes = confusion.classes
+    iou = dict(zip(classes, confusion.iou().tolist(), strict=True))
+    n_cells = dict(zip(classes, confusion.counts.sum(axis=1).tolist(), strict=True))
+    if set(VEHICLES) <= {*classes}:
+        rest = [name for name in classes if name not in VEHICLES]
+        vehicle = confusion.merged({"rest": rest, "vehicle": VEHICLES})
+        iou["vehicle"], n_cells["vehicle"] = float(vehicle.iou()[1]), int(vehicle.counts[1].sum())
+    return {
+        "accuracy": confusion.accuracy(),
+        "mean_ap": confusion.weighted_precision(),
+        "mean_iou": confusion.mean_iou(),
+        "n_cells": int(confusion.counts.sum()),
+        "iou": iou,
+        "n_cells_of": n_cells,
+    }
+
+
+def _road_row(sweep: ProbabilitySweep, decision: Confusion) -> dict[str, Any]:
+    """As the model decides, and the best F1 and the average precision over thresholds of its probability.
+
+    ``"confusion"`` holds shares of all cells, rows the truth (Figure 21 of the top-view database's paper).
+    """
+    (_, false), (missed, hits) = decision.counts.tolist()
+    return {
+        "iou": float(decision.iou()[1]),
+        "precision": float(decision.precision()[1]),
+        "recall": float(decision.recall()[1]),
+        "f1": 2 * hits / (2 * hits + false + missed) if hits + missed else math.nan,
+        "accuracy": decision.accuracy(),
+        "max_f1": sweep.max_f1(),
+        "ap": sweep.average_precision(),
+        "confusion": (decision.counts / max(int(decision.counts.sum()), 1)).tolist(),
+        "n_cells": int(decision.counts.sum()),
+        "n_road": hits + missed,
+    }
+
+
+def _add_intervals(
+    whole: dict[str, Any], drives: Sequence[dict[str, Any]], samples: Sequence[dict[str, Any]], times: NDArray[Any]
+) -> None:
+    """Put an interval beside every figure that has one, in place; ``drives`` say how many have what is judged."""
+    for key, value in list(whole.items()):
+        of_drives, of_samples = [each.get(key, {}) for each in drives], [each.get(key, {}) for each in samples]
+        if key == "iou" and isinstance(value, dict):
+            counts = {name: [each["n_cells_of"][name] for each in drives] for name in value}
+            whole["iou_interval"] = {
+                name: _interval(counts[name], [each[name] for each in of_samples], times) for name in value
+            }
+        elif isinstance(value, dict):
+            _add_intervals(value, of_drives, of_samples, times)
+        elif key in ("iou", "ap", "f1"):
+            count = next(name for name in ("n_points", "n_truth", "n_road") if name in whole)
+            values = [each.get(key, math.nan) for each in samples]
+            whole[f"{key}_interval"] = _interval([each.get(count, 0) for each in drives], values, times)
+    for mean in ("mean_iou", "mean_ap"):
+        # A mean over other classes is another figure: only drives that have them all can be compared.
+        meant = [name for name, (value, _) in _parts(whole, mean).items() if not math.isnan(value)]
+        if meant:
+            parts = [[_parts(each, mean).get(name, (math.nan, 0)) for name in meant] for each in (*drives, *samples)]
+            fewest = [min(n for _, n in each) for each in parts[: len(drives)]]
+            alike = [not any(math.isnan(value) for value, _ in each) for each in parts[len(drives) :]]
+            values = [each[mean] if same else math.nan for each, same in zip(samples, alike, strict=True)]
+            whole[f"{mean}_interval"] = _interval(fewest, values, times)
+
+
+def _parts(row: Mapping[str, Any], mean: str) -> dict[str, tuple[float, int]]:
+    """What a mean over classes is of, and how many cells or boxes each class has."""
+    if mean == "mean_iou" and "iou" in row and "n_cells_of" in row:
+        return {name: (value, row["n_cells_of"][name]) for name, value in row["iou"].items() if name != "vehicle"}
+    if mean == "mean_ap" and mean in row:
+        rows = {name: each for name, each in row.items() if isinstance(each, dict) and "ap" in each}
+        return {name: (each["ap"], each["n_truth"]) for name, each in rows.items() if name != "vehicle"}
+    return {}
+
+
+def _interval(counts: Sequence[int], values: Sequence[float], times: NDArray[Any]) -> list[float] | None:
+    """2.5 and 97.5 % of a figure's values; None unless two drives or more count."""
+    if sum(n > 0 for n in counts) < 2:
+        return None
+    every = np.repeat(np.asarray(values, np.float64), times)
+    every = every[~np.isnan(every)]
+    return [float(v) for v in np.percentile(every, [2.5, 97.5])] if every.size else None
+
+
+def _plain(value: Any) -> Any:
+    """For JSON: four decimals, None where there was nothing to count."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_plain(inner) for inner in value]
+    return (None if math.isnan(value) else round(value, 4)) if isinstance(value, float) else value

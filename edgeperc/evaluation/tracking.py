@@ -1,0 +1,387 @@
+"""KITTI's tracking sequences: labels and detections in, the tables of AB3DMOT's protocol and KUL-Seg's Table 7 out."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import TrackingError
+from ..perceiver import Perceiver
+from ..perception import Box
+from ..readers.files import read_points
+from ..tracking.tracker import Tracker
+from ..tracking.tracks import ClassParameters, Tracks
+from .datasets import IMAGE_SIZE, Calibration, KittiObjects
+from .tracking_metrics import FrameTracks, FrameTruth, evaluate_tracks
+from .unseen import check_unseen, training_scans_of
+
+__all__ = [
+    "CLASSES",
+    "FRAME_S",
+    "KINDS",
+    "TrackingSequence",
+    "evaluate_kitti",
+    "perceive_drive",
+    "read_sequence",
+    "sequence_names",
+    "sequence_scans",
+    "track_sequence",
+]
+
+CLASSES = ("car", "pedestrian", "cyclist")
+
+# What counts as each class; KUL-Seg's Table 7 knows vehicles alone.
+KINDS = {**{of: (of,) for of in CLASSES}, "vehicle": ("car", "van", "truck")}
+
+# KITTI's evaluation: what may be taken for each class unpunished, and what is too hidden or too small to be asked for.
+NEIGHBOURS = {"car": ("van",), "pedestrian": ("person", "person_sitting"), "cyclist": (), "vehicle": ("tram", "misc")}
+MAX_OCCLUSION, MAX_TRUNCATION, MIN_HEIGHT_PX, MIN_UNLABELLED = 2, 0, 25.0, 0.5
+FRAME_S = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackingSequence:
+    """One sequence: what was detected, and what there is.
+
+    Attributes
+    ----------
+    name : str
+    detections : tuple of tuple of Box
+        By frame, of all classes asked for, in the sensor's frame. Scores are in 0..1.
+    truth : mapping of str to tuple of FrameTruth
+        By class and frame.
+    unlabelled : tuple of (k, 4) float64
+        By frame: image rectangles (left, top, right, bottom) in which nothing was labelled (DontCare).
+    calibration : Calibration
+    """
+
+    name: str
+    detections: tuple[tuple[Box, ...], ...]
+    truth: Mapping[str, tuple[FrameTruth, ...]]
+    unlabelled: tuple[NDArray[np.float64], ...]
+    calibration: Calibration
+
+
+def sequence_names(root: Path | str) -> list[str]:
+    """What can be judged below ``root``: KITTI's tracking sequences, or drives of an object set with track ids.
+
+    Parameters
+    ----------
+    root : str or Path
+        Holds ``label_02/NAME.txt``, or ``training/label_2``, ``training/track_id`` (a line for each label's) and
+        ``frames.csv`` (`edgeperc.evaluation.datasets.KittiObjects`).
+
+    Returns
+    -------
+    list of str
+
+    Raises
+    ------
+    TrackingError
+        There is neither.
+    """
+    root = Path(root)
+    names = sorted(path.stem for path in (root / "label_02").glob("*.txt"))
+    if not names and (root / "training/track_id").is_dir():
+        drives = KittiObjects(root).drives
+        names = sorted({drives[path.stem] for path in (root / "training/track_id").glob("*.txt")})
+    if not names:
+        raise TrackingError(
+            f"{root} holds no label_02/*.txt and no training/track_id/*.txt; pass the root of KITTI's tracking "
+            "sequences, or of an object set with track ids"
+        )
+    return names
+
+
+def sequence_scans(root: Path | str, name: str) -> dict[int, Path]:
+    """Files of a sequence's scans by frame, ``velodyne/NAME/FRAME.bin`` below ``root`` or those of the drive.
+
+    Parameters
+    ----------
+    root : str or Path
+    name : str
+        Of `sequence_names`.
+
+    Returns
+    -------
+    dict of int to Path
+        Empty where there are none.
+    """
+    root = Path(root)
+    if (root / "label_02").is_dir():
+        return {int(path.stem): path for path in sorted((root / "velodyne" / name).glob("*.bin"))}
+    training = root / "training"
+    names = [of for of, drive in KittiObjects(root).drives.items() if drive == name]
+    told = (of for of in names if (training / "track_id" / f"{of}.txt").exists())
+    return {frame: training / "velodyne" / f"{of}.bin" for frame, of in enumerate(told)}
+
+
+def _labels(root: Path, name: str) -> tuple[Path, list[list[str]], Calibration]:
+    """Where the labels are, the words of KITTI's 17 columns, and the calibration."""
+    path = root / "label_02" / f"{name}.txt"
+    if path.parent.is_dir():
+        lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
+        return path, lines, Calibration.read(root / "calib" / f"{name}.txt")
+    path, lines, stem = root / "training/label_2", [], ""
+    for frame, scan in sequence_scans(root, name).items():
+        stem = scan.stem
+        labels = (path / f"{stem}.txt").read_text().splitlines()
+        ids = (root / "training/track_id" / f"{stem}.txt").read_text().split()
+        if len(ids) != len(labels):
+            raise TrackingError(f"{path}/{stem}.txt has {len(labels)} labels, and {len(ids)} track ids; pass one each")
+        lines += [[str(frame), one, *label.split()] for one, label in zip(ids, labels, strict=True)]
+    return path, lines, Calibration.read(root / "training/calib" / f"{stem}.txt")
+
+
+def read_sequence(
+    root: Path | str, name: str, classes: Sequence[str] = CLASSES, boxes: Sequence[Sequence[Box]] | None = None
+) -> TrackingSequence:
+    """Read a sequence's labels, calibration and ``detections/DETECTOR_CLASS/NAME.txt`` below ``root``.
+
+    Parameters
+    ----------
+    root : str or Path
+        As `sequence_names` takes it.
+    name : str
+        Such as ``"0000"``.
+    classes : sequence of str
+        Of `KINDS`.
+    boxes : sequence of sequence of Box, optional
+        By frame: detections to take in place of the files.
+
+    Returns
+    -------
+    TrackingSequence
+
+    Raises
+    ------
+    TrackingError
+        A file is not laid out as KITTI's are, a class has no folder of detections, or there are not as many frames of
+        boxes as of labels.
+    OSError
+        A file cannot be read.
+    """
+    root = Path(root)
+    label_path, labels, calibration = _labels(root, name)
+    try:
+        values = np.array([[*words[:2], *words[3:17]] for words in labels], np.float64).reshape(-1, 16)
+    except ValueError as exc:
+        raise TrackingError(f"{label_path} holds no KITTI tracking labels; expected 17 columns") from exc
+    kinds = np.array([words[2].lower() for words in labels], np.str_)
+    n_frames = 1 + int(values[:, 0].max(initial=-1.0))
+    if boxes is None:
+        detections = _read_detections(root, name, classes, calibration, n_frames)
+    elif len(boxes) < n_frames:
+        raise TrackingError(f"got boxes of {len(boxes)} frames for {n_frames} of {label_path}; pass one line a frame")
+    else:
+        detections = [list(of_frame) for of_frame in boxes]
+    n_frames = len(detections)
+    placed = calibration.sensor_boxes(values[:, 9:16])
+    ignored = (values[:, 2] > MAX_TRUNCATION) | (values[:, 3] > MAX_OCCLUSION)
+    truth: dict[str, tuple[FrameTruth, ...]] = {}
+    for of in classes:
+        mine = np.isin(kinds, [*KINDS[of], *NEIGHBOURS[of]])
+        excused = ignored | ~np.isin(kinds, KINDS[of])
+        in_frame = [np.flatnonzero(mine & (values[:, 0] == k)) for k in range(n_frames)]
+        truth[of] = tuple(
+            FrameTruth(values[rows, 1].astype(np.int64), placed[rows], excused[rows]) for rows in in_frame
+        )
+    unlabelled = kinds == "dontcare"
+    return TrackingSequence(
+        name=name,
+        detections=tuple(tuple(of_frame) for of_frame in detections),
+        truth=truth,
+        unlabelled=tuple(values[unlabelled & (values[:, 0] == k), 5:9] for k in range(n_frames)),
+        calibration=calibration,
+    )
+
+
+def _read_detections(
+    root: Path, name: str, classes: Sequence[str], calibration: Calibration, n_frames: int
+) -> list[list[Box]]:
+    """By frame; columns: frame, type, left, top, right, bottom, logit, height, width, length, x, y, z, turn, alpha."""
+    detections: list[list[Box]] = [[] for _ in range(n_frames)]
+    for of in classes:
+        folders = sorted((root / "detections").glob(f"*_{of.capitalize()}"))
+        if not folders:
+            raise TrackingError(f"{root}/detections has no folder *_{of.capitalize()}; expected one for every class")
+        path = folders[0] / f"{name}.txt"
+        try:
+            lines = [line.split(",") for line in path.read_text().splitlines() if line.strip()]
+            rows = np.array(lines, np.float64).reshape(-1, 15)
+        except ValueError as exc:
+            raise TrackingError(f"{path} holds no detections; expected 15 comma-separated columns") from exc
+        detections += [[] for _ in range(len(detections), 1 + int(rows[:, 0].max(initial=-1.0)))]
+        scores = 1.0 / (1.0 + np.exp(-rows[:, 6]))
+        placed = calibration.sensor_boxes(rows[:, 7:14])
+        for frame, score, row in zip(rows[:, 0].astype(np.int64), scores.tolist(), placed.tolist(), strict=True):
+            detections[frame].append(Box(of, score, (row[0], row[1], row[2]), (row[3], row[4], row[5]), row[6]))
+    return detections
+
+
+def track_sequence(
+    sequence: TrackingSequence, parameters: Mapping[str, ClassParameters] | None = None
+) -> tuple[list[Tracks], float]:
+    """Run a new `edgeperc.Tracker` over a sequence, without poses.
+
+    Parameters
+    ----------
+    sequence : TrackingSequence
+    parameters : mapping of str to ClassParameters, optional
+
+    Returns
+    -------
+    tracks : list of Tracks
+        A frame each.
+    seconds : float
+        Spent in the tracker.
+    """
+    # The labels and these detections cover what the left colour camera sees.
+    (fx, _, cx), width_px = sequence.calibration.P2[0, :3], IMAGE_SIZE[0]
+    edges = math.degrees(math.atan(cx / fx)), -math.degrees(math.atan((width_px - cx) / fx))
+    tracker = Tracker(parameters, field_of_view_deg=edges)
+    tracks = []
+    start = time.perf_counter()
+    for k, boxes in enumerate(sequence.detections):
+        tracks.append(tracker.update(boxes, k * FRAME_S))
+    return tracks, time.perf_counter() - start
+
+
+def judged(sequence: TrackingSequence, tracks: Sequence[Tracks], of: str) -> list[FrameTracks]:
+    """The tracks of one class as the metrics take them, by frame; which are excused is said by the image."""
+    frames = []
+    for told, unlabelled in zip(tracks, sequence.unlabelled, strict=True):
+        mine = np.flatnonzero([label in KINDS[of] for label in told.labels])
+        boxes = told.boxes[mine]
+        excused = _excused(boxes, unlabelled, sequence.calibration)
+        with np.errstate(divide="ignore"):  # log odds, as the detections have them: shares near 1 lie too close
+            scores = np.log(told.scores[mine]) - np.log1p(-told.scores[mine])
+        frames.append(FrameTracks(told.ids[mine], boxes, np.clip(scores, -36.0, 36.0), excused))
+    return frames
+
+
+def _excused(
+    boxes: NDArray[np.float64], unlabelled: NDArray[np.float64], calibration: Calibration
+) -> NDArray[np.bool_]:
+    """Boxes that look no larger than 25 pixels, or lie by more than half in a region where nothing was labelled."""
+    signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
+    local = signs[None] * boxes[:, None, 3:6]
+    cos, sin = np.cos(boxes[:, 6])[:, None], np.sin(boxes[:, 6])[:, None]
+    x = boxes[:, :1] + cos * local[..., 0] - sin * local[..., 1]
+    y = boxes[:, 1:2] + sin * local[..., 0] + cos * local[..., 1]
+    corners = np.stack([x, y, boxes[:, 2:3] + local[..., 2]], axis=-1)
+    pixel, depth = calibration.to_image(corners.reshape(-1, 3))
+    pixel, depth = pixel.reshape(-1, 8, 2), depth.reshape(-1, 8)
+    ahead = depth > 0.1  # a corner beside or behind the camera has no pixel
+    low = np.where(ahead[..., None], pixel, np.inf).min(axis=1).clip(0.0, IMAGE_SIZE)
+    high = np.where(ahead[..., None], pixel, -np.inf).max(axis=1).clip(0.0, IMAGE_SIZE)
+    size = np.maximum(high - low, 0.0)
+    hidden = (size[:, 1] <= MIN_HEIGHT_PX) | (size[:, 0] <= 0.0)
+    for left, top, right, bottom in unlabelled:
+        shared = np.minimum(high, [right, bottom]) - np.maximum(low, [left, top])
+        inside = np.where((shared > 0.0).all(axis=1), shared.prod(axis=1), 0.0)
+        hidden |= inside > MIN_UNLABELLED * np.maximum(size.prod(axis=1), 1e-9)
+    return hidden
+
+
+def evaluate_kitti(
+    root: Path | str,
+    *,
+    sequences: Sequence[str] | None = None,
+    classes: Sequence[str] = CLASSES,
+    parameters: Mapping[str, ClassParameters] | None = None,
+    boxes: Mapping[str, Sequence[Sequence[Box]]] | None = None,
+    iou_threshold: float = 0.25,
+    on_sequence: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Track KITTI's sequences and hold the tracks against the labels.
+
+    One tracker follows all classes together; no ego poses are used.
+
+    Parameters
+    ----------
+    root : str or Path
+        As `sequence_names` takes it, with ``detections`` or with ``boxes``.
+    sequences : sequence of str, optional
+        By default all that have labels.
+    classes : sequence of str
+    parameters : mapping of str to ClassParameters, optional
+    boxes : mapping of str to sequence of sequence of Box, optional
+        By sequence and frame: detections to take in place of the files.
+    iou_threshold : float
+        3-D overlap that makes a match.
+    on_sequence : callable, optional
+        Called with sequences done and sequences there are.
+
+    Returns
+    -------
+    dict
+        ``sequences``, ``iou_threshold``, ``frames_per_s``, and by class the figures of `TrackingScores`. Numbers and
+        strings alone, fit for JSON.
+
+    Raises
+    ------
+    TrackingError
+        There is no such data, or a file cannot be understood.
+    """
+    root = Path(root)
+    names = list(sequences or sequence_names(root))
+    pairs: dict[str, list[tuple[Sequence[FrameTruth], Sequence[FrameTracks]]]] = {of: [] for of in classes}
+    n_frames, seconds = 0, 0.0
+    Tracker(parameters).update([Box("car", 0.5, (9.0, 0.0, 0.0), (4.0, 2.0, 1.5), 0.0)], 0.0)  # loads the kernels
+    for done, name in enumerate(names, start=1):
+        sequence = read_sequence(root, name, classes, (boxes or {}).get(name))
+        tracks, took = track_sequence(sequence, parameters)
+        n_frames, seconds = n_frames + len(tracks), seconds + took
+        for of in classes:
+            pairs[of].append((sequence.truth[of], judged(sequence, tracks, of)))
+        if on_sequence is not None:
+            on_sequence(done, len(names))
+    return {
+        "sequences": names,
+        "iou_threshold": iou_threshold,
+        "frames_per_s": n_frames / seconds,
+        "classes": {of: asdict(evaluate_tracks(pairs[of], iou_threshold)) for of in classes},
+    }
+
+
+def perceive_drive(
+    perceive: Perceiver, scans: Mapping[int, Path], drive: str, on_scan: Callable[[], None] = lambda: None
+) -> list[list[Box]]:
+    """Boxes that a perceiver finds in the scans of a drive, by frame.
+
+    Parameters
+    ----------
+    perceive : Perceiver
+    scans : mapping of int to Path
+        By frame; a frame without a scan has no boxes.
+    drive : str
+    on_scan : callable
+        Called after each.
+
+    Returns
+    -------
+    list of list of Box
+
+    Raises
+    ------
+    SplitError
+        A model was trained on one of the scans.
+    PointsError
+        A scan cannot be read.
+    """
+    trained_on = training_scans_of(perceive.cards)
+    found: list[list[Box]] = [[] for _ in range(1 + max(scans, default=-1))]
+    for frame, path in scans.items():
+        points = read_points(path)
+        check_unseen(trained_on, path.stem, drive, points)
+        found[frame] = list(perceive(points).boxes)
+        on_scan()
+    return found

@@ -1,0 +1,523 @@
+"""Is this scan like the scans a model was trained on?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from .errors import CardError, PointsError
+from .sensors import SensorProfile
+
+__all__ = ["FitnessProfile", "check_fitness", "fill_scan_sums"]
+
+# --- fitness ---------------------------------------------------------------------------------------------------------
+
+# Some 6,000 points tell what is asked here; a prime step does not fall in with the rows of an organised scan.
+_STEPS = np.array([1, 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 53, 61, 71, 83, 97, 127, 167, 223, 307, 401])
+_SAMPLE, _BEAM_SAMPLE = 6000, 130_000
+
+# Where the ground shows as a peak among the heights of near points; KITTI scans: 0.18 (5th percentile) and above.
+_GROUND_SHARE = 0.15
+
+
+@njit(cache=True, nogil=True)
+def fill_scan_sums(
+    points: NDArray[np.float32],
+    step: int,
+    beam_step: int,
+    view_right: float,
+    view_left: float,
+    remissions: NDArray[np.int64],
+    elevations: NDArray[np.int64],
+    ranges: NDArray[np.int64],
+    heights: NDArray[np.int64],
+    rows: NDArray[np.float64],
+    n_rows: NDArray[np.int64],
+    sums: NDArray[np.float64],
+) -> None:
+    """Histograms of every ``step``-th point, from which `check_fitness` judges a scan. Points not finite are skipped.
+
+    Parameters
+    ----------
+    points : (n, 4) float32
+        x, y, z [m], remission.
+    step, beam_step : int
+        The elevations along eight directions come from every ``beam_step``-th point.
+    view_right, view_left : float
+        Edges of the model's view as pseudo-azimuth, y / (|x| + |y|) unfolded to -2..2.
+    remissions : (258,) int64, overwritten
+        Points of remission <= 0, 256 even bins in 0..1, points above 1.
+    elevations : (360,) int64, overwritten
+        Bins of half a degree from -90.
+    ranges : (200,) int64, overwritten
+        Horizontal distance, 20 bins a decade from 1 mm.
+    heights : (3, 100) int64, overwritten
+        x, y and z of the points 3 to 25 m away, bins of 0.2 m from -10 m.
+    rows : (8, 1024) float64, overwritten
+        Elevation [deg] of the points exactly ahead, left, behind, right and halfway between.
+    n_rows : (8,) int64, overwritten
+    sums : (8,) float64, overwritten
+        0 points that are finite; 1 of these, in the view; 2 sixty-fourths of the turn that hold points; 3 of those
+        in the view, the share that holds points; 4 how much more is in the way to the sides than ahead and behind;
+        5 lowest and 6 highest remission; 7 points 3 to 25 m away.
+    """
+    n = points.shape[0]
+    remissions[:] = 0
+    elevations[:] = 0
+    ranges[:] = 0
+    heights[:] = 0
+    n_rows[:] = 0
+    sums[:] = 0.0
+    seen = np.zeros(64, dtype=np.bool_)
+    lowest = math.inf
+    highest = -math.inf
+    for i in range(0, n, step):
+        x = np.float64(points[i, 0])
+        y = np.float64(points[i, 1])
+        z = np.float64(points[i, 2])
+        remission = np.float64(points[i, 3])
+        if not math.isfinite(x + y + z + remission):
+            continue
+        sums[0] += 1.0
+        lowest = min(lowest, remission)
+        highest = max(highest, remission)
+        if remission <= 0.0:
+            remissions[0] += 1
+        elif remission > 1.0:
+            remissions[257] += 1
+        else:
+            remissions[1 + min(int(remission * 256.0), 255)] += 1
+        across = abs(x) + abs(y)
+        if across == 0.0:
+            continue
+        azimuth = y / across
+        if x < 0.0:
+            azimuth = 2.0 - azimuth if y >= 0.0 else -2.0 - azimuth
+        seen[min(int((azimuth + 2.0) * 16.0), 63)] = True
+        if view_right <= azimuth <= view_left:
+            sums[1] += 1.0
+        horizontal = math.sqrt(x * x + y * y)
+        elevations[min(int((math.atan(z / horizontal) * (180.0 / math.pi) + 90.0) * 2.0), 359)] += 1
+        ranges[min(max(int((math.log10(horizontal) + 3.0) * 20.0), 0), 199)] += 1
+        square = x * x + y * y + z * z
+        if 9.0 < square < 625.0:
+            sums[7] += 1.0
+            for axis, value in enumerate((x, y, z)):
+                if -10.0 <= value < 10.0:
+                    heights[axis, min(int((value + 10.0) * 5.0), 99)] += 1
+    sums[5] = lowest
+    sums[6] = highest
+
+    in_view = 0
+    in_view_seen = 0
+    for sector in range(64):
+        sums[2] += seen[sector]
+        middle = (sector + 0.5) / 16.0 - 2.0
+        if view_right <= middle <= view_left:
+            in_view += 1
+            in_view_seen += seen[sector]
+    sums[3] = in_view_seen / max(in_view, 1)
+
+    # What stands on the ground, in corridors 4 m wide to the four sides, and how well its sides line up with the axes.
+    ground = np.argmax(heights[2]) * 0.2 - 9.9
+    ways = np.zeros(4)
+    along_x = np.zeros(120)
+    along_y = np.zeros(120)
+    for i in range(0, n, step):
+        x = np.float64(points[i, 0])
+        y = np.float64(points[i, 1])
+        z = np.float64(points[i, 2])
+        if not ground + 0.5 < z < ground + 6.0 or not abs(x) < 30.0 or not abs(y) < 30.0:
+            continue
+        if not math.isfinite(points[i, 3]):
+            continue
+        along_x[int((x + 30.0) * 2.0)] += 1.0
+        along_y[int((y + 30.0) * 2.0)] += 1.0
+        if abs(y) < 2.0 and abs(x) > 3.0:
+            ways[0 if x > 0.0 else 1] += 1.0
+        if abs(x) < 2.0 and abs(y) > 3.0:
+            ways[2 if y > 0.0 else 3] += 1.0
+    few = 0.002 * max(sums[0], 1.0)
+    sums[4] = math.log((max(ways[2], ways[3]) + few) / (max(ways[0], ways[1]) + few))
+    sums[4] += 0.5 * math.log((np.sum(along_y * along_y) + 1.0) / (np.sum(along_x * along_x) + 1.0))
+
+    for i in range(0, n, beam_step):
+        x = np.float64(points[i, 0])
+        y = np.float64(points[i, 1])
+        more = max(abs(x), abs(y))
+        less = min(abs(x), abs(y))
+        # A quarter of a degree to either side of each direction.
+        if less < 0.0044 * more:
+            direction = (0 if x > 0.0 else 4) if abs(x) > abs(y) else (2 if y > 0.0 else 6)
+        elif more - less < 0.0087 * more:
+            direction = (1 if y > 0.0 else 7) if x > 0.0 else (3 if y > 0.0 else 5)
+        else:
+            continue
+        z = np.float64(points[i, 2])
+        if more > 1.0 and n_rows[direction] < rows.shape[1] and math.isfinite(x + y + z + np.float64(points[i, 3])):
+            rows[direction, n_rows[direction]] = math.atan(z / math.sqrt(x * x + y * y)) * (180.0 / math.pi)
+            n_rows[direction] += 1
+
+
+@dataclass(frozen=True)
+class _Measures:
+    """What one scan looks like. None where the scan does not tell."""
+
+    points_in_view: float
+    view_covered: float
+    remission_median: float
+    remission_p99: float
+    remission_zeros: float
+    elevation_p01_deg: float
+    elevation_p99_deg: float
+    beams: float
+    beams_per_deg: float
+    range_median_m: float
+    ground_m: float | None
+    road_ahead: float | None
+    # What follows is judged by itself, not against the training scans.
+    n_sampled: float
+    remission_low: float
+    remission_high: float
+    remission_beyond: float
+    remission_alike: float
+    flat_axis: int | None
+    flat_m: float
+
+
+def _pseudo_azimuth(azimuth_deg: float) -> float:
+    x, y = math.cos(math.radians(azimuth_deg)), math.sin(math.radians(azimuth_deg))
+    across = y / (abs(x) + abs(y))
+    return across if x >= 0.0 else math.copysign(2.0, azimuth_deg) - across
+
+
+def _quantile(histogram: NDArray[np.int64], share: float) -> float:
+    """Place in a histogram, in bins, below which ``share`` of it lies."""
+    total = np.cumsum(histogram)
+    return float(np.searchsorted(total, share * total[-1], side="right")) + 0.5
+
+
+def _measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> _Measures | None:
+    """None where no point is finite."""
+    if points.ndim != 2 or points.shape[1] != 4:
+        raise PointsError(f"got an array of shape {points.shape}; expected (n, 4): x, y, z, remission")
+    points = np.ascontiguousarray(points, dtype=np.float32)
+    remissions, elevations, ranges = (np.empty(size, dtype=np.int64) for size in (258, 360, 200))
+    heights = np.empty((3, 100), dtype=np.int64)
+    rows, n_rows, sums = np.empty((8, 1024)), np.empty(8, dtype=np.int64), np.empty(8)
+    step = int(_STEPS[np.searchsorted(_STEPS[:-1], len(points) // _SAMPLE)])
+    left, right = (_pseudo_azimuth(angle) for angle in azimuth_deg)
+    fill_scan_sums(
+        points, step, len(points) // _BEAM_SAMPLE + 1, right, left,
+        remissions, elevations, ranges, heights, rows, n_rows, sums,
+    )  # fmt: skip
+    n_finite = sums[0]
+    if n_finite == 0.0:
+        return None
+    # In one direction, returns of one beam lie closer than 0.1 deg, those of neighbours farther apart.
+    beams = [
+        np.count_nonzero(np.diff(np.sort(row[:count])) > 0.1) + 1
+        for row, count in zip(rows, n_rows, strict=True)
+        if count
+    ]
+    n_beams = float(np.percentile(beams, 75)) if beams else 0.0
+    low, high = (_quantile(elevations, share) / 2.0 - 90.0 for share in (0.01, 0.99))
+    peaks = heights.max(axis=1) / max(1.0, sums[7])
+    flattest = int(peaks.argmax())
+    has_ground = bool(peaks[2] >= _GROUND_SHARE)
+    return _Measures(
+        points_in_view=float(sums[1]) * step,
+        view_covered=float(sums[3]),
+        remission_median=min(max((_quantile(remissions, 0.5) - 1.0) / 256.0, 0.0), 1.0),
+        remission_p99=min(max((_quantile(remissions, 0.99) - 1.0) / 256.0, 0.0), 1.0),
+        remission_zeros=float(remissions[0] / n_finite),
+        elevation_p01_deg=low,
+        elevation_p99_deg=high,
+        beams=n_beams,
+        beams_per_deg=n_beams / (high - low + 1.0),
+        range_median_m=10.0 ** (_quantile(ranges, 0.5) / 20.0 - 3.0),
+        ground_m=round(int(heights[2].argmax()) * 0.2 - 9.9, 1) if has_ground else None,
+        # 58 of 64 sectors: a full turn with a pillar or two in it.
+        road_ahead=float(sums[4]) if has_ground and sums[2] >= 58 else None,
+        n_sampled=float(n_finite),
+        remission_low=float(sums[5]),
+        remission_high=float(sums[6]),
+        remission_beyond=float(remissions[257] / n_finite),
+        remission_alike=float(remissions.max() / n_finite),
+        # Facades make y flat, too, but only a road ahead of a camera's z spreads the elevations so far.
+        flat_axis=flattest if peaks[flattest] >= max(_GROUND_SHARE, 1.5 * peaks[2]) and high - low > 60.0 else None,
+        flat_m=round(int(heights[flattest].argmax()) * 0.2 - 9.9, 1),
+    )
+
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class FitnessProfile:
+    """What the scans a model was trained on look like: lowest and highest value of each measure over the scans.
+
+    Goes into the model's card, so that `check_fitness` can tell when a scan is unlike them.
+
+    Attributes
+    ----------
+    n_scans : int
+    azimuth_deg : tuple of 2 float
+        Left and right edge of the model's view.
+    points_in_view : tuple of 2 float
+        Points in that view.
+    view_covered : tuple of 2 float
+        Share of the view, in steps of 1/64 turn, from which anything returned.
+    remission_median, remission_p99, remission_zeros : tuple of 2 float
+        Of remission scaled to 0..1: median, 99th percentile, share of points with none.
+    elevation_p01_deg, elevation_p99_deg : tuple of 2 float
+        1st and 99th percentile of the points' elevation.
+    beams, beams_per_deg : tuple of 2 float
+        Rows of points above one another, and their number per degree of elevation.
+    range_median_m : tuple of 2 float
+        Median horizontal distance.
+    ground_m : tuple of 2 float, or None
+        Height of the ground in the sensor's frame; None where no scan shows it.
+    road_ahead : tuple of 2 float, or None
+        Logarithm of how much more stands in the way to the sides than ahead and behind; None where no scan is a
+        full turn.
+    """
+
+    n_scans: int
+    azimuth_deg: Range
+    points_in_view: Range
+    view_covered: Range
+    remission_median: Range
+    remission_p99: Range
+    remission_zeros: Range
+    elevation_p01_deg: Range
+    elevation_p99_deg: Range
+    beams: Range
+    beams_per_deg: Range
+    range_median_m: Range
+    ground_m: Range | None
+    road_ahead: Range | None
+
+    @classmethod
+    def from_scans(
+        cls, scans: Iterable[NDArray[np.float32]], azimuth_deg: tuple[float, float] = (45.0, -45.0)
+    ) -> FitnessProfile:
+        """Measure training scans.
+
+        Parameters
+        ----------
+        scans : iterable of (n, 4) float32
+            x, y, z [m], remission scaled to 0..1.
+        azimuth_deg : tuple of 2 float
+            Left and right edge of the model's view, within 180 and -180.
+
+        Raises
+        ------
+        PointsError
+            When there is no scan with a finite point, or an array is no scan.
+        """
+        measures = [measure for scan in scans if (measure := _measure(scan, azimuth_deg)) is not None]
+        if not measures:
+            raise PointsError("no scan with a finite point was given; a profile needs the training scans")
+        seen: dict[str, Range | None] = {}
+        for name in _MEASURED:
+            values = [value for measure in measures if (value := getattr(measure, name)) is not None]
+            seen[name] = (round(min(values), 4), round(max(values), 4)) if values else None
+        return cls(n_scans=len(measures), azimuth_deg=(float(azimuth_deg[0]), float(azimuth_deg[1])), **seen)  # type: ignore[arg-type]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON; `from_dict` reads it."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> FitnessProfile:
+        """Read what `to_dict` wrote.
+
+        Raises
+        ------
+        CardError
+            When an entry is missing, unknown or no pair of numbers.
+        """
+        names = {field.name for field in fields(cls)}
+        if not isinstance(document, Mapping) or set(document) != names:
+            raise CardError(f"the card's fitness entry must hold exactly {', '.join(sorted(names))}")
+        values: dict[str, Any] = {}
+        for name, value in document.items():
+            try:
+                if name == "n_scans":
+                    values[name] = int(value)
+                elif value is None and name in ("ground_m", "road_ahead"):
+                    values[name] = None
+                else:
+                    low, high = (float(v) for v in value)
+                    if not math.isfinite(low) or not math.isfinite(high):
+                        raise ValueError("not finite")
+                    values[name] = (low, high)
+            except (TypeError, ValueError, OverflowError) as exc:
+                raise CardError(f"the card's fitness entry {name!r} is no pair of numbers: {value!r}") from exc
+        return cls(**values)
+
+
+_MEASURED = tuple(field.name for field in fields(FitnessProfile) if field.name not in ("n_scans", "azimuth_deg"))
+
+
+def check_fitness(points: NDArray[np.float32], profile: FitnessProfile, sensor: SensorProfile) -> tuple[str, ...]:
+    """Say in plain words what is unlike the scans a model was trained on, and what to do about it.
+
+    Margins are wide: this is to find gross mistakes (axes, units, remission scale, another sensor), and to stay quiet
+    about ordinary scans of the right sensor, those cropped to the model's view among them. What it cannot see: a scan
+    turned by 180 degrees, one mirrored left to right, and in one scan of nine (measured on KITTI) one turned by 90.
+
+    Parameters
+    ----------
+    points : (n, 4) float32
+        x, y, z [m], remission scaled to 0..1 by ``sensor``. Points not finite are skipped.
+    profile : FitnessProfile
+    sensor : SensorProfile
+        What the scan is said to come from.
+
+    Returns
+    -------
+    tuple of str
+        One sentence a finding; empty when all is well.
+
+    Raises
+    ------
+    PointsError
+        When ``points`` is of another shape.
+    """
+    scan = _measure(points, profile.azimuth_deg)
+    if scan is None:
+        return ("The scan holds no finite point: is the sensor connected and its driver running?",)
+    if scan.n_sampled < 300.0 and scan.points_in_view < 0.2 * profile.points_in_view[0]:
+        return (_too_few(scan, profile),)  # too few to tell anything else
+    return (*_geometry_findings(scan, profile, sensor), *_remission_findings(scan, profile, sensor))
+
+
+def _too_few(scan: _Measures, profile: FitnessProfile) -> str:
+    return (
+        f"The model's view holds about {scan.points_in_view:.0f} points, in training it held at least "
+        f"{profile.points_in_view[0]:.0f}: is the scan complete, and the sensor clean?"
+    )
+
+
+_UNITS = (("millimetres", 1e3), ("centimetres", 1e2), ("kilometres", 1e-3))
+
+
+def _geometry_findings(scan: _Measures, profile: FitnessProfile, sensor: SensorProfile) -> list[str]:
+    near, far = profile.range_median_m
+    if not near / 20.0 <= scan.range_median_m <= far * 20.0:
+        factor = scan.range_median_m / math.sqrt(near * far)
+        unit = next((name for name, size in _UNITS if 0.2 * size < factor < 5.0 * size), "another unit")
+        return [
+            f"The median distance is {scan.range_median_m:.3g}, in training it was {near:.0f} to {far:.0f} m: "
+            f"the coordinates seem to be in {unit}; convert them to metres."
+        ]
+    if scan.flat_axis is not None:
+        towards = ("+" if scan.flat_m > 0.0 else "-") + "xyz"[scan.flat_axis]
+        advice = "" if towards != "+y" else " They may be a camera's (x right, y down, z forward): pass z, -x, -y."
+        return [
+            f"The ground seems to lie towards {towards}, where the model expects it towards -z: the axes are not "
+            f"x forward, y left, z up.{advice}"
+        ]
+
+    findings = []
+    has_ground = scan.ground_m is not None and profile.ground_m is not None
+    if scan.ground_m is not None and profile.ground_m is not None:
+        low, high = profile.ground_m
+        if scan.ground_m > 0.5 and high < 0.0:
+            return [
+                f"The ground lies {scan.ground_m:.1f} m above the sensor: it is mounted upside down, or z points down; "
+                "turn the points by 180 degrees about x (negate y and z)."
+            ]
+        if not low - 0.6 <= scan.ground_m <= high + 0.6:
+            has_ground = False
+            findings.append(
+                f"The ground lies at z = {scan.ground_m:.1f} m, in training it lay at {low:.1f} to {high:.1f} m: the "
+                "origin is not the sensor, or the sensor is mounted at another height; shift z to match."
+            )
+
+    low, high = profile.elevation_p01_deg[1], profile.elevation_p99_deg[1]
+    # The lowest beams are missing from a crop to a camera's view (9 deg) and from a scan cut short (up to 13).
+    if scan.elevation_p01_deg > low + 13.0 or scan.elevation_p99_deg > high + 8.0:
+        findings.append(
+            f"The points lie between {scan.elevation_p01_deg:.0f} and {scan.elevation_p99_deg:.0f} deg of elevation, "
+            f"in training between {low:.0f} and {high:.0f}: this is a sensor of another field of view, or the origin "
+            "is not the sensor, or it is not level."
+        )
+
+    left, right = profile.azimuth_deg
+    if scan.view_covered < 0.6 * profile.view_covered[0]:
+        findings.append(
+            f"Only {scan.view_covered:.0%} of the model's view ({left:.0f} to {right:.0f} deg of azimuth) holds "
+            "points: the scan is cropped, or x does not point forward."
+        )
+    elif (
+        scan.road_ahead is not None
+        and profile.road_ahead is not None
+        and scan.road_ahead < min(-0.5, profile.road_ahead[0] - 0.3)
+    ):
+        findings.append(
+            "More stands in the way ahead and behind than to the sides, as if the road ran along y: if x does not "
+            "point forward, turn the points (from x right, y forward: pass y, -x, z). Across a road this may be right."
+        )
+
+    few_rows = scan.beams < 0.75 * profile.beams[0] and scan.beams_per_deg < 0.65 * profile.beams_per_deg[0]
+    if few_rows and has_ground:  # from a wrong origin, rows are not to be told apart
+        findings.append(
+            f"The scan has about {scan.beams:.0f} rows of points (sensor {sensor.name}: {sensor.n_beams}), in training "
+            f"it had at least {profile.beams[0]:.0f}: expect to lose far and small objects, or use a model trained for "
+            "it."
+        )
+
+    if scan.points_in_view < 0.2 * profile.points_in_view[0]:
+        findings.append(_too_few(scan, profile))
+    elif scan.points_in_view > 5.0 * profile.points_in_view[1]:
+        findings.append(
+            f"The model's view holds about {scan.points_in_view:.0f} points, in training it held at most "
+            f"{profile.points_in_view[1]:.0f}: pass one turn of the sensor at a time."
+        )
+    return findings
+
+
+def _remission_findings(scan: _Measures, profile: FitnessProfile, sensor: SensorProfile) -> list[str]:
+    low, high = sensor.remission_range
+    raw_low, raw_high, raw_p99 = (
+        value * (high - low) + low for value in (scan.remission_low, scan.remission_high, scan.remission_p99)
+    )
+    told = f"the profile {sensor.name} says {low:g} to {high:g}"
+    useless = max(0.9, profile.remission_zeros[1] + 0.05)
+    if scan.remission_beyond > 0.01 or scan.remission_low < -0.05:
+        likely = next((f"(0, {top})" for top in (1, 255, 65535) if raw_low >= 0.0 and raw_high <= top), "that")
+        return [
+            f"Remission runs from {raw_low:g} to {raw_high:g}, but {told}: pass sensor= a profile whose "
+            f"remission_range is {likely}."
+        ]
+    if scan.remission_zeros > useless:
+        return [
+            f"Remission is 0 for {scan.remission_zeros:.0%} of the points: the field is missing or was not read; the "
+            "model needs it."
+        ]
+    if scan.remission_p99 < 0.2 * profile.remission_p99[0]:
+        return [
+            f"Remission hardly exceeds {raw_p99:.2g}, but {told}: pass sensor= a profile with the remission_range of "
+            "this data, (0, 1) if it is scaled already."
+        ]
+    if scan.remission_alike > useless:
+        return [
+            f"Remission is the same for {scan.remission_alike:.0%} of the points ({raw_high:g}): the field holds "
+            "something else; the model needs it."
+        ]
+    darkest, brightest = profile.remission_median
+    if not darkest / 4.0 <= scan.remission_median <= brightest * 2.5:
+        return [
+            f"The median remission is {scan.remission_median:.2f} of full scale, in training it was {darkest:.2f} to "
+            f"{brightest:.2f}: sensors differ in this; fit a profile to it with edgeperc adapt fit."
+        ]
+    return []

@@ -1,0 +1,192 @@
+"""Sensor files to points: raw binary, .npy, .npz; other formats by their modules."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import PointsError
+from ..points import as_points
+from .pcd import begins_like_pcd, parse_pcd
+from .ply import parse_ply
+from .tables import MAX_HEADER_BYTES
+
+__all__ = ["read_points"]
+
+_TEXT_BYTES = np.zeros(256, dtype=np.bool_)
+_TEXT_BYTES[[9, 10, 13, *range(32, 127)]] = True
+
+
+def read_points(
+    source: str | os.PathLike[str] | ArrayLike,
+    *,
+    columns: int | None = None,
+    remission_field: str | None = None,
+) -> NDArray[np.float32]:
+    """Points of one scan, from a file or an array.
+
+    A file that begins with a PCD header, ``ply``, NumPy's or zip's magic is read as that, whatever its name. Raw
+    float32 files have no header, so their name has to end in ``.bin`` (KITTI, SemanticKITTI: x, y, z, remission) or
+    ``.pcd.bin`` (nuScenes: the same and the ring), or ``columns`` says how many values a point has.
+
+    Remission is never scaled here: the `Perceiver` does that, by its sensor's ``remission_range``. Where a file
+    holds none, it is 0. Rows that are not finite stay in place, so that labels keep the file's order.
+
+    Parameters
+    ----------
+    source : str, path or array
+        ``.bin``, ``.pcd.bin``, ``.npy``, ``.npz`` (its only array, or the one called ``points``), ``.pcd`` (ascii,
+        binary, binary_compressed), ``.ply`` (ascii, binary), or an array for `as_points`.
+    columns : int, optional
+        float32 values a point in a file without a header, at least 3. Other files say it themselves.
+    remission_field : str, optional
+        Which field is the remission, where fields have names; by default the first there is of remission,
+        intensity, i, reflectivity, reflectance.
+
+    Returns
+    -------
+    (n, 4) float32, C-contiguous
+        x, y, z [m] and remission as stored. An array that is this already is returned itself.
+
+    Raises
+    ------
+    PointsError
+        When the file cannot be read, is empty, cut short or no scan at all. A scan of no points is valid where the
+        file says so in a header; a file of 0 bytes is an error.
+    """
+    if not isinstance(source, str | os.PathLike):
+        return as_points(source, remission_field=remission_field)
+    path = Path(source)
+    try:
+        data = np.fromfile(path, dtype=np.uint8) if path.is_file() else None
+    except (OSError, ValueError) as exc:  # ValueError: a NUL in the name
+        raise PointsError(f"{path}: the file cannot be read ({exc})") from exc
+    if data is None:
+        raise PointsError(f"{path}: there is no such file; expected a scan as .bin, .npy, .npz, .pcd or .ply")
+    try:
+        return _parse(data, path.name.lower(), columns, remission_field)
+    except PointsError as exc:
+        raise PointsError(f"{path}: {exc}") from exc
+
+
+def _parse(data: NDArray[np.uint8], name: str, columns: int | None, remission_field: str | None) -> NDArray[np.float32]:
+    if data.size == 0:
+        raise PointsError(
+            "the file is empty (0 bytes), as an interrupted recording leaves it; "
+            "for a scan of no points pass an array of shape (0, 4)"
+        )
+    head = data[:MAX_HEADER_BYTES].tobytes()
+    if head.startswith(b"\x93NUMPY"):
+        return as_points(_parse_npy(data), remission_field=remission_field)
+    if head.startswith(b"PK\x03\x04"):
+        return as_points(_parse_npz(data), remission_field=remission_field)
+    if head.startswith((b"ply\n", b"ply\r")):
+        return parse_ply(data, head, remission_field)
+    if begins_like_pcd(head):
+        return parse_pcd(data, head, remission_field)
+    if columns is None:
+        if not name.endswith(".bin"):
+            raise PointsError(
+                "neither PCD, PLY, .npy nor .npz by its first bytes; for raw float32 values name it .bin or pass "
+                "columns=4 (x, y, z, remission)"
+            )
+        return _parse_raw(data, 5 if name.endswith(".pcd.bin") else 4, by_name=True)
+    return _parse_raw(data, columns, by_name=False)
+
+
+def _parse_raw(data: NDArray[np.uint8], columns: int, by_name: bool) -> NDArray[np.float32]:
+    if isinstance(columns, bool) or not isinstance(columns, int | np.integer) or not 3 <= columns <= 64:
+        raise PointsError(f"columns is the number of float32 values a point, 3 to 64, got {columns!r}")
+    if _TEXT_BYTES[data[:4096]].all():
+        raise PointsError("the file holds text, not float32 values; expected x, y, z, remission as raw float32")
+    record = 4 * int(columns)
+    if data.size % record:
+        raise PointsError(
+            f"{data.size} bytes are no whole number of points of {columns} float32 values ({record} bytes): the file "
+            "is cut short, or pass columns= with the right number of values a point"
+        )
+    values = data.view("<f4").reshape(-1, columns)
+    xyz = np.abs(values[:: max(1, len(values) // 4096), :3])
+    # Right values never look like this; float64, big-endian or other bytes taken for float32 do, in most rows.
+    with np.errstate(invalid="ignore"):  # comparing signalling NaN
+        absurd = ((xyz > 1e7) & (xyz < np.inf)) | ((xyz > 0.0) & (xyz < 1e-30))
+    if absurd.any(axis=1).mean() > 0.2:
+        raise PointsError(
+            "the values are no coordinates; expected little-endian float32 x, y, z, remission, not float64 nor "
+            "another format"
+        )
+    if by_name and columns == 4 and data.size % 20 == 0:
+        rows = data.view("<f4").reshape(-1, 5)[:1024]
+        with np.errstate(invalid="ignore"):
+            whole = rows == np.floor(rows)
+            rings = whole[:, 4] & (rows[:, 4] >= 0.0) & (rows[:, 4] < 256.0)
+        if rings.all() and not whole[:, :3].all():
+            raise PointsError(
+                "every fifth value is a small whole number, so these seem to be points of 5 values (x, y, z, "
+                "intensity, ring); pass columns=5 or name the file .pcd.bin"
+            )
+    return as_points(values[:, :4])
+
+
+def _parse_npy(data: NDArray[np.uint8]) -> NDArray[Any]:
+    stream = io.BytesIO(data[:MAX_HEADER_BYTES].tobytes())
+    try:
+        # numpy's header parser evaluates a literal and raises many things on a bad one.
+        version = np.lib.format.read_magic(stream)
+        if version == (1, 0):
+            shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+        elif version == (2, 0):
+            shape, fortran, dtype = np.lib.format.read_array_header_2_0(stream)
+        else:
+            raise ValueError(f"version {version} is for field names that are not ASCII; save it without")
+    except Exception as exc:
+        raise PointsError(f"the .npy header cannot be read: {exc}") from exc
+    if dtype.hasobject:
+        raise PointsError("the array holds Python objects, which are never unpickled; save numbers: (n, 4) float32")
+    if dtype.itemsize == 0 or any(not 0 <= edge <= data.size for edge in shape):
+        raise PointsError(f"the .npy header declares {shape} values of {dtype}, more than the file can hold")
+    start = stream.tell()
+    n_bytes = math.prod(shape) * dtype.itemsize
+    if n_bytes > data.size - start:
+        raise PointsError(
+            f"cut short: the .npy header declares {n_bytes} bytes of values, the file holds {data.size - start}"
+        )
+    try:
+        values: NDArray[Any] = data[start : start + n_bytes].view(dtype) if n_bytes else np.empty(0, dtype)
+        return values.reshape(shape, order="F" if fortran else "C")
+    except (TypeError, ValueError) as exc:
+        raise PointsError(f"the .npy array of {dtype} cannot be read: {exc}") from exc
+
+
+def _parse_npz(data: NDArray[np.uint8]) -> NDArray[Any]:
+    try:
+        # zipfile raises BadZipFile, RuntimeError (encrypted), NotImplementedError, zlib.error, EOFError and others.
+        with zipfile.ZipFile(io.BytesIO(data.tobytes())) as archive:
+            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            if "points" in members:
+                member = members["points"]
+            elif len(members) == 1:
+                (member,) = members.values()
+            else:
+                raise PointsError(f"several arrays and none called points: {', '.join(members)}")
+            # Deflate packs at most 1,032 to 1; scans pack less than 20 to 1.
+            if member.file_size > max(100 * data.size, 1 << 24):
+                raise PointsError(
+                    f"{data.size} bytes claim to unpack to {member.file_size}; no scan packs so well, so it is not "
+                    "unpacked. Save it as .npy"
+                )
+            content = archive.read(member)
+    except PointsError:
+        raise
+    except Exception as exc:
+        raise PointsError(f"the .npz archive cannot be read: {exc}") from exc
+    if not content.startswith(b"\x93NUMPY"):
+        raise PointsError(f"{member.filename!r} in the archive is no .npy array")
+    return _parse_npy(np.frombuffer(content, dtype=np.uint8))

@@ -1,0 +1,180 @@
+"""PCD files (Point Cloud Library)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ..errors import PointsError
+from ..points import assemble, plain_name
+from .tables import MAX_HEADER_BYTES, column, cut_short, parse_table, whole_number
+
+__all__ = ["begins_like_pcd", "fill_unpacked_lzf", "parse_pcd"]
+
+_PCD_TYPES = {f"{kind}{size}": f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)} | {
+    "F4": "<f4",
+    "F8": "<f8",
+}
+
+
+# --- PCD -------------------------------------------------------------------------------------------------------------
+
+
+def begins_like_pcd(head: bytes) -> bool:
+    """Whether the first lines are those of a PCD header."""
+    for line in head.splitlines():
+        words = line.split()
+        if words and not words[0].startswith(b"#"):
+            return words[0] in (b"VERSION", b"FIELDS", b"COLUMNS")
+        if line.startswith(b"# .PCD"):
+            return True
+    return False
+
+
+@dataclass(frozen=True)
+class _PcdHeader:
+    names: tuple[str, ...]
+    types: tuple[str, ...]
+    counts: tuple[int, ...]
+    n_points: int
+    encoding: str
+    n_bytes: int
+
+
+def _parse_pcd_header(head: bytes) -> _PcdHeader:
+    entries: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in entries:
+        end = head.find(b"\n", at)
+        if end < 0:
+            raise PointsError("the PCD header has no DATA line; the file is cut short or no PCD file")
+        words = head[at:end].decode("latin-1").split()
+        at = end + 1
+        if words and not words[0].startswith("#"):
+            entries[words[0]] = words[1:]
+    names = entries.get("FIELDS", entries.get("COLUMNS", []))
+    try:
+        sizes = [whole_number(word) for word in entries.get("SIZE", [])]
+        counts = [whole_number(word) for word in entries.get("COUNT", ["1"] * len(names))]
+        width, height = (whole_number(entries[key][0]) if key in entries else None for key in ("WIDTH", "HEIGHT"))
+        n_points = whole_number(entries["POINTS"][0]) if "POINTS" in entries else None
+    except (ValueError, IndexError) as exc:
+        raise PointsError(f"the PCD header holds no number where one belongs ({exc})") from exc
+    kinds = entries.get("TYPE", [])
+    if not names or not len(names) == len(sizes) == len(kinds) == len(counts):
+        raise PointsError("the PCD header's FIELDS, SIZE, TYPE and COUNT lines must be of equal length")
+    types = [_PCD_TYPES.get(f"{kind}{size}", "") for kind, size in zip(kinds, sizes, strict=True)]
+    if not all(types):
+        raise PointsError(
+            f"the PCD header has a field of an unknown TYPE and SIZE: {' '.join(kinds)} / {' '.join(map(str, sizes))}"
+        )
+    if any(not 1 <= count <= MAX_HEADER_BYTES for count in counts):
+        raise PointsError(f"the PCD header's COUNT must be at least 1, got {' '.join(map(str, counts))}")
+    organised = None if width is None else width * (1 if height is None else height)
+    if n_points is None and organised is not None and organised < 1 << 63:
+        n_points = organised
+    if n_points is None or n_points < 0 or organised not in (None, n_points):
+        raise PointsError(f"the PCD header declares {width} x {height} points and POINTS {n_points}; they must agree")
+    encoding = entries["DATA"][0].lower() if entries["DATA"] else ""
+    return _PcdHeader(tuple(names), tuple(types), tuple(counts), n_points, encoding, at)
+
+
+def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> NDArray[np.float32]:
+    """Points of a PCD file: ascii, binary or binary_compressed."""
+    header = _parse_pcd_header(head)
+    n = header.n_points
+    widths = [int(np.dtype(kind).itemsize) * count for kind, count in zip(header.types, header.counts, strict=True)]
+    record = sum(widths)
+    body = data[header.n_bytes :]
+    single: dict[str, int] = {}  # where each field of one value stands; padding is called "_" many times
+    for k, name in enumerate(header.names):
+        if header.counts[k] == 1:
+            single.setdefault(plain_name(name), k)
+    fields: dict[str, NDArray[Any]]
+    if header.encoding == "ascii":
+        return parse_table(
+            body, 0, n, {name: sum(header.counts[:k]) for name, k in single.items()}, header.names, remission_field
+        )
+    if header.encoding == "binary":
+        if n * record > body.size:
+            raise cut_short(n, record, body.size)
+        fields = {name: column(body, header.types[k], n, sum(widths[:k]), record) for name, k in single.items()}
+    elif header.encoding == "binary_compressed":
+        unpacked = _unpack_pcd(body, n * record)
+        fields = {
+            name: column(unpacked, header.types[k], n, n * sum(widths[:k]), widths[k]) for name, k in single.items()
+        }
+    else:
+        raise PointsError(f"PCD data is ascii, binary or binary_compressed, got {header.encoding!r}")
+    return assemble(n, fields, header.names, remission_field)
+
+
+def _unpack_pcd(body: NDArray[np.uint8], n_bytes: int) -> NDArray[np.uint8]:
+    if n_bytes == 0:
+        return np.empty(0, dtype=np.uint8)
+    if body.size < 8:
+        raise PointsError("cut short: no compressed data follows the PCD header")
+    packed_size, size = (int(v) for v in body[:8].view("<u4"))
+    if packed_size > body.size - 8:
+        raise PointsError(f"cut short: {packed_size} bytes of compressed data declared, {body.size - 8} are there")
+    # The longest LZF reference takes 3 bytes and gives 264, so a larger claim is false; check before allocating.
+    if size != n_bytes or size > 88 * packed_size:
+        raise PointsError(f"{packed_size} compressed bytes claim to unpack to {size}; the fields need {n_bytes}")
+    unpacked = np.empty(size, dtype=np.uint8)
+    if fill_unpacked_lzf(body[8 : 8 + packed_size], unpacked) != size:
+        raise PointsError("the compressed data is damaged")
+    return unpacked
+
+
+@njit(cache=True, nogil=True)
+def fill_unpacked_lzf(packed: NDArray[np.uint8], unpacked: NDArray[np.uint8]) -> int:
+    """Decompress LZF data into ``unpacked``.
+
+    Parameters
+    ----------
+    packed : (m,) uint8
+    unpacked : (size,) uint8, overwritten
+
+    Returns
+    -------
+    int
+        Bytes written, or -1 where the data reads before its start, past its end or past the output.
+    """
+    n_in = packed.shape[0]
+    n_out = unpacked.shape[0]
+    i = 0
+    o = 0
+    while i < n_in:
+        control = np.int64(packed[i])
+        i += 1
+        if control < 32:
+            length = control + 1
+            if i + length > n_in or o + length > n_out:
+                return -1
+            for _ in range(length):
+                unpacked[o] = packed[i]
+                o += 1
+                i += 1
+            continue
+        length = control >> 5
+        if length == 7:
+            if i >= n_in:
+                return -1
+            length += np.int64(packed[i])
+            i += 1
+        if i >= n_in:
+            return -1
+        back = o - ((control & 31) << 8) - np.int64(packed[i]) - 1
+        i += 1
+        length += 2
+        if back < 0 or o + length > n_out:
+            return -1
+        for _ in range(length):  # byte by byte: a reference may overlap what it writes
+            unpacked[o] = unpacked[back]
+            o += 1
+            back += 1
+    return o

@@ -1,0 +1,144 @@
+"""PLY files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PointsError
+from ..points import assemble, plain_name
+from .tables import column, cut_short, parse_table, whole_number
+
+__all__ = ["parse_ply"]
+
+_PLY_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+
+
+# --- PLY -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _PlyElement:
+    name: str
+    count: int
+    properties: list[tuple[str, str, str]]  # name, type, type of a list's length or ""
+
+    @property
+    def has_lists(self) -> bool:
+        return any(length_type for _, _, length_type in self.properties)
+
+
+def _parse_ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
+    encoding = ""
+    elements: list[_PlyElement] = []
+    at = 0
+    while True:
+        end = head.find(b"\n", at)
+        if end < 0:
+            raise PointsError("the PLY header has no end_header line; the file is cut short or no PLY file")
+        words = head[at:end].decode("latin-1").split()
+        at = end + 1
+        try:
+            match words:
+                case ["end_header"]:
+                    break
+                case ["format", kind, *_]:
+                    encoding = kind
+                case ["element", name, count]:
+                    if whole_number(count) < 0:
+                        raise ValueError("a negative count")
+                    elements.append(_PlyElement(name, whole_number(count), []))
+                case ["property", "list", length_type, kind, name]:
+                    if _PLY_TYPES[length_type][0] == "f":
+                        raise ValueError("a list's length must be whole")
+                    elements[-1].properties.append((name, _PLY_TYPES[kind], _PLY_TYPES[length_type]))
+                case ["property", kind, name]:
+                    elements[-1].properties.append((name, _PLY_TYPES[kind], ""))
+                case ["ply"] | [] | ["comment" | "obj_info", *_]:
+                    pass
+                case _:
+                    raise ValueError("an unknown line")
+        except (ValueError, KeyError, IndexError) as exc:
+            raise PointsError(f"the PLY header line {' '.join(words)[:80]!r} cannot be read ({exc})") from exc
+    return encoding, elements, at
+
+
+def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> NDArray[np.float32]:
+    """Points of a PLY file's vertices: ascii or binary of either byte order."""
+    encoding, elements, start = _parse_ply_header(head)
+    before: list[_PlyElement] = []
+    for vertex in elements:
+        if vertex.name == "vertex":
+            break
+        before.append(vertex)
+    else:
+        raise PointsError("the PLY file has no vertex element")
+    body = data[start:]
+    names = [name for name, _, _ in vertex.properties]
+    places: dict[str, int] = {}
+    for k, (name, _, length_type) in enumerate(vertex.properties):
+        if not length_type:
+            places.setdefault(plain_name(name), k)
+    if encoding == "ascii":
+        if vertex.has_lists:
+            raise PointsError("a PLY text file with lists among a vertex' properties; save it as binary")
+        return parse_table(body, sum(e.count for e in before), vertex.count, places, names, remission_field)
+    if encoding not in ("binary_little_endian", "binary_big_endian"):
+        raise PointsError(f"PLY data is ascii, binary_little_endian or binary_big_endian, got {encoding!r}")
+    order = "<" if encoding == "binary_little_endian" else ">"
+    at = 0
+    for element in before:
+        at = _row_starts(body, at, element, order)[1]
+    starts, _ = _row_starts(body, at, vertex, order)
+    n = vertex.count
+    fields: dict[str, NDArray[Any]] = {}
+    if starts is None:
+        widths = [int(np.dtype(kind).itemsize) for _, kind, _ in vertex.properties]
+        record = sum(widths)
+        for name, k in places.items():
+            kind = order + vertex.properties[k][1]
+            fields[name] = column(body, kind, n, at + sum(widths[:k]), record)
+    else:
+        for name, k in places.items():
+            kind = order + vertex.properties[k][1]
+            octets = starts[:, k, None] + np.arange(np.dtype(kind).itemsize)
+            fields[name] = body[octets].reshape(-1).view(kind)
+    return assemble(n, fields, names, remission_field)
+
+
+def _row_starts(
+    body: NDArray[np.uint8], at: int, element: _PlyElement, order: str
+) -> tuple[NDArray[np.int64] | None, int]:
+    """Where each property of each row begins, None where rows are of one length; and where the element ends."""
+    if not element.has_lists:
+        record = sum(int(np.dtype(kind).itemsize) for _, kind, _ in element.properties)
+        end = at + element.count * record
+        if end > body.size:
+            raise cut_short(element.count, record, body.size - at)
+        return None, end
+    byte_order: Literal["little", "big"] = "little" if order == "<" else "big"
+    steps = [
+        (np.dtype(kind).itemsize, np.dtype(length or "u1").itemsize if length else 0)
+        for _, kind, length in element.properties
+    ]
+    least = sum(length_size or size for size, length_size in steps)
+    if at + element.count * least > body.size:
+        raise cut_short(element.count, least, body.size - at)
+    starts = np.empty((element.count, len(steps)), dtype=np.int64)
+    for row in range(element.count):
+        for k, (size, length_size) in enumerate(steps):
+            starts[row, k] = at
+            if length_size:
+                at += length_size + size * int.from_bytes(body[at : at + length_size].tobytes(), byte_order)
+            else:
+                at += size
+            if at > body.size:
+                raise PointsError(f"cut short: row {row} of {element.count} of {element.name!r} ends past the file")
+    return starts, at

@@ -1,0 +1,73 @@
+"""Tables of points: text files with or without a header."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PointsError
+from ..points import assemble, remission_name
+
+__all__ = ["MAX_HEADER_BYTES", "column", "cut_short", "parse_table", "whole_number"]
+
+MAX_HEADER_BYTES = 65536
+
+
+def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int) -> NDArray[Any]:
+    """One field of binary records, as a view."""
+    if n == 0:
+        return np.empty(0, dtype=kind)
+    column: NDArray[Any] = np.ndarray((n,), kind, data.data, offset, (stride,))
+    return column
+
+
+def whole_number(word: str) -> int:
+    """An integer of a header that fits 64 bits."""
+    value = int(word)
+    if abs(value) >= 1 << 63:
+        raise ValueError("a number beyond 64 bits")
+    return value
+
+
+def cut_short(n: int, record: int, size: int) -> PointsError:
+    """The error for a file that ends before the points its header declares."""
+    return PointsError(
+        f"cut short: the header declares {n} points of {record} bytes, but {size} bytes follow it ({size // record} "
+        "points)"
+    )
+
+
+def parse_table(
+    body: NDArray[np.uint8],
+    skipped_rows: int,
+    n: int,
+    places: Mapping[str, int],
+    names: Sequence[str],
+    remission_field: str | None,
+) -> NDArray[np.float32]:
+    """Rows of text; ``places`` holds each field's position in a row."""
+    wanted = {name: places[name] for name in "xyz" if name in places}
+    remission = remission_name(places, remission_field)
+    if remission is not None:
+        wanted[remission] = places[remission]
+    if len(wanted) < 3 or n == 0:
+        return assemble(0, {name: np.empty(0) for name in wanted}, names, remission_field)
+    ends = np.flatnonzero(np.append(body, np.uint8(10)) == 10) + 1
+    if skipped_rows + n > len(ends):
+        raise PointsError(f"cut short: {skipped_rows + n} rows declared, {len(ends)} are there")
+    text = body[ends[skipped_rows - 1] if skipped_rows else 0 : ends[skipped_rows + n - 1]].tobytes()
+    if not text.strip():
+        raise PointsError(f"cut short: {n} rows declared, none are there")
+    try:
+        rows = np.loadtxt(
+            io.BytesIO(text), np.float64, comments=None, usecols=list(wanted.values()), ndmin=2, encoding="latin-1"
+        )
+    except (ValueError, OverflowError) as exc:
+        raise PointsError(f"a row of text is no row of numbers: {exc}") from exc
+    if len(rows) != n:
+        raise PointsError(f"cut short: {n} rows declared, {len(rows)} of numbers are there")
+    return assemble(n, dict(zip(wanted, rows.T, strict=True)), names, remission_field)

@@ -1,0 +1,180 @@
+"""Scenes around the boxes of a real, labelled scan."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..perception import Box
+from .raycast import GLASS, LANE, MATTE, PAINT, SLOPE_X, SLOPE_Y
+from .scene import Scene, wrapped
+from .shapes import SHAPES, Row, block
+from .street import IN_BAYS, ROW_RANGE_M, Street, add_roadside, any_vehicle, random_terrain, strip_row
+
+__all__ = ["scene_from_boxes"]
+
+_VEHICLES = ("car", "van", "truck")
+_ROW_GAP_M = 9.0  # from one parked car's middle to the next one's
+
+
+def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float = 1.73) -> Scene:
+    """A street around a real layout of objects.
+
+    Parameters
+    ----------
+    boxes : sequence of Box
+        In a sensor frame whose origin is ``mount_height_m`` above the road. Boxes whose label is none of car, van,
+        truck, pedestrian and cyclist become obstacles of the background.
+    seed : int
+        Of everything the boxes do not say: the road's edges, what stands beside it, what lies outside the view.
+    mount_height_m : float
+
+    Returns
+    -------
+    Scene
+        Its first objects are ``boxes`` of the five labels, in order, standing on the scene's ground (so that their
+        height differs a little from the given one).
+    """
+    rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 15485863))
+    vehicles = [box for box in boxes if box.label in _VEHICLES]
+    heading, curvature = _road_direction(vehicles)
+    lane = float(rng.uniform(2.9, 3.6))
+    # Those along the road widen it; those across stand on another road or in a yard.
+    beside: list[tuple[float, float, float, float]] = []
+    across: list[float] = []
+    for box in vehicles:
+        s, u = _along(box, heading, curvature)
+        turn = box.yaw - heading - curvature * s
+        if abs(math.sin(turn)) < 0.35 and abs(u) < 9.5:
+            beside.append((s, u, box.size[1] / 2, math.cos(turn)))
+        elif abs(math.sin(turn)) > 0.8 and abs(u) < 9.0 and s > 5.0:
+            across.append(s)
+    right = min([-lane / 2 - 0.2, *(u - w - 0.3 for _, u, w, _ in beside)])
+    left = max([lane / 2 + 0.2, *(u + w + 0.3 for _, u, w, _ in beside)])
+    if left < 3.0 and rng.random() < 0.7:
+        left += lane  # an empty lane for oncoming traffic
+    right -= float(rng.uniform(0.0, 0.8))
+    left += float(rng.uniform(0.0, 0.8))
+    on_foot = any(box.label == "pedestrian" for box in boxes)
+    fast = len(beside) > 0 and not on_foot and rng.random() < 0.15
+    place = str(rng.choice(["urban", "residential"])) if not fast else str(rng.choice(["rural", "highway"]))
+    bays: list[Row] = []
+    if rng.random() < IN_BAYS:
+        right, left, bays = _parking_rows(beside, lane, right, left, heading, curvature)
+    strips = [strip_row(0, 0, heading, curvature, right, left)]
+    crossings: list[float] = []
+    if across or rng.random() < 0.2:
+        s = float(np.median(across)) if across else float(rng.uniform(10.0, 55.0))
+        crossings.append(s)
+        x, y = s * math.cos(heading), s * math.sin(heading) + curvature * s * s / 2
+        width = float(rng.uniform(3.0, 5.5))
+        strips.append(strip_row(x, y, heading + curvature * s + math.pi / 2, 0.0, -width, width))
+    strips += bays
+    terrain = random_terrain(rng, place)
+    terrain[LANE] = lane
+    bottoms = np.array([(b.center[0], b.center[1], b.center[2] - b.size[2] / 2 + mount_height_m) for b in vehicles])
+    if len(bottoms) >= 3:
+        # Slopes that the boxes tell, drawn towards level by 1,000 m2.
+        xy = bottoms[:, :2]
+        slopes = np.linalg.solve(xy.T @ xy + 1000.0 * np.eye(2), xy.T @ bottoms[:, 2])
+        terrain[[SLOPE_X, SLOPE_Y]] = np.clip(slopes, -0.04, 0.04)
+    street = Street(rng, strips, terrain)
+    street.take(-0.3, 0.0, 4.8, 2.2, 0.0)
+    for box in boxes:
+        if box.label in SHAPES:
+            s, _ = _along(box, heading, curvature)
+            ahead = math.cos(box.yaw - heading - curvature * s)
+            moving = box.label in ("pedestrian", "cyclist") or ahead > 0.5
+            pace = {"pedestrian": 1.3, "cyclist": 4.0}.get(box.label, 9.0)
+            speed = float(pace * rng.uniform(0.5, 1.2)) if moving and rng.random() < 0.6 else 0.0
+            street.add_object(box.label, *box.center[:2], box.yaw, box.size, speed, force=True)
+        else:
+            length, width, height = box.size
+            rows = [
+                block(PAINT, 0.4, (0, 0, 0.25 + height * 0.3), (length, width, height * 0.5), density=0.1),
+                block(GLASS if height > 2.2 else MATTE, 0.2, (0, 0, height * 0.75),
+                       (length, width * 0.96, height * 0.5), density=0.6),
+            ]  # fmt: skip
+            street.take(*box.center[:2], length, width, box.yaw)
+            z, _ = street.ground(*box.center[:2])
+            for row in rows:
+                turned = block(int(row[1]), row[2], (box.center[0], box.center[1], z + row[6]),
+                                (2 / row[7], 2 / row[11], 2 / row[15]), yaw=box.yaw, density=row[3])  # fmt: skip
+                street.rows.append(turned)
+    # What is labelled was seen: mostly nothing new may stand in between.
+    for box in boxes:
+        away = math.hypot(box.center[0], box.center[1])
+        if away > 8.0 and rng.random() < 0.85:
+            share = 0.5 + 2.0 / away
+            x, y = box.center[0] * share, box.center[1] * share
+            street.take(x, y, away - 4.0, 1.0, math.atan2(box.center[1], box.center[0]))
+    # Behind the sensor and far to the sides nothing is labelled: mirror what is seen, thinned.
+    for s, u, _, ahead in beside:
+        if rng.random() < 0.7:
+            x, y, yaw = street.on_strip(-s + float(rng.normal(0, 3.0)), u)
+            yaw += math.pi * (ahead < 0.0)
+            street.add_object(any_vehicle(rng, 0.03), x, y, yaw)
+    _add_unlabelled_people(street, boxes)
+    add_roadside(street, place)
+    return street.scene()
+
+
+def _parking_rows(
+    beside: Sequence[tuple[float, float, float, float]],
+    lane: float,
+    right: float,
+    left: float,
+    heading: float,
+    curvature: float,
+) -> tuple[float, float, list[Row]]:
+    """The road's edges without the outermost row of vehicles, where it looks parked, and bays for those rows.
+
+    Parked looks a row of two and more, some of them close behind each other, clear of the sensor's own lane.
+    """
+    edges, bays = {-1.0: -right, 1.0: left}, []
+    for side in edges:
+        own = [(s, side * u, w) for s, u, w, _ in beside if side * u - w > lane / 2 + 0.3]
+        outermost = max((u for _, u, _ in own), default=0.0)
+        row = sorted((s, u, w) for s, u, w in own if outermost - u < 0.8)
+        gaps = np.diff([s for s, _, _ in row])
+        if len(row) < 2 or gaps.min() > _ROW_GAP_M:
+            continue
+        inner = min(u - w for _, u, w in row) - 0.2
+        bay = (inner, edges[side]) if side > 0 else (-edges[side], -inner)
+        bays.append(strip_row(0, 0, heading, curvature, *bay, ROW_RANGE_M, True))
+        edges[side] = inner
+    return -edges[-1.0], edges[1.0], bays
+
+
+def _add_unlabelled_people(street: Street, boxes: Sequence[Box]) -> None:
+    rng = street.rng
+    for box in boxes:
+        if box.label in ("pedestrian", "cyclist") and rng.random() < 0.7:
+            x, y = -box.center[0] + float(rng.normal(0, 2)), box.center[1] + float(rng.normal(0, 0.3))
+            street.add_object(box.label, x, y, box.yaw, box.size, 1.0)
+
+
+def _along(box: Box, heading: float, curvature: float) -> tuple[float, float]:
+    cos, sin = math.cos(heading), math.sin(heading)
+    s = cos * box.center[0] + sin * box.center[1]
+    return s, cos * box.center[1] - sin * box.center[0] - curvature * s * s / 2
+
+
+def _road_direction(vehicles: Sequence[Box]) -> tuple[float, float]:
+    """Heading and curvature of the road that the vehicles near the sensor's lane suggest."""
+    leaning = []
+    for box in vehicles:
+        turn = wrapped(2.0 * box.yaw) / 2.0  # modulo pi
+        if abs(turn) < 0.45 and abs(box.center[1]) < 4.0 + 0.35 * abs(box.center[0]):
+            leaning.append((box.center[0], turn))
+    if not leaning:
+        return 0.0, 0.0
+    s, turn = np.array(leaning).T
+    if len(leaning) >= 3 and np.ptp(s) > 15.0:
+        # Straight ahead at the sensor, more or less: the ego vehicle follows the road.
+        weights = np.array([[60.0 + len(s) * 4.0, s.sum()], [s.sum(), (s * s).sum() + 3000.0]])
+        heading, curvature = np.linalg.solve(weights, np.array([turn.sum(), (s * turn).sum()]))
+        return float(np.clip(heading, -0.08, 0.08)), float(np.clip(curvature, -0.012, 0.012))
+    return float(np.clip(np.median(turn) * 0.5, -0.08, 0.08)), 0.0

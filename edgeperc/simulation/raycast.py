@@ -1,0 +1,717 @@
+"""The spinning LiDAR: kernels that cast rays and turn hits into points."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = [
+    "ASPHALT",
+    "BANK_RISE",
+    "BANK_SLOPE",
+    "BAY",
+    "BOX",
+    "CROWN",
+    "CYLINDER",
+    "DITCH",
+    "DROPPED",
+    "ELLIPSOID",
+    "FACADE",
+    "GLASS",
+    "GRASS",
+    "KERB",
+    "LANE",
+    "LEAVES",
+    "LIP",
+    "MARKING",
+    "MATTE",
+    "PAINT",
+    "PAVEMENT",
+    "PAVING",
+    "POROUS",
+    "RETRO",
+    "ROUGH",
+    "ROUNDING",
+    "ROW",
+    "SLOPE_X",
+    "SLOPE_Y",
+    "STRIP",
+    "TERRAIN",
+    "TILE",
+    "WAVE_X",
+    "WAVE_X_0",
+    "WAVE_X_K",
+    "WAVE_Y",
+    "WAVE_Y_0",
+    "WAVE_Y_K",
+    "WEAR",
+    "fill_bounds",
+    "fill_cast",
+    "fill_column_counts",
+    "fill_column_rows",
+    "fill_drivable",
+    "fill_placed",
+    "fill_points",
+    "ground_at",
+]
+
+# A primitive is a row of float64: kind, material, remission, density, centre (3), rows of the matrix that takes an
+# offset from the centre into the unit shape (9), taper of the front, rear and sides (3), object (-1: none).
+BOX, CYLINDER, ELLIPSOID = 0, 1, 2
+MATTE, PAINT, GLASS, RETRO, LEAVES, POROUS, FACADE = 0, 1, 2, 3, 4, 5, 6
+ROW = 20
+
+# Columns of Scene.strips: origin x, y, cos and sin of the direction, curvature, u range, s range, 1 for a parking bay.
+STRIP = 10
+
+# Entries of Scene.terrain.
+(
+    SLOPE_X, SLOPE_Y, WAVE_X, WAVE_X_K, WAVE_X_0, WAVE_Y, WAVE_Y_K, WAVE_Y_0, KERB, PAVEMENT, CROWN,
+    BANK_SLOPE, BANK_RISE, ROUGH, DITCH, ROUNDING, ASPHALT, PAVING, GRASS, MARKING, LANE, DROPPED, WEAR,
+    LIP, BAY, TERRAIN,
+) = range(26)  # fmt: skip
+TILE = 256  # cells of the noise tile a side; 0.3 m each
+_GROUND, _NOTHING = -1, -2  # in place of a primitive's row
+
+
+# --- kernels ----------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+def _mixed(value: np.uint64) -> np.uint64:
+    # splitmix64: a draw depends on its ray and purpose alone, not on the order of the rays.
+    value = np.uint64(value + np.uint64(0x9E3779B97F4A7C15))
+    value = np.uint64((value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9))
+    value = np.uint64((value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB))
+    return np.uint64(value ^ (value >> np.uint64(31)))
+
+
+@njit(cache=True, nogil=True)
+def _uniform(bits: np.uint64) -> float:
+    """In (0, 1)."""
+    return (float(bits >> np.uint64(11)) + 0.5) * (1.0 / 9007199254740992.0)
+
+
+@njit(cache=True, nogil=True)
+def _normal(bits: np.uint64) -> float:
+    # Sum of four 16-bit uniforms, scaled to variance 1: within 3.5 sigma, and one hash a draw.
+    total = 0.0
+    for k in range(4):
+        total += float((bits >> np.uint64(16 * k)) & np.uint64(0xFFFF))
+    return (total / 65536.0 - 2.0) * 1.7320508075688772
+
+
+@njit(cache=True, nogil=True)
+def _tile_at(tile: NDArray[np.float64], x: float, y: float, cell_m: float) -> float:
+    column, row = x / cell_m, y / cell_m
+    left, below = math.floor(column), math.floor(row)
+    a, b = column - left, row - below
+    i, j = int(below) & (TILE - 1), int(left) & (TILE - 1)
+    i1, j1 = (i + 1) & (TILE - 1), (j + 1) & (TILE - 1)
+    return (1.0 - b) * ((1.0 - a) * tile[i, j] + a * tile[i, j1]) + b * ((1.0 - a) * tile[i1, j] + a * tile[i1, j1])
+
+
+@njit(cache=True, nogil=True)
+def ground_at(
+    strips: NDArray[np.float64], terrain: NDArray[np.float64], tile: NDArray[np.float64], x: float, y: float
+) -> tuple[float, float, float, float, float]:
+    """Height [m], distance out of the roads, out of the bays, and u (left of the first road's axis), s along it [m]."""
+    outside, outside_bays, u_first, s_first = 1e9, 1e9, 0.0, 0.0
+    for k in range(strips.shape[0]):
+        dx, dy = x - strips[k, 0], y - strips[k, 1]
+        s = strips[k, 2] * dx + strips[k, 3] * dy
+        bend = strips[k, 4] * s
+        u = (strips[k, 2] * dy - strips[k, 3] * dx - 0.5 * bend * s) / math.sqrt(1.0 + bend * bend)
+        d = max(max(u - strips[k, 6], strips[k, 5] - u), max(strips[k, 7] - s, s - strips[k, 8]))
+        if strips[k, 9] > 0.0:
+            outside_bays = min(outside_bays, d)
+        elif k == 0:
+            outside, u_first, s_first = d, u, s
+        else:
+            # Smooth minimum: rounds the kerbs where roads meet.
+            blend = max(terrain[ROUNDING] - abs(outside - d), 0.0)
+            outside = min(outside, d) - blend * blend / (4.0 * terrain[ROUNDING])
+    z = terrain[SLOPE_X] * x + terrain[SLOPE_Y] * y
+    z += terrain[WAVE_X] * math.sin(terrain[WAVE_X_K] * x + terrain[WAVE_X_0])
+    z += terrain[WAVE_Y] * math.sin(terrain[WAVE_Y_K] * y + terrain[WAVE_Y_0])
+    d = min(outside, outside_bays)
+    if d <= 0.0:
+        z += terrain[CROWN] * min(-d, 4.0)
+        if outside > 0.0:
+            z += terrain[LIP]
+        return z, outside, outside_bays, u_first, s_first
+    kerb = terrain[KERB]
+    along = (s_first + terrain[DROPPED]) / 23.0
+    if along - math.floor(along) < 0.15:
+        kerb *= 0.25  # dropped for a driveway
+    z += kerb * min(d / 0.05, 1.0) + 0.02 * min(d, terrain[PAVEMENT])
+    e = d - terrain[PAVEMENT]
+    if e > 0.0:
+        z += (
+            min(terrain[BANK_SLOPE] * e, terrain[BANK_RISE])
+            if terrain[BANK_RISE] > 0.0
+            else (max(-terrain[BANK_SLOPE] * e, terrain[BANK_RISE]))
+        )
+        basin = (e - 1.6) / 1.2
+        z -= terrain[DITCH] * max(1.0 - basin * basin, 0.0)
+        z += min(e / 0.3, 1.0) * terrain[ROUGH] * (1.0 + _tile_at(tile, x, y, 0.3))
+    return z, outside, outside_bays, u_first, s_first
+
+
+@njit(cache=True, nogil=True)
+def fill_drivable(
+    strips: NDArray[np.float64],
+    terrain: NDArray[np.float64],
+    tile: NDArray[np.float64],
+    T_world_sensor: NDArray[np.float64],
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    labels: NDArray[np.uint8],
+) -> None:
+    """Write 1 into ``labels`` (rows, columns) where a road surface lies below the cell's centre, 0 elsewhere."""
+    T = T_world_sensor
+    for i in range(x.shape[0]):
+        for j in range(y.shape[0]):
+            # The ground is about this far below; only a tilted sensor notices.
+            z = -T[2, 3]
+            xw = T[0, 0] * x[i] + T[0, 1] * y[j] + T[0, 2] * z + T[0, 3]
+            yw = T[1, 0] * x[i] + T[1, 1] * y[j] + T[1, 2] * z + T[1, 3]
+            labels[i, j] = 1 if ground_at(strips, terrain, tile, xw, yw)[1] < 0.0 else 0
+
+
+@njit(cache=True, nogil=True)
+def fill_placed(
+    primitives: NDArray[np.float64],
+    poses: NDArray[np.float64],
+    T_world_sensor: NDArray[np.float64],
+    placed: NDArray[np.float64],
+) -> None:
+    """Write the primitives in the sensor frame into ``placed`` (n, 20); ``poses`` (m, 4): x, y, z, yaw of objects."""
+    T = T_world_sensor
+    for k in range(primitives.shape[0]):
+        placed[k] = primitives[k]
+        x, y, z, cos, sin = 0.0, 0.0, 0.0, 1.0, 0.0
+        o = int(primitives[k, 19])
+        if o >= 0:
+            x, y, z, cos, sin = poses[o, 0], poses[o, 1], poses[o, 2], math.cos(poses[o, 3]), math.sin(poses[o, 3])
+        cx, cy, cz = primitives[k, 4], primitives[k, 5], primitives[k, 6]
+        dx = cos * cx - sin * cy + x - T[0, 3]
+        dy = sin * cx + cos * cy + y - T[1, 3]
+        dz = cz + z - T[2, 3]
+        for i in range(3):
+            placed[k, 4 + i] = T[0, i] * dx + T[1, i] * dy + T[2, i] * dz
+            ax, ay, az = primitives[k, 7 + 3 * i], primitives[k, 8 + 3 * i], primitives[k, 9 + 3 * i]
+            wx, wy = cos * ax - sin * ay, sin * ax + cos * ay
+            for j in range(3):
+                placed[k, 7 + 3 * i + j] = wx * T[0, j] + wy * T[1, j] + az * T[2, j]
+
+
+@njit(cache=True, nogil=True)
+def fill_bounds(primitives: NDArray[np.float64], bounds: NDArray[np.float64]) -> None:
+    """Write azimuth from, azimuth width, tan of elevation from, to, and horizontal distance into ``bounds`` (n, 5)."""
+    corners = np.empty((8, 3))
+    for k in range(primitives.shape[0]):
+        p = primitives[k]
+        for c in range(8):
+            for j in range(3):
+                corners[c, j] = p[4 + j]
+            for i in range(3):
+                ax, ay, az = p[7 + 3 * i], p[8 + 3 * i], p[9 + 3 * i]
+                # Row i of the matrix is the axis over its half length; the half axis is the row over its square.
+                sign = (1.0 if (c >> i) & 1 else -1.0) / (ax * ax + ay * ay + az * az)
+                corners[c, 0] += sign * ax
+                corners[c, 1] += sign * ay
+                corners[c, 2] += sign * az
+        middle = math.atan2(p[5], p[4])
+        first, last, far, low, high = 10.0, -10.0, 0.0, 1e9, -1e9
+        for c in range(8):
+            turn = math.atan2(corners[c, 1], corners[c, 0]) - middle
+            turn -= 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
+            first, last = min(first, turn), max(last, turn)
+            far = max(far, math.hypot(corners[c, 0], corners[c, 1]))
+            low, high = min(low, corners[c, 2]), max(high, corners[c, 2])
+        near = 0.0
+        if last - first < math.pi:
+            # Distance of the outline seen from above: the best separating line along an edge or facing a corner.
+            for candidate in range(14):
+                if candidate < 8:
+                    nx, ny = corners[candidate, 0], corners[candidate, 1]
+                else:
+                    i = (candidate - 8) // 2
+                    sign = 1.0 if candidate % 2 == 0 else -1.0
+                    nx, ny = -sign * p[8 + 3 * i], sign * p[7 + 3 * i]
+                length = math.hypot(nx, ny)
+                if length > 1e-9:
+                    least = 1e9
+                    for c in range(8):
+                        least = min(least, (nx * corners[c, 0] + ny * corners[c, 1]) / length)
+                    near = max(near, least)
+        else:
+            first, last = -math.pi, math.pi
+        floor = max(near, 1e-3)
+        bounds[k, 0] = middle + first - 1e-9
+        bounds[k, 1] = last - first + 2e-9
+        bounds[k, 2] = low / (floor if low < 0.0 else far) - 1e-9
+        bounds[k, 3] = high / (floor if high > 0.0 else far) + 1e-9
+        bounds[k, 4] = near
+
+
+@njit(cache=True, nogil=True)
+def _columns_of(bounds: NDArray[np.float64], k: int, n_columns: int) -> tuple[int, int]:
+    # One more to either side: azimuths jitter by a fraction of a step.
+    step = 2.0 * math.pi / n_columns
+    first = math.floor(bounds[k, 0] / step) - 1
+    count = math.ceil(bounds[k, 1] / step) + 4
+    return first, min(count, n_columns)
+
+
+@njit(cache=True, nogil=True)
+def fill_column_counts(bounds: NDArray[np.float64], n_columns: int, reach: float, starts: NDArray[np.int64]) -> None:
+    """Write where the list of each azimuth step begins into ``starts`` (n_columns + 1,)."""
+    starts[:] = 0
+    for k in range(bounds.shape[0]):
+        if bounds[k, 4] < reach:
+            first, count = _columns_of(bounds, k, n_columns)
+            for c in range(count):
+                starts[(first + c) % n_columns + 1] += 1
+    for c in range(n_columns):
+        starts[c + 1] += starts[c]
+
+
+@njit(cache=True, nogil=True)
+def fill_column_rows(
+    bounds: NDArray[np.float64], n_columns: int, reach: float, starts: NDArray[np.int64], rows: NDArray[np.int32]
+) -> None:
+    """Write the primitives of each azimuth step, in the order of ``bounds``, into ``rows``."""
+    ends = starts.copy()
+    for k in range(bounds.shape[0]):
+        if bounds[k, 4] < reach:
+            first, count = _columns_of(bounds, k, n_columns)
+            for c in range(count):
+                column = (first + c) % n_columns
+                rows[ends[column]] = k
+                ends[column] += 1
+
+
+@njit(cache=True, nogil=True)
+def _crossing(p: NDArray[np.float64], dx: float, dy: float, dz: float) -> tuple[float, float, int]:
+    """Where a ray from the origin enters and leaves a primitive, and through which face; enters > leaves: it misses."""
+    ox = -(p[7] * p[4] + p[8] * p[5] + p[9] * p[6])
+    oy = -(p[10] * p[4] + p[11] * p[5] + p[12] * p[6])
+    oz = -(p[13] * p[4] + p[14] * p[5] + p[15] * p[6])
+    ux = p[7] * dx + p[8] * dy + p[9] * dz
+    uy = p[10] * dx + p[11] * dy + p[12] * dz
+    uz = p[13] * dx + p[14] * dy + p[15] * dz
+    enter, leave, face = -1e9, 1e9, -1
+    kind = int(p[0])
+    if kind == ELLIPSOID:
+        a = ux * ux + uy * uy + uz * uz
+        b = ox * ux + oy * uy + oz * uz
+        c = ox * ox + oy * oy + oz * oz - 1.0
+        root = b * b - a * c
+        if root < 0.0:
+            return 1.0, 0.0, -1
+        root = math.sqrt(root)
+        return (-b - root) / a, (-b + root) / a, 6
+    if kind == CYLINDER:
+        a = ux * ux + uy * uy
+        b = ox * ux + oy * uy
+        c = ox * ox + oy * oy - 1.0
+        if a > 1e-18:
+            root = b * b - a * c
+            if root < 0.0:
+                return 1.0, 0.0, -1
+            root = math.sqrt(root)
+            enter, leave, face = (-b - root) / a, (-b + root) / a, 6
+        elif c > 0.0:
+            return 1.0, 0.0, -1
+        n_faces = 2
+    else:
+        n_faces = 6
+    # Half-spaces: bottom, top, then (boxes) front, rear, left, right, which lean in by the tapers.
+    for k in range(n_faces):
+        if k == 0:
+            rate, gap = -uz, 1.0 + oz
+        elif k == 1:
+            rate, gap = uz, 1.0 - oz
+        elif k == 2:
+            lean = 0.5 * p[16]
+            rate, gap = ux + lean * uz, 1.0 - ox - lean * (oz + 1.0)
+        elif k == 3:
+            lean = 0.5 * p[17]
+            rate, gap = -ux + lean * uz, 1.0 + ox - lean * (oz + 1.0)
+        else:
+            lean = 0.5 * p[18]
+            side = 1.0 if k == 4 else -1.0
+            rate, gap = side * uy + lean * uz, 1.0 - side * oy - lean * (oz + 1.0)
+        if rate > 1e-12:
+            leave = min(leave, gap / rate)
+        elif rate < -1e-12:
+            t = gap / rate
+            if t > enter:
+                enter, face = t, k
+        elif gap < 0.0:
+            return 1.0, 0.0, -1
+        if enter > leave:
+            return 1.0, 0.0, -1
+    return enter, leave, face
+
+
+@njit(cache=True, nogil=True)
+def _cosine(p: NDArray[np.float64], face: int, t: float, dx: float, dy: float, dz: float) -> float:
+    """Cosine of the angle between ray and surface normal."""
+    nx, ny, nz = 0.0, 0.0, 0.0
+    if face == 6:
+        qx, qy, qz = t * dx - p[4], t * dy - p[5], t * dz - p[6]
+        nx = p[7] * qx + p[8] * qy + p[9] * qz
+        ny = p[10] * qx + p[11] * qy + p[12] * qz
+        if int(p[0]) == ELLIPSOID:
+            nz = p[13] * qx + p[14] * qy + p[15] * qz
+    elif face == 0:
+        nz = -1.0
+    elif face == 1:
+        nz = 1.0
+    elif face == 2:
+        nx, nz = 1.0, 0.5 * p[16]
+    elif face == 3:
+        nx, nz = -1.0, 0.5 * p[17]
+    else:
+        ny, nz = (1.0 if face == 4 else -1.0), 0.5 * p[18]
+    wx = p[7] * nx + p[10] * ny + p[13] * nz
+    wy = p[8] * nx + p[11] * ny + p[14] * nz
+    wz = p[9] * nx + p[12] * ny + p[15] * nz
+    length = math.sqrt(wx * wx + wy * wy + wz * wz)
+    return min(abs(wx * dx + wy * dy + wz * dz) / max(length, 1e-12), 1.0)
+
+
+@njit(cache=True, nogil=True)
+def _height_above(
+    strips: NDArray[np.float64],
+    terrain: NDArray[np.float64],
+    tile: NDArray[np.float64],
+    T: NDArray[np.float64],
+    x: float,
+    y: float,
+    z: float,
+) -> float:
+    """Height [m] above the ground of a point in the sensor frame."""
+    xw = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+    yw = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+    zw = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+    return zw - ground_at(strips, terrain, tile, xw, yw)[0]
+
+
+@njit(cache=True, nogil=True)
+def fill_cast(
+    primitives: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    starts: NDArray[np.int64],
+    rows: NDArray[np.int32],
+    strips: NDArray[np.float64],
+    terrain: NDArray[np.float64],
+    tile: NDArray[np.float64],
+    T_world_sensor: NDArray[np.float64],
+    elevations: NDArray[np.float64],
+    azimuths: NDArray[np.float64],
+    reach: float,
+    key: np.uint64,
+    ranges: NDArray[np.float64],
+    hits: NDArray[np.int32],
+    exits: NDArray[np.float64],
+    cosines: NDArray[np.float64],
+) -> None:
+    """Find what each ray meets first.
+
+    Parameters
+    ----------
+    primitives : (n, 20) float64
+        Sensor frame, nearest first.
+    bounds, starts, rows
+        From `fill_bounds`, `fill_column_counts`, `fill_column_rows`.
+    elevations : (beams,) float64
+        Top to bottom [rad].
+    azimuths : (columns,) float64
+        [rad].
+    reach : float
+        Longest ray [m].
+    key : uint64
+        Seed of leaves and fences.
+    ranges, hits, exits, cosines : (beams, columns), overwritten
+        Range [m]; row of ``primitives``, -1 the ground, -2 nothing; range where the ray leaves that primitive again;
+        cosine of the angle of incidence.
+    """
+    n_beams, n_columns = elevations.shape[0], azimuths.shape[0]
+    tangents = np.tan(elevations)
+    T = T_world_sensor
+    # Radii from well inside the lowest beam's ring, growing by 3 %: at 30 m a third of the way between two rings.
+    height = _height_above(strips, terrain, tile, T, 0.0, 0.0, 0.0)
+    innermost = min(max(0.3, 0.4 * height / max(-tangents[n_beams - 1], 0.05)), 5.0)
+    n_radii = int(math.log(max(reach / innermost, 2.0)) / math.log(1.03)) + 2
+    radii, heights = np.empty(n_radii), np.empty(n_radii)
+    for i in range(n_radii):
+        radii[i] = innermost * 1.03**i
+    straight = abs(T[2, 2]) > 0.999999999
+    for column in range(n_columns):
+        ca, sa = math.cos(azimuths[column]), math.sin(azimuths[column])
+        z = -T[2, 3]
+        for i in range(n_radii):
+            r = radii[i]
+            # One Newton step; exact where the sensor stands straight.
+            z -= _height_above(strips, terrain, tile, T, r * ca, r * sa, z) / T[2, 2]
+            if not straight:
+                z -= _height_above(strips, terrain, tile, T, r * ca, r * sa, z) / T[2, 2]
+            heights[i] = z
+        # A higher beam meets the ground no nearer than a lower one, so one pass over the radii serves all beams.
+        i = 0
+        for b in range(n_beams - 1, -1, -1):
+            tan = tangents[b]
+            while i < n_radii and heights[i] < radii[i] * tan:
+                i += 1
+            ce = math.cos(elevations[b])
+            dx, dy, dz = ce * ca, ce * sa, math.sin(elevations[b])
+            best, hit, leave_best, face_best = reach, _NOTHING, reach, -1
+            cosine = 0.0
+            if i < n_radii:
+                low = 0.0 if i == 0 else radii[i - 1]
+                high = radii[i]
+                above = 0.1 if i == 0 else low * tan - heights[i - 1]
+                below = high * tan - heights[i]
+                r = high
+                for _ in range(24):
+                    if above - below < 1e-12:
+                        break
+                    # False position, halved when it creeps: a kerb is a corner.
+                    share = above / (above - below)
+                    share = min(max(share, 0.1), 0.9) if high - low > 0.02 else share
+                    r = low + share * (high - low)
+                    gap = _height_above(strips, terrain, tile, T, r * ca, r * sa, r * tan)
+                    if abs(gap) < 1e-4:
+                        break
+                    if gap > 0.0:
+                        low, above = r, gap
+                    else:
+                        high, below = r, gap
+                    if high - low < 1e-4:
+                        break
+                t = r / ce
+                if t < best:
+                    best, hit, leave_best = t, _GROUND, t
+                    # Slope along the ray, over 4 cm.
+                    rise = _height_above(strips, terrain, tile, T, (r - 0.02) * ca, (r - 0.02) * sa, r * tan)
+                    rise -= _height_above(strips, terrain, tile, T, (r + 0.02) * ca, (r + 0.02) * sa, r * tan)
+                    rise /= 0.04
+                    cosine = abs(rise * ce - dz) / math.sqrt(1.0 + rise * rise)
+            ray = _mixed(np.uint64(key + np.uint64(b * n_columns + column)))
+            for e in range(starts[column], starts[column + 1]):
+                k = rows[e]
+                if bounds[k, 4] >= best:
+                    break
+                if tan < bounds[k, 2] or tan > bounds[k, 3]:
+                    continue
+                p = primitives[k]
+                enter, leave, face = _crossing(p, dx, dy, dz)
+                if enter > leave or leave <= 0.0:
+                    continue
+                material = int(p[1])
+                if material == LEAVES:
+                    # Free path in a cloud of leaves.
+                    draw = _uniform(_mixed(np.uint64(ray ^ np.uint64(k + 1))))
+                    t = max(enter, 0.0) - math.log(draw) / p[3]
+                    if t < leave and t < best:
+                        best, hit, leave_best, face_best = t, k, leave, -1
+                elif enter > 0.0 and enter < best:
+                    if material == POROUS and _uniform(_mixed(np.uint64(ray ^ np.uint64(k + 1)))) > p[3]:
+                        continue
+                    best, hit, leave_best, face_best = enter, k, leave, face
+            if hit >= 0:
+                cosine = 0.7 if face_best < 0 else _cosine(primitives[hit], face_best, best, dx, dy, dz)
+            ranges[b, column] = best
+            hits[b, column] = hit
+            exits[b, column] = leave_best
+            cosines[b, column] = cosine
+
+
+@njit(cache=True, nogil=True)
+def _ground_remission(
+    strips: NDArray[np.float64], terrain: NDArray[np.float64], tile: NDArray[np.float64], x: float, y: float
+) -> float:
+    _, outside, outside_bays, u, s = ground_at(strips, terrain, tile, x, y)
+    stain = _tile_at(tile, x, y, 0.11)
+    patch = _tile_at(tile, x + 31.0, y + 17.0, 1.7)
+    if outside < 0.0:
+        value = terrain[ASPHALT] * (1.0 + terrain[WEAR] * (0.4 * stain + 0.6 * patch))
+        if terrain[MARKING] > 0.0:
+            lane = terrain[LANE]
+            to_line = abs(u / lane - math.floor(u / lane + 0.5)) * lane
+            edge = min(abs(u - strips[0, 6] + 0.25), abs(u - strips[0, 5] - 0.25))
+            dash = s / 9.0 - math.floor(s / 9.0)
+            inner = abs(u - strips[0, 6]) > 1.0 and abs(u - strips[0, 5]) > 1.0
+            if edge < 0.06 or (to_line < 0.06 and dash < 0.4 and inner):
+                value = terrain[MARKING] + 0.1 * stain
+        return value
+    if outside_bays < 0.0:
+        return terrain[BAY] * (1.0 + 0.15 * patch)
+    if outside < terrain[PAVEMENT]:
+        return terrain[PAVING] * (1.0 + 0.1 * stain + 0.1 * patch)
+    return terrain[GRASS] * (1.0 + 0.25 * stain + 0.1 * patch)
+
+
+@njit(cache=True, nogil=True)
+def _in_ego_shadow(azimuth: float, elevation: float) -> bool:
+    # Measured on KITTI: where nothing ever returns. The roof behind, its rear edges, its front, a mast to the right.
+    a = azimuth - 2.0 * math.pi * math.floor((azimuth + math.pi) / (2.0 * math.pi))
+    behind = math.pi - abs(a)
+    if behind < 0.26:
+        return elevation < -0.32
+    if behind < 0.44:
+        return elevation < -0.355
+    if behind < 0.61:
+        return elevation < -0.40
+    if 0.84 < behind < 1.02:
+        return elevation < -0.375
+    if abs(a) < 0.17:
+        return elevation < -0.35
+    if abs(a) < 0.45:
+        return elevation < -0.375 - 0.08 * (abs(a) - 0.17)
+    return ((a + 1.24) / 0.18) ** 2 + ((elevation + 0.335) / 0.075) ** 2 < 1.0
+
+
+@njit(cache=True, nogil=True)
+def fill_points(
+    primitives: NDArray[np.float64],
+    strips: NDArray[np.float64],
+    terrain: NDArray[np.float64],
+    tile: NDArray[np.float64],
+    T_world_sensor: NDArray[np.float64],
+    elevations: NDArray[np.float64],
+    azimuths: NDArray[np.float64],
+    range_offsets: NDArray[np.float64],
+    remission_offsets: NDArray[np.float64],
+    ranges: NDArray[np.float64],
+    hits: NDArray[np.int32],
+    exits: NDArray[np.float64],
+    cosines: NDArray[np.float64],
+    min_range: float,
+    reach: float,
+    key: np.uint64,
+    noise: bool,
+    ego_shadow: bool,
+    points: NDArray[np.float32],
+    objects: NDArray[np.int32],
+) -> int:
+    """Turn hits into returns, laser by laser, and count them.
+
+    Parameters
+    ----------
+    range_offsets, remission_offsets : (beams,) float64
+        Calibration errors of the beams.
+    ranges, hits, exits, cosines : (beams, columns)
+        From `fill_cast`.
+    points : (beams * columns, 4) float32, first rows overwritten
+    objects : (beams * columns,) int32, first rows overwritten
+        Object of each point, -1 none.
+    """
+    n_beams, n_columns = hits.shape
+    T = T_world_sensor
+    n = 0
+    for b in range(n_beams):
+        ce, se = math.cos(elevations[b]), math.sin(elevations[b])
+        for column in range(n_columns):
+            k = hits[b, column]
+            if k == _NOTHING:
+                continue
+            t, cosine = ranges[b, column], cosines[b, column]
+            ray = _mixed(np.uint64(key ^ np.uint64(0x5DEECE66D) ^ (np.uint64(b * n_columns + column) << np.uint64(20))))
+            luck = _uniform(ray)
+            ray = _mixed(ray)
+            spread = _normal(ray)
+            ray = _mixed(ray)
+            other = _uniform(ray)
+            if ego_shadow and _in_ego_shadow(azimuths[column] + 0.01 * spread, elevations[b] + 0.016 * (other - 0.5)):
+                continue
+            ca, sa = math.cos(azimuths[column]), math.sin(azimuths[column])
+            dx, dy, dz = ce * ca, ce * sa, se
+            lost = 0.006
+            o = -1
+            jitter = 1.0
+            floor = 0.0
+            if k == _GROUND:
+                x, y, z = t * dx, t * dy, t * dz
+                value = _ground_remission(
+                    strips,
+                    terrain,
+                    tile,
+                    T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+                    T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+                )
+                # Measured: the road keeps its remission up to 20 m, has 0.07 at 25..40 m, 0.00 beyond; and thins out.
+                value *= min(max((cosine - 0.04) / 0.034, 0.0), 1.0)
+                lost += min(max((0.045 - cosine) / 0.04, 0.0), 0.85)
+            else:
+                p = primitives[k]
+                o = int(p[19])
+                material = int(p[1])
+                value = p[2]
+                if material == PAINT:
+                    # Clear coat over a dark or light base; a mirror off the normal.
+                    value *= 0.5 + 0.5 * cosine
+                    value += 0.5 * max((cosine - 0.97) / 0.03, 0.0) * (0.25 + value) - 0.11
+                    # Measured: half as many returns on a near car as its surface would give, a fifth beyond 45 m.
+                    lost += 0.06 + p[3] * (1.0 - 0.7 * cosine) + min(max((t - 28.0) * 0.02, 0.0), 0.6)
+                elif material == GLASS:
+                    lost += p[3]
+                    if other < 0.6:  # the far side or a seat behind the pane
+                        t += (0.15 + 0.8 * other / 0.6) * max(exits[b, column] - t - 0.05, 0.0)
+                        value = 0.04
+                    else:
+                        value = 0.02
+                elif material == RETRO:
+                    value *= 0.4 + 0.6 * cosine
+                elif material == FACADE:
+                    # Windows on a grid, recessed; most of them mirror the ray away.
+                    qx, qy, qz = t * dx, t * dy, t * dz
+                    wx = T[0, 0] * qx + T[0, 1] * qy + T[0, 2] * qz + T[0, 3]
+                    wy = T[1, 0] * qx + T[1, 1] * qy + T[1, 2] * qz + T[1, 3]
+                    wz = T[2, 0] * qx + T[2, 1] * qy + T[2, 2] * qz + T[2, 3]
+                    across = (abs(p[8]) * wx + abs(p[7]) * wy) / max(math.hypot(p[7], p[8]), 1e-9)
+                    if abs(p[7] * dx + p[8] * dy) < abs(p[10] * dx + p[11] * dy):
+                        across = (p[7] * wx + p[8] * wy) / max(math.hypot(p[7], p[8]), 1e-9)
+                    fraction = across / p[3] - math.floor(across / p[3])
+                    storey = (wz - 0.9) / 2.9 - math.floor((wz - 0.9) / 2.9)
+                    if fraction < 0.42 and storey < 0.5:
+                        lost += 0.35
+                        value *= 0.3
+                        t += 0.12 / max(cosine, 0.2) + (2.5 * (other - 0.75) / 0.25 if other > 0.75 else 0.0)
+                    value *= 0.55 + 0.45 * cosine
+                elif material == LEAVES:
+                    jitter = 1.6
+                    value *= 0.75 + 0.5 * other
+                else:
+                    value *= 0.55 + 0.45 * cosine
+                if material != RETRO:
+                    # Measured on facades: 0.43 near, 0.31 at 25..40 m, 0.22 beyond; leaves 0.36, 0.23, 0.11.
+                    value *= min(1.0, max(1.0 - 0.022 * (t - 18.0), 0.35))
+                    lost += min(max((t - 35.0) * 0.004, 0.0), 0.3)
+                else:
+                    floor = 0.3
+            if noise:
+                if luck > 1.0 - lost:
+                    continue
+                t += range_offsets[b] + 0.01 * jitter * spread
+                spread = _normal(_mixed(np.uint64(ray ^ np.uint64(0xABCDEF))))
+                value += remission_offsets[b] * min(1.0, 0.2 + 4.0 * max(value, 0.0)) + 0.05 * jitter * spread
+                # Measured: hardly anything between 0 and 0.1, and 57 % of a car's returns at 0: a weak echo reads 0.
+                if value < 0.01 + 0.1 * luck or other > 0.965:
+                    value = 0.0
+            if not min_range <= t < reach:
+                continue
+            points[n, 0] = t * dx
+            points[n, 1] = t * dy
+            points[n, 2] = t * dz
+            points[n, 3] = math.floor(min(max(value, floor), 0.99) * 100.0 + 0.5) / 100.0
+            objects[n] = o
+            n += 1
+    return n

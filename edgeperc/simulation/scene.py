@@ -1,0 +1,337 @@
+"""Scenes and simulated scans; `simulate` casts a scan."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..card import TopViewGeometry
+from ..errors import PointsError
+from ..geometry import draw_footprints
+from ..perception import Box
+from ..sensors import SensorProfile, get_sensor
+from .raycast import (
+    fill_bounds,
+    fill_cast,
+    fill_column_counts,
+    fill_column_rows,
+    fill_drivable,
+    fill_placed,
+    fill_points,
+    ground_at,
+)
+
+__all__ = [
+    "POINT_CLASSES",
+    "TOP_VIEW_CLASSES",
+    "Scene",
+    "SceneObject",
+    "SimulatedScan",
+    "sensor_pose",
+    "simulate",
+    "simulate_sequence",
+    "wrapped",
+]
+
+POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
+TOP_VIEW_CLASSES = ("background", "drivable", "car", "van", "truck")
+_POINT_LABELS = {"car": 1, "van": 1, "truck": 1, "pedestrian": 2, "cyclist": 3}
+
+
+@dataclass(frozen=True, slots=True)
+class SceneObject:
+    """Something with a box that may move.
+
+    Attributes
+    ----------
+    label : str
+        ``"car"``, ``"van"``, ``"truck"``, ``"pedestrian"`` or ``"cyclist"``.
+    center : tuple of 3 float
+        Middle of the box [m], world frame.
+    size : tuple of 3 float
+        Length, width, height [m].
+    yaw : float
+        Heading about +z from +x [rad].
+    track_id : int
+        The same for as long as the scene lives.
+    speed_mps, yaw_rate_rps : float
+        Along the heading [m/s]; [rad/s].
+    """
+
+    label: str
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    yaw: float
+    track_id: int
+    speed_mps: float = 0.0
+    yaw_rate_rps: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """The world at one moment.
+
+    Attributes
+    ----------
+    objects : tuple of SceneObject
+    primitives : (n, 20) float64
+        Shapes; those of an object in the frame of the object (origin in the middle of the footprint, on the ground).
+    strips : (k, 10) float64
+        Road surfaces and parking bays; the first is the road the sensor is on.
+    terrain : (25,) float64
+        What the ground is like.
+    tile : (256, 256) float64
+        Noise in -1..1 that repeats; roughness and stains.
+    """
+
+    objects: tuple[SceneObject, ...]
+    primitives: NDArray[np.float64]
+    strips: NDArray[np.float64]
+    terrain: NDArray[np.float64]
+    tile: NDArray[np.float64]
+
+    def at(self, t_s: float) -> Scene:
+        """The scene ``t_s`` seconds later: objects go on with constant speed and turn rate, over the ground."""
+        moved = []
+        for each in self.objects:
+            turn = each.yaw_rate_rps * t_s
+            # Chord of the arc; sinc is 1 for a straight way.
+            way = each.speed_mps * t_s * float(np.sinc(turn / (2.0 * math.pi)))
+            x = each.center[0] + way * math.cos(each.yaw + turn / 2.0)
+            y = each.center[1] + way * math.sin(each.yaw + turn / 2.0)
+            z = each.center[2] + self.ground_height(x, y) - self.ground_height(each.center[0], each.center[1])
+            moved.append(replace(each, center=(x, y, z), yaw=wrapped(each.yaw + turn)))
+        return replace(self, objects=tuple(moved))
+
+    def ground_height(self, x: float, y: float) -> float:
+        """Height of the ground [m] at x, y, world frame."""
+        return float(ground_at(self.strips, self.terrain, self.tile, float(x), float(y))[0])
+
+    def on_road(self, x: float, y: float) -> bool:
+        """Whether x, y lies on a road surface (parking bays are none)."""
+        return bool(ground_at(self.strips, self.terrain, self.tile, float(x), float(y))[1] < 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedScan:
+    """One turn of the sensor and the truth about it, in the sensor frame.
+
+    Attributes
+    ----------
+    points : (n, 4) float32
+        x, y, z [m], remission 0..0.99 in steps of 0.01; laser by laser from the top, each counter-clockwise from ahead.
+    labels : (n,) uint8
+        Index into `POINT_CLASSES`.
+    objects : (n,) int32
+        Index into ``boxes``; -1 for the background.
+    boxes : tuple of Box
+        Every object of the scene, seen or not.
+    box_ids : tuple of int
+        Track id of each box.
+    box_points : tuple of int
+        Points on each box's object.
+    T_world_sensor : (4, 4) float64
+    scene : Scene
+    """
+
+    points: NDArray[np.float32]
+    labels: NDArray[np.uint8]
+    objects: NDArray[np.int32]
+    boxes: tuple[Box, ...]
+    box_ids: tuple[int, ...]
+    box_points: tuple[int, ...]
+    T_world_sensor: NDArray[np.float64]
+    scene: Scene
+
+    def top_view_labels(self, geometry: TopViewGeometry | None = None) -> NDArray[np.uint8]:
+        """Truth for every cell of a top view, seen or not.
+
+        Parameters
+        ----------
+        geometry : TopViewGeometry, optional
+
+        Returns
+        -------
+        (rows, columns) uint8
+            Index into `TOP_VIEW_CLASSES`, by the cell's centre: road surface, over it the footprints of vehicles
+            (the nearer vehicle wins).
+        """
+        view = TopViewGeometry() if geometry is None else geometry
+        x, y = view.cell_centres()
+        labels = np.zeros((view.height, view.width), dtype=np.uint8)
+        strips, terrain, tile = self.scene.strips, self.scene.terrain, self.scene.tile
+        fill_drivable(strips, terrain, tile, self.T_world_sensor, x.ravel(), y.ravel(), labels)
+        draw_footprints(labels, self.boxes, view, TOP_VIEW_CLASSES)
+        return labels
+
+
+def sensor_pose(
+    scene: Scene,
+    sensor: str | SensorProfile,
+    x: float = 0.0,
+    y: float = 0.0,
+    *,
+    yaw: float = 0.0,
+    pitch: float = 0.0,
+    roll: float = 0.0,
+) -> NDArray[np.float64]:
+    """``T_world_sensor`` of a sensor at its mounting height above the ground at x, y.
+
+    Returns
+    -------
+    (4, 4) float64
+        Turned by roll about x, then pitch about y (nose down is positive), then yaw about z [rad].
+    """
+    T_world_sensor = np.eye(4)
+    cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
+    cr, sr = math.cos(roll), math.sin(roll)
+    T_world_sensor[:3, :3] = (
+        np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+        @ np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+        @ np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    )
+    T_world_sensor[:3, 3] = x, y, scene.ground_height(x, y) + get_sensor(sensor).mount_height_m
+    return T_world_sensor
+
+
+def simulate(
+    scene: Scene,
+    sensor: str | SensorProfile,
+    seed: int,
+    T_world_sensor: ArrayLike | None = None,
+    *,
+    max_range_m: float = 80.0,
+    noise: bool = True,
+    ego_shadow: bool = True,
+) -> SimulatedScan:
+    """Turn the sensor once.
+
+    Parameters
+    ----------
+    scene : Scene
+    sensor : str or SensorProfile
+    seed : int
+        Of noise, drop-out and leaves; the same seed gives the same bits.
+    T_world_sensor : (4, 4) array_like, optional
+        By default level, looking along +x, ``mount_height_m`` above the ground at the origin. Tilts up to a few
+        degrees are meant.
+    max_range_m : float
+        Nothing farther returns, nor anything beyond the sensor's own range. KITTI's files end at 80 m.
+    noise : bool
+        False: exact ranges and azimuths, no drop-out, no beam offsets.
+    ego_shadow : bool
+        Lower beams meet the roof of the sensor's own vehicle, as on KITTI's car. Never where ``noise`` is False.
+
+    Returns
+    -------
+    SimulatedScan
+
+    Raises
+    ------
+    PointsError
+        ``T_world_sensor`` is no finite (4, 4) matrix.
+    """
+    profile = get_sensor(sensor)
+    pose = sensor_pose(scene, profile) if T_world_sensor is None else np.array(T_world_sensor, dtype=np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise PointsError(f"T_world_sensor has shape {pose.shape}; expected a finite (4, 4) matrix")
+    rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 7919))
+    n_beams, n_columns = profile.n_beams, profile.columns
+    step = 2.0 * math.pi / n_columns
+    azimuths = np.arange(n_columns, dtype=np.float64) * np.float64(step)
+    range_offsets, remission_offsets = np.zeros(n_beams), np.zeros(n_beams)
+    if noise:
+        azimuths += rng.normal(0.0, 0.08, n_columns) * step
+        # Measured: a flat road's points lie 0.008 m off their neighbours of the same laser; lasers differ by more.
+        range_offsets = rng.normal(0.0, 0.012, n_beams)
+        # Measured: mean remission of the road by laser spreads by 0.08, a few lasers almost blind.
+        remission_offsets = np.clip(rng.normal(-0.01, 0.075, n_beams), -0.25, 0.1)
+    elevations = np.radians(np.asarray(profile.elevations_deg))
+    reach = min(float(max_range_m), profile.max_range_m)
+
+    primitives = np.empty_like(scene.primitives)
+    poses = np.array([(*o.center[:2], o.center[2] - o.size[2] / 2.0, o.yaw) for o in scene.objects]).reshape(-1, 4)
+    fill_placed(scene.primitives, poses, pose, primitives)
+    bounds = np.empty((len(primitives), 5))
+    fill_bounds(primitives, bounds)
+    near_first = np.argsort(bounds[:, 4], kind="stable")
+    primitives, bounds = np.ascontiguousarray(primitives[near_first]), np.ascontiguousarray(bounds[near_first])
+    starts = np.zeros(n_columns + 1, dtype=np.int64)
+    fill_column_counts(bounds, n_columns, reach, starts)
+    rows = np.empty(starts[-1], dtype=np.int32)
+    fill_column_rows(bounds, n_columns, reach, starts, rows)
+
+    shape = (n_beams, n_columns)
+    ranges, exits, cosines = np.empty(shape), np.empty(shape), np.empty(shape)
+    hits = np.empty(shape, dtype=np.int32)
+    key = np.uint64(rng.integers(0, 2**63))
+    fill_cast(
+        primitives, bounds, starts, rows, scene.strips, scene.terrain, scene.tile, pose,
+        elevations, azimuths, reach, key, ranges, hits, exits, cosines,
+    )  # fmt: skip
+    points = np.empty((n_beams * n_columns, 4), dtype=np.float32)
+    objects = np.empty(n_beams * n_columns, dtype=np.int32)
+    n = fill_points(
+        primitives, scene.strips, scene.terrain, scene.tile, pose, elevations, azimuths, range_offsets,
+        remission_offsets, ranges, hits, exits, cosines, profile.min_range_m, reach, key, noise, noise and ego_shadow,
+        points, objects,
+    )  # fmt: skip
+    points, objects = points[:n].copy(), objects[:n].copy()
+    boxes = tuple(_box_in_sensor(each, pose) for each in scene.objects)
+    lookup = np.array([*(_POINT_LABELS[each.label] for each in scene.objects), 0], dtype=np.uint8)
+    counts = np.bincount(objects[objects >= 0], minlength=len(boxes))
+    return SimulatedScan(
+        points=points,
+        labels=lookup[objects],  # -1 finds the last entry, the background
+        objects=objects,
+        boxes=boxes,
+        box_ids=tuple(each.track_id for each in scene.objects),
+        box_points=tuple(int(c) for c in counts),
+        T_world_sensor=pose,
+        scene=scene,
+    )
+
+
+def simulate_sequence(
+    scene: Scene,
+    sensor: str | SensorProfile,
+    n_scans: int,
+    rate_hz: float = 10.0,
+    ego_speed_mps: float = 0.0,
+    seed: int = 0,
+) -> Iterator[tuple[float, NDArray[np.float64], SimulatedScan]]:
+    """Drive along the scene's first road from the origin.
+
+    Yields
+    ------
+    stamp_s : float
+    T_world_sensor : (4, 4) float64
+    scan : SimulatedScan
+        ``scan.box_ids`` tell which object is which from scan to scan.
+    """
+    curvature = float(scene.strips[0, 4])
+    heading = math.atan2(scene.strips[0, 3], scene.strips[0, 2])
+    for k in range(n_scans):
+        stamp_s = k / rate_hz
+        way = ego_speed_mps * stamp_s
+        turn = curvature * way
+        chord = way * float(np.sinc(turn / (2.0 * math.pi)))
+        x, y = chord * math.cos(heading + turn / 2.0), chord * math.sin(heading + turn / 2.0)
+        T_world_sensor = sensor_pose(scene, sensor, x, y, yaw=heading + turn)
+        yield stamp_s, T_world_sensor, simulate(scene.at(stamp_s), sensor, seed + k, T_world_sensor)
+
+
+def wrapped(angle: float) -> float:
+    """An angle in -pi..pi."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def _box_in_sensor(each: SceneObject, T_world_sensor: NDArray[np.float64]) -> Box:
+    rotation = T_world_sensor[:3, :3]
+    x, y, z = rotation.T @ (np.asarray(each.center) - T_world_sensor[:3, 3])
+    ahead = rotation.T @ np.array([math.cos(each.yaw), math.sin(each.yaw), 0.0])
+    return Box(each.label, 1.0, (float(x), float(y), float(z)), each.size, math.atan2(ahead[1], ahead[0]))

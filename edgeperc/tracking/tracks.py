@@ -1,0 +1,266 @@
+"""What a tracker returns, and its parameters by class."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..perception import Box
+from .ukf import MODES
+
+__all__ = ["PARAMETERS", "ClassParameters", "Track", "Tracks", "strength_of"]
+
+
+@dataclass(frozen=True, slots=True)
+class ClassParameters:
+    """How objects of a class move, how well they are detected, and how long a track of one lives.
+
+    Attributes
+    ----------
+    group : str
+        Classes of one group may be taken for one another; a track keeps to its group.
+    acceleration_mps2, turn_acceleration_rps2 : float
+        Standard deviations of the white accelerations of constant velocity and CTRV.
+    walk_m, wander_rad : float
+        Random motion: how far place and heading walk in a second.
+    still_mps : float
+        Random motion: speed of what in truth stands still.
+    birth_speed_mps, birth_turn_rps : float
+        How fast a newborn track may be.
+    keep_motion_s : float
+        Mean time for which a track keeps its motion.
+    along_m, across_m, heading_rad : float
+        Standard deviations of a detection beside the sensor; they grow by their own size every ``range_m``.
+    shape_m : tuple of 4 float
+        Likewise of middle height, length, width and height.
+    range_m : float
+    detection : float
+        Probability that an object in plain sight is detected in a scan.
+    clutter : float
+        False detections and new objects per square metre and radian.
+    gate : float
+        Mahalanobis distance beyond which a detection is none of a track's.
+    birth_score : float
+        Detections with a lower score begin no track.
+    sure_score : float
+        One detection with this score is told of at once, without a second.
+    memory_s : float
+        A track that is not detected is forgotten after this time, if it was not given up before.
+    """
+
+    group: str
+    acceleration_mps2: float = 3.0
+    turn_acceleration_rps2: float = 0.5
+    walk_m: float = 0.3
+    wander_rad: float = 0.1
+    still_mps: float = 0.1
+    birth_speed_mps: float = 8.0
+    birth_turn_rps: float = 0.2
+    keep_motion_s: float = 3.0
+    along_m: float = 0.15
+    across_m: float = 0.10
+    heading_rad: float = 0.06
+    shape_m: tuple[float, float, float, float] = (0.06, 0.25, 0.10, 0.10)
+    range_m: float = 30.0
+    detection: float = 0.8
+    clutter: float = 1e-3
+    gate: float = 5.0
+    birth_score: float = 0.0
+    sure_score: float = 0.95
+    memory_s: float = 1.5
+
+
+_VEHICLE = ClassParameters(group="vehicle")
+_PEDESTRIAN = ClassParameters(
+    group="pedestrian",
+    acceleration_mps2=1.5,
+    turn_acceleration_rps2=1.0,
+    walk_m=0.5,
+    wander_rad=0.5,
+    birth_speed_mps=1.5,
+    birth_turn_rps=0.5,
+    along_m=0.07,
+    across_m=0.07,
+    heading_rad=0.2,
+    shape_m=(0.08, 0.15, 0.12, 0.08),
+)
+_CYCLIST = ClassParameters(
+    group="cyclist",
+    turn_acceleration_rps2=0.8,
+    birth_speed_mps=4.0,
+    along_m=0.09,
+    across_m=0.07,
+    heading_rad=0.08,
+    shape_m=(0.08, 0.15, 0.12, 0.08),
+)
+PARAMETERS: Mapping[str, ClassParameters] = {
+    "car": _VEHICLE,
+    "van": _VEHICLE,
+    "truck": _VEHICLE,
+    "pedestrian": _PEDESTRIAN,
+    "cyclist": _CYCLIST,
+}
+DOUBT = 10.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """One object, as it is now.
+
+    Attributes
+    ----------
+    id : int
+        Never used again.
+    label : str
+        The class it was detected as most of the time.
+    score : float
+        In 0..1: of its detections, taken together.
+    box : Box
+        In the sensor's frame of this scan.
+    world_box : Box
+        In the world's frame or, without poses, the sensor's frame of the first scan.
+    velocity : (2,) float64
+        Over ground, along x and y of the sensor's frame [m/s].
+    state : (5,) float64
+        x, y [m], speed along the heading [m/s], heading [rad], turn rate [rad/s], in the frame of ``world_box``.
+    covariance : (5, 5) float64
+    modes : mapping
+        Probability of ``constant_velocity``, ``constant_turn`` and ``random_motion``.
+    age_s : float
+        Since its first detection.
+    hits : int
+        Scans in which it was detected.
+    coasting : bool
+        Not detected in this scan.
+    """
+
+    id: int
+    label: str
+    score: float
+    box: Box
+    world_box: Box
+    velocity: NDArray[np.float64]
+    state: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    modes: Mapping[str, float]
+    age_s: float
+    hits: int
+    coasting: bool
+
+
+class Tracks(Sequence[Track]):
+    """The tracks that are told of after one scan, in the order of their ids; `Track` objects are made when asked for.
+
+    Attributes
+    ----------
+    stamp_s : float
+    T_world_sensor : (4, 4) float64
+        As given, or as estimated.
+    ids : (n,) int64
+    boxes : (n, 7) float64
+        x, y, z, length, width, height [m], yaw [rad], in the sensor's frame of this scan.
+    scores : (n,) float64
+    n_tentative : int
+        Tracks too doubtful to be told of: new ones, and those not detected for too long.
+    n_approximated : int
+        Tracks whose association was solved by belief propagation.
+    """
+
+    __slots__ = (
+        "T_world_sensor",
+        "_labels",
+        "_rows",
+        "boxes",
+        "ids",
+        "n_approximated",
+        "n_tentative",
+        "scores",
+        "stamp_s",
+    )
+
+    def __init__(
+        self,
+        rows: NDArray[np.void],
+        labels: Sequence[str],
+        stamp_s: float,
+        T_world_sensor: NDArray[np.float64],
+        n_tentative: int = 0,
+        n_approximated: int = 0,
+    ) -> None:
+        self._rows, self._labels = rows, labels
+        self.stamp_s, self.T_world_sensor = stamp_s, T_world_sensor
+        self.n_tentative, self.n_approximated = n_tentative, n_approximated
+        self.ids: NDArray[np.int64] = rows["id"]
+        self.scores: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-strength_of(rows)))
+        R, t = T_world_sensor[:3, :3], T_world_sensor[:3, 3]
+        world = self._world_boxes()
+        self.boxes: NDArray[np.float64] = world.copy()
+        self.boxes[:, :3] = (world[:, :3] - t) @ R
+        cos, sin = np.cos(world[:, 6]), np.sin(world[:, 6])
+        self.boxes[:, 6] = np.arctan2(R[0, 1] * cos + R[1, 1] * sin, R[0, 0] * cos + R[1, 0] * sin)
+
+    def _world_boxes(self) -> NDArray[np.float64]:
+        state, shape = self._rows["state"], self._rows["shape"]
+        boxes = np.empty((len(state), 7))
+        boxes[:, :2], boxes[:, 2:6] = state[:, :2], shape
+        boxes[:, 6] = _wrap(state[:, 3] + math.pi * (self._rows["front"] < 0.0))
+        return boxes
+
+    @property
+    def labels(self) -> list[str]:
+        """Class of each track."""
+        return [self._labels[k] for k in self._rows["label"].tolist()]
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @overload
+    def __getitem__(self, index: int) -> Track: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Track]: ...
+    def __getitem__(self, index: int | slice) -> Track | list[Track]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        row = self._rows[index]
+        label, score = self._labels[row["label"]], float(self.scores[index])
+        state = row["state"].copy()
+        heading = np.array([math.cos(state[3]), math.sin(state[3]), 0.0])
+        return Track(
+            id=int(row["id"]),
+            label=label,
+            score=score,
+            box=_box(label, score, self.boxes[index]),
+            world_box=_box(label, score, self._world_boxes()[index]),
+            velocity=(state[2] * heading @ self.T_world_sensor[:3, :3])[:2],
+            state=state,
+            covariance=row["covariance"].copy(),
+            modes=dict(zip(MODES, row["modes"].tolist(), strict=True)),
+            age_s=float(row["age_s"]),
+            hits=int(row["hits"]),
+            coasting=bool(row["misses"] > 0),
+        )
+
+    def __iter__(self) -> Iterator[Track]:
+        return (self[k] for k in range(len(self)))
+
+
+def _box(label: str, score: float, row: NDArray[np.float64]) -> Box:
+    x, y, z, length, width, height, yaw = row.tolist()
+    return Box(label, score, (x, y, z), (length, width, height), yaw)
+
+
+def strength_of(tracks: NDArray[np.void]) -> NDArray[np.float64]:
+    """Log odds of a track: the mean of its detections', scans without one and `DOUBT` scans before it being even.
+
+    A scan in which others hid it counts by how much of it was to be seen.
+    """
+    return np.asarray(tracks["logit_sum"] / (tracks["chances"] + DOUBT))
+
+
+def _wrap(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray((angles + math.pi) % (2.0 * math.pi) - math.pi)

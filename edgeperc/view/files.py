@@ -1,0 +1,85 @@
+"""Labelled points as files: PLY and SemanticKITTI's labels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..atomic import write_whole
+from ..errors import PointsError
+from ..perception import Perception
+from .colours import check_points, colour_of, rgb
+
+__all__ = ["SEMANTICKITTI_IDS", "write_labels", "write_ply"]
+
+# The raw ids of SemanticKITTI's .label files. It counts vans as cars; 99 is its "other-object".
+SEMANTICKITTI_IDS = {
+    "background": 0,
+    "car": 10,
+    "van": 10,
+    "truck": 18,
+    "pedestrian": 30,
+    "cyclist": 31,
+    "drivable": 40,
+}
+_OTHER_ID = 99
+
+
+def write_ply(points: NDArray[np.float32], perception: Perception, path: str | Path) -> None:
+    """Write the labelled scan as a binary PLY file.
+
+    One row an input point, in input order: x, y, z, remission (float), label, red, green, blue (uchar). Comments in the
+    header name the labels.
+
+    Raises
+    ------
+    PointsError
+        ``points`` is not the scan that was perceived, or the perception holds no class for its points.
+    OSError
+        The file cannot be written.
+    """
+    check_points(points, perception)
+    if perception.points is None:
+        raise _no_labels("PLY file")
+    fields = [(name, "<f4") for name in ("x", "y", "z", "remission")]
+    fields += [(name, "|u1") for name in ("label", "red", "green", "blue")]
+    rows = np.empty(len(points), dtype=fields)
+    colours = (rgb([colour_of(name) for name in perception.points.classes]) * 255.0).round().astype(np.uint8)
+    for k in range(4):
+        rows[fields[k][0]] = points[:, k]
+    rows["label"] = perception.points.labels
+    for k, name in enumerate(("red", "green", "blue")):
+        rows[name] = colours[perception.points.labels, k]
+    words = {"<f4": "float", "|u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += [f"comment label {k} {' '.join(name.split())}" for k, name in enumerate(perception.points.classes)]
+    header += [f"element vertex {len(points)}", *(f"property {words[t]} {name}" for name, t in fields), "end_header\n"]
+    write_whole(path, "\n".join(header).encode("ascii", "replace") + rows.tobytes())
+
+
+def write_labels(perception: Perception, path: str | Path) -> None:
+    """Write SemanticKITTI's ``.label`` layout: a uint32 for every input point, in input order.
+
+    The upper 16 bits, the instance, are 0. The lower hold the raw id of `SEMANTICKITTI_IDS`: 10 car, 30 person,
+    31 bicyclist, 0 unlabelled, which background and points out of view both get; 99 a class that SemanticKITTI lacks.
+
+    Raises
+    ------
+    PointsError
+        The perception holds no class for its points.
+    OSError
+        The file cannot be written.
+    """
+    if perception.points is None:
+        raise _no_labels(".label file")
+    ids = np.array([SEMANTICKITTI_IDS.get(name, _OTHER_ID) for name in perception.points.classes], dtype="<u4")
+    write_whole(path, ids[perception.points.labels].tobytes())
+
+
+def _no_labels(what: str) -> PointsError:
+    return PointsError(
+        f"a {what} needs a class for every point, and this perception has none: no range-image model took part. "
+        "Add one, such as 'pointseg'"
+    )

@@ -1,0 +1,133 @@
+"""Roads drawn by hand: COCO files in and out, masks of them, drafts to start from, variations to train on.
+
+A COCO file is one that any drawing tool writes: polygons in pixels of the top-view image, from its upper left corner.
+Whatever is of a category called "road" (or "drivable") is road; everything else, "background" included, is not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from typing import TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeperc.simulation.samples import IGNORE
+
+from ..roads import CLASSES, HEIGHT, VIEW, WIDTH
+from .files import TopViewDatabase, road_and_vehicles
+
+__all__ = ["draft", "varied", "write_database_coco"]
+
+TURN_DEG = 8.0
+SMALLEST_M2 = 2.0
+SMOOTH_CELLS, SIMPLIFIED_CELLS = 5.0, 1.5
+
+
+def draft(labels: NDArray[np.uint8]) -> list[list[list[float]]]:
+    """Polygons around the road of a map, to be corrected by hand: holes filled, what is narrower than a metre smoothed.
+
+    Parameters
+    ----------
+    labels : (400, 200) uint8
+        Index into `CLASSES`.
+
+    Returns
+    -------
+    list of polygons of corners [x, y], in pixels from the upper left corner
+    """
+    from shapely import box, union_all
+
+    bars = []
+    for row, line in enumerate(labels == CLASSES.index("road")):
+        edges = np.nonzero(np.diff(line.astype(np.int8), prepend=0, append=0))[0]
+        bars += [box(a, row, b, row + 1) for a, b in edges.reshape(-1, 2)]
+    # Closed, then opened: a person wants ten corners, not the hundred of a network's ragged edge.
+    whole = union_all(bars)
+    for reach in (SMOOTH_CELLS, -2 * SMOOTH_CELLS, SMOOTH_CELLS):
+        whole = whole.buffer(reach, join_style="mitre")
+    whole = whole.intersection(box(0, 0, WIDTH, HEIGHT))
+    polygons = []
+    for part in getattr(whole, "geoms", [whole]):
+        outline = type(part)(part.exterior) if not part.is_empty else part
+        if outline.area * VIEW.cell_m**2 >= SMALLEST_M2:
+            corners = outline.simplify(SIMPLIFIED_CELLS).exterior.coords[:-1]
+            polygons.append([[round(x, 2), round(y, 2)] for x, y in corners])
+    return polygons
+
+
+def varied(
+    image: NDArray[np.uint8], mask: NDArray[np.uint8], name: str, k: int
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], float, bool]:
+    """Variation ``k`` of a drawn scene (section 3.4): image and mask turned about the sensor, and mirrored, alike.
+
+    About the sensor, so that the distances that the image holds stay true. Cells are moved whole and nothing is
+    interpolated: the mask stays a mask. Variation 0 is the scene itself; the same name and number give the same again.
+
+    Returns
+    -------
+    image : (400, 200, 3) uint8
+        0 where the scene does not reach.
+    mask : (400, 200) uint8
+        Likewise `IGNORE`.
+    turn_deg : float
+    mirrored : bool
+    """
+    if k == 0:
+        return image, mask, 0.0, False
+    rng = np.random.default_rng(int.from_bytes(hashlib.sha256(f"{name}/{k}".encode()).digest()[:8], "little"))
+    turn_deg, mirrored = round(float(rng.uniform(-TURN_DEG, TURN_DEG)), 3), bool(rng.random() < 0.5)
+    x, y = VIEW.cell_centres()
+    cos, sin = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    from_x, from_y = cos * x + sin * y, cos * y - sin * x
+    if mirrored:
+        from_y = -from_y
+    row = np.floor((VIEW.x_range_m[1] - from_x) / VIEW.cell_m).astype(np.int64)
+    col = np.floor((VIEW.y_range_m[1] - from_y) / VIEW.cell_m).astype(np.int64)
+    inside = (row >= 0) & (row < HEIGHT) & (col >= 0) & (col < WIDTH)
+    row, col = row % HEIGHT, col % WIDTH
+    moved = np.where(inside[..., None], image[row, col], 0).astype(np.uint8)
+    return moved, np.where(inside, mask[row, col], IGNORE).astype(np.uint8), turn_deg, mirrored
+
+
+def write_database_coco(database: TopViewDatabase, file: TextIO) -> int:
+    """Write a database as COCO: an annotation for every vehicle and for the road; how many.
+
+    Scene by scene, so that memory does not grow with the database. Vehicles are whole, also where a nearer one hides
+    part of them in the map.
+    """
+    from faster_coco_eval.core import mask as coco
+
+    def annotations() -> Iterator[str]:
+        n = 0
+        for image_id, scene in enumerate(database, 1):
+            masks = [(CLASSES.index(b.label), road_and_vehicles(np.zeros_like(scene.map), [b])) for b in scene.boxes]
+            for category, mask in [(1, scene.map == 1), *masks]:
+                if not mask.any():
+                    continue
+                n += 1
+                runs = coco.encode(np.asfortranarray(mask != 0, np.uint8))
+                entry = {
+                    "id": n,
+                    "image_id": image_id,
+                    "category_id": category,
+                    "area": int(coco.area(runs)),
+                    "bbox": [float(v) for v in coco.toBbox(runs)],
+                    "segmentation": {"size": [HEIGHT, WIDTH], "counts": runs["counts"].decode()},
+                    "iscrowd": 0,
+                }
+                yield json.dumps(entry)
+
+    images = [
+        {"id": k, "file_name": f"{name}.png", "width": WIDTH, "height": HEIGHT}
+        for k, name in enumerate(database.names, 1)
+    ]
+    categories = [{"id": k, "name": name} for k, name in enumerate(CLASSES) if k]
+    file.write(f'{{"images": {json.dumps(images)},\n"categories": {json.dumps(categories)},\n"annotations": [')
+    n = 0
+    for n, entry in enumerate(annotations(), 1):
+        file.write(f"{',' if n > 1 else ''}\n{entry}")
+    file.write("\n]}\n")
+    return n

@@ -1,0 +1,105 @@
+"""Road models taught by roads drawn by hand, one a fold (sections 3.5 and 3.6 of Electronics 12, 3165).
+
+The model of a fold is taught by the drawn scenes of the other four folds and watched on those of its own. It then finds
+the roads of the fold's scenes (section 3.7): no drive's roads come from a model that saw the drive.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from edgeperc.errors import EdgepercError
+from edgeperc.evaluation.datasets import KittiObjects, scan_hash
+from edgeperc.fitness import FitnessProfile
+
+from ..recipe import Recipe
+from ..roads import DatabaseError, mask_of, with_road
+from ..samples import RealScans
+from ..scans import LabelledScan
+from ..to_onnx import export
+from ..train import train
+from .files import N_FOLDS
+
+__all__ = ["DrawnScene", "train_folds"]
+
+
+@dataclass(frozen=True)
+class DrawnScene:
+    """A scene to train on.
+
+    Attributes
+    ----------
+    fold : int
+    road : list
+        COCO segmentations.
+    inputs : str
+        Changes when the scene's files do.
+    """
+
+    fold: int
+    road: list[Any]
+    inputs: str
+
+
+def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: Recipe, out: Path, work: Path) -> None:
+    """Write ``out/fold-0.onnx`` to ``fold-4.onnx``; a model of the same scenes and recipe is not made again.
+
+    Parameters
+    ----------
+    objects : KittiObjects
+    drawn : mapping of str to DrawnScene
+        The scenes' names.
+    recipe : Recipe
+        Of a network of the top view with a class drivable.
+    out : Path
+    work : Path
+        Where training keeps what it goes on with after a stop.
+
+    Raises
+    ------
+    DatabaseError
+        All drawn scenes are of one fold.
+    """
+    # Test scenes take the first fold's model.
+    for fold in range(N_FOLDS):
+        shown = {name: scene for name, scene in sorted(drawn.items()) if scene.fold != fold}
+        held_out = {name: scene for name, scene in sorted(drawn.items()) if scene.fold == fold}
+        if not shown:
+            raise DatabaseError(
+                f"fold {fold} has no road to learn from among {len(drawn)} drawn scenes to train on; draw roads in two "
+                "drives or more, or take a model by --road-by NAME"
+            )
+        facts = [asdict(recipe), *({name: asdict(scene) for name, scene in part.items()} for part in (shown, held_out))]
+        key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+        model, made_of = out / f"fold-{fold}.onnx", work / f"fold-{fold}.sha256"
+        if model.exists() and made_of.exists() and made_of.read_text() == key:
+            continue
+        made_of.unlink(missing_ok=True)
+        scans, watched = _labelled(objects, shown), _labelled(objects, held_out)
+        hashes = {name: scan_hash(scan.points) for name, scan in scans.items()}
+        given = RealScans([*scans.values()], hashes, [*watched.values()])
+        checkpoint = train(recipe, work / key, kitti=None, simulated=None, given=given)
+        fitness = FitnessProfile.from_scans(scan.points for scan in scans.values())
+        proof = [scan.points for scan in scans.values()][:4]
+        export(checkpoint, model, scans=proof, fitness=fitness, name=f"{recipe.network}-fold-{fold}")
+        made_of.write_text(key)
+    for left in work.iterdir():
+        if left.is_dir():
+            shutil.rmtree(left)
+
+
+def _labelled(objects: KittiObjects, drawn: Mapping[str, DrawnScene]) -> dict[str, LabelledScan]:
+    found = {}
+    for name, scene in drawn.items():
+        try:
+            scan = LabelledScan.from_frame(objects.frame(name))
+        except (EdgepercError, ValueError, OSError):
+            continue  # told of when the scene itself is made
+        found[name] = replace(scan, surface=with_road(scan.surface, mask_of(scene.road, name)))
+    return found

@@ -1,0 +1,266 @@
+"""One scene of the database: its inputs, maps and files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeperc import Perceiver
+from edgeperc.atomic import write_aside
+from edgeperc.card import TopViewGeometry
+from edgeperc.errors import CardMismatchError, EdgepercError
+from edgeperc.evaluation.datasets import KittiObjects, scan_hash
+from edgeperc.models import model_path
+from edgeperc.sensors import get_sensor
+
+from ..roads import CLASSES, HEIGHT, VEHICLES, VIEW, WIDTH, mask_of
+from .coco import varied
+from .files import FORMAT, picture, png, road_and_vehicles, vehicles, write_labels
+
+__all__ = [
+    "FOLDERS",
+    "INDEX",
+    "ROAD_FOLDERS",
+    "ROAD_INDEX",
+    "TRAIN",
+    "TRAINED",
+    "Plan",
+    "RoadModel",
+    "SceneBuilder",
+    "Task",
+    "inputs_of",
+]
+
+INDEX = (
+    "scene", "drive", "grade", "split", "fold", "points", "cells_returned", *VEHICLES,
+    *(f"{name}_cells" for name in CLASSES[1:]), "road", "scan_sha256", "image_sha256", "label_sha256", "map_sha256",
+)  # fmt: skip
+ROAD_INDEX = (
+    "name", "scene", "drive", "split", "fold", "turn_deg", "mirrored", "road_cells", "image_sha256", "mask_sha256"
+)  # fmt: skip
+FOLDERS = {"images": "png", "labels": "txt", "maps": "png", ".build/records": "json"}
+ROAD_FOLDERS = {"road/images": "png", "road/masks": "png"}
+TRAIN, TRAINED = "train", ("road/models", ".build/road")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a database is made of, apart from the scenes.
+
+    Attributes
+    ----------
+    kitti, out : Path
+        Roots of the KITTI object set and of the database; on a Ray cluster, as every computer of it sees them.
+    road_by : str
+        What finds the roads that nobody drew: a shipped model's name, the path of an .onnx with a card, or ``"train"``,
+        a model for every fold, taught by the roads that were drawn in the others.
+    sensor : str
+        Where the points come from (`edgeperc.sensors.SENSORS`).
+    provider : str
+        See `edgeperc.Perceiver`; what ``"auto"`` takes may change from one day to the next, and roads with it.
+    variations : int
+        How many variations of every drawn training scene to add (section 3.4).
+    """
+
+    kitti: Path
+    out: Path
+    road_by: str = "lodnn"
+    sensor: str = "hdl-64e"
+    provider: str = "cpu"
+    variations: int = 8
+
+    def road_model(self, fold: int | None) -> str:
+        """The model that finds the roads of a fold's scenes; the first fold's has not seen the test scenes either."""
+        return str(self.out / f"road/models/fold-{fold or 0}.onnx") if self.road_by == TRAIN else self.road_by
+
+
+@dataclass(frozen=True)
+class Task:
+    """One scene to be made."""
+
+    name: str
+    drive: str
+    grade: str
+    split: str
+    fold: int | None
+    road: list[Any] | None = field(default=None)
+
+
+class RoadModel:
+    """Road maps by a network (section 3.7).
+
+    Parameters
+    ----------
+    plan : Plan
+    model : str
+        As `Plan.road_model` gives it.
+    on_mismatch : {"warn", "ignore"}
+        What to do when the scans are unlike those the model was trained on.
+
+    Raises
+    ------
+    CardMismatchError
+        The model sees no top view of these cells, or knows no drivable ground.
+    """
+
+    def __init__(self, plan: Plan, model: str, on_mismatch: Literal["warn", "ignore"]) -> None:
+        # One thread each: scenes are made side by side.
+        self.perceive = Perceiver(
+            model, sensor=plan.sensor, provider=plan.provider, n_threads=1, on_mismatch=on_mismatch
+        )
+        (card,) = self.perceive.cards
+        view = card.view
+        if not isinstance(view, TopViewGeometry) or "drivable" not in card.classes:
+            raise CardMismatchError(
+                f"{model} is a {view.kind} model of {', '.join(card.classes)}; expected a top_view model with a "
+                "class drivable, such as lodnn"
+            )
+        self.path = model
+        self._shift = np.array([view.x_range_m[1] - VIEW.x_range_m[1], view.y_range_m[1] - VIEW.y_range_m[1], 0, 0])
+        same = (view.height, view.width, view.cell_m) == (HEIGHT, WIDTH, VIEW.cell_m)
+        if not same or np.abs(self._shift).max() > VIEW.cell_m:
+            raise CardMismatchError(
+                f"{model} sees x {view.x_range_m}, y {view.y_range_m} in cells of {view.cell_m} m; expected the "
+                f"database's x {VIEW.x_range_m}, y {VIEW.y_range_m} in cells of {VIEW.cell_m} m, give or take a cell"
+            )
+        content = (Path(model) if Path(model).suffix == ".onnx" else model_path(model)).read_bytes()
+        self.facts = {
+            "name": card.name,
+            "version": card.version,
+            "sha256": hashlib.sha256(content).hexdigest(),
+            "provider": self.perceive.providers[card.name],
+        }
+
+    def __call__(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Road of a scan, (400, 200) bool."""
+        # A scan moved by as much as the views are apart falls into the model's cells as it does into the database's.
+        top_view = self.perceive(points + self._shift.astype(np.float32)).top_view
+        assert top_view is not None
+        return top_view.drivable
+
+
+class SceneBuilder:
+    """Makes one scene after another: steps 3.1 to 3.4, 3.7 and 3.8.
+
+    Parameters
+    ----------
+    plan : Plan
+    on_mismatch : {"warn", "ignore"}
+        Passed to `RoadModel`.
+    """
+
+    def __init__(self, plan: Plan, on_mismatch: Literal["warn", "ignore"] = "ignore") -> None:
+        self.plan = plan
+        self.objects = KittiObjects(plan.kitti)
+        self.sensor = get_sensor(plan.sensor)
+        self.facts: dict[str, dict[str, str]] = {}
+        self._on_mismatch = on_mismatch
+        self._road_model: RoadModel | None = None
+
+    def road_model(self, fold: int | None) -> RoadModel:
+        """The road model of a fold. One is held at a time, for scenes come fold by fold."""
+        path = self.plan.road_model(fold)
+        if self._road_model is None or self._road_model.path != path:
+            self._road_model = RoadModel(self.plan, path, self._on_mismatch)
+            self.facts[path] = self._road_model.facts
+        return self._road_model
+
+    def is_made(self, task: Task) -> bool:
+        """Whether the scene lies there, made of the same inputs by the same settings."""
+        facts = self.road_model(task.fold).facts
+        try:
+            record = json.loads(self.record_path(task.name).read_text())
+            files = [self.plan.out / folder / f"{task.name}.{suffix}" for folder, suffix in FOLDERS.items()]
+            files += [self._variation(folder, row["name"]) for row in record["variations"] for folder in ROAD_FOLDERS]
+            return bool(record["key"] == self._key(task, facts)) and all(path.exists() for path in files)
+        except (OSError, ValueError, KeyError, TypeError):
+            return False  # a missing or foreign record: the scene is made again
+
+    def __call__(self, task: Task) -> str:
+        """Make a scene; why it was left out, or nothing.
+
+        Raises
+        ------
+        OSError
+            Its files cannot be written.
+        """
+        try:
+            frame = self.objects.frame(task.name)
+            boxes = vehicles(frame.boxes)
+        except (EdgepercError, ValueError, OSError) as exc:
+            # Without the root, so that the same set gives the same database wherever it lies.
+            return (str(exc) or type(exc).__name__).replace(f"{self.plan.kitti}{os.sep}", "")
+        image = picture(frame.points, self.sensor.remission_offset, self.sensor.remission_scale)
+        model = self.road_model(task.fold)
+        found = model(frame.points)
+        drawn = None if task.road is None else mask_of(task.road, task.name) != 0
+        road = found if drawn is None else drawn
+        labels = road_and_vehicles(road, boxes)
+        contents = {"image": png(image), "label": write_labels(boxes).encode(), "map": png(labels)}
+        kinds = Counter(box.label for box in boxes)
+        cells = np.bincount(labels.ravel(), minlength=len(CLASSES))
+        row = {
+            "points": len(frame.points),
+            "cells_returned": int(np.count_nonzero(image[..., 0])),
+            **{name: kinds[name] for name in VEHICLES},
+            **{f"{name}_cells": int(cells[k]) for k, name in enumerate(CLASSES) if k},
+            "road": "model" if drawn is None else "polygons",
+            "scan_sha256": scan_hash(frame.points),
+        }
+        for (folder, suffix), (kind, content) in zip(list(FOLDERS.items())[:3], contents.items(), strict=True):
+            row[f"{kind}_sha256"] = self._write(self.plan.out / folder / f"{task.name}.{suffix}", content)
+        record = {
+            "key": self._key(task, model.facts),
+            "row": row,
+            "variations": [] if drawn is None else list(self._vary(task, image, drawn)),
+            "found": None if drawn is None else np.bincount((2 * drawn + found).ravel(), minlength=4).tolist(),
+        }
+        self._write(self.record_path(task.name), json.dumps(record, sort_keys=True).encode())
+        return ""
+
+    def _vary(self, task: Task, image: NDArray[np.uint8], road: NDArray[np.bool_]) -> Iterator[dict[str, Any]]:
+        # Test scenes are set apart before augmentation (section 3.4, Figure 12): they are there as they are.
+        for k in range(1 + (self.plan.variations if task.split == "train" else 0)):
+            moved, mask, turn_deg, mirrored = varied(image, road.astype(np.uint8), task.name, k)
+            name = f"{task.name}-{k:02d}"
+            row = {"name": name, "turn_deg": turn_deg, "mirrored": int(mirrored)}
+            row["road_cells"] = int(np.count_nonzero(mask == 1))
+            row["image_sha256"] = self._write(self._variation("road/images", name), png(moved))
+            row["mask_sha256"] = self._write(self._variation("road/masks", name), png(mask))
+            yield row
+
+    def record_path(self, name: str) -> Path:
+        """Where a finished scene's record lies."""
+        return self.plan.out / ".build/records" / f"{name}.json"
+
+    def _variation(self, folder: str, name: str) -> Path:
+        return self.plan.out / folder / f"{name}.{ROAD_FOLDERS[folder]}"
+
+    def _key(self, task: Task, model: dict[str, str]) -> str:
+        """Changes when anything does that the scene is made of."""
+        facts = [
+            FORMAT, model, asdict(self.sensor), self.plan.variations, task.name, task.split, task.road,
+            inputs_of(self.plan.kitti, task.name),
+        ]  # fmt: skip
+        return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+    def _write(self, path: Path, content: bytes) -> str:
+        write_aside(path, content)
+        return hashlib.sha256(content).hexdigest()
+
+
+def inputs_of(kitti: Path, name: str) -> str:
+    """Changes when a scene's files do; the scan, which is large, goes by its size."""
+    training = kitti / "training"
+    small = [training / "label_2" / f"{name}.txt", training / "calib" / f"{name}.txt"]
+    facts = [hashlib.sha256(path.read_bytes()).hexdigest() for path in small]
+    return f"{' '.join(facts)} {(training / 'velodyne' / f'{name}.bin').stat().st_size}"

@@ -1,0 +1,33 @@
+"""A top-view database as PyTorch takes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from .files import TopViewDatabase
+
+__all__ = ["TopViewDataset"]
+
+
+class TopViewDataset(Dataset[tuple[Tensor, Tensor]]):
+    """Images and maps of a database; see `TopViewDatabase` for the arguments and errors.
+
+    An item is the image, (3, 400, 200) float32 in 0..1 (section 3.6), and the map, (400, 200) int64. Vehicles differ in
+    number from scene to scene, so they are no part of it; ``database[k].rectangles`` has them.
+    """
+
+    def __init__(self, root: Path | str, split: str = "all", fold: int | None = None) -> None:
+        self.database = TopViewDatabase(root, split, fold)
+
+    def __len__(self) -> int:
+        return len(self.database)
+
+    def __getitem__(self, k: int) -> tuple[Tensor, Tensor]:
+        scene = self.database[k]
+        image = np.ascontiguousarray(scene.image.transpose(2, 0, 1))
+        return torch.from_numpy(image).float() / 255.0, torch.from_numpy(scene.map.astype(np.int64))

@@ -1,0 +1,276 @@
+"""Drivable area as training truth: surfaces by height, and roads drawn by hand."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeperc.card import TopViewGeometry
+from edgeperc.errors import EdgepercError, MissingExtraError
+from edgeperc.simulation.samples import IGNORE
+
+from .scans import SURFACE
+
+__all__ = [
+    "CELL_M",
+    "CLASSES",
+    "DRAWN",
+    "HEIGHT",
+    "VEHICLES",
+    "VIEW",
+    "WIDTH",
+    "X_RANGE_M",
+    "Y_RANGE_M",
+    "Z_RANGE_M",
+    "DatabaseError",
+    "drawn_roads",
+    "ground_plane",
+    "mask_of",
+    "read_coco",
+    "sure_surface",
+    "with_road",
+    "write_coco",
+]
+
+DRAWN = Path(__file__).with_name("kitti_roads.coco.json")
+"""Roads of some training scans of KITTI, drawn over them seen from above, as ``edgeperc-export database label`` keeps
+them: polygons, no scan."""
+
+RISE_M = 0.3
+LANE_HALF_WIDTH_M = 1.2
+LANE_RANGE_M = (3.0, 25.0)
+
+# Asphalt's own remission varies by 0.05 along a lane; grass lies 0.2 and more above it.
+BRIGHTER = 0.15
+
+
+def ground_plane(points: NDArray[np.float32], seed: int = 0) -> NDArray[np.float64] | None:
+    """a, b, c of z = a x + b y + c through the ground near the vehicle (RANSAC, then least squares), or None."""
+    near = (np.hypot(points[:, 0], points[:, 1]) < 20.0) & (np.abs(points[:, 1]) < 8.0) & (points[:, 2] < -1.0)
+    p = points[near].astype(np.float64)
+    if len(p) < 500:
+        return None
+    rng = np.random.default_rng(seed)
+    best, most = None, 0
+    tested = p[:: max(1, len(p) // 4000)]
+    for _ in range(100):
+        corners = p[rng.integers(len(p), size=3)]
+        try:
+            a, b, c = np.linalg.solve(np.c_[corners[:, :2], np.ones(3)], corners[:, 2])
+        except np.linalg.LinAlgError:
+            continue
+        # The sensor stands 1.73 m above the road, and no street leans by more than a tenth.
+        if abs(a) > 0.12 or abs(b) > 0.1 or abs(c + 1.73) > 0.35:
+            continue
+        support = np.abs(tested[:, 2] - a * tested[:, 0] - b * tested[:, 1] - c) < 0.08
+        if np.count_nonzero(support) > most:
+            most, best = int(np.count_nonzero(support)), (a, b, c)
+    if best is None:
+        return None
+    a, b, c = best
+    support = np.abs(p[:, 2] - a * p[:, 0] - b * p[:, 1] - c) < 0.08
+    return np.linalg.lstsq(np.c_[p[support, :2], np.ones(support.sum())], p[support, 2], rcond=None)[0]
+
+
+def sure_surface(points: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Surface truth over `SURFACE`: 1 road, 0 no road, `IGNORE` where nobody can be sure."""
+    surface = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
+    plane = ground_plane(points)
+    if plane is None:
+        return surface
+    x, y = points[:, 0].astype(np.float64), points[:, 1].astype(np.float64)
+    height = points[:, 2] - (plane[0] * x + plane[1] * y + plane[2])
+    distance = np.hypot(x, y)
+    row = np.floor((SURFACE.x_range_m[1] - x) / SURFACE.cell_m).astype(np.int64)
+    col = np.floor((SURFACE.y_range_m[1] - y) / SURFACE.cell_m).astype(np.int64)
+    kept = (row >= 0) & (row < SURFACE.height) & (col >= 0) & (col < SURFACE.width) & (distance > 2.5) & (height < 3.0)
+    cell = row * SURFACE.width + col
+
+    low = kept & (np.abs(height) < 0.08 + 0.004 * distance)
+    lane = low & (np.abs(y) < LANE_HALF_WIDTH_M) & (x > LANE_RANGE_M[0]) & (x < LANE_RANGE_M[1])
+    risen = kept & (height > RISE_M + 0.01 * distance)
+    ahead = risen & (np.abs(y) < LANE_HALF_WIDTH_M + 0.3) & (x > LANE_RANGE_M[0])
+    if ahead.any():
+        lane &= x < x[ahead].min() - 1.0
+    if np.count_nonzero(lane) > 100:
+        usual = float(np.median(points[lane, 3]))
+        size = surface.size
+        count = np.bincount(cell[low], minlength=size).reshape(surface.shape)
+        total = np.bincount(cell[low], weights=points[low, 3], minlength=size).reshape(surface.shape)
+        around, bright = _boxed(count), _boxed(total)
+        bright = (around >= 8) & (bright > (usual + BRIGHTER) * around) & (count > 0)
+        # Markings are bright too, but not over a metre; the lane itself is never doubted.
+        surface[bright] = 0
+        surface.reshape(-1)[cell[lane]] = 1
+    surface.reshape(-1)[cell[risen]] = 0
+    return surface
+
+
+def drawn_roads(path: Path = DRAWN) -> dict[str, NDArray[np.uint8]]:
+    """Roads drawn by hand: hash of the scan (`datasets.scan_hash`) -> mask (400, 200) uint8, 1 road.
+
+    By its hash and not by its name, for names of scans differ from one copy of KITTI to the next. A COCO file keeps it
+    as ``scan`` of its images.
+
+    Raises
+    ------
+    DatabaseError
+        No COCO file of roads.
+    MissingExtraError
+        Nothing that reads COCO files is installed.
+    """
+    try:
+        from .roads import mask_of, read_coco
+
+        drawn = read_coco([path])
+    except ModuleNotFoundError as exc:
+        raise MissingExtraError(exc.name or "a package", "database", "a road drawn by hand") from exc
+    hashes = {Path(image["file_name"]).stem: image["scan"] for image in json.loads(path.read_text())["images"]}
+    return {hashes[name]: mask_of(polygons, f"{path}: {name}") for name, polygons in drawn.items()}
+
+
+def with_road(surface: NDArray[np.uint8], road: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Surface truth over `SURFACE` with a drawn road's (400, 200) where that reaches."""
+    from .roads import VIEW
+
+    x, y = SURFACE.cell_centres()
+    row = np.floor((VIEW.x_range_m[1] - x) / VIEW.cell_m).astype(np.int64)
+    col = np.floor((VIEW.y_range_m[1] - y) / VIEW.cell_m).astype(np.int64)
+    drawn = (row >= 0) & (row < VIEW.height) & (col >= 0) & (col < VIEW.width)
+    return np.where(drawn, road[row % VIEW.height, col % VIEW.width], surface).astype(np.uint8)
+
+
+def _boxed(values: NDArray, reach: int = 3) -> NDArray:
+    """Sums over (2 reach + 1)^2 cells."""
+    for axis in (0, 1):
+        padded = np.pad(values, [(reach + 1, reach) if a == axis else (0, 0) for a in (0, 1)])
+        total = padded.cumsum(axis)
+        n = values.shape[axis]
+        values = np.take(total, range(2 * reach + 1, 2 * reach + 1 + n), axis) - np.take(total, range(n), axis)
+    return values
+
+
+ROAD = ("road", "drivable")
+
+
+def read_coco(paths: Iterable[Path]) -> dict[str, list[Any]]:
+    """Roads of COCO files: scene -> COCO segmentations, polygons or run lengths.
+
+    Scenes are named by their images' file names. One with annotations, but none of road, has no road: an empty list.
+
+    Raises
+    ------
+    DatabaseError
+        A file is no COCO file, knows no road, is about images of another size, or two draw the same scene.
+    """
+    roads: dict[str, list[Any]] = {}
+    for path in paths:
+        try:
+            content = json.loads(path.read_text())
+            images = {image["id"]: image for image in content["images"]}
+            road = {c["id"] for c in content["categories"] if str(c["name"]).lower() in ROAD}
+            drawn = [(a["image_id"], a["category_id"], a["segmentation"]) for a in content["annotations"]]
+        except (ValueError, KeyError, TypeError) as exc:
+            raise DatabaseError(f"{path} is no COCO file ({exc!r}); expected images, categories, annotations") from exc
+        if not road:
+            raise DatabaseError(f"{path} has no category called road; expected the road's polygons under that name")
+        found: dict[str, list[Any]] = {}
+        for image_id, category, segmentation in drawn:
+            image = images.get(image_id)
+            if image is None:
+                raise DatabaseError(f"{path} annotates image {image_id!r}, which it does not list; export it again")
+            size, name = (image.get("width"), image.get("height")), Path(str(image.get("file_name"))).stem
+            if size != (WIDTH, HEIGHT):
+                raise DatabaseError(
+                    f"{path}: image {name} is {size[0]} x {size[1]}; expected {WIDTH} x {HEIGHT}, the database's own"
+                )
+            found.setdefault(name, [])
+            if category in road:
+                mask_of([segmentation], f"{path}: image {name}")
+                found[name].append(segmentation)
+        twice = sorted(found.keys() & roads.keys())
+        if twice:
+            raise DatabaseError(f"{path} draws {', '.join(twice[:5])}, which another file draws too; keep one of them")
+        roads |= found
+    return roads
+
+
+def mask_of(segmentations: Sequence[Any], of: str = "a polygon") -> NDArray[np.uint8]:
+    """What COCO segmentations cover, together, (400, 200) uint8: 1 and 0 (section 3.3)."""
+    from faster_coco_eval.core import mask as coco
+
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    for each in segmentations:
+        try:
+            if isinstance(each, list):
+                rings = [[float(v) for v in ring] for ring in each]
+                whole = all(len(ring) >= 6 and len(ring) % 2 == 0 and np.isfinite(ring).all() for ring in rings)
+                if not rings or not whole or max(abs(v) for ring in rings for v in ring) > 1e5:
+                    raise ValueError(f"a polygon is {str(each)[:60]}")
+                runs = coco.merge(coco.frPyObjects(rings, HEIGHT, WIDTH))
+            else:
+                if tuple(each["size"]) != (HEIGHT, WIDTH):
+                    raise ValueError(f"run lengths are of size {each['size']}")
+                runs = coco.frPyObjects(each, HEIGHT, WIDTH) if isinstance(each["counts"], list) else each
+                covered = sum(runs["counts"]) if isinstance(runs["counts"], list) else None
+                if covered not in (None, HEIGHT * WIDTH):
+                    raise ValueError(f"run lengths cover {covered} pixels")
+            mask |= coco.decode(runs)
+        except (ValueError, KeyError, TypeError) as exc:
+            raise DatabaseError(
+                f"{of}: {exc}; expected polygons of three corners and more, x y x y ..., or run lengths of the image"
+            ) from exc
+    return mask
+
+
+def write_coco(roads: Mapping[str, Sequence[Sequence[Sequence[float]]]], scans: Mapping[str, str] | None = None) -> str:
+    """The text of a COCO file: scene -> polygons -> corners (x, y) in pixels.
+
+    ``scans`` has `datasets.scan_hash` of the scenes: names differ from one copy of KITTI to the next.
+    """
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    for k, name in enumerate(sorted(roads), 1):
+        scan = {"scan": scans[name]} if scans and name in scans else {}
+        images.append({"id": k, "file_name": f"{name}.png", "width": WIDTH, "height": HEIGHT, **scan})
+        for polygon in roads[name]:
+            x, y = np.array(polygon, np.float64).T
+            area = abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2.0
+            low, size = (float(x.min()), float(y.min())), (float(np.ptp(x)), float(np.ptp(y)))
+            flat = [round(float(v), 2) for corner in polygon for v in corner]
+            annotations.append(
+                {
+                    "id": len(annotations) + 1,
+                    "image_id": k,
+                    "category_id": 1,
+                    "segmentation": [flat],
+                    "bbox": [round(v, 2) for v in (*low, *size)],
+                    "area": round(area, 2),
+                    "iscrowd": 0,
+                }
+            )
+    content = {"images": images, "categories": [{"id": 1, "name": "road"}], "annotations": annotations}
+    return json.dumps(content, indent=1) + "\n"
+
+
+CLASSES = ("background", "road", "car", "van", "truck")
+VEHICLES = CLASSES[2:]
+
+# What is looked at (3.1, and SSADNet 2.1.2): both edges belong to it.
+X_RANGE_M, Y_RANGE_M, Z_RANGE_M, CELL_M = (6.0, 46.0), (-10.0, 10.0), (-2.5, 2.5), 0.1
+HEIGHT, WIDTH = 400, 200
+
+# Coordinates are rounded to whole pixels, so pixel 0 lies around 6.0 m, not beyond it: the cells are half a cell nearer
+# and farther right than a network's that rounds down. A card with this view sees a scan in the same cells.
+VIEW = TopViewGeometry(
+    (X_RANGE_M[0] - 0.05, X_RANGE_M[1] - 0.05), (Y_RANGE_M[0] - 0.05, Y_RANGE_M[1] - 0.05), Z_RANGE_M
+)
+
+
+class DatabaseError(EdgepercError, ValueError):
+    """A top-view database, or polygons drawn for one, cannot be made or read."""

@@ -1,0 +1,150 @@
+"""Labelled scans, and turning and mirroring them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeperc.card import TopViewGeometry
+from edgeperc.evaluation.datasets import Frame
+from edgeperc.geometry import draw_footprints, inside
+from edgeperc.perception import Box
+from edgeperc.simulation.samples import IGNORE, labels_by_boxes
+from edgeperc.simulation.scene import TOP_VIEW_CLASSES, SimulatedScan
+
+__all__ = ["SURFACE", "LabelledScan", "mirrored", "turned", "turned_box"]
+
+# The ground is kept wider and coarser than the network sees it, so that a turned scan still has truth everywhere.
+SURFACE = TopViewGeometry(x_range_m=(-50.0, 50.0), y_range_m=(-50.0, 50.0), cell_m=0.2)
+CAMERA_AZIMUTHS = (-0.70, 0.69)  # KITTI's left colour camera sees 41.2 degrees to the right and 40.2 to the left
+
+
+@dataclass(frozen=True)
+class LabelledScan:
+    """A scan and its truth.
+
+    Attributes
+    ----------
+    points : (n, 4) float32
+    labels : (n,) uint8
+        PointSeg's classes, `IGNORE` where unknown.
+    boxes : tuple of Box
+    counts : tuple of int
+        Returns in each box; a box nothing returned from cannot be found.
+    surface : (500, 500) uint8
+        0 background, 1 drivable, `IGNORE` unknown, over `SURFACE`, before ``turn`` and ``mirrored``.
+    azimuths : tuple of 2 float
+        Where truth is known: lowest and highest azimuth [rad], counter-clockwise from +x.
+    turn : float
+        Angle by which the scan was turned about +z [rad].
+    mirrored : bool
+        Whether left and right were swapped, after turning.
+    """
+
+    points: NDArray[np.float32]
+    labels: NDArray[np.uint8]
+    boxes: tuple[Box, ...]
+    counts: tuple[int, ...]
+    surface: NDArray[np.uint8]
+    azimuths: tuple[float, float] = (-np.pi, np.pi)
+    turn: float = 0.0
+    mirrored: bool = False
+
+    @classmethod
+    def from_frame(
+        cls, frame: Frame, road: Callable[[NDArray[np.float32]], NDArray[np.uint8]] | None = None
+    ) -> LabelledScan:
+        """A real frame; ``road`` draws its surface, which no KITTI label tells, and without it stays unknown."""
+        points = frame.points[np.isfinite(frame.points).all(axis=1)]
+        frame = replace(frame, points=points)
+        surface = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8) if road is None else road(points)
+        counts = tuple(int(np.count_nonzero(inside(box, points, 0.1))) for box in frame.boxes)
+        return cls(points, frame.point_labels(), frame.boxes, counts, surface, CAMERA_AZIMUTHS)
+
+    @classmethod
+    def from_simulation(cls, scan: SimulatedScan) -> LabelledScan:
+        """A simulated scan: everything about it is known."""
+        surface = scan.top_view_labels(SURFACE)
+        surface = np.where(surface == 1, 1, np.where(surface >= 2, IGNORE, 0)).astype(np.uint8)
+        return cls(scan.points, labels_by_boxes(scan), scan.boxes, scan.box_points, surface)
+
+    def save(self, path: Path) -> None:
+        """Write to an .npz, without pickles."""
+        boxes = np.array([[*b.center, *b.size, b.yaw] for b in self.boxes], np.float32).reshape(-1, 7)
+        names = np.array([b.label for b in self.boxes], dtype="U16")
+        aside = path.with_suffix(".tmp.npz")
+        np.savez(
+            aside,
+            points=self.points,
+            labels=self.labels,
+            boxes=boxes,
+            names=names,
+            counts=np.array(self.counts, np.int64),
+            surface=self.surface,
+            azimuths=np.array(self.azimuths),
+        )
+        aside.rename(path)
+
+    @classmethod
+    def load(cls, path: Path) -> LabelledScan:
+        """Read what `save` wrote."""
+        with np.load(path, allow_pickle=False) as data:
+            boxes = tuple(
+                Box(str(n), 1.0, tuple(map(float, b[:3])), tuple(map(float, b[3:6])), float(b[6]))
+                for n, b in zip(data["names"], data["boxes"], strict=True)
+            )
+            low, high = (float(a) for a in data["azimuths"])
+            return cls(
+                data["points"], data["labels"], boxes, tuple(map(int, data["counts"])), data["surface"], (low, high)
+            )
+
+    def labelled(self, geometry: TopViewGeometry) -> NDArray[np.bool_]:
+        """Cells in which a vehicle would have been labelled, (rows, cols) bool."""
+        x, y = geometry.cell_centres()
+        azimuth = np.arctan2(y, x)
+        return (azimuth >= self.azimuths[0]) & (azimuth <= self.azimuths[1])
+
+    def top_view_truth(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
+        """SSADNet's segmentation truth (3.1.2): the surface under the vehicles' footprints, `IGNORE` where unknown."""
+        x, y = geometry.cell_centres()
+        if self.mirrored:
+            y = -y
+        cos, sin = np.cos(self.turn), np.sin(self.turn)
+        row = np.floor((SURFACE.x_range_m[1] - (cos * x + sin * y)) / SURFACE.cell_m).astype(np.int64)
+        col = np.floor((SURFACE.y_range_m[1] - (cos * y - sin * x)) / SURFACE.cell_m).astype(np.int64)
+        covered = (row >= 0) & (row < SURFACE.height) & (col >= 0) & (col < SURFACE.width)
+        truth = np.where(covered, self.surface[row % SURFACE.height, col % SURFACE.width], IGNORE).astype(np.uint8)
+        draw_footprints(truth, self.boxes, geometry, TOP_VIEW_CLASSES)
+        truth[~self.labelled(geometry)] = IGNORE
+        return truth
+
+
+def turned(scan: LabelledScan, angle: float) -> LabelledScan:
+    """The scan turned by ``angle`` [rad] about +z."""
+    cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+    points = scan.points.copy()
+    points[:, 0] = cos * scan.points[:, 0] - sin * scan.points[:, 1]
+    points[:, 1] = sin * scan.points[:, 0] + cos * scan.points[:, 1]
+    boxes = tuple(turned_box(b, angle) for b in scan.boxes)
+    low, high = scan.azimuths
+    full = high - low >= 2.0 * np.pi
+    azimuths = (low, high) if full else (low + angle, high + angle)
+    return replace(scan, points=points, boxes=boxes, azimuths=azimuths, turn=scan.turn + angle)
+
+
+def mirrored(scan: LabelledScan) -> LabelledScan:
+    """The scan with left and right swapped."""
+    points = scan.points * np.array([1, -1, 1, 1], np.float32)
+    boxes = tuple(replace(b, center=(b.center[0], -b.center[1], b.center[2]), yaw=-b.yaw) for b in scan.boxes)
+    low, high = scan.azimuths
+    return replace(scan, points=points, boxes=boxes, azimuths=(-high, -low), mirrored=not scan.mirrored)
+
+
+def turned_box(box: Box, angle: float) -> Box:
+    cos, sin = float(np.cos(angle)), float(np.sin(angle))
+    x, y, z = box.center
+    return replace(box, center=(cos * x - sin * y, sin * x + cos * y, z), yaw=box.yaw + float(angle))

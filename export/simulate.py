@@ -1,0 +1,48 @@
+"""The scans that training, export and proof draw from: simulated by the thousand, real where there are any."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from edgeperc.evaluation.datasets import KittiObjects, layouts
+from edgeperc.fitness import FitnessProfile
+from edgeperc.readers.files import read_points
+from edgeperc.simulation.samples import simulated_scan
+
+from .scans import LabelledScan
+
+__all__ = ["fitness_of", "parity_scans", "simulate"]
+
+
+def simulate(out: Path, n: int, *, first: int = 0, layouts_root: Path | None = None, sensor: str = "hdl-64e") -> None:
+    """Write ``n`` labelled scans into ``out``, every other one with a real layout where there are any.
+
+    Files already there are left alone, so a stopped run goes on where it was.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    real = list(layouts(layouts_root)) if layouts_root else []
+    for seed in tqdm(range(first, first + n), desc="simulating", unit="scan"):
+        path = out / f"{seed:06d}.npz"
+        if not path.exists():
+            # 4,973 is a prime: neighbouring seeds take layouts of different drives.
+            boxes = real[seed * 4973 % len(real)] if real and seed % 2 else None
+            LabelledScan.from_simulation(simulated_scan(seed, sensor, boxes)).save(path)
+
+
+def parity_scans(paths: Sequence[Path]) -> list[NDArray[np.float32]]:
+    """Scans to prove an export on: those given, and four simulated ones that no training run drew."""
+    return [read_points(p) for p in paths] + [simulated_scan(10**9 + k).points for k in range(4)]
+
+
+def fitness_of(kitti: Path | None) -> FitnessProfile:
+    """What training scans look like: the real ones, or simulated ones where there are none."""
+    if kitti is None:
+        return FitnessProfile.from_scans(simulated_scan(10**9 + k).points for k in range(32))
+    objects = KittiObjects(kitti)
+    names = objects.names("train", grades="AB")
+    return FitnessProfile.from_scans(objects.frame(n).points for n in names[:: max(1, len(names) // 64)])
