@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from edgeperc import EdgepercError, __version__
-from edgeperc.models import SHIPPED
 from edgeperc.tuning import settings_path
+from edgeperc.zoo import DEFAULT
 
 from .commands.compare import compare_command
 from .commands.matrix import matrix_command
@@ -88,7 +88,7 @@ def _parser() -> argparse.ArgumentParser:
         "--model",
         action="append",
         metavar="NAME",
-        help=f"a shipped model or an .onnx with a card; may be repeated (default: {' and '.join(SHIPPED)})",
+        help=f"a shipped model or an .onnx with a card; may be repeated (default: {' and '.join(DEFAULT)})",
     )
     common.add_argument(
         "--sensor", default="hdl-64e", metavar="NAME", help="what took the scans (default: %(default)s)"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from edgeperc import Box, PointsError, read_points
 from edgeperc.readers.captures import SCAN_SUFFIXES
-from edgeperc.sensors import get_sensor
+from edgeperc.sensor import get_sensor
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
 

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from .perception import Box, Perception, PointLabels, TopView
     from .readers.captures import read_scans
     from .readers.files import read_points
-    from .sensors import SensorProfile
+    from .sensor import SensorProfile
     from .tracking import Track, Tracker, Tracks
 
 __all__ = [
@@ -94,7 +94,7 @@ _MODULES = {
     "Perception": "perception",
     "PointLabels": "perception",
     "RoadAhead": "drivable",
-    "SensorProfile": "sensors",
+    "SensorProfile": "sensor",
     "Stream": "live",
     "TopView": "perception",
     "Track": "tracking",

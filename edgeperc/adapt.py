@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .card import RangeImageGeometry
 from .errors import PointsError, SensorError
-from .sensors import SensorProfile
+from .sensor import SensorProfile
 
 __all__ = ["Interpolator", "render"]
 

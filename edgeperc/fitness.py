@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .errors import CardError, PointsError
-from .sensors import SensorProfile
+from .sensor import SensorProfile
 
 __all__ = ["FitnessProfile", "check_fitness", "fill_scan_sums"]
 

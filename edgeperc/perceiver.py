@@ -24,13 +24,13 @@ from .decode import decode_classes, decode_top_view
 from .errors import FitnessError
 from .fitness import FitnessProfile, check_fitness
 from .ground import find_ground
-from .models import resolve
 from .perception import Box, Perception, PointLabels, TopView
 from .points import as_points
 from .projection import RangeImageProjector, TopViewProjector, make_projector
 from .refine import label_points, remove_outliers
-from .sensors import SensorProfile, get_sensor
+from .sensor import SensorProfile, get_sensor
 from .session import Session
+from .zoo import resolve
 
 __all__ = ["ADAPTATIONS", "BoxesFrom", "Perceiver"]
 
@@ -78,7 +78,7 @@ class Perceiver:
         Names of shipped models (``"ssadnet"``, ``"pointseg"``) or paths of .onnx files with a card; at most one model
         a view.
     sensor : str, Path or SensorProfile
-        Where the points come from: a built-in name (`edgeperc.sensors.SENSORS`), a file that ``edgeperc adapt fit``
+        Where the points come from: a built-in name (`edgeperc.sensor.SENSORS`), a file that ``edgeperc adapt fit``
         wrote, or a profile. Says how raw remissions map to 0..1, and how they are rendered as the training sensor's.
     provider : str
         ``"auto"``, ``"cpu"``, ``"openvino"``, ... A provider asked for is required (`edgeperc.session.PROVIDERS`).

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import PointsError, SensorError
-from .sensors import REMISSION_KINDS, RemissionFunction, SensorProfile
+from .sensor import REMISSION_KINDS, RemissionFunction, SensorProfile
 
 __all__ = [
     "N_SHARES",

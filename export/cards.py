@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
-from edgeperc.sensors import get_sensor
+from edgeperc.sensor import get_sensor
 from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES
 
 __all__ = ["LABELS_POINTS", "RANGE_IMAGE", "RANGE_IMAGE_INPUT", "ROAD_CLASSES", "TOP_VIEW", "TOP_VIEW_INPUT", "card_of"]

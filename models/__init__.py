@@ -1,4 +1,4 @@
-"""The models that come with edgeperc: .onnx files, each carrying its card; installed as ``edgeperc.models``."""
+"""The models that come with edgeperc: .onnx files, each carrying its card; installed as ``edgeperc.zoo``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from edgeperc.errors import ModelFileError
 
-__all__ = ["SHIPPED", "model_path", "resolve", "shipped_models"]
+__all__ = ["DEFAULT", "model_path", "resolve", "shipped_models"]
 
 
 def shipped_models() -> tuple[str, ...]:
@@ -42,7 +42,7 @@ def model_path(name: str) -> Path:
     return Path(str(resources.files(__name__).joinpath(f"{name}.onnx")))
 
 
-SHIPPED = ("ssadnet", "pointseg")
+DEFAULT = ("ssadnet", "pointseg")
 
 
 def resolve(model: str | os.PathLike[str]) -> Path:

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-import reference
+import twins.adapt
 from edgeperc import Perceiver
 from edgeperc.adapt import Interpolator, render
 from edgeperc.card import InputSpec, RangeImageGeometry
@@ -21,6 +21,7 @@ from edgeperc.cli import main as cli
 from edgeperc.errors import PointsError, SensorError
 from edgeperc.evaluation.transfer import compare
 from edgeperc.projection import RangeImageProjector
+from edgeperc.sensor import SENSORS, RemissionFunction, SensorProfile, get_sensor
 from edgeperc.sensor_fit import (
     N_SHARES,
     N_STRATA,
@@ -31,7 +32,6 @@ from edgeperc.sensor_fit import (
     match_quantiles,
     remission_strata,
 )
-from edgeperc.sensors import SENSORS, RemissionFunction, SensorProfile, get_sensor
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
 
@@ -192,7 +192,7 @@ def test_rendering_against_its_twin(function: RemissionFunction, points: np.ndar
     sensor = replace(get_sensor("vlp-16"), remission_range=(5.0, 105.0), remission=function)
     before = points.copy()
     with np.errstate(over="ignore", invalid="ignore"):
-        wanted = reference.rendered(points, function, sensor.remission_range)
+        wanted = twins.adapt.rendered(points, function, sensor.remission_range)
     found = render(points, sensor)
     np.testing.assert_array_equal(points, before)
     np.testing.assert_array_equal(found[:, :3], points[:, :3])
@@ -308,7 +308,7 @@ def twin(points: np.ndarray, index: np.ndarray, view: RangeImageGeometry, sensor
     azimuths = np.radians(view.azimuth_left_deg - (np.arange(view.width) + 0.5) * step)
     across = 360.0 / sensor.columns / step
     col_reach = int(across) + 1 if across > 1.1 else 0
-    return reference.between(points, index, np.radians(rows), azimuths, reach, col_reach, -sensor.mount_height_m)
+    return twins.adapt.between(points, index, np.radians(rows), azimuths, reach, col_reach, -sensor.mount_height_m)
 
 
 SMALL = RangeImageGeometry(tuple(np.linspace(2.0, -24.0, 14)), width=24, azimuth_left_deg=20.0, azimuth_right_deg=-20.0)
@@ -345,7 +345,7 @@ def test_filling_against_its_twin_and_its_promises(seed: int, n: int) -> None:
     assert sorted(filled[filled >= n].tolist()) == list(range(n, len(dense)))  # each in one pixel
     for k, (i, j) in enumerate(parents, start=n):
         one, other = dense[i].astype(np.float64), dense[j].astype(np.float64)
-        assert reference.one_surface(one, other, -1.73)
+        assert twins.adapt.one_surface(one, other, -1.73)
         low, high = np.minimum(one, other) - 1e-4, np.maximum(one, other) + 1e-4
         assert ((dense[k] >= low) & (dense[k] <= high)).all()  # between them in every coordinate, remission included
 

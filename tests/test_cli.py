@@ -592,7 +592,7 @@ def fake_models(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         return file.with_stem(name)
 
     models = SimpleNamespace(model_path=model_path, shipped_models=lambda: ("pointseg", "ssadnet"))
-    monkeypatch.setitem(sys.modules, "edgeperc.models", models)
+    monkeypatch.setitem(sys.modules, "edgeperc.zoo", models)
     monkeypatch.setitem(sys.modules, "edgeperc.session", SimpleNamespace(Session=FakeSession))
 
 

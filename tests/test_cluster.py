@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import reference
+import twins.cluster
 from edgeperc import cluster
 from edgeperc.cluster import OBJECT_SIZE_M, cluster_labels, find_clusters, objects_from_points
 from edgeperc.errors import PointsError
@@ -57,7 +57,7 @@ def test_clusters_are_those_of_every_pair_looked_at(seed, per_m):
         points, among=among, min_distance_m=0.5, distance_per_m=per_m, max_range_m=28.0, min_points=seed % 3 + 1
     )
     assert found.dtype == np.int32
-    np.testing.assert_array_equal(found, reference.clusters(points, among, 0.5, per_m, 28.0, seed % 3 + 1))
+    np.testing.assert_array_equal(found, twins.cluster.clusters(points, among, 0.5, per_m, 28.0, seed % 3 + 1))
 
 
 # Multiples of the distance's parts, so that points lie on edges of columns and pairs exactly at the distance.
@@ -70,7 +70,7 @@ def test_whatever_comes_the_twin_agrees(rows, per_m, min_points):
     points = as_points(np.array(rows).reshape(-1, 3))
     among = np.ones(len(points), bool)
     found = find_clusters(points, min_distance_m=0.5, distance_per_m=per_m, min_points=min_points)
-    np.testing.assert_array_equal(found, reference.clusters(points, among, 0.5, per_m, 100.0, min_points))
+    np.testing.assert_array_equal(found, twins.cluster.clusters(points, among, 0.5, per_m, 100.0, min_points))
 
 
 @pytest.mark.parametrize("spread", [0.02, 0.5, 20.0])
@@ -79,7 +79,7 @@ def test_a_tall_column_in_any_order_is_the_twins(spread):
     points = as_points(np.column_stack([rng.uniform(0, 0.6, (300, 2)), rng.uniform(0, spread * 10, 300)]))
     np.testing.assert_array_equal(
         find_clusters(points, min_distance_m=0.4, min_points=1),
-        reference.clusters(points, np.ones(300, bool), 0.4, 0.015, 100.0, 1),
+        twins.cluster.clusters(points, np.ones(300, bool), 0.4, 0.015, 100.0, 1),
     )
 
 
@@ -187,7 +187,7 @@ def test_rectangles_are_the_twins(n, seed, l_shaped):
     members += rng.uniform(-30, 30, 2)
     rectangle = np.empty(5)
     cluster.fill_rectangle(members, l_shaped, rectangle)
-    np.testing.assert_allclose(rectangle, reference.rectangle(members, l_shaped), atol=1e-8)
+    np.testing.assert_allclose(rectangle, twins.cluster.rectangle(members, l_shaped), atol=1e-8)
 
 
 @pytest.mark.parametrize("where", [(12.0, 5.0), (-9.0, 7.0), (-15.0, -4.0), (8.0, -20.0)])

@@ -36,7 +36,7 @@ shapely = pytest.importorskip("shapely")
 import onnx
 from shapely import Polygon
 
-import reference
+import twins.database
 from edgeperc import Perceiver
 from edgeperc.card import CARD_KEY, InputSpec, ModelCard, OutputSpec, TopViewGeometry
 from edgeperc.errors import CardMismatchError, MissingExtraError
@@ -159,13 +159,13 @@ def with_edges(rng: np.random.Generator, n: int) -> np.ndarray:
 @pytest.mark.parametrize("n", [0, 1, 5000])
 def test_a_picture_is_its_twin(n: int) -> None:
     points = with_edges(np.random.default_rng(n), n)
-    np.testing.assert_array_equal(picture(points), reference.picture(points))
+    np.testing.assert_array_equal(picture(points), twins.database.picture(points))
 
 
 @settings(max_examples=30, deadline=None)
 @given(hnp.arrays(np.float32, st.tuples(st.integers(0, 6), st.just(4)), elements=st.floats(width=32)))
 def test_a_picture_of_anything_is_its_twin(points: np.ndarray) -> None:
-    np.testing.assert_array_equal(picture(points), reference.picture(points))
+    np.testing.assert_array_equal(picture(points), twins.database.picture(points))
 
 
 def test_metres_are_rounded_and_clamped() -> None:

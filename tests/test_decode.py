@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import reference
+import twins.decode
 from edgeperc import decode
 from edgeperc.card import TopViewGeometry
 from edgeperc.decode import decode_classes, decode_dense, decode_slots, decode_top_view
@@ -33,13 +33,13 @@ def test_classes_agree_with_the_twin(shape):
     logits = np.random.default_rng(1).normal(0.0, 5.0, shape).astype(np.float32)
     values = logits[0] if logits.ndim == 4 else logits
     labels, scores = decode_classes(logits, "class_logits")
-    expected_labels, expected_scores, _ = reference.classes(values, True) if values.size else (labels, scores, 0)
+    expected_labels, expected_scores, _ = twins.decode.classes(values, True) if values.size else (labels, scores, 0)
     assert labels.dtype == np.uint8
     assert scores.dtype == np.float32
     np.testing.assert_array_equal(labels, expected_labels)
     np.testing.assert_allclose(scores, expected_scores, atol=3e-6)
 
-    probabilities = reference.softmax(values).astype(np.float32) if values.size else values
+    probabilities = twins.decode.softmax(values).astype(np.float32) if values.size else values
     labels, scores = decode_classes(probabilities, "class_probabilities")
     np.testing.assert_array_equal(labels, expected_labels)
     np.testing.assert_array_equal(scores, probabilities.max(axis=0))
@@ -192,7 +192,7 @@ def test_dense_gives_back_what_was_put_in():
         np.testing.assert_allclose(box.size, (length, width, height), rtol=1e-5)
         assert box.yaw == pytest.approx(yaw, abs=1e-5)
         assert box.score == pytest.approx(1.0 / (1.0 + math.exp(-logit)), abs=1e-6)
-    probabilities = reference.softmax(logits[0])[None].astype(np.float32)
+    probabilities = twins.decode.softmax(logits[0])[None].astype(np.float32)
     assert decode_dense(dense_of(b, a), probabilities, "class_probabilities", VIEW, CLASSES, VEHICLES) == boxes
 
 
@@ -287,7 +287,7 @@ def test_peaks_agree_with_the_twin(shape):
         heat = heat.astype(np.float32)
         peak = np.empty(shape, dtype=np.bool_)
         decode.mark_peaks(heat, 0.0, peak)
-        np.testing.assert_array_equal(peak, reference.peaks(heat, 0.0))
+        np.testing.assert_array_equal(peak, twins.decode.peaks(heat, 0.0))
         assert peak.any() or (heat < 0.0).all()
 
 
@@ -302,7 +302,7 @@ def test_footprint_sums_agree_with_the_twin(are_logits):
     sums = np.empty((12, 5))
     decode.fill_footprint_sums(values, are_logits, rectangles, 8.0, 1.5, 0.1, sums)
     np.testing.assert_allclose(
-        sums, reference.footprint_sums(values, are_logits, rectangles, 8.0, 1.5, 0.1), rtol=1e-9, atol=1e-9
+        sums, twins.decode.footprint_sums(values, are_logits, rectangles, 8.0, 1.5, 0.1), rtol=1e-9, atol=1e-9
     )
 
 

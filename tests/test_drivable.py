@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from shapely import Point, Polygon
 
 import edgeperc
-import reference
+import twins.drivable
 from edgeperc import Box, PointsError, TopView
 from edgeperc.drivable import (
     _rings,
@@ -51,7 +51,7 @@ def blank() -> NDArray[np.bool_]:
 def test_free_cells_are_counted_from_the_near_edge(cells: NDArray[np.bool_]) -> None:
     free = np.full(cells.shape[1], 99)
     fill_free(cells, free)
-    assert free.tolist() == reference.free_cells(cells)
+    assert free.tolist() == twins.drivable.free_cells(cells)
 
 
 @patient
@@ -59,7 +59,7 @@ def test_free_cells_are_counted_from_the_near_edge(cells: NDArray[np.bool_]) -> 
 def test_the_corridor_follows_the_largest_overlap(cells: NDArray[np.bool_], first: float, width: float) -> None:
     bounds = np.full((len(cells), 2), 99)
     fill_corridor(cells, first, first + width, bounds)
-    np.testing.assert_array_equal(bounds, reference.corridor(cells, first, first + width))
+    np.testing.assert_array_equal(bounds, twins.drivable.corridor(cells, first, first + width))
 
 
 @patient
@@ -69,14 +69,14 @@ def test_connected_cells_share_sides(cells: NDArray[np.bool_], data: st.DataObje
     cells[row, col] = True
     part = np.ones_like(cells)
     mark_connected(cells, row, col, part)
-    np.testing.assert_array_equal(part, reference.connected(cells, row, col))
+    np.testing.assert_array_equal(part, twins.drivable.connected(cells, row, col))
 
 
 @patient
 @given(MASKS)
 def test_rings_walk_every_side_once_with_the_cells_to_the_left(cells: NDArray[np.bool_]) -> None:
     padded = np.pad(cells, 1)
-    sides = reference.sides(padded)
+    sides = twins.drivable.sides(padded)
     corners, ends = np.empty((len(sides), 2), np.int64), np.empty(len(sides) // 4 + 1, np.int64)
     n_rings = fill_rings(padded, corners, ends)
     walked: list[tuple[tuple[int, int], tuple[int, int]]] = []
@@ -105,8 +105,8 @@ def test_simplifying_keeps_what_its_twin_keeps(ring: NDArray[np.float64], tolera
     apart = [math.hypot(x - ring[0, 0], y - ring[0, 1]) for x, y in ring]
     far = apart.index(max(apart))
     line = [*map(tuple, ring.tolist()), tuple(ring[0].tolist())]
-    there = reference.simplified(line[: far + 1], tolerance) if far else [0]
-    back = [far + k for k in reference.simplified(line[far:], tolerance)]
+    there = twins.drivable.simplified(line[: far + 1], tolerance) if far else [0]
+    back = [far + k for k in twins.drivable.simplified(line[far:], tolerance)]
     assert np.flatnonzero(kept).tolist() == sorted({k % len(ring) for k in (*there, *back)})
 
 
@@ -125,7 +125,7 @@ def test_the_polygon_is_the_part_nearest_to_the_sensor(cells: NDArray[np.bool_])
     polygon = Polygon(road.outline, road.holes)
     centres = {(row, col): top_view.to_metres(row, col) for row, col in np.argwhere(cells).tolist()}
     nearest = min(centres, key=lambda cell: math.hypot(*centres[cell]))
-    part = reference.connected(cells, *nearest)
+    part = twins.drivable.connected(cells, *nearest)
     for row in range(cells.shape[0]):
         for col in range(cells.shape[1]):
             inside = polygon.buffer(1e-6).contains(Point(top_view.to_metres(row, col)))

@@ -25,10 +25,10 @@ from edgeperc.evaluation.judge import Judge
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
 from edgeperc.evaluation.tables import BANDS, Record, banded, figures
 from edgeperc.evaluation.unseen import training_scans_of
-from edgeperc.models import model_path, shipped_models
 from edgeperc.perception import Box, Perception, PointLabels, TopView
 from edgeperc.session import Session
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE
+from edgeperc.zoo import model_path, shipped_models
 
 VIEW = TopViewGeometry()
 POINTS = ("background", "car", "pedestrian", "cyclist")

@@ -6,7 +6,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import reference
+import twins.decode
 from edgeperc import geometry
 from edgeperc.errors import PointsError
 from edgeperc.geometry import bounding_rectangles, oriented_iou, suppress_overlaps
@@ -21,8 +21,8 @@ def some_rectangles(rng, n):
 
 
 def shapely_iou(a, b):
-    first = np.array([shapely.Polygon(reference.rectangle_corners(r)) for r in a])[:, None]
-    second = np.array([shapely.Polygon(reference.rectangle_corners(r)) for r in b])[None, :]
+    first = np.array([shapely.Polygon(twins.decode.rectangle_corners(r)) for r in a])[:, None]
+    second = np.array([shapely.Polygon(twins.decode.rectangle_corners(r)) for r in b])[None, :]
     return shapely.area(shapely.intersection(first, second)) / shapely.area(shapely.union(first, second))
 
 
@@ -32,7 +32,7 @@ def test_iou_agrees_with_shapely_and_with_the_twin():
     iou = oriented_iou(a, b)
     assert 0.2 < np.mean(iou > 0.0) < 1.0
     np.testing.assert_allclose(iou, shapely_iou(a, b), atol=1e-12)
-    np.testing.assert_allclose(iou, reference.oriented_iou(a, b), atol=1e-12)
+    np.testing.assert_allclose(iou, twins.decode.oriented_iou(a, b), atol=1e-12)
     np.testing.assert_allclose(iou, oriented_iou(b, a).T, atol=1e-12)
 
 
@@ -48,7 +48,7 @@ def test_iou_of_aligned_touching_and_equal_rectangles(rows):
     iou = oriented_iou(rectangles, rectangles)
     assert ((iou >= 0.0) & (iou <= 1.0)).all()
     np.testing.assert_allclose(np.diag(iou), (rectangles[:, 2:4] > 0.0).all(axis=1), atol=1e-12)
-    np.testing.assert_allclose(iou, reference.oriented_iou(rectangles, rectangles), atol=1e-12)
+    np.testing.assert_allclose(iou, twins.decode.oriented_iou(rectangles, rectangles), atol=1e-12)
 
 
 def test_iou_by_hand():
@@ -94,7 +94,7 @@ def test_suppression_agrees_with_the_twin():
         rectangles, scores = some_rectangles(rng, n), rng.integers(0, 5, n) / 5.0
         for threshold in (0.0, 0.2, 1.0):
             order = np.argsort(-scores, kind="stable")
-            expected = order[reference.nms(rectangles[order], threshold)]
+            expected = order[twins.decode.nms(rectangles[order], threshold)]
             np.testing.assert_array_equal(suppress_overlaps(rectangles, scores, threshold), expected)
 
 
@@ -112,7 +112,7 @@ def test_bounds_hold_the_corners_tightly():
     rng = np.random.default_rng(3)
     rectangles = some_rectangles(rng, 20)
     for bounds, rectangle in zip(bounding_rectangles(rectangles), rectangles, strict=True):
-        corners = reference.rectangle_corners(rectangle)
+        corners = twins.decode.rectangle_corners(rectangle)
         np.testing.assert_allclose(bounds[:2] + bounds[2:4] / 2.0, corners.max(axis=0), atol=1e-12)
         np.testing.assert_allclose(bounds[:2] - bounds[2:4] / 2.0, corners.min(axis=0), atol=1e-12)
         assert bounds[4] == 0.0

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import reference
+import twins.ground
 from edgeperc.errors import PointsError
 from edgeperc.ground import find_ground
 from edgeperc.simulation.drawn import random_scene
@@ -113,7 +113,7 @@ def test_heights_are_the_twins(seed, regions):
     points, _ = street(rng, n=1500, slope_x=0.05, kerb=0.12 * seed, reach=[20.0, 45.0, 70.0, 90.0][seed])
     points[rng.random(len(points)) < 0.02] *= np.float32(3.0)
     points[rng.integers(0, len(points), 5), rng.integers(0, 3, 5)] = np.nan
-    heights, plane = reference.ground_heights(points, 1.73, regions)
+    heights, plane = twins.ground.ground_heights(points, 1.73, regions)
     ground = find_ground(points, regions=regions)
     np.testing.assert_allclose(ground.plane, plane, atol=1e-9)
     np.testing.assert_allclose(ground.height_m, heights, atol=1e-5, rtol=1e-6)
@@ -130,7 +130,7 @@ def test_whatever_comes_the_twin_agrees(rows, regions):
     x, y = np.meshgrid(np.arange(-10.0, 10.0, 2.5), np.arange(-10.0, 10.0, 2.5))
     floor = np.column_stack([x.ravel(), y.ravel(), 0.03 * x.ravel() - 1.7])
     points = np.concatenate([np.array(rows).reshape(-1, 3), floor]).astype(np.float32)
-    heights, plane = reference.ground_heights(points, 1.73, regions)
+    heights, plane = twins.ground.ground_heights(points, 1.73, regions)
     ground = find_ground(points, regions=regions)
     np.testing.assert_allclose(ground.plane, plane, atol=1e-9)
     np.testing.assert_allclose(ground.height_m, heights, atol=1e-4, rtol=1e-6)

@@ -13,7 +13,7 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGES = {
-    "edgeperc.models": REPOSITORY / "models",
+    "edgeperc.zoo": REPOSITORY / "models",
     "edgeperc": REPOSITORY / "edgeperc",
     "edgeperc_export": REPOSITORY / "export",
     "edgeperc_bench": REPOSITORY / "bench",
@@ -23,7 +23,7 @@ PACKAGES = {
 FLOORS = {
     "edgeperc": """
         errors atomic
-        card perception sensors tuning models.__init__
+        card perception sensor tuning zoo.__init__
         geometry
         adapt cluster decode drivable fitness ground points projection refine sensor_fit session
         readers.__init__ readers.tables

@@ -11,11 +11,11 @@ import pytest
 pytest.importorskip("psutil")
 
 from edgeperc import Perceiver
-from edgeperc.models import model_path
 from edgeperc.perception import Box
-from edgeperc.sensors import get_sensor
+from edgeperc.sensor import get_sensor
 from edgeperc.session import Session, golden_input
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
+from edgeperc.zoo import model_path
 from edgeperc_bench import cli
 from edgeperc_bench.accuracy import agreement
 from edgeperc_bench.peers import contenders as peers
@@ -26,7 +26,7 @@ from edgeperc_bench.peers.numpy_pipeline import Rival, overlap
 from edgeperc_bench.peers.projection import measure
 from edgeperc_bench.peers.tables import floor_table, latency_table
 from edgeperc_bench.worker import Answer
-from reference import oriented_iou
+from twins.decode import oriented_iou
 
 NAMES = ("pointseg", "ssadnet")
 

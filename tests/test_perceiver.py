@@ -16,11 +16,11 @@ import edgeperc
 from edgeperc import Box, FitnessError, Perceiver, Perception, PointsError, cluster, ground
 from edgeperc.card import RangeImageGeometry, TopViewGeometry
 from edgeperc.geometry import inside, oriented_iou
-from edgeperc.models import model_path, shipped_models
 from edgeperc.perception import PointLabels
-from edgeperc.sensors import get_sensor
+from edgeperc.sensor import get_sensor
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import SimulatedScan, simulate
+from edgeperc.zoo import model_path, shipped_models
 
 
 @pytest.fixture(scope="module")

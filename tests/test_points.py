@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-import reference
+import twins.points
 from edgeperc.errors import PointsError
 from edgeperc.points import as_points
 from edgeperc.readers.files import read_points
@@ -479,7 +479,7 @@ def test_any_array_gives_points_or_points_error(array):
 def test_lzf_equals_its_twin(packed, size):
     unpacked = np.zeros(size, np.uint8)
     written = fill_unpacked_lzf(np.frombuffer(packed, np.uint8), unpacked)
-    expected = reference.unpack_lzf(packed, size)
+    expected = twins.points.unpack_lzf(packed, size)
     if expected is None:
         assert written == -1
     else:

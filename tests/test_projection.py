@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import reference
+import twins.projection
 from edgeperc import projection
 from edgeperc.card import InputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.errors import CardError, PointsError
 from edgeperc.projection import column_edges, make_projector, row_edges, tabulate
-from edgeperc.sensors import get_sensor
+from edgeperc.sensor import get_sensor
 from edgeperc_bench.peers.projection import contenders
 
 KERNELS = ("mark_top_view", "mark_range_image", "fill_image")
@@ -64,7 +64,7 @@ def check(points, view, spec=None, offset=0.0, scale=1.0):
     projector.project(np.full((3, 4), 7.0, np.float32))  # leftovers must not shine through
     compiled = projector.project(points, offset, scale)
     edges = (row_edges(view), column_edges(view)) if view.kind == "range_image" else ()
-    assert_same(compiled, reference.project(points, view, edges, spec, offset, scale))
+    assert_same(compiled, twins.projection.project(points, view, edges, spec, offset, scale))
     with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
         for name in KERNELS:
             kernel = getattr(projection, name)

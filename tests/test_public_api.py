@@ -13,7 +13,7 @@ import pytest
 
 import edgeperc
 import edgeperc.errors
-import edgeperc.models
+import edgeperc.zoo
 from edgeperc.errors import ModelFileError
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -40,7 +40,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         edgeperc.Perciever  # noqa: B018
 
 
-@pytest.mark.parametrize("module_name", ["edgeperc", "edgeperc.models", *MODULES])
+@pytest.mark.parametrize("module_name", ["edgeperc", "edgeperc.zoo", *MODULES])
 def test_what_a_module_exports_is_there_and_documented(module_name: str) -> None:
     module = importlib.import_module(module_name)
     assert module.__doc__, f"{module_name} does not say what it is"
@@ -70,8 +70,8 @@ def test_the_version_is_the_changelogs_newest() -> None:
 
 
 def test_shipped_models_are_found_by_name() -> None:
-    for name in edgeperc.models.shipped_models():
-        path = edgeperc.models.model_path(name)
+    for name in edgeperc.zoo.shipped_models():
+        path = edgeperc.zoo.model_path(name)
         assert path.is_file()
         assert path.name == f"{name}.onnx"
 
@@ -79,6 +79,6 @@ def test_shipped_models_are_found_by_name() -> None:
 @pytest.mark.parametrize("name", ["pointsegg", "", "../models/pointseg", "pointseg.onnx"])
 def test_an_unknown_model_lists_those_there_are(name: str) -> None:
     with pytest.raises(ModelFileError) as caught:
-        edgeperc.models.model_path(name)
-    for shipped in edgeperc.models.shipped_models():
+        edgeperc.zoo.model_path(name)
+    for shipped in edgeperc.zoo.shipped_models():
         assert shipped in str(caught.value)

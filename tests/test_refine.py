@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import reference
+import twins.refine
 from edgeperc import refine
 from edgeperc.errors import PointsError
 from edgeperc.refine import label_points, remove_outliers
@@ -137,7 +137,7 @@ def test_outliers_agree_with_the_twin(shape, full_turn):
     for n_classes in (2, 4):
         points, _, index, labels = random_scene(rng, shape, n_classes)
         cleaned = remove_outliers(points, index, labels, CLASSES, full_turn=full_turn)
-        np.testing.assert_array_equal(cleaned, reference.without_outliers(points, index, labels, RADII, full_turn))
+        np.testing.assert_array_equal(cleaned, twins.refine.without_outliers(points, index, labels, RADII, full_turn))
         assert ((cleaned == labels) | (cleaned == 0)).all()
         again = remove_outliers(points, index, labels, CLASSES, full_turn=full_turn)
         np.testing.assert_array_equal(again, cleaned)
@@ -147,7 +147,7 @@ def test_a_component_larger_than_what_is_tested_agrees_with_the_twin():
     points, _, index, _ = random_scene(np.random.default_rng(8), (24, 64))
     labels = np.full(index.shape, 1, dtype=np.uint8)
     cleaned = remove_outliers(points, index, labels, CLASSES)
-    np.testing.assert_array_equal(cleaned, reference.without_outliers(points, index, labels, RADII, False))
+    np.testing.assert_array_equal(cleaned, twins.refine.without_outliers(points, index, labels, RADII, False))
 
 
 def test_one_point_no_point_and_points_that_are_not_finite():
@@ -199,7 +199,7 @@ def test_of_equal_differences_the_pixel_above_then_left_has_the_vote():
     pixel = np.array([*range(9), 4], dtype=np.int32)
     labels = np.array([[1, 1, 2], [2, 2, 3], [3, 3, 3]], dtype=np.uint8)
     assert label_points(points, pixel, index, labels)[-1] == 2
-    assert reference.point_labels(points, pixel, index, labels, False)[-1] == 2
+    assert twins.refine.point_labels(points, pixel, index, labels, False)[-1] == 2
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 1), (16, 40)])
@@ -208,7 +208,7 @@ def test_point_labels_agree_with_the_twin(shape, full_turn):
     points, pixel, index, labels = random_scene(np.random.default_rng(shape[0]), shape)
     found = label_points(points, pixel, index, labels, full_turn=full_turn)
     assert found.dtype == np.uint8
-    np.testing.assert_array_equal(found, reference.point_labels(points, pixel, index, labels, full_turn))
+    np.testing.assert_array_equal(found, twins.refine.point_labels(points, pixel, index, labels, full_turn))
     assert (found[pixel < 0] == 0).all()
 
 

@@ -12,9 +12,9 @@ import pytest
 import edgeperc.session as session_module
 from edgeperc.card import CARD_KEY
 from edgeperc.errors import CardError, CardMismatchError, InferenceError, ModelFileError, ProviderError
-from edgeperc.models import model_path, shipped_models
 from edgeperc.session import PROVIDERS, Session, available_providers, golden_input
 from edgeperc.tuning import fingerprint, settings_path, write_settings
+from edgeperc.zoo import model_path, shipped_models
 
 
 def edited(tmp_path: Path, name: str, *changes: tuple[bytes, bytes]) -> Path:

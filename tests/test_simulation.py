@@ -10,11 +10,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-import reference
+import twins.simulation
 from edgeperc.card import TopViewGeometry
 from edgeperc.errors import PointsError
 from edgeperc.perception import Box
-from edgeperc.sensors import SensorProfile
+from edgeperc.sensor import SensorProfile
 from edgeperc.simulation import raycast as simulation
 from edgeperc.simulation.drawn import ENVIRONMENTS, random_scene
 from edgeperc.simulation.layouts import scene_from_boxes
@@ -88,7 +88,7 @@ def cast_both(scene: Scene, pose: np.ndarray, elevations: np.ndarray, azimuths: 
         placed, bounds, starts, rows, scene.strips, scene.terrain, scene.tile, pose,
         elevations, azimuths, reach, key, ranges, hits, exits, cosines,
     )  # fmt: skip
-    return ranges, hits, cosines, *reference.cast(placed, scene, pose, elevations, azimuths, reach, key)
+    return ranges, hits, cosines, *twins.simulation.cast(placed, scene, pose, elevations, azimuths, reach, key)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -132,7 +132,7 @@ def test_bounds_hold_every_ray_that_hits(seed: int, kind: int) -> None:
     for _ in range(40):
         target = center + rng.normal(0, 0.3, 3) * size
         direction = target / np.linalg.norm(target)
-        found = reference.crossing(row[0], direction)
+        found = twins.simulation.crossing(row[0], direction)
         enter, leave, _ = simulation._crossing(row[0], *direction)
         assert (found is None) == (enter > leave)
         if found is None or found[0] <= 0:
@@ -149,15 +149,15 @@ def test_ground_equals_twin() -> None:
         scene = random_scene(seed)
         xy = rng.uniform(-60, 60, (300, 2))
         fast = np.array([ground_at(scene.strips, scene.terrain, scene.tile, x, y)[:2] for x, y in xy])
-        slow = np.stack(reference.ground(scene, xy[:, 0], xy[:, 1]), axis=1)
+        slow = np.stack(twins.simulation.ground(scene, xy[:, 0], xy[:, 1]), axis=1)
         np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-9)
 
 
 def test_draws_equal_twin() -> None:
     for value in (0, 1, 2**63, 2**64 - 1):
         bits = np.uint64(simulation._mixed(np.uint64(value)))
-        assert int(bits) == reference.mixed(value)
-        assert simulation._uniform(bits) == pytest.approx(reference.uniform_draw(int(bits)), abs=1e-15)
+        assert int(bits) == twins.simulation.mixed(value)
+        assert simulation._uniform(bits) == pytest.approx(twins.simulation.uniform_draw(int(bits)), abs=1e-15)
     normals = [simulation._normal(np.uint64(simulation._mixed(np.uint64(k)))) for k in range(4000)]
     assert abs(np.mean(normals)) < 0.06
     assert abs(np.std(normals) - 1.0) < 0.05
@@ -335,7 +335,7 @@ def test_top_view_labels() -> None:
         for col in range(0, view.width, 3):
             x, y = view.x_range_m[1] - (row + 0.5) * view.cell_m, view.y_range_m[1] - (col + 0.5) * view.cell_m
             here = np.array([[x, y, 0.0]])
-            expected = int(reference.ground(scan.scene, np.array([x]), np.array([y]))[1][0] < 0)
+            expected = int(twins.simulation.ground(scan.scene, np.array([x]), np.array([y]))[1][0] < 0)
             for each in (car, truck):
                 if in_box(here, replace(each, center=(*each.center[:2], 0.0)), 0.0)[0]:
                     expected = TOP_VIEW_CLASSES.index(each.label)

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import edgeperc
-import reference
+import twins.tracking
 from edgeperc import Box, StampError, Tracker, TrackingError
 from edgeperc.cli import main as cli
 from edgeperc.evaluation.datasets import scan_hash
@@ -32,7 +32,7 @@ from edgeperc.evaluation.tracking_metrics import (
 )
 from edgeperc.perception import Perception
 from edgeperc.records import _box_record
-from edgeperc.sensors import get_sensor
+from edgeperc.sensor import get_sensor
 from edgeperc.tracking.egomotion import fit_motion, nearest_detection, support
 from edgeperc.tracking.imm import fill_combined, fill_interaction, fill_mode_probabilities
 from edgeperc.tracking.jpda import MAX_EVENTS, fill_association, fill_by_propagation, fill_likelihoods
@@ -95,7 +95,7 @@ def test_predictions_are_those_of_the_twin(n: int) -> None:
     for dt in (0.0, 0.1, 1.3):
         means, predicted = predict(states, covariance, noise, dt)
         for i, mode in np.ndindex(n, 3):
-            mean, cov = reference.unscented_prediction(mode, states[i, mode], covariance[i, mode], NOISE, dt)
+            mean, cov = twins.tracking.unscented_prediction(mode, states[i, mode], covariance[i, mode], NOISE, dt)
             np.testing.assert_allclose(means[i, mode], mean, atol=1e-9)
             np.testing.assert_allclose(predicted[i, mode], cov, atol=1e-9)
 
@@ -109,7 +109,7 @@ def test_updates_are_those_of_the_twin(n: int, m: int) -> None:
     sigmas = np.tile(SIGMAS, (n, 1))
     states, covariance = update(means, predicted, detections, sigmas, beta)
     for i, mode in np.ndindex(n, 3):
-        mean, cov = reference.pda_update(means[i, mode], predicted[i, mode], SIGMAS, detections, beta[i, mode])
+        mean, cov = twins.tracking.pda_update(means[i, mode], predicted[i, mode], SIGMAS, detections, beta[i, mode])
         np.testing.assert_allclose(states[i, mode], mean, atol=1e-9)
         np.testing.assert_allclose(covariance[i, mode], cov, atol=1e-9)
 
@@ -121,7 +121,7 @@ def filterpy_filter(mode: int, state: np.ndarray, covariance: np.ndarray, dt: fl
         dim_x=5,
         dim_z=3,
         dt=dt,
-        fx=lambda x, dt: reference.moved(mode, x, dt),
+        fx=lambda x, dt: twins.tracking.moved(mode, x, dt),
         hx=lambda x: x[[0, 1, 3]],
         points=kalman.JulierSigmaPoints(5, kappa=1.0),
     )
@@ -138,14 +138,14 @@ def test_each_motion_filters_as_filterpys(mode: int) -> None:
     ours, spread = np.tile(state, (1, 3, 1)), np.tile(covariance, (1, 3, 1, 1))
     truth = state.copy()
     for _ in range(50):
-        truth = reference.moved(CTRV, truth, dt)
+        truth = twins.tracking.moved(CTRV, truth, dt)
         detection = truth[[0, 1, 3]] + rng.normal(0.0, 1.0, 3) * [0.1, 0.1, 0.02]
-        theirs.Q = reference.process_noise(mode, theirs.x[3], NOISE, dt)
+        theirs.Q = twins.tracking.process_noise(mode, theirs.x[3], NOISE, dt)
         theirs.predict()
         means, predicted = predict(ours, spread, NOISE[None], dt)
         np.testing.assert_allclose(means[0, mode], theirs.x, atol=1e-6)
         np.testing.assert_allclose(predicted[0, mode], theirs.P, atol=1e-6)
-        _, S = reference.innovation(means[0, mode], predicted[0, mode], SIGMAS, detection)
+        _, S = twins.tracking.innovation(means[0, mode], predicted[0, mode], SIGMAS, detection)
         theirs.update(detection, R=S - predicted[0, mode][np.ix_([0, 1, 3], [0, 1, 3])])
         if abs(detection[2] - means[0, mode, 3]) > 3.0 * math.sqrt(S[2, 2]):
             pytest.fail("the reference is to stay within what is never cut")
@@ -163,7 +163,7 @@ def test_a_straight_line_is_filtered_as_by_filterpys_linear_filter() -> None:
     theirs.R = np.diag(SIGMAS**2)
     noise = NOISE * [1, 0, 1, 0, 1]  # a heading that is known and stays makes the motion linear
     theirs.x, theirs.P = np.array([0.0, 1.0, 6.0, 0.0, 0.0]), np.diag([1.0, 1.0, 9.0, 0.0, 0.0])
-    theirs.Q = reference.process_noise(CONSTANT_VELOCITY, 0.0, noise, dt)
+    theirs.Q = twins.tracking.process_noise(CONSTANT_VELOCITY, 0.0, noise, dt)
     ours, spread = np.tile(theirs.x, (1, 3, 1)), np.tile(theirs.P, (1, 3, 1, 1))
     for k in range(60):
         detection = np.array([0.65 * k + 0.1 * math.sin(k), 1.0 + 0.1 * math.cos(k), 0.0])
@@ -189,7 +189,7 @@ def test_all_motions_together_are_filterpys_imm() -> None:
     for k in range(60):
         truth[4] = 0.4 if 20 <= k < 40 else 0.0
         truth[2] = 5.0 if k < 40 else 0.0
-        truth = reference.moved(CTRV, truth, dt)
+        truth = twins.tracking.moved(CTRV, truth, dt)
         detection = truth[[0, 1, 3]] + rng.normal(0.0, 1.0, 3) * [0.05, 0.05, 0.02]
 
         mixed, mixed_spread = np.empty_like(ours), np.empty_like(spread)
@@ -219,10 +219,10 @@ def test_all_motions_together_are_filterpys_imm() -> None:
         # filterpy mixes before its filters predict, and R lies along the predicted heading.
         headings = [sum(w * f.x[3] for w, f in zip(column, filters, strict=True)) for column in theirs.omega.T]
         for mode, one in enumerate(filters):
-            one.Q = reference.process_noise(mode, headings[mode], NOISE, dt)
+            one.Q = twins.tracking.process_noise(mode, headings[mode], NOISE, dt)
         theirs.predict()
         for one in filters:
-            _, S = reference.innovation(one.x, one.P, SIGMAS, detection)
+            _, S = twins.tracking.innovation(one.x, one.P, SIGMAS, detection)
             one.R = S - one.P[np.ix_([0, 1, 3], [0, 1, 3])]
         theirs.update(detection)
         np.testing.assert_allclose(modes[0], theirs.mu, atol=1e-6)
@@ -246,15 +246,15 @@ def test_the_imm_is_its_twin(n: int) -> None:
     shares, modes = np.empty((n, 3, 5)), np.empty((n, 3))
     fill_mode_probabilities(prior, likelihoods, beta, shares, modes)
     for i in range(n):
-        twin = reference.interaction(states[i], spread[i], probabilities[i], stay[i])
+        twin = twins.tracking.interaction(states[i], spread[i], probabilities[i], stay[i])
         for got, wanted in zip((mixed[i], mixed_spread[i], prior[i]), twin, strict=True):
             np.testing.assert_allclose(got, wanted, atol=1e-9)
         for got, wanted in zip(
-            (state[i], covariance[i]), reference.combination(states[i], spread[i], probabilities[i]), strict=True
+            (state[i], covariance[i]), twins.tracking.combination(states[i], spread[i], probabilities[i]), strict=True
         ):
             np.testing.assert_allclose(got, wanted, atol=1e-9)
         for got, wanted in zip(
-            (shares[i], modes[i]), reference.mode_probabilities(prior[i], likelihoods[i], beta[i]), strict=True
+            (shares[i], modes[i]), twins.tracking.mode_probabilities(prior[i], likelihoods[i], beta[i]), strict=True
         ):
             np.testing.assert_allclose(got, wanted, atol=1e-9)
 
@@ -277,7 +277,7 @@ def test_likelihoods_are_those_of_the_twin(n: int, m: int) -> None:
     sigmas, prior, odds = np.tile(SIGMAS, (n, 1)), rng.dirichlet(np.ones(3), n), rng.uniform(1.0, 9.0, n)
     gates, got, weights = np.full(n, 3.0), np.empty((n, 3, m)), np.empty((n, m))
     fill_likelihoods(means, predicted, sigmas, prior, odds, groups, detections, theirs, gates, got, weights)
-    wanted = reference.likelihoods(means, predicted, sigmas, groups, detections, theirs, gates)
+    wanted = twins.tracking.likelihoods(means, predicted, sigmas, groups, detections, theirs, gates)
     np.testing.assert_allclose(got, wanted, atol=1e-12)
     np.testing.assert_allclose(weights, odds[:, None] * np.einsum("nk,nkm->nm", prior, wanted), atol=1e-12)
     detections[:1] = np.nan  # the tracker never lets it in; it must not spread either way
@@ -292,7 +292,7 @@ def test_association_is_the_sum_over_all_joint_events(n: int, m: int, seed: int)
     weights = np.exp(rng.normal(0.0, 3.0, (n, m))) * (rng.random((n, m)) < 0.7)
     beta, n_approximated = associate(weights)
     assert n_approximated == 0
-    np.testing.assert_allclose(beta, reference.association(weights), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(beta, twins.tracking.association(weights), rtol=1e-9, atol=1e-12)
 
 
 @settings(max_examples=60, deadline=None)
@@ -304,9 +304,9 @@ def test_belief_propagation_is_its_twin_and_near_the_truth(n: int, m: int, seed:
     assert n_approximated == n
     np.testing.assert_allclose(beta.sum(axis=1), 1.0, atol=1e-9)
     assert (beta[:, 1:].sum(axis=0) < 1.0 + 1e-5).all()
-    twin = reference.propagation(weights)
+    twin = twins.tracking.propagation(weights)
     np.testing.assert_allclose(beta, twin, atol=1e-4)
-    exact = reference.association(weights)
+    exact = twins.tracking.association(weights)
     assert np.abs(beta - exact).max() < 0.2
     if (weights > 0).sum() < n + m - len(clusters(weights)) + 1:  # no loop: nothing is approximated
         np.testing.assert_allclose(beta, exact, atol=1e-5)
@@ -325,7 +325,7 @@ def test_belief_propagation_is_mostly_near() -> None:
     rng, gaps = rng_of(3), []
     for _ in range(100):
         weights = np.exp(rng.normal(1.0, 2.0, (4, 4))) * (rng.random((4, 4)) < 0.6)
-        gaps.append(np.abs(associate(weights, 0)[0] - reference.association(weights)).mean())
+        gaps.append(np.abs(associate(weights, 0)[0] - twins.tracking.association(weights)).mean())
     assert np.mean(gaps) < 0.01
 
 
@@ -339,7 +339,7 @@ def test_clusters_are_solved_apart_and_large_ones_approximated() -> None:
     assert n_approximated == 200
     np.testing.assert_allclose(beta.sum(axis=1), 1.0)
     np.testing.assert_allclose(beta[200:230, 0], 0.25)
-    np.testing.assert_allclose(beta[230:, [0, 231, 232]], reference.association(weights[230:, 230:]))
+    np.testing.assert_allclose(beta[230:, [0, 231, 232]], twins.tracking.association(weights[230:, 230:]))
 
 
 def test_two_certain_pairs_do_not_mix() -> None:
@@ -364,12 +364,12 @@ def test_support_is_its_twin_and_the_fit_its_best(n: int, m: int) -> None:
     prior, spread = np.array([0.5, 0.0, 0.02]), np.array([1.0, 0.1, 0.01])
     for _ in range(5):
         motion = prior + rng.normal(0.0, 1.0, 3) * [1.0, 0.3, 0.1]
-        wanted = reference.motion_support(*places, prior, spread, motion)
+        wanted = twins.tracking.motion_support(*places, prior, spread, motion)
         assert support(*places, prior, spread, motion) == pytest.approx(wanted)
     motion, covariance = np.empty(3), np.empty((3, 3))
     n_pairs = fit_motion(*places, prior, spread, motion, covariance)
-    best = reference.motion_support(*places, prior, spread, motion)
-    assert best >= reference.motion_support(*places, prior, spread, prior) - 1e-6
+    best = twins.tracking.motion_support(*places, prior, spread, motion)
+    assert best >= twins.tracking.motion_support(*places, prior, spread, prior) - 1e-6
     assert (np.linalg.eigvalsh(covariance) > 0.0).all()
     assert n_pairs <= n
     if n == 0 or m == 0:
@@ -738,15 +738,15 @@ def test_shapes_hiding_and_rivals_are_those_of_the_twins(n: int, m: int) -> None
     beta, shapes, sigmas = rng.dirichlet(np.ones(m + 1), n), rng.uniform(1, 3, (m, 4)), rng.uniform(0.1, 1, (n, 4))
     shape, variance, front = rng.uniform(1, 3, (n, 4)), rng.uniform(0.1, 1, (n, 4)), rng.uniform(-10, 10, n)
     walk = np.array([0.1, 0.2, 0.3, 0.4])
-    wanted = reference.updated_shapes(state, beta, detections, shapes, sigmas, walk, shape, variance, front)
+    wanted = twins.tracking.updated_shapes(state, beta, detections, shapes, sigmas, walk, shape, variance, front)
     update_shapes(state, beta, detections, shapes, sigmas, walk, shape, variance, front)
     for got, want in zip((shape, variance, front), wanted, strict=True):
         np.testing.assert_allclose(got, want)
     seen, sensor, shares = rng.random(n) < 0.7, np.array([3.0, -8.0]), np.empty(n)
     fill_hidden(10.0 * state, shape, seen, sensor, shares)
-    np.testing.assert_allclose(shares, reference.hidden(10.0 * state, shape, seen, sensor))
+    np.testing.assert_allclose(shares, twins.tracking.hidden(10.0 * state, shape, seen, sensor))
     strength, told = rng.permutation(n).astype(float), rng.random(n) < 0.8
-    wanted_rows = reference.rivals(state, shape, strength, told)
+    wanted_rows = twins.tracking.rivals(state, shape, strength, told)
     mark_rivals(state, shape, strength, told)
     assert np.flatnonzero(told).tolist() == wanted_rows
 
@@ -759,7 +759,7 @@ def test_births_lives_and_views_are_those_of_the_twins(n: int, m: int) -> None:
     of = tracker._classes[kinds]
     detections, shapes = rng.normal(0.0, 9.0, (n, 3)), rng.uniform(0.5, 4.0, (n, 4))
     born = kinds, of, detections, shapes, rng.normal(0.0, 3.0, n), rng.uniform(0.0, 60.0, n)
-    wanted = reference.newborn(5, *born, MOST_EXISTENCE, TRACK)
+    wanted = twins.tracking.newborn(5, *born, MOST_EXISTENCE, TRACK)
     tracks = np.zeros(n, TRACK)
     fill_newborn(5, *born, tracks)
     assert_same_tracks(tracks, wanted)
@@ -767,13 +767,13 @@ def test_births_lives_and_views_are_those_of_the_twins(n: int, m: int) -> None:
     for _ in range(4):
         beta = rng.dirichlet(np.full(m + 1, 0.2), n)
         seen = beta, rng.random(n), rng.normal(0.0, 3.0, m), rng.integers(0, 3, m), 0.1
-        wanted = reference.lives(tracks, of, *seen, MOST_HIDDEN, EXPECTED, MOST_EXISTENCE)
+        wanted = twins.tracking.lives(tracks, of, *seen, MOST_HIDDEN, EXPECTED, MOST_EXISTENCE)
         update_lives(tracks, of, *seen)
         assert_same_tracks(tracks, wanted)
 
     pose = np.array([[0.8, -0.6, 0, 3.0], [0.6, 0.8, 0, -4.0], [0, 0, 1, 0], [0, 0, 0, 1]])
     told = rng.random(n) < 0.8
-    stays = told & ((tracks["misses"] == 0) | reference.in_view(tracks, pose, 0.9, -0.7))
+    stays = told & ((tracks["misses"] == 0) | twins.tracking.in_view(tracks, pose, 0.9, -0.7))
     mark_out_of_view(tracks, pose, 0.9, -0.7, told)
     assert told.tolist() == stays.tolist()
 
@@ -848,7 +848,7 @@ def test_matches_are_as_many_as_can_be() -> None:
 def test_breaks_are_counted_as_the_twin_does(frames: list[tuple[int, int, bool]]) -> None:
     truth, ids = (np.array([frame[k] for frame in frames], np.int64) for k in (0, 1))
     ignored = np.array([frame[2] for frame in frames], bool)
-    assert count_breaks(truth, ids, ignored) == reference.breaks(truth, ids, ignored)
+    assert count_breaks(truth, ids, ignored) == twins.tracking.breaks(truth, ids, ignored)
 
 
 def test_breaks_by_hand() -> None:
@@ -868,7 +868,7 @@ def test_breaks_by_hand() -> None:
 @given(st.lists(st.floats(-5.0, 5.0), max_size=120), st.integers(0, 40))
 def test_recall_thresholds_are_those_of_kittis_walk(scores: list[float], n_missed: int) -> None:
     thresholds, recalls = recall_thresholds(scores, len(scores) + n_missed)
-    wanted, wanted_recalls = reference.thresholds_by_walking(scores, len(scores) + n_missed)
+    wanted, wanted_recalls = twins.tracking.thresholds_by_walking(scores, len(scores) + n_missed)
     assert thresholds.tolist() == wanted
     np.testing.assert_allclose(recalls, wanted_recalls)
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgeperc import EdgepercError
-from edgeperc.models import SHIPPED
 from edgeperc.session import PRECISIONS, PROVIDERS, available_providers
 from edgeperc.tuning import write_settings
+from edgeperc.zoo import DEFAULT
 
 from .. import report
 from ..options import SINGLE_STREAM
@@ -41,7 +41,7 @@ def matrix_command(arguments: argparse.Namespace) -> int:
             document["skipped"].append(words)
             live.say(f"skipped: {words}")
         given = prepare_input(arguments, Path(folder), document, live)
-        for model in dict.fromkeys(arguments.model or SHIPPED):
+        for model in dict.fromkeys(arguments.model or DEFAULT):
             base = Job((model,), sensor=arguments.sensor)
             right = reference(base, given.files)
             for provider in providers:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from edgeperc.models import SHIPPED
+from edgeperc.zoo import DEFAULT
 
 from .. import context, loadgen, report
 from ..options import DEFAULT_SCENARIOS, SINGLE_STREAM
@@ -38,7 +38,7 @@ def run_command(arguments: argparse.Namespace) -> int:
             for name in wanted
             if name == SINGLE_STREAM or name.startswith("paced")
         )
-        job = Job(tuple(arguments.model or SHIPPED), arguments.provider, arguments.threads, arguments.sensor, arriving)
+        job = Job(tuple(arguments.model or DEFAULT), arguments.provider, arguments.threads, arguments.sensor, arriving)
         setting = new_setting(job)
         document["settings"].append(setting)
         live.say(f"{arguments.repeats} repeats of {', '.join(s.name for s in arriving) or 'nothing but the start'}")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from edgeperc.models import SHIPPED
+from edgeperc.zoo import DEFAULT
 
 from .. import report
 from ..samples import percentile, trend
@@ -45,7 +45,7 @@ def scaling_command(arguments: argparse.Namespace) -> int:
             (kind, n): inputs.store(Path(folder), f"{kind}{n}", make(n, arguments.sensor)) for kind, n, make in makers
         }
         scenarios = {key: Scenario(f"{key[1]:,} {key[0]}", (file,), limits) for key, file in files.items()}
-        job = Job(tuple(arguments.model or SHIPPED), arguments.provider, arguments.threads, arguments.sensor)
+        job = Job(tuple(arguments.model or DEFAULT), arguments.provider, arguments.threads, arguments.sensor)
         setting = new_setting(job)
         document["settings"].append(setting)
         repeat(setting, replace(job, scenarios=tuple(scenarios.values())), arguments.repeats, document, live)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from edgeperc.models import SHIPPED
+from edgeperc.zoo import DEFAULT
 
 from ..samples import trend
 from ..scenarios import Limits
@@ -44,7 +44,7 @@ def soak_command(arguments: argparse.Namespace) -> int:
             Limits(arguments.scans - settling, 0.0, settling, max(1, arguments.scans // MEMORY_SAMPLES)),
         )
         job = Job(
-            tuple(arguments.model or SHIPPED), arguments.provider, arguments.threads, arguments.sensor, (scenario,)
+            tuple(arguments.model or DEFAULT), arguments.provider, arguments.threads, arguments.sensor, (scenario,)
         )
         setting = new_setting(job)
         document["settings"].append(setting)

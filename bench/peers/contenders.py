@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from edgeperc import ModelCard
-from edgeperc.models import SHIPPED, model_path, shipped_models
 from edgeperc.projection import make_projector
-from edgeperc.sensors import get_sensor
+from edgeperc.sensor import get_sensor
 from edgeperc.session import Session, available_providers
+from edgeperc.zoo import DEFAULT, model_path, shipped_models
 
 from ..samples import percentile
 from ..worker import Answer
@@ -96,7 +96,7 @@ def absent(contender: Contender) -> str:
 
 def default_models() -> list[str]:
     """The shipped models that are measured unless others are named."""
-    names = [f"{name}{suffix}" for suffix in ("", "-edge", "-edge-int8") for name in SHIPPED]
+    names = [f"{name}{suffix}" for suffix in ("", "-edge", "-edge-int8") for name in DEFAULT]
     return [name for name in names if name in shipped_models()]
 
 
@@ -132,7 +132,7 @@ def groups(models: Sequence[str], provider: str, folder: Path, scan: Path, senso
         for engine in OPENVINO:
             alone.append(Contender(f"OpenVINO API {engine[9:]}, network alone", "network", engine, (path,), (), image))
         peaks = [Contender(f"peak {engine}", "peak", engine) for engine in (*PEAKS, "copy")]
-        full = [model for model in views[card.view.kind] if name.startswith(f"{model[0]}-edge") and model[0] in SHIPPED]
+        full = [model for model in views[card.view.kind] if name.startswith(f"{model[0]}-edge") and model[0] in DEFAULT]
         told[f"Scan to answer: {name}"] = [*whole([(name, path, card)], provider), *larger(full), *alone, *peaks]
     for pair in zip(views["range_image"], views["top_view"], strict=False):
         told[f"Scan to answer: {pair[0][0]} and {pair[1][0]}"] = whole(pair, provider)

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from edgeperc.cluster import find_clusters
 from edgeperc.ground import find_ground
 from edgeperc.readers.files import read_points
-from edgeperc.sensors import get_sensor
+from edgeperc.sensor import get_sensor
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
 

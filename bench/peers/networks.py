@@ -8,8 +8,8 @@ from typing import Any
 
 from edgeperc import ModelError
 from edgeperc.card import TopViewGeometry
-from edgeperc.models import model_path
 from edgeperc.session import Session
+from edgeperc.zoo import model_path
 
 __all__ = ["resized"]
 

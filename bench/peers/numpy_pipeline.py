@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from edgeperc import Box, PointLabels, TopView
 from edgeperc.card import ModelCard, TopViewGeometry
 from edgeperc.geometry import draw_footprints
-from edgeperc.sensors import SensorProfile
+from edgeperc.sensor import SensorProfile
 
 from ..worker import Answer
 from .engines import Engine

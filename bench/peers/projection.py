@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from edgeperc.card import InputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.projection import RangeImageProjector, TopViewProjector, column_edges, row_edges, tabulate
 from edgeperc.readers.files import read_points
-from edgeperc.sensors import get_sensor
+from edgeperc.sensor import get_sensor
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
 

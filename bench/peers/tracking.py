@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from edgeperc import Box, Tracker
 from edgeperc.evaluation.tracking import CLASSES, FRAME_S, read_sequence, sequence_names, sequence_scans
-from edgeperc.sensors import get_sensor
+from edgeperc.sensor import get_sensor
 
 __all__ = ["crossing", "every_second_beam", "main"]
 

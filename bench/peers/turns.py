@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import ModelCard, Perceiver
-from edgeperc.sensors import get_sensor
+from edgeperc.sensor import get_sensor
 from edgeperc.session import Session
 
 from ..context import conditions, rss_mb, spoilers

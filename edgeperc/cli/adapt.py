@@ -16,8 +16,8 @@ __all__ = ["fit_command"]
 def fit_command(arguments: argparse.Namespace) -> int:
     """``edgeperc adapt fit``: fit a remission function and write the sensor profile."""
     from ..readers.captures import read_scans
+    from ..sensor import get_sensor
     from ..sensor_fit import fit_sensor
-    from ..sensors import get_sensor
 
     paths, empty = find_scans(arguments.scans)
     if empty:

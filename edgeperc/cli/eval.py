@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..errors import PointsError
-from ..models import SHIPPED
+from ..zoo import DEFAULT
 from .output import (
     Progress,
     counted_progress,
@@ -59,7 +59,7 @@ def eval_command(arguments: argparse.Namespace) -> int:
     with counted_progress() as on_scan:
         figures, mistakes = evaluate(
             arguments.datasets,
-            arguments.model or SHIPPED,
+            arguments.model or DEFAULT,
             split=arguments.split,
             fold=arguments.fold,
             road_by=arguments.road_by,

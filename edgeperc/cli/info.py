@@ -50,8 +50,8 @@ def _is_model(thing: str) -> bool:
 
 
 def _open(thing: str) -> Session:
-    from ..models import model_path
     from ..session import Session
+    from ..zoo import model_path
 
     return Session(thing if Path(thing).suffix == ".onnx" else model_path(thing), "cpu")
 
@@ -111,10 +111,10 @@ def _scan_rows(path: Path, sensor_name: str) -> list[tuple[str, str]]:
 
     from ..adapt import render
     from ..fitness import FitnessProfile, check_fitness
-    from ..models import model_path, shipped_models
     from ..readers.captures import read_scans
-    from ..sensors import get_sensor
+    from ..sensor import get_sensor
     from ..session import Session
+    from ..zoo import model_path, shipped_models
 
     sensor = get_sensor(sensor_name)
     _, points = next(read_scans(path))  # of several the first

@@ -19,7 +19,7 @@ from pathlib import Path
 # What takes long to import (numba's kernels, onnxruntime, matplotlib) is imported where a command needs it.
 from .. import __version__
 from ..errors import EdgepercError
-from ..models import SHIPPED
+from ..zoo import DEFAULT
 from .adapt import fit_command
 from .demo import demo_command
 from .eval import eval_command, eval_sensors_command, eval_tracking_command
@@ -93,7 +93,7 @@ def _parser() -> argparse.ArgumentParser:
         "--model",
         action="append",
         metavar="NAME",
-        help=f"a shipped model or an .onnx with a card; may be repeated (default: {' and '.join(SHIPPED)})",
+        help=f"a shipped model or an .onnx with a card; may be repeated (default: {' and '.join(DEFAULT)})",
     )
     running.add_argument("--provider", default="auto", metavar="P", help="cpu, openvino, cuda, ... (default: auto)")
     running.add_argument("--threads", type=_positive, metavar="N", help="threads inside a model (default: its choice)")

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import EdgepercError, MissingExtraError, ModelError, PointsError
-from ..models import SHIPPED
 from ..records import scan_record
+from ..zoo import DEFAULT
 from .output import Progress, complain, many, one_line, require_matplotlib, require_pillow
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def make_perceiver(
 
     try:
         return Perceiver(
-            arguments.model or SHIPPED,
+            arguments.model or DEFAULT,
             sensor=sensor,
             provider=arguments.provider,
             n_threads=arguments.threads,

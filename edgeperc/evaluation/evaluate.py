@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import PointsError
-from ..models import SHIPPED
 from ..perceiver import BoxesFrom
 from ..simulation.samples import FIRST_SEED
+from ..zoo import DEFAULT
 from .datasets import KittiObjects, SemanticKitti
 from .judge import Judge, Truth
 from .mistakes import Mistakes
@@ -28,7 +28,7 @@ N_WORST = 20
 
 def evaluate(
     datasets: Sequence[str | Path],
-    models: Sequence[str | Path] = SHIPPED,
+    models: Sequence[str | Path] = DEFAULT,
     *,
     split: str | None = None,
     fold: int | None = None,

@@ -16,13 +16,13 @@ from ..card import TopViewGeometry
 from ..decode import decode_classes
 from ..errors import EdgepercError, ModelError
 from ..geometry import draw_footprints, inside
-from ..models import model_path
 from ..perceiver import BoxesFrom, Perceiver
 from ..perception import Box, Perception, PointLabels, TopView
 from ..projection import make_projector
 from ..session import Session
 from ..simulation.samples import IGNORE, POINT_CLASS_OF, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES
+from ..zoo import model_path
 from .datasets import ROAD_CLASSES, Frame, RoadFrame
 from .metrics import BoxEvaluator, ProbabilitySweep
 from .mistakes import Mistakes

@@ -18,8 +18,8 @@ from ..geometry import inside
 from ..perceiver import ADAPTATIONS, Perceiver
 from ..perception import Box
 from ..readers.files import read_points
+from ..sensor import SensorProfile, get_sensor
 from ..sensor_fit import fit_sensor
-from ..sensors import SensorProfile, get_sensor
 from ..simulation.samples import IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASSES
 from .metrics import Confusion

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..geometry import inside
 from ..perception import Box
-from ..sensors import SensorProfile
+from ..sensor import SensorProfile
 from .drawn import random_scene
 from .layouts import scene_from_boxes
 from .scene import SimulatedScan, sensor_pose, simulate

@@ -13,7 +13,7 @@ from ..card import TopViewGeometry
 from ..errors import PointsError
 from ..geometry import draw_footprints
 from ..perception import Box
-from ..sensors import SensorProfile, get_sensor
+from ..sensor import SensorProfile, get_sensor
 from .raycast import (
     fill_bounds,
     fill_cast,

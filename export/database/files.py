@@ -68,7 +68,7 @@ def picture(
     points : (n, 4) float32
         x, y, z [m], remission. Rows that are not finite are left out.
     remission_offset, remission_scale : float
-        The remission drawn is ``(raw + offset) * scale``, clamped to 0..1; see `edgeperc.sensors.SensorProfile`.
+        The remission drawn is ``(raw + offset) * scale``, clamped to 0..1; see `edgeperc.sensor.SensorProfile`.
 
     Returns
     -------

@@ -19,8 +19,8 @@ from edgeperc.atomic import write_aside
 from edgeperc.card import TopViewGeometry
 from edgeperc.errors import CardMismatchError, EdgepercError
 from edgeperc.evaluation.datasets import KittiObjects, scan_hash
-from edgeperc.models import model_path
-from edgeperc.sensors import get_sensor
+from edgeperc.sensor import get_sensor
+from edgeperc.zoo import model_path
 
 from ..roads import CLASSES, HEIGHT, VEHICLES, VIEW, WIDTH, mask_of
 from .coco import varied
@@ -64,7 +64,7 @@ class Plan:
         What finds the roads that nobody drew: a shipped model's name, the path of an .onnx with a card, or ``"train"``,
         a model for every fold, taught by the roads that were drawn in the others.
     sensor : str
-        Where the points come from (`edgeperc.sensors.SENSORS`).
+        Where the points come from (`edgeperc.sensor.SENSORS`).
     provider : str
         See `edgeperc.Perceiver`; what ``"auto"`` takes may change from one day to the next, and roads with it.
     variations : int

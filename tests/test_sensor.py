@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-import reference
+import twins.fitness
 from edgeperc.errors import CardError, PointsError, SensorError
 from edgeperc.fitness import FitnessProfile, check_fitness, fill_scan_sums
 from edgeperc.readers.files import read_points
-from edgeperc.sensors import SENSORS, SensorProfile, get_sensor
+from edgeperc.sensor import SENSORS, SensorProfile, get_sensor
 
 # --- profiles --------------------------------------------------------------------------------------------------------
 
@@ -264,7 +264,7 @@ def check_against_twin(points, step, beam_step, view):
     out = [np.full(size, 99, np.int64) for size in (258, 360, 200, (3, 100))]
     rows, n_rows, sums = np.full((8, 1024), 99.0), np.full(8, 99, np.int64), np.full(8, 99.0)
     fill_scan_sums(points, step, beam_step, *view, *out, rows, n_rows, sums)
-    *expected, expected_rows, expected_sums = reference.scan_sums(points, step, beam_step, *view)
+    *expected, expected_rows, expected_sums = twins.fitness.scan_sums(points, step, beam_step, *view)
     for got, wanted in zip(out, expected, strict=True):
         np.testing.assert_array_equal(got, wanted)
     for row, count, wanted in zip(rows, n_rows, expected_rows, strict=True):

@@ -1,0 +1,111 @@
+"""Slow twins of decoding a network's output, and of boxes' overlaps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def rectangle_corners(rectangle):
+    """Corners of x, y, length, width, yaw, counter-clockwise, (4, 2)."""
+    x, y, length, width, yaw = rectangle
+    local = 0.5 * np.array([[length, width], [-length, width], [-length, -width], [length, -width]])
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    return local @ turn.T + [x, y]
+
+
+def polygon_area(corners):
+    """Shoelace formula; 0 for fewer than three corners."""
+    if len(corners) < 3:
+        return 0.0
+    x, y = np.asarray(corners, dtype=np.float64).T
+    return 0.5 * float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))
+
+
+def clip_polygon(subject, clip):
+    """Sutherland and Hodgman: the part of polygon ``subject`` inside the convex, counter-clockwise ``clip``."""
+    for start, end in zip(clip, np.roll(clip, -1, axis=0), strict=True):
+        edge = end - start
+
+        def side(p, start=start, edge=edge):
+            return edge[0] * (p[1] - start[1]) - edge[1] * (p[0] - start[0])
+
+        inside = []
+        for k, corner in enumerate(subject):
+            last = subject[k - 1]
+            if (side(corner) >= 0.0) != (side(last) >= 0.0):
+                share = side(last) / (side(last) - side(corner))
+                inside.append(last + share * (corner - last))
+            if side(corner) >= 0.0:
+                inside.append(corner)
+        subject = inside
+    return subject
+
+
+def oriented_iou(a, b):
+    """Twin of `edgeperc.geometry.fill_oriented_iou`."""
+    iou = np.zeros((len(a), len(b)))
+    for i, first in enumerate(np.asarray(a, dtype=np.float64)):
+        for j, second in enumerate(np.asarray(b, dtype=np.float64)):
+            if not (np.isfinite([*first, *second]).all() and min(*first[2:4], *second[2:4]) > 0.0):
+                continue
+            shared = polygon_area(clip_polygon(list(rectangle_corners(first)), rectangle_corners(second)))
+            union = first[2] * first[3] + second[2] * second[3] - shared
+            iou[i, j] = shared / union
+    return iou
+
+
+def nms(rectangles, iou_threshold):
+    """Twin of `edgeperc.geometry.mark_nms`."""
+    iou = oriented_iou(rectangles, rectangles)
+    keep = np.ones(len(rectangles), dtype=bool)
+    for i in range(len(rectangles)):
+        keep[i] = not (iou[i, :i][keep[:i]] > iou_threshold).any()
+    return keep
+
+
+def softmax(logits):
+    """Probabilities along axis 0, in float64."""
+    logits = np.asarray(logits, dtype=np.float64)
+    e = np.exp(logits - logits.max(axis=0, keepdims=True))
+    return e / e.sum(axis=0, keepdims=True)
+
+
+def classes(values, are_logits):
+    """Twin of `edgeperc.decode.fill_classes`: labels, scores and the number of values that are not finite."""
+    labels = np.argmax(values, axis=0).astype(np.uint8)
+    probabilities = softmax(values) if are_logits else values
+    return labels, probabilities.max(axis=0), int((~np.isfinite(values)).sum())
+
+
+def peaks(heat, threshold):
+    """Twin of `edgeperc.decode.mark_peaks`."""
+    padded = np.pad(heat.astype(np.float64), 1, constant_values=-np.inf)
+    height, width = heat.shape
+    peak = heat >= threshold
+    for d_row in (-1, 0, 1):
+        for d_col in (-1, 0, 1):
+            other = padded[1 + d_row : 1 + d_row + height, 1 + d_col : 1 + d_col + width]
+            if (d_row, d_col) < (0, 0):
+                peak = peak & (heat > other)
+            elif (d_row, d_col) > (0, 0):
+                peak = peak & (heat >= other)
+    return peak
+
+
+def footprint_sums(values, are_logits, rectangles, x_far, y_left, cell):
+    """Twin of `edgeperc.decode.fill_footprint_sums`."""
+    probabilities = softmax(values) if are_logits else values.astype(np.float64)
+    _, height, width = values.shape
+    x = x_far - (np.arange(height)[:, None] + 0.5) * cell
+    y = y_left - (np.arange(width)[None, :] + 0.5) * cell
+    sums = np.zeros((len(rectangles), len(values)))
+    for i, (at_x, at_y, length, across, yaw) in enumerate(rectangles):
+        along = (x - at_x) * np.cos(yaw) + (y - at_y) * np.sin(yaw)
+        aside = (y - at_y) * np.cos(yaw) - (x - at_x) * np.sin(yaw)
+        inside = (abs(along) <= length / 2) & (abs(aside) <= across / 2)
+        if not inside.any():
+            row = min(max(int(np.floor((x_far - at_x) / cell)), 0), height - 1)
+            col = min(max(int(np.floor((y_left - at_y) / cell)), 0), width - 1)
+            inside[row, col] = True
+        sums[i] = probabilities[:, inside].sum(axis=1)
+    return sums

@@ -1,0 +1,66 @@
+"""Slow twins of projecting points."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def top_view_pixel(point, view):
+    """Flat pixel of one point and its rank, the smaller the better; (-1, None) out of view."""
+    x, y, z, remission = point
+    (x_min, x_max), (y_min, y_max), (z_min, z_max) = np.float32([view.x_range_m, view.y_range_m, view.z_range_m])
+    if not (x_min <= x < x_max and y_min <= y < y_max and z_min <= z <= z_max and np.isfinite(remission)):
+        return -1, None
+    cells_per_m = np.float32(1.0 / view.cell_m)
+    ahead = min(int((x - x_min) * cells_per_m), view.height - 1)
+    left = min(int((y - y_min) * cells_per_m), view.width - 1)
+    return (view.height - 1 - ahead) * view.width + view.width - 1 - left, -z
+
+
+def range_image_pixel(point, view, row_edges, col_edges):
+    """Flat pixel of one point and its rank, the smaller the better; (-1, None) out of view."""
+    if not np.isfinite(point).all():
+        return -1, None
+    x, y, z, _ = point
+    squared_distance = x * x + y * y
+    squared_range = squared_distance + z * z
+    if squared_distance == 0 or not np.isfinite(squared_range):
+        return -1, None
+    azimuth = y / (abs(x) + abs(y))
+    if x < 0:
+        azimuth = np.float32(2 if y >= 0 else -2) - azimuth
+        if azimuth == -2:  # rounded onto the far side of straight behind
+            azimuth = np.nextafter(np.float32(-2), np.float32(0))
+    elevation = z / (np.sqrt(squared_distance) + abs(z))
+    row = np.count_nonzero(elevation <= row_edges) - 1
+    col = np.count_nonzero(azimuth <= col_edges) - 1
+    if not (0 <= row < view.height and 0 <= col < view.width):
+        return -1, None
+    return row * view.width + col, squared_range
+
+
+def project(points, view, edges, spec, remission_offset, remission_scale):
+    """Twin of `edgeperc.projection`'s kernels: image, index, pixel. ``edges``: a range image's, of rows and columns."""
+    image = np.zeros((len(spec.channels), view.height * view.width), np.float32)
+    index = np.full(view.height * view.width, -1, np.int32)
+    pixel = np.full(len(points), -1, np.int32)
+    best = {}
+    mean, std = np.float32(spec.mean), np.float32(spec.std)
+    with np.errstate(all="ignore"):
+        for i, point in enumerate(points):
+            flat, rank = (
+                top_view_pixel(point, view) if view.kind == "top_view" else range_image_pixel(point, view, *edges)
+            )
+            pixel[i] = flat
+            if flat < 0 or (flat in best and not rank < best[flat]):
+                continue
+            best[flat] = rank
+            index[flat] = i
+            x, y, z, remission = point
+            distance = np.sqrt(x * x + y * y)
+            raw = {
+                "x": x, "y": y, "z": z, "height": z, "distance": distance, "range": np.sqrt(x * x + y * y + z * z),
+                "remission": (remission + np.float32(remission_offset)) * np.float32(remission_scale),
+            }  # fmt: skip
+            image[:, flat] = (np.array([raw[name] for name in spec.channels], np.float32) - mean) / std
+    return image.reshape(-1, view.height, view.width), index.reshape(view.height, view.width), pixel
