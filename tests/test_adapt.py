@@ -17,7 +17,7 @@ import twins.adapt
 from edgeperc import Perceiver
 from edgeperc.adapt import Interpolator, render
 from edgeperc.card import InputSpec, RangeImageGeometry
-from edgeperc.cli import main as cli
+from edgeperc import cli
 from edgeperc.errors import PointsError, SensorError
 from edgeperc.evaluation.transfer import compare
 from edgeperc.projection import RangeImageProjector

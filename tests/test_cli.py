@@ -17,7 +17,7 @@ import pytest
 
 from edgeperc import __version__
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
-from edgeperc.cli import main as cli
+from edgeperc import cli
 from edgeperc.cli.eval import _figure_lines
 from edgeperc.cli.output import Progress
 from edgeperc.cli.run import _output_names

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import edgeperc
 import twins.tracking
 from edgeperc import Box, StampError, Tracker, TrackingError
-from edgeperc.cli import main as cli
+from edgeperc import cli
 from edgeperc.evaluation.datasets import scan_hash
 from edgeperc.evaluation.tracking import evaluate_kitti, read_sequence, sequence_names, sequence_scans, track_sequence
 from edgeperc.evaluation.tracking_metrics import (
