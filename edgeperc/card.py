@@ -11,7 +11,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,8 @@ from .errors import CardError
 __all__ = ["CARD_KEY", "Golden", "InputSpec", "ModelCard", "OutputSpec", "RangeImageGeometry", "TopViewGeometry"]
 
 CARD_KEY = "edgeperc.card"
-SCHEMA = 2
+Precision = Literal["fp32", "int8"]
+SCHEMA = 3
 OUTPUT_KINDS = ("class_logits", "class_probabilities", "box_slots", "box_dense")
 CHANNELS = {
     "top_view": ("distance", "remission", "height"),
@@ -186,6 +187,8 @@ class ModelCard:
     Attributes
     ----------
     name, version : str
+    precision : {"fp32", "int8"}
+        Of the stored weights: ``"int8"`` where they and the activations between them are eight-bit integers.
     view : TopViewGeometry or RangeImageGeometry
     input : InputSpec
     outputs : tuple of OutputSpec
@@ -210,6 +213,11 @@ class ModelCard:
     parity : mapping
         How far the exported graph was from the network it was made of.
     golden : Golden or None
+    precisions : mapping
+        Precision in which this file can run to how its answers agree with those of fp32 on real scans, after
+        post-processing: ``n_scans``, ``label_agreement`` (share of pixels or cells), ``mean_iou`` and ``ap`` with
+        ``fp32_mean_iou`` and ``fp32_ap`` (0..1; AP is None without boxes), ``loss`` (the larger loss of the two, in
+        points, 0 where neither is lower), ``by`` (engine and processor) and ``command``.
     """
 
     name: str
@@ -229,8 +237,12 @@ class ModelCard:
     metrics: Mapping[str, Any] = field(default_factory=dict)
     parity: Mapping[str, Any] = field(default_factory=dict)
     golden: Golden | None = None
+    precision: Precision = "fp32"
+    precisions: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if self.precision not in ("fp32", "int8"):
+            raise CardError(f"precision is {self.precision!r}; expected fp32 or int8, as the weights are stored")
         if not self.name or not self.version:
             raise CardError(f"name {self.name!r}, version {self.version!r}; expected both to be non-empty strings")
         if not 2 <= len(self.classes) <= 255 or len(set(self.classes)) != len(self.classes):
@@ -292,7 +304,7 @@ class ModelCard:
             raise CardError(f"the card is no JSON ({exc}); export the model again") from exc
         if not isinstance(document, dict) or not isinstance(document.get("schema"), int):
             raise CardError("the card has no schema number; export the model again")
-        if document["schema"] != SCHEMA:
+        if document["schema"] not in (2, SCHEMA):
             raise CardError(
                 f"the card has schema {document['schema']}, this edgeperc reads {SCHEMA}; "
                 + ("upgrade edgeperc" if document["schema"] > SCHEMA else "export the model again")
@@ -324,9 +336,14 @@ def _card(document: dict[str, Any]) -> ModelCard:
     else:
         raise CardError(f"view.kind is {kind!r}; expected top_view or range_image")
     fitness, golden = document["fitness"], document["golden"]
+    if document["schema"] == 2:  # kept the precision among the free-form metadata, and no agreement
+        precision, precisions = document["training"].get("precision", "fp32"), {}
+    else:
+        precision, precisions = document["precision"], document["precisions"]
     return ModelCard(
         name=str(document["name"]),
         version=str(document["version"]),
+        precision=precision,
         view=geometry,
         input=InputSpec(
             name=str(document["input"]["name"]),
@@ -349,6 +366,7 @@ def _card(document: dict[str, Any]) -> ModelCard:
         golden=None
         if golden is None
         else Golden(int(golden["seed"]), str(golden["input_sha256"]), dict(golden["outputs"])),
+        precisions={str(name): dict(entry) for name, entry in precisions.items()},
     )
 
 

@@ -73,7 +73,9 @@ def test_no_key_is_defaulted(key: str) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"schema": 3}, "schema 3.*upgrade edgeperc"),
+        ({"schema": 4}, "schema 4.*upgrade edgeperc"),
+        ({"precision": "fp8"}, "'fp8'; expected fp32 or int8"),
+        ({"precisions": [1]}, "malformed"),
         ({"schema": 0}, "schema 0.*export the model again"),
         ({"schema": "1"}, "no schema number"),
         ({"name": ""}, "name ''"),
@@ -98,6 +100,14 @@ def test_each_corruption_is_named(change: dict[str, Any], words: str) -> None:
     document = json.loads(TOP_VIEW_CARD.to_json()) | change
     with pytest.raises(CardError, match=words):
         ModelCard.from_json(json.dumps(document))
+
+
+@pytest.mark.parametrize("precision", ["fp32", "int8"])
+def test_a_card_of_schema_2_is_read(precision: str) -> None:
+    document = json.loads(TOP_VIEW_CARD.to_json()) | {"schema": 2, "training": {"precision": precision}}
+    del document["precision"], document["precisions"]
+    card = ModelCard.from_json(json.dumps(document))
+    assert (card.precision, card.precisions) == (precision, {})
 
 
 def test_boxes_need_a_top_view() -> None:
