@@ -3,24 +3,46 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO, Any
 
-__all__ = ["write_aside", "write_whole"]
+__all__ = ["open_whole", "write_whole"]
 
 
-def write_whole(path: str | Path, content: bytes) -> None:
-    """Write beside the target, then rename, so that nobody ever reads half a file."""
+@contextmanager
+def open_whole(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
+    """Open a temporary file in the target's folder; it replaces the target when the block ends without an error.
+
+    Readers see the old file or the new one, never a part of it.
+
+    Parameters
+    ----------
+    path : str or Path
+    mode : {"wb", "w"}
+        ``"w"`` writes text as UTF-8.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written; the target is then as it was.
+    """
     path = Path(path)
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        aside.write_bytes(content)
+        with aside.open(mode, encoding=None if "b" in mode else "utf-8") as file:
+            yield file
         aside.replace(path)
     finally:
         aside.unlink(missing_ok=True)
 
 
-def write_aside(path: Path, content: bytes) -> None:
-    """Write a file so that it is there whole or not at all."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    aside.write_bytes(content)
-    aside.replace(path)
+def write_whole(path: str | Path, content: bytes) -> None:
+    """Write a file at once, as `open_whole` does."""
+    with open_whole(path) as file:
+        file.write(content)
+
+
+def write_aside(path: Path, content: bytes) -> None:  # until its callers have moved
+    write_whole(path, content)

@@ -3,6 +3,7 @@
 ::
 
     EdgepercError
+    ├── OptionError (ValueError)      a setting that a function or a class cannot have
     ├── PointsError (ValueError)      an array or a sensor file that is no scan
     ├── SensorError (ValueError)      an unknown or impossible sensor profile
     ├── SettingsError (ValueError)    the file of this computer's settings is unreadable
@@ -32,6 +33,7 @@ __all__ = [
     "MissingExtraError",
     "ModelError",
     "ModelFileError",
+    "OptionError",
     "PointsError",
     "ProviderError",
     "SensorError",
@@ -44,6 +46,10 @@ __all__ = [
 
 class EdgepercError(Exception):
     """Root of every error that edgeperc raises on purpose."""
+
+
+class OptionError(EdgepercError, ValueError):
+    """A setting is unknown, out of its range, or excludes another setting."""
 
 
 class PointsError(EdgepercError, ValueError):

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from .errors import PointsError
 
-__all__ = ["as_points", "assemble", "plain_name", "remission_name"]
+__all__ = ["as_points", "assemble", "plain_name", "read_only", "remission_name"]
 
 # Best first; of an Ouster's fields, "intensity" is the raw signal and "reflectivity" the calibrated byte.
 _REMISSION_NAMES = ("remission", "intensity", "i", "reflectivity", "reflectance")
@@ -66,6 +66,17 @@ def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArra
         return assemble(values.shape[0], dict(zip("xyz", values.T, strict=True)), "xyz", None)
     with np.errstate(over="ignore", invalid="ignore"):
         return np.require(values, dtype=np.float32, requirements=["C", "A"])
+
+
+def read_only(array: NDArray[Any], dtype: DTypeLike = np.float32) -> NDArray[Any]:
+    """A read-only, C-contiguous and aligned view of an array, copied only where its layout or dtype is another.
+
+    numba compiles a kernel once for arrays that can be written to and once for those that cannot. Kernels get their
+    input through this function, so that a memory map or ``np.frombuffer`` needs no second compilation.
+    """
+    view = np.require(array, dtype=dtype, requirements=["C", "A"]).view()
+    view.flags.writeable = False
+    return view
 
 
 def plain_name(name: str) -> str:

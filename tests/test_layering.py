@@ -23,9 +23,11 @@ PACKAGES = {
 FLOORS = {
     "edgeperc": """
         errors atomic
-        card perception sensor tuning zoo.__init__
+        onnx_metadata
+        card points sensor tuning zoo.__init__
+        perception
         geometry
-        adapt cluster decode drivable fitness ground points projection refine sensor_fit session
+        adapt cluster decode drivable fitness ground projection refine sensor_fit session
         readers.__init__ readers.tables
         readers.pcd readers.ply
         readers.files
