@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .card import TopViewGeometry
+from .errors import PointsError
 
 __all__ = ["Box", "Perception", "PointLabels", "TopView"]
 
@@ -42,6 +46,39 @@ class Box:
         cos, sin = np.cos(self.yaw), np.sin(self.yaw)
         return local @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(self.center[:2])
 
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, rounded to 0.1 mm, 0.00001 rad and 0.0001 of the score; `from_dict` reads it."""
+        return {
+            "label": self.label,
+            "score": round(float(self.score), 4),
+            "center": [round(float(v), 4) for v in self.center],
+            "size": [round(float(v), 4) for v in self.size],
+            "yaw": round(float(self.yaw), 5),
+        }
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Box:
+        """Read what `to_dict` wrote. Other keys are ignored, so the record of a track is read as its box.
+
+        Raises
+        ------
+        PointsError
+            A key is missing, or its value is of another type or length.
+        """
+        try:
+            (x, y, z), (length, width, height) = document["center"], document["size"]
+            numbers = [float(v) for v in (document["score"], x, y, z, length, width, height, document["yaw"])]
+            label = document["label"]
+        except (KeyError, TypeError, ValueError) as exc:
+            raise PointsError(
+                f"got a box that cannot be read ({type(exc).__name__}: {exc}); expected label, score, center (x, y, z), "
+                "size (length, width, height) and yaw"
+            ) from exc
+        if not isinstance(label, str):
+            raise PointsError(f"got a box with label {label!r}; expected a str")
+        score, x, y, z, length, width, height, yaw = numbers
+        return cls(label, score, (x, y, z), (length, width, height), yaw)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TopView:
@@ -63,6 +100,11 @@ class TopView:
     cell_m: float
     x_range_m: tuple[float, float]
     y_range_m: tuple[float, float]
+
+    @property
+    def geometry(self) -> TopViewGeometry:
+        """Where the cells lie."""
+        return TopViewGeometry(self.x_range_m, self.y_range_m, cell_m=self.cell_m)
 
     @property
     def drivable(self) -> NDArray[np.bool_]:
@@ -139,3 +181,25 @@ class Perception:
     providers: Mapping[str, str]
     fitness: tuple[str, ...]
     stamp_s: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: everything but the labels of the single points and cells, which are counted.
+
+        Returns
+        -------
+        dict
+            ``stamp_s``, ``n_points``, ``n_dropped``, ``stage_ms``, ``providers``, ``boxes`` (`Box.to_dict`),
+            ``drivable_area_m2``, ``point_counts`` and ``fitness``. Every key is always there; its value is None where
+            no model of that kind took part.
+        """
+        return {
+            "stamp_s": self.stamp_s,
+            "n_points": self.n_points,
+            "n_dropped": self.n_dropped,
+            "stage_ms": {name: round(ms, 3) for name, ms in self.stage_ms.items()},
+            "providers": dict(self.providers),
+            "boxes": [box.to_dict() for box in self.boxes],
+            "drivable_area_m2": None if self.top_view is None else round(self.top_view.drivable_area_m2, 2),
+            "point_counts": None if self.points is None else self.points.counts(),
+            "fitness": list(self.fitness),
+        }

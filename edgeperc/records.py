@@ -1,37 +1,60 @@
-"""The JSON of a scan: what ``edgeperc run --json`` writes and the tracking reader reads."""
+"""The JSON of a scan: what ``edgeperc run --json`` writes and ``edgeperc eval-tracking --boxes`` reads."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .drivable import road_ahead
 from .errors import TrackingError
 from .perception import Box
 
 if TYPE_CHECKING:
-    from .perception import Box, Perception, TopView
+    from .perception import Perception
     from .tracking.tracks import Tracks
 
-__all__ = ["read_boxes", "scan_record"]
+__all__ = ["SCAN_KEYS", "read_boxes", "scan_record"]
+
+SCAN_KEYS = (
+    "n_points",
+    "n_dropped",
+    "stage_ms",
+    "providers",
+    "boxes",
+    "drivable_area_m2",
+    "road",
+    "point_counts",
+    "tracks",
+    "fitness",
+)
+"""Keys of a record, in the order in which they are written; all are always there."""
 
 
-def _box_record(box: Box) -> dict[str, Any]:
-    return {
-        "label": box.label,
-        "score": round(float(box.score), 4),
-        "center": [round(float(v), 4) for v in box.center],
-        "size": [round(float(v), 4) for v in box.size],
-        "yaw": round(float(box.yaw), 5),
-    }
+def scan_record(perception: Perception, tracks: Tracks | None = None) -> dict[str, Any]:
+    """`Perception.to_dict` with the road ahead and the tracks, as ``edgeperc run --json`` prints it.
+
+    Parameters
+    ----------
+    perception : Perception
+    tracks : Tracks, optional
+
+    Returns
+    -------
+    dict
+        The keys of `SCAN_KEYS`; None where no model of that kind took part.
+    """
+    record = perception.to_dict()
+    record["road"] = _road_record(perception)
+    record["tracks"] = [track.to_dict() for track in tracks or ()]
+    return {key: record[key] for key in SCAN_KEYS}
 
 
-def _road_record(top_view: TopView, boxes: Sequence[Box]) -> dict[str, Any]:
-    from .drivable import road_ahead
-
-    road = road_ahead(top_view, boxes)
+def _road_record(perception: Perception) -> dict[str, Any] | None:
+    if perception.top_view is None:
+        return None
+    road = road_ahead(perception.top_view, perception.boxes)
     widths = {"free_ahead_m": road.free_ahead_m(), "lane_width_m": road.lane_width_m}
     return {
         "outline": [[round(float(v), 2) for v in corner] for corner in road.outline],
@@ -39,35 +62,8 @@ def _road_record(top_view: TopView, boxes: Sequence[Box]) -> dict[str, Any]:
     }
 
 
-def scan_record(perception: Perception, tracks: Tracks | None = None) -> dict[str, Any]:
-    """What `run --json` says of a scan. Keys are always all there; null where no model of that kind took part."""
-    return {
-        "n_points": perception.n_points,
-        "n_dropped": perception.n_dropped,
-        "stage_ms": {name: round(ms, 3) for name, ms in perception.stage_ms.items()},
-        "providers": dict(perception.providers),
-        "boxes": [_box_record(box) for box in perception.boxes],
-        "drivable_area_m2": None if perception.top_view is None else round(perception.top_view.drivable_area_m2, 2),
-        "road": None if perception.top_view is None else _road_record(perception.top_view, perception.boxes),
-        "point_counts": None if perception.points is None else perception.points.counts(),
-        "tracks": [
-            {
-                "id": track.id,
-                **_box_record(track.box),
-                "velocity": [round(float(v), 3) for v in track.velocity],
-                "age_s": round(track.age_s, 3),
-                "hits": track.hits,
-                "coasting": track.coasting,
-                "modes": {name: round(share, 4) for name, share in track.modes.items()},
-            }
-            for track in tracks or ()
-        ],
-        "fitness": list(perception.fitness),
-    }
-
-
 def read_boxes(path: Path | str) -> list[list[Box]]:
-    """Read the boxes of a drive, a line a scan, as ``edgeperc run --json`` prints them.
+    """Read the boxes of a drive as ``edgeperc run --json`` prints them: one line for each scan.
 
     Parameters
     ----------
@@ -85,9 +81,7 @@ def read_boxes(path: Path | str) -> list[list[Box]]:
         The file cannot be read.
     """
     try:
-        return [
-            [Box(of["label"], of["score"], tuple(of["center"]), tuple(of["size"]), of["yaw"]) for of in line["boxes"]]
-            for line in map(json.loads, Path(path).read_text(encoding="utf-8").splitlines())
-        ]
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        return [[Box.from_dict(box) for box in json.loads(line)["boxes"]] for line in lines]
     except (KeyError, TypeError, ValueError) as exc:
         raise TrackingError(f"{path} holds no boxes ({exc}); expected what edgeperc run --json printed") from exc

@@ -31,7 +31,6 @@ from edgeperc.evaluation.tracking_metrics import (
     recall_thresholds,
 )
 from edgeperc.perception import Perception
-from edgeperc.records import _box_record
 from edgeperc.sensor import get_sensor
 from edgeperc.tracking.egomotion import fit_motion, nearest_detection, support
 from edgeperc.tracking.imm import fill_combined, fill_interaction, fill_mode_probabilities
@@ -1037,7 +1036,7 @@ def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixt
 def test_a_models_boxes_are_judged(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What run --json prints takes the place of the detections, which need not be there."""
     detections = read_sequence(kitti, "0000").detections
-    lines = [{"scan": "x", "boxes": [_box_record(replace(one, label="van")) for one in of]} for of in detections]
+    lines = [{"scan": "x", "boxes": [replace(one, label="van").to_dict() for one in of]} for of in detections]
     for of in ("Car", "Pedestrian", "Cyclist"):
         (kitti / f"detections/pointrcnn_{of}/0000.txt").unlink()
     boxes = kitti / "boxes.jsonl"

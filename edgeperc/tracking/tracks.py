@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,6 +151,33 @@ class Track:
     age_s: float
     hits: int
     coasting: bool
+
+    @property
+    def center(self) -> tuple[float, float, float]:
+        """Center of ``box``, x, y, z [m]."""
+        return self.box.center
+
+    @property
+    def size(self) -> tuple[float, float, float]:
+        """Length, width and height of ``box`` [m]."""
+        return self.box.size
+
+    @property
+    def yaw(self) -> float:
+        """Heading of ``box`` about +z from +x [rad]."""
+        return self.box.yaw
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: the entries of `Box.to_dict` and those of the track."""
+        return {
+            "id": self.id,
+            **self.box.to_dict(),
+            "velocity": [round(float(v), 3) for v in self.velocity],
+            "age_s": round(self.age_s, 3),
+            "hits": self.hits,
+            "coasting": self.coasting,
+            "modes": {name: round(share, 4) for name, share in self.modes.items()},
+        }
 
 
 class Tracks(Sequence[Track]):
