@@ -10,14 +10,13 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .adapt import Interpolator, render
+from .adapt import Interpolator, condition
 from .card import ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, join_boxes, objects_from_points
 from .decode import decode_classes, decode_top_view
@@ -30,7 +29,7 @@ from .projection import RangeImageProjector, TopViewProjector, make_projector
 from .refine import label_points, remove_outliers
 from .sensor import SensorProfile, get_sensor
 from .session import Session
-from .zoo import resolve
+from .zoo import DEFAULT
 
 __all__ = ["ADAPTATIONS", "BoxesFrom", "Perceiver"]
 
@@ -74,14 +73,17 @@ class Perceiver:
 
     Parameters
     ----------
-    models : str, Path or sequence of these
-        Names of shipped models (``"ssadnet"``, ``"pointseg"``) or paths of .onnx files with a card; at most one model
-        a view.
+    models : str, Path, sequence of these, or None
+        Names of shipped models (``"ssadnet"``, ``"pointseg:int8"``) or paths of .onnx files with a card; at most one
+        model a view. None takes the best pair, `edgeperc.zoo.DEFAULT`.
     sensor : str, Path or SensorProfile
         Where the points come from: a built-in name (`edgeperc.sensor.SENSORS`), a file that ``edgeperc adapt fit``
         wrote, or a profile. Says how raw remissions map to 0..1, and how they are rendered as the training sensor's.
     provider : str
         ``"auto"``, ``"cpu"``, ``"openvino"``, ... A provider asked for is required (`edgeperc.session.PROVIDERS`).
+    precision : {"auto", "fp32", "bf16", "int8"}
+        What the networks compute in. ``"auto"`` takes a reduced precision where it is native to the processor and the
+        card shows that it loses at most 0.3 points (`edgeperc.zoo.choose`); ``"fp32"`` forbids that.
     n_threads : int or None
         Threads inside one call; None leaves it to the provider. The answer does not depend on it.
     on_mismatch : {"warn", "raise", "ignore"}
@@ -107,7 +109,7 @@ class Perceiver:
     sessions : tuple of Session
         The networks as they are loaded; not to be run from outside.
     providers : mapping
-        What really runs, by model name.
+        What really runs, by model name: ``"pointseg int8, CPUExecutionProvider"``.
 
     Raises
     ------
@@ -126,10 +128,11 @@ class Perceiver:
 
     def __init__(
         self,
-        models: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+        models: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None,
         *,
         sensor: str | os.PathLike[str] | SensorProfile = "hdl-64e",
         provider: str = "auto",
+        precision: str = "auto",
         n_threads: int | None = None,
         on_mismatch: Literal["warn", "raise", "ignore"] = "warn",
         score_threshold: float | None = None,
@@ -150,15 +153,15 @@ class Perceiver:
         self.score_threshold = score_threshold
         self._interpolates = adapt in ("both", "interpolation")
         self._renders = self.sensor.remission is not None and adapt in ("both", "remission")
-        # Rendered remissions lie in 0..1 already.
-        self._remission = (0.0, 1.0) if self._renders else (self.sensor.remission_offset, self.sensor.remission_scale)
         self.boxes_from = boxes_from
         self.all_around = all_around
         gaps_deg = [upper - lower for upper, lower in pairwise(self.sensor.elevations_deg)]
         # Neighbouring beams and columns meet on one object, with one missing between them.
         self._distance_per_m = 2.0 * math.radians(max(np.median(gaps_deg or [0.0]), 360.0 / self.sensor.columns))
-        given = [models] if isinstance(models, (str, os.PathLike)) else list(models)
-        self._networks = [self._load(resolve(m), provider, n_threads) for m in given]
+        given = [models] if isinstance(models, (str, os.PathLike)) else list(DEFAULT if models is None else models)
+        self._networks = [
+            self._load(Session(model, provider, precision=precision, n_threads=n_threads)) for model in given
+        ]
         views = [n.session.card.view.kind for n in self._networks]
         if not views or len(views) != len(set(views)):
             raise ValueError(
@@ -168,7 +171,7 @@ class Perceiver:
             raise ValueError("boxes_from is 'clusters', which takes a class for every point; add a range-image model")
         self.sessions: tuple[Session, ...] = tuple(n.session for n in self._networks)
         self.cards: tuple[ModelCard, ...] = tuple(n.session.card for n in self._networks)
-        self.providers = MappingProxyType({n.session.card.name: n.session.provider for n in self._networks})
+        self.providers = MappingProxyType({n.session.card.name: n.session.description for n in self._networks})
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
         self._lock = threading.Lock()
         # The first call would compile the kernels; a scan of two points, in every view, gets that over with here. The
@@ -178,8 +181,7 @@ class Perceiver:
         if boxes_from != "network" and "range_image" in views:
             self._find_objects(*self._post_on_floor())
 
-    def _load(self, path: Path, provider: str, n_threads: int | None) -> _Network:
-        session = Session(path, provider, n_threads)
+    def _load(self, session: Session) -> _Network:
         card = session.card
         interpolator = None
         if self._interpolates and isinstance(card.view, RangeImageGeometry):
@@ -218,18 +220,8 @@ class Perceiver:
         self, scan: NDArray[np.float32], stamp_s: float | None, check: bool, infer: bool = True
     ) -> Perception:
         watch = _Stopwatch()
-        finite = np.isfinite(scan)
-        n_dropped = 0
-        # Reducing rows of four costs ten times the count, and nearly every scan is finite throughout.
-        if not finite.all():
-            dropped = ~finite.all(axis=1)
-            n_dropped = int(np.count_nonzero(dropped))
-            scan = scan.copy()
-            scan[dropped] = np.nan  # a point without a remission is nowhere, for every stage
-        watch.lap("check")
-        if self._renders:
-            scan = render(scan, self.sensor)
-            watch.lap("adapt")
+        scan, n_dropped = condition(scan, self.sensor, rendered=self._renders)
+        watch.lap("adapt" if self._renders else "check")
         fitness = self._check(scan) if check else ()
         watch.lap("check")
         points: PointLabels | None = None
@@ -258,25 +250,14 @@ class Perceiver:
 
     def _check(self, scan: NDArray[np.float32]) -> tuple[str, ...]:
         found: dict[str, None] = {}
-        offset, scale = (np.float32(value) for value in self._remission)
-        scaled = scan
-        if (offset, scale) != (0.0, 1.0):
-            scaled = scan.copy()
-            scaled[:, 3] = (scaled[:, 3] + offset) * scale
         for network in self._networks:
             if network.fitness is not None:
-                found |= dict.fromkeys(check_fitness(scaled, network.fitness, self.sensor))
+                found |= dict.fromkeys(check_fitness(scan, network.fitness, self.sensor))
         return tuple(found)
 
     def _project(self, network: _Network, scan: NDArray[np.float32]) -> NDArray[np.int32]:
         pixel = np.empty(len(scan), np.int32)
-        network.projector.fill(
-            scan,
-            *self._remission,
-            network.session.input,
-            network.index,
-            pixel,
-        )
+        network.projector.fill(scan, network.session.input, network.index, pixel)
         return pixel
 
     def _see_from_above(
@@ -290,7 +271,7 @@ class Perceiver:
         outputs = network.session.run() if infer else network.session.outputs
         watch.lap("infer")
         threshold = card.score_threshold if self.score_threshold is None else self.score_threshold
-        labels, found = decode_top_view(card, network.session.input, outputs, threshold)
+        labels, found = decode_top_view(card, network.index >= 0, outputs, threshold)
         watch.lap("decode")
         view = TopView(labels, card.classes, card.view.cell_m, card.view.x_range_m, card.view.y_range_m)
         return view, tuple(found)
@@ -307,7 +288,7 @@ class Perceiver:
             assert isinstance(network.projector, RangeImageProjector)
             # Points between are in the image alone; from here on there are only those that came.
             dense, filled = network.interpolator.fill(scan, network.index)
-            network.projector.fill_image(dense, *self._remission, filled, network.session.input)
+            network.projector.fill_image(dense, filled, network.session.input)
             watch.lap("adapt")
         outputs = network.session.run() if infer else network.session.outputs
         watch.lap("infer")

@@ -1,9 +1,9 @@
 """Network input to raw outputs; the only importer of onnxruntime.
 
-A provider asked for is required: where it is absent, or would hand part of the graph to another, construction raises
+A provider asked for is required: if it is absent, or would hand part of the graph to another, construction raises
 `ProviderError`. ``"auto"`` takes the setting that was measured to be the fastest on this computer
-(``edgeperc-bench matrix --recommend``), else the first of `AUTO` that runs the whole model and gives its answers, and
-says which.
+(``edgeperc-bench matrix --recommend``), else the first of `AUTO` that runs the whole model and gives the card's golden
+answers. Which variant of a network runs, and in which precision, `edgeperc.zoo.choose` decides.
 """
 
 from __future__ import annotations
@@ -13,24 +13,26 @@ import importlib
 import importlib.metadata
 import json
 import logging
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .card import CARD_KEY, ModelCard
 from .errors import (
     CardError,
     CardMismatchError,
     InferenceError,
     MissingExtraError,
     ModelFileError,
+    OptionError,
     ProviderError,
     SettingsError,
 )
-from .tuning import compiled_folder, fingerprint, read_setting, settings_path
+from .tuning import compiled_folder, cpu_features, fingerprint, read_setting, settings_path
+from .zoo import Variant, choose, digest, resolve
 
 __all__ = ["PRECISIONS", "PROVIDERS", "Session", "available_providers", "golden_input"]
 
@@ -48,10 +50,10 @@ PROVIDERS: Mapping[str, str] = {
 AUTO = ("cuda", "openvino", "cpu")
 # Providers that come as plugins beside stock onnxruntime: provider, then the package that carries its library.
 PLUGINS = {"openvino": "onnxruntime_ep_openvino", "tensorrt-rtx": "onnxruntime_ep_nv_tensorrt_rtx"}
-PRECISIONS = {"fp32": "f32", "bf16": "bf16", "fp16": "f16"}
+PRECISIONS = ("fp32", "bf16", "int8")
 # In standard deviations of an output. The same graph in fp32 was seen to differ by 1e-5 between engines; weights of one
 # layer tripled, by 0.5.
-MAX_GOLDEN_DEVIATION = {"fp32": 0.02, "bf16": 0.5, "fp16": 0.5, "int8": 0.5}
+MAX_GOLDEN_DEVIATION = {"fp32": 0.02, "bf16": 0.5, "int8": 0.5}
 # Part of the golden values that has to be as near: where max-pooling meets two maxima within a rounding of each other,
 # engines unpool either, and a few pixels differ from then on.
 GOLDEN_SHARE = 0.9
@@ -98,113 +100,161 @@ def available_providers() -> tuple[str, ...]:
     return tuple(s for s, name in PROVIDERS.items() if name in stock or (s in PLUGINS and _plugin_devices(ort, s)))
 
 
+_Attempt = tuple[str, Variant, str, int | None]
+"""Provider, file, precision and threads."""
+
+
+def _check_words(provider: str, precision: str) -> None:
+    if precision not in ("auto", *PRECISIONS):
+        raise ProviderError(f"precision {precision!r} is unknown; expected auto, {', '.join(PRECISIONS)}")
+    if provider == "auto" or provider in PROVIDERS:
+        return
+    short, _, suffix = provider.partition(":")
+    if short in PROVIDERS and suffix:
+        raise ProviderError(
+            f"provider {provider!r}: the precision is an option of its own; ask for provider {short!r} and "
+            f"precision {suffix!r}"
+        )
+    raise ProviderError(f"provider {provider!r} is unknown; expected auto or one of {', '.join(PROVIDERS)}")
+
+
 class Session:
     """One network, loaded, checked against its card and warmed up, with buffers of its own.
 
     Parameters
     ----------
-    path : Path
-        An .onnx with a card, its weights inside.
+    model : str or Path
+        A name, a name with a variant, or the path of an .onnx file with a card (`edgeperc.zoo.resolve`).
     provider : str
-        ``"auto"``, or a name of `PROVIDERS`, with ``openvino`` optionally followed by a precision:
-        ``"openvino:bf16"``. Without one, networks run in the precision they were exported in.
+        ``"auto"``, or a key of `PROVIDERS`.
+    precision : {"auto", "fp32", "bf16", "int8"}
+        ``"auto"`` takes a reduced precision where it is native to the processor and the card shows its loss to be small
+        (`edgeperc.zoo.choose`). The others are required.
     n_threads : int or None
         Threads inside one run; None leaves it to the provider.
 
     Attributes
     ----------
+    path : Path
+        The file that runs.
     card : ModelCard
     sha256 : str
         Of the file.
-    provider : str
-        What really runs, e.g. ``"CPUExecutionProvider (fp32)"``.
+    digest : str
+        What settings of this network are kept under (`edgeperc.zoo.digest`).
+    short, provider : str
+        What runs it, as a key of `PROVIDERS` and as onnxruntime calls it: ``"cpu"``, ``"CPUExecutionProvider"``.
+    precision : str
+        What it runs in: ``"fp32"``, ``"bf16"`` or ``"int8"``.
     options : dict of str to str
-        What was set of onnxruntime's session and of the provider, for reports.
+        Settings of onnxruntime's session and of the provider, for reports.
     input : (C, H, W) float32
         Write the network's input here, then `run`.
     outputs : mapping of str to ndarray
         By output *kind*, without the batch axis; overwritten by every `run`.
     golden_deviation : float
-        How far this computer's answers to the card's golden input are from the exporter's, in standard deviations of
-        that output: nine of ten are nearer. NaN where the card holds none.
+        Distance of this computer's answers to the card's golden input from the exporter's, in standard deviations of
+        the output: 90 % of the values are nearer. NaN if the card has no golden record.
 
     Raises
     ------
+    OptionError
+        A number of threads below 1.
     ModelFileError, CardError, CardMismatchError, ProviderError, MissingExtraError
     """
 
-    def __init__(self, path: Path | str, provider: str = "auto", n_threads: int | None = None) -> None:
+    def __init__(
+        self,
+        model: str | os.PathLike[str],
+        provider: str = "auto",
+        *,
+        precision: str = "auto",
+        n_threads: int | None = None,
+    ) -> None:
         if n_threads is not None and n_threads < 1:
-            raise ValueError(f"n_threads is {n_threads}; expected at least 1, or None")
+            raise OptionError(f"n_threads is {n_threads}; expected at least 1, or None")
+        _check_words(provider, precision)
         ort = _onnxruntime()
-        self.path = Path(path)
+        variants = resolve(model)
+        self.digest = digest(variants)
+        attempts = self._attempts(variants, provider, precision, n_threads)
+        for attempt in attempts:
+            try:
+                self._prepare(ort, *attempt)
+                break
+            except (CardMismatchError, InferenceError, ProviderError) as exc:
+                if attempt == attempts[-1]:
+                    raise
+                short, _, runs_in, _ = attempt
+                logger.warning("auto passes over %s on %s in %s: %s", variants[0].name, short, runs_in, exc)
+
+    def _attempts(
+        self, variants: Sequence[Variant], provider: str, precision: str, n_threads: int | None
+    ) -> list[_Attempt]:
+        """What to try, in this order: one setting, or several where something is left to "auto"."""
+        present, features = available_providers(), cpu_features()
+        wishes = [(provider, precision, n_threads)]
+        if provider == "auto":
+            wishes = [(short, precision, n_threads) for short in AUTO if short in present]
+            wishes = [*self._measured_best(variants[0].name, precision, n_threads, present), *wishes]
+        elif provider not in present:
+            raise ProviderError(
+                f"provider {provider!r} is not available on this computer (present: {', '.join(present)}); "
+                "install its onnxruntime build or plugin, or ask for one that is present"
+            )
+        attempts: list[_Attempt] = []
+        refusal = None
+        for short, wanted, threads in wishes:
+            try:
+                variant, runs_in = choose(variants, short, wanted, features)
+            except ProviderError as exc:
+                refusal = exc
+                continue
+            attempts.append((short, variant, runs_in, threads))
+            if precision == "auto" and runs_in != "fp32" and variants[0].precision == "fp32":
+                attempts.append((short, variants[0], "fp32", threads))
+        if not attempts:
+            raise refusal or ProviderError(f"none of {', '.join(AUTO)} is available; install edgeperc[cpu]")
+        return attempts
+
+    def _measured_best(
+        self, name: str, precision: str, n_threads: int | None, present: Sequence[str]
+    ) -> list[tuple[str, str, int | None]]:
+        """The provider, precision and threads that were measured to be the fastest here, if any were."""
+        try:
+            setting = read_setting(settings_path(), fingerprint(), self.digest)
+        except SettingsError as exc:
+            logger.warning("auto knows of no setting measured here: %s", exc)
+            return []
+        if setting is None or precision not in ("auto", setting["precision"]):
+            return []
+        if setting["provider"] not in present:
+            logger.warning(
+                "auto passes over %s on %s, measured as the fastest: it is not available any more",
+                *(name, setting["provider"]),
+            )
+            return []
+        return [(setting["provider"], setting["precision"], setting["n_threads"] if n_threads is None else n_threads)]
+
+    def _prepare(self, ort: Any, short: str, variant: Variant, precision: str, n_threads: int | None) -> None:
+        self.path, self.card = variant.path, variant.card
+        self.short, self.provider, self.precision = short, PROVIDERS[short], precision
         try:
             blob = self.path.read_bytes()
         except OSError as exc:
             raise ModelFileError(f"{self.path} cannot be read: {exc.strerror}") from exc
         if EXTERNAL_DATA in blob:
             raise ModelFileError(f"{self.path} keeps weights in other files; export it with its weights inside")
-        self.sha256 = hashlib.sha256(blob).hexdigest()
-        candidates = self._measured_best(n_threads) if provider == "auto" else [(provider, n_threads)]
-        for candidate, threads in candidates:
-            short, precision = self._choose(candidate)
-            try:
-                self._prepare(ort, blob, short, precision, threads)
-                break
-            except (CardMismatchError, InferenceError, ProviderError) as exc:
-                if (candidate, threads) == candidates[-1]:
-                    raise
-                logger.warning("auto passes over %s: %s", candidate, exc)
-
-    def _measured_best(self, n_threads: int | None) -> list[tuple[str, int | None]]:
-        """What "auto" tries, in this order, and the threads of each."""
-        tried: list[tuple[str, int | None]] = [(s, n_threads) for s in AUTO if s in available_providers()]
-        try:
-            setting = read_setting(settings_path(), fingerprint(), self.sha256)
-        except SettingsError as exc:
-            logger.warning("auto knows of no setting measured here: %s", exc)
-            setting = None
-        if setting is None:
-            return tried
-        best = (setting["provider"], setting["n_threads"] if n_threads is None else n_threads)
-        if best[0].partition(":")[0] not in available_providers():
-            logger.warning("auto passes over %s, measured as the fastest: it is not available any more", best[0])
-            return tried
-        return [best, *tried]
-
-    def _prepare(self, ort: Any, blob: bytes, short: str, precision: str, n_threads: int | None) -> None:
+        self.sha256 = digest([variant])
         self._session = self._open(ort, blob, short, precision, n_threads)
-        self.provider = f"{PROVIDERS[short]} ({precision})"
-        text = self._session.get_modelmeta().custom_metadata_map.get(CARD_KEY)
-        if text is None:
-            raise CardError(f"{self.path} carries no card; write one with: edgeperc-export card MODEL --card CARD.json")
-        try:
-            self.card = ModelCard.from_json(text)
-        except CardError as exc:
-            raise CardError(f"{self.path}: {exc}") from exc
-        if precision == "fp32" and self.card.training.get("precision") == "int8":
-            precision = "int8"
-            self.provider = f"{PROVIDERS[short]} ({precision})"
         self._check_graph()
         self._bind()
         self.golden_deviation = self._warm_up(MAX_GOLDEN_DEVIATION[precision])
 
-    @staticmethod
-    def _choose(provider: str) -> tuple[str, str]:
-        short, _, precision = provider.partition(":")
-        present = available_providers()
-        if short not in PROVIDERS:
-            raise ProviderError(f"provider {provider!r} is unknown; expected auto or one of {', '.join(PROVIDERS)}")
-        if short not in present:
-            raise ProviderError(
-                f"provider {short!r} is not available on this computer (present: {', '.join(present)}); "
-                "install its onnxruntime build or plugin, or ask for one that is present"
-            )
-        if precision and (short != "openvino" or precision not in PRECISIONS):
-            raise ProviderError(
-                f"provider {provider!r}: only openvino takes a precision, one of {', '.join(PRECISIONS)}"
-            )
-        return short, precision or "fp32"
+    @property
+    def description(self) -> str:
+        """What really runs: ``"pointseg int8, CPUExecutionProvider"``."""
+        return f"{self.card.name} {self.precision}, {self.provider}"
 
     def _open(self, ort: Any, blob: bytes, short: str, precision: str, n_threads: int | None) -> Any:
         options = ort.SessionOptions()
@@ -229,7 +279,8 @@ class Session:
         try:
             if plugin:
                 if short == "openvino":
-                    cpu = {"INFERENCE_PRECISION_HINT": PRECISIONS[precision], "PERFORMANCE_HINT": "LATENCY"}
+                    hint = "bf16" if precision == "bf16" else "f32"  # what is not in int8 runs in fp32
+                    cpu = {"INFERENCE_PRECISION_HINT": hint, "PERFORMANCE_HINT": "LATENCY"}
                     if n_threads is not None:
                         cpu["INFERENCE_NUM_THREADS"] = str(n_threads)
                     engine = f"onnxruntime {ort.__version__}, {_version(PLUGINS[short])}"

@@ -19,6 +19,7 @@ from .errors import SettingsError
 __all__ = [
     "cache_folder",
     "compiled_folder",
+    "cpu_features",
     "cpu_model",
     "fingerprint",
     "read_setting",
@@ -26,7 +27,7 @@ __all__ = [
     "write_settings",
 ]
 
-SCHEMA = 1
+SCHEMA = 2
 
 
 def cache_folder() -> Path:
@@ -64,12 +65,24 @@ def compiled_folder(engine: str, sha256: str, precision: str) -> Path | None:
 
 
 def cpu_model() -> str:
-    """What the processor calls itself."""
+    """The processor's name."""
+    return _cpuinfo("model name", "Hardware", "Model") or platform.processor() or platform.machine()
+
+
+def cpu_features() -> frozenset[str]:
+    """Flags of the processor as Linux names them, such as ``avx512_vnni``; empty where the system does not say."""
+    if sys.platform == "darwin" and platform.machine() == "arm64":
+        return frozenset({"asimddp"})  # every Apple processor multiplies bytes in dot products
+    return frozenset(_cpuinfo("flags", "Features").split())
+
+
+def _cpuinfo(*keys: str) -> str:
+    """The first value of any of the keys; empty where there is none."""
     for line in (_text(Path("/proc/cpuinfo")) or "").splitlines():
         key, _, value = line.partition(":")
-        if key.strip() in ("model name", "Hardware", "Model"):
+        if key.strip() in keys:
             return value.strip()
-    return platform.processor() or platform.machine()
+    return ""
 
 
 def fingerprint() -> str:
@@ -98,11 +111,12 @@ def write_settings(path: Path, machine: str, entries: Mapping[str, Mapping[str, 
     Parameters
     ----------
     path : Path
-        JSON: ``{"schema": 1, "machines": {fingerprint: {model SHA-256: entry}}}``; made where there is none.
+        JSON: ``{"schema": 2, "machines": {fingerprint: {digest: entry}}}``; created if it does not exist.
     machine : str
         `fingerprint` of the computer they were measured on.
     entries : mapping
-        Model SHA-256 to ``provider`` and ``n_threads``, as `edgeperc.Perceiver` takes them, and whatever they rest on.
+        A network's digest (`edgeperc.zoo.digest`) to ``provider``, ``precision`` and ``n_threads``, as
+        `edgeperc.Perceiver` takes them, and any further keys.
 
     Raises
     ------
@@ -117,8 +131,8 @@ def write_settings(path: Path, machine: str, entries: Mapping[str, Mapping[str, 
     part.replace(path)  # a reader finds the old file or the new one, whole
 
 
-def read_setting(path: Path, machine: str, sha256: str) -> dict[str, Any] | None:
-    """The setting for a computer and a model; None where nobody measured it.
+def read_setting(path: Path, machine: str, digest: str) -> dict[str, Any] | None:
+    """The setting for a computer and a network; None if none was measured.
 
     Raises
     ------
@@ -126,19 +140,20 @@ def read_setting(path: Path, machine: str, sha256: str) -> dict[str, Any] | None
     """
     if not path.exists():
         return None
-    entry = _read(path)["machines"].get(machine, {}).get(sha256)
+    entry = _read(path)["machines"].get(machine, {}).get(digest)
     if entry is None:
         return None
     if not isinstance(entry, dict) or not _is_setting(entry):
-        raise SettingsError(f"{path} keeps {entry!r} of a model; expected a provider and n_threads; delete it")
+        raise SettingsError(
+            f"{path} keeps {entry!r} of a model; expected a provider, a precision and n_threads; delete it"
+        )
     return entry
 
 
 def _is_setting(entry: Mapping[str, Any]) -> bool:
     n_threads = entry.get("n_threads")
-    return isinstance(entry.get("provider"), str) and (
-        n_threads is None or (isinstance(n_threads, int) and n_threads >= 1)
-    )
+    words = all(isinstance(entry.get(key), str) for key in ("provider", "precision"))
+    return words and (n_threads is None or (isinstance(n_threads, int) and n_threads >= 1))
 
 
 def _read(path: Path) -> dict[str, Any]:

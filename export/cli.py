@@ -13,6 +13,7 @@ from edgeperc import __version__
 from edgeperc.errors import EdgepercError, MissingExtraError
 
 from .database.cli import database_parser
+from .recipe import MODELS
 
 __all__ = ["main"]
 
@@ -111,8 +112,7 @@ def _parser() -> argparse.ArgumentParser:
     quantize.set_defaults(run=_quantize)
 
     make = commands.add_parser("make", help="a shipped model from nothing: simulate, train, export, judge")
-    shipped = ["kulseg", "lodnn", "pointseg", "pointseg-edge", "pointseg-sim"]
-    shipped += ["ssadnet", "ssadnet-edge", "ssadnet-paper", "ssadnet-sim"]
+    shipped = sorted(name for name in MODELS if not name.endswith("-start"))
     make.add_argument("name", choices=shipped)
     make.add_argument("out", type=Path, help="folder for scans, checkpoints and the model")
     make.add_argument("--kitti", type=Path, help="root of a KITTI object set")

@@ -147,6 +147,7 @@ class _Calibrated:
     model: onnx.ModelProto
     ranges: Any
     images: Sequence[NDArray[np.float32]]
+    returned: Sequence[NDArray[np.bool_]]  # cells of each image with a return
     answers: Sequence[Mapping[str, NDArray[np.float32]]]
     seven_bits: bool
 
@@ -155,7 +156,8 @@ class _Calibrated:
         cls, path: Path, card: ModelCard, scans: Sequence[NDArray[np.float32]], seven_bits: bool = False
     ) -> _Calibrated:
         model, projector = _folded(path), make_projector(card.view, card.input)
-        images = [projector.project(np.ascontiguousarray(points)).image[None].copy() for points in scans]
+        views = [projector.project(np.ascontiguousarray(points)) for points in scans]
+        images = [view.image[None] for view in views]
         with tempfile.TemporaryDirectory() as folder:
             onnx.save(model, f"{folder}/folded.onnx")
             augmented = f"{folder}/augmented.onnx"
@@ -168,8 +170,9 @@ class _Calibrated:
                 for image in tqdm(images, desc="calibrating", unit="scan"):
                     calibrator.collect_data(_Reader(iter([{card.input.name: image}])))
                 ranges = calibrator.compute_data()
-        probes = images[:: max(1, len(images) // N_PROBES)][:N_PROBES]
-        return cls(card, model, ranges, probes, _answers(model, card, probes), seven_bits)
+        probed = views[:: max(1, len(views) // N_PROBES)][:N_PROBES]
+        probes, returned = [view.image[None] for view in probed], [view.index >= 0 for view in probed]
+        return cls(card, model, ranges, probes, returned, _answers(model, card, probes), seven_bits)
 
     def rounded(self, convolutions: Collection[str]) -> onnx.ModelProto:
         """The network with these convolutions, and what lies between them, in eight bits."""
@@ -251,10 +254,10 @@ def _answers(
 def _disagreement(fp32: _Calibrated, answers: Sequence[Mapping[str, NDArray[np.float32]]]) -> float:
     """How far labels and boxes are from the fp32 network's: 1 less mean IoU, or less AP where that is lower."""
     card, labels, boxes = fp32.card, Confusion(fp32.card.classes), BoxEvaluator(oriented=True)
-    for image, here, there in zip(fp32.images, answers, fp32.answers, strict=True):
+    for returned, here, there in zip(fp32.returned, answers, fp32.answers, strict=True):
         if card.view.kind == "top_view":
             (mine, found), (theirs, wanted) = (
-                decode_top_view(card, image[0], outputs, card.score_threshold) for outputs in (here, there)
+                decode_top_view(card, returned, outputs, card.score_threshold) for outputs in (here, there)
             )
             boxes.update(found, wanted)
         else:
@@ -305,7 +308,7 @@ def race(
     one: Path, other: Path, n_threads: int | None, n_runs: int = N_RUNS
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Milliseconds of two networks' runs, by turns; the first of every turn is a warm-up and not counted."""
-    sessions = [Session(path, "cpu", n_threads) for path in (one, other)]
+    sessions = [Session(path, "cpu", n_threads=n_threads) for path in (one, other)]
     times = np.empty((2, n_runs))
     for run in range(n_runs):
         for k, session in enumerate(sessions):

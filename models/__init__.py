@@ -1,52 +1,214 @@
-"""The models that come with edgeperc: .onnx files, each carrying its card; installed as ``edgeperc.zoo``."""
+"""The models that come with edgeperc: .onnx files, each carrying its card; installed as ``edgeperc.zoo``.
+
+A name stands for one network and its variants: the same network with its weights in fp32 and in int8. `choose` alone
+decides which variant runs on which provider, and in which precision.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
-from edgeperc.errors import ModelFileError
+from edgeperc.card import ModelCard
+from edgeperc.errors import ModelFileError, ProviderError
 
-__all__ = ["DEFAULT", "model_path", "resolve", "shipped_models"]
+__all__ = ["DEFAULT", "Variant", "choose", "digest", "listed", "model_path", "resolve", "shipped_models"]
+
+DEFAULT = ("ssadnet", "pointseg")
+"""The best pair: drivable area and vehicles ahead, and a class for every point."""
+
+MAX_LOSS = 0.3
+"""Points of mean IoU, or of AP, that ``precision="auto"`` gives up for speed."""
+
+# Processor flags (`edgeperc.tuning.cpu_features`). Without a dot product of bytes, x86 adds pairs of 8-bit products in
+# 16 bits, which saturates, and int8 is no faster than fp32.
+INT8_FEATURES = frozenset({"avx512_vnni", "avx_vnni", "amx_int8", "asimddp"})
+BF16_FEATURES = frozenset({"amx_bf16", "avx512_bf16"})
+BF16_PROVIDERS = ("openvino",)
+# The reduced precisions of a provider, the fastest first. With AMX, OpenVINO ran SSADNet in 30 ms in bf16 and in 43 ms
+# in int8.
+FASTEST = {"cpu": ("int8",), "openvino": ("bf16", "int8")}
+
+RENAMED = {
+    "ssadnet-edge": "ssadnet:fp32",
+    "ssadnet-edge-int8": "ssadnet:int8",
+    "pointseg-edge": "pointseg:fp32",
+    "pointseg-edge-int8": "pointseg:int8",
+}
+RESEARCH = ("kulseg", "pointseg-full", "pointseg-sim", "ssadnet-full", "ssadnet-paper", "ssadnet-sim")
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """A model file and its card."""
+
+    path: Path
+    card: ModelCard
+
+    @property
+    def name(self) -> str:
+        """The network's name."""
+        return self.card.name
+
+    @property
+    def precision(self) -> str:
+        """Of the stored weights: ``"fp32"`` or ``"int8"``."""
+        return self.card.precision
+
+    def __str__(self) -> str:
+        return f"{self.name}:{self.precision}"
+
+
+def listed() -> tuple[Variant, ...]:
+    """Every model file in this installation, by name, fp32 before int8.
+
+    Raises
+    ------
+    CardError, ModelFileError
+        A file was changed or cut short.
+    """
+    paths = [Path(str(entry)) for entry in resources.files(__name__).iterdir() if entry.name.endswith(".onnx")]
+    return tuple(sorted((Variant(path, ModelCard.read(path)) for path in paths), key=str))
 
 
 def shipped_models() -> tuple[str, ...]:
-    """Names of the models in this installation, sorted."""
-    names = (entry.name for entry in resources.files(__name__).iterdir())
-    return tuple(sorted(name.removesuffix(".onnx") for name in names if name.endswith(".onnx")))
+    """Names of the networks in this installation, sorted."""
+    return tuple(dict.fromkeys(variant.name for variant in listed()))
 
 
-def model_path(name: str) -> Path:
-    """Where a shipped model lies.
+def resolve(model: str | os.PathLike[str]) -> tuple[Variant, ...]:
+    """The variants that a model's name or path stands for.
 
     Parameters
     ----------
-    name : str
-        One of `shipped_models`, such as ``"pointseg"``.
+    model : str or Path
+        ``"pointseg"`` for a network with all its variants, ``"pointseg:int8"`` for one of them, or the path of an
+        .onnx file with a card.
 
     Returns
     -------
-    path : Path
-        The .onnx file.
+    variants : tuple of Variant
+        At least one; fp32 before int8.
 
     Raises
     ------
     ModelFileError
-        No model of that name is shipped; the message lists those that are.
+        No model has this name, or the file cannot be read; the message lists the names, or gives the new one.
+    CardError
+        The file carries no card, or one that cannot be read.
     """
-    shipped = shipped_models()
-    if name not in shipped:
-        known = ", ".join(shipped) or "none in this installation"
-        raise ModelFileError(f"no model is called {name!r}. Shipped: {known}. Or give the path of an .onnx file.")
-    return Path(str(resources.files(__name__).joinpath(f"{name}.onnx")))
+    if not isinstance(model, str) or Path(model).suffix == ".onnx":
+        path = Path(model)
+        return (Variant(path, ModelCard.read(path)),)
+    name, _, precision = model.partition(":")
+    of_name = tuple(variant for variant in listed() if variant.name == name)
+    if not of_name:
+        raise ModelFileError(_unknown(name))
+    chosen = tuple(variant for variant in of_name if precision in ("", variant.precision))
+    if not chosen:
+        stored = " and ".join(map(str, of_name))
+        raise ModelFileError(
+            f"no model is called {model!r}; {name} comes as {stored}. bf16 is no file: ask for precision 'bf16'"
+        )
+    return chosen
 
 
-DEFAULT = ("ssadnet", "pointseg")
+def _unknown(name: str) -> str:
+    if name in RENAMED:
+        return f"model {name!r} is now called {RENAMED[name]!r}; {RENAMED[name].partition(':')[0]!r} takes the best variant"
+    if name in RESEARCH:
+        return (
+            f"{name!r} is a research model and is not installed; give the path models/research/{name}.onnx "
+            "in edgeperc's source distribution or repository"
+        )
+    known = ", ".join(shipped_models()) or "none in this installation"
+    return f"no model is called {name!r}. Shipped: {known}. Or give the path of an .onnx file."
 
 
-def resolve(model: str | os.PathLike[str]) -> Path:
-    """A shipped name, or anything that looks like a file, as a path."""
-    if isinstance(model, str) and Path(model).suffix != ".onnx":
-        return model_path(model)
-    return Path(model)
+def model_path(model: str | os.PathLike[str]) -> Path:
+    """The one file of ``"pointseg:int8"``, or of a network's name: there the one in fp32.
+
+    Raises
+    ------
+    CardError, ModelFileError
+        As `resolve`.
+    """
+    return resolve(model)[0].path
+
+
+def choose(
+    variants: Sequence[Variant], provider: str, precision: str = "auto", features: Collection[str] = ()
+) -> tuple[Variant, str]:
+    """Which variant of a network runs on a provider, and in which precision.
+
+    ``"auto"`` takes the fastest precision of the provider that this processor computes natively and that the card
+    shows to lose at most `MAX_LOSS` points; else fp32. A network that is there in int8 alone runs in int8.
+
+    Parameters
+    ----------
+    variants : sequence of Variant
+        Of one network, from `resolve`.
+    provider : str
+        A key of `edgeperc.session.PROVIDERS`.
+    precision : {"auto", "fp32", "bf16", "int8"}
+    features : collection of str
+        Flags of the processor (`edgeperc.tuning.cpu_features`); empty where they are not known. ``"auto"`` then takes
+        no reduced precision.
+
+    Returns
+    -------
+    variant : Variant
+    precision : str
+        ``"fp32"``, ``"bf16"`` (weights stored in fp32) or ``"int8"``.
+
+    Raises
+    ------
+    ProviderError
+        This network cannot run in the precision asked for; the message says in which it can.
+    """
+    runs = {variant.precision: (variant, variant.precision) for variant in variants}
+    if "fp32" in runs and provider in BF16_PROVIDERS and (not features or BF16_FEATURES & {*features}):
+        runs["bf16"] = (runs["fp32"][0], "bf16")
+    if precision != "auto":
+        if precision not in runs:
+            raise ProviderError(_not_in(variants[0].name, provider, precision, sorted(runs)))
+        return runs[precision]
+    native = {"int8": bool(INT8_FEATURES & {*features}), "bf16": bool(BF16_FEATURES & {*features})}
+    for reduced in FASTEST.get(provider, ()):
+        if reduced in runs and native[reduced] and _loss(runs[reduced][0].card, reduced) <= MAX_LOSS:
+            return runs[reduced]
+    return runs.get("fp32") or runs["int8"]
+
+
+def _loss(card: ModelCard, precision: str) -> float:
+    """Points lost to fp32 on real scans; infinite where nobody measured."""
+    return float(card.precisions.get(precision, {}).get("loss", "inf"))
+
+
+def _not_in(name: str, provider: str, precision: str, can: Sequence[str]) -> str:
+    message = f"{name} cannot run in precision {precision!r} on provider {provider!r}, only in {' or '.join(can)}; "
+    if precision == "bf16":
+        needs = " or ".join(sorted(BF16_FEATURES))
+        return f"{message}bf16 needs provider 'openvino', a model in fp32 and a processor with {needs}"
+    if precision in ("fp32", "int8"):
+        return f"{message}give a model whose weights are stored in {precision}, or precision 'auto'"
+    return f"{message}expected auto, fp32, bf16 or int8"
+
+
+def digest(variants: Sequence[Variant]) -> str:
+    """What settings of a network are kept under: its file's SHA-256, or, of several files, that of their SHA-256s.
+
+    Raises
+    ------
+    ModelFileError
+        A file cannot be read.
+    """
+    try:
+        hashes = [hashlib.sha256(variant.path.read_bytes()).hexdigest() for variant in variants]
+    except OSError as exc:
+        raise ModelFileError(f"{exc.filename} cannot be read: {exc.strerror}") from exc
+    return hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()

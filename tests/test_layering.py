@@ -24,8 +24,8 @@ FLOORS = {
     "edgeperc": """
         errors atomic
         onnx_metadata
-        card points sensor tuning zoo.__init__
-        perception
+        card points sensor tuning
+        perception zoo.__init__
         geometry
         adapt cluster decode drivable fitness ground projection refine sensor_fit session
         readers.__init__ readers.tables
@@ -47,12 +47,12 @@ FLOORS = {
         simulation.samples
         evaluation.__init__ evaluation.metrics evaluation.mistakes evaluation.splits evaluation.tracking_metrics
         evaluation.datasets evaluation.tables
-        evaluation.unseen
+        evaluation.unseen evaluation.truth
         evaluation.judge evaluation.tracking evaluation.transfer
         evaluation.evaluate
-        view.colours
-        view.canvas view.files view.page view.tracks
-        view.mistakes view.picture
+        view.colors
+        view.canvas view.content
+        view.files view.mistakes view.page view.picture view.tracks
         view.__init__
         cli.output
         cli.run cli.info

@@ -16,10 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from edgeperc import ModelCard
+from edgeperc.adapt import condition
 from edgeperc.projection import make_projector
 from edgeperc.sensor import get_sensor
 from edgeperc.session import Session, available_providers
-from edgeperc.zoo import DEFAULT, model_path, shipped_models
+from edgeperc.zoo import DEFAULT, listed, model_path
 
 from ..samples import percentile
 from ..worker import Answer
@@ -96,8 +97,7 @@ def absent(contender: Contender) -> str:
 
 def default_models() -> list[str]:
     """The shipped models that are measured unless others are named."""
-    names = [f"{name}{suffix}" for suffix in ("", "-edge", "-edge-int8") for name in DEFAULT]
-    return [name for name in names if name in shipped_models()]
+    return [str(variant) for variant in listed() if variant.name in DEFAULT]
 
 
 def groups(models: Sequence[str], provider: str, folder: Path, scan: Path, sensor: str) -> dict[str, list[Contender]]:
@@ -120,12 +120,12 @@ def groups(models: Sequence[str], provider: str, folder: Path, scan: Path, senso
     for name in models:
         path = Path(name) if name.endswith(".onnx") else model_path(name)
         card = Session(path, "cpu").card
-        views[card.view.kind].append((card.name, path, card))
+        views[card.view.kind].append((f"{card.name}-{card.precision}", path, card))
     told: dict[str, list[Contender]] = {}
     for name, path, card in (*views["range_image"], *views["top_view"]):
         image = folder / f"{name}-input.npy"
         projector = make_projector(card.view, card.input)
-        np.save(image, projector.project(points, profile.remission_offset, profile.remission_scale).image)
+        np.save(image, projector.project(condition(points, profile)[0]).image)
         alone = [Contender("onnxruntime CPU, network alone", "session", "cpu", (path,), image=image)]
         if provider not in ("auto", "cpu"):
             alone.append(Contender(f"onnxruntime {provider}, network alone", "session", provider, (path,), image=image))

@@ -66,7 +66,7 @@ def floor_table(title: str, found: Sequence[Found]) -> dict[str, Any]:
     if absent(Contender("", "network", "torch")):
         words.append(f"multiplications are not counted: onnx is {INSTALL}")
     else:
-        needs, rounded = cost(path), Session(path, "cpu").card.training.get("precision") == "int8"
+        needs, rounded = cost(path), Session(path, "cpu").card.precision == "int8"
         words.append(
             f"{needs.macs / 1e9:.2f} GMAC, {needs.padding_macs / 1e9:.2f} of them on padding, which the floor leaves "
             f"out; {needs.weights / 1e6:.1f} M weights; {needs.activations / 1e6:.1f} M activations"

@@ -66,7 +66,7 @@ def make_network(contender: Contender, scans: Sequence[NDArray[np.float32]], sen
         # edgeperc's Session has `input` and `run` too
         network: Any
         if contender.kind == "session":
-            network = Session(path, contender.engine, n_threads)
+            network = Session(path, contender.engine, n_threads=n_threads)
         else:
             network = open_engine(contender.engine, path, n_threads)
         network.input[:] = image

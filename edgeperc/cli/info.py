@@ -51,9 +51,8 @@ def _is_model(thing: str) -> bool:
 
 def _open(thing: str) -> Session:
     from ..session import Session
-    from ..zoo import model_path
 
-    return Session(thing if Path(thing).suffix == ".onnx" else model_path(thing), "cpu")
+    return Session(thing, "cpu")
 
 
 def _card(thing: str) -> str:
