@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from edgeperc.card import TopViewGeometry
-from edgeperc.evaluation.judge import FEWEST_RETURNS
-from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
+from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
 from edgeperc.evaluation.tables import VEHICLES
 from edgeperc.simulation.samples import IGNORE, labels_by_boxes
 from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES, SimulatedScan
@@ -73,17 +72,12 @@ def correctness(answers: Sequence[Answer], truth: Sequence[SimulatedScan]) -> di
         view = answer.top_view
         if view is None:
             continue
+        geometry = TopViewGeometry(view.x_range_m, view.y_range_m, cell_m=view.cell_m)
         if view.classes == TOP_VIEW_CLASSES:
-            cells.update(
-                view.labels, scan.top_view_labels(TopViewGeometry(view.x_range_m, view.y_range_m, cell_m=view.cell_m))
-            )
-        (near, far), (right, left) = view.x_range_m, view.y_range_m
-        wanted, ignored = [], []
-        for box, returns in zip(scan.boxes, scan.box_points, strict=True):
-            seen = near <= box.center[0] < far and right <= box.center[1] < left
-            counts = box.label in VEHICLES and seen and returns >= FEWEST_RETURNS
-            (wanted if counts else ignored).append(box)
-        boxes.update(answer.boxes, wanted, ignored=ignored)
+            cells.update(view.labels, scan.top_view_labels(geometry))
+        truth = zip(scan.boxes, scan.box_points, strict=True)
+        to_find, ignored = boxes_to_find(truth, geometry, VEHICLES)
+        boxes.update(answer.boxes, to_find, ignored=ignored)
     return {
         "points_mean_iou": _plain(points.mean_iou()),
         "cells_mean_iou": _plain(cells.mean_iou()),

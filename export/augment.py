@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from edgeperc.geometry import inside
 from edgeperc.perception import Box
-from edgeperc.simulation.samples import IGNORE, POINT_CLASS_OF
+from edgeperc.simulation.samples import IGNORE
+from edgeperc.simulation.scene import POINT_CLASS_OF
 
 from .scans import LabelledScan, mirrored, turned, turned_box
 

@@ -14,7 +14,8 @@ pytest.importorskip("tqdm")
 
 from edgeperc.geometry import inside
 from edgeperc.perception import Box
-from edgeperc.simulation.samples import IGNORE, POINT_CLASS_OF, simulated_scan
+from edgeperc.simulation.samples import IGNORE, simulated_scan
+from edgeperc.simulation.scene import POINT_CLASS_OF
 from edgeperc_export.augment import ObjectBank, augmented, facing, pasted, swapped, weathered
 from edgeperc_export.scans import SURFACE, LabelledScan, turned
 

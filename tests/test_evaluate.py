@@ -85,12 +85,13 @@ class World:
             )
 
         perceive.cards = tuple(self.cards[name] for name in models)  # type: ignore[attr-defined]
+        perceive.sessions = tuple(SimpleNamespace(card=card) for card in perceive.cards)  # type: ignore[attr-defined]
         return perceive
 
-    def network(self, model: str, provider: str) -> Any:
+    def network(self, session: Any) -> Any:
         return SimpleNamespace(
-            card=self.cards[model],
-            probability=lambda points, name: self.probability,
+            card=session.card,
+            probability=lambda name: self.probability,
             point_labels=lambda points: np.zeros(len(points), np.uint8),
         )
 
@@ -512,7 +513,7 @@ def test_a_network_agrees_with_the_perceiver() -> None:
     assert judge.from_sensor is not None
     assert found.top_view is not None
     assert found.points is not None
-    drivable = judge.from_above.probability(truth.points, "drivable")
+    drivable = judge.from_above.probability("drivable")
     assert drivable.min() >= 0.0
     assert drivable.max() <= 1.0
     assert (found.top_view.labels[drivable > 0.5] > 0).all()  # drivable, or under a box

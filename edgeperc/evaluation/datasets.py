@@ -21,7 +21,8 @@ from ..errors import PointsError
 from ..geometry import inside
 from ..perception import Box
 from ..readers.files import read_points
-from ..simulation.samples import IGNORE, POINT_CLASS_OF
+from ..simulation.samples import IGNORE
+from ..simulation.scene import POINT_CLASS_OF
 from .splits import TEST_DRIVES, in_split
 
 __all__ = [
@@ -121,12 +122,12 @@ class Frame:
     calibration: Calibration
 
     @cached_property
-    def judged(self) -> NDArray[np.bool_]:
-        """Points whose truth is known, (n,) bool: seen by the camera, outside DontCare."""
-        return self.judges(self.points)
+    def known(self) -> NDArray[np.bool_]:
+        """Points whose truth is known, (n,) bool: in the camera's field of view, outside DontCare."""
+        return self.known_at(self.points)
 
-    def judges(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Whether truth is known at each of these places (n, 3+), sensor frame."""
+    def known_at(self, points: NDArray[Any]) -> NDArray[np.bool_]:
+        """Whether the truth is known at places (n, 3+) in the sensor frame, (n,) bool."""
         known = self.calibration.in_image(points)
         pixel, _ = self.calibration.to_image(points)
         for left, top, right, bottom in self.unlabelled:
@@ -135,7 +136,7 @@ class Frame:
 
     def point_labels(self) -> NDArray[np.uint8]:
         """PointSeg's truth, (n,) uint8: a point in a box has the box's class, `IGNORE` where nobody labelled."""
-        labels = np.where(self.judged, 0, IGNORE).astype(np.uint8)
+        labels = np.where(self.known, 0, IGNORE).astype(np.uint8)
         for box in self.boxes:
             labels[inside(box, self.points)] = POINT_CLASS_OF.get(box.label, IGNORE)
         return labels

@@ -1,8 +1,7 @@
 """The papers' tables on labelled scans: points (PointSeg 5.1), boxes and top view (SSADNet 3.3, appendix A), road.
 
-Everything goes through `edgeperc.Perceiver`, as it would in a vehicle: what is judged is what a user gets. One pass
-makes a small `Record` of each scan; every figure is computed from records put together, so that an interval is the
-same figures over drives drawn anew.
+Scans go through `edgeperc.Perceiver`, so the figures are of what a user gets. Each scan leaves a small `Record` of
+counts. Every figure is computed from sums of records, and its interval from the same sums over resampled drives.
 """
 
 from __future__ import annotations
@@ -17,9 +16,10 @@ from ..perceiver import BoxesFrom
 from ..simulation.samples import FIRST_SEED
 from ..zoo import DEFAULT
 from .datasets import KittiObjects, SemanticKitti
-from .judge import Judge, Truth
+from .judge import Judge
 from .mistakes import Mistakes
 from .tables import Record, figures
+from .truth import Truth
 
 __all__ = ["evaluate"]
 
@@ -43,30 +43,30 @@ def evaluate(
     Parameters
     ----------
     datasets : sequence of str or Path
-        Roots of a KITTI object set or of SemanticKITTI, or ``"simulation:N"`` for N simulated scans (24 without).
+        Roots of a KITTI object set or of SemanticKITTI, or ``"simulation:N"`` for N simulated scans (default 24).
     models, road_by, provider, boxes_from
-        As `Judge` has them.
+        As in `Judge`.
     split : str or None
-        ``"test"``, ``"train"``, ``"validation"`` or ``"all"`` of the real scans (`edgeperc.splits`); None takes the
-        validation drives where there is a ``fold`` and the test drives where there is none.
+        Drives of the real scans: ``"test"``, ``"train"``, ``"validation"`` or ``"all"`` (`splits.in_split`). None: the
+        validation drives if there is a ``fold``, else the test drives.
     fold : int or None
     n_resamples : int
-        For the intervals.
+        Number of resamples of the drives for the intervals.
     on_scan : callable
-        Told after every scan how many are done, of how many.
+        Called after each scan with the number of scans done and the number of all scans.
 
     Returns
     -------
     figures : dict
-        ``"models"``, ``"split"``, ``"fold"``, and `figures` of ``"real"``, ``"semantickitti"`` and ``"simulated"``
-        scans, whichever there are.
+        ``"models"``, ``"split"``, ``"fold"``, and the `figures` of each kind of scans in the datasets: ``"real"``,
+        ``"semantickitti"``, ``"simulated"``.
     mistakes : list of Mistakes
-        The twenty scans with most mistakes, worst first; of real ones where there are any.
+        The twenty scans with most mistakes, worst first; of real scans if there are any, else of simulated ones.
 
     Raises
     ------
     PointsError
-        A dataset is none, or has no scans of the split.
+        A dataset is not of a known kind, or has no scans of the split.
     SplitError
         A model was trained on a scan, and ``split`` is not ``"train"``.
     """
@@ -82,16 +82,16 @@ def evaluate(
             ranked = sorted([*worst.get(block, ()), mistakes], key=lambda each: -each.n_errors)
             worst[block] = ranked[:N_WORST]
         on_scan(done, len(scans))
-    told: dict[str, Any] = {"models": {card.name: card.version for card in judge.perceive.cards}}
-    told |= {"split": split, "fold": fold}
-    told |= {block: figures(of_block, n_resamples) for block, of_block in records.items()}
-    return told, worst.get("real") or worst.get("simulated", [])
+    result: dict[str, Any] = {"models": {card.name: card.version for card in judge.perceive.cards}}
+    result |= {"split": split, "fold": fold}
+    result |= {block: figures(of_block, n_resamples) for block, of_block in records.items()}
+    return result, worst.get("real") or worst.get("simulated", [])
 
 
 def _scans(judge: Judge, dataset: str | Path, split: str, fold: int | None) -> list[tuple[str, Callable[[], Truth]]]:
-    """The scans of a dataset, yet to be read, each with the block of figures that it belongs to."""
-    word, _, number = str(dataset).partition(":")
-    if word == "simulation":
+    """For each scan of a dataset: its block of figures, and a function that reads the scan."""
+    kind, _, number = str(dataset).partition(":")
+    if kind == "simulation":
         if not (number or "24").isdecimal() or number == "0":
             raise PointsError(f"got {dataset!r}; expected simulation, or simulation:N with a number of scans from 1")
         return [("simulated", partial(judge.simulated, FIRST_SEED + k)) for k in range(int(number or 24))]
@@ -106,11 +106,11 @@ def _scans(judge: Judge, dataset: str | Path, split: str, fold: int | None) -> l
         scans = [("semantickitti", _later(judge.semantickitti, sequences.frame, name)) for name in names]
     else:
         raise PointsError(
-            f"{dataset} holds no labelled scans; expected the root of a KITTI object set (training/label_2 below it), "
+            f"{dataset} has no labeled scans; expected the root of a KITTI object set (training/label_2 below it), "
             "of SemanticKITTI (sequences/*/labels below it), or the word simulation"
         )
     if not scans:
-        raise PointsError(f"{dataset} holds no scans of the {split} drives (fold: {fold}); name another, or 'all'")
+        raise PointsError(f"{dataset} has no scans of the {split} drives (fold: {fold}); pass another split, or 'all'")
     return scans
 
 

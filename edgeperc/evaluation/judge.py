@@ -1,11 +1,11 @@
-"""Compare one scan's perception with its labels."""
+"""Evaluate the perception of one scan against its truth."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,106 +15,47 @@ from numpy.typing import NDArray
 from ..card import TopViewGeometry
 from ..decode import decode_classes
 from ..errors import EdgepercError, ModelError
-from ..geometry import draw_footprints, inside
+from ..geometry import inside
 from ..perceiver import BoxesFrom, Perceiver
-from ..perception import Box, Perception, PointLabels, TopView
+from ..perception import Perception, PointLabels, TopView
 from ..projection import make_projector
 from ..session import Session
-from ..simulation.samples import IGNORE, POINT_CLASS_OF, labels_by_boxes, simulated_scan
-from ..simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES
-from ..zoo import model_path
-from .datasets import ROAD_CLASSES, Frame, RoadFrame
-from .metrics import BoxEvaluator, ProbabilitySweep
+from ..simulation.samples import IGNORE
+from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
+from .datasets import Frame, RoadFrame
+from .metrics import FEWEST_RETURNS, BoxEvaluator, ProbabilitySweep, boxes_to_find
 from .mistakes import Mistakes
 from .tables import BANDS, VEHICLES, Record, banded, within
+from .truth import Truth, kitti_truth, semantickitti_truth, simulated_truth
 from .unseen import check_unseen, training_scans_of
 
-__all__ = ["FEWEST_RETURNS", "Judge", "Truth"]
+__all__ = ["Judge"]
 
-FEWEST_RETURNS = 3  # no network could tell an object of fewer from clutter
-FARTHEST_M = 46.0  # objects beyond count among the points' figures, but for no mistake
-GROUND_Z_M = -1.5  # where a cell is looked up in the camera's image
-
-# Names of what is judged in the top view; never put together, for each counts other cells by other truth.
-BY_BOXES, OBSERVED, EVERY_CELL = "vehicles from 3-D boxes", "observed cells", "every cell"
-Cells = dict[str, tuple[tuple[str, ...], NDArray[np.uint8]]]
-
-
-@dataclass(frozen=True)
-class Truth:
-    """A scan and what is known about it.
-
-    Attributes
-    ----------
-    name, drive : str
-    points : (n, 4) float32
-    labels : (n,) uint8 or None
-        Index into `POINT_CLASSES`, `IGNORE` where unknown; None where neither points nor objects are to be judged.
-    boxes : tuple of Box
-    returns : tuple of int
-        Returns from each box's object.
-    known : callable
-        Which of some places (k, 3) truth is known at, (k,) bool.
-    cells : mapping
-        Name of a table to its classes and the truth of every cell (rows, columns) uint8, `IGNORE` where unknown.
-    road : tuple of 2 str, or None
-        The table and its class by which the drivable cells are judged.
-    """
-
-    name: str
-    drive: str
-    points: NDArray[np.float32]
-    labels: NDArray[np.uint8] | None
-    boxes: tuple[Box, ...]
-    returns: tuple[int, ...]
-    known: Callable[[NDArray[np.float64]], NDArray[np.bool_]]
-    cells: Cells
-    road: tuple[str, str] | None = None
-
-
-class _Network:
-    """A model's own outputs, for the figures that a perception does not hold."""
-
-    def __init__(self, model: str | Path, provider: str) -> None:
-        self.session = Session(model if Path(model).suffix == ".onnx" else model_path(str(model)), provider)
-        self.card = self.session.card
-        self.projector = make_projector(self.card.view, self.card.input)
-        self.kind = next(output.kind for output in self.card.outputs if output.kind.startswith("class_"))
-
-    def classes(self, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Logits or probabilities (C, H, W), and the flat pixel of every point."""
-        projected = self.projector.project(points)
-        self.session.input[:] = projected.image
-        return self.session.run()[self.kind], projected.pixel
-
-    def probability(self, points: NDArray[np.float32], name: str) -> NDArray[np.float64]:
-        """Of one class in every pixel, (H, W)."""
-        values = self.classes(points)[0].astype(np.float64)
-        if self.kind == "class_logits":
-            values = np.exp(values - values.max(axis=0))
-        return values[self.card.classes.index(name)] / values.sum(axis=0)
-
-    def point_labels(self, points: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """The label of every point's pixel, as PointSeg has it before any refinement, (n,) uint8."""
-        output, pixel = self.classes(points)
-        labels, _ = decode_classes(output, self.kind, model=self.card.name)
-        return np.where(pixel >= 0, labels.ravel()[pixel], 0).astype(np.uint8)
+FARTHEST_M = 46.0  # an object beyond is evaluated by its points, but never listed as a mistake
 
 
 class Judge:
-    """Perceives scans and holds them against their truth.
+    """Perceives scans and compares the results with their truth.
 
     Parameters
     ----------
     models : sequence of str or Path
-        Shipped names or paths; a range-image model is judged by points, a top-view model by boxes and cells.
+        Names of shipped models, or paths. A range-image model is evaluated by points, a top-view model by boxes and
+        cells.
     provider : str
     road_by : str, Path or None
-        A top-view model whose drivable cells count as the truth of real scans with boxes (SSADNet 3.1.2 takes LoDNN's).
+        A top-view model whose drivable cells are the truth of KITTI frames, whose labels have no road (SSADNet 3.1.2
+        uses LoDNN).
     training_scans : bool
-        Judge scans that a model was trained on, too.
+        Also evaluate scans that a model was trained on.
     boxes_from : {"network", "clusters", "both"}
-        As `Perceiver` has it. Boxes of clusters are judged wherever the truth is known, a top-view model's in its view.
+        As in `Perceiver`. Boxes of clusters are evaluated wherever the truth is known, boxes of a top-view model in its
+        view.
+
+    Raises
+    ------
+    ModelError
+        ``road_by`` is one of the models, or has another top view.
     """
 
     def __init__(
@@ -127,16 +68,16 @@ class Judge:
         boxes_from: BoxesFrom = "network",
     ) -> None:
         self.perceive = _perceiver(models, provider, boxes_from)
-        networks = [_Network(model, provider) for model in models]
+        networks = [_Network(session) for session in self.perceive.sessions]
         self.from_sensor = next((n for n in networks if n.card.view.kind == "range_image"), None)
         self.from_above = next((n for n in networks if n.card.view.kind == "top_view"), None)
         self.box_classes = self.from_above.card.box_classes if self.from_above and boxes_from != "clusters" else ()
         self.cluster_classes = self.from_sensor.card.classes[1:] if self.from_sensor and boxes_from != "network" else ()
-        self.view = self.from_above.card.view if self.from_above else None
-        if isinstance(self.view, TopViewGeometry):
-            x, y = np.broadcast_arrays(*self.view.cell_centres())
-            self.cell_range_m = np.hypot(x, y)
-            self.places = np.stack([x.ravel(), y.ravel(), np.full(x.size, GROUND_Z_M)], axis=1)
+        self.view: TopViewGeometry | None = None
+        if self.from_above is not None:
+            assert isinstance(self.from_above.card.view, TopViewGeometry)
+            self.view = self.from_above.card.view
+            self.cell_range_m = np.hypot(*np.broadcast_arrays(*self.view.cell_centres()))
         self.draw_road = None if road_by is None else _perceiver([road_by], provider)
         cards = [*self.perceive.cards]
         if self.draw_road is not None:
@@ -149,7 +90,7 @@ class Judge:
         self.trained_on = {} if training_scans else training_scans_of(cards)
 
     def kitti(self, frame: Frame) -> Truth:
-        """Boxes, and the points and cells in the camera's view outside DontCare.
+        """The truth of a KITTI frame.
 
         Raises
         ------
@@ -157,29 +98,15 @@ class Judge:
             A model was trained on this scan.
         """
         check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
-        cells: Cells = {}
-        if isinstance(self.view, TopViewGeometry):
-            vehicles, unnamed = np.zeros((2, self.view.height, self.view.width), np.uint8)
-            draw_footprints(vehicles, frame.boxes, self.view, TOP_VIEW_CLASSES)
-            # Nobody said whether a tram is a truck.
-            strange = [replace(box, label="car") for box in frame.boxes if box.label in ("tram", "misc")]
-            draw_footprints(unnamed, strange, self.view, TOP_VIEW_CLASSES)
-            known = frame.judges(self.places).reshape(vehicles.shape) & (unnamed == 0)
-            by_boxes = np.where(vehicles > 0, vehicles - 1, 0)
-            cells[BY_BOXES] = ("background", *VEHICLES), np.where(known, by_boxes, IGNORE).astype(np.uint8)
-        if self.draw_road is not None:
-            drawn = self.draw_road(frame.points).top_view
-            assert drawn is not None
-            surface = np.where(vehicles > 0, vehicles, drawn.drivable)
-            (card,) = self.draw_road.cards
-            title = f"road drawn by {card.name} {card.version}"
-            cells[title] = TOP_VIEW_CLASSES, np.where(known, surface, IGNORE).astype(np.uint8)
-        returns = tuple(int(np.count_nonzero(inside(box, frame.points, 0.1))) for box in frame.boxes)
-        labels = frame.point_labels()
-        return Truth(frame.name, frame.drive, frame.points, labels, frame.boxes, returns, frame.judges, cells)
+        if self.draw_road is None:
+            return kitti_truth(frame, self.view)
+        (card,) = self.draw_road.cards
+        drawn = self.draw_road(frame.points).top_view
+        assert drawn is not None
+        return kitti_truth(frame, self.view, (f"road drawn by {card.name} {card.version}", drawn.drivable))
 
     def semantickitti(self, frame: RoadFrame) -> Truth:
-        """Cells with labelled returns.
+        """The truth of a SemanticKITTI frame.
 
         Raises
         ------
@@ -187,24 +114,21 @@ class Judge:
             A model was trained on this scan.
         """
         check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
-        cells: Cells = {}
-        if isinstance(self.view, TopViewGeometry):
-            cells[OBSERVED] = ROAD_CLASSES, frame.top_view(self.view)
-        return Truth(frame.name, frame.drive, frame.points, None, (), (), _everywhere, cells, (OBSERVED, "road"))
+        return semantickitti_truth(frame, self.view)
 
     def simulated(self, seed: int) -> Truth:
-        """A scene drawn from a seed, which is a drive of its own: everything is known."""
-        name, scan = f"scene {seed}", simulated_scan(seed)
-        cells: Cells = {}
-        if isinstance(self.view, TopViewGeometry):
-            cells[EVERY_CELL] = TOP_VIEW_CLASSES, scan.top_view_labels(self.view)
-        road = EVERY_CELL, "drivable"
-        return Truth(
-            name, name, scan.points, labels_by_boxes(scan), scan.boxes, scan.box_points, _everywhere, cells, road
-        )
+        """The truth of a simulated scene."""
+        return simulated_truth(seed, self.view)
 
     def record(self, truth: Truth) -> tuple[Record, Mistakes | None]:
-        """Judge one scan; the mistakes are None where no objects are known."""
+        """Evaluate one scan.
+
+        Returns
+        -------
+        record : Record
+        mistakes : Mistakes or None
+            None if the truth has no objects.
+        """
         found = self.perceive(truth.points)
         tallies: dict[tuple[str, ...], Any] = {}
         mistakes = None
@@ -223,15 +147,19 @@ class Judge:
     def _count_boxes(
         self, tallies: dict[tuple[str, ...], Any], truth: Truth, found: Perception, mistakes: Mistakes
     ) -> Mistakes:
-        predicted, wanted, ignored = self._judged_boxes(truth, found)
+        """Match the predicted boxes where truth is known, by axis-aligned and by oriented footprints."""
+        centers = np.array([box.center for box in found.boxes], np.float64).reshape(-1, 3)
+        predicted = [box for box, known in zip(found.boxes, truth.known(centers), strict=True) if known]
+        returns = list(zip(truth.boxes, truth.returns, strict=True))
+        to_find, ignored = boxes_to_find(returns, self.view, self.box_classes, classes_anywhere=self.cluster_classes)
         for kind in ("upright", "oriented"):
             evaluator = tallies["boxes", kind] = BoxEvaluator(oriented=kind == "oriented", together=VEHICLES)
-            pairs = evaluator.update(predicted, wanted, ignored=ignored)
-        returns = dict(zip(map(id, truth.boxes), truth.returns, strict=True))
+            pairs = evaluator.update(predicted, to_find, ignored=ignored)
+        returns_of = {id(box): n for box, n in returns}
         return replace(
             mistakes,
             found=tuple(right for guess, right in pairs if guess and right),
-            missed=tuple((right, returns[id(right)]) for guess, right in pairs if right and not guess),
+            missed=tuple((right, returns_of[id(right)]) for guess, right in pairs if right and not guess),
             false=tuple(guess for guess, right in pairs if guess and not right),
         )
 
@@ -243,7 +171,10 @@ class Judge:
         mistakes: Mistakes,
         shown: NDArray[np.bool_],
     ) -> Mistakes:
-        """Also takes objects for found or missed that no box is predicted for, as most of their points are labelled."""
+        """Count refined point labels, and pixel labels before refinement.
+
+        An object whose boxes are not evaluated counts as found if at least half of its points have its label.
+        """
         assert self.from_sensor is not None
         assert truth.labels is not None
         right = np.where(found.in_view, truth.labels, IGNORE).astype(np.uint8)
@@ -276,6 +207,7 @@ class Judge:
         return replace(mistakes, wrong=wrong[shown], found=tuple(hit), missed=tuple(missed), wrong_share=share)
 
     def _count_cells(self, tallies: dict[tuple[str, ...], Any], truth: Truth, found: TopView) -> None:
+        """Count the labels of cells in every table, and the probability of road where the truth has a road."""
         assert self.from_above is not None
         for table, (classes, right) in truth.cells.items():
             if not self.box_classes:
@@ -290,28 +222,33 @@ class Judge:
         classes, right = truth.cells[table]
         road = np.where(right == IGNORE, IGNORE, right == classes.index(name)).astype(np.uint8)
         tallies |= banded(("decision",), ("other", name), found.drivable.astype(np.uint8), road, self.cell_range_m)
-        probability = self.from_above.probability(truth.points, "drivable")
+        probability = self.from_above.probability("drivable")
         for band, within_m in BANDS.items():
-            judged = (road != IGNORE) & within(self.cell_range_m, within_m)
+            counted = (road != IGNORE) & within(self.cell_range_m, within_m)
             tallies["road", band] = ProbabilitySweep()
-            tallies["road", band].update(probability[judged], road[judged])
+            tallies["road", band].update(probability[counted], road[counted])
 
-    def _judged_boxes(self, truth: Truth, found: Perception) -> tuple[list[Box], list[Box], list[Box]]:
-        """Predictions where truth is known, the boxes to find, and those that need not be found.
 
-        To be found is whatever `FEWEST_RETURNS` or more came from and is of a class that clusters are of, or a vehicle
-        whose centre lies in the top view.
-        """
-        centres = np.array([box.center for box in found.boxes], np.float64).reshape(-1, 3)
-        predicted = [box for box, known in zip(found.boxes, truth.known(centres), strict=True) if known]
-        wanted: list[Box] = []
-        ignored: list[Box] = []
-        for box, returns in zip(truth.boxes, truth.returns, strict=True):
-            counts = box.label in self.cluster_classes
-            if box.label in self.box_classes and isinstance(self.view, TopViewGeometry):
-                counts |= self.view.holds(*box.center[:2])
-            (wanted if counts and returns >= FEWEST_RETURNS else ignored).append(box)
-        return predicted, wanted, ignored
+class _Network:
+    """The raw outputs of the perceiver's last run, for figures that a perception does not hold."""
+
+    def __init__(self, session: Session) -> None:
+        self.session, self.card = session, session.card
+        self.projector = make_projector(self.card.view, self.card.input)
+        self.kind = next(output.kind for output in self.card.outputs if output.kind.startswith("class_"))
+
+    def probability(self, name: str) -> NDArray[np.float64]:
+        """Probability of one class in each pixel, (H, W)."""
+        values = self.session.outputs[self.kind].astype(np.float64)
+        if self.kind == "class_logits":
+            values = np.exp(values - values.max(axis=0))
+        return values[self.card.classes.index(name)] / values.sum(axis=0)
+
+    def point_labels(self, points: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """Label of the pixel of each point (n,), PointSeg's answer before refinement; 0 out of view."""
+        labels, _ = decode_classes(self.session.outputs[self.kind], self.kind, model=self.card.name)
+        pixel = self.projector.project(points).pixel
+        return np.where(pixel >= 0, labels.ravel()[pixel], 0).astype(np.uint8)
 
 
 def _perceiver(models: Sequence[str | Path], provider: str, boxes_from: BoxesFrom = "network") -> Perceiver:
@@ -323,12 +260,8 @@ def _perceiver(models: Sequence[str | Path], provider: str, boxes_from: BoxesFro
         raise ModelError(str(exc)) from exc
 
 
-def _everywhere(places: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return np.ones(len(places), np.bool_)
-
-
 def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
-    """Classes and truth of a table as a model without vehicles is judged: where one stands is no road."""
+    """Classes and truth of a table for a model without vehicles: a cell of a vehicle is not road."""
     kept = tuple(name for name in classes if name not in (*VEHICLES, "vehicle"))
     number = np.full(256, IGNORE, np.uint8)
     number[: len(classes)] = [kept.index(name) if name in kept else 0 for name in classes]
@@ -336,7 +269,7 @@ def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tup
 
 
 def _renamed(labels: NDArray[np.uint8], names: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:
-    """Labels of a model as those of a table; the first class stands for what the table does not tell apart."""
+    """Labels of a model as labels of a table; classes that the table does not have become its first class."""
     coarse = {"drivable": "road", **dict.fromkeys(VEHICLES, "vehicle")}
     own = [name if name in classes else coarse.get(name, "") for name in names]
     return np.array([classes.index(name) if name in classes else 0 for name in own], np.uint8)[labels]

@@ -1,33 +1,43 @@
-"""The papers' tables: how right labels and boxes are (PointSeg 5.1, SSADNet 3.3 and appendix A)."""
+"""Confusion matrices, average precision and box matching (PointSeg 5.1, SSADNet 3.3 and appendix A)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..card import TopViewGeometry
 from ..errors import PointsError
 from ..geometry import bounding_rectangles, oriented_iou
 from ..perception import Box
 
-__all__ = ["BoxEvaluator", "BoxScores", "Confusion", "ProbabilitySweep", "average_precision"]
+__all__ = [
+    "FEWEST_RETURNS",
+    "BoxEvaluator",
+    "BoxScores",
+    "Confusion",
+    "ProbabilitySweep",
+    "average_precision",
+    "boxes_to_find",
+]
 
 EVERYWHERE = (0.0, math.inf)
+FEWEST_RETURNS = 3  # an object with fewer returns cannot be told from clutter
 
 
 class Confusion:
-    """Counts of predicted against true labels, over any number of scans or images.
+    """Counts of predicted against true labels, summed over scans or images.
 
-    A class that neither occurs nor is predicted has no score: NaN.
+    The score of a class that neither occurs nor is predicted is NaN.
 
     Parameters
     ----------
     classes : sequence of str
     ignore : int
-        Truth with this label is not counted.
+        Cells or points with this true label are not counted.
 
     Attributes
     ----------
@@ -46,12 +56,12 @@ class Confusion:
         Parameters
         ----------
         predicted, truth : array_like of int
-            Of the same shape; indices into ``classes``, in ``truth`` also ``ignore``.
+            Same shape; indices into ``classes``. ``truth`` may also hold ``ignore``.
 
         Raises
         ------
         PointsError
-            Shapes disagree, or a counted label is none of the classes.
+            The shapes differ, or a counted label is out of range.
         """
         guess, right = np.asarray(predicted), np.asarray(truth)
         if guess.shape != right.shape:
@@ -67,7 +77,7 @@ class Confusion:
         self.counts += np.bincount(right * n + guess, minlength=n * n).reshape(n, n)
 
     def __add__(self, other: Confusion) -> Confusion:
-        """What counting both one's labels and the other's would have given."""
+        """The sum of the counts of both."""
         if (self.classes, self.ignore) != (other.classes, other.ignore):
             raise PointsError(f"got counts of {self.classes} and of {other.classes}; expected the same classes")
         both = Confusion(self.classes, ignore=self.ignore)
@@ -75,18 +85,18 @@ class Confusion:
         return both
 
     def merged(self, groups: Mapping[str, Sequence[str]]) -> Confusion:
-        """Counts of coarser classes: each key stands for the classes it lists. Classes listed nowhere are left out."""
+        """Counts of coarser classes: a group's name to the classes it joins. Classes in no group are dropped."""
         member = np.array([[name in group for name in self.classes] for group in groups.values()], dtype=np.int64)
         coarse = Confusion(tuple(groups), ignore=self.ignore)
         coarse.counts = member @ self.counts @ member.T
         return coarse
 
     def precision(self) -> NDArray[np.float64]:
-        """Share of what was predicted as a class that is one, (C,): P of PointSeg 5.1, equation A3 of SSADNet."""
+        """Correct share of the predictions of each class, (C,): P of PointSeg 5.1, equation A3 of SSADNet."""
         return _share(np.diag(self.counts), self.counts.sum(axis=0))
 
     def recall(self) -> NDArray[np.float64]:
-        """Share of a class that was predicted as one, (C,): R of PointSeg 5.1."""
+        """Correctly predicted share of each class, (C,): R of PointSeg 5.1."""
         return _share(np.diag(self.counts), self.counts.sum(axis=1))
 
     def iou(self) -> NDArray[np.float64]:
@@ -95,15 +105,15 @@ class Confusion:
         return _share(hits, self.counts.sum(axis=0) + self.counts.sum(axis=1) - hits)
 
     def accuracy(self) -> float:
-        """Share of all labels that are right (SSADNet table 4, ACC)."""
+        """Correct share of all labels (SSADNet table 4, ACC)."""
         return float(_share(np.trace(self.counts), self.counts.sum()))
 
     def mean_iou(self) -> float:
-        """Mean of `iou` over the classes that have one (SSADNet table 4, mIoU)."""
+        """Mean of `iou` over the classes whose IoU is not NaN (SSADNet table 4, mIoU)."""
         return _mean(self.iou())
 
     def weighted_precision(self) -> float:
-        """`precision` weighted by how often the classes occur (SSADNet table 3's definition of its mAP)."""
+        """Mean of `precision`, weighted by the frequency of the classes (mAP as SSADNet table 3 defines it)."""
         found = self.precision()
         weights = self.counts.sum(axis=1) * ~np.isnan(found)
         return float(_share(np.nansum(found * weights), weights.sum()))
@@ -115,16 +125,16 @@ def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float
     Parameters
     ----------
     scores : (n,) array_like of float
-        Of all predictions; of equal scores the earlier counts as the better.
+        One for each prediction; of equal scores the earlier ranks higher.
     hits : (n,) array_like of bool
-        Whether each is right.
+        Whether each prediction is correct.
     n_truth : int
-        How many there were to find.
+        Number of objects to find.
 
     Returns
     -------
     float
-        In 0..1; NaN where there was nothing to find.
+        In 0..1; NaN if ``n_truth`` is 0.
 
     Raises
     ------
@@ -141,20 +151,20 @@ def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float
 
 
 def _eleven_points(found: NDArray[np.int64], predicted: NDArray[np.int64], n_truth: int) -> float:
-    """Mean of the best precision at recalls 0, 0.1 .. 1, from both counts at ever lower thresholds."""
+    """Mean of the best precision at recalls 0, 0.1 .. 1; both counts are cumulative over falling thresholds."""
     best_from_here = np.maximum.accumulate((found / np.maximum(predicted, 1))[::-1])[::-1]
-    # Whole numbers: 0.1 * 3 is not 0.3, and a recall of just 3 in 10 must reach it.
+    # In integers, because 0.1 * 3 > 0.3: a recall of exactly 3 in 10 must reach the level 0.3.
     reached = np.searchsorted(found * 10, np.arange(11) * n_truth)
     return float(np.append(best_from_here, 0.0)[reached].mean())
 
 
 class ProbabilitySweep:
-    """How right one class is at every threshold of its probability, over any number of images (KITTI road, LoDNN).
+    """Precision and recall of one class over all thresholds of its probability (KITTI road, LoDNN).
 
     Attributes
     ----------
     counts : (2, 256) int64
-        Of what is not of the class, and of what is, by probability in steps of 1/255.
+        Histograms of the probability in steps of 1/255: row 0 of cells of other classes, row 1 of the class.
     """
 
     def __init__(self) -> None:
@@ -166,14 +176,14 @@ class ProbabilitySweep:
         Parameters
         ----------
         probability : array_like of float
-            Of the class, in 0..1.
+            Probability of the class, in 0..1.
         truth : array_like of bool
-            Of the same shape. Leave out whatever is not to be judged.
+            Same shape. Leave out cells whose truth is unknown.
 
         Raises
         ------
         PointsError
-            Shapes disagree, or a probability is none.
+            The shapes differ, or a probability lies outside 0..1.
         """
         values, right = np.asarray(probability, dtype=np.float64), np.asarray(truth, dtype=np.bool_)
         if values.shape != right.shape or not ((values >= 0.0) & (values <= 1.0)).all():
@@ -184,43 +194,42 @@ class ProbabilitySweep:
         self.counts += np.bincount((right * 256 + level).ravel(), minlength=512).reshape(2, 256)
 
     def __add__(self, other: ProbabilitySweep) -> ProbabilitySweep:
-        """What counting both one's images and the other's would have given."""
+        """The sum of the counts of both."""
         both = ProbabilitySweep()
         both.counts = self.counts + other.counts
         return both
 
     def max_f1(self) -> float:
-        """Best F1 over the thresholds (KITTI road's MaxF); NaN where there was nothing of the class."""
+        """Best F1 over the thresholds (KITTI road's MaxF); NaN if the class does not occur."""
         found, predicted = self._above()
         n_truth = self.counts[1].sum()
         return float(np.max(2.0 * found / (predicted + n_truth))) if n_truth else float("nan")
 
     def average_precision(self) -> float:
-        """Mean of the best precision at recalls 0, 0.1 .. 1; NaN where there was nothing of the class."""
+        """Mean of the best precision at recalls 0, 0.1 .. 1; NaN if the class does not occur."""
         n_truth = int(self.counts[1].sum())
         return _eleven_points(*self._above(), n_truth) if n_truth else float("nan")
 
     def _above(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """What is rightly, and what is at all, taken for the class at each threshold, from the highest down."""
+        """True positives and positives at each threshold, from the highest threshold down."""
         found = np.cumsum(self.counts[1, ::-1])
         return found, np.cumsum(self.counts.sum(axis=0)[::-1])
 
 
 @dataclass(frozen=True, slots=True)
 class BoxScores:
-    """How right the boxes of one class, or of all, are.
+    """Scores of the boxes of one class, or of all classes together.
 
     Attributes
     ----------
     ap : float
-        `average_precision`; NaN where there was no box to find.
+        `average_precision`; NaN if there was no box to find.
     precision, recall : float
-        Over all boxes given; NaN where nothing was predicted, or nothing there to find.
+        Over all predictions, whatever their score; NaN without predictions, or without boxes to find.
     mean_iou_50, mean_iou_70 : float
-        Mean overlap of the boxes that overlap their truth by at least 0.5, or 0.7 (SSADNet table 5); NaN where no
-        box does.
+        Mean IoU of the predictions whose IoU is at least 0.5, or 0.7 (SSADNet table 5); NaN without any.
     n_truth, n_predicted, n_hits : int
-        Without those ignored.
+        Ignored boxes are not counted.
     """
 
     ap: float
@@ -236,9 +245,9 @@ class BoxScores:
 @dataclass(slots=True)
 class _Matches:
     scores: list[float] = field(default_factory=list)
-    overlaps: list[float] = field(default_factory=list)  # with the truth that the box was matched to; 0 for none
-    ranges_m: list[float] = field(default_factory=list)  # of that truth from the sensor; of the box itself for none
-    truth_m: list[float] = field(default_factory=list)
+    overlaps: list[float] = field(default_factory=list)  # IoU with the matched true box; 0 without a match
+    ranges_m: list[float] = field(default_factory=list)  # distance of the matched true box, else of the prediction
+    truth_m: list[float] = field(default_factory=list)  # distance of every box to find
 
     def __add__(self, other: _Matches) -> _Matches:
         return _Matches(
@@ -250,21 +259,21 @@ class _Matches:
 
 
 class BoxEvaluator:
-    """Compares predicted boxes with true ones, over any number of scans.
+    """Matches predicted boxes to true boxes, over any number of scans.
 
-    In every scan predictions pick their truth in the order of their scores: the free one that they overlap most
-    (the earlier on ties), if by the threshold or more. A prediction that has none counts for nothing where it
-    overlaps an ignored truth by the threshold, or where at least half of it lies in an ignored region; else it is
-    wrong.
+    In each scan, predictions are matched in the order of their scores. A prediction takes the free true box with the
+    largest IoU (the earlier one on ties), if that IoU reaches the threshold. An unmatched prediction is not counted if
+    its IoU with an ignored box reaches the threshold, or if at least half of it lies in an ignored region. Otherwise
+    it is a false positive.
 
     Parameters
     ----------
     iou_threshold : float
-        Overlap of footprints, seen from above, that makes a hit.
+        Least IoU of the footprints, seen from above, of a match.
     oriented : bool
-        Compare the footprints as they stand; False compares their axis-aligned bounds, as SSADNet has them.
+        Compare the oriented footprints; False compares their axis-aligned bounds, as SSADNet does.
     together : collection of str, optional
-        Classes that `overall` puts together; all by default.
+        Classes that `overall` joins; all by default.
 
     Raises
     ------
@@ -297,16 +306,16 @@ class BoxEvaluator:
         ----------
         predicted, truth : iterable of Box
         ignored : iterable of Box
-            Objects that need not be found and may be: out of view, hardly hit, of a neighbouring class. They serve
-            predictions of any class.
+            Objects that need not be found but may be: out of view, with too few returns, or of a neighboring class.
+            A prediction of any class may match them.
         ignored_regions : (r, 5) array_like
-            x, y, length, width [m], yaw [rad] of ground where nothing is known.
+            x, y, length, width [m], yaw [rad] of ground where the truth is unknown.
 
         Returns
         -------
         list of (Box or None, Box or None)
-            Predictions and the truth each was matched to, whatever their classes; None beside a wrong prediction and
-            beside a truth that was missed. Excused predictions are left out.
+            Predictions and the true box matched to each, regardless of class; None beside a false positive and beside
+            a missed true box. Predictions that are not counted are left out.
         """
         guesses = sorted(predicted, key=lambda box: -box.score)
         rights, spares = list(truth), list(ignored)
@@ -320,7 +329,7 @@ class BoxEvaluator:
         return self._match(_Matches(), guesses, rights, overlap, excused)
 
     def __add__(self, other: BoxEvaluator) -> BoxEvaluator:
-        """What updating with one's scans and then with the other's would have given."""
+        """The evaluator of the scans of both."""
         if (self.iou_threshold, self.oriented) != (other.iou_threshold, other.oriented):
             raise PointsError(
                 f"got boxes matched at {self.iou_threshold} (oriented: {self.oriented}) and at {other.iou_threshold} "
@@ -333,19 +342,20 @@ class BoxEvaluator:
         return both
 
     def per_class(self, within_m: tuple[float, float] = EVERYWHERE) -> dict[str, BoxScores]:
-        """Scores of every class seen so far, each compared with its own kind only.
+        """Scores of every class seen so far; a prediction is compared with true boxes of its own class only.
 
-        ``within_m`` keeps the truth from the nearer up to the farther distance from the sensor [m], seen from above,
-        the predictions that were matched to such truth, and the wrong predictions whose own centre lies there.
+        ``within_m`` is a range of horizontal distances from the sensor [m], the lower bound included. It keeps the
+        true boxes whose center lies in it, the predictions matched to them, and the false positives whose own center
+        lies in it.
         """
         return {label: self._scores(matches, within_m) for label, matches in self._classes.items()}
 
     def overall(self, within_m: tuple[float, float] = EVERYWHERE) -> BoxScores:
-        """Scores of all boxes, or of those of ``together``, as if they were of one class."""
+        """Scores of all boxes, or of those of the classes ``together``, as if they were one class."""
         return self._scores(self._all, within_m)
 
     def mean_ap(self, within_m: tuple[float, float] = EVERYWHERE) -> float:
-        """Mean AP over the classes that there were to find (SSADNet appendix A, mAP)."""
+        """Mean AP over the classes with boxes to find (SSADNet appendix A, mAP)."""
         return _mean(np.array([scores.ap for scores in self.per_class(within_m).values()]))
 
     def _rectangles(self, boxes: list[Box]) -> NDArray[np.float64]:
@@ -405,6 +415,44 @@ class BoxEvaluator:
         )
 
 
+def boxes_to_find(
+    truth: Iterable[tuple[Box, int]],
+    view: TopViewGeometry | None,
+    classes: Collection[str],
+    *,
+    classes_anywhere: Collection[str] = (),
+    known: Callable[[Box], bool] = lambda box: True,
+) -> tuple[list[Box], list[Box]]:
+    """Split true boxes into those that a detector must find and those that it need not find but may.
+
+    Parameters
+    ----------
+    truth : iterable of (Box, int)
+        True boxes, and the number of returns from each.
+    view : TopViewGeometry or None
+        Boxes of ``classes`` count only if their center lies in this view; None takes every place.
+    classes : collection of str
+    classes_anywhere : collection of str
+        Classes whose boxes count at any place.
+    known : callable
+        Whether the scan is labeled where a box stands.
+
+    Returns
+    -------
+    to_find : list of Box
+        Of one of the classes, labeled, with at least `FEWEST_RETURNS` returns.
+    ignored : list of Box
+        All others. Pass them to `BoxEvaluator.update` as ``ignored``.
+    """
+    to_find: list[Box] = []
+    ignored: list[Box] = []
+    for box, returns in truth:
+        counts = box.label in classes_anywhere
+        counts |= box.label in classes and (view is None or view.holds(*box.center[:2]))
+        (to_find if counts and returns >= FEWEST_RETURNS and known(box) else ignored).append(box)
+    return to_find, ignored
+
+
 def _range_m(box: Box) -> float:
     return math.hypot(box.center[0], box.center[1])
 
@@ -415,7 +463,7 @@ def _rectangles(boxes: list[Box]) -> NDArray[np.float64]:
 
 
 def _share_inside(rectangles: NDArray[np.float64], regions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Largest share of each rectangle's area that lies in one region, (n,)."""
+    """Largest share of the area of each rectangle that lies in one region, (n,)."""
     if len(rectangles) == 0 or regions.size == 0:
         return np.zeros(len(rectangles))
     iou = oriented_iou(rectangles, regions)
@@ -426,12 +474,12 @@ def _share_inside(rectangles: NDArray[np.float64], regions: NDArray[np.float64])
 
 
 def _share(part: ArrayLike, whole: ArrayLike) -> NDArray[np.float64]:
-    """Quotient, NaN where ``whole`` is 0."""
+    """Quotient; NaN where ``whole`` is 0."""
     part, whole = np.asarray(part, dtype=np.float64), np.asarray(whole, dtype=np.float64)
     return np.divide(part, whole, out=np.full(whole.shape, np.nan), where=whole > 0.0)
 
 
 def _mean(values: NDArray[np.float64]) -> float:
-    """Mean of the values that are numbers; NaN where there are none."""
+    """Mean of the values that are not NaN; NaN if there are none."""
     numbers = values[~np.isnan(values)]
     return float(numbers.mean()) if numbers.size else float("nan")

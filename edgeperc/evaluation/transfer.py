@@ -1,12 +1,10 @@
-"""What a model is worth on another sensor than it was trained on, without and with adaptation (KUL-Seg, Table 6)."""
+"""Accuracy of a model on sensors that it was not trained on, without and with adaptation (KUL-Seg, Table 6)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
-from operator import add
 from pathlib import Path
 from typing import Any
 
@@ -20,33 +18,31 @@ from ..perception import Box
 from ..readers.files import read_points
 from ..sensor import SensorProfile, get_sensor
 from ..sensor_fit import fit_sensor
-from ..simulation.samples import IGNORE, labels_by_boxes, simulated_scan
+from ..simulation.samples import FIRST_SEED, IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASSES
 from .metrics import Confusion
 
 __all__ = ["Scan", "compare"]
 
-FIRST_SEED = 2 * 10**9  # as in `edgeperc.evaluate`; the scans a function is fitted to come from before it
-N_FITTED = 8
+N_FITTED = 8  # scenes for a remission function, from seeds before the evaluated ones
 FARTHEST_M = 50.0
 
-# Classes of label files by the model's; what is named in neither is unlabelled.
+# Point class -> names in label files. Names in neither list count as unlabeled.
 CLASSES = {
     1: ("car", "pickup_truck", "medium-sized_truck", "semi-truck", "truck", "van", "bus", "emergency_vehicle",
         "type_vehicle"),
     2: ("pedestrian", "pedestrian_with_object", "person", "type_pedestrian"),
     3: ("cyclist", "type_cyclist"),
 }  # fmt: skip
-NOTHING = ("cones", "pylons", "signs", "temporary_construction_barriers")
-RIDDEN_M = 1.4  # a box called Bicycle is higher when somebody sits on it
+BACKGROUND = ("cones", "pylons", "signs", "temporary_construction_barriers")
+RIDDEN_M = 1.4  # a bicycle box at least this high holds a rider
 
-# Train ids of range images as PCLSegmentation writes them: Road to Vegetation, Person, Two-wheeler, Car, Truck, Bus,
-# None.
+# Train ids of PCLSegmentation's range images: Road to Vegetation, Person, Two-wheeler, Car, Truck, Bus, None.
 IMAGE_LABELS = np.array([0, 0, 0, 0, 0, 2, IGNORE, 1, 1, 1, IGNORE], np.uint8)
 
-# The simulator gives every sensor the HDL-64E's remission. What another one would have said, by pairs (remission, raw)
-# that are measured and of no fitted form: Ouster's signal by KUL-Seg's Table 4; Velodyne's calibrated byte by the same
-# shares of 13 nuScenes scans (HDL-32E) and of `edgeperc.sensor_fit.REFERENCES`.
+# The simulator gives every sensor the remission of an HDL-64E. These measured pairs (remission, raw value) turn it into
+# the raw value of another sensor: Ouster's signal by KUL-Seg's Table 4; Velodyne's calibrated byte by equal quantiles
+# of 13 nuScenes scans (HDL-32E) and of `edgeperc.sensor_fit.REFERENCES`.
 OUSTER_SIGNAL = (9000.0, (0.0, 0.0148, 0.022, 0.426, 0.4838, 1.0), (0.0, 45.91, 113.28, 376.01, 714.5, 9000.0))
 VELODYNE_BYTE = (
     255.0,
@@ -57,7 +53,7 @@ VELODYNE_BYTE = (
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A labelled scan of another sensor.
+    """A labeled scan of another sensor.
 
     Attributes
     ----------
@@ -80,92 +76,91 @@ def compare(
     provider: str = "cpu",
     on_scan: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
-    """IoU of points by class, for every dataset with both adaptations, each alone and neither.
+    """IoU of points by class, for each dataset and each adaptation of `edgeperc.perceiver.ADAPTATIONS`.
 
     Parameters
     ----------
     datasets : sequence of str
-        ``SENSOR=SOURCE``: a built-in sensor or a file of a profile; and ``simulation:N``, a folder with
-        ``velodyne/NAME.bin`` and ``label/NAME.txt`` (class, anything, x, y, z, extents, yaw), or one with range images
-        ``NAME.npy`` (H, W, 6). Real scans are labelled all around and the model sees a quarter, so each is turned
-        four times. A simulated sensor's remission function is fitted to eight other scenes; a real one's is that of
-        its profile.
+        ``SENSOR=SOURCE``. The sensor is a built-in name or the file of a profile. The source is ``simulation:N``, a
+        folder with ``velodyne/NAME.bin`` and ``label/NAME.txt`` (class, one unused column, x, y, z, extents, yaw), or a
+        folder with range images ``NAME.npy`` (H, W, 6). Real scans are labeled all around but the model sees a quarter
+        of the turn, so each is evaluated in four directions. The remission function of a simulated sensor is fitted to
+        eight other scenes; that of a real sensor is in its profile.
     model : str or Path
-        With a range image.
+        A range-image model.
     provider : str
     on_scan : callable
-        Told after every scan how many are done, of how many.
+        Called after each scan with the number of scans done and the number of all scans, over all adaptations.
 
     Returns
     -------
     dict
-        By dataset: ``"n_scans"``, ``"function"``, and by adaptation ``"iou"`` (class to share, None where there is
-        nothing of it), ``"mean_iou"`` over the classes but the background, ``"n_points"`` (class to count).
+        By dataset: ``"n_scans"``, ``"function"``, and by adaptation ``"iou"`` (class -> IoU, None for a class that does
+        not occur), ``"mean_iou"`` over the classes except the background, ``"n_points"`` (class -> count).
 
     Raises
     ------
     PointsError
-        A dataset is none.
+        A dataset cannot be read.
     ModelError
         The model labels no points.
     """
-    told: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     sets = [(name, *_dataset(name)) for name in datasets]
     total, done = sum(len(ADAPTATIONS) * n for _, _, n, _ in sets), 0
     for name, sensor, n_scans, read in sets:
-        counts = {}
-        for adaptation in ADAPTATIONS:
-            perceive = Perceiver(
+        perceivers = {
+            adaptation: Perceiver(
                 model,
                 sensor=sensor,
                 provider=provider,
                 on_mismatch="ignore",
                 adapt=adaptation,
-                boxes_from="network",  # points alone are judged
+                boxes_from="network",  # only points are evaluated
             )
-            parts = []
-            for scan in read():
-                parts.append(_judged(perceive, scan))
+            for adaptation in ADAPTATIONS
+        }
+        counts = {adaptation: Confusion(POINT_CLASSES) for adaptation in ADAPTATIONS}
+        for scan in read():
+            for adaptation, perceive in perceivers.items():
+                _count(counts[adaptation], perceive, scan)
                 done += 1
                 on_scan(done, total)
-            counts[adaptation] = reduce(add, parts)
         function = sensor.remission
-        told[name] = {
+        result[name] = {
             "n_scans": n_scans,
             "function": None
             if function is None
             else f"{function.kind} {', '.join(f'{c:.4g}' for c in function.coefficients)}",
             **{adaptation: _row(confusion) for adaptation, confusion in counts.items()},
         }
-    return told
+    return result
 
 
-def _judged(perceive: Perceiver, scan: Scan) -> Confusion:
+def _count(confusion: Confusion, perceive: Perceiver, scan: Scan) -> None:
     found = perceive(scan.points).points
     if found is None:
-        raise ModelError(f"{perceive.cards[0].name} labels no points; name a model with a range image")
+        raise ModelError(f"{perceive.cards[0].name} labels no points; pass a range-image model")
     near = np.hypot(scan.points[:, 0], scan.points[:, 1]) < FARTHEST_M
     known = found.in_view & near & (scan.labels != IGNORE)
     own = np.array([POINT_CLASSES.index(c) if c in POINT_CLASSES else 0 for c in found.classes], np.uint8)
-    confusion = Confusion(POINT_CLASSES)
     confusion.update(own[found.labels[known]], scan.labels[known])
-    return confusion
 
 
 def _row(confusion: Confusion) -> dict[str, Any]:
-    there = dict(zip(POINT_CLASSES, confusion.counts.sum(axis=1).tolist(), strict=True))
+    n_points = dict(zip(POINT_CLASSES, confusion.counts.sum(axis=1).tolist(), strict=True))
     iou = dict(zip(POINT_CLASSES, confusion.iou().tolist(), strict=True))
-    known = {name: iou[name] if there[name] else None for name in POINT_CLASSES}
-    objects = [iou[name] for name in POINT_CLASSES[1:] if there[name]]
-    return {"iou": known, "mean_iou": sum(objects) / len(objects) if objects else None, "n_points": there}
+    known = {name: iou[name] if n_points[name] else None for name in POINT_CLASSES}
+    objects = [iou[name] for name in POINT_CLASSES[1:] if n_points[name]]
+    return {"iou": known, "mean_iou": sum(objects) / len(objects) if objects else None, "n_points": n_points}
 
 
 def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]]]:
-    """The sensor, how many scans there are to judge, and what reads them."""
-    word, equals, source = name.partition("=")
+    """The sensor, the number of scans, and a function that reads them."""
+    sensor_name, equals, source = name.partition("=")
     if not equals:
         raise PointsError(f"got {name!r}; expected SENSOR=SOURCE, such as os1-64=simulation:24 or pandar64=FOLDER")
-    sensor = get_sensor(word)
+    sensor = get_sensor(sensor_name)
     kind, _, number = source.partition(":")
     if kind == "simulation":
         if not (number or "24").isdecimal() or number == "0":
@@ -178,7 +173,9 @@ def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]
     images = sorted(root.glob("*.npy"))
     boxed = sorted(file for file in root.glob("label/*.txt") if (root / "velodyne" / f"{file.stem}.bin").exists())
     if not images and not boxed:
-        raise PointsError(f"{root} holds neither velodyne/NAME.bin with label/NAME.txt, nor range images NAME.npy")
+        raise PointsError(
+            f"{root} has neither velodyne/NAME.bin with label/NAME.txt, nor range images NAME.npy; expected one of them"
+        )
 
     def read() -> Iterator[Scan]:
         for file in images:
@@ -198,7 +195,7 @@ def _simulated(sensor: SensorProfile, seed: int) -> Scan:
     _, remissions, raws = _raw_model(sensor)
     rng = np.random.default_rng((seed, 5))
     points = scan.points.copy()
-    # Steps of 0.01 spread out again, and a tenth of noise of the sensor's own.
+    # Undo the rounding to 0.01, and add 10 % of noise.
     spread = points[:, 3] + rng.uniform(-0.005, 0.005, len(points))
     raw = np.interp(spread, remissions, raws) * rng.lognormal(0.0, 0.1, len(points))
     points[:, 3] = np.minimum(np.rint(raw), raws[-1])
@@ -234,16 +231,16 @@ def _from_boxes(scan: Path, label: Path, sensor: SensorProfile) -> Scan:
     labels = np.zeros(len(points), np.uint8)
     axes = []
     for line in label.read_text().splitlines():
-        words = line.split()
-        x, y, z, *size, yaw = (float(v) for v in words[2:9])
-        name = words[0].lower()
-        kind = next((k for k, names in CLASSES.items() if name in names), 0 if name in NOTHING else IGNORE)
+        columns = line.split()
+        x, y, z, *size, yaw = (float(v) for v in columns[2:9])
+        name = columns[0].lower()
+        kind = next((k for k, names in CLASSES.items() if name in names), 0 if name in BACKGROUND else IGNORE)
         if name == "bicycle" and size[2] >= RIDDEN_M:
             kind = 3
         labels[inside(Box(name, 1.0, (x, y, z), (size[0], size[1], size[2]), yaw), points, 0.05)] = kind
         if kind == 1:
             axes.append(yaw)
-    # Vehicles stand along the road, whichever of their sides is called the length.
+    # Turn x along the road. Vehicles stand along it, modulo 90 degrees: some files swap length and width.
     road = math.atan2(np.sin(np.multiply(axes, 4.0)).sum(), np.cos(np.multiply(axes, 4.0)).sum()) / 4.0 if axes else 0.0
     x, y, z = _origin(points, sensor)
     cos, sin = math.cos(road), math.sin(road)
@@ -253,7 +250,7 @@ def _from_boxes(scan: Path, label: Path, sensor: SensorProfile) -> Scan:
 
 
 def _origin(points: NDArray[np.float32], sensor: SensorProfile) -> tuple[float, float, float]:
-    """Where the sensor stood: seen from above, the lines through points fired together meet there."""
+    """Place of the sensor: seen from above, the lines through points of one firing meet there."""
     xy = points[:, :2].astype(np.float64)
     along = np.diff(xy, axis=0)
     length = np.hypot(along[:, 0], along[:, 1])

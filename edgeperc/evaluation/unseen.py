@@ -15,17 +15,17 @@ __all__ = ["check_unseen", "training_scans_of"]
 
 
 def training_scans_of(cards: Sequence[ModelCard]) -> dict[str, set[str]]:
-    """By name and version: `edgeperc.evaluation.datasets.scan_hash` of every real scan that a model was trained on."""
+    """Name and version of each model -> `scan_hash` of every real scan that it was trained on, from its card."""
     frames = {f"{card.name} {card.version}": card.training.get("frames", {}) for card in cards}
     return {name: set(of.values()) if isinstance(of, Mapping) else set() for name, of in frames.items()}
 
 
 def check_unseen(trained_on: Mapping[str, set[str]], name: str, drive: str, points: NDArray[np.float32]) -> None:
-    """Raise `SplitError` where one of the models was trained on this scan (`training_scans_of`)."""
+    """Raise `SplitError` if one of the models was trained on this scan (see `training_scans_of`)."""
     digest = scan_hash(points)
     for model, hashes in trained_on.items():
         if digest in hashes:
             raise SplitError(
-                f"{model} was trained on scan {name} of drive {drive}, so its figures there say nothing; judge the "
-                "test split or a model trained without this drive, or ask for split 'train' to see training scans"
+                f"{model} was trained on scan {name} of drive {drive}, so figures on it are meaningless; evaluate the "
+                "test split, or a model trained without this drive, or ask for split 'train'"
             )

@@ -13,14 +13,11 @@ from ..perception import Box
 from ..sensor import SensorProfile
 from .drawn import random_scene
 from .layouts import scene_from_boxes
-from .scene import SimulatedScan, sensor_pose, simulate
+from .scene import POINT_CLASS_OF, SimulatedScan, sensor_pose, simulate
 
-__all__ = ["FIRST_SEED", "IGNORE", "POINT_CLASS_OF", "labels_by_boxes", "simulated_scan"]
+__all__ = ["FIRST_SEED", "IGNORE", "labels_by_boxes", "simulated_scan"]
 
 IGNORE = 255
-
-# PointSeg's car holds every vehicle with a box; pedestrians sit down too.
-POINT_CLASS_OF = {"car": 1, "van": 1, "truck": 1, "pedestrian": 2, "person_sitting": 2, "cyclist": 3}
 
 # Measured: the bottom of KITTI's boxes lies this far above the ground around them (median of 720 boxes).
 BOX_ABOVE_GROUND_M = 0.03

@@ -27,6 +27,7 @@ from .raycast import (
 
 __all__ = [
     "POINT_CLASSES",
+    "POINT_CLASS_OF",
     "TOP_VIEW_CLASSES",
     "Scene",
     "SceneObject",
@@ -39,7 +40,8 @@ __all__ = [
 
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
 TOP_VIEW_CLASSES = ("background", "drivable", "car", "van", "truck")
-_POINT_LABELS = {"car": 1, "van": 1, "truck": 1, "pedestrian": 2, "cyclist": 3}
+# Point class of an object: PointSeg's car holds every vehicle. KITTI also labels people who sit.
+POINT_CLASS_OF = {"car": 1, "van": 1, "truck": 1, "pedestrian": 2, "person_sitting": 2, "cyclist": 3}
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,7 +284,7 @@ def simulate(
     )  # fmt: skip
     points, objects = points[:n].copy(), objects[:n].copy()
     boxes = tuple(_box_in_sensor(each, pose) for each in scene.objects)
-    lookup = np.array([*(_POINT_LABELS[each.label] for each in scene.objects), 0], dtype=np.uint8)
+    lookup = np.array([*(POINT_CLASS_OF[each.label] for each in scene.objects), 0], dtype=np.uint8)
     counts = np.bincount(objects[objects >= 0], minlength=len(boxes))
     return SimulatedScan(
         points=points,
