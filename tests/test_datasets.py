@@ -23,7 +23,7 @@ from edgeperc.evaluation.datasets import (
     layouts,
     read_objects,
 )
-from edgeperc.evaluation.splits import FOLDS, TEST_DRIVES, fold_of, in_split
+from edgeperc.evaluation.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES, fold_of, in_split
 from edgeperc.geometry import draw_footprints, inside
 from edgeperc.perception import Box
 from edgeperc.simulation.samples import IGNORE, simulated_scan
@@ -262,6 +262,9 @@ def test_every_named_drive_has_one_place() -> None:
         for fold in range(len(FOLDS)):
             assert [in_split(drive, s, fold) for s in ("train", "validation", "test")].count(True) == 1
         assert not in_split(drive, "validation")
+    for drive in VALIDATION_DRIVES:
+        assert [in_split(drive, s) for s in ("train", "validation", "test", "all")] == [False, True, False, True]
+        assert not in_split(drive, "validation", 0)
     assert [in_split("mine", s) for s in ("train", "validation", "test", "all")] == [True, False, True, True]
     with pytest.raises(ValueError, match="expected train, validation, test or all"):
         in_split("mine", "both")
