@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
+import inspect
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import numba
 import pytest
@@ -16,10 +20,65 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 ARCHIVES = REPOSITORY.parent / "shared" / "data"
 
 
+CALLED = pytest.StashKey[set[str]]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--every-kernel", action="store_true", help="fail if a kernel was never called (with NUMBA_DISABLE_JIT=1)"
+    )
+
+
 def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "kernel: holds a kernel against its slow twin (set by itself)")
     if numba.config.DISABLE_JIT:
         # An interpreted kernel computes with numpy's scalars, which warn where compiled code yields NaN or infinity.
         config.addinivalue_line("filterwarnings", "ignore:(invalid value|overflow|divide by zero):RuntimeWarning")
+    if config.getoption("every_kernel"):
+        if not numba.config.DISABLE_JIT:
+            raise pytest.UsageError("--every-kernel sees interpreted kernels alone; set NUMBA_DISABLE_JIT=1")
+        called = config.stash.setdefault(CALLED, set())
+
+        def note(frame: FrameType, event: str, argument: Any) -> None:
+            if event == "call":
+                called.add(f"{frame.f_code.co_filename}:{frame.f_code.co_name}")
+
+        sys.setprofile(note)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A test that names a twin holds a kernel against it, and runs interpreted and bounds-checked too."""
+    for item in items:
+        function = getattr(item, "function", None)
+        if function is not None and "twins." in inspect.getsource(inspect.unwrap(function)):
+            item.add_marker("kernel")
+
+
+def pytest_testnodedown(node: Any) -> None:
+    """Of pytest-xdist: what a worker process called."""
+    node.config.stash.setdefault(CALLED, set()).update(node.workeroutput.get("called", ()))
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    config = session.config
+    if not config.getoption("every_kernel"):
+        return
+    called = config.stash[CALLED]
+    if hasattr(config, "workeroutput"):
+        config.workeroutput["called"] = sorted(called)
+        return
+    missing = [kernel for kernel in kernels() if kernel not in called]
+    if missing:
+        print(f"\n{len(missing)} kernels were not called:", *missing, sep="\n  ")
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def kernels() -> Iterator[str]:
+    """Every function under ``@njit``, as ``FILE:NAME``."""
+    for path in sorted(REPOSITORY.glob("[be]*/**/*.py")):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.FunctionDef) and any("njit" in ast.unparse(d) for d in node.decorator_list):
+                yield f"{path}:{node.name}"
 
 
 def cache_root() -> Path:
