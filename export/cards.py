@@ -8,10 +8,9 @@ from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, 
 from edgeperc.sensor import get_sensor
 from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES
 
-__all__ = ["LABELS_POINTS", "RANGE_IMAGE", "RANGE_IMAGE_INPUT", "ROAD_CLASSES", "TOP_VIEW", "TOP_VIEW_INPUT", "card_of"]
+from .recipe import task_name
 
-LABELS_POINTS = ("kulseg", "pointseg", "squeezesegv2")
-"""The networks of the range image, which label pixels and so points; others see the top view."""
+__all__ = ["RANGE_IMAGE", "RANGE_IMAGE_INPUT", "ROAD_CLASSES", "TOP_VIEW", "TOP_VIEW_INPUT", "card_of"]
 
 ROAD_CLASSES = TOP_VIEW_CLASSES[:2]
 """What LoDNN tells apart; a vehicle's footprint is background, for nobody drives there."""
@@ -32,7 +31,8 @@ RANGE_IMAGE_INPUT = InputSpec(
 def card_of(network: str, head: str = "dense", **facts: Any) -> ModelCard:
     """The card of a network; ``facts`` are whatever else `ModelCard` takes, at least its version."""
     facts = {"name": network, **facts}
-    if network in LABELS_POINTS:
+    task = task_name(network)
+    if task == "points":
         return ModelCard(
             view=RANGE_IMAGE,
             input=RANGE_IMAGE_INPUT,
@@ -40,7 +40,7 @@ def card_of(network: str, head: str = "dense", **facts: Any) -> ModelCard:
             classes=POINT_CLASSES,
             **facts,
         )
-    if network == "lodnn":
+    if task == "road":
         outputs = (OutputSpec("segmentation", "class_logits"),)
         return ModelCard(view=TOP_VIEW, input=TOP_VIEW_INPUT, outputs=outputs, classes=ROAD_CLASSES, **facts)
     return ModelCard(

@@ -1,119 +1,139 @@
-"""How a network is trained, without importing torch."""
+"""How a network is trained: recipes, and the runs that make the shipped models. Importing this loads no torch."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-from .cards import LABELS_POINTS
+__all__ = ["MODELS", "NETWORKS", "PAPER", "TASKS", "Recipe", "Stage", "task_name"]
 
-__all__ = ["MODELS", "PAPER", "Recipe", "Stage"]
+TASKS: Mapping[str, tuple[str, ...]] = {
+    "points": ("kulseg", "pointseg", "squeezesegv2"),
+    "vehicles": ("ssadnet",),
+    "road": ("lodnn",),
+}
+"""Networks by what they learn: a class for every point (range image), or from the top view vehicles and drivable
+ground, or drivable ground alone."""
+
+NETWORKS = tuple(sorted(network for networks in TASKS.values() for network in networks))
+EDGE_NETWORKS = ("lodnn", "pointseg", "ssadnet")
+"""Networks with a version for small computers (`edgeperc_export.networks.edge`)."""
+
+
+def task_name(network: str) -> str:
+    """The key of `TASKS` that a network belongs to.
+
+    Raises
+    ------
+    ValueError
+        There is no such network.
+    """
+    for task, networks in TASKS.items():
+        if network in networks:
+            return task
+    raise ValueError(f"network is {network!r}; expected {', '.join(NETWORKS[:-1])} or {NETWORKS[-1]}")
+
+
+def _option(
+    default: Any, text: str, networks: tuple[str, ...] = NETWORKS, *, edge: bool = True, choices: tuple[str, ...] = ()
+) -> Any:
+    """A field that `edgeperc-export train` offers for these networks; ``edge``: for their small versions too."""
+    return field(default=default, metadata={"help": text, "networks": networks, "edge": edge, "choices": choices})
+
+
+_TOP_VIEW = (*TASKS["vehicles"], *TASKS["road"])
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Everything that decides a training run, but the scans.
+    """Everything that decides a training run except the scans.
 
-    Attributes
-    ----------
-    network : str
-        ``"ssadnet"`` or ``"lodnn"``, which see the top view, or ``"pointseg"``, ``"squeezesegv2"`` or ``"kulseg"``,
-        which label points.
-    head : str
-        SSADNet's boxes: ``"slots"`` (the paper's) or ``"dense"``.
-    steps, batch : int
-    optimizer : str
-        ``"adamw"``, ``"adam"`` or ``"adagrad"``.
-    learning_rate, weight_decay : float
-        Warmed up over 100 steps, then constant, then a cosine to zero.
-    cooldown : float
-        Share of the steps that the cosine takes. Until it begins, a longer run is the same run.
-    halve_after : int
-        Epochs without a lower validation loss after which the learning rate is halved (SSADNet 3.2); 0: never.
-    simulated_share : float
-        Part of the samples that are simulated; what is left is real.
-    augment : bool
-        Turn, mirror, thin and shift every scan.
-    n_pasted : float
-        Objects cut from other scans that are pasted into one, on average.
-    swap : float
-        Share of scans one sector of which comes from another scan; point labels only.
-    paste_cars : float
-        Share of cars among what a network that labels points has pasted.
-    turn_to_rare : float
-        Share of simulated scans turned to a pedestrian or cyclist.
-    turn_anywhere : float
-        Share of simulated scans turned to any side, so that vehicles stand where streets have none.
-    weather : float
-        Share of scans in rain, snow or fog.
-    class_weights : bool
-        Weigh classes in the cross-entropy by how rare they are.
-    focal_gamma : float
-        Of the cross-entropy of networks that label points.
-    lovasz_weight : float
-        Of the Lovasz-softmax loss beside the cross-entropy.
-    deep_supervision : float
-        Weight of PointSeg's loss at a quarter of the width.
-    ema : float
-        Decay of the averaged weights, which are what is exported; 0: the last weights.
-    context_width : int
-        Channels of SSADNet's and LoDNN's context module.
-    batch_norm : bool
-        In SSADNet's segmentation branch and in LoDNN.
-    dropout : float
-        SSADNet's and LoDNN's spatial dropout; before the last convolution of networks that label points.
-    distil : float
-        Weight of what a teacher's answers are learnt with: cross-entropy towards its class probabilities (Hinton et
-        al., 2015), and its dense boxes.
-    seen_twice : bool
-        Show each scan to the teacher as it is and mirrored, and average; twice the teacher's time.
-    edge : bool
-        The network of the same inputs and outputs for small computers (`edgeperc_export.networks.edge`).
-    head_only : bool
-        Leave SSADNet's segmentation branch as it was started from; only the boxes are learnt.
-    drawn_roads : bool
-        Where a road was drawn by hand (`edgeperc_export.roads.drawn_roads`), that is the truth of the scan's surface.
-    seed : int
+    The metadata of each field holds its description (``help``) and the networks that it has an effect on
+    (``networks``; ``edge``: on their versions for small computers too). ``edgeperc-export train NETWORK --help``
+    prints them.
     """
 
     network: str
-    head: str = "dense"
-    steps: int = 2000
-    batch: int = 8
-    optimizer: str = "adamw"
-    learning_rate: float = 2e-3
-    weight_decay: float = 1e-3
-    cooldown: float = 0.4
-    halve_after: int = 0
-    simulated_share: float = 0.5
-    augment: bool = True
-    n_pasted: float = 6.0
-    swap: float = 0.3
-    paste_cars: float = 0.0
-    turn_to_rare: float = 0.3
-    turn_anywhere: float = 0.0
-    weather: float = 0.1
-    class_weights: bool = True
-    focal_gamma: float = 0.0
-    lovasz_weight: float = 1.0
-    deep_supervision: float = 0.0
-    ema: float = 0.998
-    context_width: int = 128
-    batch_norm: bool = True
-    dropout: float = 0.25
-    distil: float = 0.0
-    seen_twice: bool = True
-    edge: bool = False
-    head_only: bool = False
-    drawn_roads: bool = False
-    seed: int = 0
+    head: str = _option(
+        "dense",
+        "box head: slots (SSADNet's own, a fixed number of boxes) or dense (one prediction every four cells)",
+        TASKS["vehicles"],
+        edge=False,
+        choices=("dense", "slots"),
+    )
+    steps: int = _option(2000, "training steps")
+    batch: int = _option(8, "scans in each step")
+    optimizer: str = _option("adamw", "optimizer", choices=("adamw", "adam", "adagrad"))
+    learning_rate: float = _option(
+        2e-3, "highest learning rate; it warms up over 100 steps, stays constant and follows a cosine to zero"
+    )
+    weight_decay: float = _option(1e-3, "AdamW's weight decay of convolution weights")
+    cooldown: float = _option(
+        0.4,
+        "share of the steps in which the learning rate falls to zero; 0: constant from the first step. Until it "
+        "begins, a longer run equals a shorter one",
+    )
+    halve_after: int = _option(
+        0, "halve the learning rate after this many epochs without a lower validation loss (SSADNet 3.2); 0: never"
+    )
+    simulated_share: float = _option(0.5, "share of simulated scans; the rest are real. 1: no real scan is read")
+    augment: bool = _option(True, "turn, mirror, thin and shift every scan")
+    n_pasted: float = _option(6.0, "mean number of objects cut from other scans and pasted into each scan")
+    swap: float = _option(0.3, "share of scans that get one sector of another scan", TASKS["points"])
+    paste_cars: float = _option(
+        0.0, "share of cars among pasted objects; 0: cars are not pasted into range images", TASKS["points"]
+    )
+    turn_to_rare: float = _option(0.3, "share of simulated scans turned so that a pedestrian or cyclist is ahead")
+    turn_anywhere: float = _option(
+        0.0, "share of simulated scans turned by any angle, so that vehicles appear away from the street ahead"
+    )
+    weather: float = _option(0.1, "share of scans with rain, snow or fog added")
+    class_weights: bool = _option(
+        True, "weight rare classes more in the cross-entropy", (*TASKS["points"], *TASKS["vehicles"])
+    )
+    focal_gamma: float = _option(
+        0.0, "focal loss exponent of the cross-entropy; 0: plain cross-entropy", TASKS["points"]
+    )
+    lovasz_weight: float = _option(1.0, "weight of the Lovasz-softmax loss, added to the cross-entropy")
+    deep_supervision: float = _option(
+        0.0, "weight of an additional loss at a quarter of the image's width", ("pointseg",), edge=False
+    )
+    ema: float = _option(
+        0.998, "decay of the averaged weights, which are the ones exported; 0: export the last weights"
+    )
+    context_width: int = _option(128, "channels of the context module", _TOP_VIEW, edge=False)
+    batch_norm: bool = _option(
+        True, "batch norm in the segmentation branch (ssadnet) or the whole network (lodnn)", _TOP_VIEW, edge=False
+    )
+    dropout: float = _option(0.25, "dropout probability", edge=False)
+    distil: float = _option(
+        0.0, "weight of the distillation loss (Hinton et al., 2015) towards --teacher's outputs; 0: no distillation"
+    )
+    seen_twice: bool = _option(
+        True, "average the teacher's outputs over each scan and its mirror image; doubles the teacher's time"
+    )
+    edge: bool = _option(
+        False, "train the network's version for small computers, with the same inputs and outputs", EDGE_NETWORKS
+    )
+    head_only: bool = _option(
+        False,
+        "train only the box head and keep the segmentation branch from --start-from",
+        TASKS["vehicles"],
+        edge=False,
+    )
+    drawn_roads: bool = _option(
+        False, "use the hand-drawn roads as ground truth where a training scan has one", _TOP_VIEW
+    )
+    seed: int = _option(0, "seed of the initial weights, the samples and the dropout")
 
     @property
-    def labels_points(self) -> bool:
-        """Whether the network sees the range image and labels points."""
-        return self.network in LABELS_POINTS
+    def task(self) -> str:
+        """The key of `TASKS` that the network belongs to."""
+        return task_name(self.network)
 
 
-PLAIN = {
+PLAIN: Mapping[str, Any] = {
     "simulated_share": 0.0,
     "augment": False,
     "n_pasted": 0.0,
@@ -127,19 +147,19 @@ PLAIN = {
     "ema": 0.0,
     "batch_norm": False,
 }
-
+"""Nothing that the papers do not mention."""
 
 PAPER = {
-    # SSADNet 3.2: Adam, 1e-5, halved after 100 epochs without gain; batch 8; cross-entropy and 0.1 x MSE.
+    # SSADNet 3.2: Adam, 1e-5, halved after 100 epochs without improvement; batch 8; cross-entropy and 0.1 x MSE.
     "ssadnet": Recipe(
         "ssadnet", head="slots", optimizer="adam", learning_rate=1e-5, halve_after=100, steps=65_000, **PLAIN
     ),
     # PointSeg 5: Adagrad, 1e-3, batch 32, 50,000 steps.
     "pointseg": Recipe("pointseg", optimizer="adagrad", learning_rate=1e-3, batch=32, steps=50_000, **PLAIN),
-    # LoDNN-I (Electronics 12, 3165) 3.3 to 3.6: cross-entropy on drawn roads, augmented; 22 epochs; the rate is lowered
-    # when a watched figure stands still. Its rate is printed as "1 x 10^-x" and its batch as the largest tried: Adam's
-    # usual rate, and 16. 22 epochs of 300 scenes eight times over are 3,300 steps of 16. It drew 300 scenes; here are
-    # nine, and what is sure of the other real scans.
+    # LoDNN-I (Electronics 12, 3165) 3.3 to 3.6: cross-entropy on drawn roads, augmented; 22 epochs; the learning rate
+    # is lowered when the validation figure stops improving. The paper prints its rate as "1 x 10^-x" and its batch as
+    # the largest tried: this takes Adam's usual rate, and 16. 22 epochs of 300 scenes, each in eight variations, are
+    # 3,300 steps of 16. The authors drew 300 scenes; here there are nine, and the certain cells of the other scans.
     "lodnn": Recipe(
         "lodnn",
         optimizer="adam",
@@ -148,10 +168,10 @@ PAPER = {
         batch=16,
         steps=3_300,
         drawn_roads=True,
-        **PLAIN | {"augment": True},
+        **{**PLAIN, "augment": True},
     ),
 }
-"""What the papers say of their training; what they do not mention is left out."""
+"""The papers' own recipes; what they do not mention is left out."""
 
 
 @dataclass(frozen=True)
@@ -161,11 +181,11 @@ class Stage:
     Attributes
     ----------
     recipe : Recipe
-        One whose ``simulated_share`` is 1 sees no real scan and no real layout, and owes nothing to anybody's terms.
+        With a ``simulated_share`` of 1 the run reads no real scan and no real layout, so no data license applies.
     after : str or None
         The model whose weights the run starts from.
     teacher : str or None
-        The model that the run learns from.
+        The model that the run distils from.
     """
 
     recipe: Recipe
@@ -173,22 +193,18 @@ class Stage:
     teacher: str | None = None
 
 
-# From nothing, and with its teacher's answers from the first step on: the focal loss is SqueezeSegV2's.
+# From random weights, distilling from the first step; the focal loss is SqueezeSegV2's.
 KULSEG = Recipe("kulseg", steps=3600, batch=4, focal_gamma=2.0, distil=1.0, seen_twice=False)
 
-
-# Batches of four: for as many scans twice the steps, and better figures. SSADNet without dropout, which a network that
-# sees so few scans does not need, and which upsets batch norm.
+# Batches of four: twice the steps for as many scans, and better figures. No dropout: a network that sees so few scans
+# does not need it, and it disturbs batch norm.
 SSADNET = Recipe("ssadnet", batch=4, learning_rate=1.5e-3, context_width=64, n_pasted=3.0, dropout=0.0)
-
 
 EDGE = Recipe("ssadnet", edge=True, steps=6000, batch=4, learning_rate=3e-3, cooldown=0.2, n_pasted=3.0)
 
+DISTILLED = replace(EDGE, steps=1000, learning_rate=1e-3, cooldown=0.4, distil=1.0, seen_twice=False)
 
-TAUGHT = replace(EDGE, steps=1000, learning_rate=1e-3, cooldown=0.4, distil=1.0, seen_twice=False)
-
-
-# LoDNN-I's plan at a quarter of the resolution, with the answers of the network that draws roads best from the start.
+# LoDNN-I's structure at a quarter of the resolution, distilling from the start from the network that finds roads best.
 LODNN = Recipe(
     "lodnn",
     edge=True,
@@ -201,26 +217,26 @@ LODNN = Recipe(
     drawn_roads=True,
 )
 
-
 MODELS = {
     "pointseg-sim": Stage(Recipe("pointseg", simulated_share=1.0, steps=1000, learning_rate=2e-3, cooldown=0.3)),
-    "pointseg": Stage(Recipe("pointseg", steps=3600, batch=4, learning_rate=1e-3), after="pointseg-sim"),
-    "kulseg-start": Stage(KULSEG, teacher="pointseg"),
-    # Trained on without the focal loss, which on top of class weights makes too many pixels a pedestrian's.
+    "pointseg-full": Stage(Recipe("pointseg", steps=3600, batch=4, learning_rate=1e-3), after="pointseg-sim"),
+    "kulseg-start": Stage(KULSEG, teacher="pointseg-full"),
+    # Continued without the focal loss: together with class weights it labels too many pixels pedestrian.
     "kulseg": Stage(
-        replace(KULSEG, steps=1500, learning_rate=1e-3, cooldown=0.6, focal_gamma=0.0), "kulseg-start", "pointseg"
+        replace(KULSEG, steps=1500, learning_rate=1e-3, cooldown=0.6, focal_gamma=0.0), "kulseg-start", "pointseg-full"
     ),
     "ssadnet-sim": Stage(replace(SSADNET, simulated_share=1.0, steps=1300, cooldown=0.3)),
-    "ssadnet": Stage(replace(SSADNET, steps=2000), after="ssadnet-sim"),
-    # On the very segmentation branch of ssadnet, so that the heads can be compared.
-    "ssadnet-paper": Stage(replace(SSADNET, head="slots", head_only=True, steps=1000), after="ssadnet"),
-    # A step of a network for small computers takes a quarter of the full one's, a step with its teacher's answers as
-    # long: first many on labels alone, then some with both.
-    "pointseg-edge-start": Stage(replace(EDGE, network="pointseg", n_pasted=6.0)),
-    "pointseg-edge": Stage(
-        replace(TAUGHT, network="pointseg", n_pasted=6.0, steps=1600), "pointseg-edge-start", "pointseg"
+    "ssadnet-full": Stage(replace(SSADNET, steps=2000), after="ssadnet-sim"),
+    # With the segmentation branch of ssadnet-full, so that the two heads can be compared.
+    "ssadnet-paper": Stage(replace(SSADNET, head="slots", head_only=True, steps=1000), after="ssadnet-full"),
+    # A step of a small network takes a quarter of a full one's time, a step with a teacher as long as the full one's:
+    # so first many steps on labels alone, then some with a teacher too.
+    "pointseg-start": Stage(replace(EDGE, network="pointseg", n_pasted=6.0)),
+    "pointseg": Stage(
+        replace(DISTILLED, network="pointseg", n_pasted=6.0, steps=1600), "pointseg-start", "pointseg-full"
     ),
-    "lodnn": Stage(LODNN, teacher="ssadnet-edge"),
-    "ssadnet-edge-start": Stage(EDGE),
-    "ssadnet-edge": Stage(TAUGHT, "ssadnet-edge-start", "ssadnet"),
+    "lodnn": Stage(LODNN, teacher="ssadnet"),
+    "ssadnet-start": Stage(EDGE),
+    "ssadnet": Stage(DISTILLED, "ssadnet-start", "ssadnet-full"),
 }
+"""The training run of every model, by name; those called ``-start`` are intermediate."""

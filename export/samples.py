@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,42 +13,36 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from edgeperc.evaluation.datasets import KittiObjects, scan_hash
-from edgeperc.projection import make_projector
-from edgeperc.simulation.samples import IGNORE
-from edgeperc.simulation.scene import TOP_VIEW_CLASSES
+from edgeperc.projection import Projection, make_projector
 
 from .augment import ObjectBank, augmented, swapped
-from .cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT
 from .recipe import Recipe
 from .roads import drawn_roads, sure_surface, with_road
 from .scans import LabelledScan
-from .targets import dense_targets, slot_targets
+from .task import Targets, task_of
 
-__all__ = ["FEWEST", "RealScans", "Samples", "real_scans"]
-
-# Three returns are the fewest that any network could tell from clutter.
-FEWEST = 3
-N_SLOTS = 16
+__all__ = ["RealScans", "Samples", "real_scans"]
 
 # Scans whose objects are cut out for pasting; each holds about five.
 BANK_SCANS = 400
-PASTE_ODDS = {
-    "points": {"pedestrian": 0.4, "cyclist": 0.35, "van": 0.15, "truck": 0.1},
-    "top_view": {"car": 0.3, "van": 0.4, "truck": 0.3},
-}
 
 
 class Samples:
-    """Real and simulated scans as network inputs and targets.
+    """Network inputs and targets, from real and simulated scans.
 
     Parameters
     ----------
     recipe : Recipe
     real : sequence of LabelledScan
     real_weights : sequence of float
-        How often each real scan is drawn; frames of a long drive look alike and deserve less.
+        How often each real scan is drawn, relative to the others.
     simulated : sequence of Path
-        Files that `LabelledScan.save` wrote.
+        Files written by `LabelledScan.save`.
+
+    Raises
+    ------
+    ValueError
+        There are neither real nor simulated scans.
     """
 
     def __init__(
@@ -55,9 +50,9 @@ class Samples:
     ) -> None:
         if not real and not simulated:
             raise ValueError("no scans to train on; give --kitti, --simulated or both")
-        self.recipe, self.real, self.simulated = recipe, real, simulated
-        view = (RANGE_IMAGE, RANGE_IMAGE_INPUT) if recipe.labels_points else (TOP_VIEW, TOP_VIEW_INPUT)
-        self.projector = make_projector(*view)
+        self.task, self.recipe = task_of(recipe), recipe
+        self.real, self.simulated = real, simulated
+        self.projector = make_projector(self.task.view, self.task.input)
         weights = np.asarray(real_weights, np.float64)
         self.real_odds = weights / weights.sum() if len(weights) else weights
         share = recipe.simulated_share if real else 1.0
@@ -67,73 +62,61 @@ class Samples:
             every = max(1, len(simulated) // BANK_SCANS)
             self.bank = ObjectBank.of([*real, *(LabelledScan.load(path) for path in simulated[::every])])
 
-    def batch(self, step: int) -> tuple[NDArray, ...]:
-        """Inputs (B, C, H, W) and targets of one step; the same for the same step, always."""
+    def batch(self, step: int) -> Targets:
+        """Inputs (B, C, H, W) and targets of one step. The same step always gives the same batch."""
         rng = np.random.default_rng((self.recipe.seed, step))
         drawn = [self.sample(self._drawn(rng)) for _ in range(self.recipe.batch)]
         return tuple(np.stack(parts) for parts in zip(*drawn, strict=True))
 
+    def project(self, scan: LabelledScan) -> Projection:
+        """A scan as the network sees it."""
+        return self.projector.project(np.ascontiguousarray(scan.points, np.float32))
+
+    def sample(self, scan: LabelledScan) -> Targets:
+        """One input (C, H, W) and its targets."""
+        seen = self.project(scan)
+        return seen.image, *self.task.target(scan, seen)
+
     def _drawn(self, rng: np.random.Generator) -> LabelledScan:
-        recipe = self.recipe
+        recipe, odds = self.recipe, dict(self.task.paste_odds)
         scan = self._scan(rng)
         if not recipe.augment:
             return scan
-        odds = PASTE_ODDS["points" if recipe.labels_points else "top_view"]
         if recipe.paste_cars > 0.0:
             others = {name: share * (1.0 - recipe.paste_cars) for name, share in odds.items()}
             odds = {**others, "car": recipe.paste_cars}
-        changes = {
-            "bank": self.bank,
-            "n_pasted": recipe.n_pasted,
-            "odds": odds,
-            "turn_to_rare": recipe.turn_to_rare,
-            "turn_anywhere": recipe.turn_anywhere,
-            "weather": recipe.weather,
-        }
-        scan = augmented(scan, rng, **changes)
-        if recipe.labels_points and rng.random() < recipe.swap:
-            scan = swapped(scan, augmented(self._scan(rng), rng, **changes), rng)
+        change = partial(
+            augmented,
+            rng=rng,
+            bank=self.bank,
+            n_pasted=recipe.n_pasted,
+            odds=odds,
+            turn_to_rare=recipe.turn_to_rare,
+            turn_anywhere=recipe.turn_anywhere,
+            weather=recipe.weather,
+        )
+        scan = change(scan)
+        if self.task.swaps_sectors and rng.random() < recipe.swap:
+            scan = swapped(scan, change(self._scan(rng)), rng)
         return scan
 
     def _scan(self, rng: np.random.Generator) -> LabelledScan:
         if rng.random() < self.simulated_share:
-            return LabelledScan.load(self.simulated[rng.integers(len(self.simulated))])
-        return self.real[rng.choice(len(self.real), p=self.real_odds)]
-
-    def sample(self, scan: LabelledScan) -> tuple[NDArray, ...]:
-        """One input (C, H, W) and its targets."""
-        points = np.ascontiguousarray(scan.points, np.float32)
-        if self.recipe.labels_points:
-            seen = self.projector.project(points)
-            truth = np.append(scan.labels, np.uint8(IGNORE))[seen.index]  # an empty pixel's index is -1
-            return seen.image, truth
-        seen = self.projector.project(points)
-        truth = scan.top_view_truth(TOP_VIEW)
-        if self.recipe.network == "lodnn":
-            return seen.image, np.where(truth == IGNORE, IGNORE, truth == 1).astype(np.uint8)
-        vehicles = [b for b in zip(scan.boxes, scan.counts, strict=True) if b[0].label in TOP_VIEW_CLASSES[2:]]
-        found, unsure = (
-            np.array([[*b.center, *b.size, b.yaw] for b, n in vehicles if (n >= FEWEST) == hit], np.float64)
-            for hit in (True, False)
-        )
-        if self.recipe.head == "slots":
-            boxes = slot_targets(found, TOP_VIEW, N_SLOTS)
-        else:
-            boxes = dense_targets(found, TOP_VIEW, labelled=scan.labelled(TOP_VIEW), unsure=unsure)
-        return seen.image, truth, boxes
+            return LabelledScan.load(self.simulated[int(rng.integers(len(self.simulated)))])
+        return self.real[int(rng.choice(len(self.real), p=self.real_odds))]
 
 
 class RealScans(NamedTuple):
-    """Real scans that somebody labelled otherwise than KITTI does, as with roads drawn by hand.
+    """Real scans labeled otherwise than in KITTI's files, for instance with hand-drawn roads.
 
     Attributes
     ----------
     scans : list of LabelledScan
-        To train on.
+        Scans to train on.
     hashes : dict of str to str
-        The name of each and its `edgeperc.evaluation.datasets.scan_hash`, for the card.
+        Name of each scan -> its `edgeperc.evaluation.datasets.scan_hash`, for the card.
     watched : list of LabelledScan
-        To stop and to lower the learning rate by.
+        Scans to validate on.
     """
 
     scans: list[LabelledScan]
@@ -144,18 +127,20 @@ class RealScans(NamedTuple):
 def real_scans(
     kitti: KittiObjects, names: Sequence[str], *, drawn: bool = False
 ) -> tuple[list[LabelledScan], list[float], dict[str, str]]:
-    """Labelled scans, how often to draw each, and the SHA-256 of each file; ``drawn``: with roads drawn by hand."""
-    scans, weights, hashes = [], [], {}
-    roads = drawn_roads() if drawn else {}
-    frames = [kitti.frame(n) for n in tqdm(names, desc="reading real scans", leave=False)]
-    drives = [f.drive for f in frames]
+    """Labeled scans, how often to draw each, and the hash of each; ``drawn``: with the hand-drawn roads."""
+    scans: list[LabelledScan] = []
+    weights: list[float] = []
+    hashes: dict[str, str] = {}
+    roads: dict[str, NDArray[np.uint8]] = drawn_roads() if drawn else {}
+    frames = [kitti.frame(name) for name in tqdm(names, desc="reading real scans", leave=False)]
+    drives = [frame.drive for frame in frames]
     for frame in frames:
         scan = LabelledScan.from_frame(frame, sure_surface)
         hashes[frame.name] = digest = scan_hash(frame.points)
         if digest in roads:
             scan = replace(scan, surface=with_road(scan.surface, roads[digest]))
         scans.append(scan)
-        # A drive counts with the square root of its frames: 154 neighbours are not 154 scenes. A drawn road counts
-        # as a drive of its own, for its truth is whole.
+        # A drive weighs the square root of its number of frames: 154 neighboring frames are not 154 scenes. A scan
+        # with a drawn road weighs as much as a drive with one frame, because its ground is known everywhere.
         weights.append(1.0 if digest in roads else drives.count(frame.drive) ** -0.5)
     return scans, weights, hashes

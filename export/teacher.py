@@ -1,7 +1,7 @@
-"""What a trained network teaches another: labels for what nobody labelled, and probabilities where there are labels.
+"""What a trained network teaches another: labels for unlabeled points, and class probabilities to distil.
 
-Real scans are labelled ahead only, and some not at all; yet each holds a street on every side. A teacher, trained on
-simulation or on labels, names what it is sure of (Lee's pseudo-labels, 2013); everything else stays unknown.
+KITTI labels what its camera sees, and some scans not at all, but each scan holds the street on all sides. A teacher
+labels the points that it is sure of (pseudo-labels; Lee, 2013); all others stay unknown.
 """
 
 from __future__ import annotations
@@ -15,24 +15,25 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from edgeperc.card import InputSpec
 from edgeperc.evaluation.datasets import KittiObjects
 from edgeperc.projection import make_projector
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import IGNORE
 
-from .cards import LABELS_POINTS, RANGE_IMAGE, RANGE_IMAGE_INPUT
 from .scans import SURFACE, LabelledScan, turned
+from .task import Task
 
-__all__ = ["pseudo_labelled", "taught", "unlabelled_scans"]
+__all__ = ["pseudo_labelled", "teach", "unlabelled_scans"]
 
 SURE = 0.9
 
-# Four looks of 90 degrees cover the circle; half a step more each way, so that nothing lies on an edge alone.
+# The view covers 90 degrees. These directions overlap, so that no object is seen at the edge of a view alone.
 LOOKS = np.radians([0.0, 80.0, 160.0, 200.0, 280.0])
 
 
 def unlabelled_scans(objects: KittiObjects, fold: int | None) -> list[LabelledScan]:
-    """The scans of the training drives that nobody labelled."""
+    """The unlabeled scans of the training drives."""
     scans = []
     for name in objects.unlabelled("train", fold=fold):
         points = read_points(objects.root / "training/velodyne" / f"{name}.bin")
@@ -42,12 +43,26 @@ def unlabelled_scans(objects: KittiObjects, fold: int | None) -> list[LabelledSc
     return scans
 
 
-def pseudo_labelled(network: nn.Module, scans: Iterable[LabelledScan], sure: float = SURE) -> list[LabelledScan]:
-    """The scans with labels all around: their own where they have one, else the network's where it is sure."""
-    projector = make_projector(RANGE_IMAGE, RANGE_IMAGE_INPUT)
+def pseudo_labelled(
+    network: nn.Module, task: Task, scans: Iterable[LabelledScan], sure: float = SURE
+) -> list[LabelledScan]:
+    """The scans with labels on all sides.
+
+    Parameters
+    ----------
+    network : nn.Module
+        Labels points.
+    task : Task
+        The network's own.
+    scans : iterable of LabelledScan
+        Their own labels are kept.
+    sure : float
+        Other points take the network's label if its probability is at least this.
+    """
+    projector = make_projector(task.view, task.input)
     network.eval()
     done = []
-    for scan in tqdm(list(scans), desc="labelling", leave=False):
+    for scan in tqdm(list(scans), desc="labeling", leave=False):
         labels = scan.labels.copy()
         for angle in LOOKS:
             seen = projector.project(np.ascontiguousarray(turned(scan, float(angle)).points))
@@ -62,11 +77,10 @@ def pseudo_labelled(network: nn.Module, scans: Iterable[LabelledScan], sure: flo
 
 
 @torch.no_grad()
-def taught(network: nn.Module, image: Tensor, kind: str, *, mirror: bool) -> tuple[Tensor, Tensor | None]:
-    """What a network says of a batch of inputs: class probabilities (B, C, H, W), and boxes where it finds any.
+def teach(network: nn.Module, image: Tensor, inputs: InputSpec, *, mirror: bool) -> tuple[Tensor, Tensor | None]:
+    """A network's class probabilities (B, C, H, W) for a batch of inputs, and its boxes if it has any.
 
-    With ``mirror`` the probabilities are an average over the scene and its mirror image. ``kind`` is the network's
-    name; the y of those that label points changes its sign in a mirror.
+    ``mirror`` averages the probabilities over each scene and its mirror image, in which a channel y changes its sign.
     """
     with torch.autocast(image.device.type, torch.bfloat16):
         answer = network(image)
@@ -74,9 +88,9 @@ def taught(network: nn.Module, image: Tensor, kind: str, *, mirror: bool) -> tup
         p = logits.float().softmax(1)
         if mirror:
             mirrored = image.flip(-1)
-            if kind in LABELS_POINTS:
+            if "y" in inputs.channels:
                 mirrored = mirrored.clone()
-                mirrored[:, RANGE_IMAGE_INPUT.channels.index("y")] *= -1.0
+                mirrored[:, inputs.channels.index("y")] *= -1.0
             answer = network(mirrored)
             other = answer[0] if isinstance(answer, tuple) else answer
             p = 0.5 * (p + other.float().softmax(1).flip(-1))

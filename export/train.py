@@ -17,19 +17,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 from tqdm import tqdm
 
 from edgeperc.evaluation.datasets import KittiObjects
 
 from .networks import build
-from .objective import distilled, loss_of
 from .recipe import Recipe
 from .roads import sure_surface
 from .samples import RealScans, Samples, real_scans
 from .scans import LabelledScan
-from .teacher import pseudo_labelled, unlabelled_scans
+from .task import Targets, Task, task_of
+from .teacher import pseudo_labelled, teach, unlabelled_scans
 from .watch import Watch
 
 __all__ = ["train"]
@@ -97,19 +96,22 @@ def train(
     weights = [1.0] * len(real)
     if objects:
         only_simulated = recipe.simulated_share == 1.0
-        names = objects.names("train") if only_simulated else objects.names("validation", fold=fold)
+        names = objects.names("train") if only_simulated else []
+        if fold is not None and not only_simulated:
+            names = objects.names("validation", fold=fold)
         watched = [LabelledScan.from_frame(objects.frame(n), sure_surface) for n in names[::VALIDATION_STRIDE]]
         names = [] if only_simulated else objects.names("train", fold=fold)
         real, weights, hashes = real_scans(objects, names, drawn=recipe.drawn_roads)
     if recipe.distil > 0.0 and teacher is None:
         raise ValueError(f"the recipe distils ({recipe.distil:g}) from no teacher; give --teacher")
-    tutor = None if teacher is None else _teacher(teacher).to(device)
+    task = task_of(recipe)
+    tutor = None if teacher is None else _teacher(teacher, task).to(device)
     if tutor is not None and objects is not None and recipe.distil == 0.0:
         extra = unlabelled_scans(objects, fold)
-        real = pseudo_labelled(tutor.cpu(), [*real, *extra])
+        real = pseudo_labelled(tutor.cpu(), task, [*real, *extra])
         weights += [len(extra) ** -0.5] * len(extra)
     samples = Samples(recipe, real, weights, sorted(simulated.glob("*.npz")) if simulated else [])
-    watch = Watch(recipe, samples, watched) if watched else None
+    watch = Watch(samples, watched) if watched else None
 
     network = build(recipe)
     before: list[dict[str, object]] = []
@@ -170,9 +172,10 @@ def train(
                 network.segmentation.requires_grad_(False).eval()
             with torch.autocast(device.type, torch.bfloat16):
                 outputs = forward(x)
-            loss = loss_of(recipe, outputs, y)
+            loss = task.loss(outputs, y)
             if tutor is not None and recipe.distil > 0.0:
-                loss = loss + recipe.distil * distilled(recipe, tutor, x, outputs)
+                taught = teach(tutor, x, task.input, mirror=recipe.seen_twice)
+                loss = loss + recipe.distil * task.distillation(outputs, *taught)
             if not torch.isfinite(loss):
                 raise FloatingPointError(f"the loss is {loss.item()} at step {step}; lower --learning-rate")
             optimizer.zero_grad(set_to_none=True)
@@ -204,7 +207,7 @@ def train(
     return checkpoint
 
 
-def _ahead(samples: Samples, start: int, stop: int) -> Iterator[tuple[NDArray, ...]]:
+def _ahead(samples: Samples, start: int, stop: int) -> Iterator[Targets]:
     """Batches, the next one made while the last one is learnt from."""
     with ThreadPoolExecutor(1) as pool:
         coming = pool.submit(samples.batch, start) if start < stop else None
@@ -249,9 +252,12 @@ def _start(network: nn.Module, checkpoint: Path) -> list[dict[str, object]]:
     return [*json.loads(state["before"]), json.loads(state["recipe"])]
 
 
-def _teacher(checkpoint: Path) -> nn.Module:
+def _teacher(checkpoint: Path, task: Task) -> nn.Module:
     state = torch.load(checkpoint, weights_only=True, map_location="cpu")
-    network = build(Recipe(**json.loads(state["recipe"])))
+    recipe = Recipe(**json.loads(state["recipe"]))
+    if (task_of(recipe).view, task_of(recipe).input) != (task.view, task.input):
+        raise ValueError(f"{checkpoint} is of {recipe.network}, which sees another view than {task.recipe.network}")
+    network = build(recipe)
     network.load_state_dict(state["best"] or state["averaged"])
     return network.eval()
 

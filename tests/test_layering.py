@@ -54,18 +54,19 @@ FLOORS = {
         view.canvas view.content
         view.files view.mistakes view.page view.picture view.tracks
         view.__init__
-        cli.output
-        cli.run cli.info
-        cli.adapt cli.demo cli.eval
+        cli.arguments cli.output cli.scans
+        cli.completion cli.fit_sensor cli.info cli.run
+        cli.demo cli.eval cli.eval_sensors cli.eval_tracking cli.lists
         cli.main
         cli.__init__
         __init__
     """,
     "edgeperc_export": """
-        __init__ cards networks.pointseg networks.ssadnet targets scans
-        networks.edge networks.lodnn networks.squeezesegv2 recipe augment losses roads simulate teacher
-        networks.kulseg models_page objective samples
-        networks.__init__ watch
+        __init__ networks.pointseg networks.ssadnet recipe scans targets
+        augment cards losses networks.edge networks.lodnn networks.squeezesegv2 roads simulate
+        models_page networks.kulseg task
+        networks.__init__ samples teacher
+        watch
         to_onnx train
         quantize ablation make
         database.__init__ database.files

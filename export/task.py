@@ -1,0 +1,255 @@
+"""What a network learns: classes of points, or vehicles and drivable ground seen from above, or drivable ground alone.
+
+A task knows its view, input and classes, makes the training targets of a scan, and computes the loss and the validation
+figures of a network's outputs. Only `networks.build`, which makes the network, depends on more than the task.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edgeperc.card import InputSpec, ModelCard, RangeImageGeometry, TopViewGeometry
+from edgeperc.decode import decode_top_view
+from edgeperc.evaluation.metrics import FEWEST_RETURNS, BoxEvaluator, Confusion, boxes_to_find
+from edgeperc.perception import Box
+from edgeperc.projection import Projection
+from edgeperc.simulation.samples import IGNORE
+
+from .cards import card_of
+from .losses import box_distillation_loss, distillation_loss, pointseg_loss, road_loss, ssadnet_loss
+from .recipe import Recipe
+from .scans import LabelledScan
+from .targets import dense_targets, slot_targets
+
+__all__ = ["Outputs", "Points", "Road", "Tally", "Targets", "Task", "Vehicles", "task_of"]
+
+Outputs: TypeAlias = "Tensor | tuple[Tensor, Tensor]"
+"""What a network returns: logits (B, C, H, W), or logits and boxes, or PointSeg's logits and early logits."""
+Targets: TypeAlias = "tuple[NDArray[Any], ...]"
+
+# Vehicles are 4 % of the labeled pixels, pedestrians and cyclists 0.2 %.
+POINT_WEIGHTS = (1.0, 2.0, 4.0, 4.0)
+TOP_VIEW_WEIGHTS = (1.0, 1.0, 2.0, 4.0, 4.0)
+
+# The paper's weight of its slots (Table 2). The dense head's loss is a sum for each box and ten times the
+# segmentation's, which is a mean over cells.
+BOX_WEIGHT = {"slots": 0.1, "dense": 0.2}
+N_SLOTS = 16
+
+
+@dataclass
+class Tally:
+    """A network's labels and boxes, counted against the truth.
+
+    Attributes
+    ----------
+    pixels : Confusion
+    boxes : BoxEvaluator or None
+        None if the network has no boxes.
+    """
+
+    pixels: Confusion
+    boxes: BoxEvaluator | None = None
+
+    def decisive(self) -> float:
+        """The figure that decides which weights are kept: AP of the boxes, else mean IoU without background."""
+        return float(np.nanmean(self.pixels.iou()[1:])) if self.boxes is None else self.boxes.overall().ap
+
+    def figures(self) -> dict[str, float | None]:
+        """IoU of each class; AP and recall of the boxes. None where a figure is not defined."""
+        found = dict(zip(self.pixels.classes, map(float, self.pixels.iou()), strict=True))
+        if self.boxes is not None:
+            scores = self.boxes.overall()
+            found |= {"ap": scores.ap, "recall": scores.recall}
+        return {name: None if math.isnan(value) else round(value, 4) for name, value in found.items()}
+
+
+@dataclass(frozen=True)
+class Task(ABC):
+    """A recipe's network, seen from the data: what goes in, what it should answer, and how wrong it is.
+
+    Attributes
+    ----------
+    recipe : Recipe
+    card : ModelCard
+        View, input, classes and outputs, as the exported model has them.
+    paste_odds : mapping of str to float
+        How often each kind of object is pasted into a training scan.
+    swaps_sectors : bool
+        Whether a sector of another scan may replace the scan's own: its boxes and its ground are not replaced with it.
+    """
+
+    recipe: Recipe
+    card: ModelCard
+    paste_odds: ClassVar[Mapping[str, float]]
+    swaps_sectors: ClassVar[bool] = False
+
+    @property
+    def view(self) -> RangeImageGeometry | TopViewGeometry:
+        """The grid of the network's input."""
+        return self.card.view
+
+    @property
+    def input(self) -> InputSpec:
+        """The channels of the network's input."""
+        return self.card.input
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Classes of the network's pixels."""
+        return self.card.classes
+
+    @abstractmethod
+    def target(self, scan: LabelledScan, seen: Projection) -> Targets:
+        """What the network should answer to a scan: labels (H, W) uint8, `IGNORE` where unknown, and any box targets.
+
+        ``seen`` is the scan's projection into `view`.
+        """
+
+    @abstractmethod
+    def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
+        """The loss of a batch: a network's outputs against the stacked targets of `target`."""
+
+    def distillation(self, outputs: Outputs, probabilities: Tensor, boxes: Tensor | None) -> Tensor:
+        """The loss of a batch towards a teacher's class probabilities (B, C, H, W) and boxes."""
+        return distillation_loss(_logits(outputs), probabilities)
+
+    def tally(self) -> Tally:
+        """Counts of nothing yet, for `judge` to add to."""
+        return Tally(Confusion(self.classes))
+
+    def judge(self, outputs: Outputs, seen: Projection, targets: Targets, scan: LabelledScan, tally: Tally) -> None:
+        """Add the outputs for one scan, a batch of one, to a tally."""
+        tally.pixels.update(_logits(outputs)[0].argmax(0).cpu().numpy(), targets[0])
+
+
+class Points(Task):
+    """A class for every pixel of a range image, and so for every point."""
+
+    paste_odds: ClassVar[Mapping[str, float]] = {"pedestrian": 0.4, "cyclist": 0.35, "van": 0.15, "truck": 0.1}
+    swaps_sectors = True
+
+    def target(self, scan: LabelledScan, seen: Projection) -> Targets:
+        """The label of the point in each pixel."""
+        return (np.append(scan.labels, np.uint8(IGNORE))[seen.index],)  # the index of an empty pixel is -1
+
+    def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
+        """`pointseg_loss`; under deep supervision of the early logits too."""
+        recipe, (labels,) = self.recipe, targets
+        weights = torch.tensor(POINT_WEIGHTS, device=labels.device) if recipe.class_weights else None
+
+        def one(logits: Tensor, labels: Tensor) -> Tensor:
+            gamma, lovasz = recipe.focal_gamma, recipe.lovasz_weight
+            return pointseg_loss(logits, labels, weights, focal_gamma=gamma, lovasz_weight=lovasz)
+
+        if isinstance(outputs, Tensor):
+            return one(outputs, labels)
+        logits, early = outputs
+        # One column of every four: labels have no mean.
+        coarse = labels[:, :, 1 :: labels.shape[2] // early.shape[3]]
+        return one(logits, labels) + recipe.deep_supervision * one(early, coarse)
+
+
+class Vehicles(Task):
+    """A class for every cell of a top view, and boxes around the vehicles."""
+
+    paste_odds: ClassVar[Mapping[str, float]] = {"car": 0.3, "van": 0.4, "truck": 0.3}
+
+    def target(self, scan: LabelledScan, seen: Projection) -> Targets:
+        """Class of each cell; slots or dense maps of the vehicles."""
+        view, kinds = _top_view(self.card), self.card.box_classes
+        vehicles = [(box, n) for box, n in zip(scan.boxes, scan.counts, strict=True) if box.label in kinds]
+        to_find, unclear = (
+            np.array([[*b.center, *b.size, b.yaw] for b, n in vehicles if (n >= FEWEST_RETURNS) == wanted], np.float64)
+            for wanted in (True, False)
+        )
+        if self.recipe.head == "slots":
+            boxes = slot_targets(to_find, view, N_SLOTS)
+        else:
+            boxes = dense_targets(to_find, view, labelled=scan.labelled(view), unsure=unclear)
+        return scan.top_view_truth(view), boxes
+
+    def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
+        """`ssadnet_loss`."""
+        (logits, boxes), (labels, box_targets) = outputs, targets
+        weights = torch.tensor(TOP_VIEW_WEIGHTS, device=labels.device) if self.recipe.class_weights else None
+        lw_det, lovasz_weight = BOX_WEIGHT[self.recipe.head], self.recipe.lovasz_weight
+        return ssadnet_loss(
+            logits, boxes, labels, box_targets, lw_det=lw_det, class_weights=weights, lovasz_weight=lovasz_weight
+        )[0]
+
+    def distillation(self, outputs: Outputs, probabilities: Tensor, boxes: Tensor | None) -> Tensor:
+        """Towards the teacher's classes, and towards its boxes if the head is dense."""
+        loss = super().distillation(outputs, probabilities, boxes)
+        if self.recipe.head == "dense":
+            if boxes is None or boxes.shape != outputs[1].shape:
+                raise ValueError('the teacher has no dense boxes; give --teacher a network with head "dense"')
+            loss = loss + BOX_WEIGHT["dense"] * box_distillation_loss(outputs[1], boxes)
+        return loss
+
+    def tally(self) -> Tally:
+        """Counts of nothing yet, for labels and boxes."""
+        return Tally(Confusion(self.classes), BoxEvaluator())
+
+    def judge(self, outputs: Outputs, seen: Projection, targets: Targets, scan: LabelledScan, tally: Tally) -> None:
+        """Labels and boxes as the runtime decodes them; boxes count where the scan is labeled."""
+        view = _top_view(self.card)
+        kinds = [output.kind for output in self.card.outputs]
+        answers = {kind: output[0].cpu().numpy() for kind, output in zip(kinds, outputs, strict=True)}
+        labels, found = decode_top_view(self.card, seen.index >= 0, answers, self.card.score_threshold)
+        tally.pixels.update(labels, targets[0])
+        labelled = scan.labelled(view)
+
+        def known(box: Box) -> bool:
+            x, y = box.center[:2]
+            row, col = int((view.x_range_m[1] - x) / view.cell_m), int((view.y_range_m[1] - y) / view.cell_m)
+            return view.holds(x, y) and bool(labelled[min(row, view.height - 1), min(col, view.width - 1)])
+
+        truth = zip(scan.boxes, scan.counts, strict=True)
+        to_find, ignored = boxes_to_find(truth, view, self.card.box_classes, known=known)
+        assert tally.boxes is not None
+        tally.boxes.update([box for box in found if known(box)], to_find, ignored=ignored)
+
+
+class Road(Task):
+    """Drivable or not, for every cell of a top view; the ground under a vehicle is not."""
+
+    paste_odds = Vehicles.paste_odds
+
+    def target(self, scan: LabelledScan, seen: Projection) -> Targets:
+        """1 for drivable cells, 0 for others."""
+        truth = scan.top_view_truth(_top_view(self.card))
+        return (np.where(truth == IGNORE, IGNORE, truth == 1).astype(np.uint8),)
+
+    def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
+        """`road_loss`."""
+        return road_loss(_logits(outputs), targets[0], self.recipe.lovasz_weight)
+
+    def distillation(self, outputs: Outputs, probabilities: Tensor, boxes: Tensor | None) -> Tensor:
+        """Towards the teacher's drivable class against all its others, vehicles among them."""
+        drivable = probabilities[:, 1]
+        return distillation_loss(_logits(outputs), torch.stack([1.0 - drivable, drivable], dim=1))
+
+
+def task_of(recipe: Recipe) -> Task:
+    """The task of a recipe's network."""
+    kind = {"points": Points, "vehicles": Vehicles, "road": Road}[recipe.task]
+    return kind(recipe, card_of(recipe.network, recipe.head, version="0"))
+
+
+def _logits(outputs: Outputs) -> Tensor:
+    return outputs if isinstance(outputs, Tensor) else outputs[0]
+
+
+def _top_view(card: ModelCard) -> TopViewGeometry:
+    assert isinstance(card.view, TopViewGeometry)
+    return card.view
