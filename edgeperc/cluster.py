@@ -16,8 +16,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .errors import PointsError
-from .geometry import oriented_iou
+from .geometry import oriented_iou, rectangles, shared_area
 from .perception import Box
+from .points import read_only
 
 __all__ = ["MIN_SCORE", "OBJECT_SIZE_M", "cluster_labels", "find_clusters", "join_boxes", "objects_from_points"]
 
@@ -112,8 +113,8 @@ def find_clusters(
             f"got min_distance_m={min_distance_m}, distance_per_m={distance_per_m} and max_range_m={max_range_m}; "
             "expected a distance above 0 and no less than 1/2000 of the range, and 0 to 1 m more a metre"
         )
-    rows = np.ascontiguousarray(points, dtype=np.float32)
-    chosen = np.ones(len(rows), dtype=np.bool_) if among is None else np.ascontiguousarray(among, dtype=np.bool_)
+    rows = read_only(points)
+    chosen = read_only(np.ones(len(rows)) if among is None else among, np.bool_)
     clusters = np.empty(len(rows), dtype=np.int32)
     fill_clusters(rows, chosen, min_distance_m, distance_per_m, max_range_m, min_points, clusters)
     return clusters
@@ -293,15 +294,11 @@ def join_boxes(first: Sequence[Box], second: Sequence[Box]) -> tuple[Box, ...]:
 
 def _doubles(first: Sequence[Box], second: Sequence[Box]) -> NDArray[np.bool_]:
     """Which boxes of two lists are of one object, (n, m) bool."""
-    overlap = oriented_iou(_rectangles(first), _rectangles(second))
-    areas = [np.array([box.size[0] * box.size[1] for box in boxes]) for boxes in (first, second)]
-    shared = overlap / (1.0 + overlap) * np.add.outer(*areas)  # as overlap = shared / (both - shared)
-    found: NDArray[np.bool_] = (overlap > MAX_OVERLAP) | (shared > MAX_INSIDE * np.minimum.outer(*areas))
+    a, b = rectangles(first), rectangles(second)
+    overlap = oriented_iou(a, b)
+    smaller = np.minimum.outer(a[:, 2] * a[:, 3], b[:, 2] * b[:, 3])
+    found: NDArray[np.bool_] = (overlap > MAX_OVERLAP) | (shared_area(overlap, a, b) > MAX_INSIDE * smaller)
     return found
-
-
-def _rectangles(boxes: Sequence[Box]) -> list[tuple[float, ...]]:
-    return [(*box.center[:2], *box.size[:2], box.yaw) for box in boxes]
 
 
 def _completed(

@@ -464,13 +464,37 @@ def add_probabilities(
 
 
 def decode_top_view(
-    card: ModelCard, image: NDArray[np.float32], outputs: Mapping[str, NDArray[np.float32]], score_threshold: float
+    card: ModelCard, returned: NDArray[np.bool_], outputs: Mapping[str, NDArray[np.float32]], score_threshold: float
 ) -> tuple[NDArray[np.uint8], list[Box]]:
-    """Labels (rows, cols) and boxes from a top-view network's input (C, rows, cols) and its raw outputs, by kind.
+    """Labels and boxes of a top-view network.
 
-    A dense head's boxes are drawn into the labels, as boxes are in the truth (SSADNet 3.1.2). Outside them a cell keeps
-    a box class only where something returned, else it is background, which nobody drives on. On simulated scans that
-    took the IoU of cars from 0.41 to 0.54 and of vans from 0.14 to 0.35: few cells of a vehicle hold a return.
+    Parameters
+    ----------
+    card : ModelCard
+        With a top view.
+    returned : (rows, cols) bool
+        Cells with a return: ``Projection.index >= 0``.
+    outputs : mapping of str to ndarray
+        Raw outputs, by kind.
+    score_threshold : float
+        Least score of a box, in 0..1.
+
+    Returns
+    -------
+    labels : (rows, cols) uint8
+        Index into ``card.classes``. The boxes of a dense head are drawn into the labels, as boxes are in the truth
+        (SSADNet 3.1.2). Outside boxes, a cell of a box class without a return becomes background. On simulated scans
+        this raised the IoU of cars from 0.41 to 0.54 and of vans from 0.14 to 0.35: few cells of a vehicle hold a
+        return.
+    boxes : list of Box
+        Best score first.
+
+    Raises
+    ------
+    InferenceError
+        An output holds values that are not finite.
+    CardMismatchError
+        Shapes disagree with the card.
     """
     assert isinstance(card.view, TopViewGeometry)
     kind = next(k for k in outputs if k.startswith("class_"))
@@ -492,8 +516,7 @@ def decode_top_view(
         )
         is_box = np.array([name in card.box_classes for name in card.classes])
         boxed = np.flatnonzero(is_box[labels])  # few cells of many
-        empty = (image.reshape(len(image), -1)[:, boxed] == 0.0).all(axis=0)  # 0 in every channel
-        labels.reshape(-1)[boxed[empty]] = 0
+        labels.reshape(-1)[boxed[~returned.reshape(-1)[boxed]]] = 0
         draw_footprints(labels, found, card.view, card.classes)
     elif "box_slots" in outputs:
         found = decode_slots(

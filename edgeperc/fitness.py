@@ -12,6 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .errors import CardError, PointsError
+from .points import read_only
 from .sensor import SensorProfile
 
 __all__ = ["FitnessProfile", "check_fitness", "fill_scan_sums"]
@@ -207,7 +208,7 @@ def _measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> _
     """None where no point is finite."""
     if points.ndim != 2 or points.shape[1] != 4:
         raise PointsError(f"got an array of shape {points.shape}; expected (n, 4): x, y, z, remission")
-    points = np.ascontiguousarray(points, dtype=np.float32)
+    points = read_only(points)
     remissions, elevations, ranges = (np.empty(size, dtype=np.int64) for size in (258, 360, 200))
     heights = np.empty((3, 100), dtype=np.int64)
     rows, n_rows, sums = np.empty((8, 1024)), np.empty(8, dtype=np.int64), np.empty(8)

@@ -17,8 +17,17 @@ from numpy.typing import ArrayLike, NDArray
 from .card import TopViewGeometry
 from .errors import PointsError
 from .perception import Box
+from .points import read_only
 
-__all__ = ["bounding_rectangles", "draw_footprints", "inside", "oriented_iou", "suppress_overlaps"]
+__all__ = [
+    "bounding_rectangles",
+    "draw_footprints",
+    "inside",
+    "oriented_iou",
+    "rectangles",
+    "shared_area",
+    "suppress_overlaps",
+]
 
 
 def draw_footprints(
@@ -53,6 +62,12 @@ def draw_footprints(
         labels[rows, cols][inside] = classes.index(box.label)
 
 
+def rectangles(boxes: Iterable[Box]) -> NDArray[np.float64]:
+    """Footprints of boxes, (n, 5): x, y, length, width [m], yaw [rad]."""
+    rows = [(*box.center[:2], *box.size[:2], box.yaw) for box in boxes]
+    return np.array(rows, dtype=np.float64).reshape(-1, 5)
+
+
 def oriented_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     """Intersection over union of every rectangle of ``a`` with every one of ``b`` (SSADNet equation A1).
 
@@ -77,6 +92,24 @@ def oriented_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     iou = np.empty((len(first), len(second)))
     fill_oriented_iou(first, second, iou)
     return iou
+
+
+def shared_area(iou: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Area [m2] that rectangles share, from their overlap: ``iou = shared / (area of a + area of b - shared)``.
+
+    Parameters
+    ----------
+    iou : (n, m) float64
+        `oriented_iou` of ``a`` and ``b``.
+    a : (n, 5) float64
+    b : (m, 5) float64
+
+    Returns
+    -------
+    (n, m) float64
+    """
+    areas = np.add.outer(a[:, 2] * a[:, 3], b[:, 2] * b[:, 3])
+    return np.asarray(iou / (1.0 + iou) * areas, np.float64)
 
 
 def suppress_overlaps(rectangles: ArrayLike, scores: ArrayLike, iou_threshold: float) -> NDArray[np.int64]:
@@ -139,7 +172,7 @@ def bounding_rectangles(rectangles: ArrayLike) -> NDArray[np.float64]:
 
 
 def _as_rectangles(given: ArrayLike) -> NDArray[np.float64]:
-    rows = np.ascontiguousarray(given, dtype=np.float64)
+    rows = read_only(given, np.float64)
     if rows.size == 0:
         rows = rows.reshape(0, 5)
     if rows.ndim != 2 or rows.shape[1] != 5:

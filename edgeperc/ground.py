@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .errors import PointsError
+from .points import read_only
 
 __all__ = ["Ground", "find_ground"]
 
@@ -125,7 +126,7 @@ def find_ground(
         raise PointsError(
             f"got mount_height_m={mount_height_m} and max_height_m={max_height_m}; expected metres above 0"
         )
-    rows = np.ascontiguousarray(points, dtype=np.float32)
+    rows = read_only(points)
     cell = np.empty(len(rows), dtype=np.int32)
     lowest = np.empty((N_CELLS, N_CELLS), dtype=np.int32)
     fill_lowest(rows, cell, lowest)

@@ -68,7 +68,7 @@ def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArra
         return np.require(values, dtype=np.float32, requirements=["C", "A"])
 
 
-def read_only(array: NDArray[Any], dtype: DTypeLike = np.float32) -> NDArray[Any]:
+def read_only(array: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray[Any]:
     """A read-only, C-contiguous and aligned view of an array, copied only where its layout or dtype is another.
 
     numba compiles a kernel once for arrays that can be written to and once for those that cannot. Kernels get their

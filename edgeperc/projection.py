@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from .card import InputSpec, RangeImageGeometry, TopViewGeometry
 from .errors import CardError, PointsError
+from .points import read_only
 
 __all__ = [
     "Projection",
@@ -263,8 +264,6 @@ def mark_range_image(
 def fill_image(
     points: NDArray[np.float32],
     index: NDArray[np.int32],
-    remission_offset: np.float32,
-    remission_scale: np.float32,
     channels: NDArray[np.int32],
     mean: NDArray[np.float32],
     std: NDArray[np.float32],
@@ -277,8 +276,6 @@ def fill_image(
     points : (n, 4) float32, C-contiguous
     index : (pixels,) int32
         Row of points; -1 where nothing returned.
-    remission_offset, remission_scale : float32
-        The remission used is ``(raw + offset) * scale``.
     channels : (C,) int32
         Of ``CHANNEL_CODES``.
     mean, std : (C,) float32
@@ -308,7 +305,7 @@ def fill_image(
             planes[0, p] = x
             planes[1, p] = y
             planes[2, p] = z
-            planes[3, p] = (remission + remission_offset) * remission_scale
+            planes[3, p] = remission
             planes[4, p] = np.sqrt(squared_distance)
             planes[5, p] = np.sqrt(squared_distance + z * z)
         for c in range(channels.shape[0]):
@@ -350,8 +347,6 @@ class TopViewProjector:
     def fill(
         self,
         points: NDArray[np.float32],
-        remission_offset: float,
-        remission_scale: float,
         image: NDArray[np.float32],
         index: NDArray[np.int32],
         pixel: NDArray[np.int32],
@@ -361,9 +356,7 @@ class TopViewProjector:
         Parameters
         ----------
         points : (n, 4) float32, C-contiguous
-            x, y, z [m] in the sensor frame, remission as the sensor gives it. May be empty or read-only.
-        remission_offset, remission_scale : float
-            The remission used is ``(raw + offset) * scale``.
+            x, y, z [m] in the sensor frame, remission in 0..1 (`edgeperc.adapt.condition`). May be empty or read-only.
         image : (C, H, W) float32, C-contiguous, overwritten
         index : (H, W) int32, C-contiguous, overwritten
         pixel : (n,) int32, C-contiguous, overwritten
@@ -372,25 +365,20 @@ class TopViewProjector:
         Raises
         ------
         PointsError
-            An array has another shape, dtype or layout, or the remission scaling is not finite.
+            An array has another shape, dtype or layout.
         """
-        points = _checked(self.shape, points, remission_offset, remission_scale, image, index, pixel)
+        points = _checked(self.shape, points, image, index, pixel)
         _, height, width = self.shape
         x_range, y_range, z_range = self._ranges
         flat_index = index.reshape(-1)
         mark_top_view(
             points, x_range, y_range, z_range, self._cells_per_m, np.int32(height), np.int32(width), flat_index, pixel
         )
-        fill_image(
-            points, flat_index, np.float32(remission_offset), np.float32(remission_scale),
-            self._channels, self._mean, self._std, image.reshape(self.shape[0], -1),
-        )  # fmt: skip
+        fill_image(points, flat_index, self._channels, self._mean, self._std, image.reshape(self.shape[0], -1))
 
-    def project(
-        self, points: NDArray[np.float32], remission_offset: float = 0.0, remission_scale: float = 1.0
-    ) -> Projection:
+    def project(self, points: NDArray[np.float32]) -> Projection:
         """Project into fresh buffers; arguments and errors as in `fill`."""
-        return _project(self, points, remission_offset, remission_scale)
+        return _project(self, points)
 
 
 class RangeImageProjector:
@@ -438,40 +426,31 @@ class RangeImageProjector:
     def fill(
         self,
         points: NDArray[np.float32],
-        remission_offset: float,
-        remission_scale: float,
         image: NDArray[np.float32],
         index: NDArray[np.int32],
         pixel: NDArray[np.int32],
     ) -> None:
         """Project into the caller's buffers; arguments and errors as in `TopViewProjector.fill`."""
-        points = _checked(self.shape, points, remission_offset, remission_scale, image, index, pixel)
+        points = _checked(self.shape, points, image, index, pixel)
         flat_index = index.reshape(-1)
         mark_range_image(
             points, self._wedge, *self._rows, *self._cols, np.int32(self.shape[2]), self._winner, flat_index, pixel
         )
-        self.fill_image(points, remission_offset, remission_scale, index, image)
+        self.fill_image(points, index, image)
 
     def fill_image(
         self,
         points: NDArray[np.float32],
-        remission_offset: float,
-        remission_scale: float,
         index: NDArray[np.int32],
         image: NDArray[np.float32],
     ) -> None:
         """Write the image of an ``index`` that is known already; arguments and errors as in `TopViewProjector.fill`."""
-        points = _checked(self.shape, points, remission_offset, remission_scale, image, index)
-        fill_image(
-            points, index.reshape(-1), np.float32(remission_offset), np.float32(remission_scale),
-            self._channels, self._mean, self._std, image.reshape(self.shape[0], -1),
-        )  # fmt: skip
+        points = _checked(self.shape, points, image, index)
+        fill_image(points, index.reshape(-1), self._channels, self._mean, self._std, image.reshape(self.shape[0], -1))
 
-    def project(
-        self, points: NDArray[np.float32], remission_offset: float = 0.0, remission_scale: float = 1.0
-    ) -> Projection:
+    def project(self, points: NDArray[np.float32]) -> Projection:
         """Project into fresh buffers; arguments and errors as in `TopViewProjector.fill`."""
-        return _project(self, points, remission_offset, remission_scale)
+        return _project(self, points)
 
 
 def make_projector(
@@ -575,8 +554,6 @@ def _channels(
 def _checked(
     shape: tuple[int, int, int],
     points: NDArray[np.float32],
-    remission_offset: float,
-    remission_scale: float,
     image: NDArray[np.float32],
     index: NDArray[np.int32],
     pixel: NDArray[np.int32] | None = None,
@@ -595,11 +572,7 @@ def _checked(
                 f"{name} buffer is {buffer.shape} {buffer.dtype}; expected {expected} {np.dtype(dtype)}, "
                 "C-contiguous and writeable"
             )
-    if not (math.isfinite(remission_offset) and math.isfinite(remission_scale)):
-        raise PointsError(f"remission offset {remission_offset}, scale {remission_scale}; expected finite numbers")
-    read_only = points.view()
-    read_only.flags.writeable = False
-    return read_only
+    return read_only(points)
 
 
 def _check_points(points: NDArray[np.float32]) -> None:
@@ -615,8 +588,6 @@ def _check_points(points: NDArray[np.float32]) -> None:
 def _project(
     projector: TopViewProjector | RangeImageProjector,
     points: NDArray[np.float32],
-    remission_offset: float,
-    remission_scale: float,
 ) -> Projection:
     _check_points(points)
     projection = Projection(
@@ -624,5 +595,5 @@ def _project(
         index=np.empty(projector.shape[1:], dtype=np.int32),
         pixel=np.empty(points.shape[0], dtype=np.int32),
     )
-    projector.fill(points, remission_offset, remission_scale, projection.image, projection.index, projection.pixel)
+    projector.fill(points, projection.image, projection.index, projection.pixel)
     return projection

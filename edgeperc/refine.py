@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .errors import PointsError
+from .points import read_only
 
 __all__ = ["OBJECT_RADIUS_M", "label_points", "remove_outliers"]
 
@@ -146,7 +147,7 @@ def label_points(
             "expected one pixel a point, from the same projection"
         )
     point_labels = np.empty(len(points), dtype=np.uint8)
-    fill_point_labels(rows, np.ascontiguousarray(pixel, dtype=np.int32), behind, classes, full_turn, point_labels)
+    fill_point_labels(rows, read_only(pixel, np.int32), behind, classes, full_turn, point_labels)
     return point_labels
 
 
@@ -160,9 +161,9 @@ def _check(
     if index.size and int(index.max()) >= len(points):
         raise PointsError(f"index holds {int(index.max())} for {len(points)} points; pass the points it was made of")
     return (
-        np.ascontiguousarray(points, dtype=np.float32),
-        np.ascontiguousarray(index, dtype=np.int32),
-        np.ascontiguousarray(labels, dtype=np.uint8),
+        read_only(points),
+        read_only(index, np.int32),
+        read_only(labels, np.uint8),
     )
 
 

@@ -195,7 +195,8 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
     projector = make_projector(card.view, card.input)
     worst, agreement, box_deviation = 0.0, 1.0, 0.0
     for points in scans:
-        image = projector.project(np.ascontiguousarray(points)).image
+        seen = projector.project(np.ascontiguousarray(points))
+        image = seen.image
         with torch.no_grad():
             answers = network.eval()(torch.from_numpy(image[None]))
         answers = answers if isinstance(answers, tuple) else (answers,)
@@ -207,7 +208,7 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
             worst = max(worst, float(apart) / max(float(want.std()), 1e-6))
         if card.view.kind == "top_view":
             (here_labels, mine), (labels, theirs) = (
-                decode_top_view(card, image, a, card.score_threshold) for a in (here, wanted)
+                decode_top_view(card, seen.index >= 0, a, card.score_threshold) for a in (here, wanted)
             )
             if [b.label for b in mine] != [b.label for b in theirs]:
                 raise ParityError(f"{path}: onnxruntime finds {len(mine)} boxes, torch {len(theirs)}, or others")

@@ -311,9 +311,9 @@ def test_boxes_are_drawn_into_the_map():
     drivable, stray = CLASSES.index("drivable"), CLASSES.index("van")
     logits = class_logits((slice(0, 10), slice(None), drivable, 9.0), (slice(350, 360), slice(0, 20), stray, 9.0))[0]
     dense = dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0), (38.0, 5.0, -1.0, 10.0, 2.6, 3.2, 0.4, 2.0))[0]
-    image = np.zeros((3, *SHAPE), np.float32)
-    image[1, 355, 7] = 0.2  # a stray van's cell with a return
-    labels, boxes = decode_top_view(card, image, {"class_logits": logits, "box_dense": dense}, 0.3)
+    returned = np.zeros(SHAPE, np.bool_)
+    returned[355, 7] = True  # a stray van's cell with a return
+    labels, boxes = decode_top_view(card, returned, {"class_logits": logits, "box_dense": dense}, 0.3)
     assert [box.label for box in boxes] == ["truck", "car"]  # of equal scores, the farther first
     expected = np.zeros(SHAPE, np.uint8)
     expected[:10], expected[355, 7] = drivable, stray
@@ -329,7 +329,7 @@ def test_the_papers_boxes_leave_the_map_alone():
     slots = np.zeros((2, 4), np.float32)
     slots[0] = 58 / 200, 120 / 400, 20 / 200, 44 / 400
     labels, (box,) = decode_top_view(
-        card, np.zeros((3, *SHAPE), np.float32), {"class_logits": logits, "box_slots": slots}, 0.3
+        card, np.zeros(SHAPE, np.bool_), {"class_logits": logits, "box_slots": slots}, 0.3
     )
     assert box.label == "van"
     assert np.count_nonzero(labels == 3) == 40 * 16

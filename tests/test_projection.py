@@ -57,20 +57,20 @@ def assert_same(got, expected):
         np.testing.assert_array_equal(getattr(got, name), expected_array, err_msg=name)
 
 
-def check(points, view, spec=None, offset=0.0, scale=1.0):
+def check(points, view, spec=None):
     """Compiled, interpreted and slow runs agree to the last bit; returns the projection."""
     spec = spec or spec_of(view)
     projector = make_projector(view, spec)
     projector.project(np.full((3, 4), 7.0, np.float32))  # leftovers must not shine through
-    compiled = projector.project(points, offset, scale)
+    compiled = projector.project(points)
     edges = (row_edges(view), column_edges(view)) if view.kind == "range_image" else ()
-    assert_same(compiled, twins.projection.project(points, view, edges, spec, offset, scale))
+    assert_same(compiled, twins.projection.project(points, view, edges, spec))
     with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
         for name in KERNELS:
             kernel = getattr(projection, name)
             patch.setattr(projection, name, getattr(kernel, "py_func", kernel))
         if view.height * view.width < 2000:  # an interpreted run visits every pixel
-            assert_same(projector.project(points, offset, scale), (compiled.image, compiled.index, compiled.pixel))
+            assert_same(projector.project(points), (compiled.image, compiled.index, compiled.pixel))
     return compiled
 
 
@@ -78,7 +78,7 @@ def check(points, view, spec=None, offset=0.0, scale=1.0):
 @pytest.mark.parametrize("n", [1, 255, 256, 257, 3000])
 def test_random_points(name, n):
     rng = np.random.default_rng(n)
-    seen = check(random_points(rng, n), VIEWS[name], spec_of(VIEWS[name], (-1) ** n), 0.1, 0.7)
+    seen = check(random_points(rng, n), VIEWS[name], spec_of(VIEWS[name], (-1) ** n))
     assert n < 3000 or (seen.index >= 0).any()
 
 
@@ -140,8 +140,8 @@ def test_a_point_lands_where_the_equations_say():
 @pytest.mark.parametrize("channels", [("height",), ("remission", "distance"), ("height", "distance", "remission")])
 def test_channels_are_normalised_in_the_order_asked_for(channels):
     mean, std = (10.0, 0.5, -1.0)[: len(channels)], (2.0, 0.25, 4.0)[: len(channels)]
-    points = np.float32([[3.0, 4.0, 1.0, 100.0], [1.0, 1.0, 0.5, 200.0]])
-    seen = check(points, VIEWS["coarse top view"], InputSpec("input", channels, mean, std), -50.0, 0.01)
+    points = np.float32([[3.0, 4.0, 1.0, 0.5], [1.0, 1.0, 0.5, 1.5]])
+    seen = check(points, VIEWS["coarse top view"], InputSpec("input", channels, mean, std))
     raw = {"distance": 5.0, "remission": 0.5, "height": 1.0}
     expected = [(raw[name] - m) / s for name, m, s in zip(channels, mean, std, strict=True)]
     np.testing.assert_allclose(seen.image.reshape(len(channels), -1)[:, seen.pixel[0]], expected, rtol=1e-6)
@@ -275,10 +275,7 @@ def test_wrong_arrays_are_told():
         ("pixel", locked),
     ):
         with pytest.raises(PointsError, match=f"^{name} buffer"):
-            projector.fill(good, 0.0, 1.0, **(buffers | {name: bad}))
-    for offset, scale in ((math.nan, 1.0), (0.0, math.inf)):
-        with pytest.raises(PointsError, match="finite"):
-            projector.fill(good, offset, scale, **buffers)
+            projector.fill(good, **(buffers | {name: bad}))
 
 
 def test_the_benchmark_compares_equal_answers():

@@ -167,7 +167,7 @@ def contenders(points: NDArray[np.float32]) -> dict[str, Callable[[], object]]:
         for _ in range(2):
             image, index = np.empty(kernels.shape, np.float32), np.empty(kernels.shape[1:], np.int32)
             answers.append((image, index, np.empty(len(points), np.int32)))
-        calls[name] = lambda: kernels.fill(points, 0.0, 1.0, *answers[0])
+        calls[name] = lambda: kernels.fill(points, *answers[0])
         if by_numpy is None:
             return
         calls[f"{name}, numpy"] = lambda: by_numpy.fill(points, *answers[1])

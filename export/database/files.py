@@ -55,9 +55,7 @@ N_FOLDS = 5
 FARTHEST_M = float(np.hypot(X_RANGE_M[1], Y_RANGE_M[1]))
 
 
-def picture(
-    points: NDArray[np.float32], remission_offset: float = 0.0, remission_scale: float = 1.0
-) -> NDArray[np.uint8]:
+def picture(points: NDArray[np.float32]) -> NDArray[np.uint8]:
     """A scan seen from above (section 3.1).
 
     Metres become pixels of 0.1 m, rounded to the nearest and clamped to the image; of the points of a pixel the highest
@@ -66,9 +64,8 @@ def picture(
     Parameters
     ----------
     points : (n, 4) float32
-        x, y, z [m], remission. Rows that are not finite are left out.
-    remission_offset, remission_scale : float
-        The remission drawn is ``(raw + offset) * scale``, clamped to 0..1; see `edgeperc.sensor.SensorProfile`.
+        x, y, z [m], remission, clamped to 0..1 (`edgeperc.adapt.condition` scales a sensor's). Rows that are not finite
+        are left out.
 
     Returns
     -------
@@ -81,7 +78,7 @@ def picture(
     p = p[np.isfinite(p[:, 3])].astype(np.float64)  # NaN passes none of the comparisons above
     ahead = np.clip(np.floor((p[:, 0] - X_RANGE_M[0]) / CELL_M + 0.5), 0, HEIGHT - 1).astype(np.int64)
     left = np.clip(np.floor((p[:, 1] - Y_RANGE_M[0]) / CELL_M + 0.5), 0, WIDTH - 1).astype(np.int64)
-    remission = np.clip((p[:, 3] + remission_offset) * remission_scale, 0.0, 1.0)
+    remission = np.clip(p[:, 3], 0.0, 1.0)
     height = (p[:, 2] - Z_RANGE_M[0]) / (Z_RANGE_M[1] - Z_RANGE_M[0])
     values = np.stack([np.hypot(p[:, 0], p[:, 1]) / FARTHEST_M, height, remission], axis=1)
     # Of several assignments to a pixel the last one stays: lowest first, and of equals the later ones first.

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import Perceiver
+from edgeperc.adapt import condition
 from edgeperc.atomic import write_aside
 from edgeperc.card import TopViewGeometry
 from edgeperc.errors import CardMismatchError, EdgepercError
@@ -199,7 +200,7 @@ class SceneBuilder:
         except (EdgepercError, ValueError, OSError) as exc:
             # Without the root, so that the same set gives the same database wherever it lies.
             return (str(exc) or type(exc).__name__).replace(f"{self.plan.kitti}{os.sep}", "")
-        image = picture(frame.points, self.sensor.remission_offset, self.sensor.remission_scale)
+        image = picture(condition(frame.points, self.sensor, rendered=False)[0])
         model = self.road_model(task.fold)
         found = model(frame.points)
         drawn = None if task.road is None else mask_of(task.road, task.name) != 0

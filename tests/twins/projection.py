@@ -39,7 +39,7 @@ def range_image_pixel(point, view, row_edges, col_edges):
     return row * view.width + col, squared_range
 
 
-def project(points, view, edges, spec, remission_offset, remission_scale):
+def project(points, view, edges, spec):
     """Twin of `edgeperc.projection`'s kernels: image, index, pixel. ``edges``: a range image's, of rows and columns."""
     image = np.zeros((len(spec.channels), view.height * view.width), np.float32)
     index = np.full(view.height * view.width, -1, np.int32)
@@ -60,7 +60,7 @@ def project(points, view, edges, spec, remission_offset, remission_scale):
             distance = np.sqrt(x * x + y * y)
             raw = {
                 "x": x, "y": y, "z": z, "height": z, "distance": distance, "range": np.sqrt(x * x + y * y + z * z),
-                "remission": (remission + np.float32(remission_offset)) * np.float32(remission_scale),
+                "remission": remission,
             }  # fmt: skip
             image[:, flat] = (np.array([raw[name] for name in spec.channels], np.float32) - mean) / std
     return image.reshape(-1, view.height, view.width), index.reshape(view.height, view.width), pixel
