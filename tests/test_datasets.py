@@ -257,6 +257,24 @@ def test_no_ground_no_claim() -> None:
 # --- real data -------------------------------------------------------------------------------------------------------
 
 
+def test_every_table_of_frames_is_read_and_unknown_drives_are_left_out(tmp_path: Path) -> None:
+    (tmp_path / "training/label_2").mkdir(parents=True)
+    for name in ("000000", "000001", "000002"):
+        (tmp_path / f"training/label_2/{name}.txt").touch()
+    assert KittiObjects(tmp_path).names("test") == ["000000", "000001", "000002"]  # no table: drives of their own
+    (tmp_path / "frames.csv").write_text("name,drive,grade\n000000,2011_09_26_drive_0011,A\n")
+    (tmp_path / "frames-2.csv").write_text("name,drive,grade\n000001,2011_09_26_drive_0001,B\n")
+    objects = KittiObjects(tmp_path)
+    assert objects.drives == {"000000": "2011_09_26_drive_0011", "000001": "2011_09_26_drive_0001"}
+    assert objects.names("test", grades="AB") == ["000000"]
+    assert objects.names("validation", grades="AB") == ["000001"]
+    assert objects.names("all", grades="AB") == ["000000", "000001"]  # nobody knows the drive of 000002
+    for text in ("name,drive\n000002,\n", "name,day\n000002,26\n"):
+        (tmp_path / "frames-2.csv").write_text(text)
+        with pytest.raises(PointsError, match="expected columns name and drive"):
+            KittiObjects(tmp_path)
+
+
 def test_every_named_drive_has_one_place() -> None:
     for drive in {*TEST_DRIVES, *(d for fold in FOLDS for d in fold)}:
         for fold in range(len(FOLDS)):
@@ -276,9 +294,12 @@ def test_drives_are_never_shared(kitti_root: Path) -> None:
     objects = KittiObjects(kitti_root)
     drive = {r["name"]: r["drive"] for r in objects.rows}
     train, test = (objects.names(s, grades="AB") for s in ("train", "test"))
-    assert len(train) + len(test) == len(objects.names("all", grades="AB")) == 228
+    validation = objects.names("validation", grades="AB")
+    assert sorted(train + validation + test) == sorted(objects.names("all", grades="AB"))
+    assert len(train + validation + test) == 228 + 167  # frames.csv and frames-2.csv
     assert {drive[n] for n in test} == TEST_DRIVES - {"2011_10_03_drive_0027"}
-    assert not {drive[n] for n in train} & TEST_DRIVES
+    assert {drive[n] for n in validation} == VALIDATION_DRIVES
+    assert not {drive[n] for n in train} & (TEST_DRIVES | VALIDATION_DRIVES)
     for fold in range(len(FOLDS)):
         left, held_back = (objects.names(s, fold=fold, grades="AB") for s in ("train", "validation"))
         assert sorted(left + held_back) == sorted(train)

@@ -1,6 +1,6 @@
-"""Labelled real scans, and the truth that SSADNet and PointSeg are trained on and judged by.
+"""Readers of labeled real scans: KITTI objects and SemanticKITTI, for training and evaluation.
 
-Labels cover the left colour camera's field of view only: outside it, truth is unknown, not background.
+KITTI's object labels cover the field of view of the left color camera only. Outside it the truth is unknown.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ IMAGE_SIZE = (1242, 375)
 
 @dataclass(frozen=True)
 class Calibration:
-    """Where the camera is, and how it sees.
+    """Pose and projection of the left color camera.
 
     Attributes
     ----------
     T_cam_velo : (4, 4) float64
         Sensor frame to rectified camera frame.
     P2 : (3, 4) float64
-        Rectified camera frame to the left colour image.
+        Rectified camera frame to the image of the left color camera.
     """
 
     T_cam_velo: NDArray[np.float64]
@@ -59,7 +59,13 @@ class Calibration:
 
     @classmethod
     def read(cls, path: Path) -> Calibration:
-        """Read a KITTI object or tracking calibration file."""
+        """Read a KITTI object or tracking calibration file.
+
+        Raises
+        ------
+        PointsError
+            P2, R0_rect or Tr_velo_to_cam is missing or malformed.
+        """
         values = {}
         for line in path.read_text().splitlines():
             key, _, numbers = line.replace(":", " ", 1).partition(" ")
@@ -74,7 +80,7 @@ class Calibration:
             raise PointsError(f"{path} holds no KITTI calibration; expected P2, R0_rect and Tr_velo_to_cam") from exc
 
     def to_image(self, points: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pixels (n, 2) and depth (n,) [m] of points (n, 3+) in the sensor frame."""
+        """Project points (n, 3+) in the sensor frame: pixels (n, 2) and depth (n,) [m]."""
         cam = np.asarray(points[:, :3], np.float64) @ self.T_cam_velo[:3, :3].T + self.T_cam_velo[:3, 3]
         image = cam @ self.P2[:, :3].T + self.P2[:, 3]
         depth = image[:, 2]
@@ -82,34 +88,45 @@ class Calibration:
             return image[:, :2] / depth[:, None], depth
 
     def sensor_boxes(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """KITTI's height, width, length, x, y, z, turn in the camera's frame -> x, y, z, length, width, height, yaw."""
+        """Boxes in KITTI's camera frame -> boxes in the sensor frame.
+
+        Parameters
+        ----------
+        rows : (n, 7) float64
+            Height, width, length, x, y, z of the center of the bottom face [m], rotation about the camera's y axis.
+
+        Returns
+        -------
+        (n, 7) float64
+            x, y, z of the center, length, width, height [m], yaw [rad].
+        """
         T_velo_cam = np.linalg.inv(self.T_cam_velo)
         height, width, length, x, y, z, turn = rows.T
-        # KITTI gives the middle of the bottom face; y points down in the camera frame.
-        middles = np.stack([x, y - height / 2.0, z], axis=1) @ T_velo_cam[:3, :3].T + T_velo_cam[:3, 3]
+        # y points down in the camera frame.
+        centers = np.stack([x, y - height / 2.0, z], axis=1) @ T_velo_cam[:3, :3].T + T_velo_cam[:3, 3]
         ahead = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], axis=1) @ T_velo_cam[:3, :3].T
-        return np.column_stack([middles, length, width, height, np.arctan2(ahead[:, 1], ahead[:, 0])])
+        return np.column_stack([centers, length, width, height, np.arctan2(ahead[:, 1], ahead[:, 0])])
 
     def in_image(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which points the camera sees, (n,) bool."""
+        """Which points lie in the camera's field of view, (n,) bool."""
         pixel, depth = self.to_image(points)
         return (depth > 0.1) & (pixel >= 0).all(axis=1) & (pixel[:, 0] < IMAGE_SIZE[0]) & (pixel[:, 1] < IMAGE_SIZE[1])
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One scan with everything labelled in it.
+    """One KITTI scan and its labels.
 
     Attributes
     ----------
     name, drive : str
     grade : str
-        ``"A"`` where the boxes were checked to fit the scan.
+        ``"A"`` if the boxes were checked to fit the scan.
     points : (n, 4) float32
     boxes : tuple of Box
         In the sensor frame, labels in lower case (car, van, truck, pedestrian, person_sitting, cyclist, tram, misc).
     unlabelled : (k, 4) float64
-        Image rectangles (left, top, right, bottom) whose objects nobody labelled (DontCare).
+        Image rectangles (left, top, right, bottom) whose objects are not labeled (DontCare).
     calibration : Calibration
     """
 
@@ -135,7 +152,7 @@ class Frame:
         return known
 
     def point_labels(self) -> NDArray[np.uint8]:
-        """PointSeg's truth, (n,) uint8: a point in a box has the box's class, `IGNORE` where nobody labelled."""
+        """True class of each point, (n,) uint8: that of the box around it, `IGNORE` where the truth is unknown."""
         labels = np.where(self.known, 0, IGNORE).astype(np.uint8)
         for box in self.boxes:
             labels[inside(box, self.points)] = POINT_CLASS_OF.get(box.label, IGNORE)
@@ -164,66 +181,93 @@ def read_objects(label_path: Path, calibration: Calibration) -> tuple[tuple[Box,
 
 
 def scan_hash(points: NDArray[np.float32]) -> str:
-    """What a card calls a scan that its model was trained on: the first 16 digits of its SHA-256."""
+    """Name of a training scan in a model's card: the first 16 digits of the SHA-256 of its points."""
     return hashlib.sha256(points.tobytes()).hexdigest()[:16]
 
 
 class KittiObjects:
-    """The labelled scans below a KITTI root (``training/velodyne``, ``label_2``, ``calib``), by drive.
+    """The labeled scans below a KITTI root (``training/velodyne``, ``label_2``, ``calib``), by drive.
 
-    A ``frames.csv`` beside ``training`` says which drive each scan is of (columns ``name``, ``drive`` and, where there
-    are any, ``grade``, ``crop``); without one, each scan counts as a drive of its own and nothing is held back.
+    ``frames.csv`` and ``frames-*.csv`` beside ``training`` name the drive of each scan (columns ``name``, ``drive`` and
+    optionally ``grade``). A scan that they do not name is left out: its drive may be one that a model was trained on.
+    Without any table, each scan counts as a drive of its own.
+
+    Parameters
+    ----------
+    root : str or Path
+
+    Attributes
+    ----------
+    drives : dict of str to str
+        Name of each scan, labeled or not -> its drive.
+    rows : list of dict
+        Rows of the tables, of the labeled scans.
+
+    Raises
+    ------
+    PointsError
+        There are no label files, or a table does not name the drive of a scan.
     """
 
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root)
-        table = self.root / "frames.csv"
-        if table.exists():
-            with table.open(newline="") as file:
-                rows = list(csv.DictReader(file))
-        else:
-            rows = [{"name": p.stem, "drive": p.stem} for p in sorted((self.root / "training/label_2").glob("*.txt"))]
-        self.drives = {r["name"]: r["drive"] for r in rows}
-        self.rows = [r for r in rows if (self.root / "training/label_2" / f"{r['name']}.txt").exists()]
+        labels = self.root / "training/label_2"
+        rows = _frame_rows(self.root) or [
+            {"name": path.stem, "drive": path.stem} for path in sorted(labels.glob("*.txt"))
+        ]
+        self.drives = {row["name"]: row["drive"] for row in rows}
+        self.rows = [row for row in rows if (labels / f"{row['name']}.txt").exists()]
         if not self.rows:
-            raise PointsError(f"{self.root} holds no training/label_2/*.txt; expected the root of a KITTI object set")
+            raise PointsError(f"{self.root} has no training/label_2/*.txt; expected the root of a KITTI object set")
 
     def names(self, split: str, *, fold: int | None = None, grades: str = "A") -> list[str]:
-        """Names of the frames of a split (`splits.in_split`) whose boxes are of one of the ``grades``."""
+        """Names of the labeled scans of a split (`splits.in_split`) whose labels have one of the ``grades``."""
         return [r["name"] for r in self.rows if in_split(r["drive"], split, fold) and r.get("grade", "A") in grades]
 
     def unlabelled(self, split: str, *, fold: int | None = None) -> list[str]:
         """Names of the scans of a split that have no label file."""
-        labelled = {r["name"] for r in self.rows}
-        names = [name for name, drive in self.drives.items() if name not in labelled and in_split(drive, split, fold)]
-        return [name for name in names if (self.root / "training/velodyne" / f"{name}.bin").exists()]
+        labeled, scans = {row["name"] for row in self.rows}, self.root / "training/velodyne"
+        names = [name for name, drive in self.drives.items() if name not in labeled and in_split(drive, split, fold)]
+        return [name for name in names if (scans / f"{name}.bin").exists()]
 
     def frame(self, name: str) -> Frame:
-        """Read one frame whole."""
-        row = next(r for r in self.rows if r["name"] == name)
+        """Read a labeled scan with its labels and calibration."""
+        row = next(row for row in self.rows if row["name"] == name)
         calibration = Calibration.read(self.root / "training/calib" / f"{name}.txt")
         boxes, unlabelled = read_objects(self.root / "training/label_2" / f"{name}.txt", calibration)
         points = read_points(self.root / "training/velodyne" / f"{name}.bin")
         return Frame(name, row["drive"], row.get("grade", "A"), points, boxes, unlabelled, calibration)
 
 
+def _frame_rows(root: Path) -> list[dict[str, str]]:
+    """Rows of ``frames.csv`` and ``frames-*.csv``; none if there is no table."""
+    rows: list[dict[str, str]] = []
+    for table in (root / "frames.csv", *sorted(root.glob("frames-*.csv"))):
+        if not table.exists():
+            continue
+        with table.open(newline="") as file:
+            rows += csv.DictReader(file)
+        nowhere = next((row for row in rows if not (row.get("name") and row.get("drive"))), None)
+        if nowhere is not None:
+            raise PointsError(f"{table}: got {nowhere}; expected columns name and drive, both filled in every row")
+    return rows
+
+
 def layouts(root: Path | str) -> Iterator[tuple[Box, ...]]:
-    """Boxes of every KITTI label file below ``root`` that is of no test drive: real scenes to simulate."""
+    """Boxes of every KITTI label file below ``root`` that is not of a test drive: real layouts to simulate."""
     root = Path(root)
-    with (root / "frames.csv").open(newline="") as file:
-        names = [r["name"] for r in csv.DictReader(file) if r["drive"] not in TEST_DRIVES]
-    for name in names:
+    for name in [row["name"] for row in _frame_rows(root) if row["drive"] not in TEST_DRIVES]:
         calibration = Calibration.read(root / "calib" / f"{name}.txt")
         yield read_objects(root / "label_2" / f"{name}.txt", calibration)[0]
 
 
 ROAD_CLASSES = ("other", "road", "vehicle")
 
-# SemanticKITTI's raw ids: road and lane marking; car, bus, truck, other vehicle, and those that move.
+# Raw ids of SemanticKITTI: road and lane marking; car, bus, on-rails, truck and other vehicle, standing and moving.
 ROAD_IDS = (40, 60)
 VEHICLE_IDS = (10, 13, 18, 20, 252, 257, 258, 259)
 
-# KITTI's odometry sequences with labels are raw drives too.
+# Raw drive of each odometry sequence with labels.
 SEQUENCE_DRIVES = {
     "00": "2011_10_03_drive_0027",
     "01": "2011_10_03_drive_0042",
@@ -241,14 +285,14 @@ SEQUENCE_DRIVES = {
 
 @dataclass(frozen=True)
 class RoadFrame:
-    """A SemanticKITTI scan whose road and vehicles are known.
+    """One SemanticKITTI scan with labels of road and vehicles.
 
     Attributes
     ----------
     name, drive : str
     points : (n, 4) float32
     labels : (n,) uint8
-        Index into `ROAD_CLASSES`, `IGNORE` where unlabelled.
+        Index into `ROAD_CLASSES`, `IGNORE` for unlabeled points.
     """
 
     name: str
@@ -257,9 +301,9 @@ class RoadFrame:
     labels: NDArray[np.uint8]
 
     def top_view(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
-        """Truth of the observed cells, (rows, cols) uint8: road or vehicle where most labelled returns are, else other.
+        """True class of the observed cells, (rows, cols) uint8: index into `ROAD_CLASSES`.
 
-        `IGNORE` where no labelled return fell: what the sensor did not see, nobody can call right or wrong.
+        A cell is road, or vehicle, if more than half of its labeled returns are, and `IGNORE` without a labeled return.
         """
         p, known = self.points, self.labels != IGNORE
         row = np.floor((geometry.x_range_m[1] - p[:, 0]) / geometry.cell_m).astype(np.int64)
@@ -277,14 +321,20 @@ class RoadFrame:
 
 
 class SemanticKitti:
-    """The scans with point labels below a SemanticKITTI root (``sequences/00/velodyne``, ``labels``), by drive."""
+    """The scans with point labels below a SemanticKITTI root (``sequences/00/velodyne``, ``labels``), by drive.
+
+    Raises
+    ------
+    PointsError
+        There are no label files.
+    """
 
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root)
         found = sorted(self.root.glob("sequences/*/labels/*.label"))
         if not found:
             raise PointsError(
-                f"{self.root} holds no sequences/*/labels/*.label; expected the root of a SemanticKITTI set"
+                f"{self.root} has no sequences/*/labels/*.label; expected the root of a SemanticKITTI set"
             )
         self.drives = {
             f"{path.parts[-3]}/{path.stem}": SEQUENCE_DRIVES.get(path.parts[-3], path.parts[-3]) for path in found
@@ -295,14 +345,14 @@ class SemanticKitti:
         return [name for name, drive in self.drives.items() if in_split(drive, split, fold)]
 
     def frame(self, name: str) -> RoadFrame:
-        """Read one scan and its labels."""
+        """Read one scan and its labels; `PointsError` if there is not one label for each point."""
         sequence, stem = name.split("/")
         points = read_points(self.root / "sequences" / sequence / "velodyne" / f"{stem}.bin")
         path = self.root / "sequences" / sequence / "labels" / f"{stem}.label"
-        raw = np.fromfile(path, np.uint32) & 0xFFFF  # above is the instance
+        raw = np.fromfile(path, np.uint32) & 0xFFFF  # the upper 16 bits are the instance
         if len(raw) != len(points):
             raise PointsError(
-                f"{path} holds {len(raw)} labels for a scan of {len(points)} points; expected one a point"
+                f"{path} has {len(raw)} labels for a scan of {len(points)} points; expected one for each point"
             )
         labels = np.where(np.isin(raw, ROAD_IDS), 1, np.where(np.isin(raw, VEHICLE_IDS), 2, 0))
         return RoadFrame(name, self.drives[name], points, np.where(raw == 0, IGNORE, labels).astype(np.uint8))

@@ -1,9 +1,9 @@
-"""Which drives are for what: the one list that training, ablations and figures go by.
+"""The drives for training, validation and testing.
 
-Frames of one drive look alike, so whole drives are kept apart, never frames. Test drives are looked at for the final
-figures alone: neither their scans nor their layouts (the boxes simulated scenes are built around) are trained on, and
-nothing is chosen by them. Choices are made on the folds of the training drives: a model that has not seen a fold's
-scans is judged on it, for every fold in turn.
+Frames of one drive look alike, so drives are split, not frames. Test drives are used for the final figures only: no
+model is trained on their scans or their layouts (the boxes that simulated scenes are built around), and no choice is
+made by them. Recipes are chosen on the folds of the training drives: for each fold, a model is trained on the others
+and evaluated on it. Shipped models are compared on the validation drives.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ TEST_DRIVES = frozenset(
     {"2011_09_26_drive_0011", "2011_09_26_drive_0015", "2011_09_26_drive_0032", "2011_10_03_drive_0027"}
 )
 
-# Fold 0 is one long drive that holds most cyclists; the others mix short ones.
+# Fold 0 is one long drive with most of the cyclists; the others are many short drives.
 FOLDS = (
     frozenset({"2011_09_26_drive_0005"}),
     frozenset(
@@ -45,8 +45,8 @@ FOLDS = (
 )
 
 
-# No shipped model was trained on their scans; only their boxes are among the layouts of simulated training scenes. They
-# decide which network has a task's name, and which precision is good enough.
+# No shipped model was trained on these scans, but their boxes are among the layouts of simulated training scenes. They
+# decide which network gets a task's name, and which precision is accurate enough.
 VALIDATION_DRIVES = frozenset(
     {
         "2011_09_26_drive_0001",
@@ -67,16 +67,21 @@ VALIDATION_DRIVES = frozenset(
 
 
 def fold_of(drive: str) -> int | None:
-    """The fold of a training drive, 0 to 2; None for any other."""
+    """The fold of a training drive, 0 to 2; None for any other drive."""
     return next((k for k, drives in enumerate(FOLDS) if drive in drives), None)
 
 
 def in_split(drive: str, split: str, fold: int | None = None) -> bool:
     """Whether a drive belongs to ``"train"``, ``"validation"``, ``"test"`` or ``"all"``.
 
-    With a ``fold``, validation is that fold and training the other two; without, all folds are trained on and
-    validation is `VALIDATION_DRIVES`. A drive named nowhere, as of a user's own scans, may be trained on and may be judged: that no
-    model is judged on what it was trained on is then up to the hashes in its card (`edgeperc.evaluate`).
+    With a ``fold``, that fold is for validation and the other two for training. Without one, all folds are for training
+    and `VALIDATION_DRIVES` for validation. A drive that is listed nowhere (a user's own scans) is for both training and
+    testing; the hashes in a model's card then keep it from being evaluated on its training scans (`unseen`).
+
+    Raises
+    ------
+    ValueError
+        ``split`` or ``fold`` is unknown.
     """
     if split not in ("train", "validation", "test", "all"):
         raise ValueError(f"split is {split!r}; expected train, validation, test or all")
