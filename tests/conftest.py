@@ -30,7 +30,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", "kernel: holds a kernel against its slow twin (set by itself)")
+    config.addinivalue_line("markers", "kernel: holds a kernel against its slow twin")
     if numba.config.DISABLE_JIT:
         # An interpreted kernel computes with numpy's scalars, which warn where compiled code yields NaN or infinity.
         config.addinivalue_line("filterwarnings", "ignore:(invalid value|overflow|divide by zero):RuntimeWarning")
@@ -47,11 +47,17 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """A test that names a twin holds a kernel against it, and runs interpreted and bounds-checked too."""
+    """A test that calls a twin, itself or through a function of its file, holds a kernel against it.
+
+    Such a test runs interpreted and bounds-checked, too; ``@pytest.mark.kernel`` marks one that knows another truth.
+    """
     for item in items:
-        function = getattr(item, "function", None)
-        if function is not None and "twins." in inspect.getsource(inspect.unwrap(function)):
-            item.add_marker("kernel")
+        function, module = getattr(item, "function", None), getattr(item, "module", None)
+        if function is not None and module is not None:
+            names = {*inspect.unwrap(function).__code__.co_names}
+            helpers = [value for name, value in vars(module).items() if name in names and inspect.isfunction(value)]
+            if any("twins" in {*inspect.unwrap(each).__code__.co_names} for each in (function, *helpers)):
+                item.add_marker("kernel")
 
 
 def pytest_testnodedown(node: Any) -> None:
