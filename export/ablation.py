@@ -1,7 +1,8 @@
-"""What each part of the data and of the training is worth, on drives that the run has not seen.
+"""The effect of each part of the data and of the training, measured on drives that the run has not seen.
 
-Every variant is the same short run from the same simulation-only weights (LoDNN's from nothing), with one thing
-changed, judged on a fold of the training drives; test drives take no part, and no teacher, which would know the fold.
+All variants are short runs from the same weights, trained on simulation alone (LoDNN's are random), and differ in one
+setting. Each is evaluated on a fold of the training drives. Test drives take no part, nor do teachers, which may have
+been trained on the fold.
 """
 
 from __future__ import annotations
@@ -61,6 +62,8 @@ VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     },
 }  # fmt: skip
 PAPERS = "the paper's recipe, from nothing, as many scans"
+SHIPPED = {"pointseg": "pointseg-full", "ssadnet": "ssadnet-full", "lodnn": "lodnn"}
+"""Network -> the model whose recipe is varied: one that can be trained without a teacher."""
 
 
 def ablate(
@@ -75,7 +78,7 @@ def ablate(
     variants: Sequence[str] = (),
     n_threads: int | None = None,
 ) -> list[dict[str, Any]]:
-    """Run variants and add their figures to ``out/ablation.json``; those there already are not run again.
+    """Run variants and add their figures to ``out/ablation.json``; variants with figures there are not run again.
 
     Parameters
     ----------
@@ -84,23 +87,31 @@ def ablate(
     out : Path
     kitti, simulated : Path
     start_from : Path or None
-        Checkpoint of the network's ``-sim`` model; None where it has none.
+        Checkpoint of the network's ``-sim`` model; None for ``"lodnn"``, which has none.
     fold, steps : int
     variants : sequence of str
-        Names in `VARIANTS`, or `PAPERS`; all of them by default.
+        Names in `VARIANTS`, or `PAPERS`; by default all of them.
     n_threads : int or None
 
     Returns
     -------
     list of dict
-        ``network``, ``variant``, ``fold``, ``steps``, ``scans`` drawn, and ``figures`` at the end of the run.
+        ``network``, ``variant``, ``fold``, ``steps``, number of ``scans`` drawn, and ``figures`` at the end of the run.
+
+    Raises
+    ------
+    ValueError
+        There is no such variant.
     """
     out.mkdir(parents=True, exist_ok=True)
     path = out / "ablation.json"
     rows: list[dict[str, Any]] = json.loads(path.read_text()) if path.exists() else []
     done = {(row["network"], row["variant"], row["fold"], row["steps"]) for row in rows}
-    shipped = replace(MODELS[network].recipe, steps=steps, distil=0.0)
-    for variant in variants or [*VARIANTS[network], PAPERS]:
+    shipped = replace(MODELS[SHIPPED[network]].recipe, steps=steps, distil=0.0)
+    known = [*VARIANTS[network], PAPERS]
+    if unknown := [variant for variant in variants if variant not in known]:
+        raise ValueError(f"{network} has no variant {unknown[0]!r}; expected one of: {'; '.join(known)}")
+    for variant in variants or known:
         if (network, variant, fold, steps) in done:
             continue
         changes = dict(VARIANTS[network].get(variant, {}))
@@ -132,14 +143,14 @@ def ablate(
 
 
 def plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw what the search for LoDNN's learning rate, number of scans and batch found, as the paper's Figure 16."""
+    """Draw the search for LoDNN's learning rate, number of scans and batch size, like the paper's Figure 16."""
     from matplotlib.figure import Figure
 
     rows = [row for row in rows if row["network"] == "lodnn"]
     if not rows:
         raise ValueError("no run of lodnn to draw; run: edgeperc-export ablate lodnn OUT")
     (shipped,) = [row for row in rows if row["variant"] == "as shipped"]
-    recipe = MODELS["lodnn"].recipe
+    recipe = MODELS[SHIPPED["lodnn"]].recipe
     usual = {"learning rate": recipe.learning_rate, "scans times": 1.0, "batches of": float(recipe.batch)}
     titles = {
         "learning rate": "learning rate",

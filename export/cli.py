@@ -1,4 +1,4 @@
-"""``edgeperc-export``: train, export and prove new checkpoints."""
+"""``edgeperc-export``: train networks, export them as proven models, and build top-view databases."""
 
 from __future__ import annotations
 
@@ -6,21 +6,40 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import Field, fields, replace
 from pathlib import Path
+from typing import Any
 
 from edgeperc import __version__
 from edgeperc.errors import EdgepercError, MissingExtraError
 
-from .database.cli import database_parser
-from .recipe import MODELS
+from .database.cli import add_database_commands
+from .recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe
 
 __all__ = ["main"]
 
+KITTI = "KITTI object set: a folder of training/velodyne, label_2, calib and of frames.csv"
+LAYOUTS = "folder of KITTI's label_2, calib and frames.csv: half of the simulated scenes get their boxes"
+SEMANTICKITTI = "root folder of SemanticKITTI, to evaluate the drivable area on"
+FOLD = "fold of the training drives (0, 1 or 2) to validate on instead of training on it"
+THREADS = "number of CPU threads (default: one for each core)"
+COMPILE = "run the network through torch.compile, which needs a C++ compiler and a minute to start"
+VERSION = "version to write into the card (default 1.0.0)"
+PROOF = "scan files on which torch and onnxruntime must agree, in addition to four simulated scans"
+
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; 0 when done, 1 when a model was refused or a scene left out, 2 for wrong usage or bad files."""
-    args = _parser().parse_args(argv)
+    """Run one command.
+
+    Returns
+    -------
+    int
+        0 for success, 1 if a model was refused or a scene left out, 2 for wrong usage or unusable files.
+    """
+    parser, words = _parser(), list(sys.argv[1:] if argv is None else argv)
+    if words[:1] == ["database"]:
+        parser.error(f'"{" ".join(words[:2])}" is now written {"-".join(words[:2])}; see edgeperc-export --help')
+    args = parser.parse_args(words)
     try:
         return int(args.run(args))
     except ModuleNotFoundError as exc:
@@ -38,115 +57,281 @@ def _parser() -> argparse.ArgumentParser:
     parser.set_defaults(extra="export")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    simulate = commands.add_parser("simulate", help="make labelled scans to train on")
-    simulate.add_argument("out", type=Path, help="folder for the scans")
-    simulate.add_argument("-n", type=int, default=1000, help="how many (default 1000)")
-    simulate.add_argument("--first", type=int, default=0, help="number, and seed, of the first")
-    simulate.add_argument("--layouts", type=Path, help="folder of KITTI label_2, calib and frames.csv: real layouts")
-    simulate.add_argument("--sensor", default="hdl-64e")
+    simulate = commands.add_parser("simulate", help="write simulated, labeled scans to train on")
+    simulate.add_argument("out", type=Path, help="folder for the scans; scans that are there already are kept")
+    simulate.add_argument("-n", type=int, default=1000, help="number of scans (default 1000)")
+    simulate.add_argument("--first", type=int, default=0, help="number of the first scan, and its seed (default 0)")
+    simulate.add_argument("--layouts", type=Path, help=LAYOUTS)
+    simulate.add_argument("--sensor", default="hdl-64e", help="sensor to simulate (default hdl-64e)")
     simulate.set_defaults(run=_simulate)
 
-    train = commands.add_parser("train", help="train a network, or go on where a stopped run left off")
-    train.add_argument("network", choices=["kulseg", "lodnn", "pointseg", "squeezesegv2", "ssadnet"])
-    train.add_argument("out", type=Path, help="folder for checkpoint.pt and log.jsonl")
-    train.add_argument("--kitti", type=Path, help="root of a KITTI object set")
-    train.add_argument("--simulated", type=Path, help="folder made by: edgeperc-export simulate")
-    train.add_argument("--fold", type=int, help="fold of the training drives to leave out and stop by: 0, 1 or 2")
-    train.add_argument("--recipe", choices=["ours", "paper"], default="ours", help="where the options below start from")
-    train.add_argument("--start-from", type=Path, help="a checkpoint whose weights a new run starts from")
-    train.add_argument("--teacher", type=Path, help="a checkpoint to learn from: see the recipe's distil")
-    train.add_argument("--threads", type=int)
-    train.add_argument("--compile", action="store_true", help="through torch.compile, which needs a C++ compiler")
-    recipe = train.add_argument_group("recipe", "see edgeperc_export.recipe.Recipe")
-    for option, of in _recipe_options().items():
-        how = {"action": argparse.BooleanOptionalAction} if of is bool else {"type": of}
-        recipe.add_argument(option, **how)
+    train = commands.add_parser("train", help="train a network, or resume a stopped training run")
+    train.add_argument("network", choices=NETWORKS, help="network to train")
+    train.add_argument("out", type=Path, help="folder for checkpoint.pt and log.jsonl; a checkpoint in it is resumed")
+    train.add_argument("--kitti", type=Path, help=KITTI)
+    train.add_argument("--simulated", type=Path, help="folder of scans written by edgeperc-export simulate")
+    train.add_argument("--fold", type=int, help=FOLD)
+    train.add_argument(
+        "--recipe",
+        choices=("ours", "paper"),
+        default="ours",
+        help=f"source of the options not given below: the defaults shown, or the network's paper ({', '.join(PAPER)})",
+    )
+    train.add_argument("--start-from", type=Path, help="checkpoint.pt whose weights the run starts from")
+    train.add_argument(
+        "--teacher",
+        type=Path,
+        help="checkpoint.pt of the network to distil from; with --distil 0, of one that labels the unlabeled points",
+    )
+    train.add_argument("--threads", type=int, help=THREADS)
+    train.add_argument("--compile", action="store_true", help=COMPILE)
+    _add_recipe_options(train)
     train.set_defaults(run=_train)
 
-    export = commands.add_parser("export", help="checkpoint -> .onnx with a card, or an error that says how far off")
-    export.add_argument("checkpoint", type=Path)
-    export.add_argument("out", type=Path, help="the .onnx to write")
-    export.add_argument("--scans", type=Path, nargs="*", default=[], help="scans to compare torch and onnxruntime on")
-    export.add_argument("--kitti", type=Path, help="also describe the training scans, for the fitness check")
-    export.add_argument("--metrics", type=Path, help="JSON of edgeperc eval, to keep in the card")
-    export.add_argument("--name", help="what the model is called (default: the network)")
-    export.add_argument("--model-version", default="1.0.0")
+    export = commands.add_parser("export", help="write a checkpoint as an .onnx model with a card")
+    export.add_argument("checkpoint", type=Path, help="checkpoint.pt of a training run")
+    export.add_argument("out", type=Path, help=".onnx file to write; not written if torch and onnxruntime disagree")
+    export.add_argument("--scans", type=Path, nargs="*", default=[], help=PROOF)
+    export.add_argument("--kitti", type=Path, help=f"{KITTI}; the card describes its scans, for the check of inputs")
+    export.add_argument("--metrics", type=Path, help="JSON file of edgeperc eval --json, to keep in the card")
+    export.add_argument("--name", help="name of the model (default: the network's)")
+    export.add_argument("--model-version", default="1.0.0", help=VERSION)
     export.add_argument(
-        "--licence", default="Apache-2.0", help="of the weights, where no real scan was trained on (default Apache-2.0)"
+        "--licence",
+        default="Apache-2.0",
+        help="license of weights trained on simulation alone (default Apache-2.0); KITTI's applies to all others",
     )
     export.set_defaults(run=_export)
 
-    verify = commands.add_parser("verify", help="hold an .onnx against its checkpoint")
-    verify.add_argument("checkpoint", type=Path)
-    verify.add_argument("model", type=Path)
-    verify.add_argument("--scans", type=Path, nargs="*", default=[])
+    verify = commands.add_parser("verify", help="compare an .onnx model with its checkpoint")
+    verify.add_argument("checkpoint", type=Path, help="checkpoint.pt that the model was exported from")
+    verify.add_argument("model", type=Path, help=".onnx file")
+    verify.add_argument("--scans", type=Path, nargs="*", default=[], help=PROOF)
     verify.set_defaults(run=_verify)
 
-    card = commands.add_parser("card", help="write a card into a network made elsewhere")
-    card.add_argument("model", type=Path, help="the network")
-    card.add_argument("card", type=Path, help="the card, as JSON; edgeperc info MODEL --json prints one to start from")
-    card.add_argument("out", type=Path, help="the .onnx to write")
+    card = commands.add_parser(
+        "card", help="add a card to an .onnx network made elsewhere, so that edgeperc can run it"
+    )
+    card.add_argument("model", type=Path, help=".onnx file of the network")
+    card.add_argument("card", type=Path, help="JSON file of the card; edgeperc info MODEL --json prints one to edit")
+    card.add_argument("out", type=Path, help=".onnx file to write")
     card.set_defaults(run=_card)
 
-    quantize = commands.add_parser("quantize", help="an eight-bit model, where it is faster here and answers as well")
-    quantize.add_argument("model", type=Path, help="the .onnx, with its card")
-    quantize.add_argument("out", type=Path, help="the .onnx to write")
+    quantize = commands.add_parser("quantize", help="make an int8 model, if it is faster on this computer and as good")
+    quantize.add_argument("model", type=Path, help=".onnx file of the fp32 model")
+    quantize.add_argument("out", type=Path, help=".onnx file to write")
     quantize.add_argument(
         "--scans", type=Path, nargs="*", default=[], help="scans, or folders of .bin, to calibrate on"
     )
     quantize.add_argument(
-        "--kitti", type=Path, help="KITTI object root: calibrate on training drives, judge on test ones"
+        "--kitti", type=Path, help=f"{KITTI}; calibrates on training drives, evaluates on test drives"
     )
     quantize.add_argument(
-        "--simulated", type=int, default=64, metavar="N", help="scans to simulate for calibration (default 64)"
+        "--simulated", type=int, default=64, metavar="N", help="simulated scans to calibrate on (default 64)"
     )
-    quantize.add_argument("--semantickitti", type=Path, help="root of SemanticKITTI, to judge the road by")
+    quantize.add_argument("--semantickitti", type=Path, help=SEMANTICKITTI)
     quantize.add_argument(
-        "--seven-bits", action="store_true", default=None, help="for any computer, x86 without VNNI among them"
+        "--seven-bits",
+        action="store_true",
+        default=None,
+        help="use 7-bit weights, so that the model also runs on x86 without VNNI (default: if this computer needs it)",
     )
     quantize.add_argument(
-        "--judged", type=int, default=48, help="simulated scans both models are judged by (default 48)"
+        "--evaluate-on",
+        type=int,
+        default=48,
+        metavar="N",
+        help="simulated scans to evaluate both models on (default 48)",
     )
-    quantize.add_argument("--exclude", nargs="*", default=[], metavar="NODE", help="nodes of the graph to leave alone")
-    quantize.add_argument("--threads", type=int, help="to time both models with")
+    quantize.add_argument("--exclude", nargs="*", default=[], metavar="NODE", help="graph nodes to keep in fp32")
+    quantize.add_argument(
+        "--threads", type=int, help="number of CPU threads for timing (default: onnxruntime's choice)"
+    )
     quantize.set_defaults(run=_quantize)
 
-    make = commands.add_parser("make", help="a shipped model from nothing: simulate, train, export, judge")
+    make = commands.add_parser("make", help="make a shipped model from scratch: simulate, train, export, evaluate")
     shipped = sorted(name for name in MODELS if not name.endswith("-start"))
-    make.add_argument("name", choices=shipped)
-    make.add_argument("out", type=Path, help="folder for scans, checkpoints and the model")
-    make.add_argument("--kitti", type=Path, help="root of a KITTI object set")
-    make.add_argument("--layouts", type=Path, help="folder of KITTI label_2, calib and frames.csv")
-    make.add_argument("--semantickitti", type=Path, help="root of SemanticKITTI, to judge the road by")
-    make.add_argument("--fold", type=int, help="fold of the training drives to leave out and stop by: 0, 1 or 2")
-    make.add_argument("--steps", type=int, help="another number than the shipped model's, as for folds")
-    make.add_argument("--threads", type=int)
-    make.add_argument("--compile", action="store_true", help="through torch.compile, which needs a C++ compiler")
-    make.add_argument("--model-version", default="1.0.0")
+    make.add_argument("name", choices=shipped, help="model to make; the models that it learns from are made first")
+    make.add_argument("out", type=Path, help="folder for scans, checkpoints and models; finished ones in it are kept")
+    make.add_argument("--kitti", type=Path, help=KITTI)
+    make.add_argument("--layouts", type=Path, help=LAYOUTS)
+    make.add_argument("--semantickitti", type=Path, help=SEMANTICKITTI)
+    make.add_argument("--fold", type=int, help=FOLD)
+    make.add_argument("--steps", type=int, help="training steps (default: as many as for the shipped model)")
+    make.add_argument("--threads", type=int, help=THREADS)
+    make.add_argument("--compile", action="store_true", help=COMPILE)
+    make.add_argument("--model-version", default="1.0.0", help=VERSION)
     make.set_defaults(run=_make)
 
-    ablate = commands.add_parser("ablate", help="what each part of the training is worth, on a fold left out")
-    ablate.add_argument("network", choices=["ssadnet", "pointseg", "lodnn"])
-    ablate.add_argument("out", type=Path, help="folder for the runs and ablation.json")
-    ablate.add_argument("--kitti", type=Path, required=True)
-    ablate.add_argument("--simulated", type=Path, required=True)
-    ablate.add_argument("--start-from", type=Path, help="checkpoint of the -sim model (lodnn: none)")
-    ablate.add_argument("--fold", type=int, default=0)
-    ablate.add_argument("--steps", type=int, default=150)
-    ablate.add_argument("--variant", action="append", default=[], help="one of them; again for more (default: all)")
-    ablate.add_argument("--threads", type=int)
-    ablate.add_argument("--plot", type=Path, metavar="PNG", help="draw what was found (lodnn)")
+    ablate = commands.add_parser("ablate", help="measure the effect of each part of the training on a fold")
+    ablate.add_argument("network", choices=["ssadnet", "pointseg", "lodnn"], help="network to train")
+    ablate.add_argument("out", type=Path, help="folder for the runs and ablation.json; finished runs in it are kept")
+    ablate.add_argument("--kitti", type=Path, required=True, help=KITTI)
+    ablate.add_argument("--simulated", type=Path, required=True, help="folder of scans from edgeperc-export simulate")
+    ablate.add_argument(
+        "--start-from", type=Path, help="checkpoint.pt of NETWORK-sim; lodnn starts from random weights"
+    )
+    ablate.add_argument("--fold", type=int, default=0, help="fold of the training drives to evaluate on (default 0)")
+    ablate.add_argument("--steps", type=int, default=150, help="training steps of each run (default 150)")
+    ablate.add_argument(
+        "--variant", action="append", default=[], help="run this variant only; may be repeated (default: all)"
+    )
+    ablate.add_argument("--threads", type=int, help=THREADS)
+    ablate.add_argument("--plot", type=Path, metavar="PNG", help="also draw the results (lodnn only)")
     ablate.set_defaults(run=_ablate)
 
-    database = commands.add_parser(
-        "database", help="scans as top-view images, labels and maps: make, draw roads, export"
-    )
-    database_parser(database)
+    add_database_commands(commands)
 
     models = commands.add_parser("models", help="write MODELS.md from the cards of a folder's models")
-    models.add_argument("folder", type=Path)
+    models.add_argument("folder", type=Path, help="folder of .onnx models")
     models.set_defaults(run=_models)
     return parser
+
+
+# --- recipes ----------------------------------------------------------------------------------------------------------
+
+TYPES = {"bool": bool, "float": float, "int": int, "str": str}
+
+
+def _recipe_fields() -> dict[str, Field[Any]]:
+    """Option -> field, of every field of a recipe but the network."""
+    return {f"--{field.name.replace('_', '-')}": field for field in fields(Recipe) if field.metadata}
+
+
+def _add_recipe_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a recipe, in a group for every set of networks that they have an effect on."""
+    groups: dict[tuple[str, ...], argparse._ArgumentGroup] = {}
+    for option, field in _recipe_fields().items():
+        networks = field.metadata["networks"]
+        if networks not in groups:
+            groups[networks] = parser.add_argument_group(f"recipe: {_title(networks)}")
+        how: dict[str, Any] = {"type": TYPES[str(field.type)], "choices": field.metadata["choices"] or None}
+        if field.type == "bool":
+            how = {"action": argparse.BooleanOptionalAction}
+        groups[networks].add_argument(option, help=f"{field.metadata['help']} (default: {field.default})", **how)
+
+
+def _title(networks: tuple[str, ...]) -> str:
+    if networks == NETWORKS:
+        return "all networks"
+    tasks = [task for task, of in TASKS.items() if set(of) & set(networks)]
+    return f"{' and '.join(tasks)} ({', '.join(networks)})"
+
+
+def _recipe(args: argparse.Namespace) -> Recipe:
+    """The recipe of a ``train`` command.
+
+    Raises
+    ------
+    ValueError
+        An option has no effect on the network.
+    """
+    if args.recipe == "paper" and args.network not in PAPER:
+        raise ValueError(f"--recipe paper is for {', '.join(PAPER)}; got {args.network}")
+    given = {}
+    for option, field in _recipe_fields().items():
+        value, networks = getattr(args, field.name), field.metadata["networks"]
+        if value is None:
+            continue
+        if args.network not in networks:
+            raise ValueError(f"{option} has no effect on {args.network}, only on {', '.join(networks)}; leave it out")
+        if args.edge and not field.metadata["edge"]:
+            raise ValueError(f"{option} has no effect on a network for small computers; leave out it or --edge")
+        given[field.name] = value
+    return replace(PAPER[args.network] if args.recipe == "paper" else Recipe(args.network), **given)
+
+
+# --- commands ---------------------------------------------------------------------------------------------------------
+
+
+def _simulate(args: argparse.Namespace) -> int:
+    from .simulate import simulate
+
+    simulate(args.out, args.n, first=args.first, layouts_root=args.layouts, sensor=args.sensor)
+    return 0
+
+
+def _train(args: argparse.Namespace) -> int:
+    recipe = _recipe(args)
+    from .train import train
+
+    checkpoint = train(
+        recipe,
+        args.out,
+        kitti=args.kitti,
+        simulated=args.simulated,
+        fold=args.fold,
+        start_from=args.start_from,
+        teacher=args.teacher,
+        n_threads=args.threads,
+        compiled=args.compile,
+    )
+    print(checkpoint)
+    return 0
+
+
+def _export(args: argparse.Namespace) -> int:
+    from .simulate import fitness_of, parity_scans
+    from .to_onnx import export
+
+    metrics = json.loads(args.metrics.read_text()) if args.metrics else None
+    card = export(
+        args.checkpoint,
+        args.out,
+        scans=parity_scans(args.scans),
+        fitness=fitness_of(args.kitti),
+        name=args.name,
+        version=args.model_version,
+        metrics=metrics,
+        licence=args.licence,
+    )
+    print(f"{args.out}: {card.name} {card.version}, parity {json.dumps(dict(card.parity))}")
+    return 0
+
+
+def _verify(args: argparse.Namespace) -> int:
+    from .simulate import parity_scans
+    from .to_onnx import load, verify
+
+    print(json.dumps(verify(load(args.checkpoint)[0], args.model, parity_scans(args.scans))))
+    return 0
+
+
+def _card(args: argparse.Namespace) -> int:
+    import onnx
+
+    from edgeperc.card import ModelCard
+
+    from .to_onnx import with_golden, write_card
+
+    model = onnx.load(args.model)
+    card = with_golden(model, ModelCard.from_json(args.card.read_text()))
+    write_card(model, card, args.out)
+    print(f"{args.out}: {card.name} {card.version}")
+    return 0
+
+
+def _quantize(args: argparse.Namespace) -> int:
+    from .quantize import calibration_scans, quantize
+
+    scans, hashes = calibration_scans(args.scans, kitti=args.kitti, n_simulated=args.simulated)
+    card = quantize(
+        args.model,
+        args.out,
+        scans=scans,
+        hashes=hashes,
+        kitti=args.kitti,
+        semantickitti=args.semantickitti,
+        exclude=args.exclude,
+        seven_bits=args.seven_bits,
+        n_judged=args.evaluate_on,
+        n_threads=args.threads,
+    )
+    print(
+        f"{args.out}: {card.name} {card.version}, kept in fp32: {', '.join(card.training['quantized']['left_alone'])}"
+    )
+    print(json.dumps(dict(card.parity)))
+    return 0
 
 
 def _make(args: argparse.Namespace) -> int:
@@ -195,112 +380,6 @@ def _models(args: argparse.Namespace) -> int:
     from .models_page import models_page
 
     (args.folder / "MODELS.md").write_text(models_page(args.folder))
-    return 0
-
-
-def _simulate(args: argparse.Namespace) -> int:
-    from .simulate import simulate
-
-    simulate(args.out, args.n, first=args.first, layouts_root=args.layouts, sensor=args.sensor)
-    return 0
-
-
-def _recipe_options() -> dict[str, type]:
-    """Command line options of a recipe and their types, without loading torch for --help."""
-    return {
-        "--head": str, "--steps": int, "--batch": int, "--optimizer": str, "--learning-rate": float,
-        "--weight-decay": float, "--cooldown": float, "--halve-after": int, "--simulated-share": float,
-        "--augment": bool, "--n-pasted": float, "--swap": float, "--turn-to-rare": float, "--weather": float,
-        "--class-weights": bool, "--focal-gamma": float, "--lovasz-weight": float, "--deep-supervision": float,
-        "--ema": float, "--context-width": int, "--batch-norm": bool, "--dropout": float, "--distil": float,
-        "--seen-twice": bool, "--paste-cars": float, "--turn-anywhere": float, "--head-only": bool, "--edge": bool,
-        "--drawn-roads": bool,
-        "--seed": int,
-    }  # fmt: skip
-
-
-def _train(args: argparse.Namespace) -> int:
-    from .recipe import PAPER, Recipe
-    from .train import train
-
-    if args.recipe == "paper" and args.network not in PAPER:
-        raise ValueError(f"no recipe of a paper's is kept for {args.network}; expected {' or '.join(PAPER)}")
-    given = {f.name: getattr(args, f.name, None) for f in fields(Recipe)}
-    start = PAPER[args.network] if args.recipe == "paper" else Recipe(args.network)
-    checkpoint = train(
-        replace(start, **{name: value for name, value in given.items() if value is not None}),
-        args.out,
-        kitti=args.kitti,
-        simulated=args.simulated,
-        fold=args.fold,
-        start_from=args.start_from,
-        teacher=args.teacher,
-        n_threads=args.threads,
-        compiled=args.compile,
-    )
-    print(checkpoint)
-    return 0
-
-
-def _export(args: argparse.Namespace) -> int:
-    from .simulate import fitness_of, parity_scans
-    from .to_onnx import export
-
-    metrics = json.loads(args.metrics.read_text()) if args.metrics else None
-    card = export(
-        args.checkpoint,
-        args.out,
-        scans=parity_scans(args.scans),
-        fitness=fitness_of(args.kitti),
-        name=args.name,
-        version=args.model_version,
-        metrics=metrics,
-        licence=args.licence,
-    )
-    print(f"{args.out}: {card.name} {card.version}, parity {json.dumps(dict(card.parity))}")
-    return 0
-
-
-def _verify(args: argparse.Namespace) -> int:
-    from .simulate import parity_scans
-    from .to_onnx import load, verify
-
-    print(json.dumps(verify(load(args.checkpoint)[0], args.model, parity_scans(args.scans))))
-    return 0
-
-
-def _quantize(args: argparse.Namespace) -> int:
-    from .quantize import calibration_scans, quantize
-
-    scans, hashes = calibration_scans(args.scans, kitti=args.kitti, n_simulated=args.simulated)
-    card = quantize(
-        args.model,
-        args.out,
-        scans=scans,
-        hashes=hashes,
-        kitti=args.kitti,
-        semantickitti=args.semantickitti,
-        exclude=args.exclude,
-        seven_bits=args.seven_bits,
-        n_judged=args.judged,
-        n_threads=args.threads,
-    )
-    print(f"{args.out}: {card.name} {card.version}, left alone: {', '.join(card.training['quantized']['left_alone'])}")
-    print(json.dumps(dict(card.parity)))
-    return 0
-
-
-def _card(args: argparse.Namespace) -> int:
-    import onnx
-
-    from edgeperc.card import ModelCard
-
-    from .to_onnx import with_golden, write_card
-
-    model = onnx.load(args.model)
-    card = with_golden(model, ModelCard.from_json(args.card.read_text()))
-    write_card(model, card, args.out)
-    print(f"{args.out}: {card.name} {card.version}")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""How every shipped model is made, from nothing, by one command: ``edgeperc-export make NAME OUT``."""
+"""A shipped model from scratch, by one command: ``edgeperc-export make NAME OUT``."""
 
 from __future__ import annotations
 
@@ -6,16 +6,20 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import onnx
+
 from edgeperc.evaluation.evaluate import evaluate
 
 from .recipe import MODELS
 from .simulate import fitness_of, parity_scans, simulate
-from .to_onnx import export
+from .to_onnx import export, write_card
 from .train import train
 
-__all__ = ["make"]
+__all__ = ["finish", "make"]
 
 N_SIMULATED = 2400
+ROAD_TRUTH = "ssadnet-sim"
+"""Draws the road that counts as the truth of KITTI's scans."""
 
 
 def make(
@@ -31,30 +35,35 @@ def make(
     compiled: bool = False,
     version: str = "1.0.0",
 ) -> Path:
-    """Simulate, train, export, judge: everything a shipped model takes. What is there already is not made again.
+    """Simulate, train, export, evaluate: everything that a shipped model takes. Finished parts are not made again.
 
     Parameters
     ----------
     name : str
-        A key of `MODELS`.
+        A key of `MODELS`. The models that it starts or distils from are made first.
     out : Path
-        Folder for scans, checkpoints and the model.
+        Folder for scans, checkpoints and models.
     kitti, layouts, semantickitti : Path or None
-        Roots of a KITTI object set, of its labels and calibrations alone, and of SemanticKITTI. The models called
-        ``-sim`` are made without the first two, and judged on them where they are given.
+        Folders of a KITTI object set, of its labels and calibrations alone, and of SemanticKITTI. The models called
+        ``-sim`` are made without the first two, and evaluated on KITTI if it is given.
     fold : int, optional
-        Leave out this fold of the training drives and stop by it, as for figures over folds.
+        Validate on this fold of the training drives, and do not train on it.
     steps : int, optional
-        Another number of steps than the shipped model's, as for figures over folds.
+        Number of training steps; by default the shipped model's.
     n_threads : int or None
     compiled : bool
-        As `edgeperc_export.train.train` has it; the shipped PointSegs were, the SSADNets not.
+        As for `edgeperc_export.train.train`; the shipped PointSegs were compiled, the SSADNets not.
     version : str
 
     Returns
     -------
     Path
-        ``out/NAME.onnx``, its figures in its card.
+        ``out/NAME.onnx``, with its figures in its card.
+
+    Raises
+    ------
+    ValueError
+        The model is trained on real scans too, and a folder of them is missing.
     """
     stage = MODELS[name]
     recipe = stage.recipe if steps is None else replace(stage.recipe, steps=steps)
@@ -63,32 +72,32 @@ def make(
         raise ValueError(f"{name} is trained on real scans too; give --kitti and --layouts")
     scans = out / ("scans" if simulated_only else "scans-with-layouts")
     simulate(scans, N_SIMULATED, layouts_root=None if simulated_only else layouts)
-    before: dict[str, Path | None] = {"start_from": None, "teacher": None}
-    for role, other in zip(before, (stage.after, stage.teacher), strict=True):
-        if other is None:
-            continue
-        # What a model starts or learns from must not have seen the fold either.
-        base_fold = None if MODELS[other].recipe.simulated_share == 1.0 else fold
-        base = out / f"{other}{_suffix(base_fold)}"
+
+    def checkpoint_of(other: str) -> Path:
+        # The models that this one starts or distils from must not have seen the fold either.
+        own_fold = None if MODELS[other].recipe.simulated_share == 1.0 else fold
+        base = out / f"{other}{_suffix(own_fold)}"
         if not base.with_suffix(".onnx").exists():
             make(
                 other,
                 out,
                 kitti=kitti,
                 layouts=layouts,
-                fold=base_fold,
+                fold=own_fold,
                 n_threads=n_threads,
                 compiled=compiled,
                 version=version,
             )
-        before[role] = base / "checkpoint.pt"
+        return base / "checkpoint.pt"
+
     checkpoint = train(
         recipe,
         out / f"{name}{_suffix(fold)}",
         kitti=kitti,
         simulated=scans,
         fold=fold,
-        **before,
+        start_from=None if stage.after is None else checkpoint_of(stage.after),
+        teacher=None if stage.teacher is None else checkpoint_of(stage.teacher),
         n_threads=n_threads,
         compiled=compiled,
     )
@@ -111,20 +120,33 @@ def finish(
     fold: int | None = None,
     version: str = "1.0.0",
 ) -> None:
-    """Export a checkpoint as a shipped model, judge the file, and write its figures into its card and beside it."""
+    """Export a checkpoint as a shipped model, evaluate the file, and write the figures into its card and beside it.
+
+    Parameters
+    ----------
+    name : str
+        A key of `MODELS`, and the name of the model.
+    checkpoint : Path
+    path : Path
+        The .onnx to write; the figures go into a .json beside it, too.
+    kitti, semantickitti, fold, version
+        As for `make`.
+    """
     stage = MODELS[name]
     fitness = fitness_of(None if stage.recipe.simulated_share == 1.0 else kitti)
-    facts = {"scans": parity_scans([]), "fitness": fitness, "name": name, "version": version}
-    export(checkpoint, path, **facts)
-    datasets = {"KITTI": kitti, "SEMANTICKITTI": semantickitti if fold is None else None, "simulation": "simulation"}
-    datasets = {word: where for word, where in datasets.items() if where is not None}
-    # The paper's way to a road where nobody labelled one: another network's (SSADNet 3.1.2).
-    sees_road = stage.recipe.network in ("lodnn", "ssadnet") and (stage.after or stage.teacher)
-    draws = "ssadnet-sim" if sees_road else None
-    road_by = path.with_name(f"{draws}.onnx") if draws and kitti else None
+    card = export(checkpoint, path, scans=parity_scans([]), fitness=fitness, name=name, version=version)
+    datasets: dict[str, str | Path] = {"simulation": "simulation"}
+    if semantickitti is not None and fold is None:
+        datasets = {"SEMANTICKITTI": semantickitti, **datasets}
+    if kitti is not None:
+        datasets = {"KITTI": kitti, **datasets}
+    # SSADNet 3.1.2 takes another network's road as truth where no road is labeled.
+    learned_road = "drivable" in card.classes and (stage.after or stage.teacher) is not None
+    road_by = path.with_name(f"{ROAD_TRUTH}.onnx") if learned_road and kitti is not None else None
     figures, _ = evaluate([*datasets.values()], [path], fold=fold, road_by=road_by)
-    words = ["edgeperc eval", *datasets, f"--model {name}"]
-    words += [f"--road-by {draws}"] * (road_by is not None) + [f"--fold {fold}"] * (fold is not None)
-    figures["command"] = " ".join(words)
+    command = ["edgeperc eval", *datasets, f"--model {name}"]
+    command += [f"--road-by {ROAD_TRUTH}"] if road_by else []
+    command += [f"--fold {fold}"] if fold is not None else []
+    figures["command"] = " ".join(command)
     path.with_suffix(".json").write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
-    export(checkpoint, path, metrics=figures, **facts)
+    write_card(onnx.load(path), replace(card, metrics=figures), path)
