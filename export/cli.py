@@ -149,6 +149,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     quantize.set_defaults(run=_quantize)
 
+    agree = commands.add_parser("agree", help="measure bf16 and int8 against fp32, and write it into the cards")
+    agree.add_argument("models", nargs="+", metavar="MODEL", help="a network's name, or its files, one of them in fp32")
+    agree.add_argument("--kitti", type=Path, help="root of a KITTI object set")
+    agree.add_argument("--semantickitti", type=Path, help="root of SemanticKITTI, for the road")
+    agree.add_argument("--split", default="validation", help="drives of the KITTI set (default: validation)")
+    agree.add_argument("--scans", type=int, metavar="N", help="at most N scans of each set (default: all)")
+    agree.set_defaults(run=_agree)
+
     make = commands.add_parser("make", help="make a shipped model from scratch: simulate, train, export, evaluate")
     shipped = sorted(name for name in MODELS if not name.endswith("-start"))
     make.add_argument("name", choices=shipped, help="model to make; the models that it learns from are made first")
@@ -331,6 +339,18 @@ def _quantize(args: argparse.Namespace) -> int:
         f"{args.out}: {card.name} {card.version}, kept in fp32: {', '.join(card.training['quantized']['left_alone'])}"
     )
     print(json.dumps(dict(card.parity)))
+    return 0
+
+
+def _agree(args: argparse.Namespace) -> int:
+    from .agree import agree, summary
+
+    measured = agree(
+        args.models, kitti=args.kitti, semantickitti=args.semantickitti, split=args.split, n_scans=args.scans
+    )
+    print(*summary(measured), sep="\n")
+    if "bf16" not in measured:
+        print("bf16 is not measured: that takes a processor with bf16, and openvino: pip install 'edgeperc[peers]'")
     return 0
 
 

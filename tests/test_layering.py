@@ -68,7 +68,7 @@ FLOORS = {
         networks.__init__ samples teacher
         watch
         to_onnx train
-        quantize ablation make
+        agree quantize ablation make
         database.__init__ database.files
         database.coco database.torch
         database.label_page database.scenes database.folds

@@ -1,0 +1,217 @@
+"""How the answers of a network in bf16 and int8 agree with those in fp32, on labelled real scans: written into its cards.
+
+`edgeperc.zoo.choose` reads this record: ``precision="auto"`` takes a reduced precision only where its loss is small.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+from numpy.typing import NDArray
+
+from edgeperc.errors import ModelError, PointsError
+from edgeperc.evaluation.datasets import KittiObjects, SemanticKitti
+from edgeperc.evaluation.judge import Judge
+from edgeperc.evaluation.tables import Record, figures
+from edgeperc.perception import Perception
+from edgeperc.session import Session
+from edgeperc.tuning import cpu_features, cpu_model
+from edgeperc.zoo import BF16_FEATURES, Variant, resolve
+
+from .to_onnx import write_card
+
+__all__ = ["agree", "summary"]
+
+
+@dataclass(frozen=True)
+class _Answers:
+    """What one precision answers on all scans."""
+
+    labels: list[NDArray[np.uint8]]
+    mean_iou: float
+    ap: float | None
+    by: str
+
+
+def agree(
+    models: Sequence[str | Path],
+    *,
+    kitti: Path | None,
+    semantickitti: Path | None = None,
+    split: str = "validation",
+    n_scans: int | None = None,
+    on_scan: Callable[[str], None] = lambda precision: None,
+) -> dict[str, dict[str, Any]]:
+    """Measure every precision that the files of one network can run in, and write the record into their cards.
+
+    fp32 and int8 run on stock onnxruntime's CPU provider. bf16 runs the fp32 file in OpenVINO's own Python API, and is
+    measured where that is installed and the processor has bf16 instructions.
+
+    Parameters
+    ----------
+    models : sequence of str or Path
+        Files of one network, or its name, which stands for all its variants. One of them is in fp32.
+    kitti, semantickitti : Path or None
+        Roots of a KITTI object set and of SemanticKITTI, whose labels are the truth: of points or of vehicles, and of
+        road. All scans of SemanticKITTI are taken, which belong to a test drive: they have the only road of real scans.
+    split : str
+        Drives of the KITTI object set (`edgeperc.evaluation.splits.in_split`).
+    n_scans : int or None
+        At most so many scans of each set, evenly spread; None takes all.
+    on_scan : callable
+        Called after each scan with the precision.
+
+    Returns
+    -------
+    precisions : dict
+        Precision to its record (`edgeperc.card.ModelCard`, ``precisions``).
+
+    Raises
+    ------
+    ModelError
+        The files are not of one network, or none is in fp32.
+    PointsError
+        No scans.
+    SplitError
+        The network was trained on one of the scans.
+    """
+    variants = {variant.precision: variant for model in models for variant in resolve(model)}
+    names = {f"{variant.name} {variant.card.version}" for variant in variants.values()}
+    if len(names) != 1 or "fp32" not in variants:
+        raise ModelError(
+            f"got {', '.join(map(str, variants.values()))} of {', '.join(sorted(names))}; expected files of one network, "
+            "one of them in fp32"
+        )
+    runs: dict[str, Variant] = {"fp32": variants["fp32"]}
+    if importlib.util.find_spec("openvino") is not None and not BF16_FEATURES.isdisjoint(cpu_features()):
+        runs["bf16"] = variants["fp32"]
+    runs |= variants
+    answers = {
+        precision: _answers(variant, precision, kitti, semantickitti, split, n_scans, on_scan)
+        for precision, variant in runs.items()
+    }
+    options = [f"--kitti KITTI --split {split}"] * (kitti is not None)
+    options += ["--semantickitti SEMANTICKITTI"] * (semantickitti is not None) + [f"--scans {n_scans}"] * bool(n_scans)
+    command = " ".join(["edgeperc-export agree", variants["fp32"].name, *options])
+    told = {precision: _record(each, answers["fp32"], command) for precision, each in answers.items()}
+    for variant in variants.values():
+        own = {precision: told[precision] for precision, each in runs.items() if each is variant}
+        write_card(onnx.load(variant.path), replace(variant.card, precisions=own), variant.path)
+    return told
+
+
+def summary(precisions: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """A line for each precision."""
+    return [
+        f"{precision}: labels agree on {record['label_agreement']:.3%}, mean IoU {100 * record['mean_iou']:.2f} "
+        f"(fp32 {100 * record['fp32_mean_iou']:.2f})"
+        + (f", AP {100 * record['ap']:.2f} (fp32 {100 * record['fp32_ap']:.2f})" if record["ap"] is not None else "")
+        + f", loss {record['loss']:.2f} points, {record['n_scans']} scans"
+        for precision, record in precisions.items()
+    ]
+
+
+def _record(here: _Answers, fp32: _Answers, command: str) -> dict[str, Any]:
+    same = sum(int(np.count_nonzero(a == b)) for a, b in zip(here.labels, fp32.labels, strict=True))
+    losses = [fp32.mean_iou - here.mean_iou, 0.0]
+    if here.ap is not None and fp32.ap is not None:
+        losses.append(fp32.ap - here.ap)
+    return {
+        "n_scans": len(here.labels),
+        "label_agreement": round(same / max(sum(labels.size for labels in here.labels), 1), 6),
+        "mean_iou": round(here.mean_iou, 5),
+        "fp32_mean_iou": round(fp32.mean_iou, 5),
+        "ap": None if here.ap is None else round(here.ap, 5),
+        "fp32_ap": None if fp32.ap is None else round(fp32.ap, 5),
+        "loss": round(100.0 * max(losses), 3),
+        "by": here.by,
+        "command": command,
+    }
+
+
+def _answers(
+    variant: Variant,
+    precision: str,
+    kitti: Path | None,
+    semantickitti: Path | None,
+    split: str,
+    n_scans: int | None,
+    on_scan: Callable[[str], None],
+) -> _Answers:
+    judge = Judge([variant.path])
+    (session,) = judge.perceive.sessions
+    by = f"onnxruntime {onnxruntime.__version__}, {session.provider}"
+    if precision == "bf16":
+        by = _run_in_openvino(session)
+    truths: list[tuple[str, Callable[[], Any]]] = []
+    if kitti is not None:
+        objects = KittiObjects(kitti)
+        names = _spread(objects.names(split), n_scans)
+        truths += [("real", lambda name=name: judge.kitti(objects.frame(name))) for name in names]  # type: ignore[misc]
+    if semantickitti is not None and judge.from_above is not None:
+        roads = SemanticKitti(semantickitti)
+        names = _spread(roads.names("all"), n_scans)
+        truths += [("road", lambda name=name: judge.semantickitti(roads.frame(name))) for name in names]  # type: ignore[misc]
+    if not truths:
+        raise PointsError(f"no labelled scan of {split} drives in {kitti}, {semantickitti}; name a KITTI object set")
+    records: dict[str, list[Record]] = {}
+    labels = []
+    for block, read in truths:
+        truth = read()
+        records.setdefault(block, []).append(judge.record(truth)[0])
+        labels.append(_labels(judge.perceive(truth.points)))
+        on_scan(precision)
+    measured = [figures(of_block, 0) for of_block in records.values()]
+    ious = [iou for of_block in measured for iou in _ious(of_block)]
+    ap = [of_block["boxes"]["oriented"]["all"]["vehicle"]["ap"] for of_block in measured if "boxes" in of_block]
+    return _Answers(labels, float(np.nanmean(ious)), ap[0] if ap else None, f"{by}, {cpu_model()}")
+
+
+def _spread(names: Sequence[str], most: int | None) -> Sequence[str]:
+    return names if most is None else names[:: max(1, -(-len(names) // most))]
+
+
+def _labels(found: Perception) -> NDArray[np.uint8]:
+    """Of points or of cells, after post-processing."""
+    if found.points is not None:
+        return found.points.labels
+    assert found.top_view is not None
+    return found.top_view.labels.ravel()
+
+
+def _ious(block: Mapping[str, Any]) -> list[float]:
+    """IoU of every class of points but the background, of vehicles as one class, and of road."""
+    found = [row["iou"] for name, row in block.get("points", {}).get("all", {}).items() if name != "background"]
+    for bands in block.get("segmentation", {}).values():
+        found += [iou for name, iou in bands["all"]["iou"].items() if name in ("vehicle", "road")]
+    return [np.nan if iou is None else iou for iou in found]
+
+
+def _run_in_openvino(session: Session) -> str:
+    """Let OpenVINO's own API compute a session's outputs in bf16; returns what computes."""
+    import openvino
+
+    core = openvino.Core()
+    settings = {"INFERENCE_PRECISION_HINT": "bf16", "PERFORMANCE_HINT": "LATENCY"}
+    compiled = core.compile_model(core.read_model(session.path), "CPU", settings)
+    active = compiled.get_property("INFERENCE_PRECISION_HINT")
+    if active != openvino.Type.bf16:
+        raise ModelError(f"OpenVINO runs {session.path} in {active}, not in bf16, on this processor")
+    request = compiled.create_infer_request()
+    request.set_input_tensor(openvino.Tensor(session.input[None], shared_memory=True))
+
+    def run() -> Mapping[str, NDArray[np.float32]]:
+        request.infer()
+        for output in session.card.outputs:
+            session.outputs[output.kind][...] = request.get_tensor(output.name).data[0]
+        return session.outputs
+
+    session.run = run  # type: ignore[method-assign]
+    return f"OpenVINO {openvino.__version__.partition('-')[0]}"
