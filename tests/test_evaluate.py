@@ -479,7 +479,7 @@ def test_mistakes_are_named(world: World) -> None:
     assert set(mistakes.found) == {car, walker}
     assert dict(mistakes.missed) == {van: 5, rider: 6, beside: 7}  # no box was to be predicted beside the view
     assert mistakes.false == (box(35, 0, "truck"),)
-    assert mistakes.words == "missed: 1 van, 1 cyclist, 1 car (18 points); false: 1 truck"
+    assert mistakes.summary == "missed: 1 van, 1 cyclist, 1 car (18 points); false: 1 truck; 26 points wrong"
     assert np.bincount(mistakes.wrong).tolist() == [8, 25, 1]
     assert mistakes.wrong_share == pytest.approx(26 / 34)
     assert mistakes.n_errors == pytest.approx(4 + 26 / 34)

@@ -16,23 +16,23 @@ __all__ = ["Mistakes"]
 
 @dataclass(frozen=True, eq=False)
 class Mistakes:
-    """A scan held against its truth, to be drawn.
+    """A scan compared with its ground truth, to be drawn.
 
     Attributes
     ----------
     name, drive : str
     points : (n, 4) float32
-        Those to be drawn.
+        The points to draw: x, y, z [m] in the sensor frame, remission.
     wrong : (n,) uint8
-        1 where a point of an object was not labelled as its class, 2 where a point of none was labelled as one.
+        1: a point of an object, not labeled as its class. 2: a point of no object, labeled as one. 0: all others.
     found : tuple of Box
         True boxes that were found.
     missed : tuple of (Box, int)
-        True boxes that were not, and the points in each.
+        True boxes that were not found, and the number of points in each.
     false : tuple of Box
-        Predicted boxes where there is nothing.
+        Predicted boxes where there is no object.
     wrong_share : float
-        Wrong points, of those that belong to objects or were said to.
+        Wrong points, as a share of the points that belong to objects or were labeled as objects.
     """
 
     name: str
@@ -46,20 +46,23 @@ class Mistakes:
 
     @property
     def n_errors(self) -> float:
-        """Boxes missed and boxes made up; among equals, scans with more wrong points come first."""
+        """Missed and false boxes, plus `wrong_share`, which ranks scans with equally many; 0 without any mistake."""
         return len(self.missed) + len(self.false) + self.wrong_share
 
     @property
-    def words(self) -> str:
-        """Such as ``"missed: 2 car, 1 cyclist (340 points); false: 1 car"``."""
+    def summary(self) -> str:
+        """Such as ``"missed: 2 car, 1 cyclist (340 points); false: 1 car; 57 points wrong"``."""
 
         def listed(boxes: Sequence[Box]) -> str:
             return ", ".join(f"{n} {label}" for label, n in Counter(box.label for box in boxes).most_common())
 
-        told = []
+        parts = []
         if self.missed:
             n_points = sum(n for _, n in self.missed)
-            told.append(f"missed: {listed([box for box, _ in self.missed])} ({n_points:,} points)")
+            parts.append(f"missed: {listed([box for box, _ in self.missed])} ({n_points:,} points)")
         if self.false:
-            told.append(f"false: {listed(self.false)}")
-        return "; ".join(told) or "no box missed or false"
+            parts.append(f"false: {listed(self.false)}")
+        n_wrong = int(np.count_nonzero(self.wrong))
+        if n_wrong:
+            parts.append(f"{n_wrong:,} point{'s' * (n_wrong != 1)} wrong")
+        return "; ".join(parts) or "no mistake"

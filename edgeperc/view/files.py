@@ -1,4 +1,4 @@
-"""Labelled points as files: PLY and SemanticKITTI's labels."""
+"""Labeled points as files: PLY and SemanticKITTI's labels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from ..atomic import write_whole
 from ..errors import PointsError
 from ..perception import Perception
-from .colours import check_points, colour_of, rgb
+from .colors import color_of, rgb
+from .content import check_points
 
 __all__ = ["SEMANTICKITTI_IDS", "write_labels", "write_ply"]
 
@@ -28,10 +29,18 @@ _OTHER_ID = 99
 
 
 def write_ply(points: NDArray[np.float32], perception: Perception, path: str | Path) -> None:
-    """Write the labelled scan as a binary PLY file.
+    """Write the labeled scan as a binary PLY file.
 
-    One row an input point, in input order: x, y, z, remission (float), label, red, green, blue (uchar). Comments in the
-    header name the labels.
+    One row per input point, in input order: x, y, z, remission (float), label, red, green, blue (uchar). Comments in
+    the header name the labels.
+
+    Parameters
+    ----------
+    points : (n, 4) float32
+        The scan that was perceived: x, y, z [m] in the sensor frame, remission.
+    perception : Perception
+    path : str or Path
+        An existing file is replaced whole.
 
     Raises
     ------
@@ -46,24 +55,30 @@ def write_ply(points: NDArray[np.float32], perception: Perception, path: str | P
     fields = [(name, "<f4") for name in ("x", "y", "z", "remission")]
     fields += [(name, "|u1") for name in ("label", "red", "green", "blue")]
     rows = np.empty(len(points), dtype=fields)
-    colours = (rgb([colour_of(name) for name in perception.points.classes]) * 255.0).round().astype(np.uint8)
+    colors = (rgb([color_of(name) for name in perception.points.classes]) * 255.0).round().astype(np.uint8)
     for k in range(4):
         rows[fields[k][0]] = points[:, k]
     rows["label"] = perception.points.labels
     for k, name in enumerate(("red", "green", "blue")):
-        rows[name] = colours[perception.points.labels, k]
-    words = {"<f4": "float", "|u1": "uchar"}
+        rows[name] = colors[perception.points.labels, k]
+    kinds = {"<f4": "float", "|u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"comment label {k} {' '.join(name.split())}" for k, name in enumerate(perception.points.classes)]
-    header += [f"element vertex {len(points)}", *(f"property {words[t]} {name}" for name, t in fields), "end_header\n"]
+    header += [f"element vertex {len(points)}", *(f"property {kinds[t]} {name}" for name, t in fields), "end_header\n"]
     write_whole(path, "\n".join(header).encode("ascii", "replace") + rows.tobytes())
 
 
 def write_labels(perception: Perception, path: str | Path) -> None:
     """Write SemanticKITTI's ``.label`` layout: a uint32 for every input point, in input order.
 
-    The upper 16 bits, the instance, are 0. The lower hold the raw id of `SEMANTICKITTI_IDS`: 10 car, 30 person,
-    31 bicyclist, 0 unlabelled, which background and points out of view both get; 99 a class that SemanticKITTI lacks.
+    The upper 16 bits (the instance) are 0. The lower 16 bits hold the raw id of `SEMANTICKITTI_IDS`: 10 car, 30 person,
+    31 bicyclist, 0 unlabeled (background and points out of view), 99 a class that SemanticKITTI lacks.
+
+    Parameters
+    ----------
+    perception : Perception
+    path : str or Path
+        An existing file is replaced whole.
 
     Raises
     ------

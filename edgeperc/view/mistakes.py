@@ -1,8 +1,7 @@
-"""Pictures of scans with the most mistakes."""
+"""The picture of scans with mistakes."""
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,31 +9,47 @@ from typing import Any
 
 import numpy as np
 
-from ..atomic import write_whole
-from ..errors import MissingExtraError
 from ..evaluation.mistakes import Mistakes
-from .canvas import lift_clear, write_text
-from .colours import FAINT, FALSE, FOUND, GROUND, INK, MISSED, PANEL
+from .canvas import Label, add_axes, area_of, as_png, new_figure, place_labels, shorten, wrap, write_at, write_text
+from .colors import FAINT, FALSE, FOUND, INK, MISSED
+from .content import drawable_boxes, drawable_points
 
 __all__ = ["draw_mistakes"]
 
+# All in pixels.
+_WIDTH, _MARGIN, _TOP, _GAP, _CAPTION = 1600, 28, 168, 20, 84
+_RIGHT_M, _FAR_M = 27.0, 52.0
+_LEGEND = (
+    (
+        MISSED,
+        "missed",
+        "an object that was not found, with its number of points; dots: points of objects, not labeled so",
+    ),
+    (FALSE, "false", "found where there is none; dots: points of no object, labeled as one"),
+    (FOUND, "found", "as it should be"),
+)
+
 
 def draw_mistakes(
-    scans: Sequence[Mistakes], path: str | Path | None = None, *, title: str = "", columns: int = 5
+    scans: Sequence[Mistakes], path: str | Path | None = None, *, title: str = "", columns: int = 3
 ) -> bytes:
-    """Draw scans from above with what was found, missed and made up, a panel a scan.
+    """Draw what was missed and what was found where there is nothing, seen from above, a panel for each scan.
 
     Parameters
     ----------
     scans : sequence of Mistakes
+        Drawn in this order. Scans without a mistake are left out; the picture says so if none is left.
     path : str or Path, optional
         Where to write the picture as well; an existing file is replaced whole.
     title : str
+        Such as the names of the models.
     columns : int
+        Panels side by side; at least 1.
 
     Returns
     -------
     png : bytes
+        1600 pixels wide.
 
     Raises
     ------
@@ -43,74 +58,64 @@ def draw_mistakes(
     OSError
         The file cannot be written.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as exc:
-        raise MissingExtraError("matplotlib", "view", "Drawing a picture") from exc
-    columns = max(1, min(columns, len(scans)))
-    rows = max(1, -(-len(scans) // columns))
-    width, height, head = 470, 520, 80
-    size = columns * width, rows * height + head
-    figure = Figure(figsize=(size[0] / 100.0, size[1] / 100.0), dpi=100, facecolor=GROUND)
-    canvas: Any = FigureCanvasAgg(figure)
-    write_text(figure, 14 / size[0], 1.0 - 26 / size[1], title, fontsize=15.0, fontweight="bold", va="center")
-    at = 14.0
-    for colour, words in ((FOUND, "found"), (MISSED, "missed"), (FALSE, "false")):
-        for text, style in (("■", {"color": colour, "fontsize": 15.0}), (words, {"color": FAINT, "fontsize": 12.0})):
-            end = (
-                write_text(figure, at / size[0], 1.0 - 58 / size[1], text, va="center", **style).get_window_extent().x1
-            )
-            at = float(end) + 8.0
-        at += 14.0
-    for k, scan in enumerate(scans):
-        left, top = k % columns * width + 8, k // columns * height + head + 48
-        place = left / size[0], 1.0 - (top + height - 56) / size[1], (width - 16) / size[0], (height - 56) / size[1]
-        axes = figure.add_axes(place)
-        _draw_mistakes_of(axes, scan)
-        words = scan.words if len(scan.words) <= 66 else f"{scan.words[:65]}…"
-        write_text(
-            axes,
-            0.0,
-            1.055,
-            "  ".join(dict.fromkeys((scan.name, scan.drive))),
-            transform=axes.transAxes,
-            fontweight="bold",
-        )
-        write_text(axes, 0.0, 1.015, words, transform=axes.transAxes, color=FAINT, fontsize=9.5)
-    stream = io.BytesIO()
-    canvas.print_png(stream)
-    if path is not None:
-        write_whole(path, stream.getvalue())
-    return stream.getvalue()
+    wrong = [scan for scan in scans if scan.n_errors > 0]
+    columns = max(1, min(columns, max(1, len(wrong))))
+    # A single panel need not be as wide as the picture.
+    width = (_WIDTH - 2 * _MARGIN - (columns - 1) * _GAP) // max(columns, 2)
+    height = round(width * (_FAR_M + 3.0) / (2.0 * _RIGHT_M))
+    rows = -(-len(wrong) // columns)
+    figure = new_figure(_WIDTH, _TOP + (rows * (height + _CAPTION + _GAP) if wrong else 90))
+    heading = f"{len(wrong)} scan{'s' * (len(wrong) != 1)} with mistakes, of {len(scans)}"
+    style = {"fontsize": 21.0, "fontweight": "bold"}
+    end = write_at(figure, _MARGIN, 42, heading, **style) + 18
+    write_at(figure, end, 43, shorten(figure, title, _WIDTH - _MARGIN - end, fontsize=16.0), fontsize=16.0, color=FAINT)
+    for k, (color, name, meaning) in enumerate(_LEGEND):
+        end = write_at(figure, _MARGIN, 84 + 27 * k, "■", fontsize=17.0, color=color)
+        write_at(figure, end + 8, 84 + 27 * k, name, fontsize=14.0, fontweight="bold")
+        write_at(figure, _MARGIN + 128, 84 + 27 * k, meaning, fontsize=14.0, color=FAINT)
+    if not wrong:
+        text = "No mistakes: every object was found, and nothing else." if scans else "No scans were given."
+        write_at(figure, _MARGIN, _TOP + 36, text, fontsize=17.0)
+    for k, scan in enumerate(wrong):
+        left = _MARGIN + k % columns * (width + _GAP)
+        top = _TOP + k // columns * (height + _CAPTION + _GAP)
+        name = "  ".join(dict.fromkeys((scan.name, scan.drive)))
+        style = {"fontsize": 14.5, "fontweight": "bold"}
+        write_at(figure, left, top + 16, shorten(figure, name, width, **style), **style)
+        lines = wrap(figure, scan.summary, width, fontsize=12.0)
+        if len(lines) > 2:
+            lines = [lines[0], f"{lines[1]} …"]
+        for line, text in enumerate(lines):
+            write_at(figure, left, top + 40 + 22 * line, text, fontsize=12.0, color=FAINT)
+        _draw_panel(add_axes(figure, left, top + _CAPTION - 8, width, height), scan)
+    return as_png(figure, path)
 
 
-def _draw_mistakes_of(axes: Any, scan: Mistakes) -> None:
+def _draw_panel(axes: Any, scan: Mistakes) -> None:
     from matplotlib.patches import Polygon
 
-    axes.set_facecolor(PANEL)
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.set_xlim(26.0, -26.0)  # left is left
-    axes.set_ylim(-1.5, 51.5)
-    for spine in axes.spines.values():
-        spine.set_color("#2a343f")
-    for ring in (15.0, 30.0, 46.0):
+    axes.set_xlim(_RIGHT_M, -_RIGHT_M)  # left is left
+    axes.set_ylim(-3.0, _FAR_M)
+    for ring in (15.0, 30.0, 45.0):
         turn = np.linspace(-math.pi / 2.0, math.pi / 2.0, 90)
         axes.plot(ring * np.sin(turn), ring * np.cos(turn), color=INK, alpha=0.16, linewidth=0.8)
-        write_text(axes, -0.5 * ring, 0.87 * ring, f"{ring:.0f} m", color=FAINT, fontsize=7.5, ha="right", va="bottom")
-    for kind, colour, dot, alpha in ((0, "#66737f", 0.5, 0.6), (2, FALSE, 2.5, 0.9), (1, MISSED, 2.5, 0.9)):
-        kept = scan.points[scan.wrong == kind]
-        axes.scatter(kept[:, 1], kept[:, 0], s=dot, c=colour, alpha=alpha, linewidths=0, zorder=2 + (kind > 0))
-    boxes = [(box, FOUND, "-", "") for box in scan.found] + [(box, FALSE, "--", box.label) for box in scan.false]
-    boxes += [(box, MISSED, "-", f"{box.label} {n}") for box, n in scan.missed]
-    taken: list[Any] = []
-    for box, colour, line, words in boxes:
+        write_text(axes, 0.0, ring, f"{ring:.0f} m", color=FAINT, fontsize=10.5, ha="center", va="bottom", alpha=0.8)
+    sensor = np.array([[0.0, 1.0], [0.8, -1.2], [-0.8, -1.2]])
+    axes.add_patch(Polygon(sensor, closed=True, facecolor=INK))
+    seen = drawable_points(scan.points)
+    for kind, color, size, alpha in ((0, "#66737f", 0.7, 0.6), (2, FALSE, 7.0, 0.9), (1, MISSED, 7.0, 0.9)):
+        shown = scan.points[seen & (scan.wrong == kind)]
+        axes.scatter(shown[:, 1], shown[:, 0], s=size, c=color, alpha=alpha, linewidths=0, zorder=2 + (kind > 0))
+    boxes = [(box, FOUND, "-", "") for box in scan.found]
+    boxes += [(box, FALSE, "--", box.label) for box in scan.false]
+    boxes += [(box, MISSED, "-", f"{box.label} · {n:,}") for box, n in scan.missed]
+    labels = []
+    for box, color, line, text in boxes:
+        if not drawable_boxes([box]):
+            continue
         footprint = box.corners()[:, ::-1]
-        style = {"edgecolor": colour, "linestyle": line, "linewidth": 1.6, "zorder": 5}
+        style = {"edgecolor": color, "linestyle": line, "linewidth": 2.2 if text else 1.2, "zorder": 5 if text else 4}
         axes.add_patch(Polygon(footprint, closed=True, fill=False, **style))
-        if words:
-            above = footprint[:, 1].max() + 0.5
-            text = write_text(axes, box.center[1], above, words, color=colour, fontsize=8.5, ha="center", zorder=6)
-            text.set(va="bottom", clip_on=True, fontweight="bold")
-            lift_clear(text, taken, 0.5)
+        if text and abs(box.center[1]) < _RIGHT_M and -3.0 < box.center[0] < _FAR_M:
+            labels.append(Label(area_of(axes, footprint), text, color))
+    place_labels(axes, labels, [area_of(axes, sensor)], fontsize=12.0)

@@ -1,55 +1,54 @@
-"""Pictures of a perception, and files that other viewers read.
-
-`draw`, `draw_mistakes` and `draw_tracks` need the extra ``view``; `write_html`, `write_ply` and `write_labels` need
-numpy alone. One set of colours serves them all.
-"""
+"""The picture of a scan: from behind, from above and as the sensor sees it."""
 
 from __future__ import annotations
 
-import io
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import write_whole
-from ..drivable import road_ahead
-from ..errors import MissingExtraError
-from ..perception import Perception
-from .canvas import add_axes, lift_clear, write_text
-from .colours import (
-    AMBER,
+from ..drivable import RoadAhead, road_ahead
+from ..perception import Box, Perception, TopView
+from .canvas import Label, add_axes, area_of, as_png, new_figure, place_labels, shorten, wrap, write_at
+from .colors import AMBER, FAINT, INK, PANEL, color_of, ramp, rgb
+from .content import (
     EDGES,
-    FAINT,
-    GROUND,
-    INK,
-    PANEL,
     box_corners,
     check_points,
-    colour_of,
-    ground_height,
+    class_facts,
+    drawable_boxes,
+    drawable_points,
+    fit_ground,
     paint_points,
-    ramp,
-    rgb,
+    provider_lines,
     timing_line,
 )
 
 __all__ = ["draw"]
 
+# All in pixels. Where the README shows 1000 of the 1600 pixels, 13 points are as tall as 8.
+_WIDTH, _MARGIN, _TOP, _BOTTOM = 1600, 28, 128, 868
+_AXIS = 62
+_CLASSES_A_ROW = 7
+_NEAR_M = 1.0
+_HALF_STRIP_M = 1.0
+
 
 def draw(
     points: NDArray[np.float32], perception: Perception, path: str | Path | None = None, *, title: str = ""
 ) -> bytes:
-    """Draw a scan and what was perceived in it: from above, from the sensor and from behind.
+    """Draw a scan and what was perceived in it.
 
     Parameters
     ----------
     points : (n, 4) float32
-        The scan that was perceived: x, y, z [m] in the sensor frame, remission. Rows that are not finite are left out.
+        The scan that was perceived: x, y, z [m] in the sensor frame, remission. Rows that are not finite are left out,
+        and so are points and boxes at impossible places.
     perception : Perception
-        Views it does not hold are left out.
+        Without a top view, the picture has no panel from above.
     path : str or Path, optional
         Where to write the picture as well; an existing file is replaced whole.
     title : str
@@ -58,7 +57,7 @@ def draw(
     Returns
     -------
     png : bytes
-        1600 by 1000 pixels.
+        1600 pixels wide and about 1080 high: more where there are warnings.
 
     Raises
     ------
@@ -70,96 +69,173 @@ def draw(
         The file cannot be written.
     """
     check_points(points, perception)
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as exc:
-        raise MissingExtraError("matplotlib", "view", "Drawing a picture") from exc
     names, painted = paint_points(points, perception)
-    seen = np.isfinite(points).all(axis=1)
+    seen = drawable_points(points)
     points, painted = points[seen], painted[seen]
-    ground = ground_height(points, names, painted)
-
-    figure = Figure(figsize=(16, 10), dpi=100, facecolor=GROUND)
-    canvas: Any = FigureCanvasAgg(figure)
-    left = 28.0
-    if perception.top_view is not None:
-        x_range, y_range = perception.top_view.x_range_m, perception.top_view.y_range_m
-        px_per_m = min(852.0 / (x_range[1] - x_range[0]), 640.0 / (y_range[1] - y_range[0]))
-        width, height = px_per_m * (y_range[1] - y_range[0]), px_per_m * (x_range[1] - x_range[0])
-        axes = add_axes(figure, 66, 78, width, height)
-        _draw_top_view(axes, points, perception, ground)
-        left = 66.0 + width + 34.0
-    _draw_range_image(add_axes(figure, left, 78, 1572 - left, 226), points, perception, names, painted)
-    _draw_from_behind(add_axes(figure, left, 318, 1572 - left, 520), points, perception, names, painted, ground)
-    _write_words(figure, perception, left, title)
-
-    stream = io.BytesIO()
-    canvas.print_png(stream)
-    if path is not None:
-        write_whole(path, stream.getvalue())
-    return stream.getvalue()
-
-
-def _draw_top_view(axes: Any, points: NDArray[np.float32], perception: Perception, ground: float) -> None:
-    from matplotlib.patches import Polygon
-
+    ground = fit_ground(points, names, painted)
+    boxes = drawable_boxes(perception.boxes)
     top_view = perception.top_view
-    assert top_view is not None
+    road = None if top_view is None else road_ahead(top_view, boxes)
+
+    facts = class_facts(perception)
+    warnings = _wrapped_warnings(perception)
+    legend_top = _BOTTOM + 40
+    legend_height = 104 * -(-max(1, len(facts)) // _CLASSES_A_ROW)
+    notes_top = legend_top + legend_height + 30
+    figure = new_figure(_WIDTH, notes_top + 38 + 26 * len(warnings))
+
+    left = float(_MARGIN)
+    if top_view is not None and road is not None:
+        width = _draw_top_view(figure, points, top_view, road, boxes, ground)
+        left = _MARGIN + _AXIS + width + 34.0
+    width = _WIDTH - _MARGIN - left
+    _draw_from_behind(figure, (left, _TOP, width, 520), points, names, painted, top_view, road, boxes, ground)
+    _draw_range_image(figure, (left, 700, width, _BOTTOM - 700), points, names, painted)
+
+    _write_header(figure, perception, title)
+    _draw_legend(figure, legend_top, legend_height, facts)
+    ran = " · ".join([timing_line(perception), *provider_lines(perception)])
+    ran = shorten(figure, ran, _WIDTH - 2 * _MARGIN, fontsize=12.0)
+    write_at(figure, _MARGIN, notes_top, ran, fontsize=12.0, color=FAINT)
+    for k, line in enumerate(warnings):
+        write_at(figure, _MARGIN, notes_top + 32 + 26 * k, line, fontsize=13.0, color=AMBER)
+    return as_png(figure, path)
+
+
+def _wrapped_warnings(perception: Perception) -> list[str]:
+    ruler = new_figure(_WIDTH, 100)
+    return [line for text in perception.fitness for line in wrap(ruler, text, _WIDTH - 2 * _MARGIN, fontsize=13.0)]
+
+
+def _write_header(figure: Any, perception: Perception, title: str) -> None:
+    facts = f"{perception.n_points:,} points"
+    if perception.stage_ms:
+        facts += f" in {sum(perception.stage_ms.values()):.0f} ms"
+    write_at(figure, _WIDTH - _MARGIN, 46, facts, fontsize=18.0, ha="right", color=FAINT)
+    style = {"fontsize": 23.0, "fontweight": "bold"}
+    write_at(figure, _MARGIN, 46, shorten(figure, title, 1100, **style), **style)
+
+
+def _write_heading(figure: Any, left: float, top: float, heading: str, more: str) -> None:
+    end = write_at(figure, left, top, heading, fontsize=14.5, fontweight="bold")
+    write_at(figure, end + 12, top, more, fontsize=13.0, color=FAINT)
+
+
+def _draw_legend(figure: Any, top: float, height: float, facts: dict[str, list[str]]) -> None:
+    """A panel with a field for each class: color, name, and what was found."""
+    width = _WIDTH - 2 * _MARGIN
+    add_axes(figure, _MARGIN, top, width, height)
+    across = width / min(_CLASSES_A_ROW, max(1, len(facts)))
+    for k, (name, lines) in enumerate(facts.items()):
+        left = _MARGIN + 16 + across * (k % _CLASSES_A_ROW)
+        y = top + 24 + 104 * (k // _CLASSES_A_ROW)
+        end = write_at(figure, left, y, "■", fontsize=20.0, color=color_of(name))
+        style = {"fontsize": 15.0, "fontweight": "bold"}
+        name = shorten(figure, name, across - 56, **style)
+        write_at(figure, end + 8, y, name, alpha=1.0 if lines else 0.5, **style)
+        for line, fact in enumerate(lines[:2] or ["none found"]):
+            write_at(figure, end + 8, y + 27 + 24 * line, fact, fontsize=13.0, color=FAINT, alpha=1.0 if lines else 0.6)
+
+
+def _strip(road: RoadAhead, x_near: float, x_far: float) -> tuple[str, NDArray[np.float64] | None]:
+    """What is free ahead in short words, and the arrow that shows it as corners x, y [m]."""
+    free_m = road.free_ahead_m(_HALF_STRIP_M)
+    if not math.isfinite(free_m):
+        return "", None
+    if free_m <= x_near:
+        return f"not free {x_near:.0f} m ahead", None
+    text = f"free ahead: {'at least ' if free_m >= x_far else ''}{free_m:.0f} m"
+    half = _HALF_STRIP_M
+    neck = max(x_near, free_m - 2.0 * half)
+    return text, np.array(
+        [[x_near, half], [neck, half], [free_m, 0.0], [neck, -half], [x_near, -half]], dtype=np.float64
+    )
+
+
+def _draw_top_view(
+    figure: Any,
+    points: NDArray[np.float32],
+    top_view: TopView,
+    road: RoadAhead,
+    boxes: Sequence[Box],
+    ground: tuple[float, float, float],
+) -> float:
+    """The panel from above; its width [px]."""
+    from matplotlib.patches import Polygon, Rectangle
+
     (x_near, x_far), (y_right, y_left) = top_view.x_range_m, top_view.y_range_m
+    low, high, right, left = min(-2.5, x_near - 2.5), x_far + 2.0, y_right - 4.0, y_left + 4.0
+    px_per_m = min((_BOTTOM - _TOP) / (high - low), 560.0 / (left - right))
+    width = px_per_m * (left - right)
+    axes = add_axes(figure, _MARGIN + _AXIS, _TOP, width, px_per_m * (high - low))
+    axes.set_xlim(left, right)  # left is left
+    axes.set_ylim(low, high)
+
     layer = np.zeros((*top_view.labels.shape, 4))
     for k, name in enumerate(top_view.classes):
         if k:
-            layer[top_view.labels == k] = (*rgb([colour_of(name)])[0], 0.5 if name == "drivable" else 0.6)
-    axes.imshow(layer, extent=(y_left, y_right, x_near, x_far), aspect="auto", interpolation="nearest", zorder=1)
-    x, y, z = points[:, 0], points[:, 1], points[:, 2]
-    inside = np.flatnonzero((x >= x_near) & (x <= x_far) & (y >= y_right) & (y <= y_left))
+            layer[top_view.labels == k] = (*rgb([color_of(name)])[0], 0.62 if name == "drivable" else 0.45)
+    extent = (y_left, y_right, x_near, x_far)
+    axes.imshow(layer, extent=extent, aspect="auto", interpolation="nearest", zorder=1)
+    x, y, z = points[:, :3].astype(np.float64).T
+    inside = np.flatnonzero((x >= low) & (x <= high) & (y >= right) & (y <= left))
     inside = inside[np.argsort(z[inside], kind="stable")]
-    shade = ramp(z[inside], ground - 0.2, ground + 2.5)
-    axes.scatter(y[inside], x[inside], s=1.6, c=shade, alpha=0.75, linewidths=0, zorder=2)
-    metres = np.arange(math.ceil(x_near / 10.0) * 10.0, x_far + 0.01, 10.0)
-    for at in metres:
-        axes.axhline(at, color=INK, alpha=0.13, linewidth=0.8, zorder=3)
-    axes.set_xlim(y_left, y_right)
-    axes.set_ylim(x_near, x_far)
-    road = road_ahead(top_view, perception.boxes)
-    for ring in (road.outline, *road.holes):
-        edge = Polygon(ring[:, ::-1], closed=True, fill=False, edgecolor=colour_of("drivable"), linewidth=1.2, zorder=3)
-        axes.add_patch(edge)
-    free = np.where(road.free_m > x_near, road.free_m, np.nan)
-    axes.plot(road.y_m, free, color=INK, linewidth=1.0, alpha=0.7, drawstyle="steps-mid", zorder=4)
-    taken: list[Any] = []
-    for box in perception.boxes:
-        colour = colour_of(box.label)
-        footprint = box.corners()
-        axes.add_patch(Polygon(footprint[:, ::-1], closed=True, fill=False, edgecolor=colour, linewidth=2.0, zorder=5))
+    a, b, c = ground
+    above = z - (a + b * x + c * y)
+    axes.scatter(y[inside], x[inside], s=1.8, c=ramp(above[inside], -0.2, 2.5), alpha=0.8, linewidths=0, zorder=2)
+    bounds = Rectangle((y_right, x_near), y_left - y_right, x_far - x_near, fill=False, edgecolor=FAINT, linestyle="--")
+    axes.add_patch(bounds)
+
+    step = 10.0 if high - low > 25.0 else 5.0
+    ahead = np.arange(math.ceil(low / step) * step, high, step)[:30]
+    beside = np.arange(math.ceil(right / step) * step, left, step)[:30]
+    axes.set_yticks(ahead, labels=[f"{at:.0f} m" for at in ahead])
+    axes.set_xticks(
+        beside, labels=[f"{abs(at):.0f} m{' left' * (at > 0)}{' right' * (at < 0)}" for at in beside.tolist()]
+    )
+    axes.grid(color=INK, alpha=0.12, linewidth=0.8)
+    axes.set_axisbelow(True)
+    sensor = Polygon([[0.0, 1.2], [0.9, -1.2], [-0.9, -1.2]], closed=True, facecolor=INK, zorder=5)
+    axes.add_patch(sensor)
+
+    avoid = [area_of(axes, sensor.get_xy())]
+    text, arrow = _strip(road, x_near, x_far)
+    if arrow is not None:
+        axes.add_patch(Polygon(arrow[:, ::-1], closed=True, facecolor=INK, alpha=0.3, zorder=3))
+        axes.add_patch(Polygon(arrow[:, ::-1], closed=True, fill=False, edgecolor=INK, linewidth=1.5, zorder=4))
+    labels: list[Label] = []
+    beside_arrow = area_of(axes, [[0.0, x_near]] if arrow is None else arrow[:, ::-1])
+    avoid.append(beside_arrow)
+    for box in sorted(boxes, key=lambda box: math.hypot(*box.center[:2])):
+        color, footprint = color_of(box.label), box.corners()
+        shape = Polygon(footprint[:, ::-1], closed=True, fill=False, edgecolor=color, linewidth=2.4, zorder=5)
+        axes.add_patch(shape)
         front = footprint[[0, 3]].mean(axis=0)
-        tip = front + 0.25 * (front - np.asarray(box.center[:2]))
-        axes.plot([box.center[1], tip[1]], [box.center[0], tip[0]], color=colour, linewidth=2.0, zorder=5)
-        if not (x_near <= box.center[0] <= x_far and y_right <= box.center[1] <= y_left):
-            continue  # beside or behind what is drawn
-        # Beside the box, on the side with more room.
-        room_right = box.center[1] - y_right >= y_left - box.center[1]
-        side = footprint[:, 1].min() - 0.25 if room_right else footprint[:, 1].max() + 0.25
-        ahead = min(max(box.center[0], x_near + 0.5), x_far - 0.5)
-        words = write_text(axes, side, ahead, f"{box.label} {box.score:.2f}", color=colour, fontsize=9.5, zorder=6)
-        words.set(ha="left" if room_right else "right", va="center", clip_on=True, fontweight="bold")
-        lift_clear(words, taken, 0.2)
-        words.set_bbox({"facecolor": PANEL, "edgecolor": "none", "alpha": 0.72, "pad": 1.5})
-    below = x_near - 0.022 * (x_far - x_near)
-    axes.plot([y_right + 5.0, y_right], [below, below], color=INK, linewidth=3, clip_on=False)
-    write_text(axes, y_right + 5.4, below, "5 m", ha="right", va="center")
-    axes.set_yticks(metres, labels=[f"{at:.0f} m" for at in metres])
-    axes.tick_params(left=False, colors=FAINT, labelsize=9.5, labelfontfamily="DejaVu Sans")
-    write_text(axes, 0.0, 1.008, "top view; the line: free ahead", color=FAINT, transform=axes.transAxes, va="bottom")
+        axes.plot([box.center[1], front[1]], [box.center[0], front[0]], color=color, linewidth=2.4, zorder=5)
+        if low <= box.center[0] <= high and right <= box.center[1] <= left:
+            area = area_of(axes, footprint[:, ::-1])
+            labels.append(Label(area, f"{box.label} {box.score:.2f}", color))
+    if text:
+        labels.append(Label(beside_arrow, text, AMBER if arrow is None else INK))
+    n_omitted = place_labels(axes, labels, avoid)
+    _write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", _omitted("scores", n_omitted))
+    return width
+
+
+def _omitted(text: str, n_omitted: int) -> str:
+    return f"{text}; {n_omitted} label{'s' * (n_omitted != 1)} omitted" if n_omitted else text
 
 
 def _draw_range_image(
-    axes: Any, points: NDArray[np.float32], perception: Perception, names: list[str], painted: NDArray[np.uint8]
+    figure: Any,
+    place: tuple[float, float, float, float],
+    points: NDArray[np.float32],
+    names: list[str],
+    painted: NDArray[np.uint8],
 ) -> None:
     """The front quarter turn as the sensor saw it. It is a picture, and no network's projection."""
-    from matplotlib.patches import Rectangle
-
+    axes = add_axes(figure, *place)
+    _write_heading(figure, place[0], place[1] - 20, "as the sensor sees it", "90° ahead, a class for every point")
     x, y, z = points[:, :3].astype(np.float64).T
     range_m = np.sqrt(x * x + y * y + z * z)
     azimuth = np.degrees(np.arctan2(y, x))
@@ -172,118 +248,147 @@ def _draw_range_image(
     rows = next((n for n in (16, 32, 64) if n >= len(ahead) / columns), 128)
     row = np.floor((high - elevation) / (high - low) * rows).astype(np.intp)
     col = np.floor((45.0 - azimuth[ahead]) / 90.0 * columns).astype(np.intp)
-    kept = (row >= 0) & (row < rows)
+    kept = (row >= 0) & (row < rows) & (col >= 0) & (col < columns)
     ahead, row, col = ahead[kept], row[kept], col[kept]
     nearest_last = np.argsort(-range_m[ahead], kind="stable")
     index = np.full((rows, columns), -1, dtype=np.intp)
     index[row[nearest_last], col[nearest_last]] = ahead[nearest_last]
     for axis, shift in ((0, 1), (0, -1), (1, 1), (1, -1)):
-        # Beams are not spread evenly: a pixel that none met borrows its neighbour's return.
-        neighbour = np.roll(index, shift, axis)
+        # Beams are not spread evenly: a pixel that none met borrows its neighbor's return.
+        neighbor = np.roll(index, shift, axis)
         edge = [slice(None), slice(None)]
         edge[axis] = slice(0, 1) if shift > 0 else slice(-1, None)
-        neighbour[tuple(edge)] = -1
-        index = np.where(index < 0, neighbour, index)
+        neighbor[tuple(edge)] = -1
+        index = np.where(index < 0, neighbor, index)
     picture = np.broadcast_to(rgb([PANEL])[0], (rows, columns, 3)).copy()
     hit = index >= 0
     behind = index[hit]
     shade = ramp(-np.log(np.maximum(range_m[behind], 1.0)), -math.log(70.0), -math.log(4.0))
-    share = np.array([0.0 if k == 0 else 0.55 if name == "drivable" else 0.92 for k, name in enumerate(names)])
+    share = np.array([0.0 if k == 0 else 0.7 if name == "drivable" else 1.0 for k, name in enumerate(names)])
     share = share[painted[behind]][:, None]
-    picture[hit] = (1.0 - share) * 0.75 * shade + share * rgb([colour_of(name) for name in names])[painted[behind]]
-    axes.imshow(picture, extent=(0, columns, rows, 0), aspect="auto", interpolation="nearest")
-    for box in perception.boxes:
-        corner = box_corners(box)
-        side = (45.0 - np.degrees(np.arctan2(corner[:, 1], corner[:, 0]))) / 90.0 * columns
-        up = np.degrees(np.arctan2(corner[:, 2], np.hypot(corner[:, 0], corner[:, 1])))
-        up = (high - up) / (high - low) * rows
-        if side.min() >= 0 and side.max() <= columns:
-            at, size = (side.min(), up.min()), (np.ptp(side), np.ptp(up))
-            axes.add_patch(Rectangle(at, *size, fill=False, edgecolor=colour_of(box.label), linewidth=1.3))
-    write_text(axes, 0.0, 1.03, "range image, 90° ahead", color=FAINT, transform=axes.transAxes, va="bottom")
+    picture[hit] = (1.0 - share) * 0.72 * shade + share * rgb([color_of(name) for name in names])[painted[behind]]
+    axes.imshow(picture, extent=(45.0, -45.0, 0.0, 1.0), aspect="auto", interpolation="nearest")
+    axes.set_xticks([40, 20, 0, -20, -40], labels=["40° left", "20° left", "straight ahead", "20° right", "40° right"])
 
 
 def _draw_from_behind(
-    axes: Any,
+    figure: Any,
+    place: tuple[float, float, float, float],
     points: NDArray[np.float32],
-    perception: Perception,
     names: list[str],
     painted: NDArray[np.uint8],
-    ground: float,
+    top_view: TopView | None,
+    road: RoadAhead | None,
+    boxes: Sequence[Box],
+    ground: tuple[float, float, float],
 ) -> None:
     from matplotlib.collections import LineCollection
+    from matplotlib.patches import Polygon
 
-    # Behind and above the sensor, looking at the road some 15 m ahead.
-    eye, target = np.array([-8.0, 0.0, ground + 7.0]), np.array([15.0, 0.0, ground + 0.5])
+    axes = add_axes(figure, *place)
+    panel = axes.get_window_extent()
+    tall = 0.27
+    wide = tall * panel.width / panel.height
+    axes.set_xlim(-wide, wide)
+    axes.set_ylim(-tall, tall)
+
+    # Behind and above the sensor, looking at the road some 16 m ahead.
+    a, b, c = ground
+    eye, target = np.array([-7.0, 0.0, a + 6.2]), np.array([16.0, 0.0, a + 16.0 * b + 0.4])
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.array([0.0, -1.0, 0.0])
-    turn = np.stack([right, np.cross(right, forward), forward])
+    turn = np.stack([right, np.cross(right, forward), forward])  # sensor -> camera: right, up, forward
 
+    if top_view is not None:
+        axes.imshow(
+            _ground_layer(top_view, ground, eye, turn, wide, tall),
+            extent=(-wide, wide, -tall, tall),
+            aspect="auto",
+            interpolation="bilinear",
+            zorder=1,
+        )
     seen = (points[:, :3].astype(np.float64) - eye) @ turn.T
-    panel = axes.get_window_extent()
-    tall = 0.285
-    wide = tall * panel.width / panel.height
     shown = (seen[:, 2] > 2.0) & (seen[:, 2] < 90.0)
     shown &= (np.abs(seen[:, 0]) < wide * seen[:, 2]) & (np.abs(seen[:, 1]) < tall * seen[:, 2])
     order = np.flatnonzero(shown)
     order = order[np.argsort(-seen[order, 2], kind="stable")]
     depth = seen[order, 2]
-    colours = rgb([colour_of(name) for name in names])[painted[order]]
+    colors = rgb([color_of(name) for name in names])[painted[order]]
     plain = painted[order] == 0
-    colours[plain] = ramp(points[order[plain], 2], ground - 0.3, ground + 3.0)
-    size = np.clip(26.0 / depth, 0.8, 3.2) ** 1.5 * np.where(plain, 0.8, 1.5)
-    axes.scatter(seen[order, 0] / depth, seen[order, 1] / depth, s=size, c=colours, linewidths=0)
-    axes.set_xlim(-wide, wide)
-    axes.set_ylim(-tall, tall)
-    taken: list[Any] = []
-    for found in sorted(perception.boxes, key=lambda found: found.center[0]):
-        corner = (box_corners(found) - eye) @ turn.T
-        if corner[:, 2].min() < 1.0:
+    x, y, z = points[order[plain], :3].astype(np.float64).T
+    colors[plain] = ramp(z - (a + b * x + c * y), -0.3, 3.0)
+    if "drivable" in names:
+        colors[painted[order] == names.index("drivable")] *= 1.35
+    size = np.clip(32.0 / depth, 1.1, 3.6) ** 1.5 * np.where(plain, 0.85, 1.5)
+    axes.scatter(
+        seen[order, 0] / depth, seen[order, 1] / depth, s=size, c=colors.clip(0.0, 1.0), linewidths=0, zorder=2
+    )
+
+    labels: list[Label] = []
+    if top_view is not None and road is not None:
+        text, arrow = _strip(road, *top_view.x_range_m)
+        if arrow is not None:
+            flat = (np.column_stack([arrow, a + arrow @ [b, c] + 0.02]) - eye) @ turn.T
+            flat = flat[:, :2] / np.maximum(flat[:, 2:], _NEAR_M)
+            axes.add_patch(Polygon(flat, closed=True, facecolor=INK, alpha=0.3, zorder=3))
+            axes.add_patch(Polygon(flat, closed=True, fill=False, edgecolor=INK, linewidth=1.5, zorder=3))
+            labels.append(Label(area_of(axes, flat), text, INK))
+    # The nearest boxes last: they lie before the others.
+    for box in sorted(boxes, key=lambda box: -box.center[0]):
+        corners = (box_corners(box) - eye) @ turn.T
+        ends = [end for k, m in EDGES if (end := _clipped(corners[k], corners[m])) is not None]
+        if not ends:
             continue
-        flat = corner[:, :2] / corner[:, 2:]
-        colour = colour_of(found.label)
-        axes.add_collection(LineCollection([flat[list(e)] for e in EDGES], colors=colour, linewidths=1.5))
-        words = f"{found.label} {math.hypot(*found.center[:2]):.0f} m"
-        text = write_text(axes, float(flat[:, 0].mean()), float(flat[:, 1].max()) + 0.006, words, color=colour)
-        text.set(ha="center", va="bottom", clip_on=True, fontweight="bold")
-        text.set_bbox({"facecolor": PANEL, "edgecolor": "none", "alpha": 0.6, "pad": 1.0})
-        lift_clear(text, taken, 0.004)
-    write_text(axes, 0.008, 0.975, "from behind", color=FAINT, transform=axes.transAxes, va="top")
+        flat = np.array(ends)[:, :, :2] / np.array(ends)[:, :, 2:]
+        color = color_of(box.label)
+        axes.add_collection(LineCollection(list(flat), colors=color, linewidths=1.8, zorder=4))
+        if corners[:, 2].min() > _NEAR_M:
+            front = corners[[0, 3, 7, 4]]
+            axes.add_patch(Polygon(front[:, :2] / front[:, 2:], closed=True, facecolor=color, alpha=0.25, zorder=4))
+        area = np.array(area_of(axes, flat.reshape(-1, 2)))
+        low, high = area[:2].clip(panel.min, panel.max), area[2:].clip(panel.min, panel.max)
+        if (high - low).min() > 1.0:
+            distance_m = math.hypot(*box.center[:2])
+            labels.append(Label((*low.tolist(), *high.tolist()), f"{box.label} {distance_m:.0f} m", color))
+    n_omitted = place_labels(axes, labels[::-1])
+    more = "drivable area, boxes and their distance"
+    _write_heading(figure, place[0], place[1] - 20, "from behind", _omitted(more, n_omitted))
 
 
-def _write_words(figure: Any, perception: Perception, left: float, title: str) -> None:
-    def say(x: float, y: float, words: str, **style: Any) -> float:
-        """Write at pixels from the upper left corner; where the words end."""
-        text = write_text(figure, x / 1600.0, 1.0 - y / 1000.0, words, va="center", **style)
-        return float(text.get_window_extent().x1)
+def _clipped(start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """The part of an edge before the camera, (2, 3); None without one."""
+    if start[2] > end[2]:
+        start, end = end, start
+    if end[2] <= _NEAR_M:
+        return None
+    if start[2] < _NEAR_M:
+        start = start + (end - start) * (_NEAR_M - start[2]) / (end[2] - start[2])
+    return np.stack([start, end])
 
-    say(28, 34, title if len(title) <= 90 else f"…{title[-89:]}", fontsize=16.0, fontweight="bold")
-    say(1572, 34, f"{perception.n_points:,} points", fontsize=13.0, ha="right", color=FAINT)
 
-    counts = perception.points.counts() if perception.points is not None else {}
-    boxed = [box.label for box in perception.boxes]
-    names = list(counts)
-    names += [name for name in (perception.top_view.classes if perception.top_view else ()) if name not in names]
-    x, y = left, 866.0
-    for name in names:
-        facts = []
-        if name == "drivable" and perception.top_view is not None:
-            facts.append(f"{perception.top_view.drivable_area_m2:.0f} m²")
-        if name in boxed:
-            facts.append(f"{boxed.count(name)} box{'es' * (boxed.count(name) > 1)}")
-        if name in counts:
-            facts.append(f"{counts[name]:,} points")
-        if x > 1572 - 190:
-            x, y = left, y + 27.0
-        end = say(x, y, "■", fontsize=15.0, color=colour_of(name))
-        end = say(end + 7, y, name, fontsize=11.5, fontweight="bold", alpha=1.0 if facts else 0.55)
-        if facts:
-            end = say(end + 8, y, ", ".join(facts), fontsize=11.5, color=FAINT)
-        x = end + 24
-    say(left, 935, timing_line(perception), fontsize=11.5)
-    ran = " · ".join(f"{model} on {provider}" for model, provider in perception.providers.items())
-    say(left, 958, ran, fontsize=10.5, color=FAINT)
-    if perception.fitness:
-        more = f"  (+{len(perception.fitness) - 1} more)" if len(perception.fitness) > 1 else ""
-        line = perception.fitness[0]
-        say(left, 982, (line if len(line) <= 125 else f"{line[:124]}…") + more, fontsize=10.5, color=AMBER)
+def _ground_layer(
+    top_view: TopView,
+    ground: tuple[float, float, float],
+    eye: NDArray[np.float64],
+    turn: NDArray[np.float64],
+    wide: float,
+    tall: float,
+) -> NDArray[np.float64]:
+    """The drivable cells on the ground as the camera sees them, (rows, columns, 4)."""
+    columns = 1200
+    rows = max(1, round(columns * tall / wide))
+    u = np.linspace(-wide, wide, columns)
+    v = np.linspace(tall, -tall, rows)[:, None]
+    ray = u[..., None] * turn[0] + v[..., None] * turn[1] + turn[2]
+    a, b, c = ground
+    # eye + k ray lies on z = a + b x + c y
+    with np.errstate(divide="ignore", invalid="ignore"):
+        k = (a + b * eye[0] + c * eye[1] - eye[2]) / (ray[..., 2] - b * ray[..., 0] - c * ray[..., 1])
+        row = (top_view.x_range_m[1] - eye[0] - k * ray[..., 0]) / top_view.cell_m
+        col = (top_view.y_range_m[1] - eye[1] - k * ray[..., 1]) / top_view.cell_m
+    height, width = top_view.labels.shape
+    hit = (k > 0.0) & (row >= 0) & (row < height) & (col >= 0) & (col < width)
+    layer = np.zeros((rows, columns, 4))
+    layer[..., :3] = rgb([color_of("drivable")])[0]
+    layer[hit, 3] = 0.55 * top_view.drivable[row[hit].astype(np.intp), col[hit].astype(np.intp)]
+    return layer

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..atomic import write_whole
 from ..errors import MissingExtraError
-from .colours import FAINT, INK, PANEL, colour_of
+from .colors import FAINT, INK, PANEL, color_of
 
 if TYPE_CHECKING:
     from ..tracking.tracks import Tracks
@@ -85,7 +85,7 @@ def draw_tracks(
         for track in tracks:
             ways.setdefault(track.id, []).append((*track.world_box.center, tracks.stamp_s))
             way = ways[track.id] = [place for place in ways[track.id] if place[3] > tracks.stamp_s - tail_s]
-            colour = colour_of(track.label)
+            colour = color_of(track.label)
             if len(way) > 1:
                 pen.line(pixels((np.array(way)[:, :3] - t) @ R), fill=colour)
             pen.polygon(pixels(track.box.corners()), outline=colour, width=1 if track.coasting else 2)
@@ -100,7 +100,7 @@ def draw_tracks(
         told = f"{title}  {tracks.stamp_s:.1f} s  {len(tracks)} track{'s' * (len(tracks) != 1)}"
         pen.text((10.0, 8.0), told.strip(), fill=INK)
         for line, label in enumerate(sorted({*tracks.labels})):
-            pen.text((10.0, 24.0 + 14.0 * line), label, fill=colour_of(label))
+            pen.text((10.0, 24.0 + 14.0 * line), label, fill=color_of(label))
         pictures.append(picture.quantize(64))
     if not pictures:
         return b""

@@ -1,0 +1,167 @@
+"""What pictures and pages show of a scan: classes of points, drawable boxes, the ground, short facts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PointsError
+from ..perception import Box, Perception
+from .colors import CLASS_COLORS
+
+__all__ = [
+    "EDGES",
+    "box_corners",
+    "check_points",
+    "class_facts",
+    "drawable_boxes",
+    "drawable_points",
+    "fit_ground",
+    "paint_points",
+    "provider_lines",
+    "timing_line",
+]
+
+# Nothing farther than this is drawn: no sensor reaches as far, and a drawing library may fail on huge coordinates.
+_REACH_M = 1000.0
+_LARGEST_BOX_M = 100.0
+
+EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
+"""Pairs of `box_corners`: the edges of a box."""
+
+
+def check_points(points: NDArray[np.float32], perception: Perception) -> None:
+    """Raise `PointsError` unless the points are the scan that was perceived."""
+    if points.ndim != 2 or points.shape[1] != 4:
+        raise PointsError(f"points have shape {points.shape}; expected (n, 4): x, y, z, remission")
+    if len(points) != perception.n_points:
+        raise PointsError(
+            f"{len(points)} points with a perception of {perception.n_points}; expected the scan that was perceived"
+        )
+
+
+def drawable_points(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Rows that are finite and no farther than any sensor reaches, (n,)."""
+    return np.isfinite(points).all(axis=1) & (np.abs(points[:, :3]) < _REACH_M).all(axis=1)
+
+
+def drawable_boxes(boxes: Iterable[Box]) -> list[Box]:
+    """Boxes whose numbers are finite and whose place and size are possible."""
+    return [
+        box
+        for box in boxes
+        if all(map(math.isfinite, (*box.center, *box.size, box.yaw)))
+        and max(map(abs, box.center)) < _REACH_M
+        and 0.0 < min(box.size) <= max(box.size) < _LARGEST_BOX_M
+    ]
+
+
+def paint_points(points: NDArray[np.float32], perception: Perception) -> tuple[list[str], NDArray[np.uint8]]:
+    """Class of every point for a picture.
+
+    Parameters
+    ----------
+    points : (n, 4) float32
+    perception : Perception
+
+    Returns
+    -------
+    names : list of str
+        The classes of both views.
+    painted : (n,) uint8
+        Index into ``names``: the point's own class; for background, the class of its cell in the top view.
+    """
+    names = list(perception.points.classes if perception.points is not None else ("background",))
+    painted = np.zeros(len(points), dtype=np.uint8)
+    if perception.points is not None:
+        painted[:] = perception.points.labels
+    top_view = perception.top_view
+    if top_view is None:
+        return names, painted
+    names += [name for name in top_view.classes if name not in names]
+    near = np.flatnonzero(drawable_points(points))
+    x, y, z = points[near, :3].astype(np.float64).T
+    row = np.floor((top_view.x_range_m[1] - x) / top_view.cell_m)
+    col = np.floor((top_view.y_range_m[1] - y) / top_view.cell_m)
+    inside = (row >= 0) & (row < top_view.labels.shape[0]) & (col >= 0) & (col < top_view.labels.shape[1])
+    near, z = near[inside], z[inside]
+    cell = top_view.labels[row[inside].astype(np.intp), col[inside].astype(np.intp)]
+    lent = np.array([names.index(name) for name in top_view.classes], dtype=np.uint8)[cell]
+    road = names.index("drivable") if "drivable" in names else -1
+    take = (painted[near] == 0) & (lent != 0)
+    if perception.points is not None:
+        take &= lent == road
+    if (lent == road).any():
+        # Leaves over the road are not road.
+        take &= (lent != road) | (z < np.median(z[lent == road]) + 0.5)
+    painted[near[take]] = lent[take]
+    return names, painted
+
+
+def fit_ground(points: NDArray[np.float32], names: list[str], painted: NDArray[np.uint8]) -> tuple[float, float, float]:
+    """The ground for a picture to stand on: z = a + b x + c y [m].
+
+    Parameters
+    ----------
+    points : (n, 4) float32
+        Drawable.
+    names : list of str
+    painted : (n,) uint8
+
+    Returns
+    -------
+    a, b, c : float
+        A plane through the drivable points; level where there are few.
+    """
+    if "drivable" in names:
+        road = points[painted == names.index("drivable"), :3].astype(np.float64)
+        if len(road) >= 50:
+            # A second fit without what stands out of the first.
+            for _ in range(2):
+                known = np.column_stack([np.ones(len(road)), road[:, :2]])
+                plane = np.linalg.lstsq(known, road[:, 2], rcond=None)[0]
+                road = road[np.abs(known @ plane - road[:, 2]) < 0.3]
+                if len(road) < 50:
+                    break
+            if np.abs(plane[1:]).max() < 0.2:
+                return float(plane[0]), float(plane[1]), float(plane[2])
+    near = np.hypot(points[:, 0], points[:, 1]) < 30.0
+    return (float(np.percentile(points[near, 2], 15.0)) if near.any() else -1.73), 0.0, 0.0
+
+
+def box_corners(box: Box) -> NDArray[np.float64]:
+    """The eight corners, (8, 3) [m]: the four of `Box.corners` below, then above."""
+    z = box.center[2] + np.repeat([-0.5, 0.5], 4) * box.size[2]
+    return np.column_stack([np.tile(box.corners(), (2, 1)), z])
+
+
+def class_facts(perception: Perception) -> dict[str, list[str]]:
+    """For each class of both views, what was found of it: area, boxes, points. The background comes last."""
+    counts = perception.points.counts() if perception.points is not None else {}
+    labels = [box.label for box in perception.boxes]
+    facts: dict[str, list[str]] = {}
+    known = {*counts, *(perception.top_view.classes if perception.top_view is not None else ()), *labels}
+    order = [*CLASS_COLORS][1:]
+    for name in sorted(known, key=lambda name: (order.index(name) if name in order else len(order), name)):
+        facts[name] = []
+        if name == "drivable" and perception.top_view is not None:
+            facts[name].append(f"{perception.top_view.drivable_area_m2:.0f} m²")
+        if name in labels:
+            facts[name].append(f"{labels.count(name)} box{'es' * (labels.count(name) > 1)}")
+        if counts.get(name):
+            facts[name].append(f"{counts[name]:,} point{'s' * (counts[name] != 1)}")
+    return facts
+
+
+def timing_line(perception: Perception) -> str:
+    """Milliseconds in all and by stage."""
+    stages = ", ".join(f"{name} {ms:.1f}" for name, ms in perception.stage_ms.items())
+    return f"{sum(perception.stage_ms.values()):.1f} ms ({stages})" if stages else "not timed"
+
+
+def provider_lines(perception: Perception) -> list[str]:
+    """For each model, what ran it."""
+    return [text if name in text else f"{name}: {text}" for name, text in perception.providers.items()]
