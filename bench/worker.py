@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import edgeperc.errors
-from edgeperc import EdgepercError, ModelError, Perceiver
+from edgeperc import EdgepercError, Perceiver
 
 from .context import EnergyMeter, conditions, peak_rss_mb, rss_mb
 from .loadgen import single_stream
@@ -101,12 +101,7 @@ OnTick = Callable[[str, Sequence[float]], None]
 
 def make_perceiver(job: Job) -> Perceiver:
     """The Perceiver that a job asks for; every fault of the request is an `EdgepercError`."""
-    try:
-        return Perceiver(list(job.models), sensor=job.sensor, provider=job.provider, n_threads=job.n_threads)
-    except EdgepercError:
-        raise
-    except ValueError as exc:  # two models of one view
-        raise ModelError(str(exc)) from exc
+    return Perceiver(list(job.models), sensor=job.sensor, provider=job.provider, n_threads=job.n_threads)
 
 
 def serve(connection: Any, job: Job) -> None:

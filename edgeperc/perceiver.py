@@ -1,17 +1,19 @@
-"""The one file that joins the stages: a scan in, a perception out."""
+"""Joins the stages: a scan in, a perception out."""
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import threading
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, ParamSpec
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +22,7 @@ from .adapt import Interpolator, condition
 from .card import ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, join_boxes, objects_from_points
 from .decode import decode_classes, decode_top_view
-from .errors import FitnessError
+from .errors import FitnessError, OptionError
 from .fitness import FitnessProfile, check_fitness
 from .ground import find_ground
 from .perception import Box, Perception, PointLabels, TopView
@@ -34,12 +36,15 @@ from .zoo import DEFAULT
 __all__ = ["ADAPTATIONS", "BoxesFrom", "Perceiver"]
 
 STAGES = ("check", "project", "infer", "decode", "refine", "cluster")
-Adaptation = Literal["both", "remission", "interpolation", "neither"]
+Adaptation = Literal["both", "remission", "interpolation", "none"]
 BoxesFrom = Literal["both", "network", "clusters"]
-ADAPTATIONS: tuple[Adaptation, ...] = ("neither", "remission", "interpolation", "both")
+OnMismatch = Literal["warn", "raise", "ignore"]
+ADAPTATIONS: tuple[Adaptation, ...] = ("none", "remission", "interpolation", "both")
 
-# A wrong set-up shows in any scan; a few are looked at, as one may be taken in a tunnel or a depot.
+# A wrong set-up shows in any scan. Several are checked because one may be taken in a tunnel or a depot.
 CHECKED_SCANS = 5
+
+_P = ParamSpec("_P")
 
 
 class _Stopwatch:
@@ -64,12 +69,48 @@ class _Network:
     interpolator: Interpolator | None
 
 
+def _renamed(**names: str) -> Callable[[Callable[_P, None]], Callable[_P, None]]:
+    """Refuse the old name of a keyword, and give the new one."""
+
+    def decorate(function: Callable[_P, None]) -> Callable[_P, None]:
+        @functools.wraps(function)
+        def checked(*args: _P.args, **kwargs: _P.kwargs) -> None:
+            for old in names.keys() & kwargs.keys():
+                raise OptionError(f"{old}= was renamed; pass {names[old]}={kwargs[old]!r}")
+            function(*args, **kwargs)
+
+        return checked
+
+    return decorate
+
+
+def _check_choice(
+    option: str, value: object, choices: Sequence[object], renamed: Mapping[str, str] = MappingProxyType({})
+) -> None:
+    if isinstance(value, str) and value in renamed:
+        raise OptionError(f"{option}={value!r} was renamed; pass {option}={renamed[value]!r}")
+    if value not in choices:
+        *others, last = map(str, choices)
+        raise OptionError(f"{option} is {value!r}; expected {', '.join(others)} or {last}")
+
+
+def _listed(models: object) -> list[str | os.PathLike[str]]:
+    """The models as a list; a name or a path alone is a list of one."""
+    if models is None:
+        return list(DEFAULT)
+    given = models if isinstance(models, Sequence) and not isinstance(models, str) else [models]
+    listed = [model for model in given if isinstance(model, str | os.PathLike)]
+    if not listed or len(listed) < len(given):
+        raise OptionError(f"models is {models!r}; expected names or paths of models, at least one, or None")
+    return listed
+
+
 class Perceiver:
     """Turn a LiDAR scan into drivable area, boxes and a class for every point.
 
-    Everything a model needs is read from its card, so a name or a path is enough. Construction loads, checks and warms
-    up. Working buffers are reused between calls; results are yours. One instance answers one call at a time (others
-    wait); for parallel calls make one a thread.
+    Construction loads the models, checks them against their cards and compiles every kernel. Results are the caller's;
+    internal buffers are reused between calls. One instance answers one call at a time, and other threads wait; for
+    parallel calls use one instance per thread. Options cannot be changed after construction.
 
     Parameters
     ----------
@@ -77,8 +118,8 @@ class Perceiver:
         Names of shipped models (``"ssadnet"``, ``"pointseg:int8"``) or paths of .onnx files with a card; at most one
         model a view. None takes the best pair, `edgeperc.zoo.DEFAULT`.
     sensor : str, Path or SensorProfile
-        Where the points come from: a built-in name (`edgeperc.sensor.SENSORS`), a file that ``edgeperc adapt fit``
-        wrote, or a profile. Says how raw remissions map to 0..1, and how they are rendered as the training sensor's.
+        The sensor that takes the scans: a built-in name (`edgeperc.sensors`), a file that ``edgeperc fit-sensor``
+        wrote, or a profile.
     provider : str
         ``"auto"``, ``"cpu"``, ``"openvino"``, ... A provider asked for is required (`edgeperc.session.PROVIDERS`).
     precision : {"auto", "fp32", "bf16", "int8"}
@@ -87,36 +128,41 @@ class Perceiver:
     n_threads : int or None
         Threads inside one call; None leaves it to the provider. The answer does not depend on it.
     on_mismatch : {"warn", "raise", "ignore"}
-        What to do when one of the first scans is unlike those the model was trained on. ``"ignore"`` skips the check.
+        What to do when one of the first five scans is unlike the training scans. ``"ignore"`` skips the check.
     score_threshold : float or None
-        Least score of a box; None takes the card's, and 0.3 of a cluster's.
-    adapt : {"both", "remission", "interpolation", "neither"}
-        What is done about another sensor than the models were trained on: its remission is rendered, where its profile
-        has a function, and a range image is filled between its beams and columns, where it has fewer. Nothing where
-        the sensor is the same.
+        Least score of a box, in 0..1. None takes the card's for boxes of a network, and 0.3 for boxes of clusters.
+    adapt : {"both", "remission", "interpolation", "none"}
+        How to adapt scans of a sensor that the models were not trained on. ``"remission"``: replace its remission by
+        what the training sensor would report, where its profile has a function. ``"interpolation"``: fill the range
+        image between its beams and columns, where it has fewer. Scans of the training sensor are not changed.
     boxes_from : {"both", "network", "clusters"}
-        ``"network"``: the boxes of a top-view model, vehicles ahead. ``"clusters"``: those around what stands on the
-        ground and carries a range-image model's labels, of every class and as far as that model sees
-        (`edgeperc.cluster.objects_from_points`). ``"both"``: whichever the models allow; a cluster's box goes where
-        there is a network's, and where a network looks for that class.
-    all_around : bool
-        Where a range-image model sees a part of the turn, run it for every part, four times for the shipped ones: then
-        every point has a class, and there are boxes beside and behind the vehicle.
+        ``"network"``: boxes of a top-view model, vehicles ahead. ``"clusters"``: boxes around clusters of labelled
+        points above the ground, of every class and everywhere in the range image
+        (`edgeperc.cluster.objects_from_points`). ``"both"``: use both. A cluster's box is dropped where it overlaps a
+        network's box, or where the network detects its class.
+    full_turn : bool
+        Run a range-image model that sees a sector once for every sector, four times for the shipped ones: every point
+        then has a class, and there are boxes beside and behind the vehicle.
 
     Attributes
     ----------
+    sensor : SensorProfile
+    on_mismatch, score_threshold, adapt, boxes_from, full_turn
+        As given; read-only.
     cards : tuple of ModelCard
     sessions : tuple of Session
-        The networks as they are loaded; not to be run from outside.
+        The loaded networks. Do not run them from outside.
     providers : mapping
-        What really runs, by model name: ``"pointseg int8, CPUExecutionProvider"``.
+        What runs, by model name: ``"pointseg int8, CPUExecutionProvider"``.
 
     Raises
     ------
+    OptionError
+        An option is unknown or out of range, or the models do not go together.
     ModelError, ProviderError, SensorError, MissingExtraError
-        From construction only.
+        A model, a provider or a sensor is not there or does not fit. Like OptionError from construction only.
     PointsError, InferenceError, FitnessError
-        From a call.
+        From a call only.
 
     Examples
     --------
@@ -126,6 +172,17 @@ class Perceiver:
     (123397,)
     """
 
+    sensor: SensorProfile
+    on_mismatch: OnMismatch
+    score_threshold: float | None
+    adapt: Adaptation
+    boxes_from: BoxesFrom
+    full_turn: bool
+    cards: tuple[ModelCard, ...]
+    sessions: tuple[Session, ...]
+    providers: Mapping[str, str]
+
+    @_renamed(all_around="full_turn")
     def __init__(
         self,
         models: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None,
@@ -134,52 +191,61 @@ class Perceiver:
         provider: str = "auto",
         precision: str = "auto",
         n_threads: int | None = None,
-        on_mismatch: Literal["warn", "raise", "ignore"] = "warn",
+        on_mismatch: OnMismatch = "warn",
         score_threshold: float | None = None,
         adapt: Adaptation = "both",
         boxes_from: BoxesFrom = "both",
-        all_around: bool = False,
+        full_turn: bool = False,
     ) -> None:
-        if adapt not in ADAPTATIONS:
-            raise ValueError(f"adapt is {adapt!r}; expected one of {', '.join(ADAPTATIONS)}")
-        if on_mismatch not in ("warn", "raise", "ignore"):
-            raise ValueError(f"on_mismatch is {on_mismatch!r}; expected warn, raise or ignore")
-        if boxes_from not in ("both", "network", "clusters"):
-            raise ValueError(f"boxes_from is {boxes_from!r}; expected both, network or clusters")
-        if score_threshold is not None and not 0.0 <= score_threshold <= 1.0:
-            raise ValueError(f"score_threshold is {score_threshold}; expected a number in 0..1")
+        _check_choice("adapt", adapt, ADAPTATIONS, {"neither": "none"})
+        _check_choice("on_mismatch", on_mismatch, ("warn", "raise", "ignore"))
+        _check_choice("boxes_from", boxes_from, ("both", "network", "clusters"))
+        _check_choice("full_turn", full_turn, (True, False))
+        if score_threshold is not None and not (isinstance(score_threshold, Real) and 0.0 <= score_threshold <= 1.0):
+            raise OptionError(f"score_threshold is {score_threshold!r}; expected a number in 0..1, or None")
+        if n_threads is not None and not (isinstance(n_threads, Integral) and n_threads >= 1):
+            raise OptionError(f"n_threads is {n_threads!r}; expected a whole number of at least 1, or None")
+        for option, given in (("provider", provider), ("precision", precision)):
+            if not isinstance(given, str):
+                raise OptionError(f"{option} is {given!r}; expected a str")
+        wanted = _listed(models)
         self.sensor = get_sensor(sensor)
         self.on_mismatch = on_mismatch
         self.score_threshold = score_threshold
+        self.adapt = adapt
         self._interpolates = adapt in ("both", "interpolation")
         self._renders = self.sensor.remission is not None and adapt in ("both", "remission")
         self.boxes_from = boxes_from
-        self.all_around = all_around
+        self.full_turn = full_turn
         gaps_deg = [upper - lower for upper, lower in pairwise(self.sensor.elevations_deg)]
-        # Neighbouring beams and columns meet on one object, with one missing between them.
+        # So that neighbouring beams and columns on one object are linked, also with one missing between them.
         self._distance_per_m = 2.0 * math.radians(max(np.median(gaps_deg or [0.0]), 360.0 / self.sensor.columns))
-        given = [models] if isinstance(models, (str, os.PathLike)) else list(DEFAULT if models is None else models)
         self._networks = [
-            self._load(Session(model, provider, precision=precision, n_threads=n_threads)) for model in given
+            self._load(Session(model, provider, precision=precision, n_threads=n_threads)) for model in wanted
         ]
         views = [n.session.card.view.kind for n in self._networks]
         if not views or len(views) != len(set(views)):
-            raise ValueError(
-                f"models {[str(m) for m in given]} have views {views}; expected at least one model, at most one a view"
+            raise OptionError(
+                f"models {[str(m) for m in wanted]} have views {views}; expected at least one model, at most one a view"
             )
         if boxes_from == "clusters" and "range_image" not in views:
-            raise ValueError("boxes_from is 'clusters', which takes a class for every point; add a range-image model")
-        self.sessions: tuple[Session, ...] = tuple(n.session for n in self._networks)
-        self.cards: tuple[ModelCard, ...] = tuple(n.session.card for n in self._networks)
+            raise OptionError("boxes_from is 'clusters', which needs a class for every point; add a range-image model")
+        self.sessions = tuple(n.session for n in self._networks)
+        self.cards = tuple(n.session.card for n in self._networks)
         self.providers = MappingProxyType({n.session.card.name: n.session.description for n in self._networks})
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
         self._lock = threading.Lock()
-        # The first call would compile the kernels; a scan of two points, in every view, gets that over with here. The
-        # networks have run already, on their golden inputs; the answers to those will do.
+        # Compile every kernel here and not in the first call, with a scan of two points. The networks have run already,
+        # on their golden inputs: those outputs are decoded.
         warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
         self._perceive(warm_up, None, check=self._to_check > 0, infer=False)
         if boxes_from != "network" and "range_image" in views:
             self._find_objects(*self._post_on_floor())
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not name.startswith("_") and "_lock" in vars(self):  # the last attribute of construction
+            raise AttributeError(f"{name} of a Perceiver cannot be set after construction; make another Perceiver")
+        super().__setattr__(name, value)
 
     def _load(self, session: Session) -> _Network:
         card = session.card
@@ -203,7 +269,16 @@ class Perceiver:
             x, y, z [m] in the sensor frame, remission in the sensor's raw unit. Left unchanged. Rows that are not
             finite are counted, labelled 0 and otherwise ignored; an empty scan gives an empty perception.
         stamp_s : float or None
-            Passed through.
+            Time of the scan [s], for the tracker; returned in the perception.
+
+        Raises
+        ------
+        PointsError
+            ``points`` is no scan.
+        InferenceError
+            A network failed, or answered with values that are not finite.
+        FitnessError
+            The scan is unlike the training scans, and ``on_mismatch`` is ``"raise"``.
         """
         scan = as_points(points)
         with self._lock:
@@ -229,9 +304,10 @@ class Perceiver:
         boxes: tuple[Box, ...] = ()
         for network in self._networks:
             if isinstance(network.session.card.view, TopViewGeometry):
-                top_view, boxes = self._see_from_above(network, scan, watch, infer)
+                top_view, boxes = self._label_cells(network, scan, watch, infer)
             else:
-                points = (self._look_around if self.all_around else self._see_from_sensor)(network, scan, watch, infer)
+                label = self._label_full_turn if self.full_turn else self._label_sector
+                points = label(network, scan, watch, infer)
         if points is not None and self.boxes_from != "network":
             clustered = self._find_objects(scan, points)
             boxes = join_boxes(boxes, self._new_to_networks(clustered)) if self.boxes_from == "both" else clustered
@@ -260,10 +336,10 @@ class Perceiver:
         network.projector.fill(scan, network.session.input, network.index, pixel)
         return pixel
 
-    def _see_from_above(
+    def _label_cells(
         self, network: _Network, scan: NDArray[np.float32], watch: _Stopwatch, infer: bool
     ) -> tuple[TopView, tuple[Box, ...]]:
-        """SSADNet: segmentation map and boxes."""
+        """Class of every cell of the top view, and boxes (SSADNet)."""
         card = network.session.card
         assert isinstance(card.view, TopViewGeometry)
         self._project(network, scan)
@@ -276,17 +352,17 @@ class Perceiver:
         view = TopView(labels, card.classes, card.view.cell_m, card.view.x_range_m, card.view.y_range_m)
         return view, tuple(found)
 
-    def _see_from_sensor(
+    def _label_sector(
         self, network: _Network, scan: NDArray[np.float32], watch: _Stopwatch, infer: bool
     ) -> PointLabels:
-        """PointSeg: a class for every pixel, carried back to every point and cleaned."""
+        """Class of every point in the range image: decoded for pixels, cleaned, carried to points (PointSeg)."""
         card = network.session.card
         assert isinstance(card.view, RangeImageGeometry)
         pixel = self._project(network, scan)
         watch.lap("project")
         if network.interpolator is not None:
             assert isinstance(network.projector, RangeImageProjector)
-            # Points between are in the image alone; from here on there are only those that came.
+            # Interpolated points are in the image only; refinement uses the points of the scan.
             dense, filled = network.interpolator.fill(scan, network.index)
             network.projector.fill_image(dense, filled, network.session.input)
             watch.lap("adapt")
@@ -295,31 +371,33 @@ class Perceiver:
         ((kind, raw),) = outputs.items()
         labels, _ = decode_classes(raw, kind, model=card.name)
         watch.lap("decode")
-        full_turn = card.view.azimuth_left_deg - card.view.azimuth_right_deg == 360.0
-        cleaned = remove_outliers(scan, network.index, labels, card.classes, full_turn=full_turn)
-        labelled = label_points(scan, pixel, network.index, cleaned, full_turn=full_turn)
+        edges_meet = card.view.azimuth_left_deg - card.view.azimuth_right_deg == 360.0
+        cleaned = remove_outliers(scan, network.index, labels, card.classes, full_turn=edges_meet)
+        labelled = label_points(scan, pixel, network.index, cleaned, full_turn=edges_meet)
         watch.lap("refine")
         return PointLabels(labelled, pixel >= 0, card.classes)
 
-    def _look_around(self, network: _Network, scan: NDArray[np.float32], watch: _Stopwatch, infer: bool) -> PointLabels:
-        """What a network that looks ahead sees as the scan is turned; where two views meet, the earlier counts."""
+    def _label_full_turn(
+        self, network: _Network, scan: NDArray[np.float32], watch: _Stopwatch, infer: bool
+    ) -> PointLabels:
+        """Run the network once for each sector, with the scan turned; a point of two sectors keeps its first label."""
         view = network.session.card.view
         assert isinstance(view, RangeImageGeometry)
         width_deg = view.azimuth_left_deg - view.azimuth_right_deg
-        ahead = self._see_from_sensor(network, scan, watch, infer)
+        ahead = self._label_sector(network, scan, watch, infer)
         labels, in_view = ahead.labels, ahead.in_view
         for k in range(1, math.ceil(360.0 / width_deg)):
             cos, sin = math.cos(math.radians(k * width_deg)), math.sin(math.radians(k * width_deg))
             turned = scan.copy()
             turned[:, 0] = cos * scan[:, 0] + sin * scan[:, 1]
             turned[:, 1] = cos * scan[:, 1] - sin * scan[:, 0]
-            aside = self._see_from_sensor(network, turned, watch, infer)
+            aside = self._label_sector(network, turned, watch, infer)
             labels = np.where(in_view, labels, aside.labels)
             in_view = in_view | aside.in_view
         return PointLabels(labels, in_view, ahead.classes)
 
     def _post_on_floor(self) -> tuple[NDArray[np.float32], PointLabels]:
-        """Nine points of a car on a floor, enough for every kernel of `_find_objects` to be compiled."""
+        """Nine points of a car on a floor: enough to compile every kernel of `_find_objects`."""
         x, y = np.meshgrid(np.arange(-8.0, 8.0), np.arange(-8.0, 8.0))
         scan = np.zeros((x.size + 9, 4), np.float32)
         scan[:-9, 0], scan[:-9, 1], scan[:-9, 2] = x.ravel(), y.ravel(), -self.sensor.mount_height_m
@@ -328,9 +406,10 @@ class Perceiver:
         return scan, PointLabels(labels, np.ones(len(scan), np.bool_), ("background", "car"))
 
     def _find_objects(self, scan: NDArray[np.float32], points: PointLabels) -> tuple[Box, ...]:
-        """KUL-Seg 5.2: boxes around what stands on the ground, in clusters that one class prevails in.
+        """Boxes around clusters of points above the ground in which one class prevails (KUL-Seg 5.2).
 
-        Points out of the network's view take part, as background: what the view's edge cuts gets a whole box, or none.
+        Points out of the network's view count as background. An object cut by the view's edge therefore gets a box for
+        the whole object, or none.
         """
         ground = find_ground(scan, mount_height_m=self.sensor.mount_height_m)
         return objects_from_points(
@@ -344,7 +423,7 @@ class Perceiver:
         )
 
     def _new_to_networks(self, boxes: tuple[Box, ...]) -> list[Box]:
-        """Those that no network looks for: of another class, or out of its view."""
+        """Boxes that no network detects: of another class, or out of its view."""
         looking = [(c.view, c.box_classes) for c in self.cards if isinstance(c.view, TopViewGeometry)]
         return [
             b for b in boxes if not any(b.label in classes and view.holds(*b.center[:2]) for view, classes in looking)

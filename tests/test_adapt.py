@@ -428,13 +428,13 @@ def test_labels_are_of_the_points_that_came(name: str) -> None:
     before = points.copy()
     own = replace(get_sensor(name), remission_range=(0.0, 1.0), remission=None)  # the simulator's is the HDL-64E's
     answers = {}
-    for adapt in ("neither", "interpolation"):
+    for adapt in ("none", "interpolation"):
         perceive = Perceiver("pointseg", sensor=own, provider="cpu", n_threads=1, on_mismatch="ignore", adapt=adapt)
         answers[adapt] = perceive(points)
         assert ("adapt" in answers[adapt].stage_ms) == (adapt == "interpolation")
         assert perceive(points[:0]).points.labels.shape == (0,)
     np.testing.assert_array_equal(points, before)
-    one, other = answers["neither"].points, answers["interpolation"].points
+    one, other = answers["none"].points, answers["interpolation"].points
     assert one.labels.shape == other.labels.shape == (len(points),)
     np.testing.assert_array_equal(one.in_view, other.in_view)
     assert (one.labels != other.labels).any()
@@ -444,7 +444,7 @@ def test_the_training_sensor_is_left_alone() -> None:
     points = simulate(random_scene(4, "urban"), "hdl-64e", seed=4).points
     answers = [
         Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore", adapt=adapt)(points)
-        for adapt in ("both", "neither")
+        for adapt in ("both", "none")
     ]
     np.testing.assert_array_equal(answers[0].points.labels, answers[1].points.labels)
     assert all("adapt" not in answer.stage_ms for answer in answers)
@@ -463,7 +463,7 @@ def test_a_rendered_scan_is_seen_as_the_reference_would_be() -> None:
     rendered = Perceiver("pointseg", sensor=sensor, **settings)(distorted)
     assert "adapt" in rendered.stage_ms
     assert (rendered.points.labels == given.labels).mean() > 0.999
-    plain = Perceiver("pointseg", sensor=sensor, adapt="neither", **settings)(distorted)
+    plain = Perceiver("pointseg", sensor=sensor, adapt="none", **settings)(distorted)
     assert (plain.points.labels == given.labels).mean() < 0.999
 
 
@@ -492,7 +492,7 @@ def test_adapt_fit_writes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureF
     run = ["run", str(scans / "0.bin"), "--sensor", str(out), "--model", "pointseg", "--provider", "cpu", "--json"]
     assert cli.main([*run, "--on-mismatch", "ignore"]) == 0
     assert "adapt" in json.loads(capsys.readouterr().out)["stage_ms"]
-    assert cli.main([*run, "--on-mismatch", "ignore", "--adapt", "neither"]) == 0
+    assert cli.main([*run, "--on-mismatch", "ignore", "--adapt", "none"]) == 0
     assert "adapt" not in json.loads(capsys.readouterr().out)["stage_ms"]
     for wrong in ([*fit[:-1], str(tmp_path / "mine.txt")], [*fit[:4], "vlp-17", *fit[5:]], [*fit[:6], "x", *fit[7:]]):
         assert cli.main(wrong) == 2
@@ -528,7 +528,7 @@ def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     out = tmp_path / "figures.json"
     assert cli.main(["eval", "sensors", *datasets, "--json", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert printed.count("neither") == printed.count("both") == 3
+    assert printed.count("none") == printed.count("both") == 3
     figures = json.loads(out.read_text())
     simulated, boxed, pictured = (figures[name] for name in datasets)
     assert simulated["n_scans"] == 1
@@ -536,7 +536,7 @@ def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert (boxed["n_scans"], pictured["n_scans"]) == (4, 4)
     for told in (boxed, pictured):
         assert told["function"] is None
-        assert told["both"] == told["neither"] == told["remission"] == told["interpolation"]
+        assert told["both"] == told["none"] == told["remission"] == told["interpolation"]
         assert told["both"]["iou"]["car"] > 0.5
     assert pictured["both"]["iou"]["cyclist"] is None  # two-wheelers are not told apart from their riders
     for source in ("vlp-16", "vlp-16=simulation:0", f"vlp-16={tmp_path}", "vlp-17=simulation"):

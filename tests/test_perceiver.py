@@ -434,9 +434,9 @@ def test_a_car_that_the_views_edge_cuts_gets_a_whole_box_or_none(seen: float, n_
         np.testing.assert_allclose(box.size[0], 4.0, atol=0.05)
 
 
-def test_boxes_all_around(scan: SimulatedScan) -> None:
+def test_boxes_all_around_the_vehicle(scan: SimulatedScan) -> None:
     ahead = Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore")
-    around = Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore", all_around=True)
+    around = Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore", full_turn=True)
     seen, every = ahead(scan.points), around(scan.points)
     assert seen.points is not None
     assert every.points is not None

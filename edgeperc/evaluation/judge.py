@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..card import TopViewGeometry
 from ..decode import decode_classes
-from ..errors import EdgepercError, ModelError
+from ..errors import ModelError
 from ..geometry import inside
 from ..perceiver import BoxesFrom, Perceiver
 from ..perception import Perception, PointLabels, TopView
@@ -252,12 +252,7 @@ class _Network:
 
 
 def _perceiver(models: Sequence[str | Path], provider: str, boxes_from: BoxesFrom = "network") -> Perceiver:
-    try:
-        return Perceiver(list(models), sensor="hdl-64e", provider=provider, on_mismatch="ignore", boxes_from=boxes_from)
-    except EdgepercError:
-        raise
-    except ValueError as exc:  # two models of one view; no labels to cluster by
-        raise ModelError(str(exc)) from exc
+    return Perceiver(list(models), sensor="hdl-64e", provider=provider, on_mismatch="ignore", boxes_from=boxes_from)
 
 
 def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
