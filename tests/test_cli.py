@@ -1,8 +1,12 @@
 from __future__ import annotations
 
+import argparse
+import hashlib
 import io
 import json
 import os
+import shlex
+import shutil
 import subprocess
 import sys
 import warnings
@@ -15,16 +19,19 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from edgeperc import __version__
+from edgeperc import __version__, cli, session, tuning, zoo
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
-from edgeperc import cli
+from edgeperc.cli.arguments import DEFAULT, PRECISIONS, PROVIDERS
 from edgeperc.cli.eval import _figure_lines
-from edgeperc.cli.output import Progress
-from edgeperc.cli.run import _output_names
-from edgeperc.errors import InferenceError, ModelFileError, PointsError
+from edgeperc.cli.main import build_parser, in_options
+from edgeperc.cli.output import progress, say
+from edgeperc.cli.scans import find_scans, output_names
+from edgeperc.errors import InferenceError, ModelFileError, OptionError, PointsError
 from edgeperc.fitness import FitnessProfile
 from edgeperc.perception import Box, Perception, PointLabels, TopView
 from edgeperc.readers import captures
+from edgeperc.sensor import SENSORS
+from edgeperc.zoo import Variant
 
 POINTSEG = ModelCard(
     name="pointseg",
@@ -40,8 +47,9 @@ POINTSEG = ModelCard(
         "drives": ["a", "b"],
         "seen": dict.fromkeys("abcdefghijklmnopqrstuvwxyz", 0),
     },
-    metrics={"iou": {"car": 0.65123}},
+    metrics={"real": {"n_frames": 21, "points": {"all": {"car": {"iou": 0.65123, "n_objects": 3}}}}},
     parity={"max_abs_diff": 1.5e-5},
+    precisions={"int8": {"label_agreement": 0.99953, "loss": 0.1}},
 )
 SSADNET = ModelCard(
     name="ssadnet",
@@ -69,7 +77,7 @@ class FakePerceiver:
             if name not in known:
                 raise ModelFileError(f"no model is called {name!r}.\nShipped: pointseg, ssadnet.")
         if len(set(models)) < len(self.given[0]):
-            raise ValueError("two models of one view")
+            raise OptionError(f"models {self.given[0]} have one view; n_threads is {n_threads}")
         self.cards = tuple(known[name] for name in models)
         FakePerceiver.made.append(self)
 
@@ -214,10 +222,12 @@ def test_run_prints_a_line_a_scan(
     assert "boxes: 1 car" in lines[1]
     assert "car 600, pedestrian 0, cyclist 0" in lines[1]
     assert fake.made[0].given == (["ssadnet", "pointseg"], "os1-64", "cpu", 2, "ignore")
-    assert run("run", scans[0], "--boxes-from", "clusters", "--all-around") == 0
+    assert (
+        run("run", scans[0], "--boxes-from", "clusters", "--full-turn", "--precision", "bf16", "--adapt", "none") == 0
+    )
     assert [one.more for one in fake.made] == [
-        {"adapt": "both", "boxes_from": "both", "all_around": False},
-        {"adapt": "both", "boxes_from": "clusters", "all_around": True},
+        {"precision": "auto", "adapt": "both", "boxes_from": "both", "full_turn": False},
+        {"precision": "bf16", "adapt": "none", "boxes_from": "clusters", "full_turn": True},
     ]
 
 
@@ -343,7 +353,7 @@ def test_live(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         write_scan(folder / f"{k}.bin", 10 + k)
     assert run("run", folder, "--live", "--rate", 1000, "--json") == 0
     answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert {answer["scan"] for answer in answers} == {str(folder)}
+    assert [answer["scan"] for answer in answers] == [str(folder / f"{a['n_points'] - 10}.bin") for a in answers]
     assert answers[-1]["n_points"] == 13
     assert answers[-1]["stamp_s"] == pytest.approx(0.003)
     last = answers[-1]["live"]
@@ -356,7 +366,7 @@ def test_live(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     captured = capsys.readouterr()
     assert "4.bin" in captured.err
     words = captured.out.splitlines()[-1].split("  ")
-    assert words[0] == str(folder)
+    assert words[0] == str(folder / "3.bin")
     assert [word.split()[0] for word in words[1:5]] == ["age_ms", "health", "scans", "dropped"]
     assert words[5] == "13 points"
 
@@ -392,10 +402,10 @@ def test_scans_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
     assert run("run", *folders, "--out", out, "--labels") == 0
     sizes = {file.relative_to(out).as_posix(): file.stat().st_size // 4 for file in out.rglob("*.label")}
     assert sizes == {
-        "day1/velodyne/000.label": 10,
-        "day1/velodyne/001.label": 20,
-        "day2/velodyne/000.label": 11,
-        "day2/velodyne/001.label": 21,
+        "day1/000.label": 10,
+        "day1/001.label": 20,
+        "day2/000.label": 11,
+        "day2/001.label": 21,
     }
 
 
@@ -409,12 +419,14 @@ def test_scans_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
         (["/d/A.bin", "/e/a.bin"], ["d/A", "e/a"]),
         (["/x/d/a.bin", "/y/d/a.bin", "/y/d/b.bin"], ["x/d/a", "y/d/a", "y/d/b"]),
         (["/a.bin", "/d/a.bin"], ["a", "d/a"]),
+        (["/00/velodyne/a.bin", "/01/velodyne/a.bin"], ["00/a", "01/a"]),
+        (["/d/velodyne/a.bin", "/d/a.bin"], ["velodyne/a", "d/a"]),
         (["/d/.bin"], [".bin"]),
         ([], []),
     ],
 )
-def test_output_names(given: list[str], names: list[str]) -> None:
-    assert [name.as_posix() for name in _output_names([Path(scan) for scan in given])] == names
+def testoutput_names(given: list[str], names: list[str]) -> None:
+    assert [name.as_posix() for name in output_names([Path(scan) for scan in given])] == names
 
 
 def test_a_scan_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -442,7 +454,7 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: t
         assert words in capsys.readouterr().err
     for arguments, words in [
         (("--model", "nonesuch"), "no model is called 'nonesuch'. Shipped: pointseg, ssadnet."),
-        (("--model", "pointseg", "--model", "pointseg"), "two models of one view"),
+        (("--model", "pointseg", "--model", "pointseg"), "models ['pointseg', 'pointseg'] have one view; --threads is"),
         (("--model", "ssadnet", "--labels", "--out", tmp_path / "out"), "add a range-image model"),
     ]:
         assert run("run", scan, *arguments) == 2
@@ -521,19 +533,50 @@ def test_names_that_are_no_text(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert len(list((tmp_path / "out").iterdir())) == 1
 
 
-def test_progress_bar_only_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = io.StringIO()
-    terminal.isatty = lambda: True  # type: ignore[method-assign]
-    monkeypatch.setattr(sys, "stderr", terminal)
-    progress = Progress(4)
-    progress.show(2)
-    assert f"[{'#' * 15}{' ' * 15}] 2/4" in terminal.getvalue()
-    progress.clear()
-    assert terminal.getvalue().endswith("\r\x1b[K")
-    assert not Progress(1).live
-    monkeypatch.setattr(sys, "stderr", io.StringIO())
-    Progress(4).show(1)
-    assert sys.stderr.getvalue() == ""
+class Terminal(io.StringIO):
+    """Text that a terminal would show."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_progress_bar_is_drawn_on_a_terminal_below_the_lines(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("tqdm")
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with progress("file") as show:
+        show(0, 4)
+        show(2, 4)
+        say("a line")
+    shown = sys.stderr.getvalue()  # type: ignore[attr-defined]
+    assert "0/4" in shown
+    assert "2/4" in shown
+    assert "file" in shown
+    assert shown.endswith("\r")  # nothing of the bar stays
+    assert capsys.readouterr().out == "a line\n"
+
+
+@pytest.mark.parametrize("why", ["no terminal", "one thing", "no tqdm"])
+def test_no_progress_bar(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", io.StringIO() if why == "no terminal" else Terminal())
+    if why == "no tqdm":
+        monkeypatch.setitem(sys.modules, "tqdm", None)
+    with progress() as show:
+        show(0, 1 if why == "one thing" else 4)
+        show(1, 1 if why == "one thing" else 4)
+    assert sys.stderr.getvalue() == ""  # type: ignore[attr-defined]
+
+
+def test_run_shows_progress_beside_its_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("tqdm")
+    scans = [write_scan(tmp_path / f"{k}.bin") for k in range(3)]
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    assert run("run", *scans) == 0
+    assert "1/3" in sys.stderr.getvalue()  # type: ignore[attr-defined]
+    assert [line.split("  ")[0] for line in capsys.readouterr().out.splitlines()] == [str(scan) for scan in scans]
 
 
 @pytest.fixture
@@ -552,7 +595,7 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "100 m2 of the 40 x 20 m ahead" in out
     assert "20.2 m away:  20.0 m ahead,  3.0 m right" in out
     assert "heading   17 deg" in out
-    assert "(there are 1,000)" in out
+    assert "(true: 1,000)" in out
     assert "ssadnet: CPUExecutionProvider (fp32)" in out
     for name in ("scene.png", "scene.html"):
         assert str(tmp_path / "demo" / name) in out
@@ -576,45 +619,67 @@ def test_demo_without_matplotlib(
 def fake_models(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     file = tmp_path / "pointseg.onnx"
     file.write_bytes(bytes(2_500_000))
+    file.with_stem("pointseg-int8").write_bytes(bytes(700_000))
     file.with_stem("ssadnet").write_bytes(bytes(10))
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "cache"))
 
-    class FakeSession:
-        def __init__(self, path: Path | str, provider: str) -> None:
-            assert provider == "cpu"
-            path = Path(path)
-            self.path, self.sha256, self.golden_deviation = path, "ab" * 32, 2e-6
-            self.card = POINTSEG if path.stem == "pointseg" else SSADNET
-            self.input = np.zeros((3, 3, 8), np.float32)
+    def listed() -> tuple[Variant, ...]:
+        return (
+            Variant(file, POINTSEG),
+            Variant(file.with_stem("pointseg-int8"), replace(POINTSEG, precision="int8")),
+            Variant(file.with_stem("ssadnet"), SSADNET),
+        )
 
-    def model_path(name: str) -> Path:
-        if name not in ("pointseg", "ssadnet"):
-            raise ModelFileError(f"no model is called {name!r}")
-        return file.with_stem(name)
+    def resolve(model: str) -> tuple[Variant, ...]:
+        found = tuple(each for each in listed() if each.name in (Path(model).stem, model))
+        if not found:
+            raise ModelFileError(f"no model is called {model!r}")
+        return found
 
-    models = SimpleNamespace(model_path=model_path, shipped_models=lambda: ("pointseg", "ssadnet"))
-    monkeypatch.setitem(sys.modules, "edgeperc.zoo", models)
-    monkeypatch.setitem(sys.modules, "edgeperc.session", SimpleNamespace(Session=FakeSession))
+    monkeypatch.setattr(zoo, "listed", listed)
+    monkeypatch.setattr(zoo, "resolve", resolve)
+
+
+def rows_of(text: str) -> dict[str, str]:
+    """First words of lines, and what follows."""
+    return dict((*line.split(None, 1), "")[:2] for line in text.splitlines())
 
 
 @pytest.mark.usefixtures("fake_models")
 @pytest.mark.parametrize("thing", ["pointseg", "pointseg.onnx"])
 def test_info_of_a_model(thing: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("info", thing if thing == "pointseg" else tmp_path / thing) == 0
-    rows = dict(line.split(None, 1) for line in capsys.readouterr().out.splitlines())
-    assert rows["model"] == "pointseg 1.2.3"
-    assert rows["file"].endswith("pointseg.onnx (2.5 MB)")
-    assert rows["sha256"] == "ab" * 32
+    rows = rows_of(capsys.readouterr().out)
+    assert rows["model"] == "pointseg 1.2.3: a class for every point (car, pedestrian, cyclist)"
+    assert rows["variants"] == "fp32 2.5 MB, int8 0.7 MB"
+    assert rows["sha256"] == hashlib.sha256(bytes(2_500_000)).hexdigest()
     assert rows["view"] == "range_image: 3 beams from 2 to -10 deg, azimuths 45 to -45 deg"
     assert rows["input"] == "3 x 3 x 8: x, y, z"
     assert rows["outputs"] == "logits (class_logits)"
     assert rows["classes"] == "background, car, pedestrian, cyclist"
-    assert rows["training.licence"] == "CC0"
-    assert rows["training.frames"] == "40 values"
-    assert rows["training.drives"] == "a, b"
-    assert rows["training.seen"] == "26 entries"
-    assert rows["metrics.iou.car"] == "0.6512"
-    assert rows["parity.max_abs_diff"] == "1.5e-05"
-    assert rows["here"].startswith("answers within 2e-06 standard deviations")
+    assert rows["data"] == "streets"
+    assert rows["licence"] == "CC0"
+    assert rows["on"] == "KITTI  21 scans, %: IoU car 65.1"
+    assert rows["int8"] == "99.95 % of the labels as in fp32, 0.1 points lost"
+    assert "frames" not in rows
+
+
+@pytest.mark.parametrize("name", zoo.shipped_models())
+def test_info_of_a_shipped_model_fits_a_screen(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info", name) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert 8 < len(lines) <= 24
+    assert max(map(len, lines)) <= 100
+
+
+def test_info_folds_what_is_long(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    card = replace(POINTSEG, training={"data": "street " * 100}, classes=tuple(f"class {k}" for k in range(250)))
+    monkeypatch.setattr(zoo, "resolve", lambda model: (Variant(Path(__file__), card),))
+    assert run("info", "pointseg") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 24
+    assert max(map(len, lines)) <= 100
+    assert sum(line.endswith(" ...") for line in lines) == 3  # classes are in two rows
 
 
 @pytest.mark.usefixtures("fake_models")
@@ -632,26 +697,27 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     points = np.array([[3, 4, 0, 10], [0, 10, 10, 255], [-6, 0, 8, 51], [np.nan, 0, 0, 0]], np.float32)
     np.save(tmp_path / "scan.npy", points)
     assert run("info", tmp_path / "scan.npy", "--sensor", "os1-64") == 0
-    out = capsys.readouterr().out
-    rows = dict(line.split(None, 1) for line in out.splitlines())
+    rows = rows_of(capsys.readouterr().out)
     assert rows["points"] == "4, of which 1 are not finite"
-    assert rows["x"] == "-6.0 .. 3.0 m"
-    assert rows["range"] == "5.0 .. 14.1 m, median 10.0"
-    assert rows["remission"].startswith("least 10, 5 % ")
+    assert rows["extent"] == "x -6.0 .. 3.0, y 0.0 .. 10.0, z 0.0 .. 10.0 m"
+    assert rows["range"] == "5.0 .. 14.1 m, median 10.0 m"
+    assert rows["remission"].startswith("min 10, 5 % ")
     assert rows["beams"].endswith("rows of points (os1-64: 64)")
     assert rows["pointseg"] == "as a scan of os1-64: it has 32 beams"
-    assert rows["ssadnet"].startswith("its card does not say")
+    assert rows["ssadnet"].startswith("its card does not describe")
     ((scaled, profile, sensor),) = checked
     np.testing.assert_allclose(scaled[:3, 3], np.array([10, 255, 51]) / 255, rtol=1e-6)
     assert (profile, sensor) == ({"n_beams": 64}, "os1-64")
+    assert run("info", tmp_path / "scan.npy", "--sensor", "os1-64", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["range_m"] == pytest.approx([5.0, 10.0, 14.1421], abs=1e-4)
+    assert (document["n_points"], document["n_not_finite"]) == (4, 1)
+    assert document["models"] == {"pointseg": ["it has 32 beams"], "ssadnet": None}
 
 
-def test_info_prints_a_card_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.save(tmp_path / "scan.npy", np.zeros((1, 4), np.float32))
-    assert run("info", "ssadnet", tmp_path / "scan.npy", "--json") == 1
-    captured = capsys.readouterr()
-    assert ModelCard.from_json(captured.out).name == "ssadnet"
-    assert "scan.npy is a scan" in captured.err
+def test_info_prints_a_card_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info", "ssadnet", "--json") == 0
+    assert ModelCard.from_json(capsys.readouterr().out).to_json() == zoo.resolve("ssadnet")[0].card.to_json()
 
 
 @pytest.mark.usefixtures("fake_models")
@@ -663,6 +729,246 @@ def test_info_goes_on_after_what_it_does_not_know(tmp_path: Path, capsys: pytest
     assert [line.split(":")[0] for line in captured.err.splitlines()] == ["edgeperc", "edgeperc"]
     assert "0, of which 0 are not finite" in captured.out
     assert "top_view: x 6..46 m, y -10..10 m, cells of 0.1 m" in captured.out
-    assert "boxes    car, van, score from 0.3" in captured.out
+    assert "car, van, score from 0.3" in captured.out
     assert run("info", empty, "--sensor", "nonesuch") == 2
     assert "nonesuch" in capsys.readouterr().err
+
+
+def test_info_and_lists_need_no_onnxruntime(tmp_path: Path) -> None:
+    scan = write_scan(tmp_path / "a.bin", 40)
+    code = (
+        "import sys; from edgeperc.cli import main\n"
+        f"for words in (['info', 'pointseg', {str(scan)!r}], ['models'], ['sensors']): assert main(words) == 0\n"
+        "sys.exit('opened' if 'onnxruntime' in sys.modules else 0)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+# --- models, sensors, providers, completion --------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("fake_models")
+def test_models_are_listed_with_what_was_measured_here(capsys: pytest.CaptureFixture[str]) -> None:
+    entry = {"provider": "cpu", "precision": "int8", "n_threads": 2, "p50_ms": 7.25}
+    digest = zoo.digest(zoo.resolve("pointseg"))
+    tuning.write_settings(tuning.settings_path(), tuning.fingerprint(), {digest: entry})
+    assert run("models") == 0
+    heading, pointseg, ssadnet = capsys.readouterr().out.splitlines()
+    assert heading.split()[:2] == ["name", "default"]
+    assert pointseg.split()[:2] == ["pointseg", "yes"]
+    assert "fp32 2.5, int8 0.7" in pointseg
+    assert "7.2 ms, cpu int8" in pointseg
+    assert pointseg.endswith("CC0")
+    assert "boxes of car, van" in ssadnet
+    assert run("models", "--json") == 0
+    first, second = map(json.loads, capsys.readouterr().out.splitlines())
+    assert (first["name"], first["ms"], first["default"]) == ("pointseg", 7.25, True)
+    assert second["ms"] is None
+
+
+def test_sensors_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("sensors") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[1:]] == [*SENSORS]
+    assert [line.split()[0] for line in lines[1:] if line.split()[1] == "yes"] == ["hdl-64e"]
+    assert run("sensors", "--json") == 0
+    records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [record["name"] for record in records] == [*SENSORS]
+    assert records[0]["n_beams"] == 64
+
+
+def test_providers_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("onnxruntime")
+    assert run("providers", "--json") == 0
+    records = {record["name"]: record for record in map(json.loads, capsys.readouterr().out.splitlines())}
+    assert {*records} == {*session.PROVIDERS}
+    assert records["cpu"]["available"]
+    assert run("providers") == 0
+    assert len(capsys.readouterr().out.splitlines()) == 1 + len(records)
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
+def test_completion_knows_commands_options_and_names(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("shtab")
+    assert run("completion", shell) == 0
+    script = capsys.readouterr().out
+    for word in ("eval-tracking", "full-turn", "os1-64", "ssadnet", "openvino", "bf16"):
+        assert word in script
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["mod"], {"models"}),
+        (["run", "--full"], {"--full-turn"}),
+        (["run", "--precision", "b"], {"bf16"}),
+        (["run", "--model", "ssad"], {"ssadnet"}),
+        (["run", "--sensor", "pandarx"], {"pandarxt-32"}),
+        (["run", "--model", "ssadnet", "sca"], {"scan.bin"}),
+        (["info", "sca"], {"scan.bin"}),
+        (["eval-tracking", "--gif", "sca"], {"scan.bin"}),
+    ],
+)
+def test_bash_completes(words: list[str], found: set[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("shtab")
+    assert run("completion", "bash") == 0
+    (tmp_path / "scan.bin").touch()
+    (tmp_path / "completion").write_text(capsys.readouterr().out)
+    code = (
+        f"source ./completion; COMP_WORDS=(edgeperc {' '.join(words)}); COMP_CWORD={len(words)}; "
+        '_shtab_edgeperc 2>/dev/null; printf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(["bash", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert {*done.stdout.split()} == found, done.stderr
+
+
+def test_completion_names_its_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert run("completion", "bash") == 2
+    assert "pip install 'edgeperc[completion]'" in capsys.readouterr().err
+
+
+# --- data sets -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("files", "names"),
+    [
+        (
+            ["training/velodyne/000000.bin", "testing/velodyne/000000.bin", "training/label_2/000000.txt"],
+            ["training/000000", "testing/000000"],
+        ),
+        (["sequences/01/velodyne/000000.bin", "sequences/00/velodyne/000001.bin"], ["00/000001", "01/000000"]),
+        (["sequences/08/velodyne/000000.bin"], ["08/000000"]),
+        (["velodyne/0000/000000.bin", "velodyne/0001/000000.bin"], ["0000/000000", "0001/000000"]),
+        (["velodyne_points/data/0000000000.bin", "velodyne_points/timestamps.txt"], ["root/0000000000"]),
+        (["drive_1/velodyne_points/data/0.bin", "drive_2/velodyne_points/data/0.bin"], ["drive_1/0", "drive_2/0"]),
+        (["0.bin", "velodyne/1.bin"], ["0"]),
+    ],
+)
+def test_the_scans_of_a_data_set(files: list[str], names: list[str], tmp_path: Path) -> None:
+    for file in files:
+        write_scan(tmp_path / "root" / file)
+    assert run("run", tmp_path / "root", "--labels", "--out", tmp_path / "out") == 0
+    found = find_scans([tmp_path / "root"])
+    assert [n.as_posix() for n in output_names(found.paths, keep_folder=found.of_data_set)] == names
+    written = {file.relative_to(tmp_path / "out").as_posix() for file in (tmp_path / "out").rglob("*.label")}
+    assert written == {f"{name}.label" for name in names}
+
+
+def test_live_replays_the_one_folder_of_a_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan = write_scan(tmp_path / "sequences" / "00" / "velodyne" / "000000.bin")
+    assert run("run", tmp_path, "--live", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["scan"] == str(scan)
+    write_scan(tmp_path / "sequences" / "01" / "velodyne" / "000000.bin")
+    assert usage_code("run", tmp_path, "--live") == 2
+    assert "--live replays one folder of scans" in capsys.readouterr().err
+
+
+def test_live_names_the_scans_of_a_capture(capture: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    monkeypatch.setattr("edgeperc.live.read_scans", captures.read_scans)
+    assert run("run", capture, "--live", "--json") == 1
+    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    named = [answer["scan"] for answer in answers if "error" not in answer]
+    assert named
+    assert {*named} <= {str(capture / f"{k:06d}") for k in range(3)}
+
+
+# --- help and renamed words ------------------------------------------------------------------------------------------
+
+COMMANDS = (
+    *("demo", "run", "info", "models", "sensors", "providers", "eval", "eval-sensors", "eval-tracking", "fit-sensor"),
+    "completion",
+)
+
+
+def parsers() -> dict[str, argparse.ArgumentParser]:
+    (commands,) = [action for action in build_parser()._actions if isinstance(action, argparse._SubParsersAction)]
+    return dict(commands.choices)
+
+
+def test_there_is_one_level_of_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    assert tuple(parsers()) == COMMANDS
+    assert usage_code("--help") == 0
+    out = capsys.readouterr().out
+    assert all(f"    {name}" in out for name in COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_help_page_fits_a_terminal_and_explains_every_option(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert usage_code(name, "--help") == 0
+    page = capsys.readouterr().out
+    assert max(map(len, page.splitlines())) <= 80
+    assert f"examples:\n  edgeperc {name}" in page
+    for action in parsers()[name]._actions:
+        if action.help is argparse.SUPPRESS:
+            continue
+        assert action.help, f"{action.option_strings or action.dest} has no help text"
+        if action.option_strings and action.nargs != 0 and not action.required:
+            assert "(default: " in action.help or "; default: " in action.help, f"{action.dest} names no default"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_examples_of_a_help_page_can_be_parsed(name: str) -> None:
+    parser = build_parser()
+    epilog = parsers()[name].epilog or ""
+    examples = [line for line in epilog.splitlines() if line.startswith("  edgeperc ")]
+    assert examples
+    for line in examples:
+        words = shlex.split(line.partition(" > ")[0].partition(" #")[0])
+        assert callable(parser.parse_args(words[1:]).command)
+
+
+def test_the_help_page_lists_what_there_is() -> None:
+    assert zoo.DEFAULT == DEFAULT
+    assert {*PROVIDERS} == {"auto", *session.PROVIDERS}
+    assert ("auto", *session.PRECISIONS) == PRECISIONS
+
+
+@pytest.mark.parametrize(
+    ("words", "new"),
+    [
+        (
+            ["eval", "sensors", "os1-64=simulation"],
+            "'eval sensors' is now 'eval-sensors': edgeperc eval-sensors os1-64=",
+        ),
+        (["eval", "tracking", "root", "--iou", "0.5"], "edgeperc eval-tracking root --iou 0.5"),
+        (["adapt", "fit", "a", "--sensor", "x", "--out", "b"], "edgeperc fit-sensor a --sensor x --out b"),
+        (["run", "a.bin", "--all-around"], "--all-around is now --full-turn"),
+        (["demo", "--all-around"], "--all-around is now --full-turn"),
+        (["run", "a.bin", "--adapt", "neither"], "neither is now none"),
+        (["run", "a.bin", "--precis", "int8"], "unrecognized arguments: --precis"),
+    ],
+)
+def test_old_words_are_refused_with_the_new_one(words: list[str], new: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert usage_code(*words) == 2
+    assert new in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        ("n_threads is 0; expected at least 1", "--threads is 0; expected at least 1"),
+        ("provider 'x' is unknown; expected auto", "--provider 'x' is unknown; expected auto"),
+        ("ask for provider 'openvino' and precision 'bf16'", "ask for --provider 'openvino' and --precision 'bf16'"),
+        ('pass precision="fp32", or adapt=none', "pass --precision fp32, or --adapt none"),
+        ("models ['a', 'b'] have views", "models ['a', 'b'] have views"),
+        (
+            "the sensor gives no remission; the provider's choice",
+            "the sensor gives no remission; the provider's choice",
+        ),
+        ("--provider 'x' is given; no sensor 'y' is built in", "--provider 'x' is given; no --sensor 'y' is built in"),
+    ],
+)
+def test_messages_name_options(message: str, expected: str) -> None:
+    assert in_options(message) == expected
+
+
+def test_python_m_edgeperc() -> None:
+    done = subprocess.run([sys.executable, "-m", "edgeperc", "--version"], capture_output=True, text=True, check=False)
+    assert done.stdout == f"edgeperc {__version__}\n"

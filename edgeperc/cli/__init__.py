@@ -1,4 +1,4 @@
-"""The ``edgeperc`` command, one file a subcommand; `main` runs it."""
+"""The ``edgeperc`` command: one file for each subcommand; `main` joins them."""
 
 from __future__ import annotations
 

@@ -4,48 +4,74 @@ from __future__ import annotations
 
 import argparse
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import MissingExtraError
+from .arguments import Commands, add_command, add_model, add_network
 from .output import one_line, print_rows
 from .run import make_perceiver
 
 if TYPE_CHECKING:
     from ..perception import Box, Perception
 
-__all__ = ["demo_command"]
+__all__ = ["add_parser", "demo_command"]
 
-# A junction with cars, a truck, pedestrians and a cyclist, most of which are found; far from the seeds that models are
-# trained on.
+# A junction with cars, a truck, pedestrians and a cyclist, most of which are found; its seed is far from those of the
+# training scenes.
 DEMO_SCENE = (2_000_000_110, "junction")
 
 
-# demo
+def add_parser(commands: Commands) -> None:
+    """Add ``demo``."""
+    parser = add_command(
+        commands,
+        "demo",
+        demo_command,
+        help="perceive a bundled scene: a table, a picture and a 3-D page",
+        description="Perceive one simulated scan of an hdl-64e whose true labels are known. Print what was found and "
+        "how long it took, and write scene.png (needs the extra 'view') and scene.html. It needs no data.",
+        examples=[
+            "edgeperc demo",
+            "edgeperc demo --out /tmp/demo --model pointseg --full-turn",
+        ],
+    )
+    output = parser.add_argument_group("output")
+    output.add_argument(
+        "--out",
+        type=Path,
+        default=Path("edgeperc-demo"),
+        metavar="DIR",
+        help="folder for scene.png and scene.html, made if needed (default: %(default)s)",
+    )
+    models = parser.add_argument_group("models")
+    add_model(models)
+    add_network(models)
 
 
 def demo_command(arguments: argparse.Namespace) -> int:
-    """``edgeperc demo``: perceive the bundled scene, print a table and write a picture and a page."""
+    """Perceive the bundled scene, print a table and write a picture and a page."""
     import numpy as np
 
     from .. import view
     from ..simulation.drawn import random_scene
     from ..simulation.scene import simulate
 
-    perceive = make_perceiver(arguments, "hdl-64e", "ignore")
+    perceive = make_perceiver(arguments, sensor="hdl-64e", on_mismatch="ignore")
     scan = simulate(random_scene(*DEMO_SCENE), "hdl-64e", DEMO_SCENE[0])
     perceive(scan.points)  # the first pass over a whole scan meets cold caches
     perception = perceive(scan.points)
 
-    rows = [("scene", f"{perception.n_points:,} points, a simulated hdl-64e in a street that is known to the cell")]
+    rows = [("scene", f"{perception.n_points:,} points, a simulated hdl-64e in a street with known labels")]
     if perception.top_view is not None:
         area_m2 = perception.top_view.drivable_area_m2
         rows.append(("drivable", f"{area_m2:.0f} m2 of the {_extent(perception)} ahead"))
-    found = [_box_words(box) for box in perception.boxes] or ["none"]
-    rows += [("boxes" if k == 0 else "", words) for k, words in enumerate(found)]
+    found = [_box_text(box) for box in perception.boxes] or ["none"]
+    rows += [("boxes" if k == 0 else "", text) for k, text in enumerate(found)]
     if perception.points is not None:
-        there = np.bincount(scan.labels[perception.points.in_view], minlength=len(perception.points.classes))
+        true = np.bincount(scan.labels[perception.points.in_view], minlength=len(perception.points.classes))
         for k, (name, count) in enumerate(perception.points.counts().items()):
-            rows.append(("points" if k == 0 else "", f"{name:<12}{count:>9,}   (there are {there[k]:,})"))
+            rows.append(("points" if k == 0 else "", f"{name:<12}{count:>9,}   (true: {true[k]:,})"))
     total_ms = sum(perception.stage_ms.values())
     rows.append(("time", f"{total_ms:.1f} ms: " + ", ".join(f"{k} {ms:.1f}" for k, ms in perception.stage_ms.items())))
     for k, (name, provider) in enumerate(perception.providers.items()):
@@ -71,7 +97,7 @@ def _extent(perception: Perception) -> str:
     return f"{x_far - x_near:.0f} x {y_left - y_right:.0f} m"
 
 
-def _box_words(box: Box) -> str:
+def _box_text(box: Box) -> str:
     x, y, _ = box.center
     length, width, height = box.size
     side = f"{abs(y):4.1f} m {'left' if y >= 0 else 'right'}"

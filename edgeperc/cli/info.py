@@ -1,156 +1,240 @@
-"""``edgeperc info``: what a model is, what a scan looks like and which models it suits."""
+"""``edgeperc info``: what a model is; what a scan looks like and which models suit it."""
 
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Mapping
+import hashlib
+import json
+import textwrap
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import EdgepercError, MissingExtraError, ModelFileError, SensorError
-from .output import complain, one_line, print_rows
+from ..errors import EdgepercError, MissingExtraError, SensorError
+from .arguments import Commands, add_command, add_sensor
+from .output import complain, print_rows, say
 
 if TYPE_CHECKING:
-    from ..session import Session
+    from ..card import ModelCard
+    from ..zoo import Variant
 
-__all__ = ["info_command"]
+__all__ = ["add_parser", "info_command"]
+
+_WIDTH = 100  # of a line, with its name
+_LINES = 2  # of a row; --json has the rest
 
 
-# info
+def add_parser(commands: Commands) -> None:
+    """Add ``info``."""
+    parser = add_command(
+        commands,
+        "info",
+        info_command,
+        help="what a model is; what a scan looks like and which models suit it",
+        description="Describe models by their cards: view, classes, training data, licence and accuracy. Describe "
+        "scans: extent [m], elevations [deg], remission, beams, ground height [m], and for each installed model "
+        "whether the scan is like those it was trained on. No model is run.",
+        examples=[
+            "edgeperc info pointseg",
+            "edgeperc info 000123.bin",
+            "edgeperc info drive.pcap --sensor os1-64",
+            "edgeperc info pointseg:int8 --json",
+        ],
+    )
+    reading = parser.add_argument_group("input")
+    reading.add_argument(
+        "things",
+        nargs="+",
+        metavar="MODEL|SCAN",
+        help="a name from 'edgeperc models', an .onnx file, a scan, or a capture (its first scan)",
+    )
+    add_sensor(reading)
+    output = parser.add_argument_group("output")
+    output.add_argument(
+        "--json",
+        action="store_true",
+        help="print one JSON object for each thing: a model's whole card, a scan's measurements",
+    )
 
 
 def info_command(arguments: argparse.Namespace) -> int:
-    """``edgeperc info``: describe models and scans; 1 if some failed."""
-    n_failed = n_told = 0
+    """Describe models and scans; 1 if some failed."""
+    n_failed = n_printed = 0
     for thing in arguments.things:
         try:
-            if arguments.json:
-                print(_card(thing))
-                n_told += 1
-                continue
-            rows = _model_rows(thing) if _is_model(thing) else _scan_rows(Path(thing), arguments.sensor)
+            if _is_model(thing):
+                variants = _variants(thing)
+                rows, document = _model_rows(variants), json.loads(variants[0].card.to_json())
+            else:
+                rows, document = _scan_rows(Path(thing), arguments.sensor)
         except (SensorError, MissingExtraError):
             raise
         except EdgepercError as exc:
             n_failed += 1
             complain(exc)
             continue
-        if n_told:
-            print()
-        print_rows(rows)
-        n_told += 1
+        if arguments.json:
+            say(json.dumps(document, allow_nan=False))
+        else:
+            if n_printed:
+                say("")
+            print_rows(_folded(rows))
+        n_printed += 1
     return 1 if n_failed else 0
 
 
 def _is_model(thing: str) -> bool:
-    """A path that exists, or looks like one, is a scan unless it ends in .onnx; any other word is a model's name."""
+    """A path that exists, or looks like one, is a scan unless it ends in .onnx; anything else is a model's name."""
     path = Path(thing)
     return path.suffix == ".onnx" or not (path.exists() or path.suffix or len(path.parts) > 1)
 
 
-def _open(thing: str) -> Session:
-    from ..session import Session
+def _variants(thing: str) -> Sequence[Variant]:
+    from ..zoo import resolve
 
-    return Session(thing, "cpu")
-
-
-def _card(thing: str) -> str:
-    if not _is_model(thing):
-        raise ModelFileError(f"{thing} is a scan; only models have a card")
-    return _open(thing).card.to_json()
+    return resolve(thing)
 
 
-def _model_rows(thing: str) -> list[tuple[str, str]]:
+def _folded(rows: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Rows with long values wrapped to `_WIDTH`, or cut off after `_LINES`."""
+    width = _WIDTH - max(len(name) for name, _ in rows) - 2
+    folded = []
+    for name, value in rows:
+        lines = textwrap.wrap(value, width, max_lines=_LINES, placeholder=" ...") or [""]
+        folded += [(name if k == 0 else "", line) for k, line in enumerate(lines)]
+    return folded
+
+
+def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
+    """What a user wants to know of a network; of its variants the first one's card."""
     from ..card import TopViewGeometry
 
-    session = _open(thing)
-    card = session.card
-    channels, height, width = session.input.shape
+    path, card = variants[0].path, variants[0].card
+    size = ", ".join(f"{variant.precision} {_megabytes(variant.path)}" for variant in variants)
+    rows = [
+        ("model", f"{card.name} {card.version}: {model_task(card)}"),
+        ("file", str(path)),
+        ("variants", size),
+        ("sha256", hashlib.sha256(path.read_bytes()).hexdigest()),
+    ]
     if isinstance(card.view, TopViewGeometry):
         (x_near, x_far), (y_right, y_left) = card.view.x_range_m, card.view.y_range_m
         seen = f"x {x_near:g}..{x_far:g} m, y {y_right:g}..{y_left:g} m, cells of {card.view.cell_m:g} m"
     else:
         up, down = card.view.row_elevations_deg[0], card.view.row_elevations_deg[-1]
         left, right = card.view.azimuth_left_deg, card.view.azimuth_right_deg
-        seen = f"{height} beams from {up:g} to {down:g} deg, azimuths {left:g} to {right:g} deg"
-    rows = [
-        ("model", f"{card.name} {card.version}"),
-        ("file", f"{session.path} ({session.path.stat().st_size / 1e6:.1f} MB)"),
-        ("sha256", session.sha256),
+        seen = f"{card.view.height} beams from {up:g} to {down:g} deg, azimuths {left:g} to {right:g} deg"
+    channels = card.input.channels
+    rows += [
         ("view", f"{card.view.kind}: {seen}"),
-        ("input", f"{channels} x {height} x {width}: {', '.join(card.input.channels)}"),
+        ("input", f"{len(channels)} x {card.view.height} x {card.view.width}: {', '.join(channels)}"),
         ("outputs", ", ".join(f"{output.name} ({output.kind})" for output in card.outputs)),
         ("classes", ", ".join(card.classes)),
     ]
     if card.box_classes:
         rows.append(("boxes", f"{', '.join(card.box_classes)}, score from {card.score_threshold:g}"))
-    for name in ("training", "metrics", "parity"):
-        rows += _nested(name, getattr(card, name))
-    if not math.isnan(session.golden_deviation):
-        rows.append(("here", f"answers within {session.golden_deviation:.2g} standard deviations of the exporter's"))
+    rows += [(key, str(card.training[key])) for key in ("data", "licence") if key in card.training]
+    rows += _accuracy_rows(card.metrics)
+    for precision, agreement in card.precisions.items():
+        loss, same = agreement.get("loss"), agreement.get("label_agreement")
+        if isinstance(same, float):
+            lost = f", {loss:.2g} points lost" if isinstance(loss, float) else ""
+            rows.append((precision, f"{100.0 * same:.2f} % of the labels as in fp32{lost}"))
     return rows
 
 
-def _nested(name: str, value: Any) -> list[tuple[str, str]]:
-    """A card's free-form facts, an inner mapping's keys joined by dots; what is long by its length."""
-    if isinstance(value, Mapping) and len(value) > 24:
-        return [(name, f"{len(value)} entries")]
-    if isinstance(value, Mapping):
-        return [row for key, inner in value.items() for row in _nested(f"{name}.{key}", inner)]
-    if isinstance(value, (list, tuple)) and (len(value) > 12 or any(isinstance(v, (list, Mapping)) for v in value)):
-        return [(name, f"{len(value)} values")]
-    if isinstance(value, (list, tuple)):
-        return [(name, ", ".join(map(one_line, value)))]
-    return [(name, f"{value:.4g}" if isinstance(value, float) else one_line(value))]
+def model_task(card: ModelCard) -> str:
+    """What a model is for, from its outputs and classes."""
+    if card.view.kind == "range_image":
+        return f"a class for every point ({', '.join(card.classes[1:])})"
+    found = ["drivable area"] if "drivable" in card.classes else []
+    found += [f"boxes of {', '.join(card.box_classes)}"] if card.box_classes else []
+    return " and ".join(found) or "classes of a top view"
 
 
-def _scan_rows(path: Path, sensor_name: str) -> list[tuple[str, str]]:
+def _accuracy_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The main figures on each kind of scans that was evaluated, over all distances, in per cent."""
+    rows = []
+    for block, of in (("real", "KITTI"), ("semantickitti", "SemanticKITTI"), ("simulated", "simulation")):
+        figures = metrics.get(block, {})
+        points = figures.get("points", {}).get("all", {})
+        parts = [f"IoU {name} {_percent(row.get('iou'))}" for name, row in points.items() if row.get("n_objects")]
+        boxes = figures.get("boxes", {}).get("oriented", {}).get("all", {})
+        parts += [
+            f"AP {name} {_percent(row.get('ap'))}"
+            for name, row in boxes.items()
+            if isinstance(row, Mapping) and row.get("n_truth")
+        ]
+        road = figures.get("road", {}).get("all", {})
+        parts += [f"road F1 {_percent(road['f1'])}"] if road.get("f1") is not None else []
+        if parts:
+            rows.append((f"on {of}", f"{figures.get('n_frames', '?')} scans, %: {', '.join(parts)}"))
+    return rows
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100.0 * share:.1f}"
+
+
+def _megabytes(path: Path) -> str:
+    return f"{path.stat().st_size / 1e6:.1f} MB"
+
+
+def _scan_rows(path: Path, sensor_name: str) -> tuple[list[tuple[str, str]], dict[str, Any]]:
+    """What a scan looks like and which models suit it, as rows and as the same measurements for JSON."""
     import numpy as np
 
-    from ..adapt import render
+    from ..adapt import condition
     from ..fitness import FitnessProfile, check_fitness
     from ..readers.captures import read_scans
     from ..sensor import get_sensor
-    from ..session import Session
-    from ..zoo import model_path, shipped_models
+    from ..zoo import listed
 
     sensor = get_sensor(sensor_name)
     _, points = next(read_scans(path))  # of several the first
     finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-    rows = [("scan", str(path)), ("points", f"{len(points):,}, of which {len(points) - len(finite):,} are not finite")]
-    if len(finite):
-        flat = np.hypot(finite[:, 0], finite[:, 1])
-        distance = np.hypot(flat, finite[:, 2])
-        low, high = np.percentile(np.degrees(np.arctan2(finite[:, 2], flat)), [0.5, 99.5])
-        for k, axis in enumerate(("x", "y", "z")):
-            rows.append((axis, f"{finite[:, k].min():.1f} .. {finite[:, k].max():.1f} m"))
-        rows.append(("range", "{:.1f} .. {:.1f} m, median {:.1f}".format(*np.percentile(distance, [0, 100, 50]))))
-        rows.append(("elevation", f"{low:.1f} .. {high:.1f} deg (99 % of the points)"))
-        quantiles = np.percentile(finite[:, 3], [0, 5, 50, 95, 100])
-        rows.append(("remission", "least {:g}, 5 % {:g}, median {:g}, 95 % {:g}, most {:g}".format(*quantiles)))
-    if sensor.remission is not None:
-        points = render(points, sensor)
-        rows.append(("", f"rendered as the {sensor.remission.to}'s by a {sensor.remission.kind}"))
-    else:
-        points = points.copy()
-        points[:, 3] = (points[:, 3] + np.float32(sensor.remission_offset)) * np.float32(sensor.remission_scale)
+    n_lost = len(points) - len(finite)
+    document: dict[str, Any] = {
+        "scan": str(path),
+        "n_points": len(points),
+        "n_not_finite": n_lost,
+        "sensor": sensor.name,
+    }
+    rows = [("scan", str(path)), ("points", f"{len(points):,}, of which {n_lost:,} are not finite")]
     if not len(finite):
-        return rows
-    measured = FitnessProfile.from_scans([points])
-    rows.append(("beams", f"about {measured.beams[0]:.0f} rows of points ({sensor.name}: {sensor.n_beams})"))
-    rows.append(("ground", "not found" if measured.ground_m is None else f"at z = {measured.ground_m[0]:.1f} m"))
-    for name in shipped_models():
-        try:
-            fitness = Session(model_path(name), "cpu").card.fitness
-        except MissingExtraError as exc:
-            rows.append((name, one_line(exc)))
+        return rows, document
+    flat = np.hypot(finite[:, 0], finite[:, 1])
+    measured = {
+        **{f"{axis}_m": np.percentile(finite[:, k], [0, 100]) for k, axis in enumerate("xyz")},
+        "range_m": np.percentile(np.hypot(flat, finite[:, 2]), [0, 50, 100]),
+        "elevation_deg": np.percentile(np.degrees(np.arctan2(finite[:, 2], flat)), [0.5, 99.5]),
+        "remission": np.percentile(finite[:, 3], [0, 5, 50, 95, 100]),
+    }
+    document |= {name: [round(float(v), 4) for v in values] for name, values in measured.items()}
+    extents = [f"{axis} {low:.1f} .. {high:.1f}" for axis in "xyz" for low, high in [measured[f"{axis}_m"]]]
+    rows += [
+        ("extent", f"{', '.join(extents)} m"),
+        ("range", "{:.1f} .. {:.1f} m, median {:.1f} m".format(*measured["range_m"][[0, 2, 1]])),
+        ("elevation", "{:.1f} .. {:.1f} deg (99 % of the points)".format(*measured["elevation_deg"])),
+        ("remission", "min {:g}, 5 % {:g}, median {:g}, 95 % {:g}, max {:g}".format(*measured["remission"])),
+    ]
+    if sensor.remission is not None:
+        rows.append(("", f"mapped to that of the {sensor.remission.to} by a {sensor.remission.kind}"))
+    scan, _ = condition(points, sensor)
+    profile = FitnessProfile.from_scans([scan])
+    ground_m = None if profile.ground_m is None else round(float(profile.ground_m[0]), 2)
+    rows.append(("beams", f"about {profile.beams[0]:.0f} rows of points ({sensor.name}: {sensor.n_beams})"))
+    rows.append(("ground", "not found" if ground_m is None else f"at z = {ground_m:.1f} m"))
+    findings: dict[str, list[str] | None] = {}
+    for card in {variant.name: variant.card for variant in listed()}.values():
+        if card.fitness is None:
+            findings[card.name] = None
+            rows.append((card.name, "its card does not describe its training scans"))
             continue
-        if fitness is None:
-            rows.append((name, "its card does not say what its training scans looked like"))
-            continue
-        found = check_fitness(points, FitnessProfile.from_dict(fitness), sensor)
-        rows += [(name, f"as a scan of {sensor.name}: {sentence}") for sentence in found]
+        found = check_fitness(scan, FitnessProfile.from_dict(card.fitness), sensor)
+        findings[card.name] = list(found)
+        rows += [(card.name, f"as a scan of {sensor.name}: {sentence}") for sentence in found]
         if not found:
-            rows.append((name, f"suits this scan, taken as one of {sensor.name}"))
-    return rows
+            rows.append((card.name, f"suits this scan, taken as one of {sensor.name}"))
+    document |= {"beams": round(float(profile.beams[0])), "ground_m": ground_m, "models": findings}
+    return rows, document

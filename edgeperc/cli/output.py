@@ -1,4 +1,4 @@
-"""What the commands print: messages, progress, tables, files of figures."""
+"""What the commands print: lines, warnings, progress bars, tables and files of figures."""
 
 from __future__ import annotations
 
@@ -7,21 +7,22 @@ import contextlib
 import json
 import math
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from importlib import import_module
+from pathlib import Path
+from typing import Any, TextIO
 
 from ..errors import MissingExtraError
 
 __all__ = [
-    "Progress",
     "complain",
-    "counted_progress",
     "many",
     "one_line",
+    "print_columns",
     "print_rows",
-    "require_matplotlib",
-    "require_pillow",
+    "progress",
+    "require",
+    "say",
     "show_warning",
     "table_lines",
     "without_nan",
@@ -29,14 +30,21 @@ __all__ = [
 ]
 
 
-def one_line(words: object) -> str:
+def one_line(text: object) -> str:
     """Text without line breaks."""
-    return " ".join(str(words).split())
+    return " ".join(str(text).split())
 
 
-def complain(words: object) -> None:
-    """Print one line on stderr."""
-    print(f"edgeperc: {one_line(words)}", file=sys.stderr)
+def say(text: str, file: TextIO | None = None) -> None:
+    """Print a line at once, by default on stdout; a progress bar moves below it."""
+    tqdm = getattr(sys.modules.get("tqdm"), "tqdm", None)  # imported only while a bar is drawn
+    with contextlib.nullcontext() if tqdm is None else tqdm.external_write_mode(sys.stdout):
+        print(text, file=file, flush=True)
+
+
+def complain(text: object) -> None:
+    """Print one line on stderr, with the program's name."""
+    say(f"edgeperc: {one_line(text)}", sys.stderr)
 
 
 def show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
@@ -44,97 +52,95 @@ def show_warning(message: Warning | str, category: type[Warning], *_: Any, **__:
     complain(f"warning: {message}")
 
 
-def require_matplotlib() -> None:
-    """Raise `MissingExtraError` before any work is done if matplotlib is absent."""
+def require(package: str, extra: str, purpose: str, *, module: str | None = None) -> Any:
+    """Import a package of an extra before any work is done.
+
+    Raises
+    ------
+    MissingExtraError
+        It is not installed; the message says which line installs it.
+    """
     try:
-        import matplotlib  # noqa: F401
+        return import_module(module or package)
     except ImportError as exc:
-        raise MissingExtraError("matplotlib", "view", "Drawing a picture") from exc
-
-
-def require_pillow() -> None:
-    """Raise `MissingExtraError` before any work is done if Pillow is absent."""
-    try:
-        import PIL  # noqa: F401
-    except ImportError as exc:
-        raise MissingExtraError("pillow", "view", "Drawing an animation") from exc
-
-
-class Progress:
-    """A bar on stderr, where that is a terminal and there is more than one scan."""
-
-    def __init__(self, total: int) -> None:
-        self.total = total
-        self.live = total > 1 and sys.stderr.isatty()
-        self.started = time.perf_counter()
-        self.show(0)
-
-    def show(self, done: int) -> None:
-        """Draw the bar, with an estimate of the time left."""
-        if not self.live:
-            return
-        left_s = (time.perf_counter() - self.started) / max(done, 1) * (self.total - done)
-        bar = "#" * (30 * done // self.total)
-        words = f", {left_s:.0f} s left" if done else ""
-        sys.stderr.write(f"\r\x1b[K[{bar:<30}] {done}/{self.total}{words}")
-        sys.stderr.flush()
-
-    def clear(self) -> None:
-        """Remove the bar from the line."""
-        if self.live:
-            sys.stderr.write("\r\x1b[K")
-            sys.stderr.flush()
+        raise MissingExtraError(package, extra, purpose) from exc
 
 
 @contextlib.contextmanager
-def counted_progress() -> Iterator[Callable[[int, int], None]]:
-    """What shows how many are done, of how many: a bar that learns the latter when it is first called."""
-    bars: list[Progress] = []
+def progress(unit: str = "scan") -> Iterator[Callable[[int, int], None]]:
+    """Yield a function that shows how many of how many are done.
 
-    def show(done: int, total: int) -> None:
-        """Draw the bar, with an estimate of the time left."""
-        bars[:] = bars or [Progress(total)]
-        bars[0].show(done)
+    The bar is drawn on stderr if that is a terminal, if there is more than one thing to do, and if tqdm is installed
+    (extra ``progress``). Without tqdm the commands print the same lines and no bar.
+    """
+    with contextlib.ExitStack() as stack:
+        bars: list[Any] = []
 
-    yield show
-    for bar in bars:
-        bar.clear()
+        def show(done: int, total: int) -> None:
+            """Draw the bar; the first call sets its length."""
+            if not bars and total > 1 and sys.stderr.isatty():
+                with contextlib.suppress(ImportError):
+                    tqdm = import_module("tqdm").tqdm
+                    bars.append(stack.enter_context(tqdm(total=total, unit=unit, leave=False, file=sys.stderr)))
+            for bar in bars:
+                bar.update(done - bar.n)
+
+        yield show
 
 
 def print_rows(rows: Sequence[tuple[str, str]]) -> None:
     """Print names and values as two aligned columns."""
     width = max(len(name) for name, _ in rows) + 2
-    for name, words in rows:
-        print(f"{name:<{width}}{words}".rstrip())
+    for name, value in rows:
+        say(f"{name:<{width}}{value}".rstrip())
 
 
-# eval
+def print_columns(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table: headings and left-aligned columns."""
+    lines = [headings, *rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for line in lines:
+        say("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
 
 
 def write_figures(arguments: argparse.Namespace, figures: Mapping[str, Any]) -> None:
-    """Every figure, and the command that gave them, where ``--json`` says."""
-    if arguments.json is not None:
-        arguments.json.parent.mkdir(parents=True, exist_ok=True)
+    """Write every figure, and the command line that gave them, to the file that ``--json`` names, if any."""
+    path: Path | None = arguments.json
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps({"command": arguments.typed, **figures}, indent=1, allow_nan=False)
-        arguments.json.write_text(text + "\n", encoding="utf-8")
+        path.write_text(text + "\n", encoding="utf-8")
 
 
 def without_nan(value: Any) -> Any:
-    """The same with None for every number that is none, as JSON has it."""
+    """A copy with None in place of NaN and infinity, which JSON does not have."""
     if isinstance(value, Mapping):
-        return {key: without_nan(of) for key, of in value.items()}
+        return {key: without_nan(inner) for key, inner in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def many(n: int, noun: str) -> str:
-    """A count with its noun in the right number."""
+    """A count and its noun, singular or plural."""
     return f"{n:,} {noun}{'s' * (n != 1)}"
 
 
 def table_lines(
     title: str, columns: Sequence[tuple[str, str]], rows: Sequence[tuple[tuple[str, str], Mapping[str, Any]]]
 ) -> list[str]:
-    """A table as lines of text: a title, headings, and rows with two names each."""
+    """A table of figures as lines of text.
+
+    Parameters
+    ----------
+    title : str
+    columns : sequence of (heading, key)
+    rows : sequence of ((first name, second name), figures by key)
+        A first name that repeats is printed once.
+
+    Returns
+    -------
+    list of str
+        Empty if there are no rows.
+    """
     if not rows:
         return []
     cells = [["", "", *(heading for heading, _ in columns)]]
@@ -152,6 +158,7 @@ def table_lines(
 
 
 def _cell(value: Any) -> str:
+    """Shares and their intervals in per cent, counts as they are."""
     if value is None:
         return "-"
     if isinstance(value, list):

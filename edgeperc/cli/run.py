@@ -6,7 +6,6 @@ import argparse
 import itertools
 import json
 import os
-import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import EdgepercError, MissingExtraError, ModelError, PointsError
-from ..records import scan_record
-from ..zoo import DEFAULT
-from .output import Progress, complain, many, one_line, require_matplotlib, require_pillow
+from .arguments import DEFAULT, Commands, add_adapt, add_command, add_model, add_network, add_sensor, positive_number
+from .output import complain, many, one_line, progress, require, say
+from .scans import Scans, find_scans, output_names, scan_folders, scan_namer
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,132 +26,244 @@ if TYPE_CHECKING:
     from ..perception import Perception
     from ..tracking.tracks import Tracks
 
-__all__ = ["find_scans", "make_perceiver", "run_command"]
+__all__ = ["add_parser", "make_perceiver", "run_command"]
+
+_KINDS = ("png", "html", "labels", "ply")
+
+
+def add_parser(commands: Commands) -> None:
+    """Add ``run``."""
+    parser = add_command(
+        commands,
+        "run",
+        run_command,
+        help="perceive scans: a line or a JSON object for each, and files",
+        description="Perceive scans and print one line for each: drivable area [m2], boxes, points of each class and "
+        "the time it took [ms]. A scan that fails is reported, the others are done, and the exit code is 1.",
+        examples=[
+            "edgeperc run 000123.bin",
+            "edgeperc run velodyne/ --out out --png --labels",
+            "edgeperc run KITTI/ --json > perceptions.jsonl",
+            "edgeperc run drive.pcap --sensor os1-64 --track --gif --out out",
+            "edgeperc run velodyne/ --live --rate 10",
+        ],
+    )
+    reading = parser.add_argument_group("input")
+    reading.add_argument(
+        "paths",
+        nargs="+",
+        type=Path,
+        metavar="PATH",
+        help="scan files (.bin, .pcd, .ply, .npy, .npz); folders of them; the root of a KITTI object set, of "
+        "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .osf, .bag, .mcap, a ROS 2 bag's folder (extra 'io')",
+    )
+    add_sensor(reading)
+    reading.add_argument(
+        "--topic",
+        metavar="NAME",
+        help="the topic of a bag with several point clouds, or the serial number of a sensor in an Ouster capture "
+        "(default: the only one)",
+    )
+    reading.add_argument(
+        "--on-mismatch",
+        choices=("warn", "raise", "ignore"),
+        default="warn",
+        help="if a scan is unlike those that a model was trained on: print a warning, fail that scan, or do not check "
+        "(default: %(default)s)",
+    )
+    models = parser.add_argument_group("models")
+    add_model(models)
+    add_network(models)
+    add_adapt(models)
+    output = parser.add_argument_group("output")
+    output.add_argument(
+        "--json", action="store_true", help="print one JSON object for each scan, and nothing else, on stdout"
+    )
+    output.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the files below, made if needed (default: no files)"
+    )
+    output.add_argument("--png", action="store_true", help="write NAME.png, a picture (needs the extra 'view')")
+    output.add_argument("--html", action="store_true", help="write NAME.html, the labeled points in 3-D for a browser")
+    output.add_argument(
+        "--labels", action="store_true", help="write NAME.label, one uint32 for each point as SemanticKITTI has it"
+    )
+    output.add_argument("--ply", action="store_true", help="write NAME.ply, the points with labels and colors")
+    tracking = parser.add_argument_group("tracking")
+    tracking.add_argument(
+        "--track", action="store_true", help="track the boxes from scan to scan; the scans must be one drive, in order"
+    )
+    tracking.add_argument(
+        "--gif",
+        action="store_true",
+        help="write tracks.gif, the tracks seen from above; needs --track, --out and the extra 'view'",
+    )
+    live = parser.add_argument_group("live")
+    live.add_argument(
+        "--live",
+        action="store_true",
+        help="replay one PATH in real time; a scan that comes while another is perceived replaces the one that waits",
+    )
+    live.add_argument(
+        "--rate",
+        type=positive_number,
+        default=10.0,
+        metavar="HZ",
+        help="scans per second of files that have no time stamps, for --live and --track (default: 10)",
+    )
 
 
 def make_perceiver(
     arguments: argparse.Namespace,
+    *,
     sensor: str,
     on_mismatch: Literal["warn", "raise", "ignore"],
-    adapt: Literal["both", "remission", "interpolation", "neither"] = "both",
+    adapt: Literal["both", "remission", "interpolation", "none"] = "both",
 ) -> Perceiver:
-    """A perceiver by the command's options."""
+    """A perceiver with the options of the command line."""
     from ..perceiver import Perceiver
 
-    try:
-        return Perceiver(
-            arguments.model or DEFAULT,
-            sensor=sensor,
-            provider=arguments.provider,
-            n_threads=arguments.threads,
-            on_mismatch=on_mismatch,
-            adapt=adapt,
-            boxes_from=arguments.boxes_from,
-            all_around=arguments.all_around,
-        )
-    except EdgepercError:
-        raise
-    except ValueError as exc:  # two models of one view; no labels to cluster by
-        raise ModelError(str(exc)) from exc
-
-
-# run
+    return Perceiver(
+        arguments.model or DEFAULT,
+        sensor=sensor,
+        provider=arguments.provider,
+        precision=arguments.precision,
+        n_threads=arguments.threads,
+        on_mismatch=on_mismatch,
+        adapt=adapt,
+        boxes_from=arguments.boxes_from,
+        full_turn=arguments.full_turn,
+    )
 
 
 def run_command(arguments: argparse.Namespace) -> int:
-    """``edgeperc run``: perceive scans; 1 if some failed."""
-    kinds = [kind for kind in ("png", "html", "labels", "ply") if getattr(arguments, kind)]
-    if arguments.live and (kinds or arguments.gif or len(arguments.paths) > 1):
-        arguments.usage_error("--live replays one PATH and writes no files")
-    if (kinds or arguments.gif) and arguments.out is None:
-        arguments.usage_error(f"--{[*kinds, 'gif'][0]} writes files; add --out DIR")
-    if arguments.out is not None and not kinds and not arguments.gif:
-        arguments.usage_error("--out DIR without anything to write; add --png, --html, --labels, --ply or --gif")
-    if arguments.gif and not arguments.track:
-        arguments.usage_error("--gif shows tracks; add --track")
-    if arguments.png:
-        require_matplotlib()
-    if arguments.gif:
-        require_pillow()
-    scans, empty = (arguments.paths, []) if arguments.live else find_scans(arguments.paths)
-    targets = [arguments.out / name for name in _output_names(scans)] if kinds else [Path()] * len(scans)
+    """Perceive scans; 1 if some failed."""
+    kinds = [kind for kind in _KINDS if getattr(arguments, kind)]
+    _check_usage(arguments, kinds)
+    found = Scans([_live_source(arguments)], [], False) if arguments.live else find_scans(arguments.paths)
+    scans = found.paths
+    names = output_names(scans, keep_folder=found.of_data_set) if kinds else []
+    targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
     sources = {os.path.realpath(scan) for scan in scans}
     for file in (_file_of(target, kind) for target in targets for kind in kinds):
         if os.path.realpath(file) in sources:
             arguments.usage_error(f"{file} is one of the scans and would be overwritten; choose another --out")
 
-    from ..perception import Perception
-
-    perceive = make_perceiver(arguments, arguments.sensor, arguments.on_mismatch, arguments.adapt)
+    perceive = make_perceiver(
+        arguments, sensor=arguments.sensor, on_mismatch=arguments.on_mismatch, adapt=arguments.adapt
+    )
     if (arguments.labels or arguments.ply) and not any(card.view.kind == "range_image" for card in perceive.cards):
         raise ModelError("--labels and --ply need a class for every point; add a range-image model: --model pointseg")
     for target in targets if kinds else ():
         target.parent.mkdir(parents=True, exist_ok=True)
     follow = _follower(arguments.rate) if arguments.track else None
-    followed: list[Tracks] = []
-
-    progress = Progress(len(scans))
-    n_told = n_failed = 0
-
-    def tell(source: Path, outcome: Perception | Answer | Exception, tracks: Tracks | None = None) -> None:
-        nonlocal n_told, n_failed
-        if isinstance(outcome, MissingExtraError):
-            raise outcome
-        n_told += 1
-        progress.clear()
-        if isinstance(outcome, Exception):
-            n_failed += 1
-            complain(f"{source}: {str(outcome).removeprefix(f'{source}: ')}")
-            if arguments.json:
-                print(json.dumps({"scan": str(source), "error": one_line(outcome)}), flush=True)
-            return
-        answer, perception = (None, outcome) if isinstance(outcome, Perception) else (outcome, outcome.perception)
-        timing = None if answer is None else _timing(answer)
-        if tracks is not None and arguments.gif:
-            followed.append(tracks)
-        if arguments.json:
-            record = {
-                "scan": str(source),
-                "stamp_s": perception.stamp_s,
-                "live": timing,
-                **scan_record(perception, tracks),
-            }
-            print(json.dumps(record, allow_nan=False), flush=True)
-        else:
-            words = "  ".join(f"{key} {value}" for key, value in (timing or {}).items())
-            tail = "" if tracks is None else f"  tracks: {many(len(tracks), 'object')}"
-            print(f"{source}  {words}{'  ' * bool(words)}{_summary(perception)}{tail}", flush=True)
-
-    for folder in empty:
-        tell(folder, PointsError("no scan in this folder; expected scans, captures or a ROS 2 bag's metadata.yaml"))
+    report = _Report(arguments)
+    for folder in found.empty:
+        report.add(folder, PointsError("no scan in this folder; expected scans, captures or a ROS 2 bag's folder"))
     started = time.perf_counter()
-    for done, (scan, target) in enumerate(zip(scans, targets, strict=True), start=1):
-        answers = (
-            _live(perceive, follow, scan, arguments)
-            if arguments.live
-            else _each(perceive, follow, scan, target, kinds, arguments)
-        )
-        for told in answers:
-            tell(*told)
-        progress.show(done)
-    progress.clear()
-    if arguments.gif and followed:
+    with progress("file") as show:
+        for done, (scan, target) in enumerate(zip(scans, targets, strict=True)):
+            show(done, len(scans))
+            outcomes = (
+                _live(perceive, follow, scan, arguments)
+                if arguments.live
+                else _each(perceive, follow, scan, target, kinds, arguments)
+            )
+            for outcome in outcomes:
+                report.add(*outcome)
+    if report.tracks:
         from ..view.tracks import draw_tracks
 
         arguments.out.mkdir(parents=True, exist_ok=True)
-        draw_tracks(followed, arguments.out / "tracks.gif")
-    if n_told - len(empty) > 1:
-        each_ms = 1e3 * (time.perf_counter() - started) / (n_told - len(empty))
+        draw_tracks(report.tracks, arguments.out / "tracks.gif")
+    n_perceived = report.n - len(found.empty)
+    if n_perceived > 1:
+        each_ms = 1e3 * (time.perf_counter() - started) / n_perceived
         things = "answers" if arguments.live else "scans"
-        print(f"{n_told} {things}, {n_failed} failed, {each_ms:.0f} ms each with files", file=sys.stderr)
-    return 1 if n_failed else 0
+        say(f"{report.n} {things}, {report.n_failed} failed, {each_ms:.0f} ms each with files", sys.stderr)
+    return 1 if report.n_failed else 0
+
+
+def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
+    """Refuse options that contradict each other, and extras that are missing, before any work."""
+    if arguments.live and (kinds or arguments.gif or len(arguments.paths) > 1):
+        arguments.usage_error("--live replays one PATH and writes no files")
+    if (kinds or arguments.gif) and arguments.out is None:
+        arguments.usage_error(f"--{[*kinds, 'gif'][0]} writes files; add --out DIR")
+    if arguments.out is not None and not kinds and not arguments.gif:
+        arguments.usage_error("--out DIR has nothing to write; add --png, --html, --labels, --ply or --gif")
+    if arguments.gif and not arguments.track:
+        arguments.usage_error("--gif shows tracks; add --track")
+    if arguments.png:
+        require("matplotlib", "view", "Drawing a picture")
+    if arguments.gif:
+        require("pillow", "view", "Drawing an animation", module="PIL")
+
+
+def _live_source(arguments: argparse.Namespace) -> Path:
+    """The path to replay: a scan, a capture, or one folder of scans."""
+    from ..readers.captures import is_capture
+
+    path: Path = arguments.paths[0]
+    folders = scan_folders(path) if path.is_dir() and not is_capture(path) else []
+    if len(folders) > 1:
+        arguments.usage_error(f"--live replays one folder of scans; {path} has {len(folders)}, such as {folders[0]}")
+    return folders[0] if folders else path
+
+
+class _Report:
+    """What `run` prints for each scan, and counts.
+
+    Attributes
+    ----------
+    n, n_failed : int
+        Scans reported, and those of them that failed.
+    tracks : list of Tracks
+        Of every scan, if ``--gif`` draws them.
+    """
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self.n = self.n_failed = 0
+        self.tracks: list[Tracks] = []
+        self._json, self._gif = arguments.json, arguments.gif
+
+    def add(self, source: Path, outcome: Perception | Answer | Exception, tracks: Tracks | None = None) -> None:
+        """Print one scan's line or JSON object; errors go to stderr too."""
+        from ..perception import Perception
+
+        if isinstance(outcome, MissingExtraError):
+            raise outcome
+        self.n += 1
+        if isinstance(outcome, Exception):
+            self.n_failed += 1
+            complain(f"{source}: {str(outcome).removeprefix(f'{source}: ')}")
+            if self._json:
+                say(json.dumps({"scan": str(source), "error": one_line(outcome)}))
+            return
+        answer, perception = (None, outcome) if isinstance(outcome, Perception) else (outcome, outcome.perception)
+        timing = None if answer is None else _timing(answer)
+        if tracks is not None and self._gif:
+            self.tracks.append(tracks)
+        if self._json:
+            from ..records import scan_record
+
+            stamp_s = perception.stamp_s
+            record = {"scan": str(source), "stamp_s": stamp_s, "live": timing, **scan_record(perception, tracks)}
+            say(json.dumps(record, allow_nan=False))
+            return
+        parts = [str(source)]
+        if timing is not None:
+            parts.append("  ".join(f"{key} {value}" for key, value in timing.items()))
+        parts.append(_summary(perception))
+        if tracks is not None:
+            parts.append(f"tracks: {many(len(tracks), 'object')}")
+        say("  ".join(parts))
 
 
 Follow = Callable[["Perception"], "Tracks"]
 
 
 def _follower(rate_hz: float) -> Follow:
-    """What tells the tracks after a scan, of one without a stamp as after the next of a drive."""
+    """A function from a scan's perception to the tracks after it; scans without stamps are 1 / rate apart."""
     from ..tracking.tracker import Tracker
 
     tracker, counted = Tracker(), itertools.count(1)
@@ -172,7 +283,7 @@ def _each(
     kinds: Sequence[str],
     arguments: argparse.Namespace,
 ) -> Iterator[tuple[Path, Perception | Exception, Tracks | None]]:
-    """Every scan of a file, those of a capture numbered, and what was perceived or what went wrong."""
+    """Every scan of a file, those of a capture numbered, with its perception or the error."""
     from ..readers.captures import is_capture, read_scans
 
     try:
@@ -196,9 +307,10 @@ def _each(
 def _live(
     perceive: Perceiver, follow: Follow | None, path: Path, arguments: argparse.Namespace
 ) -> Iterator[tuple[Path, Answer | Exception, Tracks | None]]:
-    """Answers of a stream, and what went wrong, as they come."""
+    """Answers of a stream and errors as they come, each with the scan's name."""
     from ..live import stream
 
+    name_of = scan_namer(path)
     with stream(path, perceive, follow, rate_hz=arguments.rate, topic=arguments.topic) as answers:
         while True:
             try:
@@ -206,48 +318,10 @@ def _live(
             except StopIteration:
                 return
             except (EdgepercError, OSError) as exc:
-                yield path, exc, None
+                yield path, exc, None  # newer scans may have come since: which one failed is not known
             else:
                 assert answer is not None
-                yield path, answer, answer.tracks
-
-
-def find_scans(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """Scans and captures in the order given, folders opened and sorted, none twice; and the folders that hold none."""
-    from ..readers.captures import is_capture, scan_files
-
-    scans: dict[str, Path] = {}
-    empty = []
-    for path in paths:
-        found = [path]
-        if path.is_dir() and not is_capture(path):
-            found = scan_files(path)
-            if not found:
-                empty.append(path)
-        for scan in found:
-            scans.setdefault(_absolute(scan), scan)
-    return list(scans.values()), empty
-
-
-def _output_names(scans: Sequence[Path]) -> list[Path]:
-    """A name for each scan's files: its own, with as many folders before it as tell all scans apart."""
-    parts = [Path(_absolute(scan)).parts[1:] for scan in scans]
-    names: list[Path] = []
-    for depth in range(1, max(map(len, parts), default=0) + 1):
-        names = [Path(*of_scan[-depth:]) for of_scan in parts]
-        if _all_differ(names):
-            break
-    bare = [name.with_name(re.sub(r"(?i)(\.pcd)?\.[^.]+$", "", name.name) or name.name) for name in names]
-    return bare if _all_differ(bare) else names
-
-
-def _absolute(path: Path) -> str:
-    return os.path.abspath(path)  # noqa: PTH100 - resolve() follows links, and a linked scan keeps its name
-
-
-def _all_differ(names: Sequence[Path]) -> bool:
-    # Some file systems take A and a for the same.
-    return len({str(name).casefold() for name in names}) == len(names)
+                yield name_of(answer.n_scans - 1), answer, answer.tracks
 
 
 def _file_of(target: Path, kind: str) -> Path:
@@ -268,7 +342,7 @@ def _write(points: NDArray[np.float32], perception: Perception, wanted: Mapping[
 
 
 def _timing(answer: Answer) -> dict[str, Any]:
-    """What `run --live` says of an answer beside what was perceived."""
+    """What `run --live` reports of an answer beside the perception."""
     return {
         "age_ms": round(1e3 * answer.age_s, 3),
         "health": answer.health,
@@ -277,20 +351,15 @@ def _timing(answer: Answer) -> dict[str, Any]:
     }
 
 
-def _tally(perception: Perception) -> str:
-    if perception.points is None:
-        return ""
-    counts = perception.points.counts()
-    return ", ".join(f"{name} {counts[name]:,}" for name in perception.points.classes[1:])
-
-
 def _summary(perception: Perception) -> str:
-    words = [f"{perception.n_points:,} points", f"{sum(perception.stage_ms.values()):.1f} ms"]
+    """One line: points, time, drivable area, boxes and points of each class."""
+    parts = [f"{perception.n_points:,} points", f"{sum(perception.stage_ms.values()):.1f} ms"]
     if perception.top_view is not None:
-        words.append(f"drivable {perception.top_view.drivable_area_m2:.1f} m2")
+        parts.append(f"drivable {perception.top_view.drivable_area_m2:.1f} m2")
     labels = [box.label for box in perception.boxes]
     boxes = ", ".join(f"{labels.count(label)} {label}" for label in dict.fromkeys(labels))
-    words.append(f"boxes: {boxes or 'none'}")
+    parts.append(f"boxes: {boxes or 'none'}")
     if perception.points is not None:
-        words.append(f"points: {_tally(perception)}")
-    return "  ".join(words)
+        counts = perception.points.counts()
+        parts.append("points: " + ", ".join(f"{name} {counts[name]:,}" for name in perception.points.classes[1:]))
+    return "  ".join(parts)

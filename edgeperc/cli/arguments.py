@@ -1,0 +1,208 @@
+"""Options that several commands share, and how every command's help page is built."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import textwrap
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+__all__ = [
+    "DEFAULT",
+    "PRECISIONS",
+    "PROVIDERS",
+    "Commands",
+    "Renamed",
+    "add_adapt",
+    "add_boxes_from",
+    "add_command",
+    "add_figures_file",
+    "add_model",
+    "add_network",
+    "add_provider",
+    "add_sensor",
+    "positive",
+    "positive_number",
+]
+
+Commands = Any  # what ArgumentParser.add_subparsers returns; argparse keeps its class private
+_WIDTH = 78
+
+# As in `edgeperc.zoo` and `edgeperc.session`. They import numpy, and a help page has to come at once.
+DEFAULT = ("ssadnet", "pointseg")
+PROVIDERS = ("auto", "cpu", "openvino", "cuda", "tensorrt", "tensorrt-rtx", "coreml", "directml")
+PRECISIONS = ("auto", "fp32", "bf16", "int8")
+
+
+def add_command(
+    commands: Commands,
+    name: str,
+    command: Callable[[argparse.Namespace], int],
+    *,
+    help: str,
+    description: str,
+    examples: Sequence[str],
+) -> argparse.ArgumentParser:
+    """Add a subcommand.
+
+    Parameters
+    ----------
+    commands : argparse's subparsers
+    name : str
+    command : callable
+        Takes the parsed arguments and returns the exit code.
+    help : str
+        The line in the list of commands.
+    description : str
+    examples : sequence of str
+        Command lines, printed below the options.
+
+    Returns
+    -------
+    argparse.ArgumentParser
+    """
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name,
+        help=help,
+        description="\n\n".join(textwrap.fill(paragraph, _WIDTH) for paragraph in description.split("\n\n")),
+        epilog="\n".join(["examples:", *(f"  {example}" for example in examples)]),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,  # an abbreviation would break when another option begins alike
+    )
+    parser.set_defaults(command=command, usage_error=parser.error)
+    return parser
+
+
+class Renamed(argparse.Action):
+    """An option that was renamed: using it is an error that names the new one (``const``)."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """End with usage error 2."""
+        parser.error(f"{option_string} is now {self.const}")
+
+
+def add_sensor(group: Any, *, required: bool = False) -> None:
+    """Add ``--sensor``."""
+    group.add_argument(
+        "--sensor",
+        required=required,
+        default=None if required else "hdl-64e",
+        metavar="SENSOR",
+        help="the LiDAR that recorded the scans: a name from 'edgeperc sensors', or a .json file written by "
+        "'edgeperc fit-sensor'" + (" (required)" if required else " (default: %(default)s)"),
+    )
+
+
+def add_model(group: Any, default: Sequence[str] = DEFAULT) -> None:
+    """Add ``--model``, which may be repeated."""
+    group.add_argument(
+        "--model",
+        action="append",
+        metavar="MODEL",
+        help="a name from 'edgeperc models', one of its variants such as pointseg:int8, or the path of an .onnx file "
+        f"with a card; repeat it for one model of each kind (default: {' and '.join(default)})",
+    )
+
+
+def add_provider(group: Any, *, provider: str = "auto", precision: str = "auto") -> None:
+    """Add ``--provider`` and ``--precision``."""
+    group.add_argument(
+        "--provider",
+        default=provider,
+        metavar="PROVIDER",
+        help=f"the onnxruntime execution provider: {', '.join(PROVIDERS)}; auto takes the fastest that was measured "
+        "on this computer, else the first of cuda, openvino and cpu that runs the model; any other is required: "
+        "nothing falls back (default: %(default)s)",
+    )
+    group.add_argument(
+        "--precision",
+        choices=PRECISIONS,
+        default=precision,
+        help="arithmetic of the networks; auto takes a reduced precision only where the model's card proves that its "
+        "answers agree with fp32's (default: %(default)s)",
+    )
+
+
+def add_network(group: Any) -> None:
+    """Add how networks are run: ``--provider``, ``--precision``, ``--threads``, ``--boxes-from``, ``--full-turn``."""
+    add_provider(group)
+    group.add_argument(
+        "--threads",
+        type=positive,
+        metavar="N",
+        help="threads inside one network (default: the provider's choice, usually one for each core)",
+    )
+    add_boxes_from(group, "both")
+    group.add_argument(
+        "--full-turn",
+        action="store_true",
+        help="run the range-image model on all four quarters of the turn, for a class of every point around the "
+        "vehicle; takes four times as long (default: only the quarter ahead)",
+    )
+    group.add_argument(
+        "--all-around", action=Renamed, nargs=0, const="--full-turn", default=argparse.SUPPRESS, help=argparse.SUPPRESS
+    )
+
+
+def add_boxes_from(group: Any, default: str) -> None:
+    """Add ``--boxes-from``."""
+    group.add_argument(
+        "--boxes-from",
+        choices=("both", "network", "clusters"),
+        default=default,
+        help="network: boxes of the top-view model (vehicles ahead); clusters: boxes around clusters of labeled "
+        "points (every class, as far as points have a class); both: network boxes, and cluster boxes where there are "
+        "none (default: %(default)s)",
+    )
+
+
+def add_adapt(group: Any) -> None:
+    """Add ``--adapt``."""
+    group.add_argument(
+        "--adapt",
+        type=_adaptation,
+        choices=("both", "remission", "interpolation", "none"),
+        default="both",
+        help="for a sensor other than the models': map its remission to the training sensor's (remission), fill the "
+        "range image between its beams (interpolation), both, or none; no effect on an hdl-64e (default: %(default)s)",
+    )
+
+
+def positive(text: str) -> int:
+    """A count of at least 1."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is too small; expected 1 or more")
+    return value
+
+
+def positive_number(text: str) -> float:
+    """A finite number above 0."""
+    value = float(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{value} is out of range; expected a number above 0")
+    return value
+
+
+def add_figures_file(group: Any) -> None:
+    """Add ``--json FILE``, for the commands that print tables of figures."""
+    group.add_argument(
+        "--json",
+        type=Path,
+        metavar="FILE",
+        help="write every figure to this file, with the command line that gave them (default: tables only)",
+    )
+
+
+def _adaptation(text: str) -> str:
+    if text == "neither":
+        raise argparse.ArgumentTypeError("neither is now none")
+    return text

@@ -1,0 +1,66 @@
+"""``edgeperc completion``: a script that completes the command line in a shell."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from typing import Any
+
+from .arguments import PROVIDERS, Commands, add_command
+from .output import require, say
+
+__all__ = ["add_parser", "completion_command"]
+
+
+def add_parser(commands: Commands) -> None:
+    """Add ``completion``."""
+    parser = add_command(
+        commands,
+        "completion",
+        completion_command,
+        help="print a script that completes commands, options and names in a shell",
+        description="Print a completion script: commands, options, files, and the names of models, sensors and "
+        "providers. Install the extra 'completion' first.",
+        examples=[
+            "edgeperc completion bash > ~/.local/share/bash-completion/completions/edgeperc",
+            "edgeperc completion zsh > ~/.zfunc/_edgeperc    # with fpath+=~/.zfunc",
+            "edgeperc completion tcsh > ~/.edgeperc.tcsh     # with source ~/.edgeperc.tcsh",
+        ],
+    )
+    parser.add_argument("shell", choices=("bash", "zsh", "tcsh"), metavar="SHELL", help="bash, zsh or tcsh")
+
+
+def completion_command(arguments: argparse.Namespace) -> int:
+    """Print the script."""
+    shtab = require("shtab", "completion", "Completing a command line")
+    from ..sensor import SENSORS
+    from ..zoo import shipped_models
+
+    names = {"model": shipped_models(), "sensor": tuple(SENSORS), "provider": PROVIDERS}
+    functions: dict[str, list[str]] = {"bash": [], "zsh": []}
+    completed = {
+        **dict.fromkeys(("FILE", "PATH", "SCAN", "DATASET", "SENSOR=SOURCE", "ROOT"), shtab.FILE),
+        "DIR": shtab.DIRECTORY,
+    }
+    for kind, of in names.items():
+        function, words = f"_edgeperc_{kind}_or_file", " ".join(of)
+        completed[kind.upper()] = {"bash": function, "zsh": function, "tcsh": f"({words})"}
+        # The name has "file" in it, by which shtab knows that a folder's name is not the end of a word.
+        functions["bash"].append(f'{function}() {{ compgen -W \'{words}\' -- "$1"; compgen -f -- "$1"; }}')
+        functions["zsh"].append(f"{function}() {{ compadd {words}; _files; }}")
+    completed["MODEL|SCAN"] = completed["MODEL"]
+    for action in _actions(arguments.parser):
+        if action.choices is None and action.metavar in completed:
+            action.complete = completed[action.metavar]
+    preamble = {shell: "\n".join(lines) for shell, lines in functions.items()}
+    say(shtab.complete(arguments.parser, arguments.shell, preamble=preamble))
+    return 0
+
+
+def _actions(parser: argparse.ArgumentParser) -> Iterator[Any]:
+    """The arguments of a parser and of its subcommands."""
+    for action in parser._actions:
+        yield action
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                yield from _actions(command)

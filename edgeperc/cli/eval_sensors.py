@@ -1,0 +1,63 @@
+"""``edgeperc eval-sensors``: accuracy on other sensors, with and without adaptation."""
+
+from __future__ import annotations
+
+import argparse
+
+from .arguments import Commands, add_command, add_figures_file, add_provider
+from .output import many, progress, table_lines, write_figures
+
+__all__ = ["add_parser", "eval_sensors_command"]
+
+
+def add_parser(commands: Commands) -> None:
+    """Add ``eval-sensors``."""
+    parser = add_command(
+        commands,
+        "eval-sensors",
+        eval_sensors_command,
+        help="accuracy on other sensors, with and without adaptation",
+        description="IoU of points by class on labeled scans of other sensors than the model's: with no adaptation, "
+        "with the remission mapped, with interpolation between beams, and with both.",
+        examples=[
+            "edgeperc eval-sensors os1-64=simulation:24",
+            "edgeperc eval-sensors pandar64=PandaSet/ vlp-16=simulation:8 --json out.json",
+        ],
+    )
+    reading = parser.add_argument_group("input")
+    reading.add_argument(
+        "datasets",
+        nargs="+",
+        metavar="SENSOR=SOURCE",
+        help="a sensor's name or .json profile, and simulation:N, or a folder with velodyne/NAME.bin and "
+        "label/NAME.txt, or a folder of labeled range images NAME.npy",
+    )
+    models = parser.add_argument_group("models")
+    models.add_argument(
+        "--model",
+        default="pointseg",
+        metavar="MODEL",
+        help="a range-image model: a name from 'edgeperc models' or an .onnx file with a card (default: %(default)s)",
+    )
+    add_provider(models, provider="cpu")
+    output = parser.add_argument_group("output")
+    add_figures_file(output)
+
+
+def eval_sensors_command(arguments: argparse.Namespace) -> int:
+    """Print IoU of points on other sensors."""
+    from ..evaluation.transfer import compare
+    from ..perceiver import ADAPTATIONS
+
+    with progress() as show:
+        figures = compare(arguments.datasets, arguments.model, provider=arguments.provider, on_scan=show)
+    lines = [f"{arguments.model}; IoU of points in per cent, mIoU over the classes shown"]
+    for name, of in figures.items():
+        rows = [((kind, ""), {**of[kind]["iou"], "mean": of[kind]["mean_iou"]}) for kind in ADAPTATIONS]
+        there = ", ".join(f"{count:,} {label}" for label, count in of["both"]["n_points"].items())
+        columns = [(label, label) for label in of["both"]["iou"] if label != "background"]
+        title = f"{name}: {many(of['n_scans'], 'scan')}, {there}; remission: {of['function'] or 'no function'}"
+        lines += table_lines(title, (*columns, ("mIoU", "mean")), rows)
+    print("\n".join(lines))
+    write_figures(arguments, figures)
+    return 0

@@ -1,0 +1,171 @@
+"""``edgeperc eval-tracking``: tracking figures on KITTI's sequences."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import PointsError
+from .arguments import (
+    Commands,
+    add_adapt,
+    add_command,
+    add_figures_file,
+    add_model,
+    add_network,
+    add_sensor,
+    positive_number,
+)
+from .output import many, progress, require, table_lines, without_nan, write_figures
+from .run import make_perceiver
+
+if TYPE_CHECKING:
+    from ..perception import Box
+
+__all__ = ["add_parser", "eval_tracking_command"]
+
+
+def add_parser(commands: Commands) -> None:
+    """Add ``eval-tracking``."""
+    parser = add_command(
+        commands,
+        "eval-tracking",
+        eval_tracking_command,
+        help="tracking figures on KITTI's sequences",
+        description="Track KITTI's sequences without ego poses and compare the tracks with the labels: CLEAR-MOT at "
+        "the score with the best MOTA, its averages over forty recalls, and HOTA.\n\nThe boxes are those of "
+        "detections/, if the root has that folder; those of --boxes; or, with --model or without either, what the "
+        "models find in velodyne/.",
+        examples=[
+            "edgeperc eval-tracking tracking/",
+            "edgeperc eval-tracking tracking/ --sequences 0000 0002 --gif 0000.gif",
+            "edgeperc eval-tracking KITTI/ --model pointseg --json figures.json",
+        ],
+    )
+    reading = parser.add_argument_group("input")
+    reading.add_argument(
+        "root",
+        type=Path,
+        metavar="ROOT",
+        help="folder with label_02, calib, and detections/DETECTOR_CLASS or velodyne; or a KITTI object set with "
+        "training/track_id",
+    )
+    reading.add_argument(
+        "--sequences", nargs="+", metavar="SEQ", help="names such as 0000 0002 (default: all that have labels)"
+    )
+    reading.add_argument(
+        "--boxes",
+        type=Path,
+        metavar="FILE",
+        help="track these boxes: what 'edgeperc run --json' printed of the scans of one sequence (default: none)",
+    )
+    add_sensor(reading)
+    rules = parser.add_argument_group("evaluation")
+    rules.add_argument(
+        "--classes",
+        nargs="+",
+        choices=("car", "pedestrian", "cyclist", "vehicle"),
+        default=["car", "pedestrian", "cyclist"],
+        metavar="CLASS",
+        help="some of car, pedestrian, cyclist, vehicle; vehicle is cars, vans and trucks together, for boxes of "
+        "models (default: car pedestrian cyclist)",
+    )
+    rules.add_argument(
+        "--iou",
+        type=positive_number,
+        default=0.25,
+        metavar="X",
+        help="least 3-D overlap (intersection over union) of a match, 0..1 (default: %(default)s)",
+    )
+    models = parser.add_argument_group("models, if the scans are perceived")
+    add_model(models)
+    add_network(models)
+    add_adapt(models)
+    output = parser.add_argument_group("output")
+    add_figures_file(output)
+    output.add_argument(
+        "--gif",
+        type=Path,
+        metavar="FILE",
+        help="write the first sequence's tracks seen from above (needs the extra 'view'; default: none)",
+    )
+
+
+def eval_tracking_command(arguments: argparse.Namespace) -> int:
+    """Print tracking figures on KITTI's sequences."""
+    if arguments.gif is not None:
+        require("pillow", "view", "Drawing an animation", module="PIL")
+    if arguments.boxes is not None and len(arguments.sequences or ()) != 1:
+        arguments.usage_error("--boxes holds the boxes of one sequence; name it with --sequences SEQ")
+    for file in filter(None, (arguments.json, arguments.gif)):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    from ..evaluation.tracking import evaluate_kitti, read_sequence, sequence_names, track_sequence
+    from ..records import read_boxes
+
+    names = arguments.sequences or sequence_names(arguments.root)
+    of = "given detections"
+    boxes: dict[str, list[list[Box]]] = {}
+    if arguments.boxes is not None:
+        boxes, of = {names[0]: read_boxes(arguments.boxes)}, f"boxes of {arguments.boxes}"
+    elif arguments.model or not (arguments.root / "detections").is_dir():
+        boxes, of = _perceived(arguments, names)
+    with progress("sequence") as show:
+        figures = {"of": of} | evaluate_kitti(
+            arguments.root,
+            sequences=names,
+            classes=arguments.classes,
+            boxes=boxes,
+            iou_threshold=arguments.iou,
+            on_sequence=show,
+        )
+    print("\n".join(_tracking_lines(figures)))
+    write_figures(arguments, without_nan(figures))
+    if arguments.gif is not None:
+        from ..view.tracks import draw_tracks
+
+        name = figures["sequences"][0]
+        sequence = read_sequence(arguments.root, name, arguments.classes, boxes.get(name))
+        draw_tracks(track_sequence(sequence)[0], arguments.gif, title=f"sequence {sequence.name}")
+    return 0
+
+
+def _perceived(arguments: argparse.Namespace, names: Sequence[str]) -> tuple[dict[str, list[list[Box]]], str]:
+    """By sequence and frame, the boxes that models find in the scans; and the models' names."""
+    from ..evaluation.tracking import perceive_drive, sequence_scans
+
+    scans = {name: sequence_scans(arguments.root, name) for name in names}
+    for name, of in scans.items():
+        if not of:
+            raise PointsError(f"{arguments.root} has no scans of {name}; expected velodyne/{name}/*.bin, or detections")
+    perceive = make_perceiver(arguments, sensor=arguments.sensor, on_mismatch="ignore", adapt=arguments.adapt)
+    total, counted = sum(map(len, scans.values())), itertools.count(1)
+    with progress() as show:
+        boxes = {
+            name: perceive_drive(perceive, of, name, lambda: show(next(counted), total)) for name, of in scans.items()
+        }
+    return boxes, "boxes of " + " and ".join(f"{card.name} {card.version}" for card in perceive.cards)
+
+
+_AVERAGE_COLUMNS = (
+    *(("sAMOTA", "samota"), ("AMOTA", "amota"), ("AMOTP", "amotp"), ("MOTA", "mota"), ("MOTP", "motp")),
+    *(("HOTA", "hota"), ("DetA", "deta"), ("AssA", "assa"), ("fragments", "n_fragments")),
+)
+_COUNT_COLUMNS = (
+    *(("frames", "n_frames"), ("objects", "n_objects"), ("boxes", "n_truth"), ("false alarms", "n_false")),
+    *(("missed", "n_missed"), ("ID switches", "n_switches")),
+)
+
+
+def _tracking_lines(figures: Mapping[str, Any]) -> list[str]:
+    rows = [(("", name), without_nan({**of, **of["best"], **of["hota"]})) for name, of in figures["classes"].items()]
+    every = [(("", name), without_nan({**of, **of["told"]})) for name, of in figures["classes"].items()]
+    return [
+        f"{many(len(figures['sequences']), 'sequence')}, {figures['of']}, 3-D IoU {figures['iou_threshold']}; "
+        f"{figures['frames_per_s']:,.0f} scans a second in the tracker; shares in per cent",
+        *table_lines("over forty recalls; at the best MOTA", _AVERAGE_COLUMNS, rows),
+        *table_lines("counts at the best MOTA", _COUNT_COLUMNS, rows),
+        *table_lines("counts of all tracks, with any score", _COUNT_COLUMNS, every),
+    ]

@@ -1,0 +1,68 @@
+"""``edgeperc fit-sensor``: a sensor profile from scans."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ..errors import PointsError, SensorError
+from .arguments import Commands, add_command, add_sensor
+from .output import print_rows
+from .scans import find_scans
+
+__all__ = ["add_parser", "fit_sensor_command"]
+
+
+def add_parser(commands: Commands) -> None:
+    """Add ``fit-sensor``."""
+    parser = add_command(
+        commands,
+        "fit-sensor",
+        fit_sensor_command,
+        help="fit a sensor's remission to the training sensor's and write a profile",
+        description="Fit a function that maps the remission of one sensor to that of another, and write a sensor "
+        "profile for --sensor. It takes unlabeled scans of any streets, at least a dozen of different places, and "
+        "assumes that equal shares of the points of both sensors are equally bright.",
+        examples=[
+            "edgeperc fit-sensor drives/ --sensor os1-64 --out my-os1.json",
+            "edgeperc run drives/ --sensor my-os1.json",
+        ],
+    )
+    reading = parser.add_argument_group("input")
+    reading.add_argument(
+        "scans", nargs="+", type=Path, metavar="SCAN", help="scan files, captures, or folders of them, as for 'run'"
+    )
+    add_sensor(reading, required=True)
+    reading.add_argument(
+        "--to",
+        default="hdl-64e",
+        metavar="SENSOR",
+        help="the sensor whose remission comes out: the one that the models were trained on (default: %(default)s)",
+    )
+    output = parser.add_argument_group("output")
+    output.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help="the profile to write, a .json file (required)"
+    )
+
+
+def fit_sensor_command(arguments: argparse.Namespace) -> int:
+    """Fit a remission function and write the sensor profile."""
+    from ..readers.captures import read_scans
+    from ..sensor import get_sensor
+    from ..sensor_fit import fit_sensor
+
+    found = find_scans(arguments.scans)
+    if found.empty:
+        raise PointsError(f"{found.empty[0]}: no scan in this folder; expected scans or captures")
+    if arguments.out.suffix != ".json":
+        raise SensorError(f"{arguments.out}: expected a name that ends in .json, by which --sensor knows a file")
+    scans = [points for path in found.paths for _, points in read_scans(path)]
+    profile, functions = fit_sensor(scans, get_sensor(arguments.sensor), arguments.to)
+    assert profile.remission is not None
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(profile.to_json() + "\n", encoding="utf-8")
+    rows = [
+        (f.kind, f"RMSE {f.rmse:.4f}; coefficients {', '.join(f'{c:.5g}' for c in f.coefficients)}") for f in functions
+    ]
+    print_rows([*rows, ("written", f"{arguments.out}: {profile.name} with the {profile.remission.kind}")])
+    return 0

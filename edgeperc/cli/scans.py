@@ -1,0 +1,110 @@
+"""Paths of the command line to scan files, and a name for the files that are written of each."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+__all__ = ["Scans", "find_scans", "output_names", "scan_folders", "scan_namer"]
+
+# Where data sets keep their scans: KITTI's object and tracking sets, SemanticKITTI, a KITTI raw drive, a day of them.
+_LAYOUTS = (
+    *("training/velodyne", "training/velodyne/*", "testing/velodyne", "testing/velodyne/*", "sequences/*/velodyne"),
+    *("velodyne", "velodyne/*", "velodyne_points/data", "*/velodyne_points/data"),
+)
+# Folders of these layouts that say nothing about a scan.
+_LAYOUT_FOLDERS = ("velodyne", "velodyne_points", "data")
+
+
+class Scans(NamedTuple):
+    """What lies at the paths of a command line.
+
+    Attributes
+    ----------
+    paths : list of Path
+        Scan files and captures, each once.
+    empty : list of Path
+        Folders without any.
+    of_data_set : bool
+        Some paths were found below the root of a data set, whose sequences number their scans from 0 each.
+    """
+
+    paths: list[Path]
+    empty: list[Path]
+    of_data_set: bool
+
+
+def scan_folders(root: Path) -> list[Path]:
+    """The folder itself if it holds scans, else those that do below the root of a data set.
+
+    Data sets are KITTI's object and tracking sets, SemanticKITTI, and KITTI's raw drives.
+    """
+    from ..readers.captures import scan_files
+
+    if scan_files(root):
+        return [root]
+    found = (folder for layout in _LAYOUTS for folder in sorted(root.glob(layout)))
+    return [folder for folder in found if folder.is_dir() and scan_files(folder)]
+
+
+def find_scans(paths: Sequence[Path]) -> Scans:
+    """Scan files and captures in the order given; folders and data sets are opened, their scans sorted."""
+    from ..readers.captures import is_capture, scan_files
+
+    scans: dict[str, Path] = {}
+    empty, of_data_set = [], False
+    for path in paths:
+        found = [path]
+        if path.is_dir() and not is_capture(path):
+            folders = scan_folders(path)
+            found = [scan for folder in folders for scan in scan_files(folder)]
+            of_data_set |= folders not in ([], [path])
+            if not found:
+                empty.append(path)
+        for scan in found:
+            scans.setdefault(_absolute(scan), scan)
+    return Scans(list(scans.values()), empty, of_data_set)
+
+
+def scan_namer(path: Path) -> Callable[[int], Path]:
+    """A function from the number of a scan in a source, from 0, to a name: its file, or the capture and the number."""
+    from ..readers.captures import is_capture, scan_files
+
+    if path.is_dir() and not is_capture(path):
+        files = scan_files(path)
+        if not any(map(is_capture, files)):
+            return files.__getitem__
+    elif not is_capture(path):
+        return lambda k: path
+    return lambda k: path / f"{k:06d}"
+
+
+def output_names(scans: Sequence[Path], *, keep_folder: bool = False) -> list[Path]:
+    """A name for each scan's files: its own, after as many of its folders as make all names different.
+
+    Parameters
+    ----------
+    scans : sequence of Path
+    keep_folder : bool
+        Name one folder at least, the sequence of a data set.
+    """
+    whole = [Path(_absolute(scan)).parts[1:] for scan in scans]
+    short = [(*(p for p in parts[:-1] if p not in _LAYOUT_FOLDERS), parts[-1]) for parts in whole]
+    deepest = max(map(len, whole), default=0)
+    depths = range(min(2 if keep_folder else 1, deepest), deepest + 1)
+    candidates = ([Path(*parts[-depth:]) for parts in kind] for kind in (short, whole) for depth in depths)
+    names = next(filter(_all_differ, candidates), [Path(*parts) for parts in whole])
+    bare = [name.with_name(re.sub(r"(?i)(\.pcd)?\.[^.]+$", "", name.name) or name.name) for name in names]
+    return bare if _all_differ(bare) else names
+
+
+def _absolute(path: Path) -> str:
+    return os.path.abspath(path)  # noqa: PTH100 - resolve() follows links, and a linked scan keeps its name
+
+
+def _all_differ(names: Sequence[Path]) -> bool:
+    # Some file systems do not distinguish A from a.
+    return len({str(name).casefold() for name in names}) == len(names)
