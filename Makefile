@@ -12,21 +12,23 @@ BIN := .venv/bin
 TEST := .venv-test/bin
 MINIMAL := .venv-minimal/bin
 
-.PHONY: help demo test check test-full test-wheel test-minimal clean
+.PHONY: help demo test check test-full test-kernels test-wheel test-minimal docs clean
 
 help:
 	@echo "make demo          perceive the bundled scene: a table, and a picture in demo/"
 	@echo "make test          everything below"
 	@echo "make check         ruff, mypy"
 	@echo "make test-full     pytest with every extra"
+	@echo "make test-kernels  the kernels' tests again: interpreted, and with array bounds checked"
 	@echo "make test-wheel    build the wheel, run the demo from it outside the checkout"
 	@echo "make test-minimal  pytest with nothing but the runtime: no torch, no onnx, no matplotlib"
+	@echo "make docs          build the documentation into docs/_build/html; warnings are errors"
 	@echo "make clean         remove the environments and whatever else is made here"
 
 demo: .venv/installed
 	$(BIN)/edgeperc demo --out demo
 
-test: check test-full test-wheel test-minimal
+test: check docs test-full test-kernels test-wheel test-minimal
 
 check: .venv-test/installed
 	$(TEST)/ruff check .
@@ -35,6 +37,15 @@ check: .venv-test/installed
 
 test-full: .venv-test/installed
 	$(TEST)/pytest -n $(JOBS)
+
+# Interpreted, a kernel answers as it does compiled; compiled, it stays inside its arrays.
+test-kernels: .venv-test/installed
+	NUMBA_DISABLE_JIT=1 $(TEST)/pytest -q -n $(JOBS) -m kernel --every-kernel
+	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/.venv-test/bounds-checked $(TEST)/pytest -q -n $(JOBS) -m kernel
+
+docs: .venv-test/installed
+	$(TEST)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "open docs/_build/html/index.html"
 
 test-wheel: .venv-test/installed
 	PYTHON=$(TEST)/python tests/wheel_demo.sh
@@ -51,7 +62,7 @@ test-minimal: .venv-minimal/installed
 
 .venv-test/installed: pyproject.toml constraints.txt
 	$(call environment,.venv-test)
-	$(TEST)/pip install --quiet --constraint constraints.txt --editable '.[cpu,openvino,view,io,peers,database,ray,test]'
+	$(TEST)/pip install --quiet --constraint constraints.txt --editable '.[cpu,openvino,view,io,peers,database,ray,docs,test]'
 	@touch $@
 
 .venv-minimal/installed: pyproject.toml constraints.txt
@@ -68,5 +79,5 @@ define environment
 endef
 
 clean:
-	rm -rf .venv .venv-test .venv-minimal build dist demo *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-test .venv-minimal build dist demo docs/_build docs/reference/generated *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find bench edgeperc export models tests -name __pycache__ -type d -exec rm -rf {} +
