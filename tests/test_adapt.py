@@ -477,7 +477,7 @@ def test_adapt_fit_writes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureF
         scan = simulate(random_scene(k, "urban"), "vlp-16", k).points
         scan[:, 3] = np.rint(np.expm1((scan[:, 3] + 0.1) / 0.15))
         scan.tofile(scans / f"{k}.bin")
-    fit = ["adapt", "fit", str(scans), "--sensor", "vlp-16", "--to", "hdl-64e", "--out", str(out)]
+    fit = ["fit-sensor", str(scans), "--sensor", "vlp-16", "--to", "hdl-64e", "--out", str(out)]
     assert cli.main(fit) == 0
     told = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in told] == [
@@ -494,11 +494,11 @@ def test_adapt_fit_writes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureF
     assert "adapt" in json.loads(capsys.readouterr().out)["stage_ms"]
     assert cli.main([*run, "--on-mismatch", "ignore", "--adapt", "none"]) == 0
     assert "adapt" not in json.loads(capsys.readouterr().out)["stage_ms"]
-    for wrong in ([*fit[:-1], str(tmp_path / "mine.txt")], [*fit[:4], "vlp-17", *fit[5:]], [*fit[:6], "x", *fit[7:]]):
+    for wrong in ([*fit[:-1], str(tmp_path / "mine.txt")], [*fit[:3], "vlp-17", *fit[4:]], [*fit[:5], "x", *fit[6:]]):
         assert cli.main(wrong) == 2
         assert capsys.readouterr().err.startswith("edgeperc: ")
     (tmp_path / "none").mkdir()
-    assert cli.main(["adapt", "fit", str(tmp_path / "none"), *fit[3:]]) == 2
+    assert cli.main(["fit-sensor", str(tmp_path / "none"), *fit[2:]]) == 2
     assert "no scan in this folder" in capsys.readouterr().err
 
 
@@ -526,7 +526,7 @@ def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
     datasets = ["os1-64=simulation:1", f"hdl-64e={boxes}", f"hdl-64e={images}"]
     out = tmp_path / "figures.json"
-    assert cli.main(["eval", "sensors", *datasets, "--json", str(out)]) == 0
+    assert cli.main(["eval-sensors", *datasets, "--json", str(out)]) == 0
     printed = capsys.readouterr().out
     assert printed.count("none") == printed.count("both") == 3
     figures = json.loads(out.read_text())
@@ -540,7 +540,7 @@ def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         assert told["both"]["iou"]["car"] > 0.5
     assert pictured["both"]["iou"]["cyclist"] is None  # two-wheelers are not told apart from their riders
     for source in ("vlp-16", "vlp-16=simulation:0", f"vlp-16={tmp_path}", "vlp-17=simulation"):
-        assert cli.main(["eval", "sensors", source]) == 2
+        assert cli.main(["eval-sensors", source]) == 2
         assert capsys.readouterr().err.startswith("edgeperc: ")
 
 

@@ -454,7 +454,7 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: t
         assert words in capsys.readouterr().err
     for arguments, words in [
         (("--model", "nonesuch"), "no model is called 'nonesuch'. Shipped: pointseg, ssadnet."),
-        (("--model", "pointseg", "--model", "pointseg"), "models ['pointseg', 'pointseg'] have one view; --threads is"),
+        (("--model", "pointseg", "--model", "pointseg"), "--model ['pointseg', 'pointseg'] have one view; --threads is"),
         (("--model", "ssadnet", "--labels", "--out", tmp_path / "out"), "add a range-image model"),
     ]:
         assert run("run", scan, *arguments) == 2
@@ -957,7 +957,7 @@ def test_old_words_are_refused_with_the_new_one(words: list[str], new: str, caps
         ("provider 'x' is unknown; expected auto", "--provider 'x' is unknown; expected auto"),
         ("ask for provider 'openvino' and precision 'bf16'", "ask for --provider 'openvino' and --precision 'bf16'"),
         ('pass precision="fp32", or adapt=none', "pass --precision fp32, or --adapt none"),
-        ("models ['a', 'b'] have views", "models ['a', 'b'] have views"),
+        ("models ['a', 'b'] have views", "--model ['a', 'b'] have views"),
         (
             "the sensor gives no remission; the provider's choice",
             "the sensor gives no remission; the provider's choice",

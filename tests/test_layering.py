@@ -59,7 +59,7 @@ FLOORS = {
         cli.demo cli.eval cli.eval_sensors cli.eval_tracking cli.lists
         cli.main
         cli.__init__
-        __init__
+        __init__ __main__
     """,
     "edgeperc_export": """
         __init__ networks.pointseg networks.ssadnet recipe scans targets
@@ -83,14 +83,14 @@ FLOORS = {
         plots report worker options
         accuracy start
         measure
-        peers.__init__ peers.arithmetic peers.projection
-        peers.engines peers.ground peers.tracking
+        peers.__init__ peers.arithmetic peers.rounds
+        peers.engines peers.ground peers.projection peers.tracking
         peers.numpy_pipeline peers.networks peers.contenders
         peers.tables
         peers.turns
-        commands.__init__ commands.common commands.compare
-        commands.matrix commands.peers commands.run commands.soak
-        commands.scaling
+        commands.common
+        commands.compare commands.matrix commands.peers commands.run commands.scaling commands.soak
+        commands.__init__
         cli
     """,
 }

@@ -1019,7 +1019,7 @@ def test_kitti_errors(kitti: Path, tmp_path: Path) -> None:
 
 
 def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["eval", "tracking", str(kitti), "--json", str(kitti / "out/figures.json")]
+    arguments = ["eval-tracking", str(kitti), "--json", str(kitti / "out/figures.json")]
     assert cli.main(arguments) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("1 sequence, given detections, 3-D IoU 0.25;")
@@ -1028,7 +1028,7 @@ def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixt
     assert any(line[:7] == ["sAMOTA", "AMOTA", "AMOTP", "MOTA", "MOTP", "HOTA", "DetA"] for line in words)
     figures = json.loads((kitti / "out/figures.json").read_text())
     assert figures["classes"]["cyclist"]["best"]["mota"] is None
-    assert figures["command"].startswith("edgeperc eval tracking")
+    assert figures["command"].startswith("edgeperc eval-tracking")
     assert cli.main(["eval-tracking", str(kitti / "calib")]) == 2
     assert "no label_02" in capsys.readouterr().err
 
@@ -1042,8 +1042,7 @@ def test_a_models_boxes_are_judged(kitti: Path, capsys: pytest.CaptureFixture[st
     boxes = kitti / "boxes.jsonl"
     boxes.write_text("\n".join(map(json.dumps, lines)))
     arguments = [
-        "eval",
-        "tracking",
+        "eval-tracking",
         str(kitti),
         "--sequences",
         "0000",
@@ -1065,7 +1064,7 @@ def test_a_models_boxes_are_judged(kitti: Path, capsys: pytest.CaptureFixture[st
     assert cli.main(arguments) == 2
     assert "holds no boxes" in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        cli.main([*arguments[:3], "--boxes", str(boxes)])
+        cli.main([*arguments[:2], "--boxes", str(boxes)])
 
 
 @pytest.fixture

@@ -35,6 +35,7 @@ _OPTIONS = {
     "boxes_from": "--boxes-from",
     "fold": "--fold",
     "full_turn": "--full-turn",
+    "models": "--model",
     "n_threads": "--threads",
     "on_mismatch": "--on-mismatch",
     "precision": "--precision",
@@ -115,4 +116,4 @@ def in_options(message: str) -> str:
     """
     names = "|".join(_OPTIONS)
     message = re.sub(rf"(?<![\w-])({names})=(['\"]?)([\w.:-]+)\2", lambda m: f"{_OPTIONS[m[1]]} {m[3]}", message)
-    return re.sub(rf"(?<![\w-])({names})(?= is | are | ')", lambda m: _OPTIONS[m[1]], message)
+    return re.sub(rf"(?<![\w-])({names})(?= is | are | '| \[)", lambda m: _OPTIONS[m[1]], message)
