@@ -93,7 +93,7 @@ def render(points: NDArray[np.float32], sensor: SensorProfile) -> NDArray[np.flo
     if points.ndim != 2 or points.shape[1] != 4 or points.dtype != np.float32:
         raise PointsError(f"got points of shape {points.shape} and {points.dtype}; expected (n, 4) float32")
     if sensor.remission is None:
-        raise SensorError(f"sensor {sensor.name!r} has no remission function; fit one with edgeperc adapt fit")
+        raise SensorError(f"sensor {sensor.name!r} has no remission function; fit one with edgeperc fit-sensor")
     function = sensor.remission
     rendered = np.empty_like(points, order="C")
     coefficients = np.zeros(3)

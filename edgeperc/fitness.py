@@ -519,6 +519,6 @@ def _remission_findings(scan: _Measures, profile: FitnessProfile, sensor: Sensor
     if not darkest / 4.0 <= scan.remission_median <= brightest * 2.5:
         return [
             f"The median remission is {scan.remission_median:.2f} of full scale, in training it was {darkest:.2f} to "
-            f"{brightest:.2f}: sensors differ in this; fit a profile to it with edgeperc adapt fit."
+            f"{brightest:.2f}: sensors differ in this; fit a profile to it with edgeperc fit-sensor."
         ]
     return []

@@ -169,7 +169,7 @@ class SensorProfile:
         try:
             document = json.loads(text)
         except (RecursionError, ValueError) as exc:
-            raise SensorError(f"the sensor profile is no JSON ({exc}); write it again with edgeperc adapt fit") from exc
+            raise SensorError(f"the sensor profile is no JSON ({exc}); write it again with edgeperc fit-sensor") from exc
         if not isinstance(document, dict) or document.get("schema") != SCHEMA:
             found = document.get("schema") if isinstance(document, dict) else None
             raise SensorError(f"the sensor profile has schema {found!r}, this edgeperc reads {SCHEMA}")
@@ -288,7 +288,7 @@ def _ouster(model: str, half_fov_deg: float, min_range_m: float, max_range_m: fl
 
 _BYTE = (0.0, 255.0)
 
-# `edgeperc adapt fit`, from unlabelled scans. The logarithm was the best of three each time.
+# `edgeperc fit-sensor`, from unlabelled scans. The logarithm was the best of three each time.
 _OF_NUSCENES = RemissionFunction(
     "logarithm", (-0.2949, 0.1832), 255.0, "hdl-64e", 0.0209, "13 nuScenes scans, quantiles by range and incidence"
 )
@@ -344,7 +344,7 @@ def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
     Parameters
     ----------
     sensor : str, Path or SensorProfile
-        A str that ends in ``.json`` and every Path is a file, as ``edgeperc adapt fit`` or `SensorProfile.to_json`
+        A str that ends in ``.json`` and every Path is a file, as ``edgeperc fit-sensor`` or `SensorProfile.to_json`
         writes it.
 
     Raises
