@@ -42,7 +42,3 @@ def write_whole(path: str | Path, content: bytes) -> None:
     """Write a file at once, as `open_whole` does."""
     with open_whole(path) as file:
         file.write(content)
-
-
-def write_aside(path: Path, content: bytes) -> None:  # until its callers have moved
-    write_whole(path, content)

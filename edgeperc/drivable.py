@@ -14,7 +14,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .card import TopViewGeometry
 from .errors import PointsError
 from .geometry import draw_footprints
 from .perception import Box, TopView
@@ -110,9 +109,8 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
     drivable = np.ascontiguousarray(top_view.drivable)
     standing = list(boxes)
     if standing:
-        view = TopViewGeometry(top_view.x_range_m, top_view.y_range_m, cell_m=top_view.cell_m)
         taken = np.zeros(drivable.shape, np.uint8)
-        draw_footprints(taken, standing, view, ("free", *{box.label for box in standing}))
+        draw_footprints(taken, standing, top_view.geometry, ("free", *{box.label for box in standing}))
         drivable &= taken == 0
     height, width = drivable.shape
     cell_m, (x_near, x_far), y_left = top_view.cell_m, top_view.x_range_m, top_view.y_range_m[1]

@@ -86,9 +86,8 @@ def sure_surface(points: NDArray[np.float32]) -> NDArray[np.uint8]:
     x, y = points[:, 0].astype(np.float64), points[:, 1].astype(np.float64)
     height = points[:, 2] - (plane[0] * x + plane[1] * y + plane[2])
     distance = np.hypot(x, y)
-    row = np.floor((SURFACE.x_range_m[1] - x) / SURFACE.cell_m).astype(np.int64)
-    col = np.floor((SURFACE.y_range_m[1] - y) / SURFACE.cell_m).astype(np.int64)
-    kept = (row >= 0) & (row < SURFACE.height) & (col >= 0) & (col < SURFACE.width) & (distance > 2.5) & (height < 3.0)
+    row, col, kept = SURFACE.cells(x, y)
+    kept &= (distance > 2.5) & (height < 3.0)
     cell = row * SURFACE.width + col
 
     low = kept & (np.abs(height) < 0.08 + 0.004 * distance)
@@ -139,9 +138,7 @@ def with_road(surface: NDArray[np.uint8], road: NDArray[np.uint8]) -> NDArray[np
     from .roads import VIEW
 
     x, y = SURFACE.cell_centres()
-    row = np.floor((VIEW.x_range_m[1] - x) / VIEW.cell_m).astype(np.int64)
-    col = np.floor((VIEW.y_range_m[1] - y) / VIEW.cell_m).astype(np.int64)
-    drawn = (row >= 0) & (row < VIEW.height) & (col >= 0) & (col < VIEW.width)
+    row, col, drawn = VIEW.cells(x, y)
     return np.where(drawn, road[row % VIEW.height, col % VIEW.width], surface).astype(np.uint8)
 
 

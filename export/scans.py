@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from edgeperc.atomic import open_whole
 from edgeperc.card import TopViewGeometry
 from edgeperc.evaluation.datasets import Frame
 from edgeperc.geometry import draw_footprints, inside
@@ -76,18 +77,17 @@ class LabelledScan:
         """Write to an .npz, without pickles."""
         boxes = np.array([[*b.center, *b.size, b.yaw] for b in self.boxes], np.float32).reshape(-1, 7)
         names = np.array([b.label for b in self.boxes], dtype="U16")
-        aside = path.with_suffix(".tmp.npz")
-        np.savez(
-            aside,
-            points=self.points,
-            labels=self.labels,
-            boxes=boxes,
-            names=names,
-            counts=np.array(self.counts, np.int64),
-            surface=self.surface,
-            azimuths=np.array(self.azimuths),
-        )
-        aside.rename(path)
+        with open_whole(path) as file:
+            np.savez(
+                file,
+                points=self.points,
+                labels=self.labels,
+                boxes=boxes,
+                names=names,
+                counts=np.array(self.counts, np.int64),
+                surface=self.surface,
+                azimuths=np.array(self.azimuths),
+            )
 
     @classmethod
     def load(cls, path: Path) -> LabelledScan:
@@ -114,9 +114,7 @@ class LabelledScan:
         if self.mirrored:
             y = -y
         cos, sin = np.cos(self.turn), np.sin(self.turn)
-        row = np.floor((SURFACE.x_range_m[1] - (cos * x + sin * y)) / SURFACE.cell_m).astype(np.int64)
-        col = np.floor((SURFACE.y_range_m[1] - (cos * y - sin * x)) / SURFACE.cell_m).astype(np.int64)
-        covered = (row >= 0) & (row < SURFACE.height) & (col >= 0) & (col < SURFACE.width)
+        row, col, covered = SURFACE.cells(cos * x + sin * y, cos * y - sin * x)
         truth = np.where(covered, self.surface[row % SURFACE.height, col % SURFACE.width], IGNORE).astype(np.uint8)
         draw_footprints(truth, self.boxes, geometry, TOP_VIEW_CLASSES)
         truth[~self.labelled(geometry)] = IGNORE

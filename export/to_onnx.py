@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from edgeperc.atomic import open_whole
 from edgeperc.card import CARD_KEY, Golden, ModelCard
 from edgeperc.decode import decode_classes, decode_top_view
 from edgeperc.errors import EdgepercError
@@ -138,15 +139,12 @@ def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
     del model.metadata_props[:]
     model.metadata_props.extend(kept)
     model.metadata_props.add(key=CARD_KEY, value=card.to_json())
-    aside = path.with_name(f".{path.name}.aside.onnx")
-    try:
-        aside.write_bytes(model.SerializeToString(deterministic=True))
-        session = Session(aside, "cpu")
+    with open_whole(path) as file:
+        file.write(model.SerializeToString(deterministic=True))
+        file.flush()
+        session = Session(Path(file.name), "cpu")
         if session.card.to_json() != card.to_json():
             raise ParityError(f"{path}: the card read back is not the card written")
-        aside.replace(path)
-    finally:
-        aside.unlink(missing_ok=True)
 
 
 def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:

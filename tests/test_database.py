@@ -497,7 +497,7 @@ def test_stopped_at_every_write_and_resumed_it_is_the_same(
     out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The plug is pulled in every file: before it, half way, and before it is renamed, in turn."""
-    plan, write, stops = plan_of(kitti, tmp_path / "out", model), database_build.write_aside, 0
+    plan, write, stops = plan_of(kitti, tmp_path / "out", model), database_build.write_whole, 0
 
     def failing(path: Path, content: bytes) -> None:
         nonlocal left
@@ -509,7 +509,7 @@ def test_stopped_at_every_write_and_resumed_it_is_the_same(
         left -= 1
         write(path, content)
 
-    monkeypatch.setattr(database_build, "write_aside", failing)
+    monkeypatch.setattr(database_build, "write_whole", failing)
     while True:
         left = 3 + 7 * stops % 13  # a scene writes four files, a drawn one up to twelve
         try:
@@ -533,11 +533,11 @@ from pathlib import Path
 from edgeperc_export import database_build
 from edgeperc_export.database.build import Plan, build
 
-def told(path, content, write=database_build.write_aside):
+def told(path, content, write=database_build.write_whole):
     print(path.name, flush=True)
     write(path, content)
 
-database_build.write_aside = told
+database_build.write_whole = told
 kitti, out, model, polygons = sys.argv[1:]
 print("ready", flush=True)
 build(Plan(Path(kitti), Path(out), model, provider="cpu", variations=3), polygons=[Path(polygons)], workers=1)

@@ -306,9 +306,8 @@ class RoadFrame:
         A cell is road, or vehicle, if more than half of its labeled returns are, and `IGNORE` without a labeled return.
         """
         p, known = self.points, self.labels != IGNORE
-        row = np.floor((geometry.x_range_m[1] - p[:, 0]) / geometry.cell_m).astype(np.int64)
-        col = np.floor((geometry.y_range_m[1] - p[:, 1]) / geometry.cell_m).astype(np.int64)
-        known &= (row >= 0) & (row < geometry.height) & (col >= 0) & (col < geometry.width)
+        row, col, in_view = geometry.cells(p[:, 0], p[:, 1])
+        known &= in_view
         known &= (p[:, 2] >= geometry.z_range_m[0]) & (p[:, 2] <= geometry.z_range_m[1])
         cell = row[known] * geometry.width + col[known]
         size = geometry.height * geometry.width

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..card import TopViewGeometry
 from ..errors import PointsError
-from ..geometry import bounding_rectangles, oriented_iou
+from ..geometry import bounding_rectangles, oriented_iou, rectangles, shared_area
 from ..perception import Box
 
 __all__ = [
@@ -321,7 +321,7 @@ class BoxEvaluator:
         rights, spares = list(truth), list(ignored)
         overlap = oriented_iou(self._rectangles(guesses), self._rectangles(rights))
         excused = (oriented_iou(self._rectangles(guesses), self._rectangles(spares)) >= self.iou_threshold).any(axis=1)
-        excused |= _share_inside(_rectangles(guesses), np.asarray(ignored_regions, dtype=np.float64)) >= 0.5
+        excused |= _share_inside(rectangles(guesses), np.asarray(ignored_regions, dtype=np.float64)) >= 0.5
         for label in dict.fromkeys(box.label for box in (*guesses, *rights)):
             matches = self._classes.setdefault(label, _Matches())
             self._match(matches, guesses, rights, overlap, excused, {label})
@@ -359,8 +359,8 @@ class BoxEvaluator:
         return _mean(np.array([scores.ap for scores in self.per_class(within_m).values()]))
 
     def _rectangles(self, boxes: list[Box]) -> NDArray[np.float64]:
-        rectangles = _rectangles(boxes)
-        return rectangles if self.oriented else bounding_rectangles(rectangles)
+        rows = rectangles(boxes)
+        return rows if self.oriented else bounding_rectangles(rows)
 
     def _match(
         self,
@@ -457,19 +457,12 @@ def _range_m(box: Box) -> float:
     return math.hypot(box.center[0], box.center[1])
 
 
-def _rectangles(boxes: list[Box]) -> NDArray[np.float64]:
-    rows = [(box.center[0], box.center[1], box.size[0], box.size[1], box.yaw) for box in boxes]
-    return np.array(rows, dtype=np.float64).reshape(-1, 5)
-
-
-def _share_inside(rectangles: NDArray[np.float64], regions: NDArray[np.float64]) -> NDArray[np.float64]:
+def _share_inside(rows: NDArray[np.float64], regions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Largest share of the area of each rectangle that lies in one region, (n,)."""
-    if len(rectangles) == 0 or regions.size == 0:
-        return np.zeros(len(rectangles))
-    iou = oriented_iou(rectangles, regions)
-    areas = rectangles[:, 2] * rectangles[:, 3]
-    both = areas[:, None] + (regions[:, 2] * regions[:, 3])[None, :]
-    shared = iou / (1.0 + iou) * both  # as iou = shared / (both - shared)
+    if len(rows) == 0 or regions.size == 0:
+        return np.zeros(len(rows))
+    shared = shared_area(oriented_iou(rows, regions), rows, regions)
+    areas = rows[:, 2] * rows[:, 3]
     return np.asarray(np.max(shared / np.maximum(areas, np.finfo(np.float64).tiny)[:, None], axis=1))
 
 

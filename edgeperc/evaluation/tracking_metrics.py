@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import TrackingError
-from ..geometry import oriented_iou
+from ..geometry import oriented_iou, shared_area
 
 __all__ = [
     "Clear",
@@ -167,10 +167,9 @@ def box_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     """
     first = np.asarray(a, dtype=np.float64).reshape(-1, 7)
     second = np.asarray(b, dtype=np.float64).reshape(-1, 7)
-    flat = oriented_iou(first[:, [0, 1, 3, 4, 6]], second[:, [0, 1, 3, 4, 6]])
-    areas = (first[:, 3] * first[:, 4])[:, None] + (second[:, 3] * second[:, 4])[None, :]
+    footprints = first[:, [0, 1, 3, 4, 6]], second[:, [0, 1, 3, 4, 6]]
     with np.errstate(invalid="ignore", divide="ignore"):
-        shared = flat / (1.0 + flat) * areas  # as flat = shared / (areas - shared)
+        shared = shared_area(oriented_iou(*footprints), *footprints)
         top = np.minimum.outer(first[:, 2] + first[:, 5] / 2.0, second[:, 2] + second[:, 5] / 2.0)
         bottom = np.maximum.outer(first[:, 2] - first[:, 5] / 2.0, second[:, 2] - second[:, 5] / 2.0)
         shared *= np.maximum(top - bottom, 0.0)

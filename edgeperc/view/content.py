@@ -84,9 +84,7 @@ def paint_points(points: NDArray[np.float32], perception: Perception) -> tuple[l
     names += [name for name in top_view.classes if name not in names]
     near = np.flatnonzero(drawable_points(points))
     x, y, z = points[near, :3].astype(np.float64).T
-    row = np.floor((top_view.x_range_m[1] - x) / top_view.cell_m)
-    col = np.floor((top_view.y_range_m[1] - y) / top_view.cell_m)
-    inside = (row >= 0) & (row < top_view.labels.shape[0]) & (col >= 0) & (col < top_view.labels.shape[1])
+    row, col, inside = top_view.geometry.cells(x, y)
     near, z = near[inside], z[inside]
     cell = top_view.labels[row[inside].astype(np.intp), col[inside].astype(np.intp)]
     lent = np.array([names.index(name) for name in top_view.classes], dtype=np.uint8)[cell]

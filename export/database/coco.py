@@ -84,9 +84,7 @@ def varied(
     from_x, from_y = cos * x + sin * y, cos * y - sin * x
     if mirrored:
         from_y = -from_y
-    row = np.floor((VIEW.x_range_m[1] - from_x) / VIEW.cell_m).astype(np.int64)
-    col = np.floor((VIEW.y_range_m[1] - from_y) / VIEW.cell_m).astype(np.int64)
-    inside = (row >= 0) & (row < HEIGHT) & (col >= 0) & (col < WIDTH)
+    row, col, inside = VIEW.cells(from_x, from_y)
     row, col = row % HEIGHT, col % WIDTH
     moved = np.where(inside[..., None], image[row, col], 0).astype(np.uint8)
     return moved, np.where(inside, mask[row, col], IGNORE).astype(np.uint8), turn_deg, mirrored

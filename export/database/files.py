@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from edgeperc.geometry import draw_footprints
+from edgeperc.geometry import draw_footprints, rectangles
 from edgeperc.perception import Box
 
 from ..roads import CELL_M, CLASSES, HEIGHT, VEHICLES, VIEW, WIDTH, X_RANGE_M, Y_RANGE_M, Z_RANGE_M, DatabaseError
@@ -189,7 +189,7 @@ class TopViewScene:
     @property
     def rectangles(self) -> NDArray[np.float64]:
         """The vehicles as `edgeperc.geometry` takes them, (k, 5): x, y, length, width [m], yaw [rad]."""
-        return np.array([[*b.center[:2], *b.size[:2], b.yaw] for b in self.boxes]).reshape(-1, 5)
+        return rectangles(self.boxes)
 
 
 class TopViewDatabase:
