@@ -1,4 +1,4 @@
-"""Labelled scans, real and simulated, in one form, and the changes that leave their labels true."""
+"""Augmentation of labeled scans: pasted objects, swapped sectors, bad weather, turns. Labels stay correct."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ FEWEST_PASTED = 5
 
 @dataclass(frozen=True)
 class ObjectBank:
-    """Objects cut out of labelled scans, to be pasted into others (GT sampling of SECOND; Yan et al., 2018).
+    """Objects cut out of labeled scans, to paste into others (ground-truth sampling of SECOND; Yan et al., 2018).
 
     Attributes
     ----------
     objects : dict of str to list of (Box, (n, 4) float32)
-        By the box's label.
+        By label.
     """
 
     objects: dict[str, list[tuple[Box, NDArray[np.float32]]]]
 
     @classmethod
     def of(cls, scans: Iterable[LabelledScan], fewest: int = 8) -> ObjectBank:
-        """Everything with ``fewest`` returns and more."""
+        """The objects within 60 m with at least ``fewest`` returns."""
         objects: dict[str, list[tuple[Box, NDArray[np.float32]]]] = {}
         for scan in scans:
             for box, count in zip(scan.boxes, scan.counts, strict=True):
@@ -52,11 +52,11 @@ class ObjectBank:
 def pasted(
     scan: LabelledScan, bank: ObjectBank, rng: np.random.Generator, n: int, odds: Mapping[str, float]
 ) -> LabelledScan:
-    """The scan with up to ``n`` objects of the bank standing in it, their kinds drawn by ``odds``.
+    """The scan with up to ``n`` objects of the bank added, of kinds drawn by ``odds``.
 
-    An object keeps its distance, so that its returns stay as dense as the sensor would see them, and goes around the
-    sensor to another azimuth in the front; it is set on the ground found there, if it is clear. What it would
-    hide goes, and of itself what stands behind something nearer, both ray by ray.
+    An object keeps its distance, and so its density of returns, and moves to a random azimuth ahead. It is placed on
+    the ground there if the place is free. Returns behind the object are removed, and so are returns of the object
+    behind something nearer, ray by ray.
     """
     names = [name for name in odds if bank.objects.get(name)]
     if not names or n == 0:
@@ -92,7 +92,7 @@ def pasted(
         here[:, 0], here[:, 1] = cos * cut[:, 0] - sin * cut[:, 1], sin * cut[:, 0] + cos * cut[:, 1]
         here[:, 2] += np.float32(ground - foot)
 
-        # Rays: an HDL-64E's beams lie 0.4 degrees apart, its columns 0.17.
+        # The beams of an HDL-64E are 0.4 degrees apart, its columns 0.17.
         own, own_range = _rays(here)
         other, other_range = _rays(points[window])
         rays = np.unique(own)
@@ -134,9 +134,9 @@ def _rays(points: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.fl
 
 
 def swapped(scan: LabelledScan, other: LabelledScan, rng: np.random.Generator) -> LabelledScan:
-    """The scan with one sector of another (PolarMix; Xiao et al., 2022): points and their labels, not boxes.
+    """The scan with one sector replaced by another scan's (PolarMix; Xiao et al., 2022): points and their labels only.
 
-    For point labels alone: boxes and surface know nothing of the sector.
+    Boxes and surface are not changed, so this is only for networks that label points.
     """
     low = rng.uniform(-np.pi / 4.0, np.pi / 8.0)
     high = low + rng.uniform(np.pi / 8.0, np.pi / 4.0)
@@ -150,7 +150,7 @@ def swapped(scan: LabelledScan, other: LabelledScan, rng: np.random.Generator) -
 
 
 def weathered(scan: LabelledScan, rng: np.random.Generator) -> LabelledScan:
-    """The scan in rain, snow or fog: returns lost the more the farther they are, and a few from drops in the air."""
+    """The scan in rain, snow or fog: far returns are lost more often, and a few come from drops in the air."""
     points, labels = scan.points, scan.labels
     distance = np.linalg.norm(points[:, :3], axis=1)
     kept = rng.random(len(points)) < np.exp(-rng.uniform(0.0, 0.02) * distance)
@@ -164,7 +164,7 @@ def weathered(scan: LabelledScan, rng: np.random.Generator) -> LabelledScan:
 
 
 def facing(scan: LabelledScan, rng: np.random.Generator) -> float:
-    """The angle that turns a pedestrian or cyclist of the scan to the front; 0 where there is none within 40 m."""
+    """The angle [rad] that turns a pedestrian or cyclist to the front; 0 if there is none within 40 m."""
     rare = [b for b, n in zip(scan.boxes, scan.counts, strict=True) if b.label in RARE and n >= FEWEST_PASTED]
     rare = [b for b in rare if np.hypot(*b.center[:2]) < 40.0]
     if not rare:
@@ -184,10 +184,10 @@ def augmented(
     turn_anywhere: float = 0.0,
     weather: float = 0.0,
 ) -> LabelledScan:
-    """A scan as it might have been: turned, mirrored, thinned, its heights and remissions a little off.
+    """The scan turned, mirrored, thinned, shifted in height and scaled in remission, all at random.
 
-    Where truth is known all around (simulation), one scan gives as many views as there are directions along the
-    street: it is looked at forwards or backwards, give or take 10 degrees.
+    A scan that is labeled on all sides (simulation) is turned forwards or backwards along the street, all others by a
+    few degrees only.
 
     Parameters
     ----------
@@ -195,13 +195,13 @@ def augmented(
     rng : np.random.Generator
     bank : ObjectBank, optional
     n_pasted : float
-        Objects of the bank to paste, on average.
+        Mean number of objects to paste.
     odds : mapping of str to float, optional
-        How often each kind is pasted; by default all alike.
+        How often each kind is pasted; by default equally often.
     turn_to_rare : float
-        Share of fully known scans that are turned to a pedestrian or cyclist instead of along the street.
+        Share of the scans labeled on all sides that are turned to a pedestrian or cyclist instead.
     turn_anywhere : float
-        Share of the other fully known scans that are turned to any side.
+        Share of the remaining ones that are turned by any angle.
     weather : float
         Share of scans in bad weather.
     """
@@ -216,7 +216,7 @@ def augmented(
     scan = turned(scan, float(angle))
     if rng.random() < 0.5:
         scan = mirrored(scan)
-    # Both views look ahead; what lies behind only costs time.
+    # Both views look ahead; points behind would only cost time.
     ahead = scan.points[:, 0] > 0.0
     scan = replace(scan, points=scan.points[ahead], labels=scan.labels[ahead])
     if bank is not None and n_pasted > 0.0:

@@ -1,4 +1,4 @@
-"""What the networks are trained towards: the targets made from boxes (numpy) and the losses (torch)."""
+"""Losses of the networks."""
 
 from __future__ import annotations
 
@@ -23,25 +23,21 @@ __all__ = [
     "ssadnet_loss",
 ]
 
-
-# Offsets, log sizes and the doubled angle err by about as much in an untrained head; height above ground, which no
-# metric here looks at, counts half.
+# Offsets, log sizes and the doubled angle have errors of similar size in an untrained head. Height above ground, which
+# no metric here uses, counts half.
 GEOMETRY_WEIGHTS = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.5, 0.5)
-
-
-# --- Losses ----------------------------------------------------------------------------------------------------------
 
 
 def cross_entropy(
     logits: Tensor, labels: Tensor, class_weights: Tensor | None = None, *, focal_gamma: float = 0.0
 ) -> Tensor:
-    """Cross-entropy averaged over labelled pixels (SSADNet equation 4, where every pixel is labelled).
+    """Cross-entropy averaged over the labeled pixels (SSADNet equation 4, where all pixels are labeled).
 
     Parameters
     ----------
     logits : (B, C, H, W) float
     labels : (B, H, W) integer
-        `IGNORE` where not labelled. Without a labelled pixel the loss is 0.
+        `IGNORE` in unlabeled pixels. Without a labeled pixel the loss is 0.
     class_weights : (C,) float, optional
         Weights of the average, by true class.
     focal_gamma : float
@@ -55,13 +51,13 @@ def cross_entropy(
     weights = known.float() if class_weights is None else class_weights.float()[truth] * known
     loss = -log_p_true
     if focal_gamma > 0.0:
-        # Clamped, for below 1 the power's slope at 0 is infinite.
+        # Clamped, because the slope of a power below 1 is infinite at 0.
         loss = loss * (1.0 - log_p_true.exp()).clamp(min=1e-6) ** focal_gamma
     return (weights * loss).sum() / weights.sum().clamp(min=1e-6)
 
 
 def lovasz_softmax(logits: Tensor, labels: Tensor) -> Tensor:
-    """A convex stand-in for 1 - mean IoU over the classes present (Berman et al., 2018).
+    """A differentiable bound of 1 - mean IoU over the classes present (Berman et al., 2018).
 
     Shapes as for `cross_entropy`; the batch counts as one image.
     """
@@ -69,11 +65,13 @@ def lovasz_softmax(logits: Tensor, labels: Tensor) -> Tensor:
     probabilities = logits.float().softmax(1).movedim(1, -1)[known]  # (n, C)
     labels = labels[known].long()
     losses = []
-    for index in labels.unique():
+    for index in range(logits.shape[1]):
+        if not (labels == index).any():
+            continue
         truth = (labels == index).float()
         errors, order = (truth - probabilities[:, index]).abs().sort(descending=True)
         truth = truth[order]
-        # The Jaccard loss if the 1st, the first 2, ... pixels were the wrong ones; its steps weigh the errors.
+        # The Jaccard loss if the first 1, 2, ... pixels were wrong; its increments weight the errors.
         intersection = truth.sum() - truth.cumsum(0)
         union = truth.sum() + (1.0 - truth).cumsum(0)
         jaccard = 1.0 - intersection / union
@@ -96,9 +94,9 @@ def pointseg_loss(
 
 
 def road_loss(logits: Tensor, labels: Tensor, lovasz_weight: float = 0.0) -> Tensor:
-    """Cross-entropy of a map of roads, plus so many times `lovasz_softmax` of every fourth cell.
+    """Cross-entropy of a road map plus ``lovasz_weight`` times `lovasz_softmax` of every fourth cell.
 
-    Of every fourth: sorting all of them would take a tenth of a training step.
+    Sorting all cells would take a tenth of a training step.
     """
     loss = cross_entropy(logits, labels)
     if lovasz_weight > 0.0:
@@ -107,14 +105,14 @@ def road_loss(logits: Tensor, labels: Tensor, lovasz_weight: float = 0.0) -> Ten
 
 
 def distillation_loss(logits: Tensor, probabilities: Tensor) -> Tensor:
-    """Mean cross-entropy of pixels towards a teacher's probabilities (B, C, H, W) (Hinton et al., 2015)."""
+    """Mean cross-entropy of the pixels towards a teacher's probabilities (B, C, H, W) (Hinton et al., 2015)."""
     return -(probabilities * F.log_softmax(logits.float(), dim=1)).sum(1).mean()
 
 
 def box_distillation_loss(predicted: Tensor, taught: Tensor) -> Tensor:
-    """Distance of dense boxes (B, 9, H, W) from a teacher's: cross-entropy of the heat maps and L1 of the geometry.
+    """Difference of dense boxes (B, 9, H, W) from a teacher's: cross-entropy of the heat maps plus L1 of the geometry.
 
-    Both count by the teacher's heat: the first is a sum a box, as in `dense_loss`, the second a weighted mean.
+    Both are divided by the sum of the teacher's heat, which also weights the L1.
     """
     predicted, taught = predicted.float(), taught.float()
     heat = taught[:, 0].sigmoid()
@@ -128,8 +126,8 @@ def box_distillation_loss(predicted: Tensor, taught: Tensor) -> Tensor:
 def slots_loss(predicted: Tensor, target: Tensor) -> Tensor:
     """Mean squared errors of x, y, width and height, summed (SSADNet equations 5 and 6).
 
-    Both are (B, n_slots, 4). The mean is taken over the batch, as printed, and over the slots, of which the paper does
-    not speak. Slots with a negative target are not learned.
+    Both are (B, n_slots, 4). The mean is over the batch, as printed, and over the slots, which the paper does not
+    mention. Slots with a negative target are not learned.
     """
     known = (target >= 0.0).all(2, keepdim=True).float()
     squared = known * (predicted.float() - target) ** 2
@@ -139,16 +137,17 @@ def slots_loss(predicted: Tensor, target: Tensor) -> Tensor:
 def dense_loss(predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """Loss of the heat map (penalty-reduced focal loss; Zhou et al., 2019) and of the geometry (L1).
 
-    Both arguments are (B, 9, H, W), the target from `dense_targets`. The heat map's is a sum a box; the geometry's an
-    average over the cells that learn it, weighted by their heat and summed over channels by `GEOMETRY_WEIGHTS`.
+    Both arguments are (B, 9, H, W), the target from `dense_targets`. The heat map's loss is a sum divided by the number
+    of boxes. The geometry's is a mean over the cells that learn it, weighted by their heat, of the errors summed over
+    the channels by `GEOMETRY_WEIGHTS`.
     """
     predicted = predicted.float()
     logit, heat = predicted[:, 0], target[:, 0]
-    centre, known = heat == 1.0, heat >= 0.0
+    center, known = heat == 1.0, heat >= 0.0
     p = logit.sigmoid()
     hit = (1.0 - p) ** 2 * F.logsigmoid(logit)
     miss = (1.0 - heat) ** 4 * p**2 * F.logsigmoid(-logit)
-    heat_loss = -(torch.where(centre, hit, miss) * known).sum() / centre.sum().clamp(min=1)
+    heat_loss = -(torch.where(center, hit, miss) * known).sum() / center.sum().clamp(min=1)
 
     share = heat * (heat >= REGRESSED_FROM)
     error = (predicted[:, 1:] - target[:, 1:]).abs() * predicted.new_tensor(GEOMETRY_WEIGHTS).view(1, -1, 1, 1)
@@ -172,7 +171,7 @@ def ssadnet_loss(
     Parameters
     ----------
     logits, boxes : Tensor
-        What the network returned.
+        Outputs of the network.
     labels : (B, H, W) integer
     box_targets : Tensor
         Shaped like ``boxes``: (B, n_slots, 4) from `slot_targets`, or (B, 9, H/4, W/4) from `dense_targets`.
@@ -181,7 +180,7 @@ def ssadnet_loss(
     class_weights : (C,) float, optional
         Not in the paper.
     lovasz_weight : float
-        Adds so many times `lovasz_softmax` to the segmentation's loss. Not in the paper.
+        Weight of `lovasz_softmax`, which is added to the segmentation's loss. Not in the paper.
 
     Returns
     -------
@@ -191,7 +190,7 @@ def ssadnet_loss(
     """
     seg = cross_entropy(logits, labels, class_weights)
     if lovasz_weight > 0.0:
-        # Every fourth cell: sorting all of them would take a tenth of a training step.
+        # Every fourth cell, because sorting all of them would take a tenth of a training step.
         seg = seg + lovasz_weight * lovasz_softmax(logits[:, :, ::2, ::2], labels[:, ::2, ::2])
     parts = {"seg": seg}
     if boxes.ndim == 4:

@@ -1,4 +1,4 @@
-"""Drivable area as training truth: surfaces by height, and roads drawn by hand."""
+"""Ground truth of the drivable area: cells that a scan makes certain, and hand-drawn roads (COCO files)."""
 
 from __future__ import annotations
 
@@ -38,19 +38,22 @@ __all__ = [
 ]
 
 DRAWN = Path(__file__).with_name("kitti_roads.coco.json")
-"""Roads of some training scans of KITTI, drawn over them seen from above, as ``edgeperc-export database label`` keeps
-them: polygons, no scan."""
+"""Hand-drawn roads of some training scans of KITTI, as ``edgeperc-export database-label`` saves them: polygons in the
+top view, without the scans."""
 
 RISE_M = 0.3
 LANE_HALF_WIDTH_M = 1.2
 LANE_RANGE_M = (3.0, 25.0)
 
-# Asphalt's own remission varies by 0.05 along a lane; grass lies 0.2 and more above it.
+# The remission of asphalt varies by 0.05 along a lane; that of grass is higher by 0.2 and more.
 BRIGHTER = 0.15
 
 
 def ground_plane(points: NDArray[np.float32], seed: int = 0) -> NDArray[np.float64] | None:
     """a, b, c of z = a x + b y + c through the ground near the vehicle (RANSAC, then least squares), or None."""
+    # Not `edgeperc.ground.find_ground`, which fits the lowest returns of cells: that plane is 1 to 6 cm lower. With it,
+    # 0.921 instead of 0.938 of the cells called "no road" are right on 8 drawn KITTI scans, and 0.963 instead of 0.982
+    # on 24 simulated ones ("road": 0.991 instead of 0.987, and 0.986 instead of 0.988).
     near = (np.hypot(points[:, 0], points[:, 1]) < 20.0) & (np.abs(points[:, 1]) < 8.0) & (points[:, 2] < -1.0)
     p = points[near].astype(np.float64)
     if len(p) < 500:
@@ -64,7 +67,7 @@ def ground_plane(points: NDArray[np.float32], seed: int = 0) -> NDArray[np.float
             a, b, c = np.linalg.solve(np.c_[corners[:, :2], np.ones(3)], corners[:, 2])
         except np.linalg.LinAlgError:
             continue
-        # The sensor stands 1.73 m above the road, and no street leans by more than a tenth.
+        # The sensor is mounted 1.73 m above the road, and no street is steeper than 12 %.
         if abs(a) > 0.12 or abs(b) > 0.1 or abs(c + 1.73) > 0.35:
             continue
         support = np.abs(tested[:, 2] - a * tested[:, 0] - b * tested[:, 1] - c) < 0.08
@@ -78,7 +81,7 @@ def ground_plane(points: NDArray[np.float32], seed: int = 0) -> NDArray[np.float
 
 
 def sure_surface(points: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Surface truth over `SURFACE`: 1 road, 0 no road, `IGNORE` where nobody can be sure."""
+    """Ground truth of the cells of `SURFACE`: 1 road, 0 no road, `IGNORE` where the scan leaves it open."""
     surface = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
     plane = ground_plane(points)
     if plane is None:
@@ -103,7 +106,7 @@ def sure_surface(points: NDArray[np.float32]) -> NDArray[np.uint8]:
         total = np.bincount(cell[low], weights=points[low, 3], minlength=size).reshape(surface.shape)
         around, bright = _boxed(count), _boxed(total)
         bright = (around >= 8) & (bright > (usual + BRIGHTER) * around) & (count > 0)
-        # Markings are bright too, but not over a metre; the lane itself is never doubted.
+        # Lane markings are bright too, but not over a meter; the lane itself always stays road.
         surface[bright] = 0
         surface.reshape(-1)[cell[lane]] = 1
     surface.reshape(-1)[cell[risen]] = 0
@@ -111,39 +114,34 @@ def sure_surface(points: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def drawn_roads(path: Path = DRAWN) -> dict[str, NDArray[np.uint8]]:
-    """Roads drawn by hand: hash of the scan (`datasets.scan_hash`) -> mask (400, 200) uint8, 1 road.
+    """Hand-drawn roads: hash of the scan (`edgeperc.evaluation.datasets.scan_hash`) -> mask (400, 200) uint8, 1 road.
 
-    By its hash and not by its name, for names of scans differ from one copy of KITTI to the next. A COCO file keeps it
-    as ``scan`` of its images.
+    The file keeps the hash as ``scan`` of each image, because names of scans differ between copies of KITTI.
 
     Raises
     ------
     DatabaseError
-        No COCO file of roads.
+        The file is not a COCO file of roads.
     MissingExtraError
-        Nothing that reads COCO files is installed.
+        The package that reads COCO files is not installed.
     """
     try:
-        from .roads import mask_of, read_coco
-
         drawn = read_coco([path])
     except ModuleNotFoundError as exc:
-        raise MissingExtraError(exc.name or "a package", "database", "a road drawn by hand") from exc
+        raise MissingExtraError(exc.name or "a package", "database", "a hand-drawn road") from exc
     hashes = {Path(image["file_name"]).stem: image["scan"] for image in json.loads(path.read_text())["images"]}
     return {hashes[name]: mask_of(polygons, f"{path}: {name}") for name, polygons in drawn.items()}
 
 
 def with_road(surface: NDArray[np.uint8], road: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Surface truth over `SURFACE` with a drawn road's (400, 200) where that reaches."""
-    from .roads import VIEW
-
+    """Ground truth over `SURFACE`, replaced by a drawn road's (400, 200) in the drawing's view."""
     x, y = SURFACE.cell_centres()
     row, col, drawn = VIEW.cells(x, y)
     return np.where(drawn, road[row % VIEW.height, col % VIEW.width], surface).astype(np.uint8)
 
 
-def _boxed(values: NDArray, reach: int = 3) -> NDArray:
-    """Sums over (2 reach + 1)^2 cells."""
+def _boxed(values: NDArray[Any], reach: int = 3) -> NDArray[Any]:
+    """Sums over the (2 reach + 1)² cells around each cell."""
     for axis in (0, 1):
         padded = np.pad(values, [(reach + 1, reach) if a == axis else (0, 0) for a in (0, 1)])
         total = padded.cumsum(axis)
@@ -156,14 +154,15 @@ ROAD = ("road", "drivable")
 
 
 def read_coco(paths: Iterable[Path]) -> dict[str, list[Any]]:
-    """Roads of COCO files: scene -> COCO segmentations, polygons or run lengths.
+    """Roads of COCO files: scene -> COCO segmentations, polygons in pixels of the top-view image or run lengths.
 
-    Scenes are named by their images' file names. One with annotations, but none of road, has no road: an empty list.
+    Annotations of a category "road" or "drivable" are road. Scenes have the names of their image files. A scene with
+    annotations but none of road has an empty list.
 
     Raises
     ------
     DatabaseError
-        A file is no COCO file, knows no road, is about images of another size, or two draw the same scene.
+        A file is not a COCO file, has no category of roads or images of another size, or two files draw one scene.
     """
     roads: dict[str, list[Any]] = {}
     for path in paths:
@@ -173,9 +172,11 @@ def read_coco(paths: Iterable[Path]) -> dict[str, list[Any]]:
             road = {c["id"] for c in content["categories"] if str(c["name"]).lower() in ROAD}
             drawn = [(a["image_id"], a["category_id"], a["segmentation"]) for a in content["annotations"]]
         except (ValueError, KeyError, TypeError) as exc:
-            raise DatabaseError(f"{path} is no COCO file ({exc!r}); expected images, categories, annotations") from exc
+            raise DatabaseError(
+                f"{path} is not a COCO file ({exc!r}); expected images, categories and annotations"
+            ) from exc
         if not road:
-            raise DatabaseError(f"{path} has no category called road; expected the road's polygons under that name")
+            raise DatabaseError(f"{path} has no category called road or drivable; name the category of the roads so")
         found: dict[str, list[Any]] = {}
         for image_id, category, segmentation in drawn:
             image = images.get(image_id)
@@ -184,7 +185,7 @@ def read_coco(paths: Iterable[Path]) -> dict[str, list[Any]]:
             size, name = (image.get("width"), image.get("height")), Path(str(image.get("file_name"))).stem
             if size != (WIDTH, HEIGHT):
                 raise DatabaseError(
-                    f"{path}: image {name} is {size[0]} x {size[1]}; expected {WIDTH} x {HEIGHT}, the database's own"
+                    f"{path}: image {name} is {size[0]} x {size[1]}; expected the database's images, {WIDTH} x {HEIGHT}"
                 )
             found.setdefault(name, [])
             if category in road:
@@ -192,13 +193,13 @@ def read_coco(paths: Iterable[Path]) -> dict[str, list[Any]]:
                 found[name].append(segmentation)
         twice = sorted(found.keys() & roads.keys())
         if twice:
-            raise DatabaseError(f"{path} draws {', '.join(twice[:5])}, which another file draws too; keep one of them")
+            raise DatabaseError(f"{path} and another file both draw {', '.join(twice[:5])}; give one of them")
         roads |= found
     return roads
 
 
 def mask_of(segmentations: Sequence[Any], of: str = "a polygon") -> NDArray[np.uint8]:
-    """What COCO segmentations cover, together, (400, 200) uint8: 1 and 0 (section 3.3)."""
+    """The union of COCO segmentations, (400, 200) uint8: 1 inside, 0 outside (section 3.3)."""
     from faster_coco_eval.core import mask as coco
 
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
@@ -220,7 +221,7 @@ def mask_of(segmentations: Sequence[Any], of: str = "a polygon") -> NDArray[np.u
             mask |= coco.decode(runs)
         except (ValueError, KeyError, TypeError) as exc:
             raise DatabaseError(
-                f"{of}: {exc}; expected polygons of three corners and more, x y x y ..., or run lengths of the image"
+                f"{of}: {exc}; expected polygons x y x y ... of three corners or more, or run lengths of the image"
             ) from exc
     return mask
 
@@ -228,7 +229,7 @@ def mask_of(segmentations: Sequence[Any], of: str = "a polygon") -> NDArray[np.u
 def write_coco(roads: Mapping[str, Sequence[Sequence[Sequence[float]]]], scans: Mapping[str, str] | None = None) -> str:
     """The text of a COCO file: scene -> polygons -> corners (x, y) in pixels.
 
-    ``scans`` has `datasets.scan_hash` of the scenes: names differ from one copy of KITTI to the next.
+    ``scans`` gives `edgeperc.evaluation.datasets.scan_hash` of scenes, because names differ between copies of KITTI.
     """
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
@@ -258,16 +259,16 @@ def write_coco(roads: Mapping[str, Sequence[Sequence[Sequence[float]]]], scans: 
 CLASSES = ("background", "road", "car", "van", "truck")
 VEHICLES = CLASSES[2:]
 
-# What is looked at (3.1, and SSADNet 2.1.2): both edges belong to it.
+# The view of section 3.1 and SSADNet 2.1.2; both ends of each range belong to it.
 X_RANGE_M, Y_RANGE_M, Z_RANGE_M, CELL_M = (6.0, 46.0), (-10.0, 10.0), (-2.5, 2.5), 0.1
 HEIGHT, WIDTH = 400, 200
 
-# Coordinates are rounded to whole pixels, so pixel 0 lies around 6.0 m, not beyond it: the cells are half a cell nearer
-# and farther right than a network's that rounds down. A card with this view sees a scan in the same cells.
+# Coordinates are rounded to whole pixels, so pixel 0 lies around 6.0 m, not beyond it: its cells are half a cell nearer
+# and farther right than those of a network that rounds down. A card with this view has the database's cells.
 VIEW = TopViewGeometry(
     (X_RANGE_M[0] - 0.05, X_RANGE_M[1] - 0.05), (Y_RANGE_M[0] - 0.05, Y_RANGE_M[1] - 0.05), Z_RANGE_M
 )
 
 
 class DatabaseError(EdgepercError, ValueError):
-    """A top-view database, or polygons drawn for one, cannot be made or read."""
+    """A top-view database, or a COCO file of drawn roads, cannot be made or read."""

@@ -1,4 +1,4 @@
-"""Labelled scans, and turning and mirroring them."""
+"""Labeled scans, and turning and mirroring them."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from edgeperc.simulation.scene import TOP_VIEW_CLASSES, SimulatedScan
 
 __all__ = ["SURFACE", "LabelledScan", "mirrored", "turned", "turned_box"]
 
-# The ground is kept wider and coarser than the network sees it, so that a turned scan still has truth everywhere.
+# Wider and coarser than the network's view, so that a turned scan has ground truth everywhere in the view.
 SURFACE = TopViewGeometry(x_range_m=(-50.0, 50.0), y_range_m=(-50.0, 50.0), cell_m=0.2)
-CAMERA_AZIMUTHS = (-0.70, 0.69)  # KITTI's left colour camera sees 41.2 degrees to the right and 40.2 to the left
+CAMERA_AZIMUTHS = (-0.70, 0.69)  # KITTI's left color camera sees 41.2 degrees to the right and 40.2 to the left
 
 
 @dataclass(frozen=True)
 class LabelledScan:
-    """A scan and its truth.
+    """A scan and its ground truth.
 
     Attributes
     ----------
@@ -35,15 +35,15 @@ class LabelledScan:
         PointSeg's classes, `IGNORE` where unknown.
     boxes : tuple of Box
     counts : tuple of int
-        Returns in each box; a box nothing returned from cannot be found.
+        Number of returns from each box.
     surface : (500, 500) uint8
-        0 background, 1 drivable, `IGNORE` unknown, over `SURFACE`, before ``turn`` and ``mirrored``.
+        0 background, 1 drivable, `IGNORE` unknown, over `SURFACE`, as it was before ``turn`` and ``mirrored``.
     azimuths : tuple of 2 float
-        Where truth is known: lowest and highest azimuth [rad], counter-clockwise from +x.
+        Least and largest azimuth of the labeled sector [rad], counterclockwise from +x.
     turn : float
-        Angle by which the scan was turned about +z [rad].
+        Angle by which the points were turned about +z [rad].
     mirrored : bool
-        Whether left and right were swapped, after turning.
+        Whether left and right were then swapped.
     """
 
     points: NDArray[np.float32]
@@ -59,7 +59,7 @@ class LabelledScan:
     def from_frame(
         cls, frame: Frame, road: Callable[[NDArray[np.float32]], NDArray[np.uint8]] | None = None
     ) -> LabelledScan:
-        """A real frame; ``road`` draws its surface, which no KITTI label tells, and without it stays unknown."""
+        """A KITTI frame; ``road`` computes its surface from the points. Without it the surface is unknown."""
         points = frame.points[np.isfinite(frame.points).all(axis=1)]
         frame = replace(frame, points=points)
         surface = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8) if road is None else road(points)
@@ -68,13 +68,13 @@ class LabelledScan:
 
     @classmethod
     def from_simulation(cls, scan: SimulatedScan) -> LabelledScan:
-        """A simulated scan: everything about it is known."""
+        """A simulated scan; everything is labeled."""
         surface = scan.top_view_labels(SURFACE)
         surface = np.where(surface == 1, 1, np.where(surface >= 2, IGNORE, 0)).astype(np.uint8)
         return cls(scan.points, labels_by_boxes(scan), scan.boxes, scan.box_points, surface)
 
     def save(self, path: Path) -> None:
-        """Write to an .npz, without pickles."""
+        """Write an .npz file, without pickles."""
         boxes = np.array([[*b.center, *b.size, b.yaw] for b in self.boxes], np.float32).reshape(-1, 7)
         names = np.array([b.label for b in self.boxes], dtype="U16")
         with open_whole(path) as file:
@@ -91,11 +91,12 @@ class LabelledScan:
 
     @classmethod
     def load(cls, path: Path) -> LabelledScan:
-        """Read what `save` wrote."""
+        """Read a file written by `save`."""
         with np.load(path, allow_pickle=False) as data:
+            numbers = zip(data["names"], data["boxes"].tolist(), strict=True)
             boxes = tuple(
-                Box(str(n), 1.0, tuple(map(float, b[:3])), tuple(map(float, b[3:6])), float(b[6]))
-                for n, b in zip(data["names"], data["boxes"], strict=True)
+                Box(str(name), 1.0, (x, y, z), (length, width, height), yaw)
+                for name, (x, y, z, length, width, height, yaw) in numbers
             )
             low, high = (float(a) for a in data["azimuths"])
             return cls(
@@ -103,13 +104,13 @@ class LabelledScan:
             )
 
     def labelled(self, geometry: TopViewGeometry) -> NDArray[np.bool_]:
-        """Cells in which a vehicle would have been labelled, (rows, cols) bool."""
+        """Cells of the labeled sector, (rows, cols) bool."""
         x, y = geometry.cell_centres()
         azimuth = np.arctan2(y, x)
         return (azimuth >= self.azimuths[0]) & (azimuth <= self.azimuths[1])
 
     def top_view_truth(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
-        """SSADNet's segmentation truth (3.1.2): the surface under the vehicles' footprints, `IGNORE` where unknown."""
+        """SSADNet's segmentation truth (3.1.2): the surface, and over it vehicles; `IGNORE` where unknown."""
         x, y = geometry.cell_centres()
         if self.mirrored:
             y = -y
@@ -143,6 +144,7 @@ def mirrored(scan: LabelledScan) -> LabelledScan:
 
 
 def turned_box(box: Box, angle: float) -> Box:
+    """The box turned by ``angle`` [rad] about the sensor's z axis."""
     cos, sin = float(np.cos(angle)), float(np.sin(angle))
     x, y, z = box.center
     return replace(box, center=(cos * x - sin * y, sin * x + cos * y, z), yaw=box.yaw + float(angle))

@@ -1,4 +1,4 @@
-"""The scans that training, export and proof draw from: simulated by the thousand, real where there are any."""
+"""Simulated scans to train on, and the scans that an export is proven and described by."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ __all__ = ["fitness_of", "parity_scans", "simulate"]
 
 
 def simulate(out: Path, n: int, *, first: int = 0, layouts_root: Path | None = None, sensor: str = "hdl-64e") -> None:
-    """Write ``n`` labelled scans into ``out``, every other one with a real layout where there are any.
+    """Write ``n`` labeled scans into ``out``; with ``layouts_root``, every other one has the boxes of a real scan.
 
-    Files already there are left alone, so a stopped run goes on where it was.
+    Existing files are kept, so a stopped run resumes.
     """
     out.mkdir(parents=True, exist_ok=True)
     real = list(layouts(layouts_root)) if layouts_root else []
     for seed in tqdm(range(first, first + n), desc="simulating", unit="scan"):
         path = out / f"{seed:06d}.npz"
         if not path.exists():
-            # 4,973 is a prime: neighbouring seeds take layouts of different drives.
+            # 4,973 is prime: neighboring seeds take layouts of different drives.
             boxes = real[seed * 4973 % len(real)] if real and seed % 2 else None
             LabelledScan.from_simulation(simulated_scan(seed, sensor, boxes)).save(path)
 
 
 def parity_scans(paths: Sequence[Path]) -> list[NDArray[np.float32]]:
-    """Scans to prove an export on: those given, and four simulated ones that no training run drew."""
+    """Scans to prove an export on: the given files, and four simulated scans that are in no training set."""
     return [read_points(p) for p in paths] + [simulated_scan(10**9 + k).points for k in range(4)]
 
 
 def fitness_of(kitti: Path | None) -> FitnessProfile:
-    """What training scans look like: the real ones, or simulated ones where there are none."""
+    """The profile of the training scans, for the check of inputs: KITTI's, or simulated ones without ``kitti``."""
     if kitti is None:
         return FitnessProfile.from_scans(simulated_scan(10**9 + k).points for k in range(32))
     objects = KittiObjects(kitti)

@@ -1,4 +1,4 @@
-"""What the box heads should answer: slots and dense maps."""
+"""Targets of the box heads: slots and dense maps."""
 
 from __future__ import annotations
 
@@ -10,13 +10,10 @@ from edgeperc.card import TopViewGeometry
 __all__ = ["REGRESSED_FROM", "dense_targets", "slot_targets"]
 
 STRIDE = 4
-"""Top-view cells along the edge of an output cell of head "dense"."""
+"""Top-view cells along the edge of one output cell of head "dense"."""
 REGRESSED_FROM = 0.5
-"""Cells whose heat is at least this learn the box's geometry, weighted by the heat. The peak found may be a neighbour
-of the true one, whose geometry must then be right too."""
-
-
-# --- Targets ---------------------------------------------------------------------------------------------------------
+"""Cells with at least this heat learn the box's geometry, weighted by the heat. The detected peak may be a neighbor of
+the true one, whose geometry must then be correct too."""
 
 
 def slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> NDArray[np.float32]:
@@ -25,16 +22,16 @@ def slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> NDArr
     Parameters
     ----------
     boxes : (m, 7) array_like
-        x, y, z of the centre, length, width, height [m], yaw [rad], in the sensor frame.
+        x, y, z of the center, length, width, height [m], yaw [rad], in the sensor frame.
     view : TopViewGeometry
     n_slots : int
-        The nearest this many are kept.
+        Number of boxes to keep, nearest first.
 
     Returns
     -------
     (n_slots, 4) float32
-        Centre column, centre row, width and height as shares of the image's width and height; zeros in empty slots.
-        Boxes whose centre is outside the view are left out.
+        Center column, center row, width and height as shares of the image's width and height; zeros in empty slots.
+        Boxes whose center is outside the view are left out.
 
     Raises
     ------
@@ -71,15 +68,15 @@ def dense_targets(
     view : TopViewGeometry
         Height and width divisible by 4.
     labelled : (height, width) bool, optional
-        False where a box would not have been labelled, as outside the camera's view.
+        False in cells where boxes are not labeled, such as outside the camera's view.
     unsure : (k, 7) array_like, optional
-        Boxes that are neither to be found nor to be missed, such as those without a single point in them.
+        Boxes that need not be found but may, such as those without returns.
 
     Returns
     -------
     (9, height/4, width/4) float32
-        Channel 0: 1 in the output cell that holds a box's centre, falling off as a Gaussian shaped like the box (its
-        edges are three standard deviations away); -1 where nothing is to be learned. Channels 1 to 8: the geometry of
+        Channel 0: 1 in the output cell that holds a box's center, falling off as a Gaussian shaped like the box (its
+        edges are three standard deviations away); -1 in cells that are not learned. Channels 1 to 8: the geometry of
         the box with the highest heat, in the format of box_dense, where that heat is at least `REGRESSED_FROM`; else 0.
     """
     height, width = view.height // STRIDE, view.width // STRIDE
@@ -112,10 +109,10 @@ def dense_targets(
 def _boxes_in_view(
     boxes: ArrayLike, view: TopViewGeometry
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Boxes whose centre is in the view, and the row and column [cells, from the far left corner] of those centres."""
+    """Boxes whose center is in the view, and the rows and columns of the centers [cells from the far left corner]."""
     boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
     if not (boxes[:, 3:6] > 0.0).all():
-        raise ValueError("a box is without extent; expected length, width and height above 0 m")
+        raise ValueError("a box has no extent; expected length, width and height above 0 m")
     rows = (view.x_range_m[1] - boxes[:, 0]) / view.cell_m
     cols = (view.y_range_m[1] - boxes[:, 1]) / view.cell_m
     inside = (rows >= 0) & (rows < view.height) & (cols >= 0) & (cols < view.width)
@@ -130,6 +127,6 @@ def _gaussian(
     left = int(col) - np.arange(shape[1])[None, :]
     cos, sin = np.cos(box[6]), np.sin(box[6])
     along, across = cos * forward + sin * left, cos * left - sin * forward
-    # No narrower than half a cell, or a bump would be one cell and hard to hit.
+    # At least half a cell wide: a bump of a single cell would be hard to hit.
     sigma_along, sigma_across = max(box[3] / cell_m / 6.0, 0.5), max(box[4] / cell_m / 6.0, 0.5)
     return np.exp(-0.5 * ((along / sigma_along) ** 2 + (across / sigma_across) ** 2)).astype(np.float32)

@@ -1,7 +1,7 @@
-"""One visible training loop for every network.
+"""The training loop of all networks.
 
-Every step draws its samples and its dropout from ``(seed, step)`` alone, so that a run stopped anywhere and resumed
-from its checkpoint ends, bit for bit, where an uninterrupted one ends.
+Each step draws its samples and its dropout from ``(seed, step)`` alone. A run that is stopped and resumed from its
+checkpoint therefore ends with the same weights, bit for bit, as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
+from edgeperc.atomic import open_whole
 from edgeperc.evaluation.datasets import KittiObjects
 
 from .networks import build
@@ -35,7 +36,7 @@ __all__ = ["train"]
 
 WARM_UP_STEPS = 100
 
-# Of neighbouring frames one in so many is enough to watch a run by.
+# Neighboring frames look alike: one in so many is enough to validate on.
 VALIDATION_STRIDE = 6
 
 
@@ -53,39 +54,45 @@ def train(
     compiled: bool = False,
     checkpoint_every: int = 100,
 ) -> Path:
-    """Train, or go on training, the network of a recipe.
+    """Train the network of a recipe, or resume its training.
 
     Parameters
     ----------
     recipe : Recipe
     out : Path
-        Folder for ``checkpoint.pt`` and ``log.jsonl``. A checkpoint already there, of the same recipe, is resumed.
+        Folder for ``checkpoint.pt`` and ``log.jsonl``. A checkpoint of the same recipe in it is resumed.
     kitti : Path or None
-        Root of a KITTI object set; frames of test drives are left out, and so are all where the recipe's
-        ``simulated_share`` is 1.
+        Folder of a KITTI object set. Frames of test drives are not used; with a ``simulated_share`` of 1, no frame is
+        trained on, and all training drives are validated on.
     simulated : Path or None
-        Folder of scans from ``edgeperc-export simulate``.
+        Folder of scans written by ``edgeperc-export simulate``.
     given : RealScans, optional
-        In place of ``kitti``'s.
+        Real scans in place of those of ``kitti``.
     fold : int, optional
-        Fold of the training drives that is not trained on but watched: every ``checkpoint_every`` steps the averaged
-        network is judged on it, and the best is kept (early stopping). Without real scans to train on, all training
-        drives are watched.
+        Fold of the training drives to validate on instead of training on it. Every ``checkpoint_every`` steps the
+        averaged network is evaluated on it, and the best weights are kept (early stopping).
     start_from : Path or None
-        A checkpoint whose weights a new run starts from; what the recipe's network lacks or has besides is left.
+        A checkpoint whose weights a new run starts from. Weights that the networks do not share are ignored.
     teacher : Path or None
-        A checkpoint that the recipe distils from; where it distils nothing, a PointSeg that labels what nobody labelled
-        in the real scans of the training drives.
+        A checkpoint of the network to distil from. If the recipe does not distil, of a network that labels the
+        unlabeled points of the real scans of the training drives.
     n_threads : int or None
     compiled : bool
-        Through `torch.compile`: a minute and a C++ compiler first, then PointSeg is a third faster.
+        Use `torch.compile`, which takes a minute and a C++ compiler; PointSeg then trains a third faster.
     checkpoint_every : int
         Steps between checkpoints.
 
     Returns
     -------
     Path
-        Of the last checkpoint.
+        The checkpoint.
+
+    Raises
+    ------
+    ValueError
+        There are no scans, the checkpoint is of another recipe, or the teacher is missing or of no use.
+    FloatingPointError
+        The loss is not finite.
     """
     out.mkdir(parents=True, exist_ok=True)
     if n_threads is not None:
@@ -103,8 +110,10 @@ def train(
         names = [] if only_simulated else objects.names("train", fold=fold)
         real, weights, hashes = real_scans(objects, names, drawn=recipe.drawn_roads)
     if recipe.distil > 0.0 and teacher is None:
-        raise ValueError(f"the recipe distils ({recipe.distil:g}) from no teacher; give --teacher")
+        raise ValueError(f"the recipe distils ({recipe.distil:g}) but there is no teacher; give --teacher")
     task = task_of(recipe)
+    if teacher is not None and recipe.distil == 0.0 and (objects is None or recipe.task != "points"):
+        raise ValueError("the teacher is not used; give --distil, or train a network that labels points on --kitti")
     tutor = None if teacher is None else _teacher(teacher, task).to(device)
     if tutor is not None and objects is not None and recipe.distil == 0.0:
         extra = unlabelled_scans(objects, fold)
@@ -127,7 +136,7 @@ def train(
     if checkpoint.exists():
         state = torch.load(checkpoint, weights_only=True, map_location=device)
         if Recipe(**json.loads(state["recipe"])) != recipe:
-            raise ValueError(f"{checkpoint} is of another recipe: {state['recipe']}; train into an empty folder")
+            raise ValueError(f"{checkpoint} is of another recipe: {state['recipe']}; give an empty folder")
         before, curve = json.loads(state["before"]), json.loads(state["curve"])
         network.load_state_dict(state["network"])
         averaged.load_state_dict(state["averaged"])
@@ -136,27 +145,26 @@ def train(
         best_figure, lowest_loss, since_best, halvings = state["watched"]
 
     def save() -> None:
-        aside = checkpoint.with_suffix(".tmp")
-        torch.save(
-            {
-                "recipe": json.dumps(asdict(recipe)),
-                "before": json.dumps(before),
-                "step": step,
-                "network": network.state_dict(),
-                "averaged": averaged.state_dict(),
-                "best": best,
-                "watched": (best_figure, lowest_loss, since_best, halvings),
-                "optimizer": optimizer.state_dict(),
-                "curve": json.dumps(curve),
-                "frames": json.dumps(hashes),
-                "fold": -1 if fold is None else fold,
-                "n_simulated": len(samples.simulated),
-            },
-            aside,
-        )
-        aside.replace(checkpoint)
+        with open_whole(checkpoint) as file:
+            torch.save(
+                {
+                    "recipe": json.dumps(asdict(recipe)),
+                    "before": json.dumps(before),
+                    "step": step,
+                    "network": network.state_dict(),
+                    "averaged": averaged.state_dict(),
+                    "best": best,
+                    "watched": (best_figure, lowest_loss, since_best, halvings),
+                    "optimizer": optimizer.state_dict(),
+                    "curve": json.dumps(curve),
+                    "frames": json.dumps(hashes),
+                    "fold": -1 if fold is None else fold,
+                    "n_simulated": len(samples.simulated),
+                },
+                file,
+            )
 
-    # The averaged network and the checkpoint know the network as it is; compiled, it shares its weights.
+    # The compiled network shares its weights with the original, which is averaged and saved.
     forward = torch.compile(network) if compiled else network
     progress = tqdm(total=recipe.steps, initial=step, desc=recipe.network, unit="step")
     losses: list[float] = []
@@ -179,7 +187,7 @@ def train(
             if not torch.isfinite(loss):
                 raise FloatingPointError(f"the loss is {loss.item()} at step {step}; lower --learning-rate")
             optimizer.zero_grad(set_to_none=True)
-            loss.backward()
+            torch.autograd.backward(loss)
             nn.utils.clip_grad_norm_(network.parameters(), 5.0)
             optimizer.step()
             step += 1
@@ -208,7 +216,7 @@ def train(
 
 
 def _ahead(samples: Samples, start: int, stop: int) -> Iterator[Targets]:
-    """Batches, the next one made while the last one is learnt from."""
+    """Batches; the next one is made while the last one is trained on."""
     with ThreadPoolExecutor(1) as pool:
         coming = pool.submit(samples.batch, start) if start < stop else None
         for step in range(start, stop):
@@ -219,7 +227,7 @@ def _ahead(samples: Samples, start: int, stop: int) -> Iterator[Targets]:
 
 
 def _schedule(recipe: Recipe, step: int) -> float:
-    """Share of the learning rate: up, level, down."""
+    """Factor of the learning rate: warm-up, constant, cosine."""
     begin = round(recipe.steps * (1.0 - recipe.cooldown))
     if step >= begin:
         return float(0.5 * (1.0 + np.cos(np.pi * (step - begin) / max(1, recipe.steps - begin))))
@@ -242,12 +250,12 @@ def _optimizer(recipe: Recipe, network: nn.Module) -> torch.optim.Optimizer:
 
 
 def _start(network: nn.Module, checkpoint: Path) -> list[dict[str, object]]:
-    """Take over what another checkpoint has in common with the network; the recipes that made it."""
+    """Copy the weights that a checkpoint shares with the network; the recipes that the checkpoint was made with."""
     state = torch.load(checkpoint, weights_only=True, map_location="cpu")
     own, theirs = network.state_dict(), state["best"] or state["averaged"]
     common = {name: value for name, value in theirs.items() if name in own and own[name].shape == value.shape}
     if not common:
-        raise ValueError(f"{checkpoint} has no weight in common with the recipe's network")
+        raise ValueError(f"{checkpoint} has no weight in common with the network to train")
     network.load_state_dict(common, strict=False)
     return [*json.loads(state["before"]), json.loads(state["recipe"])]
 

@@ -1,1 +1,1 @@
-"""The top-view database: built scene by scene, resumed, spread over processes; its roads drawn by hand."""
+"""The top-view database of KITTI scenes, and the hand-drawn roads in it."""

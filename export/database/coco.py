@@ -1,7 +1,6 @@
-"""Roads drawn by hand: COCO files in and out, masks of them, drafts to start from, variations to train on.
+"""Drafts and variations of hand-drawn roads, and a database as a COCO file.
 
-A COCO file is one that any drawing tool writes: polygons in pixels of the top-view image, from its upper left corner.
-Whatever is of a category called "road" (or "drivable") is road; everything else, "background" included, is not.
+`edgeperc_export.roads` reads and writes the COCO files of drawn roads.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ SMOOTH_CELLS, SIMPLIFIED_CELLS = 5.0, 1.5
 
 
 def draft(labels: NDArray[np.uint8]) -> list[list[list[float]]]:
-    """Polygons around the road of a map, to be corrected by hand: holes filled, what is narrower than a metre smoothed.
+    """Polygons around the road of a map, for a person to correct; holes are filled and details below 1 m smoothed.
 
     Parameters
     ----------
@@ -44,7 +43,7 @@ def draft(labels: NDArray[np.uint8]) -> list[list[list[float]]]:
     for row, line in enumerate(labels == CLASSES.index("road")):
         edges = np.nonzero(np.diff(line.astype(np.int8), prepend=0, append=0))[0]
         bars += [box(a, row, b, row + 1) for a, b in edges.reshape(-1, 2)]
-    # Closed, then opened: a person wants ten corners, not the hundred of a network's ragged edge.
+    # Closing, then opening: a person wants ten corners, not the hundred of a network's ragged edge.
     whole = union_all(bars)
     for reach in (SMOOTH_CELLS, -2 * SMOOTH_CELLS, SMOOTH_CELLS):
         whole = whole.buffer(reach, join_style="mitre")
@@ -61,17 +60,17 @@ def draft(labels: NDArray[np.uint8]) -> list[list[list[float]]]:
 def varied(
     image: NDArray[np.uint8], mask: NDArray[np.uint8], name: str, k: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], float, bool]:
-    """Variation ``k`` of a drawn scene (section 3.4): image and mask turned about the sensor, and mirrored, alike.
+    """Variation ``k`` of a drawn scene (section 3.4): image and mask, turned by the same angle and mirrored or not.
 
-    About the sensor, so that the distances that the image holds stay true. Cells are moved whole and nothing is
-    interpolated: the mask stays a mask. Variation 0 is the scene itself; the same name and number give the same again.
+    They turn about the sensor, so that the distances in the image stay true. Cells are moved without interpolation, so
+    the mask stays a mask. Variation 0 is the scene itself. The same name and number give the same variation.
 
     Returns
     -------
     image : (400, 200, 3) uint8
-        0 where the scene does not reach.
+        0 outside the scene.
     mask : (400, 200) uint8
-        Likewise `IGNORE`.
+        `IGNORE` outside the scene.
     turn_deg : float
     mirrored : bool
     """
@@ -91,10 +90,10 @@ def varied(
 
 
 def write_database_coco(database: TopViewDatabase, file: TextIO) -> int:
-    """Write a database as COCO: an annotation for every vehicle and for the road; how many.
+    """Write a database as COCO, one annotation for each vehicle and each scene's road; the number of annotations.
 
-    Scene by scene, so that memory does not grow with the database. Vehicles are whole, also where a nearer one hides
-    part of them in the map.
+    Scenes are written one at a time, so that memory use does not grow with the database. Vehicles are complete, even if
+    a nearer one covers part of them in the map.
     """
     from faster_coco_eval.core import mask as coco
 

@@ -1,19 +1,18 @@
-"""The top-view database: what its files hold, and the reader of them.
+"""The files of the top-view database, and their reader.
 
 KITTI's scenes as images, labels and maps of the ground ahead, made by the eight steps of section 3 of the paper in
 Electronics 12, 3165 (2023)::
 
-    OUT/images/NAME.png   3.1  the scan: red distance, green height, blue remission, 0 where nothing returned
-    OUT/labels/NAME.txt   3.2  a vehicle a line: class x y length width yaw, metres and radians in the sensor frame
-    OUT/maps/NAME.png     3.8  a class for every cell: background 0, road 1, car 2, van 3, truck 4
-    OUT/index.csv              a scene a line, with its drive, split, fold, counts and hashes
-    OUT/road/             3.4  images and masks to train a road model on, with an index of their own
-    OUT/manifest.json          what all this was made of; written last, so that a folder without one is unfinished
+    OUT/images/NAME.png   3.1  the scan: red distance, green height, blue remission; 0 without a return
+    OUT/labels/NAME.txt   3.2  a line for each vehicle: class x y length width yaw, meters and radians, sensor frame
+    OUT/maps/NAME.png     3.8  the class of each cell: background 0, road 1, car 2, van 3, truck 4
+    OUT/index.csv              a line for each scene: drive, split, fold, counts and hashes
+    OUT/road/             3.4  images and masks to train a road model on, with their own index
+    OUT/manifest.json          sources and settings; written last, so a folder without it is unfinished
 
-The index is CSV, not Parquet: a few megabytes at any size anyone has, the same bytes whatever library wrote it, read by
-everything and compared by diff.
+The index is CSV rather than Parquet: a few megabytes, the same bytes with every library, and diff can compare it.
 
-KITTI labels what the camera sees: vehicles in the near corners, outside the camera's view, are in no label and no map.
+KITTI labels only what the camera sees: vehicles in the near corners, outside its view, are in no label and no map.
 """
 
 from __future__ import annotations
@@ -58,8 +57,8 @@ FARTHEST_M = float(np.hypot(X_RANGE_M[1], Y_RANGE_M[1]))
 def picture(points: NDArray[np.float32]) -> NDArray[np.uint8]:
     """A scan seen from above (section 3.1).
 
-    Metres become pixels of 0.1 m, rounded to the nearest and clamped to the image; of the points of a pixel the highest
-    counts, of equally high ones the first. Every channel is scaled from its range to 0..255.
+    Coordinates are rounded to pixels of 0.1 m and clamped to the image. A pixel shows its highest point, and the first
+    of equally high ones. Each channel is scaled from its range to 0..255.
 
     Parameters
     ----------
@@ -71,7 +70,7 @@ def picture(points: NDArray[np.float32]) -> NDArray[np.uint8]:
     -------
     (400, 200, 3) uint8
         Distance in the plane 0..47.07 m, height -2.5..2.5 m, remission 0..1. Row 0 is farthest, column 0 leftmost.
-        The first channel is 0 where nothing returned, and nowhere else.
+        The first channel is 0 in exactly the pixels without a return.
     """
     p = points[(points[:, 0] >= X_RANGE_M[0]) & (points[:, 0] <= X_RANGE_M[1])]
     p = p[(p[:, 1] >= Y_RANGE_M[0]) & (p[:, 1] <= Y_RANGE_M[1]) & (p[:, 2] >= Z_RANGE_M[0]) & (p[:, 2] <= Z_RANGE_M[1])]
@@ -81,7 +80,7 @@ def picture(points: NDArray[np.float32]) -> NDArray[np.uint8]:
     remission = np.clip(p[:, 3], 0.0, 1.0)
     height = (p[:, 2] - Z_RANGE_M[0]) / (Z_RANGE_M[1] - Z_RANGE_M[0])
     values = np.stack([np.hypot(p[:, 0], p[:, 1]) / FARTHEST_M, height, remission], axis=1)
-    # Of several assignments to a pixel the last one stays: lowest first, and of equals the later ones first.
+    # The last assignment to a pixel remains: lowest points first, and of equally high ones the later first.
     order = len(p) - 1 - np.argsort(p[::-1, 2], kind="stable")
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[HEIGHT - 1 - ahead[order], WIDTH - 1 - left[order]] = np.rint(255.0 * values[order]).astype(np.uint8)
@@ -89,14 +88,14 @@ def picture(points: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def vehicles(boxes: Iterable[Box]) -> tuple[Box, ...]:
-    """Cars, vans and trucks that cover a cell of the view, reduced to the plane (section 3.2).
+    """Cars, vans and trucks that cover a cell of the view, as rectangles in the plane (section 3.2).
 
-    Rounded to a tenth of a millimetre, as a label file says them, so that the map drawn from them is the label's.
+    Numbers are rounded to 0.1 mm as in the label files, so that a map drawn from a label file is the same.
 
     Raises
     ------
     DatabaseError
-        A vehicle's numbers are not finite, or its footprint has no area.
+        A vehicle's numbers are not finite or not plausible, or its footprint has no area.
     """
     kept = []
     for box in boxes:
@@ -115,10 +114,10 @@ def vehicles(boxes: Iterable[Box]) -> tuple[Box, ...]:
 
 
 def road_and_vehicles(road: NDArray[Any], boxes: Iterable[Box]) -> NDArray[np.uint8]:
-    """The map of a scene (section 3.8): road 1, other ground 0, and the vehicles' classes over it.
+    """The map of a scene (section 3.8): road 1, other ground 0, and over both the vehicles' classes.
 
-    A cell is a vehicle's where its centre, turned back by the vehicle's yaw, lies in the rectangle: the paper's rotated
-    box, without the holes that turning whole pixels forward leaves. Of two vehicles the nearer one is drawn.
+    A cell belongs to a vehicle if its center lies in the vehicle's rectangle. This is the paper's rotated box, without
+    the holes left by rotating whole pixels. Where two vehicles overlap, the nearer one is drawn.
     """
     labels = road.astype(np.uint8)
     draw_footprints(labels, boxes, VIEW, CLASSES)
@@ -126,7 +125,7 @@ def road_and_vehicles(road: NDArray[Any], boxes: Iterable[Box]) -> NDArray[np.ui
 
 
 def write_labels(boxes: Iterable[Box]) -> str:
-    """The text of a label file: a vehicle a line, ``class x y length width yaw``."""
+    """The text of a label file: a line ``class x y length width yaw`` for each vehicle."""
     rows = [(b.label, *b.center[:2], *b.size[:2], b.yaw) for b in boxes]
     return "".join(
         f"{name} {x:.4f} {y:.4f} {length:.4f} {width:.4f} {yaw:.4f}\n" for name, x, y, length, width, yaw in rows
@@ -134,14 +133,14 @@ def write_labels(boxes: Iterable[Box]) -> str:
 
 
 def read_labels(path: Path) -> tuple[Box, ...]:
-    """Vehicles of a label file, in the plane: their z and height are 0."""
+    """Vehicles of a label file; their z and height are 0."""
     boxes = []
     for line in path.read_text().splitlines():
         try:
             name, *numbers = line.split()
             x, y, length, width, yaw = map(float, numbers)
         except ValueError as exc:
-            raise DatabaseError(f"{path} says {line!r}; expected lines of: class x y length width yaw") from exc
+            raise DatabaseError(f"{path} has the line {line!r}; expected lines of: class x y length width yaw") from exc
         boxes.append(Box(name, 1.0, (x, y, 0.0), (length, width, 0.0), yaw))
     return tuple(boxes)
 
@@ -159,7 +158,7 @@ def read_png(path: Path) -> NDArray[np.uint8]:
         with Image.open(path) as image:
             return np.asarray(image)
     except (OSError, SyntaxError) as exc:
-        raise DatabaseError(f"{path} is no image ({exc}); run database check, then build again") from exc
+        raise DatabaseError(f"{path} is not an image ({exc}); run database-check, then build again") from exc
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,10 +169,10 @@ class TopViewScene:
     ----------
     name, drive, split : str
     fold : int or None
-        None for a test scene.
+        None for test scenes.
     image : (400, 200, 3) uint8
     boxes : tuple of Box
-        In the plane: z and height are 0.
+        Their z and height are 0.
     map : (400, 200) uint8
         Index into `CLASSES`.
     """
@@ -188,32 +187,32 @@ class TopViewScene:
 
     @property
     def rectangles(self) -> NDArray[np.float64]:
-        """The vehicles as `edgeperc.geometry` takes them, (k, 5): x, y, length, width [m], yaw [rad]."""
+        """The vehicles as `edgeperc.geometry` takes them, (k, 5) float64: x, y, length, width [m], yaw [rad]."""
         return rectangles(self.boxes)
 
 
 class TopViewDatabase:
-    """A finished database, read back scene by scene; a sequence of `TopViewScene`.
+    """A finished database: a sequence of `TopViewScene`, read one at a time.
 
     Parameters
     ----------
     root : Path or str
-        What ``edgeperc-export database build`` wrote.
+        Folder written by ``edgeperc-export database-build``.
     split : str
         ``"all"``, ``"train"``, ``"validation"`` or ``"test"``.
     fold : int, optional
-        With it, validation is that fold and training the other four; without, validation is empty.
+        Validation is this fold, and training the other four. Without it, validation is empty.
 
     Attributes
     ----------
     manifest : dict
     rows : list of dict of str to str
-        The chosen lines of the index.
+        The lines of the index that belong to the split.
 
     Raises
     ------
     DatabaseError
-        ``root`` holds no finished database, one of a newer format, or an index that is not the manifest's.
+        ``root`` holds no finished database, one of another format, or an index that does not match the manifest.
     """
 
     def __init__(self, root: Path | str, split: str = "all", fold: int | None = None) -> None:
@@ -228,28 +227,28 @@ class TopViewDatabase:
             known, index_hash = self.manifest["format"], self.manifest["sha256"]["index.csv"]
         except FileNotFoundError as exc:
             raise DatabaseError(
-                f"{path} is not there: the database is unfinished or elsewhere; run edgeperc-export database build"
+                f"{path} does not exist: the database is unfinished or elsewhere; run edgeperc-export database-build"
             ) from exc
         except (ValueError, KeyError, TypeError) as exc:
-            raise DatabaseError(f"{path} is no manifest of a top-view database; build it again") from exc
+            raise DatabaseError(f"{path} is not the manifest of a top-view database; build it again") from exc
         if known != FORMAT:
-            raise DatabaseError(f"{path} is of format {known}; this edgeperc reads {FORMAT}: build it again, or update")
+            raise DatabaseError(f"{path} has format {known}; this edgeperc reads {FORMAT}: build it again, or update")
         content = (self.root / "index.csv").read_bytes()
         if hashlib.sha256(content).hexdigest() != index_hash:
-            raise DatabaseError(f"{self.root / 'index.csv'} is not the one of the manifest; build the database again")
+            raise DatabaseError(f"{self.root / 'index.csv'} does not match the manifest; build the database again")
         rows = csv.DictReader(io.StringIO(content.decode()))
         self.rows = [row for row in rows if _belongs(row, split, fold)]
         self._at = {row["scene"]: k for k, row in enumerate(self.rows)}
 
     @property
     def names(self) -> list[str]:
-        """Names of the chosen scenes, sorted."""
+        """Names of the scenes, sorted."""
         return list(self._at)
 
     def scene(self, name: str) -> TopViewScene:
-        """Read one of the chosen scenes by its name."""
+        """Read a scene by its name."""
         if name not in self._at:
-            raise DatabaseError(f"no scene is called {name!r} among the {len(self)} chosen ones; see .names")
+            raise DatabaseError(f"none of the {len(self)} scenes is called {name!r}; see .names")
         return self[self._at[name]]
 
     def __len__(self) -> int:
@@ -272,7 +271,7 @@ class TopViewDatabase:
         return (self[k] for k in range(len(self)))
 
     def damaged(self) -> list[str]:
-        """Files of the chosen scenes that are missing, or not the ones that the index was written for."""
+        """Files of the scenes that are missing, or differ from the hash in the index."""
         bad = []
         for row in self.rows:
             for folder, suffix in (("image", "png"), ("label", "txt"), ("map", "png")):

@@ -1,7 +1,7 @@
-"""Road models taught by roads drawn by hand, one a fold (sections 3.5 and 3.6 of Electronics 12, 3165).
+"""Road models trained on hand-drawn roads, one for each fold (sections 3.5 and 3.6 of Electronics 12, 3165).
 
-The model of a fold is taught by the drawn scenes of the other four folds and watched on those of its own. It then finds
-the roads of the fold's scenes (section 3.7): no drive's roads come from a model that saw the drive.
+The model of a fold is trained on the drawn scenes of the other four folds and validated on those of its own. It then
+finds the roads of the fold's scenes (section 3.7), so that no road comes from a model that was trained on its drive.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ __all__ = ["DrawnScene", "train_folds"]
 
 @dataclass(frozen=True)
 class DrawnScene:
-    """A scene to train on.
+    """A scene with a drawn road.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class DrawnScene:
     road : list
         COCO segmentations.
     inputs : str
-        Changes when the scene's files do.
+        Identifies the scene's files: `edgeperc_export.database.scenes.inputs_of`.
     """
 
     fold: int
@@ -48,32 +48,31 @@ class DrawnScene:
 
 
 def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: Recipe, out: Path, work: Path) -> None:
-    """Write ``out/fold-0.onnx`` to ``fold-4.onnx``; a model of the same scenes and recipe is not made again.
+    """Write ``out/fold-0.onnx`` to ``fold-4.onnx``. A model of the same scenes and recipe is not made again.
 
     Parameters
     ----------
     objects : KittiObjects
     drawn : mapping of str to DrawnScene
-        The scenes' names.
+        By name.
     recipe : Recipe
-        Of a network of the top view with a class drivable.
+        Of a top-view network with a class "drivable".
     out : Path
     work : Path
-        Where training keeps what it goes on with after a stop.
+        Folder for checkpoints, from which a stopped training run resumes.
 
     Raises
     ------
     DatabaseError
-        All drawn scenes are of one fold.
+        All drawn scenes are in one fold.
     """
-    # Test scenes take the first fold's model.
     for fold in range(N_FOLDS):
         shown = {name: scene for name, scene in sorted(drawn.items()) if scene.fold != fold}
         held_out = {name: scene for name, scene in sorted(drawn.items()) if scene.fold == fold}
         if not shown:
             raise DatabaseError(
-                f"fold {fold} has no road to learn from among {len(drawn)} drawn scenes to train on; draw roads in two "
-                "drives or more, or take a model by --road-by NAME"
+                f"all {len(drawn)} drawn scenes are in fold {fold}, whose road model cannot be trained on them; draw "
+                "roads in two drives or more, or name a model by --road-by NAME"
             )
         facts = [asdict(recipe), *({name: asdict(scene) for name, scene in part.items()} for part in (shown, held_out))]
         key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
@@ -100,6 +99,6 @@ def _labelled(objects: KittiObjects, drawn: Mapping[str, DrawnScene]) -> dict[st
         try:
             scan = LabelledScan.from_frame(objects.frame(name))
         except (EdgepercError, ValueError, OSError):
-            continue  # told of when the scene itself is made
+            continue  # reported when the scene itself is made
         found[name] = replace(scan, surface=with_road(scan.surface, mask_of(scene.road, name)))
     return found

@@ -1,6 +1,6 @@
-"""A web page of this computer's own in which a person draws roads over a database's images (section 3.3).
+"""A local web page for drawing roads over a database's images (section 3.3).
 
-Served to this computer alone, needing nothing of the network. Every change is written to the COCO file at once.
+The page is served to this computer only and loads nothing from the network. Each change is saved to the COCO file.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ __all__ = ["LabelServer"]
 PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".webp": "image/webp"}
 LARGEST_REQUEST = 4_000_000
 
-# The page's own script and style; pictures and data from here, and nothing from anywhere else.
+# The page's own script and style, and pictures and data of this server only.
 POLICY = "default-src 'none'; img-src 'self'; connect-src 'self'; script-src 'unsafe-inline'; style-src 'unsafe-inline'"
 
 
 class LabelServer(ThreadingHTTPServer):
-    """Serves the page on 127.0.0.1; ``serve_forever`` runs it.
+    """The page's server, on 127.0.0.1; ``serve_forever`` runs it.
 
     Parameters
     ----------
     root : Path
         A finished database.
     polygons : Path
-        COCO file that is gone on with, where there is one, and written.
+        COCO file to write; its polygons are read if it exists.
     kitti : Path, optional
-        Where ``training/image_2`` holds the camera's pictures.
+        Object set whose ``training/image_2`` holds camera pictures.
     port : int
-        0 takes any free one.
+        0 takes any free port.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class LabelServer(ThreadingHTTPServer):
     Raises
     ------
     DatabaseError
-        ``root`` is no finished database, or ``polygons`` holds what this page cannot draw.
+        ``root`` is not a finished database, or ``polygons`` holds run lengths, which the page cannot draw.
     OSError
         The port is taken.
     """
@@ -69,7 +69,7 @@ class LabelServer(ThreadingHTTPServer):
         self.url = f"http://127.0.0.1:{self.server_address[1]}/"
 
     def save(self, name: str, polygons: list[Any]) -> None:
-        """Keep a scene's polygons, and write the file."""
+        """Set a scene's polygons and write the file."""
         with self.lock:
             self.roads.pop(name, None)
             if polygons:
@@ -82,7 +82,7 @@ def _polygons(path: Path) -> tuple[dict[str, list[Any]], dict[str, str]]:
     roads = {}
     for name, segmentations in read_coco([path]).items():
         if not all(isinstance(each, list) for each in segmentations):
-            raise DatabaseError(f"{path} holds {name} as run lengths, which cannot be drawn; give another file")
+            raise DatabaseError(f"{path} has run lengths for {name}; the page edits polygons only: give another file")
         rings = [ring for each in segmentations for ring in each]
         roads[name] = [[[x, y] for x, y in zip(ring[::2], ring[1::2], strict=True)] for ring in rings]
     images = json.loads(path.read_text())["images"]
@@ -93,7 +93,7 @@ class _Handler(BaseHTTPRequestHandler):
     server: LabelServer
 
     def do_GET(self) -> None:
-        # Any other page of the browser may ask this address under a name of its own; it is told nothing.
+        # Pages of other sites can reach this address under their own host name; they get no answer.
         if self.headers.get("Host") != urlsplit(self.server.url).netloc:
             return self.send_error(HTTPStatus.FORBIDDEN)
         what, _, name = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
@@ -130,12 +130,12 @@ class _Handler(BaseHTTPRequestHandler):
         return self.send_error(HTTPStatus.NOT_FOUND)
 
     def do_PUT(self) -> None:
-        """Polygons of a scene: corners [x, y] in pixels of the image."""
+        """Set the polygons of a scene: corners [x, y] in pixels of the image."""
         if self.headers.get("Host") != urlsplit(self.server.url).netloc:
             return self.send_error(HTTPStatus.FORBIDDEN)
         what, _, name = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
         length = int(self.headers.get("Content-Length") or 0)
-        # Only a page of this address may send JSON: a browser asks first, and is not answered.
+        # Pages of other sites cannot send JSON: the browser asks for permission first, and gets no answer.
         json_sent = self.headers.get("Content-Type") == "application/json"
         if what != "road" or name not in self.server.names:
             return self.send_error(HTTPStatus.NOT_FOUND)
@@ -164,7 +164,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, *_: Any) -> None:
-        """Say nothing of every request."""
+        """Log no requests."""
 
 
 def _within(value: float, limit: int) -> float:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from edgeperc import Perceiver
 from edgeperc.adapt import condition
-from edgeperc.atomic import write_aside
+from edgeperc.atomic import write_whole
 from edgeperc.card import TopViewGeometry
 from edgeperc.errors import CardMismatchError, EdgepercError
 from edgeperc.evaluation.datasets import KittiObjects, scan_hash
@@ -34,10 +34,10 @@ __all__ = [
     "ROAD_INDEX",
     "TRAIN",
     "TRAINED",
+    "Job",
     "Plan",
     "RoadModel",
     "SceneBuilder",
-    "Task",
     "inputs_of",
 ]
 
@@ -55,21 +55,21 @@ TRAIN, TRAINED = "train", ("road/models", ".build/road")
 
 @dataclass(frozen=True)
 class Plan:
-    """What a database is made of, apart from the scenes.
+    """Settings of a database.
 
     Attributes
     ----------
     kitti, out : Path
-        Roots of the KITTI object set and of the database; on a Ray cluster, as every computer of it sees them.
+        Folders of the KITTI object set and of the database. On a Ray cluster, all its computers must see them there.
     road_by : str
-        What finds the roads that nobody drew: a shipped model's name, the path of an .onnx with a card, or ``"train"``,
-        a model for every fold, taught by the roads that were drawn in the others.
+        Source of the roads that nobody drew: the name of a shipped model, the path of an .onnx with a card, or
+        ``"train"``: a model for each fold, trained on the drawn roads of the other folds.
     sensor : str
-        Where the points come from (`edgeperc.sensor.SENSORS`).
+        Sensor of the scans, as `edgeperc.Perceiver` takes it.
     provider : str
-        See `edgeperc.Perceiver`; what ``"auto"`` takes may change from one day to the next, and roads with it.
+        As `edgeperc.Perceiver` takes it. With ``"auto"`` the provider, and so the roads, may change between builds.
     variations : int
-        How many variations of every drawn training scene to add (section 3.4).
+        Number of variations of each drawn training scene (section 3.4).
     """
 
     kitti: Path
@@ -80,13 +80,13 @@ class Plan:
     variations: int = 8
 
     def road_model(self, fold: int | None) -> str:
-        """The model that finds the roads of a fold's scenes; the first fold's has not seen the test scenes either."""
+        """The road model of a fold. Test scenes (None) take the first fold's, which was not trained on them either."""
         return str(self.out / f"road/models/fold-{fold or 0}.onnx") if self.road_by == TRAIN else self.road_by
 
 
 @dataclass(frozen=True)
-class Task:
-    """One scene to be made."""
+class Job:
+    """One scene to make; ``road`` are its drawn roads, if any, as COCO segmentations."""
 
     name: str
     drive: str
@@ -105,16 +105,16 @@ class RoadModel:
     model : str
         As `Plan.road_model` gives it.
     on_mismatch : {"warn", "ignore"}
-        What to do when the scans are unlike those the model was trained on.
+        What to do if the scans differ from those the model was trained on.
 
     Raises
     ------
     CardMismatchError
-        The model sees no top view of these cells, or knows no drivable ground.
+        The model's input is not a top view of these cells, or it has no class "drivable".
     """
 
     def __init__(self, plan: Plan, model: str, on_mismatch: Literal["warn", "ignore"]) -> None:
-        # One thread each: scenes are made side by side.
+        # One thread each, because scenes are made in parallel.
         self.perceive = Perceiver(
             model, sensor=plan.sensor, provider=plan.provider, n_threads=1, on_mismatch=on_mismatch
         )
@@ -143,14 +143,14 @@ class RoadModel:
 
     def __call__(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Road of a scan, (400, 200) bool."""
-        # A scan moved by as much as the views are apart falls into the model's cells as it does into the database's.
+        # Moved by the offset between the views, a scan falls into the same cells of the model as of the database.
         top_view = self.perceive(points + self._shift.astype(np.float32)).top_view
         assert top_view is not None
         return top_view.drivable
 
 
 class SceneBuilder:
-    """Makes one scene after another: steps 3.1 to 3.4, 3.7 and 3.8.
+    """Makes scenes, one at a time (sections 3.1 to 3.4, 3.7 and 3.8).
 
     Parameters
     ----------
@@ -168,26 +168,26 @@ class SceneBuilder:
         self._road_model: RoadModel | None = None
 
     def road_model(self, fold: int | None) -> RoadModel:
-        """The road model of a fold. One is held at a time, for scenes come fold by fold."""
+        """The road model of a fold. Only one is kept in memory, because scenes come fold by fold."""
         path = self.plan.road_model(fold)
         if self._road_model is None or self._road_model.path != path:
             self._road_model = RoadModel(self.plan, path, self._on_mismatch)
             self.facts[path] = self._road_model.facts
         return self._road_model
 
-    def is_made(self, task: Task) -> bool:
-        """Whether the scene lies there, made of the same inputs by the same settings."""
-        facts = self.road_model(task.fold).facts
+    def is_made(self, job: Job) -> bool:
+        """Whether the scene exists, made from the same inputs with the same settings."""
+        facts = self.road_model(job.fold).facts
         try:
-            record = json.loads(self.record_path(task.name).read_text())
-            files = [self.plan.out / folder / f"{task.name}.{suffix}" for folder, suffix in FOLDERS.items()]
+            record = json.loads(self.record_path(job.name).read_text())
+            files = [self.plan.out / folder / f"{job.name}.{suffix}" for folder, suffix in FOLDERS.items()]
             files += [self._variation(folder, row["name"]) for row in record["variations"] for folder in ROAD_FOLDERS]
-            return bool(record["key"] == self._key(task, facts)) and all(path.exists() for path in files)
+            return bool(record["key"] == self._key(job, facts)) and all(path.exists() for path in files)
         except (OSError, ValueError, KeyError, TypeError):
-            return False  # a missing or foreign record: the scene is made again
+            return False  # no record, or not one of this format: the scene is made again
 
-    def __call__(self, task: Task) -> str:
-        """Make a scene; why it was left out, or nothing.
+    def __call__(self, job: Job) -> str:
+        """Make a scene; the reason if it is left out, else "".
 
         Raises
         ------
@@ -195,15 +195,15 @@ class SceneBuilder:
             Its files cannot be written.
         """
         try:
-            frame = self.objects.frame(task.name)
+            frame = self.objects.frame(job.name)
             boxes = vehicles(frame.boxes)
         except (EdgepercError, ValueError, OSError) as exc:
-            # Without the root, so that the same set gives the same database wherever it lies.
+            # Without the folder's path, so that a set gives the same database wherever it lies.
             return (str(exc) or type(exc).__name__).replace(f"{self.plan.kitti}{os.sep}", "")
         image = picture(condition(frame.points, self.sensor, rendered=False)[0])
-        model = self.road_model(task.fold)
+        model = self.road_model(job.fold)
         found = model(frame.points)
-        drawn = None if task.road is None else mask_of(task.road, task.name) != 0
+        drawn = None if job.road is None else mask_of(job.road, job.name) != 0
         road = found if drawn is None else drawn
         labels = road_and_vehicles(road, boxes)
         contents = {"image": png(image), "label": write_labels(boxes).encode(), "map": png(labels)}
@@ -218,21 +218,21 @@ class SceneBuilder:
             "scan_sha256": scan_hash(frame.points),
         }
         for (folder, suffix), (kind, content) in zip(list(FOLDERS.items())[:3], contents.items(), strict=True):
-            row[f"{kind}_sha256"] = self._write(self.plan.out / folder / f"{task.name}.{suffix}", content)
+            row[f"{kind}_sha256"] = self._write(self.plan.out / folder / f"{job.name}.{suffix}", content)
         record = {
-            "key": self._key(task, model.facts),
+            "key": self._key(job, model.facts),
             "row": row,
-            "variations": [] if drawn is None else list(self._vary(task, image, drawn)),
+            "variations": [] if drawn is None else list(self._vary(job, image, drawn)),
             "found": None if drawn is None else np.bincount((2 * drawn + found).ravel(), minlength=4).tolist(),
         }
-        self._write(self.record_path(task.name), json.dumps(record, sort_keys=True).encode())
+        self._write(self.record_path(job.name), json.dumps(record, sort_keys=True).encode())
         return ""
 
-    def _vary(self, task: Task, image: NDArray[np.uint8], road: NDArray[np.bool_]) -> Iterator[dict[str, Any]]:
-        # Test scenes are set apart before augmentation (section 3.4, Figure 12): they are there as they are.
-        for k in range(1 + (self.plan.variations if task.split == "train" else 0)):
-            moved, mask, turn_deg, mirrored = varied(image, road.astype(np.uint8), task.name, k)
-            name = f"{task.name}-{k:02d}"
+    def _vary(self, job: Job, image: NDArray[np.uint8], road: NDArray[np.bool_]) -> Iterator[dict[str, Any]]:
+        # Test scenes are separated before augmentation (section 3.4, Figure 12), so they are not varied.
+        for k in range(1 + (self.plan.variations if job.split == "train" else 0)):
+            moved, mask, turn_deg, mirrored = varied(image, road.astype(np.uint8), job.name, k)
+            name = f"{job.name}-{k:02d}"
             row = {"name": name, "turn_deg": turn_deg, "mirrored": int(mirrored)}
             row["road_cells"] = int(np.count_nonzero(mask == 1))
             row["image_sha256"] = self._write(self._variation("road/images", name), png(moved))
@@ -240,27 +240,27 @@ class SceneBuilder:
             yield row
 
     def record_path(self, name: str) -> Path:
-        """Where a finished scene's record lies."""
+        """Path of a finished scene's record."""
         return self.plan.out / ".build/records" / f"{name}.json"
 
     def _variation(self, folder: str, name: str) -> Path:
         return self.plan.out / folder / f"{name}.{ROAD_FOLDERS[folder]}"
 
-    def _key(self, task: Task, model: dict[str, str]) -> str:
-        """Changes when anything does that the scene is made of."""
+    def _key(self, job: Job, model: dict[str, str]) -> str:
+        """A hash of everything that decides a scene's files."""
         facts = [
-            FORMAT, model, asdict(self.sensor), self.plan.variations, task.name, task.split, task.road,
-            inputs_of(self.plan.kitti, task.name),
+            FORMAT, model, asdict(self.sensor), self.plan.variations, job.name, job.split, job.road,
+            inputs_of(self.plan.kitti, job.name),
         ]  # fmt: skip
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
     def _write(self, path: Path, content: bytes) -> str:
-        write_aside(path, content)
+        write_whole(path, content)
         return hashlib.sha256(content).hexdigest()
 
 
 def inputs_of(kitti: Path, name: str) -> str:
-    """Changes when a scene's files do; the scan, which is large, goes by its size."""
+    """Identifies a scene's input files: hashes of label and calibration, and the size of the scan, which is large."""
     training = kitti / "training"
     small = [training / "label_2" / f"{name}.txt", training / "calib" / f"{name}.txt"]
     facts = [hashlib.sha256(path.read_bytes()).hexdigest() for path in small]

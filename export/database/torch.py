@@ -1,4 +1,4 @@
-"""A top-view database as PyTorch takes it."""
+"""A top-view database as a PyTorch data set."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ __all__ = ["TopViewDataset"]
 
 
 class TopViewDataset(Dataset[tuple[Tensor, Tensor]]):
-    """Images and maps of a database; see `TopViewDatabase` for the arguments and errors.
+    """Images and maps of a database; parameters and errors are those of `TopViewDatabase`.
 
-    An item is the image, (3, 400, 200) float32 in 0..1 (section 3.6), and the map, (400, 200) int64. Vehicles differ in
-    number from scene to scene, so they are no part of it; ``database[k].rectangles`` has them.
+    Item k is the image, (3, 400, 200) float32 in 0..1 (section 3.6), and the map, (400, 200) int64. The vehicles, whose
+    number varies, are in ``database[k].rectangles``.
     """
 
     def __init__(self, root: Path | str, split: str = "all", fold: int | None = None) -> None:

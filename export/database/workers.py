@@ -16,42 +16,42 @@ from typing import Any
 from edgeperc.errors import MissingExtraError
 
 from ..roads import DatabaseError
-from .scenes import Plan, SceneBuilder, Task
+from .scenes import Job, Plan, SceneBuilder
 
 __all__ = ["run_jobs"]
 
-# Tasks on their way to each worker: enough to keep it busy, few enough that memory stays flat.
+# Jobs queued for each worker: enough to keep it busy, few enough that memory use stays constant.
 AHEAD = 4
 
 _builder: SceneBuilder  # of this worker process
 
 
-def run_jobs(builder: SceneBuilder, tasks: list[Task], engine: str, workers: int) -> Iterator[tuple[str, str]]:
-    """Make scenes in any order: their names, and why they were left out."""
-    # The first is made here: it warns where scan and model do not go together, and stops what would fail everywhere.
-    for task in tasks[:1]:
-        yield task.name, builder(task)
-    rest = tasks[1:]
+def run_jobs(builder: SceneBuilder, jobs: list[Job], engine: str, workers: int) -> Iterator[tuple[str, str]]:
+    """Make scenes in any order; yields each name, and the reason if the scene is left out, else ""."""
+    # The first scene is made in this process: it warns if scans do not suit the model, and fails early if all would.
+    for job in jobs[:1]:
+        yield job.name, builder(job)
+    rest = jobs[1:]
     if not rest:
         return
     if engine == "ray":
         yield from _run_on_ray(builder.plan, rest, workers)
     elif workers == 1:
-        yield from ((task.name, builder(task)) for task in rest)
+        yield from ((job.name, builder(job)) for job in rest)
     else:
         yield from _run_in_processes(builder.plan, rest, workers)
 
 
-def _run_in_processes(plan: Plan, tasks: list[Task], workers: int) -> Iterator[tuple[str, str]]:
-    # Spawned, as a fork of a process that runs an onnxruntime may hang.
+def _run_in_processes(plan: Plan, jobs: list[Job], workers: int) -> Iterator[tuple[str, str]]:
+    # Spawned, because a fork of a process that runs onnxruntime may hang.
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(tasks)), context, _start_worker, (plan,))
+    pool = ProcessPoolExecutor(min(workers, len(jobs)), context, _start_worker, (plan,))
     try:
-        left = iter(tasks)
+        left = iter(jobs)
         waiting: dict[Future[str], str] = {}
         while True:
-            for task in left:
-                waiting[pool.submit(_make_scene, task)] = task.name
+            for job in left:
+                waiting[pool.submit(_make_scene, job)] = job.name
                 if len(waiting) >= AHEAD * workers:
                     break
             if not waiting:
@@ -60,7 +60,7 @@ def _run_in_processes(plan: Plan, tasks: list[Task], workers: int) -> Iterator[t
                 yield waiting.pop(future), future.result()
     except BrokenProcessPool as exc:
         raise DatabaseError(
-            f"a worker of {workers} was killed, as where memory runs out; build again to go on, with fewer --workers"
+            f"one of {workers} workers was killed, perhaps for lack of memory; resume with fewer --workers"
         ) from exc
     finally:
         pool.shutdown(cancel_futures=True)
@@ -68,36 +68,36 @@ def _run_in_processes(plan: Plan, tasks: list[Task], workers: int) -> Iterator[t
 
 def _start_worker(plan: Plan) -> None:
     global _builder
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted too, and stops the workers in order
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted too, and stops the workers
     threading.Thread(target=_die_with_parent, daemon=True).start()
     _builder = SceneBuilder(plan)
 
 
 def _die_with_parent() -> None:
-    # A worker of a killed parent would wait for its next task for ever, and write until then.
+    # Otherwise the worker of a killed parent would finish its jobs and then wait forever.
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
     os._exit(1)
 
 
-def _make_scene(task: Task) -> str:
-    return _builder(task)
+def _make_scene(job: Job) -> str:
+    return _builder(job)
 
 
 class RayWorker:
-    """`SceneBuilder` as ``ray.data`` calls it: a row in, a row out, tasks as JSON for they are of uneven shape."""
+    """`SceneBuilder` as ``ray.data`` calls it: a row in, a row out; jobs are JSON because their shapes differ."""
 
     def __init__(self, plan: Plan) -> None:
         self.builder = SceneBuilder(plan)
 
     def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
         """Make one scene."""
-        task = Task(**json.loads(row["task"]))
-        return {"scene": task.name, "reason": self.builder(task)}
+        job = Job(**json.loads(row["job"]))
+        return {"scene": job.name, "reason": self.builder(job)}
 
 
-def _run_on_ray(plan: Plan, tasks: list[Task], workers: int) -> Iterator[tuple[str, str]]:
+def _run_on_ray(plan: Plan, jobs: list[Job], workers: int) -> Iterator[tuple[str, str]]:
     try:
         import ray
         import ray.data
@@ -111,9 +111,9 @@ def _run_on_ray(plan: Plan, tasks: list[Task], workers: int) -> Iterator[tuple[s
     try:
         ray.data.DataContext.get_current().enable_progress_bars = False
         rows = ray.data.from_items(
-            [{"task": json.dumps(asdict(task))} for task in tasks], override_num_blocks=min(len(tasks), 16 * workers)
+            [{"job": json.dumps(asdict(job))} for job in jobs], override_num_blocks=min(len(jobs), 16 * workers)
         )
-        done = rows.map(RayWorker, fn_constructor_args=(plan,), num_cpus=1, concurrency=min(workers, len(tasks)))
+        done = rows.map(RayWorker, fn_constructor_args=(plan,), num_cpus=1, concurrency=min(workers, len(jobs)))
         for row in done.iter_rows():
             yield str(row["scene"]), str(row["reason"])
     finally:

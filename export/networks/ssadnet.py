@@ -177,7 +177,7 @@ class BoxRegressor(nn.Module):
 class SlotsHead(nn.Module):
     """The paper's detection branch: five F.E. blocks, four B.B.R. blocks (Figure 7).
 
-    Out: (B, n_slots, 4), each row the centre column, centre row, width and height of an upright box in the top view,
+    Out: (B, n_slots, 4), each row the center column, center row, width and height of an upright box in the top view,
     as shares of its width and height; zeros where no box is left.
     """
 
@@ -200,8 +200,8 @@ class SlotsHead(nn.Module):
 class DenseHead(nn.Module):
     """An anchor-free regressor on F.E. blocks 1 to 3: one prediction every four cells.
 
-    Out: (B, 9, H/4, W/4): heat-map logit; offset of the centre from the output cell's centre in rows, columns [output
-    cells]; log length, log width [m]; sin and cos of twice the yaw; centre z [m]; log height [m].
+    Out: (B, 9, H/4, W/4): heat-map logit; offset of the center from the output cell's center in rows, columns [output
+    cells]; log length, log width [m]; sin and cos of twice the yaw; center z [m]; log height [m].
     """
 
     def __init__(self, c_in: int) -> None:
