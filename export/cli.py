@@ -332,7 +332,7 @@ def _quantize(args: argparse.Namespace) -> int:
         semantickitti=args.semantickitti,
         exclude=args.exclude,
         seven_bits=args.seven_bits,
-        n_judged=args.evaluate_on,
+        n_evaluated=args.evaluate_on,
         n_threads=args.threads,
     )
     print(

@@ -1,15 +1,15 @@
-"""Eight-bit models: written only where they are faster here and answer as well.
+"""The int8 variant of a model: written only if it is faster on this computer and as accurate.
 
-Weights become int8 per channel, activations uint8: of the pairs onnxruntime offers on the CPU, u8s8 is the one with
+Weights become int8 per channel, activations uint8: of the pairs that onnxruntime's CPU provider supports, u8s8 has the
 fast kernels (u8u8 took twice as long). Scales come from the calibration scans and clip one value in ten thousand of
-every tensor: with the largest values kept, all of pointseg-edge's convolutions cost 0.10 in agreement, so 0.04. What
-reads or makes the network's own inputs and outputs stays in fp32, and so do the convolutions
-whose rounding moves labels and boxes most.
+each tensor: disagreement with fp32 with all convolutions of pointseg in int8 was 0.04, and 0.10 without clipping. The
+first and last convolutions stay in fp32, and so do those whose rounding changes labels and boxes most.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import platform
 import re
@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 from edgeperc.card import ModelCard
 from edgeperc.decode import decode_classes, decode_top_view
-from edgeperc.errors import EdgepercError, PointsError, SplitError
+from edgeperc.errors import EdgepercError, ModelError, OptionError, PointsError, SplitError
 from edgeperc.evaluation.datasets import SEQUENCE_DRIVES, KittiObjects, scan_hash
 from edgeperc.evaluation.evaluate import evaluate
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
@@ -38,6 +38,8 @@ from edgeperc.projection import make_projector
 from edgeperc.readers.files import read_points
 from edgeperc.session import Session
 from edgeperc.simulation.samples import simulated_scan
+from edgeperc.tuning import cpu_features
+from edgeperc.zoo import INT8_FEATURES
 
 from .simulate import parity_scans
 from .to_onnx import with_golden, write_card
@@ -48,11 +50,11 @@ __all__ = ["RefusedError", "calibration_scans", "quantize"]
 ROUNDED_OPS = (
     *("Add", "Concat", "Conv", "DepthToSpace", "MaxPool", "Mul", "Relu", "Reshape", "Resize", "Sigmoid", "Transpose"),
 )
-FIRST_SEED = 3 * 10**9  # training draws its scenes from 0, proofs from 10**9, judging from 2 * 10**9
+FIRST_SEED = 3 * 10**9  # seeds of training start at 0, of parity scans at 10**9, of evaluation at 2 * 10**9
 N_PROBES = 8
 KEPT_PERCENT = 99.99
-# Of labels and boxes with the fp32 network's (`_disagreement`). All convolutions of pointseg-edge cost 0.024, of
-# ssadnet-edge 0.079, and both answer as well; all of SSADNet's 0.17, of which 0.16 is one that feeds its unpooling.
+# Of labels and boxes with the fp32 network's (`_disagreement`). With all convolutions in int8: pointseg 0.024, ssadnet
+# 0.079, both as accurate as in fp32; ssadnet-full 0.17, of which 0.16 is due to one convolution before its unpooling.
 MAX_DISAGREEMENT = 0.1
 MAX_LOSS = 0.01
 N_RUNS = 40
@@ -62,7 +64,7 @@ Race = Callable[[Path, Path, "int | None"], tuple[NDArray[np.float64], NDArray[n
 
 
 class RefusedError(EdgepercError):
-    """An eight-bit model is no faster here, or answers worse; nothing was written."""
+    """The int8 model is not faster on this computer, or less accurate; nothing was written."""
 
 
 def calibration_scans(
@@ -75,21 +77,21 @@ def calibration_scans(
     paths : sequence of Path
         Scans, or folders of ``.bin`` files.
     kitti : Path or None
-        Root of a KITTI object set, of whose training drives 64 scans are taken, evenly spread.
+        Root of a KITTI object set; 64 scans of its training drives are taken, evenly spread.
     n_simulated : int
 
     Raises
     ------
     SplitError
-        A scan is of a test drive, as its folders or the ``frames.csv`` above it tell.
+        A scan is of a test or validation drive, according to its folders or the ``frames.csv`` above it.
     PointsError
-        There are none.
+        No scan was found.
     """
     files = [file for path in paths for file in (sorted(path.rglob("*.bin")) if path.is_dir() else [path])]
     for file in files:
         drive = _drive(file)
         if drive is not None and not in_split(drive, "train"):
-            raise SplitError(f"{file} is of test drive {drive}; calibrate on scans of other drives")
+            raise SplitError(f"{file} is of drive {drive}, which is kept for evaluation; calibrate on other drives")
     real = [read_points(file) for file in files]
     if kitti is not None:
         objects = KittiObjects(kitti)
@@ -103,7 +105,7 @@ def calibration_scans(
 
 
 def _drive(file: Path) -> str | None:
-    """The KITTI drive of a scan, where its place tells."""
+    """The KITTI drive of a scan; None if its folders do not say."""
     file = file.resolve()
     if named := DRIVE.search(str(file)):
         return named[0]
@@ -115,10 +117,7 @@ def _drive(file: Path) -> str | None:
 
 def _saturates() -> bool:
     """Whether this computer adds pairs of eight-bit products in sixteen bits: x86 without VNNI, or unknown x86."""
-    if platform.machine() not in ("x86_64", "AMD64"):
-        return False
-    flags = Path("/proc/cpuinfo")
-    return not flags.exists() or re.search(r"\b(avx512_vnni|avx_vnni)\b", flags.read_text()) is None
+    return platform.machine() in ("x86_64", "AMD64") and INT8_FEATURES.isdisjoint(cpu_features())
 
 
 def _folded(path: Path) -> onnx.ModelProto:
@@ -165,8 +164,8 @@ class _Calibrated:
                 *(f"{folder}/folded.onnx", [*ROUNDED_OPS], augmented, CalibrationMethod.Percentile),
                 extra_options={"percentile": KEPT_PERCENT},
             )
-            with contextlib.redirect_stdout(io.StringIO()):  # it prints what it does
-                # One by one: of all that it is given at once, it keeps every tensor in memory.
+            with contextlib.redirect_stdout(io.StringIO()):  # the calibrator prints its progress
+                # One at a time: it keeps every tensor of a batch of scans in memory.
                 for image in tqdm(images, desc="calibrating", unit="scan"):
                     calibrator.collect_data(_Reader(iter([{card.input.name: image}])))
                 ranges = calibrator.compute_data()
@@ -203,14 +202,14 @@ class _Calibrated:
 
 
 class _Reader:
-    """What onnxruntime's calibrators take images from."""
+    """The interface from which onnxruntime's calibrators read images."""
 
     def __init__(self, feed: Iterator[dict[str, NDArray[np.float32]]]) -> None:
         self.get_next = lambda: next(feed, None)
 
 
 def _between(graph: onnx.GraphProto, convolutions: Collection[str]) -> set[str]:
-    """The convolutions, and the operators all of whose inputs come from what is rounded already."""
+    """The convolutions, and the operators whose inputs all come from rounded operators."""
     constants = {"", *(weight.name for weight in graph.initializer)}
     names: set[str] = set()
     tensors: set[str] = set()
@@ -223,9 +222,9 @@ def _between(graph: onnx.GraphProto, convolutions: Collection[str]) -> set[str]:
 
 
 def _unround(graph: onnx.GraphProto, rounded: Collection[str]) -> None:
-    """Let operators in fp32 read what operators in fp32 wrote, not its rounding.
+    """Connect operators in fp32 directly to outputs in fp32, without rounding in between.
 
-    Where SSADNet unpools, it compares a tensor with its maxima: rounding one side leaves few equal.
+    SSADNet's unpooling compares a tensor with its maxima: with one side rounded, few are equal.
     """
     maker = {output: node for node in graph.node for output in node.output}
     origin = {}
@@ -252,7 +251,7 @@ def _answers(
 
 
 def _disagreement(fp32: _Calibrated, answers: Sequence[Mapping[str, NDArray[np.float32]]]) -> float:
-    """How far labels and boxes are from the fp32 network's: 1 less mean IoU, or less AP where that is lower."""
+    """Distance of labels and boxes from the fp32 network's: 1 - min(mean IoU, AP)."""
     card, labels, boxes = fp32.card, Confusion(fp32.card.classes), BoxEvaluator(oriented=True)
     for returned, here, there in zip(fp32.returned, answers, fp32.answers, strict=True):
         if card.view.kind == "top_view":
@@ -267,10 +266,10 @@ def _disagreement(fp32: _Calibrated, answers: Sequence[Mapping[str, NDArray[np.f
 
 
 def _candidates(graph: onnx.GraphProto, exclude: Collection[str]) -> list[str]:
-    """Convolutions that may be rounded: neither named, nor the first after an input or the last before an output."""
+    """Convolutions that may be rounded: all except the excluded, the first after an input, the last before an output."""
     unknown = set(exclude) - {node.name for node in graph.node}
     if unknown:
-        raise ValueError(f"no node is called {', '.join(sorted(unknown))}; expected names of the graph's nodes")
+        raise OptionError(f"no node is called {', '.join(sorted(unknown))}; expected names of the graph's nodes")
     inputs, maker = {i.name for i in graph.input}, {output: node for node in graph.node for output in node.output}
     last, pending = set(), [o.name for o in graph.output]
     while pending:
@@ -284,9 +283,9 @@ def _candidates(graph: onnx.GraphProto, exclude: Collection[str]) -> list[str]:
 
 
 def _choose(fp32: _Calibrated, candidates: Sequence[str], limit: float) -> tuple[list[str], float]:
-    """The convolutions to round, and their loss: all, or as many as keep below the limit, the harmless ones first.
+    """The convolutions to round, and their loss: all, or as many as stay below the limit, the least harmful first.
 
-    Takes at most a trial a convolution, and as many as halve their number down to one.
+    Takes at most n + log2(n) trials for n convolutions.
     """
     loss = fp32.loss(candidates)
     if loss <= limit:
@@ -307,7 +306,7 @@ def _choose(fp32: _Calibrated, candidates: Sequence[str], limit: float) -> tuple
 def race(
     one: Path, other: Path, n_threads: int | None, n_runs: int = N_RUNS
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Milliseconds of two networks' runs, by turns; the first of every turn is a warm-up and not counted."""
+    """Times of two networks' runs [ms], taken in turn; the first run of each turn is a warm-up."""
     sessions = [Session(path, "cpu", n_threads=n_threads) for path in (one, other)]
     times = np.empty((2, n_runs))
     for run in range(n_runs):
@@ -329,7 +328,7 @@ def _ratio(one: NDArray[np.float64], other: NDArray[np.float64]) -> tuple[float,
 
 
 def _scores(figures: Mapping[str, Any]) -> dict[str, float]:
-    """Every IoU of points and cells, and the AP of boxes, at all ranges."""
+    """The IoU of each class of points and cells, and the AP of boxes, over all ranges."""
     scores = {}
     for block in ("real", "simulated"):
         of = figures.get(block, {})
@@ -354,12 +353,14 @@ def quantize(
     semantickitti: Path | None = None,
     exclude: Sequence[str] = (),
     seven_bits: bool | None = None,
-    n_judged: int = 48,
+    n_evaluated: int = 48,
     n_threads: int | None = None,
     max_disagreement: float = MAX_DISAGREEMENT,
     race: Race = race,
 ) -> ModelCard:
-    """Write an eight-bit model with its card, judged like the one it was made of.
+    """Write the int8 variant of a model, with its card and figures of its own.
+
+    ``precision="auto"`` takes the variant only after `edgeperc_export.agree` has measured it.
 
     Parameters
     ----------
@@ -368,24 +369,24 @@ def quantize(
     scans : sequence of (n, 4) float32
         To calibrate on, from `calibration_scans`.
     hashes : sequence of str
-        Of the real ones among them: the card lists them, so that the model is never judged on them.
+        Of the real scans among them; the card lists them, so that the model is never evaluated on them.
     kitti : Path or None
-        Root of a KITTI object set, on whose test drives both models are judged, too.
+        Root of a KITTI object set; both models are evaluated on its test drives.
     semantickitti : Path or None
-        Root of SemanticKITTI, likewise.
+        Root of SemanticKITTI; both models are evaluated on its roads.
     exclude : sequence of str
-        Nodes to leave alone.
+        Nodes to keep in fp32.
     seven_bits : bool or None
-        Whether weights keep to seven bits. They have to on x86 without VNNI, whose sums of eight-bit products saturate,
-        and may for a model that is to run anywhere; None asks this computer.
-    n_judged : int
-        How many simulated scans, none of them calibrated on, both models are judged by.
+        Use 7-bit weights. x86 without VNNI needs them, because its sums of 8-bit products saturate; None: only if this
+        computer does.
+    n_evaluated : int
+        Number of simulated scans, other than those of the calibration, on which both models are evaluated.
     n_threads : int or None
-        To race with; None as many as onnxruntime takes.
+        For timing; None leaves it to onnxruntime.
     max_disagreement : float
-        What rounding may cost in agreement with the fp32 labels and boxes before convolutions are left alone.
+        Largest disagreement with the labels and boxes of fp32; above it, convolutions stay in fp32.
     race : callable
-        Of two paths and ``n_threads``: milliseconds of paired runs of both.
+        Two paths and ``n_threads`` -> times of paired runs of both models [ms].
 
     Returns
     -------
@@ -394,14 +395,19 @@ def quantize(
     Raises
     ------
     RefusedError
-        Not faster by more than the race's noise, or more than a point of IoU or AP lost; ``out`` is left as it was.
-    PointsError, ValueError
-        No scans, or an excluded node that there is none of.
+        The int8 model is not faster beyond the noise of the race, or an IoU or AP is more than a point lower. ``out``
+        is unchanged.
+    ModelError
+        The model is not in fp32.
+    PointsError, OptionError
+        No scans, or an excluded node that the graph does not have.
     """
     if not scans:
         raise PointsError("no scan to calibrate on; expected at least one")
     session = Session(path, "cpu")
     card = session.card
+    if card.precision != "fp32":
+        raise ModelError(f"{path} is in {card.precision}; quantize the model in fp32")
     seven_bits = _saturates() if seven_bits is None else seven_bits
     fp32 = _Calibrated.on(path, card, scans, seven_bits)
     candidates = _candidates(fp32.model.graph, exclude)
@@ -412,22 +418,22 @@ def quantize(
     training = dict(card.training)
     frames = training.get("frames")
     training |= {
-        "precision": "int8",
         "frames": {**dict(zip(hashes, hashes, strict=True)), **(frames if isinstance(frames, Mapping) else {})},
         "quantized": {
             "from": f"{card.name} {card.version}",
-            "sha256": session.sha256,
+            "graph_sha256": hashlib.sha256(onnx.load(path).graph.SerializeToString(deterministic=True)).hexdigest(),
             "calibration": f"{len(hashes)} real and {len(scans) - len(hashes)} simulated scans",
             "left_alone": alone,
             "disagreement": disagreement,
             "weight_bits": 7 if seven_bits else 8,
         },
     }
-    card = with_golden(model, replace(card, name=f"{card.name}-int8", training=training, parity={}, metrics={}))
+    card = replace(card, precision="int8", precisions={}, training=training, parity={}, metrics={})
+    card = with_golden(model, card)
     trial = out.with_name(f".{out.name}.trial.onnx")
     try:
         write_card(model, card, trial)
-        told = f"{len(chosen)} of {len(chosen) + len(alone)} convolutions in int8"
+        share = f"{len(chosen)} of {len(chosen) + len(alone)} convolutions in int8"
         one, other = race(path, trial, n_threads)
         ratio, least, most = _ratio(one, other)
         speed = (
@@ -435,16 +441,17 @@ def quantize(
             f"{ratio:.2f} times as long ({least:.2f} to {most:.2f})"
         )
         if most >= 1.0:
-            raise RefusedError(f"{path}: not faster here with {told}: {speed}; the time must be shorter beyond noise")
-        judges = {"KITTI": kitti, "SEMANTICKITTI": semantickitti, f"simulation:{n_judged}": f"simulation:{n_judged}"}
-        judges = {word: where for word, where in judges.items() if where is not None}
-        figures, before = (evaluate([*judges.values()], [each])[0] for each in (trial, path))
+            raise RefusedError(f"{path}: not faster here with {share}: {speed}; the time must be shorter beyond noise")
+        simulated = f"simulation:{n_evaluated}"
+        datasets = {"KITTI": kitti, "SEMANTICKITTI": semantickitti, simulated: simulated}
+        datasets = {name: root for name, root in datasets.items() if root is not None}
+        figures, before = (evaluate([*datasets.values()], [each])[0] for each in (trial, path))
         mine, theirs = _scores(figures), _scores(before)
         lost = {name: theirs[name] - mine.get(name, 0.0) for name in theirs}
         worse = [f"{name} {theirs[name]:.3f} to {mine.get(name, 0.0):.3f}" for name in lost if lost[name] > MAX_LOSS]
         if worse:
-            raise RefusedError(f"{path}: more than {MAX_LOSS} lost with {told}: {'; '.join(worse)} ({speed})")
-        figures["command"] = " ".join(["edgeperc eval", *judges, f"--model {card.name}"])
+            raise RefusedError(f"{path}: more than {MAX_LOSS} lost with {share}: {'; '.join(worse)} ({speed})")
+        figures["command"] = " ".join(["edgeperc eval", *datasets, f"--model {out.name}"])
         parity = {**_parity(path, trial), "speed": speed, "largest_loss": max(lost.values(), default=0.0)}
         card = replace(card, parity=parity, metrics=figures)
         write_card(model, card, out)
@@ -454,7 +461,7 @@ def quantize(
 
 
 def _parity(path: Path, rounded: Path) -> dict[str, float]:
-    """Agreement of labels with the fp32 model's on scans that neither was made with."""
+    """Least agreement of pixel labels with the fp32 model's, on simulated scans that neither was made with."""
     sessions, scans, agreement = [Session(each, "cpu") for each in (path, rounded)], parity_scans([]), 1.0
     card = sessions[0].card
     projector = make_projector(card.view, card.input)

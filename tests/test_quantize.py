@@ -15,7 +15,7 @@ onnx = pytest.importorskip("onnx")
 from torch import Tensor, nn
 
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry
-from edgeperc.errors import PointsError, SplitError
+from edgeperc.errors import ModelError, PointsError, SplitError
 from edgeperc.evaluation.datasets import KittiObjects
 from edgeperc.evaluation.splits import in_split
 from edgeperc.session import Session
@@ -119,7 +119,7 @@ def convolutions(path: Path) -> dict[str, int]:
 def test_inner_layers_become_int8_and_the_card_says_so(tmp_path: Path, small: Path, scans: list[np.ndarray]) -> None:
     out = tmp_path / "small-int8.onnx"
     before = Session(small).card
-    card = quantize(small, out, scans=scans, hashes=["f" * 16], n_judged=1, max_disagreement=1.0, race=FASTER)
+    card = quantize(small, out, scans=scans, hashes=["f" * 16], n_evaluated=1, max_disagreement=1.0, race=FASTER)
     int8, fp32 = onnx.TensorProto.INT8, onnx.TensorProto.FLOAT
     assert convolutions(out) == {"stem": fp32, "down": int8, "context": int8, "merge": int8, "last": fp32}
     nodes = onnx.load(out).graph.node
@@ -127,14 +127,17 @@ def test_inner_layers_become_int8_and_the_card_says_so(tmp_path: Path, small: Pa
     assert {zeros[n.input[2]] for n in nodes if n.op_type == "QuantizeLinear"} == {onnx.TensorProto.UINT8}
 
     session = Session(out, "cpu")
-    assert session.provider == "CPUExecutionProvider (int8)"
+    assert session.description == "small int8, CPUExecutionProvider"
     assert session.card.to_json() == card.to_json()
-    assert (card.name, card.version, card.view, card.outputs) == ("small-int8", "1.0.0", before.view, before.outputs)
+    assert (card.name, card.version, card.view, card.outputs) == ("small", "1.0.0", before.view, before.outputs)
+    assert (card.precision, card.precisions) == ("int8", {})
     assert session.golden_deviation == 0.0
     assert card.golden != before.golden
     assert card.training["licence"] == "Apache-2.0"
     assert set(card.training["frames"].values()) == {"f" * 16, "0123456789abcdef"}
     assert len(card.training["quantized"]["left_alone"]) == 2
+    with pytest.raises(ModelError, match="quantize the model in fp32"):
+        quantize(out, out, scans=scans)
     assert card.parity["label_agreement"] > 0.9
     assert card.metrics["simulated"]["n_frames"] == 1
     assert [p.name for p in tmp_path.iterdir()] == ["small-int8.onnx"]
@@ -145,7 +148,7 @@ def test_weights_of_seven_bits_are_for_any_computer(
     tmp_path: Path, small: Path, scans: list[np.ndarray], seven_bits: bool, most: int
 ) -> None:
     out = tmp_path / "int8.onnx"
-    card = quantize(small, out, scans=scans, n_judged=1, max_disagreement=1.0, seven_bits=seven_bits, race=FASTER)
+    card = quantize(small, out, scans=scans, n_evaluated=1, max_disagreement=1.0, seven_bits=seven_bits, race=FASTER)
     weights = [onnx.numpy_helper.to_array(w) for w in onnx.load(out).graph.initializer]
     assert max(int(abs(w.astype(int)).max()) for w in weights if w.dtype == np.int8) == most
     assert card.training["quantized"]["weight_bits"] == (7 if seven_bits else 8)
@@ -153,7 +156,7 @@ def test_weights_of_seven_bits_are_for_any_computer(
 
 def test_layers_that_rounding_spoils_are_left_alone(tmp_path: Path, scans: list[np.ndarray]) -> None:
     path, out = written(Spoilt(1e4), tmp_path / "spoilt.onnx"), tmp_path / "int8.onnx"
-    card = quantize(path, out, scans=scans, n_judged=1, race=FASTER)
+    card = quantize(path, out, scans=scans, n_evaluated=1, race=FASTER)
     types = convolutions(out)
     assert types["good"] == onnx.TensorProto.INT8
     assert types["spoil"] == onnx.TensorProto.FLOAT
@@ -163,7 +166,7 @@ def test_layers_that_rounding_spoils_are_left_alone(tmp_path: Path, scans: list[
 def test_a_model_that_answers_worse_is_refused(tmp_path: Path, scans: list[np.ndarray]) -> None:
     path = written(Spoilt(1e4), tmp_path / "spoilt.onnx")
     with pytest.raises(RefusedError, match=r"simulated car IoU 0\.\d+ to 0\.000"):
-        quantize(path, tmp_path / "int8.onnx", scans=scans, n_judged=1, max_disagreement=1.0, race=FASTER)
+        quantize(path, tmp_path / "int8.onnx", scans=scans, n_evaluated=1, max_disagreement=1.0, race=FASTER)
     assert [p.name for p in tmp_path.iterdir()] == ["spoilt.onnx"]
 
 
@@ -189,7 +192,7 @@ def test_the_race_takes_as_many_runs_of_both(small: Path) -> None:
 def test_excluded_nodes_are_left_alone(tmp_path: Path, small: Path, scans: list[np.ndarray]) -> None:
     out = tmp_path / "int8.onnx"
     name = next(n.name for n in onnx.load(small).graph.node if "down.weight" in n.input)
-    quantize(small, out, scans=scans, exclude=[name], n_judged=1, max_disagreement=1.0, race=FASTER)
+    quantize(small, out, scans=scans, exclude=[name], n_evaluated=1, max_disagreement=1.0, race=FASTER)
     assert convolutions(out)["down"] == onnx.TensorProto.FLOAT
     with pytest.raises(ValueError, match="no node is called nothing"):
         quantize(small, out, scans=scans, exclude=["nothing"], race=FASTER)
@@ -269,7 +272,7 @@ def test_the_command_refuses_with_1_and_writes_with_0(
 ) -> None:
     out, scan = tmp_path / "int8.onnx", tmp_path / "scan.bin"
     scans[0].tofile(scan)
-    words = ["quantize", str(small), str(out), "--scans", str(scan), "--simulated", "2", "--judged", "1"]
+    words = ["quantize", str(small), str(out), "--scans", str(scan), "--simulated", "2", "--evaluate-on", "1"]
     monkeypatch.setattr(module.quantize, "__kwdefaults__", {**quantize.__kwdefaults__, "race": timed(5.0, 5.0)})
     assert cli.main(words) == 1
     assert "not faster here" in capsys.readouterr().err
@@ -278,5 +281,5 @@ def test_the_command_refuses_with_1_and_writes_with_0(
     monkeypatch.setattr(module.quantize, "__kwdefaults__", settings)
     assert cli.main(words) == 0
     told = capsys.readouterr().out.splitlines()
-    assert "small-int8 1.0.0, left alone: " in told[0]
+    assert "small 1.0.0, left alone: " in told[0]
     assert json.loads(told[1])["n_scans"] == 4

@@ -21,15 +21,21 @@ from edgeperc.tuning import (
 )
 
 
+CPU_2 = {"provider": "cpu", "precision": "int8", "n_threads": 2}
+CPU_4 = {"provider": "cpu", "precision": "fp32", "n_threads": 4}
+OPENVINO = {"provider": "openvino", "precision": "bf16", "n_threads": None}
+CUDA = {"provider": "cuda", "precision": "fp32", "n_threads": 1}
+
+
 def test_settings_of_computers_and_models_live_side_by_side(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "settings.json"
     assert read_setting(path, "m", "s") is None
-    write_settings(path, "m", {"s": {"provider": "cpu", "n_threads": 2}})
-    write_settings(path, "m", {"t": {"provider": "openvino", "n_threads": None}})
-    write_settings(path, "n", {"s": {"provider": "cuda", "n_threads": 1}})
-    write_settings(path, "m", {"s": {"provider": "cpu", "n_threads": 4}})
-    assert read_setting(path, "m", "s") == {"provider": "cpu", "n_threads": 4}
-    assert read_setting(path, "m", "t") == {"provider": "openvino", "n_threads": None}
+    write_settings(path, "m", {"s": CPU_2})
+    write_settings(path, "m", {"t": OPENVINO})
+    write_settings(path, "n", {"s": CUDA})
+    write_settings(path, "m", {"s": CPU_4})
+    assert read_setting(path, "m", "s") == CPU_4
+    assert read_setting(path, "m", "t") == OPENVINO
     assert read_setting(path, "n", "t") is None
     assert [*path.parent.iterdir()] == [path]
 
@@ -37,10 +43,12 @@ def test_settings_of_computers_and_models_live_side_by_side(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     "text",
     [
-        *("[]", "{", '{"schema": 9, "machines": {}}', '{"schema": 1}', '{"schema": 1, "machines": {"m": 3}}'),
-        '{"schema": 1, "machines": {"m": {"s": "cpu"}}}',
-        '{"schema": 1, "machines": {"m": {"s": {"provider": 3}}}}',
-        '{"schema": 1, "machines": {"m": {"s": {"provider": "cpu", "n_threads": 0}}}}',
+        *("[]", "{", '{"schema": 9, "machines": {}}', '{"schema": 2}', '{"schema": 2, "machines": {"m": 3}}'),
+        '{"schema": 1, "machines": {"m": {"s": {"provider": "openvino:bf16", "n_threads": 2}}}}',
+        '{"schema": 2, "machines": {"m": {"s": "cpu"}}}',
+        '{"schema": 2, "machines": {"m": {"s": {"provider": 3, "precision": "fp32"}}}}',
+        '{"schema": 2, "machines": {"m": {"s": {"provider": "cpu", "n_threads": 2}}}}',
+        '{"schema": 2, "machines": {"m": {"s": {"provider": "cpu", "precision": "fp32", "n_threads": 0}}}}',
     ],
 )
 def test_what_is_no_setting_is_named(tmp_path: Path, text: str) -> None:
