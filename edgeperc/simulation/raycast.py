@@ -58,8 +58,8 @@ __all__ = [
     "ground_at",
 ]
 
-# A primitive is a row of float64: kind, material, remission, density, centre (3), rows of the matrix that takes an
-# offset from the centre into the unit shape (9), taper of the front, rear and sides (3), object (-1: none).
+# A primitive is a row of float64: kind, material, remission, density, center (3), rows of the matrix that maps an
+# offset from the center into the unit shape (9), taper of the front, rear and sides (3), object (-1: none).
 BOX, CYLINDER, ELLIPSOID = 0, 1, 2
 MATTE, PAINT, GLASS, RETRO, LEAVES, POROUS, FACADE = 0, 1, 2, 3, 4, 5, 6
 ROW = 20
@@ -73,8 +73,8 @@ STRIP = 10
     BANK_SLOPE, BANK_RISE, ROUGH, DITCH, ROUNDING, ASPHALT, PAVING, GRASS, MARKING, LANE, DROPPED, WEAR,
     LIP, BAY, TERRAIN,
 ) = range(26)  # fmt: skip
-TILE = 256  # cells of the noise tile a side; 0.3 m each
-_GROUND, _NOTHING = -1, -2  # in place of a primitive's row
+TILE = 256  # cells along each side of the noise tile; 0.3 m each
+_GROUND, _NOTHING = -1, -2  # hits that are not rows of primitives
 
 
 # --- kernels ----------------------------------------------------------------------------------------------------------
@@ -82,7 +82,7 @@ _GROUND, _NOTHING = -1, -2  # in place of a primitive's row
 
 @njit(cache=True, nogil=True)
 def _mixed(value: np.uint64) -> np.uint64:
-    # splitmix64: a draw depends on its ray and purpose alone, not on the order of the rays.
+    # splitmix64: a draw depends on its ray and purpose only, not on the order of the rays.
     value = np.uint64(value + np.uint64(0x9E3779B97F4A7C15))
     value = np.uint64((value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9))
     value = np.uint64((value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB))
@@ -97,7 +97,7 @@ def _uniform(bits: np.uint64) -> float:
 
 @njit(cache=True, nogil=True)
 def _normal(bits: np.uint64) -> float:
-    # Sum of four 16-bit uniforms, scaled to variance 1: within 3.5 sigma, and one hash a draw.
+    # Sum of four 16-bit uniforms, scaled to variance 1: within 3.5 sigma, from one hash.
     total = 0.0
     for k in range(4):
         total += float((bits >> np.uint64(16 * k)) & np.uint64(0xFFFF))
@@ -118,7 +118,10 @@ def _tile_at(tile: NDArray[np.float64], x: float, y: float, cell_m: float) -> fl
 def ground_at(
     strips: NDArray[np.float64], terrain: NDArray[np.float64], tile: NDArray[np.float64], x: float, y: float
 ) -> tuple[float, float, float, float, float]:
-    """Height [m], distance out of the roads, out of the bays, and u (left of the first road's axis), s along it [m]."""
+    """The ground at x, y: height, distance outside the roads, outside the bays, u, s along the first road [m].
+
+    Both distances are negative inside. u is the distance to the left of the first road's axis.
+    """
     outside, outside_bays, u_first, s_first = 1e9, 1e9, 0.0, 0.0
     for k in range(strips.shape[0]):
         dx, dy = x - strips[k, 0], y - strips[k, 1]
@@ -145,7 +148,7 @@ def ground_at(
         return z, outside, outside_bays, u_first, s_first
     kerb = terrain[KERB]
     along = (s_first + terrain[DROPPED]) / 23.0
-    if along - math.floor(along) < 0.15:
+    if along - np.floor(along) < 0.15:
         kerb *= 0.25  # dropped for a driveway
     z += kerb * min(d / 0.05, 1.0) + 0.02 * min(d, terrain[PAVEMENT])
     e = d - terrain[PAVEMENT]
@@ -171,11 +174,11 @@ def fill_drivable(
     y: NDArray[np.float64],
     labels: NDArray[np.uint8],
 ) -> None:
-    """Write 1 into ``labels`` (rows, columns) where a road surface lies below the cell's centre, 0 elsewhere."""
+    """Write 1 into ``labels`` (rows, columns) if a road surface lies below the center of the cell, else 0."""
     T = T_world_sensor
     for i in range(x.shape[0]):
         for j in range(y.shape[0]):
-            # The ground is about this far below; only a tilted sensor notices.
+            # An approximate height of the ground; it matters only if the sensor is tilted.
             z = -T[2, 3]
             xw = T[0, 0] * x[i] + T[0, 1] * y[j] + T[0, 2] * z + T[0, 3]
             yw = T[1, 0] * x[i] + T[1, 1] * y[j] + T[1, 2] * z + T[1, 3]
@@ -189,7 +192,17 @@ def fill_placed(
     T_world_sensor: NDArray[np.float64],
     placed: NDArray[np.float64],
 ) -> None:
-    """Write the primitives in the sensor frame into ``placed`` (n, 20); ``poses`` (m, 4): x, y, z, yaw of objects."""
+    """Transform primitives into the sensor frame.
+
+    Parameters
+    ----------
+    primitives : (n, 20) float64
+        In the frame of their object, or of the world.
+    poses : (m, 4) float64
+        x, y, z [m], yaw [rad] of the objects.
+    T_world_sensor : (4, 4) float64
+    placed : (n, 20) float64, overwritten
+    """
     T = T_world_sensor
     for k in range(primitives.shape[0]):
         placed[k] = primitives[k]
@@ -211,10 +224,22 @@ def fill_placed(
 
 @njit(cache=True, nogil=True)
 def fill_bounds(primitives: NDArray[np.float64], bounds: NDArray[np.float64]) -> None:
-    """Write azimuth from, azimuth width, tan of elevation from, to, and horizontal distance into ``bounds`` (n, 5)."""
+    """Bound every ray from the origin that can hit a primitive.
+
+    Parameters
+    ----------
+    primitives : (n, 20) float64
+        In the sensor frame.
+    bounds : (n, 5) float64, overwritten
+        First azimuth, width in azimuth [rad], lowest and highest tangent of the elevation, horizontal distance [m]; the
+        distance of a primitive that is not finite is infinite.
+    """
     corners = np.empty((8, 3))
     for k in range(primitives.shape[0]):
         p = primitives[k]
+        if not np.isfinite(p[4:16]).all():
+            bounds[k] = np.inf
+            continue
         for c in range(8):
             for j in range(3):
                 corners[c, j] = p[4 + j]
@@ -235,7 +260,7 @@ def fill_bounds(primitives: NDArray[np.float64], bounds: NDArray[np.float64]) ->
             low, high = min(low, corners[c, 2]), max(high, corners[c, 2])
         near = 0.0
         if last - first < math.pi:
-            # Distance of the outline seen from above: the best separating line along an edge or facing a corner.
+            # Distance of the convex outline seen from above: its largest separation, normal to an edge or to a corner.
             for candidate in range(14):
                 if candidate < 8:
                     nx, ny = corners[candidate, 0], corners[candidate, 1]
@@ -261,7 +286,7 @@ def fill_bounds(primitives: NDArray[np.float64], bounds: NDArray[np.float64]) ->
 
 @njit(cache=True, nogil=True)
 def _columns_of(bounds: NDArray[np.float64], k: int, n_columns: int) -> tuple[int, int]:
-    # One more to either side: azimuths jitter by a fraction of a step.
+    # One more column on either side, because azimuths jitter by a fraction of a step.
     step = 2.0 * math.pi / n_columns
     first = math.floor(bounds[k, 0] / step) - 1
     count = math.ceil(bounds[k, 1] / step) + 4
@@ -270,7 +295,7 @@ def _columns_of(bounds: NDArray[np.float64], k: int, n_columns: int) -> tuple[in
 
 @njit(cache=True, nogil=True)
 def fill_column_counts(bounds: NDArray[np.float64], n_columns: int, reach: float, starts: NDArray[np.int64]) -> None:
-    """Write where the list of each azimuth step begins into ``starts`` (n_columns + 1,)."""
+    """Write the start of each column's list of primitives into ``starts`` (n_columns + 1,)."""
     starts[:] = 0
     for k in range(bounds.shape[0]):
         if bounds[k, 4] < reach:
@@ -285,7 +310,7 @@ def fill_column_counts(bounds: NDArray[np.float64], n_columns: int, reach: float
 def fill_column_rows(
     bounds: NDArray[np.float64], n_columns: int, reach: float, starts: NDArray[np.int64], rows: NDArray[np.int32]
 ) -> None:
-    """Write the primitives of each azimuth step, in the order of ``bounds``, into ``rows``."""
+    """Write the primitives of each column, in the order of ``bounds``, into ``rows`` (starts[-1],)."""
     ends = starts.copy()
     for k in range(bounds.shape[0]):
         if bounds[k, 4] < reach:
@@ -298,7 +323,7 @@ def fill_column_rows(
 
 @njit(cache=True, nogil=True)
 def _crossing(p: NDArray[np.float64], dx: float, dy: float, dz: float) -> tuple[float, float, int]:
-    """Where a ray from the origin enters and leaves a primitive, and through which face; enters > leaves: it misses."""
+    """Ranges at which a ray from the origin enters and leaves a primitive, and the face; enter > leave if it misses."""
     ox = -(p[7] * p[4] + p[8] * p[5] + p[9] * p[6])
     oy = -(p[10] * p[4] + p[11] * p[5] + p[12] * p[6])
     oz = -(p[13] * p[4] + p[14] * p[5] + p[15] * p[6])
@@ -423,7 +448,7 @@ def fill_cast(
     exits: NDArray[np.float64],
     cosines: NDArray[np.float64],
 ) -> None:
-    """Find what each ray meets first.
+    """Find the first hit of each ray.
 
     Parameters
     ----------
@@ -440,13 +465,14 @@ def fill_cast(
     key : uint64
         Seed of leaves and fences.
     ranges, hits, exits, cosines : (beams, columns), overwritten
-        Range [m]; row of ``primitives``, -1 the ground, -2 nothing; range where the ray leaves that primitive again;
-        cosine of the angle of incidence.
+        Range [m]; row of ``primitives``, -1 for the ground, -2 for nothing; range at which the ray leaves that
+        primitive; cosine of the angle of incidence.
     """
     n_beams, n_columns = elevations.shape[0], azimuths.shape[0]
     tangents = np.tan(elevations)
     T = T_world_sensor
-    # Radii from well inside the lowest beam's ring, growing by 3 %: at 30 m a third of the way between two rings.
+    # Radii of ground samples start well inside the ring of the lowest beam and grow by 3 %: at 30 m, a third of the
+    # distance between two rings.
     height = _height_above(strips, terrain, tile, T, 0.0, 0.0, 0.0)
     innermost = min(max(0.3, 0.4 * height / max(-tangents[n_beams - 1], 0.05)), 5.0)
     n_radii = int(math.log(max(reach / innermost, 2.0)) / math.log(1.03)) + 2
@@ -459,12 +485,12 @@ def fill_cast(
         z = -T[2, 3]
         for i in range(n_radii):
             r = radii[i]
-            # One Newton step; exact where the sensor stands straight.
+            # One Newton step, which is exact for an upright sensor.
             z -= _height_above(strips, terrain, tile, T, r * ca, r * sa, z) / T[2, 2]
             if not straight:
                 z -= _height_above(strips, terrain, tile, T, r * ca, r * sa, z) / T[2, 2]
             heights[i] = z
-        # A higher beam meets the ground no nearer than a lower one, so one pass over the radii serves all beams.
+        # A higher beam never meets the ground nearer than a lower one, so one pass over the radii serves all beams.
         i = 0
         for b in range(n_beams - 1, -1, -1):
             tan = tangents[b]
@@ -483,7 +509,7 @@ def fill_cast(
                 for _ in range(24):
                     if above - below < 1e-12:
                         break
-                    # False position, halved when it creeps: a kerb is a corner.
+                    # False position; the limits keep it from converging slowly at a kerb, which is a corner.
                     share = above / (above - below)
                     share = min(max(share, 0.1), 0.9) if high - low > 0.02 else share
                     r = low + share * (high - low)
@@ -499,7 +525,7 @@ def fill_cast(
                 t = r / ce
                 if t < best:
                     best, hit, leave_best = t, _GROUND, t
-                    # Slope along the ray, over 4 cm.
+                    # Slope of the ground along the ray, over 4 cm.
                     rise = _height_above(strips, terrain, tile, T, (r - 0.02) * ca, (r - 0.02) * sa, r * tan)
                     rise -= _height_above(strips, terrain, tile, T, (r + 0.02) * ca, (r + 0.02) * sa, r * tan)
                     rise /= 0.04
@@ -517,7 +543,7 @@ def fill_cast(
                     continue
                 material = int(p[1])
                 if material == LEAVES:
-                    # Free path in a cloud of leaves.
+                    # Random free path through the leaves.
                     draw = _uniform(_mixed(np.uint64(ray ^ np.uint64(k + 1))))
                     t = max(enter, 0.0) - math.log(draw) / p[3]
                     if t < leave and t < best:
@@ -561,7 +587,7 @@ def _ground_remission(
 
 @njit(cache=True, nogil=True)
 def _in_ego_shadow(azimuth: float, elevation: float) -> bool:
-    # Measured on KITTI: where nothing ever returns. The roof behind, its rear edges, its front, a mast to the right.
+    # Measured on KITTI: directions without any return. The roof behind, its rear edges, its front, a mast to the right.
     a = azimuth - 2.0 * math.pi * math.floor((azimuth + math.pi) / (2.0 * math.pi))
     behind = math.pi - abs(a)
     if behind < 0.26:
@@ -602,17 +628,28 @@ def fill_points(
     points: NDArray[np.float32],
     objects: NDArray[np.int32],
 ) -> int:
-    """Turn hits into returns, laser by laser, and count them.
+    """Turn hits into returns, beam by beam.
 
     Parameters
     ----------
     range_offsets, remission_offsets : (beams,) float64
         Calibration errors of the beams.
     ranges, hits, exits, cosines : (beams, columns)
-        From `fill_cast`.
+        From `fill_cast`; a range that is not finite gives no return.
+    min_range, reach : float
+        Shortest and longest range of a return [m].
+    key : uint64
+        Seed of noise and drop-out.
+    noise, ego_shadow : bool
+        Whether there is noise and drop-out, and whether the own vehicle hides the directions measured on KITTI's car.
     points : (beams * columns, 4) float32, first rows overwritten
     objects : (beams * columns,) int32, first rows overwritten
-        Object of each point, -1 none.
+        Object of each point, -1 for none.
+
+    Returns
+    -------
+    n : int
+        Number of returns.
     """
     n_beams, n_columns = hits.shape
     T = T_world_sensor
@@ -621,9 +658,9 @@ def fill_points(
         ce, se = math.cos(elevations[b]), math.sin(elevations[b])
         for column in range(n_columns):
             k = hits[b, column]
-            if k == _NOTHING:
-                continue
             t, cosine = ranges[b, column], cosines[b, column]
+            if k == _NOTHING or not math.isfinite(t):
+                continue
             ray = _mixed(np.uint64(key ^ np.uint64(0x5DEECE66D) ^ (np.uint64(b * n_columns + column) << np.uint64(20))))
             luck = _uniform(ray)
             ray = _mixed(ray)
@@ -647,7 +684,7 @@ def fill_points(
                     T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
                     T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
                 )
-                # Measured: the road keeps its remission up to 20 m, has 0.07 at 25..40 m, 0.00 beyond; and thins out.
+                # Measured: a road's remission is constant up to 20 m, 0.07 at 25..40 m, 0.00 beyond; returns get rarer.
                 value *= min(max((cosine - 0.04) / 0.034, 0.0), 1.0)
                 lost += min(max((0.045 - cosine) / 0.04, 0.0), 0.85)
             else:
@@ -656,10 +693,10 @@ def fill_points(
                 material = int(p[1])
                 value = p[2]
                 if material == PAINT:
-                    # Clear coat over a dark or light base; a mirror off the normal.
+                    # Clear coat over a dark or light base; specular, so brightest along the normal.
                     value *= 0.5 + 0.5 * cosine
                     value += 0.5 * max((cosine - 0.97) / 0.03, 0.0) * (0.25 + value) - 0.11
-                    # Measured: half as many returns on a near car as its surface would give, a fifth beyond 45 m.
+                    # Measured: a near car gives half of the returns that its surface would, beyond 45 m a fifth.
                     lost += 0.06 + p[3] * (1.0 - 0.7 * cosine) + min(max((t - 28.0) * 0.02, 0.0), 0.6)
                 elif material == GLASS:
                     lost += p[3]
@@ -671,7 +708,7 @@ def fill_points(
                 elif material == RETRO:
                     value *= 0.4 + 0.6 * cosine
                 elif material == FACADE:
-                    # Windows on a grid, recessed; most of them mirror the ray away.
+                    # Recessed windows on a grid; most of them reflect the ray away.
                     qx, qy, qz = t * dx, t * dy, t * dz
                     wx = T[0, 0] * qx + T[0, 1] * qy + T[0, 2] * qz + T[0, 3]
                     wy = T[1, 0] * qx + T[1, 1] * qy + T[1, 2] * qz + T[1, 3]
@@ -703,7 +740,7 @@ def fill_points(
                 t += range_offsets[b] + 0.01 * jitter * spread
                 spread = _normal(_mixed(np.uint64(ray ^ np.uint64(0xABCDEF))))
                 value += remission_offsets[b] * min(1.0, 0.2 + 4.0 * max(value, 0.0)) + 0.05 * jitter * spread
-                # Measured: hardly anything between 0 and 0.1, and 57 % of a car's returns at 0: a weak echo reads 0.
+                # Measured: hardly any value between 0 and 0.1, and 57 % of a car's returns at 0: a weak echo reads 0.
                 if value < 0.01 + 0.1 * luck or other > 0.965:
                     value = 0.0
             if not min_range <= t < reach:

@@ -71,7 +71,7 @@ def fit_motion(
             shift_x = landmarks[i, 0] - prior[0] - (cos * x - sin * y)
             shift_y = landmarks[i, 1] - prior[1] - (sin * x + cos * y)
             turn = math.atan2(landmarks[i, 1] - prior[1], landmarks[i, 0] - prior[0]) - math.atan2(y, x) - prior[2]
-            turn -= 2.0 * math.pi * math.floor(turn / (2.0 * math.pi) + 0.5)
+            turn -= 2.0 * math.pi * np.floor(turn / (2.0 * math.pi) + 0.5)  # math.floor raises on NaN
             for by_turn in (False, True):
                 proposal[:] = prior
                 if by_turn:

@@ -113,7 +113,7 @@ def fill_likelihoods(
                 squared = (d * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / place
                 limit = forms[mode, 7]
                 turn = detections[j, 2] - means[i, mode, 3]
-                turn -= math.pi * np.floor(turn / math.pi + 0.5)  # not math.floor, which NaN makes raise
+                turn -= math.pi * np.floor(turn / math.pi + 0.5)  # math.floor raises on NaN
                 turn = min(max(turn, -limit), limit) - forms[mode, 4] * dx - forms[mode, 5] * dy
                 squared += turn * turn / forms[mode, 6]
                 likelihoods[i, mode, j] = math.exp(-0.5 * squared) * forms[mode, 8]

@@ -1,6 +1,9 @@
-"""Slow twins of casting rays."""
+"""Slow twins of the simulator's kernels (`edgeperc.simulation.raycast`)."""
 
 from __future__ import annotations
+
+import itertools
+import math
 
 import numpy as np
 
@@ -44,17 +47,109 @@ def crossing(primitive: np.ndarray, direction: np.ndarray) -> tuple[float, float
             return None
     if curved:
         o, d = start[curved], way[curved]
-        roots = np.roots([d @ d, 2 * o @ d, o @ o - 1])
-        if np.iscomplex(roots).any():
+        half, root = o @ d, (o @ d) ** 2 - (d @ d) * (o @ o - 1)
+        if root < 0:
             return None
-        enter, leave = max(enter, roots.real.min()), min(leave, roots.real.max())
+        enter, leave = max(enter, (-half - root**0.5) / (d @ d)), min(leave, (-half + root**0.5) / (d @ d))
     return (enter, leave) if enter <= leave else None
 
 
-def ground(scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Height of the ground, and how far out of the roads, for arrays of x and y."""
-    slope_x, slope_y, ax, kx, px, ay, ky, py = scene.terrain[:8]
-    kerb, pavement, crown, bank, rise, rough, ditch, rounding = scene.terrain[8:16]
+def cosine(primitive: np.ndarray, direction: np.ndarray, t: float) -> float:
+    """Cosine between a ray and the normal of a primitive's surface where it enters: its most binding constraint."""
+    kind, matrix = int(primitive[0]), primitive[7:16].reshape(3, 3)
+    front, rear, side = primitive[16:19] / 2.0
+    x, y, z = place = matrix @ (t * direction - primitive[4:7])
+    ends = [(abs(z) - 1.0, np.array([0.0, 0.0, np.sign(z)]))]
+    if kind == 2:
+        surfaces = [(0.0, place)]
+    elif kind == 1:
+        surfaces = [*ends, (math.hypot(x, y) - 1.0, np.array([x, y, 0.0]))]
+    else:
+        surfaces = [
+            *ends,
+            (x + front * (z + 1) - 1, np.array([1.0, 0.0, front])),
+            (-x + rear * (z + 1) - 1, np.array([-1.0, 0.0, rear])),
+            (abs(y) + side * (z + 1) - 1, np.array([0.0, np.sign(y), side])),
+        ]
+    normal = matrix.T @ max(surfaces, key=lambda each: each[0])[1]
+    return abs(normal @ direction) / np.linalg.norm(normal)
+
+
+def placed(primitives: np.ndarray, poses: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Twin of `fill_placed`."""
+    out = primitives.copy()
+    for row in out:
+        x, y, z, yaw = poses[int(row[19])] if row[19] >= 0 else np.zeros(4)
+        turn = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1.0]])
+        row[4:7] = pose[:3, :3].T @ (turn @ row[4:7] + [x, y, z] - pose[:3, 3])
+        row[7:16] = (row[7:16].reshape(3, 3) @ turn.T @ pose[:3, :3]).ravel()
+    return out
+
+
+def distance_to_segment(a: np.ndarray, b: np.ndarray) -> float:
+    """Distance of the origin from a segment in the plane."""
+    way = b - a
+    share = np.clip(-(a @ way) / max(way @ way, 1e-300), 0.0, 1.0)
+    return float(np.linalg.norm(a + share * way))
+
+
+def bounds(primitives: np.ndarray) -> np.ndarray:
+    """Twin of `fill_bounds`: from the eight corners, and the segments between each two of them seen from above."""
+    out = np.full((len(primitives), 5), np.inf)
+    for row, wanted in zip(primitives, out, strict=True):
+        if not np.isfinite(row[4:16]).all():
+            continue
+        matrix = row[7:16].reshape(3, 3)
+        half = matrix / (matrix**2).sum(axis=1, keepdims=True)
+        corners = row[4:7] + np.array([*itertools.product((-1.0, 1.0), repeat=3)]) @ half
+        middle = math.atan2(row[5], row[4])
+        turns = (np.arctan2(corners[:, 1], corners[:, 0]) - middle + math.pi) % (2 * math.pi) - math.pi
+        first, last, near = turns.min(), turns.max(), 0.0
+        if last - first < math.pi:
+            near = min(distance_to_segment(a[:2], b[:2]) for a, b in itertools.combinations(corners, 2))
+        else:
+            first, last = -math.pi, math.pi
+        closest, farthest = max(near, 1e-3), np.hypot(corners[:, 0], corners[:, 1]).max()
+        low, high = corners[:, 2].min(), corners[:, 2].max()
+        lowest, highest = low / (closest if low < 0 else farthest), high / (closest if high > 0 else farthest)
+        wanted[:] = middle + first, last - first, lowest, highest, near
+    return out
+
+
+def columns(bounds: np.ndarray, n_columns: int, reach: float) -> list[list[int]]:
+    """Twin of `fill_column_counts` and `fill_column_rows`: the primitives of each column."""
+    lists: list[list[int]] = [[] for _ in range(n_columns)]
+    step = 2 * math.pi / n_columns
+    for k, (azimuth, width, _, _, near) in enumerate(bounds):
+        if near < reach:
+            first, count = math.floor(azimuth / step) - 1, math.ceil(width / step) + 4
+            for column in range(first, first + min(count, n_columns)):
+                lists[column % n_columns].append(k)
+    return lists
+
+
+def drivable(scene, pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Twin of `fill_drivable`; a place that is not finite is no road."""
+    with np.errstate(invalid="ignore"):
+        places = np.stack(np.broadcast_arrays(x[:, None], y[None, :], -pose[2, 3]), axis=-1) @ pose[:3, :3].T
+        return (road_places(scene, *(places + pose[:3, 3])[..., :2].transpose(2, 0, 1))[0] < 0).astype(np.uint8)
+
+
+def tile_at(tile: np.ndarray, x: np.ndarray, y: np.ndarray, cell_m: float) -> np.ndarray:
+    """The noise tile between its cells, by bilinear interpolation; it repeats."""
+    size = len(tile)
+    row, column = np.floor(y / cell_m).astype(int), np.floor(x / cell_m).astype(int)
+    b, a = y / cell_m - row, x / cell_m - column
+    return sum(
+        wy * wx * tile[(row + i) % size, (column + j) % size]
+        for i, wy in ((0, 1 - b), (1, b))
+        for j, wx in ((0, 1 - a), (1, a))
+    )
+
+
+def road_places(scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Distance outside the roads and outside the bays, and u, s along the first road, for arrays of x and y."""
+    rounding = scene.terrain[15]
     outside, bays = np.full(np.shape(x), np.inf), np.full(np.shape(x), np.inf)
     for k, (x0, y0, cos, sin, curvature, right, left, first, last, is_bay) in enumerate(scene.strips):
         s, across = cos * (x - x0) + sin * (y - y0), cos * (y - y0) - sin * (x - x0)
@@ -63,9 +158,17 @@ def ground(scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         if is_bay:
             bays = np.minimum(bays, d)
         elif k == 0:
-            outside, along = d, s
+            outside, u_first, s_first = d, u, s
         else:
             outside = np.minimum(outside, d) - np.maximum(rounding - abs(outside - d), 0) ** 2 / (4 * rounding)
+    return outside, bays, u_first, s_first
+
+
+def ground(scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Twin of `ground_at`, its height and its distance outside the roads, for arrays of x and y."""
+    slope_x, slope_y, ax, kx, px, ay, ky, py = scene.terrain[:8]
+    kerb, pavement, crown, bank, rise, rough, ditch, _ = scene.terrain[8:16]
+    outside, bays, _, along = road_places(scene, x, y)
     z = slope_x * x + slope_y * y + ax * np.sin(kx * x + px) + ay * np.sin(ky * y + py)
     d = np.minimum(outside, bays)
     inside = crown * np.minimum(-d, 4.0) + scene.terrain[23] * (outside > 0)
@@ -73,21 +176,17 @@ def ground(scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     verge = kerb * np.where(dropped, 0.25, 1.0) * np.minimum(d / 0.05, 1.0) + 0.02 * np.minimum(d, pavement)
     e = d - pavement
     slope = np.minimum(bank * e, rise) if rise > 0 else np.maximum(-bank * e, rise)
-    size = len(scene.tile)
-    row, column = np.floor(y / 0.3).astype(int), np.floor(x / 0.3).astype(int)
-    b, a = y / 0.3 - row, x / 0.3 - column
-    noise = sum(
-        wy * wx * scene.tile[(row + i) % size, (column + j) % size]
-        for i, wy in ((0, 1 - b), (1, b))
-        for j, wx in ((0, 1 - a), (1, a))
-    )
+    noise = tile_at(scene.tile, x, y, 0.3)
     grass = slope - ditch * np.maximum(1 - ((e - 1.6) / 1.2) ** 2, 0) + np.minimum(e / 0.3, 1) * rough * (1 + noise)
     return z + np.where(d <= 0, inside, verge + np.where(e > 0, grass, 0.0)), outside
 
 
 def cast(primitives, scene, pose, elevations, azimuths, reach, key):
-    """What each ray meets first, by trying every primitive and walking over the ground in steps of 5 mm."""
+    """Twin of `fill_cast`: tries every primitive near the ray, and walks over the ground in steps of 5 mm."""
     shape = (len(elevations), len(azimuths))
+    centers = primitives[:, 4:7]
+    with np.errstate(invalid="ignore"):
+        radii = np.sqrt((1.0 / (primitives[:, 7:16].reshape(-1, 3, 3) ** 2).sum(axis=2)).sum(axis=1))
     ranges, hits = np.full(shape, float(reach)), np.full(shape, -2)
     for b, elevation in enumerate(elevations):
         for column, azimuth in enumerate(azimuths):
@@ -99,11 +198,12 @@ def cast(primitives, scene, pose, elevations, azimuths, reach, key):
             if len(below):
                 ranges[b, column], hits[b, column] = steps[below[0]], -1
             ray = mixed((int(key) + b * len(azimuths) + column) & (2**64 - 1))
-            for k, primitive in enumerate(primitives):
+            for k in np.flatnonzero(np.linalg.norm(np.cross(centers, direction), axis=1) <= radii):
+                primitive = primitives[k]
                 found = crossing(primitive, direction)
                 if found is None or found[1] <= 0:
                     continue
-                t, draw = found[0], uniform_draw(mixed(ray ^ (k + 1)))
+                t, draw = found[0], uniform_draw(mixed(ray ^ (int(k) + 1)))
                 if primitive[1] == 4:  # leaves: a free path
                     t = max(t, 0.0) - np.log(draw) / primitive[3]
                     if t >= found[1]:
@@ -113,3 +213,123 @@ def cast(primitives, scene, pose, elevations, azimuths, reach, key):
                 if t < ranges[b, column]:
                     ranges[b, column], hits[b, column] = t, k
     return ranges, hits
+
+
+def normal_draw(bits: int) -> float:
+    return (sum((bits >> shift) & 0xFFFF for shift in (0, 16, 32, 48)) / 65536.0 - 2.0) * math.sqrt(3.0)
+
+
+def ground_remission(scene, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Twin of `_ground_remission`."""
+    terrain = scene.terrain
+    pavement, asphalt, paving, grass, marking, lane = terrain[[9, 16, 17, 18, 19, 20]]
+    wear, bay = terrain[[22, 24]]
+    outside, bays, u, s = road_places(scene, x, y)
+    stain, patch = tile_at(scene.tile, x, y, 0.11), tile_at(scene.tile, x + 31.0, y + 17.0, 1.7)
+    right, left = scene.strips[0, 5], scene.strips[0, 6]
+    to_line = abs(u / lane - np.floor(u / lane + 0.5)) * lane
+    dashed = (to_line < 0.06) & ((s / 9.0) % 1.0 < 0.4) & (abs(u - left) > 1.0) & (abs(u - right) > 1.0)
+    edge = np.minimum(abs(u - left + 0.25), abs(u - right - 0.25)) < 0.06
+    road = np.where(
+        (edge | dashed) & (marking > 0), marking + 0.1 * stain, asphalt * (1 + wear * (0.4 * stain + 0.6 * patch))
+    )
+    return np.select(
+        [outside < 0, bays < 0, outside < pavement],
+        [road, bay * (1 + 0.15 * patch), paving * (1 + 0.1 * stain + 0.1 * patch)],
+        grass * (1 + 0.25 * stain + 0.1 * patch),
+    )
+
+
+def in_ego_shadow(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
+    """Twin of `_in_ego_shadow`."""
+    a = (azimuth + math.pi) % (2 * math.pi) - math.pi
+    behind, ahead = math.pi - abs(a), abs(a)
+    roof = np.select(
+        [behind < 0.26, behind < 0.44, behind < 0.61, (behind > 0.84) & (behind < 1.02), ahead < 0.17, ahead < 0.45],
+        [-0.32, -0.355, -0.40, -0.375, -0.35, -0.375 - 0.08 * (ahead - 0.17)],
+        np.nan,
+    )
+    mast = ((a + 1.24) / 0.18) ** 2 + ((elevation + 0.335) / 0.075) ** 2 < 1
+    return np.where(np.isnan(roof), mast, elevation < roof)
+
+
+def points(
+    primitives, scene, pose, elevations, azimuths, range_offsets, remission_offsets,
+    ranges, hits, exits, cosines, min_range, reach, key, noise, ego_shadow,
+):  # fmt: skip
+    """Twin of `fill_points`: the returns (n, 4) float32 and the object of each, all rays at once."""
+    beam, column = np.nonzero((hits > -2) & np.isfinite(ranges))
+    hit, t, leave, cos = (of[beam, column] for of in (hits, ranges, exits, cosines))
+    t = t.copy()
+
+    def draws(seeds) -> np.ndarray:
+        return np.array([mixed(int(seed)) for seed in seeds], dtype=object)
+
+    first = draws(
+        (int(key) ^ 0x5DEECE66D ^ (b * hits.shape[1] + c) << 20) & (2**64 - 1)
+        for b, c in zip(beam.tolist(), column.tolist(), strict=True)
+    )
+    second = draws(first)
+    third = draws(second)
+    luck, other = (np.array([uniform_draw(int(bits)) for bits in of], float) for of in (first, third))
+    spread = np.array([normal_draw(int(bits)) for bits in second], float)
+    last_spread = np.array([normal_draw(int(bits)) for bits in draws(int(bits) ^ 0xABCDEF for bits in third)], float)
+
+    level = np.cos(elevations)[beam]
+    direction = np.stack(
+        [level * np.cos(azimuths)[column], level * np.sin(azimuths)[column], np.sin(elevations)[beam]], 1
+    )
+    world = (t[:, None] * direction) @ pose[:3, :3].T + pose[:3, 3]
+    shapes = np.zeros((len(t), 20))
+    shapes[hit >= 0] = primitives[hit[hit >= 0]]
+    material, density = np.where(hit >= 0, shapes[:, 1], -1), shapes[:, 3]
+    earth, paint, glass, retro, leaves, facade = (material == kind for kind in (-1, 1, 2, 3, 4, 6))
+
+    value, lost = shapes[:, 2].copy(), np.full(len(t), 0.006)
+    if earth.any():
+        fade = np.clip((cos[earth] - 0.04) / 0.034, 0, 1)
+        value[earth] = ground_remission(scene, world[earth, 0], world[earth, 1]) * fade
+    lost = np.where(earth, lost + np.clip((0.045 - cos) / 0.04, 0, 0.85), lost)
+    coat = value * (0.5 + 0.5 * cos)
+    coat += 0.5 * np.maximum((cos - 0.97) / 0.03, 0) * (0.25 + coat) - 0.11
+    value = np.where(paint, coat, value)
+    lost = np.where(paint, lost + 0.06 + density * (1 - 0.7 * cos) + np.clip((t - 28) * 0.02, 0, 0.6), lost)
+    through = glass & (other < 0.6)
+    lost = np.where(glass, lost + density, lost)
+    value = np.where(glass, np.where(through, 0.04, 0.02), value)
+    t = np.where(through, t + (0.15 + 0.8 * other / 0.6) * np.maximum(leave - t - 0.05, 0), t)
+    value = np.where(retro, value * (0.4 + 0.6 * cos), value)
+    # Facades: the coordinate along the wall that the ray hits, and windows on a grid.
+    a, b = abs(shapes[:, 7]), abs(shapes[:, 8])
+    first_wall = abs((shapes[:, 7:9] * direction[:, :2]).sum(1)) < abs((shapes[:, 10:12] * direction[:, :2]).sum(1))
+    across = np.where(first_wall, (shapes[:, 7:9] * world[:, :2]).sum(1), b * world[:, 0] + a * world[:, 1])
+    across = across / np.maximum(np.hypot(a, b), 1e-9)
+    storey = (world[:, 2] - 0.9) / 2.9
+    window = facade & ((across / np.where(facade, density, 1)) % 1 < 0.42) & (storey % 1 < 0.5)
+    lost = np.where(window, lost + 0.35, lost)
+    recess = 0.12 / np.maximum(cos, 0.2) + np.where(other > 0.75, 2.5 * (other - 0.75) / 0.25, 0)
+    t = np.where(window, t + recess, t)
+    value = np.where(window, 0.3 * value, value)
+    value = np.where(leaves, value * (0.75 + 0.5 * other), value)
+    value = np.where(~(earth | paint | glass | retro | leaves), value * (0.55 + 0.45 * cos), value)
+    dull = ~(earth | retro)
+    value = np.where(dull, value * np.clip(1 - 0.022 * (t - 18), 0.35, 1), value)
+    lost = np.where(dull, lost + np.clip((t - 35) * 0.004, 0, 0.3), lost)
+
+    kept = np.ones(len(t), bool)
+    if ego_shadow:
+        kept = ~in_ego_shadow(azimuths[column] + 0.01 * spread, elevations[beam] + 0.016 * (other - 0.5))
+    if noise:
+        jitter = np.where(leaves, 1.6, 1.0)
+        kept &= luck <= 1 - lost
+        t = t + range_offsets[beam] + 0.01 * jitter * spread
+        value = (
+            value
+            + remission_offsets[beam] * np.minimum(1, 0.2 + 4 * np.maximum(value, 0))
+            + 0.05 * jitter * last_spread
+        )
+        value = np.where((value < 0.01 + 0.1 * luck) | (other > 0.965), 0, value)
+    kept &= (t >= min_range) & (t < reach)
+    value = np.floor(np.clip(value, np.where(retro, 0.3, 0), 0.99) * 100 + 0.5) / 100
+    found = np.column_stack([t[:, None] * direction, value]).astype(np.float32)
+    return found[kept], np.where(hit >= 0, shapes[:, 19], -1)[kept].astype(np.int32)
