@@ -189,6 +189,7 @@ def test_tables_of_figures() -> None:
     }
     figures = {
         "models": {"pointseg": "1.2.3"},
+        "providers": {"pointseg": "pointseg int8, CPUExecutionProvider"},
         "split": "validation",
         "fold": 1,
         "semantickitti": {
@@ -200,8 +201,9 @@ def test_tables_of_figures() -> None:
     }
     lines = _figure_lines(figures)
     assert lines[0].startswith("pointseg 1.2.3; validation drives, fold 1")
-    assert lines[2] == "== SemanticKITTI: 1 scan, 1 drive =="
-    words = [line.split() for line in lines[3:]]
+    assert lines[1] == "ran as pointseg int8, CPUExecutionProvider"
+    assert lines[3] == "== SemanticKITTI: 1 scan, 1 drive =="
+    words = [line.split() for line in lines[4:]]
     assert ["all", "car", "50.0", "25.0", "20.0", "10.0-30.0", "1,200", "3"] in words
     assert ["all", "car", "100.0", "-", "-", "0.0", "-", "-", "2", "0", "0"] in words
     assert ["mean", "100.0", *"--------"] in words
@@ -454,7 +456,10 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: t
         assert words in capsys.readouterr().err
     for arguments, words in [
         (("--model", "nonesuch"), "no model is called 'nonesuch'. Shipped: pointseg, ssadnet."),
-        (("--model", "pointseg", "--model", "pointseg"), "--model ['pointseg', 'pointseg'] have one view; --threads is"),
+        (
+            ("--model", "pointseg", "--model", "pointseg"),
+            "--model ['pointseg', 'pointseg'] have one view; --threads is",
+        ),
         (("--model", "ssadnet", "--labels", "--out", tmp_path / "out"), "add a range-image model"),
     ]:
         assert run("run", scan, *arguments) == 2

@@ -83,6 +83,7 @@ def eval_command(arguments: argparse.Namespace) -> int:
             road_by=arguments.road_by,
             boxes_from=arguments.boxes_from,
             provider=arguments.provider,
+            precision=arguments.precision,
             on_scan=show,
         )
     print("\n".join(_figure_lines(figures)))
@@ -113,7 +114,10 @@ _BLOCKS = {"real": "real scans with boxes", "semantickitti": "SemanticKITTI", "s
 def _figure_lines(figures: Mapping[str, Any]) -> list[str]:
     models = ", ".join(f"{name} {version}" for name, version in figures["models"].items())
     fold = "" if figures["fold"] is None else f", fold {figures['fold']}"
-    lines = [f"{models}; {figures['split']} drives{fold}; shares in per cent, intervals over drives"]
+    lines = [
+        f"{models}; {figures['split']} drives{fold}; shares in per cent, intervals over drives",
+        f"ran as {'; '.join(figures['providers'].values())}",
+    ]
     for block, name in _BLOCKS.items():
         if block not in figures:
             continue

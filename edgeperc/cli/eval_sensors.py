@@ -50,7 +50,13 @@ def eval_sensors_command(arguments: argparse.Namespace) -> int:
     from ..perceiver import ADAPTATIONS
 
     with progress() as show:
-        figures = compare(arguments.datasets, arguments.model, provider=arguments.provider, on_scan=show)
+        figures = compare(
+            arguments.datasets,
+            arguments.model,
+            provider=arguments.provider,
+            precision=arguments.precision,
+            on_scan=show,
+        )
     lines = [f"{arguments.model}; IoU of points in per cent, mIoU over the classes shown"]
     for name, of in figures.items():
         rows = [((kind, ""), {**of[kind]["iou"], "mean": of[kind]["mean_iou"]}) for kind in ADAPTATIONS]

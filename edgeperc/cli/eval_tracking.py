@@ -124,11 +124,20 @@ def eval_tracking_command(arguments: argparse.Namespace) -> int:
     print("\n".join(_tracking_lines(figures)))
     write_figures(arguments, without_nan(figures))
     if arguments.gif is not None:
-        from ..view.tracks import draw_tracks
+        import numpy as np
+
+        from ..evaluation.tracking import sequence_scans
+        from ..readers.files import read_points
+        from ..view.tracks import draw_tracks, flatten_scan
 
         name = figures["sequences"][0]
         sequence = read_sequence(arguments.root, name, arguments.classes, boxes.get(name))
-        draw_tracks(track_sequence(sequence)[0], arguments.gif, title=f"sequence {sequence.name}")
+        tracks, scans = track_sequence(sequence)[0], sequence_scans(arguments.root, name)
+        under = [
+            flatten_scan(read_points(scans[k]) if k in scans else np.empty((0, 4), np.float32))
+            for k in range(len(tracks) if scans else 0)
+        ]
+        draw_tracks(tracks, arguments.gif, under=under, title=f"sequence {sequence.name}")
     return 0
 
 

@@ -112,7 +112,7 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
     path, card = variants[0].path, variants[0].card
     size = ", ".join(f"{variant.precision} {_megabytes(variant.path)}" for variant in variants)
     rows = [
-        ("model", f"{card.name} {card.version}: {model_task(card)}"),
+        ("model", f"{card.name} {card.version}: {purpose(card)}"),
         ("file", str(path)),
         ("variants", size),
         ("sha256", hashlib.sha256(path.read_bytes()).hexdigest()),
@@ -141,15 +141,6 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
             lost = f", {loss:.2g} points lost" if isinstance(loss, float) else ""
             rows.append((precision, f"{100.0 * same:.2f} % of the labels as in fp32{lost}"))
     return rows
-
-
-def model_task(card: ModelCard) -> str:
-    """What a model is for, from its outputs and classes."""
-    if card.view.kind == "range_image":
-        return f"a class for every point ({', '.join(card.classes[1:])})"
-    found = ["drivable area"] if "drivable" in card.classes else []
-    found += [f"boxes of {', '.join(card.box_classes)}"] if card.box_classes else []
-    return " and ".join(found) or "classes of a top view"
 
 
 def _accuracy_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:

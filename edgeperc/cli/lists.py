@@ -107,9 +107,9 @@ def _print(
 
 
 def _models() -> list[dict[str, Any]]:
+    from ..listing import purpose
     from ..tuning import fingerprint, read_setting, settings_path
     from ..zoo import digest, resolve, shipped_models
-    from .info import model_task
 
     machine, records = fingerprint(), []
     for name in shipped_models():
@@ -121,7 +121,7 @@ def _models() -> list[dict[str, Any]]:
                 "name": name,
                 "version": card.version,
                 "default": name in DEFAULT,
-                "task": model_task(card),
+                "task": purpose(card),
                 "size_mb": {variant.precision: round(variant.path.stat().st_size / 1e6, 2) for variant in variants},
                 "licence": card.training.get("licence", "not said"),
                 "ms": setting.get("p50_ms"),

@@ -174,7 +174,7 @@ def run_command(arguments: argparse.Namespace) -> int:
         from ..view.tracks import draw_tracks
 
         arguments.out.mkdir(parents=True, exist_ok=True)
-        draw_tracks(report.tracks, arguments.out / "tracks.gif")
+        draw_tracks(report.tracks, arguments.out / "tracks.gif", under=report.under)
     n_perceived = report.n - len(found.empty)
     if n_perceived > 1:
         each_ms = 1e3 * (time.perf_counter() - started) / n_perceived
@@ -219,14 +219,23 @@ class _Report:
         Scans reported, and those of them that failed.
     tracks : list of Tracks
         Of every scan, if ``--gif`` draws them.
+    under : list of bytes
+        What the animation shows under them.
     """
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         self.n = self.n_failed = 0
         self.tracks: list[Tracks] = []
-        self._json, self._gif = arguments.json, arguments.gif
+        self.under: list[bytes] = []
+        self._json = arguments.json
 
-    def add(self, source: Path, outcome: Perception | Answer | Exception, tracks: Tracks | None = None) -> None:
+    def add(
+        self,
+        source: Path,
+        outcome: Perception | Answer | Exception,
+        tracks: Tracks | None = None,
+        under: bytes | None = None,
+    ) -> None:
         """Print one scan's line or JSON object; errors go to stderr too."""
         from ..perception import Perception
 
@@ -241,8 +250,9 @@ class _Report:
             return
         answer, perception = (None, outcome) if isinstance(outcome, Perception) else (outcome, outcome.perception)
         timing = None if answer is None else _timing(answer)
-        if tracks is not None and self._gif:
+        if tracks is not None and under is not None:
             self.tracks.append(tracks)
+            self.under.append(under)
         if self._json:
             from ..records import scan_record
 
@@ -282,9 +292,10 @@ def _each(
     target: Path,
     kinds: Sequence[str],
     arguments: argparse.Namespace,
-) -> Iterator[tuple[Path, Perception | Exception, Tracks | None]]:
+) -> Iterator[tuple[Path, Perception | Exception, Tracks | None, bytes | None]]:
     """Every scan of a file, those of a capture numbered, with its perception or the error."""
     from ..readers.captures import is_capture, read_scans
+    from ..view.tracks import flatten_scan
 
     try:
         numbered = is_capture(path)
@@ -297,11 +308,11 @@ def _each(
                     target.mkdir(exist_ok=True)
                 _write(points, perception, {kind: _file_of(file, kind) for kind in kinds}, title=str(name))
             except (EdgepercError, OSError) as exc:
-                yield name, exc, None
+                yield name, exc, None, None
             else:
-                yield name, perception, tracks
+                yield name, perception, tracks, flatten_scan(points, perception) if arguments.gif else None
     except (EdgepercError, OSError) as exc:
-        yield path, exc, None
+        yield path, exc, None, None
 
 
 def _live(

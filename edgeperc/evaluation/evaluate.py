@@ -34,6 +34,7 @@ def evaluate(
     fold: int | None = None,
     road_by: str | Path | None = None,
     provider: str = "cpu",
+    precision: str = "auto",
     boxes_from: BoxesFrom = "network",
     n_resamples: int = 1000,
     on_scan: Callable[[int, int], None] = lambda done, total: None,
@@ -44,7 +45,7 @@ def evaluate(
     ----------
     datasets : sequence of str or Path
         Roots of a KITTI object set or of SemanticKITTI, or ``"simulation:N"`` for N simulated scans (default 24).
-    models, road_by, provider, boxes_from
+    models, road_by, provider, precision, boxes_from
         As in `Judge`.
     split : str or None
         Drives of the real scans: ``"test"``, ``"train"``, ``"validation"`` or ``"all"`` (`splits.in_split`). None: the
@@ -58,8 +59,8 @@ def evaluate(
     Returns
     -------
     figures : dict
-        ``"models"``, ``"split"``, ``"fold"``, and the `figures` of each kind of scans in the datasets: ``"real"``,
-        ``"semantickitti"``, ``"simulated"``.
+        ``"models"``, ``"providers"`` (as `Perceiver` has them), ``"split"``, ``"fold"``, and the `figures` of each kind
+        of scans in the datasets: ``"real"``, ``"semantickitti"``, ``"simulated"``.
     mistakes : list of Mistakes
         The twenty scans with most mistakes, worst first; of real scans if there are any, else of simulated ones.
 
@@ -71,7 +72,14 @@ def evaluate(
         A model was trained on a scan, and ``split`` is not ``"train"``.
     """
     split = split or ("test" if fold is None else "validation")
-    judge = Judge(models, provider=provider, road_by=road_by, training_scans=split == "train", boxes_from=boxes_from)
+    judge = Judge(
+        models,
+        provider=provider,
+        precision=precision,
+        road_by=road_by,
+        training_scans=split == "train",
+        boxes_from=boxes_from,
+    )
     scans = [scan for dataset in datasets for scan in _scans(judge, dataset, split, fold)]
     records: dict[str, list[Record]] = {}
     worst: dict[str, list[Mistakes]] = {}
@@ -83,7 +91,7 @@ def evaluate(
             worst[block] = ranked[:N_WORST]
         on_scan(done, len(scans))
     result: dict[str, Any] = {"models": {card.name: card.version for card in judge.perceive.cards}}
-    result |= {"split": split, "fold": fold}
+    result |= {"providers": dict(judge.perceive.providers), "split": split, "fold": fold}
     result |= {block: figures(of_block, n_resamples) for block, of_block in records.items()}
     return result, worst.get("real") or worst.get("simulated", [])
 

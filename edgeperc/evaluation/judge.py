@@ -42,7 +42,8 @@ class Judge:
     models : sequence of str or Path
         Names of shipped models, or paths. A range-image model is evaluated by points, a top-view model by boxes and
         cells.
-    provider : str
+    provider, precision : str
+        As in `Perceiver`.
     road_by : str, Path or None
         A top-view model whose drivable cells are the truth of KITTI frames, whose labels have no road (SSADNet 3.1.2
         uses LoDNN).
@@ -63,11 +64,12 @@ class Judge:
         models: Sequence[str | Path],
         *,
         provider: str = "cpu",
+        precision: str = "auto",
         road_by: str | Path | None = None,
         training_scans: bool = False,
         boxes_from: BoxesFrom = "network",
     ) -> None:
-        self.perceive = _perceiver(models, provider, boxes_from)
+        self.perceive = _perceiver(models, provider, precision, boxes_from)
         networks = [_Network(session) for session in self.perceive.sessions]
         self.from_sensor = next((n for n in networks if n.card.view.kind == "range_image"), None)
         self.from_above = next((n for n in networks if n.card.view.kind == "top_view"), None)
@@ -78,7 +80,7 @@ class Judge:
             assert isinstance(self.from_above.card.view, TopViewGeometry)
             self.view = self.from_above.card.view
             self.cell_range_m = np.hypot(*np.broadcast_arrays(*self.view.cell_centres()))
-        self.draw_road = None if road_by is None else _perceiver([road_by], provider)
+        self.draw_road = None if road_by is None else _perceiver([road_by], provider, precision)
         cards = [*self.perceive.cards]
         if self.draw_road is not None:
             (card,) = self.draw_road.cards
@@ -251,8 +253,10 @@ class _Network:
         return np.where(pixel >= 0, labels.ravel()[pixel], 0).astype(np.uint8)
 
 
-def _perceiver(models: Sequence[str | Path], provider: str, boxes_from: BoxesFrom = "network") -> Perceiver:
-    return Perceiver(list(models), sensor="hdl-64e", provider=provider, on_mismatch="ignore", boxes_from=boxes_from)
+def _perceiver(
+    models: Sequence[str | Path], provider: str, precision: str, boxes_from: BoxesFrom = "network"
+) -> Perceiver:
+    return Perceiver(list(models), provider=provider, precision=precision, on_mismatch="ignore", boxes_from=boxes_from)
 
 
 def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tuple[tuple[str, ...], NDArray[np.uint8]]:

@@ -74,6 +74,7 @@ def compare(
     model: str | Path = "pointseg",
     *,
     provider: str = "cpu",
+    precision: str = "auto",
     on_scan: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
     """IoU of points by class, for each dataset and each adaptation of `edgeperc.perceiver.ADAPTATIONS`.
@@ -88,7 +89,8 @@ def compare(
         eight other scenes; that of a real sensor is in its profile.
     model : str or Path
         A range-image model.
-    provider : str
+    provider, precision : str
+        As in `Perceiver`.
     on_scan : callable
         Called after each scan with the number of scans done and the number of all scans, over all adaptations.
 
@@ -114,6 +116,7 @@ def compare(
                 model,
                 sensor=sensor,
                 provider=provider,
+                precision=precision,
                 on_mismatch="ignore",
                 adapt=adaptation,
                 boxes_from="network",  # only points are evaluated
