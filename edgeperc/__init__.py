@@ -1,17 +1,21 @@
-"""A LiDAR scan in, perception out: drivable area, vehicle boxes and a class for every point.
+"""A LiDAR scan in, perception out: drivable area, boxes, a class for every point, and tracks.
 
 ::
 
     import edgeperc
 
     points = edgeperc.read_points("000123.bin")
-    perceive = edgeperc.Perceiver(["ssadnet", "pointseg"], sensor="hdl-64e")
+    perceive = edgeperc.Perceiver(sensor="hdl-64e")
     perception = perceive(points)
+    perception.to_dict()
+    edgeperc.draw(perception, points, "000123.png")
 
-Importing this package does no work: no compiling, no thread, no file. A name is looked up in its module on first
-use, for numba probes the cache folder of every kernel as it reads the kernel's decorator. onnxruntime is an extra,
-for its builds exclude one another; without one everything but a model works, and constructing a `Perceiver` raises
-`MissingExtraError`, which says which line installs it.
+`models`, `sensors` and `providers` list what there is to choose from.
+
+Importing this package compiles nothing, starts no thread and reads no file. A name is looked up in its module on first
+use, because numba probes the cache folder of every kernel when it reads the kernel's decorator. onnxruntime is an
+extra, because its builds exclude one another. Without it everything but a model works, and `Perceiver` raises
+`MissingExtraError`, which names the line that installs it.
 """
 
 from __future__ import annotations
@@ -41,6 +45,7 @@ from .errors import (
 if TYPE_CHECKING:
     from .card import ModelCard
     from .drivable import RoadAhead, road_ahead
+    from .listing import ModelInfo, ProviderInfo, SensorInfo, models, providers, sensors
     from .live import Answer, Stream, stream
     from .perceiver import Perceiver
     from .perception import Box, Perception, PointLabels, TopView
@@ -48,6 +53,7 @@ if TYPE_CHECKING:
     from .readers.files import read_points
     from .sensor import SensorProfile
     from .tracking import Track, Tracker, Tracks
+    from .view import draw
 
 __all__ = [
     "Answer",
@@ -61,14 +67,17 @@ __all__ = [
     "ModelCard",
     "ModelError",
     "ModelFileError",
+    "ModelInfo",
     "OptionError",
     "Perceiver",
     "Perception",
     "PointLabels",
     "PointsError",
     "ProviderError",
+    "ProviderInfo",
     "RoadAhead",
     "SensorError",
+    "SensorInfo",
     "SensorProfile",
     "SettingsError",
     "SplitError",
@@ -80,9 +89,13 @@ __all__ = [
     "TrackingError",
     "Tracks",
     "__version__",
+    "draw",
+    "models",
+    "providers",
     "read_points",
     "read_scans",
     "road_ahead",
+    "sensors",
     "stream",
 ]
 
@@ -92,19 +105,26 @@ _MODULES = {
     "Answer": "live",
     "Box": "perception",
     "ModelCard": "card",
+    "ModelInfo": "listing",
     "Perceiver": "perceiver",
     "Perception": "perception",
     "PointLabels": "perception",
+    "ProviderInfo": "listing",
     "RoadAhead": "drivable",
+    "SensorInfo": "listing",
     "SensorProfile": "sensor",
     "Stream": "live",
     "TopView": "perception",
     "Track": "tracking",
     "Tracker": "tracking",
     "Tracks": "tracking",
+    "draw": "view",
+    "models": "listing",
+    "providers": "listing",
     "read_points": "readers.files",
     "read_scans": "readers.captures",
     "road_ahead": "drivable",
+    "sensors": "listing",
     "stream": "live",
 }
 

@@ -36,7 +36,7 @@ FLOORS = {
         tracking.tracks
         tracking.tracker
         tracking.__init__
-        perceiver records
+        listing perceiver records
         live
         simulation.raycast
         simulation.shapes

@@ -15,7 +15,6 @@ from .arguments import Commands, add_command, add_sensor
 from .output import complain, print_rows, say
 
 if TYPE_CHECKING:
-    from ..card import ModelCard
     from ..zoo import Variant
 
 __all__ = ["add_parser", "info_command"]
@@ -108,6 +107,7 @@ def _folded(rows: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
 def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
     """What a user wants to know of a network; of its variants the first one's card."""
     from ..card import TopViewGeometry
+    from ..listing import purpose
 
     path, card = variants[0].path, variants[0].card
     size = ", ".join(f"{variant.precision} {_megabytes(variant.path)}" for variant in variants)
