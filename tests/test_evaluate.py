@@ -85,6 +85,7 @@ class World:
             )
 
         perceive.cards = tuple(self.cards[name] for name in models)  # type: ignore[attr-defined]
+        perceive.providers = {name: f"{name} fp32" for name in models}  # type: ignore[attr-defined]
         perceive.sessions = tuple(SimpleNamespace(card=card) for card in perceive.cards)  # type: ignore[attr-defined]
         return perceive
 
