@@ -1,4 +1,4 @@
-"""How right the answers are whose speed is told: by those of fp32 on the stock CPU provider, and by the truth."""
+"""How accurate the measured results are: compared with a reference (fp32 on the CPU provider) and the ground truth."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from edgeperc.evaluation.tables import VEHICLES
 from edgeperc.simulation.samples import IGNORE, labels_by_boxes
 from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES, SimulatedScan
 
-from .worker import Answer
+from .worker import Prediction
 
 __all__ = ["agreement", "agrees", "correctness"]
 
-# Answers agree where nearly all labels and boxes are the reference's, and no figure against the truth falls by a point.
+# Results agree if nearly all labels and boxes are the reference's, and no figure of `correctness` falls by a point.
 LEAST_EQUAL = 0.99
 LEAST_BOX_F1 = 0.9
 MOST_LOST = 0.01
 
 
-def agreement(reference: Sequence[Answer], found: Sequence[Answer]) -> dict[str, Any]:
-    """How far answers are those of the reference, scan by scan the same.
+def agreement(reference: Sequence[Prediction], found: Sequence[Prediction]) -> dict[str, Any]:
+    """How far predictions equal those of the reference on the same scans.
 
     Returns
     -------
     dict
-        Of ``"points"`` in view and ``"cells"``: the share of ``equal`` labels, and ``mean_iou`` with the reference as
-        truth; of ``"boxes"``: ``n_reference``, ``n_found``, ``n_both`` (overlap at least 0.5) and ``f1``. None for what
-        the models do not answer.
+        ``"n_scans"``; for ``"points"`` in view and ``"cells"``: the share of ``equal`` labels, and ``mean_iou`` with
+        the reference as ground truth; for ``"boxes"``: ``n_reference``, ``n_found``, ``n_both`` (IoU at least 0.5) and
+        ``f1``. None for what the models do not predict.
     """
-    told: dict[str, Any] = {"n_scans": len(reference), "points": None, "cells": None, "boxes": None}
+    result: dict[str, Any] = {"n_scans": len(reference), "points": None, "cells": None, "boxes": None}
     points, cells = [], []
     for right, guess in zip(reference, found, strict=True):
         if right.points is not None and guess.points is not None:
@@ -47,56 +47,59 @@ def agreement(reference: Sequence[Answer], found: Sequence[Answer]) -> dict[str,
             confusion = Confusion(pairs[0][0])
             for _, guess_labels, right_labels in pairs:
                 confusion.update(guess_labels, right_labels)
-            told[name] = {"equal": _plain(confusion.accuracy()), "mean_iou": _plain(confusion.mean_iou())}
+            result[name] = {"equal": _rounded(confusion.accuracy()), "mean_iou": _rounded(confusion.mean_iou())}
     if cells:
         boxes = BoxEvaluator()
         for right, guess in zip(reference, found, strict=True):
             boxes.update(guess.boxes, right.boxes)
         scores = boxes.overall()
         n = scores.n_truth + scores.n_predicted
-        told["boxes"] = {"n_reference": scores.n_truth, "n_found": scores.n_predicted, "n_both": scores.n_hits}
-        told["boxes"]["f1"] = 2.0 * scores.n_hits / n if n else 1.0
-    return told
+        result["boxes"] = {
+            "n_reference": scores.n_truth,
+            "n_found": scores.n_predicted,
+            "n_both": scores.n_hits,
+            "f1": 2.0 * scores.n_hits / n if n else 1.0,
+        }
+    return result
 
 
-def correctness(answers: Sequence[Answer], truth: Sequence[SimulatedScan]) -> dict[str, float | None]:
-    """Figures against what simulated scans hold: ``points_mean_iou``, ``cells_mean_iou``, ``vehicle_ap50``.
+def correctness(predictions: Sequence[Prediction], truth: Sequence[SimulatedScan]) -> dict[str, float | None]:
+    """Figures against the ground truth of simulated scans: ``points_mean_iou``, ``cells_mean_iou``, ``vehicle_ap50``.
 
-    None for what the models do not answer, or answer in other classes than the simulator's. A few scans make a check,
-    no figure of merit: `edgeperc eval` has those.
+    None for what the models do not predict, or predict in other classes than the simulator's. A few scans only check
+    an engine; `edgeperc eval` evaluates a model.
     """
     points, cells, boxes = Confusion(POINT_CLASSES), Confusion(TOP_VIEW_CLASSES), BoxEvaluator()
-    for answer, scan in zip(answers, truth, strict=True):
-        if answer.points is not None and answer.points.classes == POINT_CLASSES:
-            points.update(answer.points.labels, np.where(answer.points.in_view, labels_by_boxes(scan), IGNORE))
-        view = answer.top_view
+    for predicted, scan in zip(predictions, truth, strict=True):
+        if predicted.points is not None and predicted.points.classes == POINT_CLASSES:
+            points.update(predicted.points.labels, np.where(predicted.points.in_view, labels_by_boxes(scan), IGNORE))
+        view = predicted.top_view
         if view is None:
             continue
         geometry = TopViewGeometry(view.x_range_m, view.y_range_m, cell_m=view.cell_m)
         if view.classes == TOP_VIEW_CLASSES:
             cells.update(view.labels, scan.top_view_labels(geometry))
-        truth = zip(scan.boxes, scan.box_points, strict=True)
-        to_find, ignored = boxes_to_find(truth, geometry, VEHICLES)
-        boxes.update(answer.boxes, to_find, ignored=ignored)
+        to_find, ignored = boxes_to_find(zip(scan.boxes, scan.box_points, strict=True), geometry, VEHICLES)
+        boxes.update(predicted.boxes, to_find, ignored=ignored)
     return {
-        "points_mean_iou": _plain(points.mean_iou()),
-        "cells_mean_iou": _plain(cells.mean_iou()),
-        "vehicle_ap50": _plain(boxes.overall().ap),
+        "points_mean_iou": _rounded(points.mean_iou()),
+        "cells_mean_iou": _rounded(cells.mean_iou()),
+        "vehicle_ap50": _rounded(boxes.overall().ap),
     }
 
 
 def agrees(accuracy: Mapping[str, Any]) -> bool:
-    """Whether answers are as good as the reference's.
+    """Whether predictions are as good as the reference's.
 
     Parameters
     ----------
     accuracy : mapping
         ``"agreement"`` of `agreement`, ``"truth"`` and ``"reference_truth"`` of `correctness`, or None.
     """
-    told = accuracy["agreement"]
-    if any(told[kind] is not None and told[kind]["equal"] < LEAST_EQUAL for kind in ("points", "cells")):
+    same = accuracy["agreement"]
+    if any(same[kind] is not None and same[kind]["equal"] < LEAST_EQUAL for kind in ("points", "cells")):
         return False
-    if told["boxes"] is not None and told["boxes"]["f1"] < LEAST_BOX_F1:
+    if same["boxes"] is not None and same["boxes"]["f1"] < LEAST_BOX_F1:
         return False
     found, right = accuracy["truth"] or {}, accuracy["reference_truth"] or {}
     return all(
@@ -104,5 +107,5 @@ def agrees(accuracy: Mapping[str, Any]) -> bool:
     )
 
 
-def _plain(value: float) -> float | None:
+def _rounded(value: float) -> float | None:
     return None if math.isnan(value) else round(value, 6)

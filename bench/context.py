@@ -1,6 +1,6 @@
-"""What a figure of latency depends on besides the code: the machine, its software, its state, and who else is busy.
+"""What a latency depends on besides the code: the machine, its software, its state, and other busy processes.
 
-Everything here is read, nothing is set. What a machine does not expose is None, never a guess.
+Everything here is read, nothing is set. A figure that the machine does not expose is None.
 """
 
 from __future__ import annotations
@@ -10,33 +10,47 @@ import importlib.metadata
 import os
 import platform
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from edgeperc import MissingExtraError, __version__
 from edgeperc.tuning import cpu_model
 
-try:
-    import psutil
-except ImportError as exc:
-    raise MissingExtraError("psutil", "bench", "Measuring") from exc
-
-__all__ = ["EnergyMeter", "conditions", "machine", "peak_rss_mb", "rss_mb", "software", "spoilers"]
+__all__ = [
+    "EnergyMeter",
+    "busiest",
+    "conditions",
+    "disturbances",
+    "lasting_disturbances",
+    "machine",
+    "peak_rss_mb",
+    "rss_mb",
+    "software",
+]
 
 PACKAGES = (
     *("numpy", "numba", "onnxruntime", "onnxruntime-gpu", "onnxruntime-ep-openvino", "onnxruntime-ep-nv-tensorrt-rtx"),
     "mlcommons-loadgen",
 )
-# Settings that decide how many threads compute, and for how long they spin for more work.
+# Environment variables that set how many threads compute, and how long they spin while they wait for work.
 VARIABLES = (
     *("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "KMP_BLOCKTIME", "GOMP_SPINCOUNT", "NUMBA_NUM_THREADS"),
     *("NUMBA_DISABLE_JIT", "ORT_LOG_LEVEL", "MALLOC_ARENA_MAX"),
 )
 CPU = Path("/sys/devices/system/cpu")
-BUSY_CORES = 0.1  # of others: a tenth of a core takes the p99 of a scan with it
+BUSY_CORES = 0.1  # of other processes: a tenth of a core shows in the p99 of a scan
 STOLEN_SHARE = 0.01
 HOT_MARGIN_C = 10.0
+
+
+def _psutil() -> ModuleType:
+    try:
+        import psutil
+    except ImportError as exc:
+        raise MissingExtraError("psutil", "bench", "Measuring") from exc
+    return psutil
 
 
 def _read(path: Path) -> str | None:
@@ -53,6 +67,7 @@ def _number(path: Path) -> int | None:
 
 def machine() -> dict[str, Any]:
     """The hardware and how it is set up."""
+    psutil = _psutil()
     affinity = psutil.Process().cpu_affinity() if hasattr(psutil.Process, "cpu_affinity") else None
     governors = {text for path in CPU.glob("cpu[0-9]*/cpufreq/scaling_governor") if (text := _read(path))}
     no_turbo, boost = _number(CPU / "intel_pstate/no_turbo"), _number(CPU / "cpufreq/boost")
@@ -84,7 +99,7 @@ def _has_hypervisor() -> bool | None:
 
 def software() -> dict[str, Any]:
     """Versions and environment settings."""
-    versions = {}
+    versions: dict[str, str | None] = {}
     for package in PACKAGES:
         try:
             versions[package] = importlib.metadata.version(package)
@@ -97,12 +112,13 @@ def software() -> dict[str, Any]:
         **versions,
         "environment": {name: os.environ[name] for name in VARIABLES if name in os.environ},
         "niceness": os.nice(0) if hasattr(os, "nice") else None,
-        "taken": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+        "measured": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
     }
 
 
 def conditions() -> dict[str, Any]:
-    """The state of the machine at this moment; two of them tell what happened in between (`spoilers`)."""
+    """The state of the machine at this moment; two of them show what happened in between (`disturbances`)."""
+    psutil = _psutil()
     frequency = psutil.cpu_freq()
     sensors = psutil.sensors_temperatures() if hasattr(psutil, "sensors_temperatures") else {}
     found = [each for group in sensors.values() for each in group if each.current]
@@ -129,33 +145,30 @@ def conditions() -> dict[str, Any]:
 
 
 def busiest(seconds: float = 0.5) -> list[dict[str, Any]]:
-    """Other processes that take a twentieth of a core or more, the busiest first; watched for some time."""
+    """Other processes that use a twentieth of a core or more during some seconds, the busiest first, five at most."""
+    psutil = _psutil()
     processes = [p for p in psutil.process_iter() if p.pid != os.getpid()]
     for process in processes:
-        _percent(process)
+        _ask(process.cpu_percent, 0.0)
     time.sleep(seconds)
-    found = [{"name": _name(p), "cores": round(_percent(p) / 100.0, 2)} for p in processes]
+    found = [
+        {"name": _ask(process.name, "?"), "cores": round(_ask(process.cpu_percent, 0.0) / 100.0, 2)}
+        for process in processes
+    ]
     return sorted((each for each in found if each["cores"] >= 0.05), key=lambda each: -each["cores"])[:5]
 
 
-def _percent(process: psutil.Process) -> float:
+def _ask(question: Callable[[], Any], otherwise: Any) -> Any:
     try:
-        return float(process.cpu_percent())
-    except psutil.Error:  # it has ended, or is not ours to look at
-        return 0.0
+        return question()
+    except _psutil().Error:  # the process has ended, or may not be inspected
+        return otherwise
 
 
-def _name(process: psutil.Process) -> str:
-    try:
-        return str(process.name())
-    except psutil.Error:
-        return "?"
-
-
-def spoilers(
+def disturbances(
     hardware: Mapping[str, Any], before: Mapping[str, Any], after: Mapping[str, Any], own_cpu_s: float
 ) -> list[str]:
-    """What makes the samples taken between two `conditions` worth less, in plain words.
+    """What disturbed the samples taken between two `conditions`, one sentence each.
 
     Parameters
     ----------
@@ -164,61 +177,61 @@ def spoilers(
     before, after : mapping
         Of `conditions`.
     own_cpu_s : float
-        CPU time that what was measured took itself [s].
+        CPU time of the measured process itself [s].
     """
-    told = []
+    found = []
     wall_s = max(after["at_s"] - before["at_s"], 1e-9)
     others = (after["busy_s"] - before["busy_s"] - own_cpu_s) / wall_s
     if others > BUSY_CORES:
-        told.append(f"other processes kept {others:.1f} of {hardware['logical_cores']} cores busy meanwhile")
+        found.append(f"other processes kept {others:.1f} of {hardware['logical_cores']} cores busy")
     stolen = (after["stolen_s"] - before["stolen_s"]) / wall_s / hardware["logical_cores"]
     if stolen > STOLEN_SHARE:
-        told.append(f"the hypervisor withheld {stolen:.0%} of the CPU time (steal)")
-    for key, words in (
-        ("throttle_count", "the CPU throttled itself for heat {} times"),
-        ("quota_throttled", "the container's CPU quota stopped it {} times"),
+        found.append(f"the hypervisor withheld {stolen:.0%} of the CPU time (steal)")
+    for key, sentence in (
+        ("throttle_count", "the CPU was throttled for heat {} times"),
+        ("quota_throttled", "the container's CPU quota paused it {} times"),
     ):
         if before[key] is not None and after[key] is not None and after[key] > before[key]:
-            told.append(words.format(after[key] - before[key]))
+            found.append(sentence.format(after[key] - before[key]))
     hot, critical = after["temperature_c"], after["critical_c"]
     if hot is not None and critical is not None and hot > critical - HOT_MARGIN_C:
-        told.append(f"it is {hot:.0f} C hot; {critical:.0f} C is critical")
+        found.append(f"the CPU is at {hot:.0f} C; {critical:.0f} C is critical")
     if before["mhz"] and after["mhz"] and after["mhz"] < 0.9 * before["mhz"]:
-        told.append(f"the clock fell from {before['mhz']:.0f} to {after['mhz']:.0f} MHz")
+        found.append(f"the clock fell from {before['mhz']:.0f} to {after['mhz']:.0f} MHz")
     if after["on_battery"]:
-        told.append("the machine runs on battery")
-    return told
+        found.append("the machine runs on battery")
+    return found
 
 
-def standing_spoilers(hardware: Mapping[str, Any], busy: list[dict[str, Any]]) -> list[str]:
-    """What is true of the whole report and makes its samples worth less, in plain words."""
-    told = []
+def lasting_disturbances(hardware: Mapping[str, Any], busy: list[dict[str, Any]]) -> list[str]:
+    """What disturbs every sample of a report, one sentence each."""
+    found = []
     governor = hardware["governor"]
     if governor not in (None, "performance"):
-        told.append(f"the frequency governor is {governor}, not performance: the clock follows the load")
+        found.append(f"the frequency governor is {governor}, not performance: the clock follows the load")
     if hardware["turbo"]:
-        told.append("turbo is on: the clock depends on heat and on the other cores")
+        found.append("turbo is on: the clock depends on heat and on the other cores")
     if hardware["cpu_quota"]:
-        told.append(f"a container's CPU quota applies ({hardware['cpu_quota']})")
+        found.append(f"a container's CPU quota applies ({hardware['cpu_quota']})")
     if busy:
-        told.append("busy before the start: " + ", ".join(f"{p['name']} ({p['cores']:g} cores)" for p in busy))
+        found.append("busy before the start: " + ", ".join(f"{p['name']} ({p['cores']:g} cores)" for p in busy))
     if hardware["hypervisor"]:
-        told.append("a virtual machine: its neighbours, clock and heat cannot be seen from here")
-    return told
+        found.append("a virtual machine: other machines on its host, the clock and the heat are not visible")
+    return found
 
 
 def rss_mb() -> float:
     """Resident memory of this process [MB]."""
-    return float(psutil.Process().memory_info().rss / 1e6)
+    return float(_psutil().Process().memory_info().rss / 1e6)
 
 
 def peak_rss_mb() -> float | None:
-    """The most that this process ever had resident [MB]."""
-    # getrusage's figure goes on from the parent's across fork and exec.
+    """Largest resident memory of this process so far [MB]."""
+    # getrusage counts on from the parent's figure across fork and exec.
     for line in (_read(Path("/proc/self/status")) or "").splitlines():
         if line.startswith("VmHWM:"):
             return int(line.split()[1]) * 1.024e-3
-    memory = psutil.Process().memory_info()
+    memory = _psutil().Process().memory_info()
     if hasattr(memory, "peak_wset"):
         return float(memory.peak_wset / 1e6)
     try:
@@ -229,10 +242,10 @@ def peak_rss_mb() -> float | None:
 
 
 class EnergyMeter:
-    """Energy that the machine's own counters tell: RAPL domains, and INA power rails as on Jetson boards.
+    """Energy by the machine's own counters: RAPL domains, and INA power rails as on Jetson boards.
 
-    It is that of whole packages or boards, idle draw and all else that runs included. `tick` often: counters wrap, and
-    rails tell power only, which is integrated here.
+    It is the energy of whole packages or boards, with idle power and everything else that runs. Call `tick` often:
+    counters wrap, and rails show power only, which is integrated here.
 
     Parameters
     ----------
@@ -241,7 +254,7 @@ class EnergyMeter:
 
     Attributes
     ----------
-    rails : dict of str to callable
+    rails : tuple of str
     joules : dict of str to float
         Since construction, by rail.
     """
@@ -249,7 +262,7 @@ class EnergyMeter:
     def __init__(self, root: Path = Path("/sys")) -> None:
         self._counters: dict[str, tuple[Path, int]] = {}
         for domain in sorted(root.glob("class/powercap/intel-rapl:*")):
-            if _number(domain / "energy_uj") is not None:  # often for root alone
+            if _number(domain / "energy_uj") is not None:  # often readable by root only
                 span = _number(domain / "max_energy_range_uj") or 2**32
                 self._counters[f"{_read(domain / 'name')} ({domain.name})"] = domain / "energy_uj", span + 1
         self._powers: dict[str, tuple[Path, Path]] = {}
@@ -272,7 +285,7 @@ class EnergyMeter:
         return counted | {rail: 1e-6 * (_number(v) or 0) * (_number(a) or 0) for rail, (v, a) in self._powers.items()}
 
     def tick(self) -> None:
-        """Add what was used since the last tick."""
+        """Add the energy since the last tick."""
         now_s, now = time.perf_counter(), self._readings()
         for rail, (_, span) in self._counters.items():
             self.joules[rail] += (now[rail] - self._last[rail]) % span * 1e-6

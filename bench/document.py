@@ -1,4 +1,11 @@
-"""The document of a measurement: what `edgeperc-bench --json` writes and `compare` reads."""
+"""The document of a measurement: what ``edgeperc-bench --json`` writes and ``compare`` reads.
+
+The JSON has ``schema``, ``kind`` (run, matrix, scaling, soak, peers), ``command``, ``complete``, ``machine``,
+``software``, ``input``, ``disturbances`` and, by kind, ``settings`` (a list: models, provider, precision and threads as
+asked for, ``repeats`` with the engines that really ran and all samples, ``accuracy``, ``offline``, ``cold_start``,
+``loadgen``), ``skipped``, ``recommended``, ``tables``, ``soak`` or ``peers`` (by table, the samples of each contender
+in each round). Everything that is shown is computed from it.
+"""
 
 from __future__ import annotations
 
@@ -8,31 +15,35 @@ from pathlib import Path
 from typing import Any
 
 from edgeperc import EdgepercError
+from edgeperc.atomic import write_whole
 
 from .samples import noise_floor, percentile, summary
 
 __all__ = [
+    "KINDS",
+    "SCHEMA",
     "ReportError",
     "latency",
     "pooled",
     "read_report",
     "repeats_ms",
     "scenario_names",
+    "setting_label",
     "stage_medians",
     "write_report",
 ]
 
-SCHEMA = 1
+SCHEMA = 2  # 2: provider and precision are two settings
 KINDS = ("run", "matrix", "scaling", "soak", "peers")
 
 
 class ReportError(EdgepercError):
-    """A file is no report, or one of another schema."""
+    """A file is not a report, or has another schema."""
 
 
 def write_report(document: Mapping[str, Any], path: Path) -> None:
     """Write a document as JSON."""
-    path.write_text(json.dumps(document, allow_nan=False) + "\n", encoding="utf-8")
+    write_whole(path, json.dumps(document, allow_nan=False).encode() + b"\n")
 
 
 def read_report(path: Path) -> dict[str, Any]:
@@ -47,29 +58,42 @@ def read_report(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as exc:
         raise ReportError(f"{path} cannot be read as a report: {exc}") from exc
     if not isinstance(document, dict) or document.get("schema") != SCHEMA or document.get("kind") not in KINDS:
-        raise ReportError(f"{path} is no report of schema {SCHEMA}; expected what edgeperc-bench wrote with --json")
+        raise ReportError(
+            f"{path} is not a report of schema {SCHEMA}; expected a file that this version of edgeperc-bench wrote "
+            "with --json; measure again"
+        )
     return document
 
 
 def scenario_names(setting: Mapping[str, Any]) -> list[str]:
-    """Of one setting, in the order of measuring."""
+    """The scenarios of one setting, in the order of measuring."""
     return list(dict.fromkeys(name for repeat in setting["repeats"] for name in repeat["scenarios"]))
 
 
+def setting_label(setting: Mapping[str, Any]) -> str:
+    """What ran: each model with its precision and provider, and the threads."""
+    engines = [each for repeat in setting["repeats"][:1] for each in repeat["engines"]]
+    ran = "; ".join(f"{each['name']} {each['precision']}, {each['provider']}" for each in engines)
+    return f"{ran or setting['provider']}, {setting['n_threads'] or 'default'} threads"
+
+
+def _parts(setting: Mapping[str, Any], scenario: str) -> list[dict[str, Any]]:
+    return [repeat["scenarios"][scenario] for repeat in setting["repeats"] if scenario in repeat["scenarios"]]
+
+
 def repeats_ms(setting: Mapping[str, Any], scenario: str, key: str = "ms") -> list[list[float]]:
-    """Samples of each repeat that has any."""
-    found = [repeat["scenarios"][scenario][key] for repeat in setting["repeats"] if scenario in repeat["scenarios"]]
-    return [samples for samples in found if samples]
+    """The samples of each repeat that has any."""
+    return [part[key] for part in _parts(setting, scenario) if part[key]]
 
 
 def pooled(setting: Mapping[str, Any], scenario: str, key: str = "ms") -> list[float]:
-    """Samples of all repeats, put together."""
+    """The samples of all repeats in one list."""
     return [value for samples in repeats_ms(setting, scenario, key) for value in samples]
 
 
 def latency(setting: Mapping[str, Any], scenario: str) -> dict[str, Any]:
-    """Everything that is told of one scenario in one number each; None for what is unknown or not supported."""
-    parts = [repeat["scenarios"][scenario] for repeat in setting["repeats"] if scenario in repeat["scenarios"]]
+    """The figures of one scenario, one number each; None for what is unknown or what the samples do not support."""
+    parts = _parts(setting, scenario)
     ms = pooled(setting, scenario)
     n, wall_s = sum(part["n"] for part in parts), sum(part["wall_s"] for part in parts)
     rails = {rail for part in parts for rail in part["energy_j"] or {}}
@@ -87,8 +111,8 @@ def latency(setting: Mapping[str, Any], scenario: str) -> dict[str, Any]:
 
 
 def stage_medians(setting: Mapping[str, Any], name: str) -> dict[str, float]:
-    """Median milliseconds of each stage; ``outside`` is what a call takes beyond its stages."""
-    parts = [repeat["scenarios"][name] for repeat in setting["repeats"] if name in repeat["scenarios"]]
+    """Median milliseconds of each stage; ``outside`` is the part of a call outside its stages."""
+    parts = _parts(setting, name)
     stages = dict.fromkeys(stage for part in parts for stage in part["stage_ms"])
     values = {stage: [v for part in parts for v in part["stage_ms"].get(stage, ())] for stage in stages}
     outside = [ms - sum(of[k] for of in part["stage_ms"].values()) for part in parts for k, ms in enumerate(part["ms"])]

@@ -1,4 +1,4 @@
-"""The scans that are measured with: simulated ones, which carry their truth, or the user's own."""
+"""The scans to measure with: simulated ones with ground truth, or the user's own."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from edgeperc.sensor import get_sensor
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
 
-__all__ = ["Input", "crowd", "read", "simulate", "sized"]
+__all__ = ["Input", "crowd", "raw", "read_input", "simulated_input", "sized", "store"]
 
 
 @dataclass(frozen=True)
 class Input:
-    """Scans as files that processes load.
+    """Scans as files for measuring processes.
 
     Attributes
     ----------
     files : tuple of Path
         .npy, (n, 4) float32 in the sensor's raw unit of remission.
     truth : tuple of SimulatedScan
-        Empty where nothing is known.
-    told : dict
-        What the report says of them; ``sha256`` tells whether two reports are of the same scans.
+        Empty if there is no ground truth.
+    record : dict
+        For the report; two reports with the same ``sha256`` are of the same scans.
     """
 
     files: tuple[Path, ...]
     truth: tuple[SimulatedScan, ...]
-    told: dict[str, Any]
+    record: dict[str, Any]
 
 
-def simulate(folder: Path, n: int, sensor: str) -> Input:
-    """The first scans that `edgeperc eval simulation` judges by, of no scene that a model was trained on."""
+def simulated_input(folder: Path, n: int, sensor: str) -> Input:
+    """The first scans of `edgeperc eval simulation`; no model was trained on their scenes."""
     truth = [simulated_scan(FIRST_SEED + k, sensor) for k in range(n)]
     scans = [raw(scan.points, sensor) for scan in truth]
     source = f"{n} simulated scans, seeds {FIRST_SEED} to {FIRST_SEED + n - 1}"
@@ -48,20 +48,20 @@ def simulate(folder: Path, n: int, sensor: str) -> Input:
 
 
 def raw(points: NDArray[np.float32], sensor: str) -> NDArray[np.float32]:
-    """Simulated points with their remission, 0..1, in the unit that the sensor's own files have."""
+    """Simulated points, whose remission is 0..1, with remission in the unit of the sensor's own files."""
     profile = get_sensor(sensor)
     points = points.copy()
     points[:, 3] = points[:, 3] / np.float32(profile.remission_scale) - np.float32(profile.remission_offset)
     return points
 
 
-def read(folder: Path, paths: Sequence[Path], sensor: str) -> Input:
-    """The user's scans, folders opened.
+def read_input(folder: Path, paths: Sequence[Path], sensor: str) -> Input:
+    """The user's scans: files, and all scan files of folders.
 
     Raises
     ------
     PointsError
-        A file is no scan, or a folder holds none.
+        A file is not a scan, or a folder holds none.
     """
     get_sensor(sensor)
     files: list[Path] = []
@@ -76,7 +76,7 @@ def read(folder: Path, paths: Sequence[Path], sensor: str) -> Input:
 
 
 def store(folder: Path, name: str, points: NDArray[np.float32]) -> Path:
-    """Points as a file in ``folder``."""
+    """Write points to a file in ``folder``."""
     file = folder / f"{name}.npy"
     np.save(file, points)
     return file
@@ -86,23 +86,23 @@ def _stored(
     folder: Path, scans: Sequence[NDArray[np.float32]], truth: tuple[SimulatedScan, ...], source: str, sensor: str
 ) -> Input:
     files = tuple(store(folder, f"{k:06d}", scan) for k, scan in enumerate(scans))
-    told = {
+    record = {
         "source": source,
         "sensor": sensor,
         "n_points": [len(scan) for scan in scans],
         "sha256": hashlib.sha256(b"".join(hashlib.sha256(scan.tobytes()).digest() for scan in scans)).hexdigest(),
         "scan_sha256": [hashlib.sha256(scan.tobytes()).hexdigest() for scan in scans],
     }
-    return Input(files, truth, told)
+    return Input(files, truth, record)
 
 
 def sized(n_points: int, sensor: str) -> NDArray[np.float32]:
-    """A scan of a number of points: rows of one simulated scan left out, or as many scans laid over one another."""
+    """A scan of this many points, drawn from one simulated scan, or from several laid over each other."""
     scans: list[NDArray[np.float32]] = []
     while sum(map(len, scans)) < n_points:
         scans.append(simulated_scan(FIRST_SEED + len(scans), sensor).points)
     points = np.concatenate(scans)
-    # Order is kept: a sensor's own order is what caches meet.
+    # In the sensor's own order, which decides how caches are used.
     kept = np.sort(np.random.default_rng(0).choice(len(points), n_points, replace=False))
     return raw(points[kept], sensor)
 

@@ -1,4 +1,4 @@
-"""MLPerf LoadGen in the place of our own loop: it draws the scans, takes the time, and writes its own logs."""
+"""MLPerf LoadGen in place of our own loop: it draws the scans, measures the time and writes its own logs."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from edgeperc import MissingExtraError
 
-from .scenarios import KeepGoing, Limits, Perceive, Samples, back_to_back
+from .scenarios import KeepGoing, Limits, Perceive, Timings, back_to_back
 
-__all__ = ["require", "single_stream", "told"]
+__all__ = ["read_summary", "require", "single_stream"]
 
 SUMMARY = "mlperf_log_summary.txt"
-# Of MLPerf's early stopping: the least queries that support a 99.9th percentile.
+# MLPerf's early stopping needs this many queries for a 99.9th percentile.
 QUERIES_FOR_P999 = 6636
 
 
 def require() -> Any:
-    """The module of the package ``mlcommons-loadgen``."""
+    """The module of the package ``mlcommons-loadgen``; `MissingExtraError` if it is not installed."""
     try:
         import mlperf_loadgen
     except ImportError as exc:
@@ -37,9 +37,9 @@ def single_stream(
     limits: Limits,
     *,
     folder: Path,
-    keep_going: KeepGoing = lambda samples: True,
+    keep_going: KeepGoing = lambda timings: True,
     on_start: Callable[[], None] = lambda: None,
-) -> Samples:
+) -> Timings:
     """MLPerf's single stream: LoadGen draws a scan, waits for its answer, draws the next.
 
     Parameters
@@ -47,17 +47,17 @@ def single_stream(
     folder : Path
         Where LoadGen writes ``mlperf_log_summary.txt``, ``mlperf_log_detail.txt`` and so on.
     perceive, scans, limits, keep_going, on_start
-        As in `back_to_back`, but a test that has begun cannot be stopped.
+        As in `back_to_back`, but a test cannot be stopped once it runs.
 
     Returns
     -------
-    Samples
-        Of the calls as seen from here, for the stages; LoadGen's own figures are in its logs (`told`).
+    Timings
+        Of the calls as measured here, for the stages; LoadGen's own figures are in its logs (`read_summary`).
     """
     loadgen = require()
-    samples = back_to_back(perceive, scans, Limits(0, 0.0, limits.warm_up_scans), keep_going=keep_going)
+    timings = back_to_back(perceive, scans, Limits(0, 0.0, limits.warm_up_scans), keep_going=keep_going)
     on_start()
-    first = samples.first_s = time.perf_counter()
+    first = timings.first_s = time.perf_counter()
     failed: list[Exception] = []
 
     def issue(queries: Sequence[Any]) -> None:
@@ -66,13 +66,13 @@ def single_stream(
                 began = time.perf_counter()
                 try:
                     found = perceive(scans[query.index])
-                except Exception as exc:  # one of LoadGen's threads; raised below, in ours
+                except Exception as exc:  # this is LoadGen's thread; raised below, in ours
                     failed.append(exc)
                 else:
                     took_ms = 1e3 * (time.perf_counter() - began)
-                    samples.add(began - first, took_ms, took_ms, found.stage_ms)
+                    timings.add(began - first, took_ms, took_ms, found.stage_ms)
             loadgen.QuerySamplesComplete([loadgen.QuerySampleResponse(query.id, 0, 0)])
-        keep_going(samples)
+        keep_going(timings)
 
     settings = loadgen.TestSettings()
     settings.scenario = loadgen.TestScenario.SingleStream
@@ -93,11 +93,11 @@ def single_stream(
         loadgen.DestroySUT(sut)
     if failed:
         raise failed[0]
-    return samples
+    return timings
 
 
-def told(folder: Path) -> dict[str, Any]:
-    """Percentiles [ms], the number of queries and LoadGen's verdict, as its summary has them."""
+def read_summary(folder: Path) -> dict[str, Any]:
+    """Percentiles [ms], LoadGen's result and its whole summary."""
     text = (folder / SUMMARY).read_text(encoding="utf-8", errors="replace")
     found: dict[str, Any] = {
         f"p{float(p):g}": int(ns) / 1e6

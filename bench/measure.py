@@ -1,4 +1,4 @@
-"""Repeats, accuracy, offline throughput and cold starts of one setting, put into a report's document as they come."""
+"""Repeats, accuracy, offline throughput and cold starts of one setting, recorded in a report's document at once."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from edgeperc.simulation.scene import SimulatedScan
 
 from .accuracy import agreement, agrees, correctness
-from .context import conditions, spoilers
+from .context import conditions, disturbances
 from .scenarios import Limits, throughput
-from .worker import Answer, Job, OnTick, Scenario, WorkerError, measure
+from .worker import Job, OnTick, Prediction, Scenario, WorkerError, measure, perceiver_arguments
 
-__all__ = ["cold_starts", "judged", "new_setting", "offline", "reference", "repeat"]
+__all__ = ["Reference", "accuracy_of", "cold_starts", "new_setting", "offline", "reference", "repeat"]
 
 
 def new_setting(job: Job) -> dict[str, Any]:
-    """The document of one setting, nothing measured yet."""
+    """The record of one setting as asked for, with nothing measured yet."""
     return {
         "models": list(job.models),
         "provider": job.provider,
+        "precision": job.precision,
         "n_threads": job.n_threads,
         "sensor": job.sensor,
         "repeats": [],
@@ -41,12 +42,12 @@ def new_setting(job: Job) -> dict[str, Any]:
 
 def repeat(
     setting: dict[str, Any], job: Job, n_repeats: int, document: dict[str, Any], on_tick: OnTick
-) -> list[Answer]:
-    """Do a job in as many fresh processes, one after the other; each goes into ``setting`` when it is done.
+) -> list[Prediction]:
+    """Do a job in this many fresh processes, one after the other; each is recorded in ``setting`` when it is done.
 
     Returns
     -------
-    answers : list of Answer
+    predictions : list of Prediction
         Of the first process.
 
     Raises
@@ -54,40 +55,51 @@ def repeat(
     KeyboardInterrupt
         After what was measured by then is in ``setting``.
     """
-    answers: list[Answer] = []
+    predictions: list[Prediction] = []
     for k in range(n_repeats):
-        (result,) = measure([job if k == 0 else replace(job, answers=())], on_tick)
-        answers += result.pop("answers")
+        (result,) = measure([job if k == 0 else replace(job, predict=())], on_tick)
+        predictions += result.pop("predictions")
         setting["repeats"].append(result)
         for name, each in result["scenarios"].items():
-            for words in spoilers(document["machine"], each["before"], each["after"], each["cpu_s"]):
-                document["spoilers"].append(f"{name}, repeat {k + 1}: {words}")
+            for disturbance in disturbances(document["machine"], each["before"], each["after"], each["cpu_s"]):
+                document["disturbances"].append(f"{name}, repeat {k + 1}: {disturbance}")
         if result["interrupted"]:
             raise KeyboardInterrupt
-    return answers
+    return predictions
 
 
-def reference(job: Job, files: Sequence[Path]) -> list[Answer]:
-    """Answers of fp32 on onnxruntime's stock CPU provider."""
-    (result,) = measure([Job(job.models, "cpu", None, job.sensor, answers=tuple(files))])
+@dataclass(frozen=True)
+class Reference:
+    """Predictions to compare with, one per scan, and the engines that made them."""
+
+    predictions: list[Prediction]
+    engines: list[str]
+
+
+def reference(job: Job, files: Sequence[Path]) -> Reference:
+    """Predictions of a job's models in fp32 on the CPU provider; a model given by its path runs as it is stored."""
+    models = tuple(
+        model if Path(model).suffix == ".onnx" else f"{model.partition(':')[0]}:fp32" for model in job.models
+    )
+    (result,) = measure([Job(models, provider="cpu", sensor=job.sensor, predict=tuple(files))])
     if result["interrupted"]:
         raise KeyboardInterrupt
-    answers: list[Answer] = result["answers"]
-    return answers
+    return Reference(result["predictions"], [engine["description"] for engine in result["engines"]])
 
 
-def judged(right: Sequence[Answer], found: Sequence[Answer], truth: Sequence[SimulatedScan]) -> dict[str, Any]:
-    """The accuracy that stands beside a setting's speed."""
+def accuracy_of(right: Reference, found: Sequence[Prediction], truth: Sequence[SimulatedScan]) -> dict[str, Any]:
+    """The accuracy of a setting, which is reported beside its speed."""
     accuracy: dict[str, Any] = {
-        "agreement": agreement(right, found),
+        "reference": right.engines,
+        "agreement": agreement(right.predictions, found),
         "truth": correctness(found, truth) if truth else None,
-        "reference_truth": correctness(right, truth) if truth else None,
+        "reference_truth": correctness(right.predictions, truth) if truth else None,
     }
     return accuracy | {"agrees": agrees(accuracy)}
 
 
 def offline(job: Job, files: Sequence[Path], n_processes: int, limits: Limits, on_tick: OnTick) -> dict[str, Any]:
-    """Several processes, each back to back; one thread each unless the job says otherwise."""
+    """Throughput of several processes, each back to back, with one thread each unless the job sets another number."""
     name = f"offline x {n_processes}"
     own = replace(job, n_threads=job.n_threads or 1, scenarios=(Scenario(name, tuple(files), limits),))
     before = conditions()
@@ -112,23 +124,23 @@ def offline(job: Job, files: Sequence[Path], n_processes: int, limits: Limits, o
 
 
 def cold_starts(job: Job, scan: Path, n: int) -> list[dict[str, Any]]:
-    """Start a process, perceive one scan, and do it again: the first finds empty caches, the others what it left there.
+    """Start processes that perceive one scan: the first finds empty caches, the others what it left there.
 
-    Caches are numba's and whatever keeps to the user's cache folder. The operating system has the files in memory.
+    The caches are numba's and those in the user's cache folder. The operating system keeps the files in memory.
     """
-    told = []
+    starts = []
     with tempfile.TemporaryDirectory() as folder:
         cache = {"NUMBA_CACHE_DIR": folder, "XDG_CACHE_HOME": folder, "LOCALAPPDATA": folder}
         for k in range(n):
-            request = {"models": list(job.models), "provider": job.provider, "n_threads": job.n_threads}
-            request |= {"sensor": job.sensor, "scan": str(scan), "spawned_s": time.perf_counter()}
+            request: dict[str, Any] = perceiver_arguments(job)
+            request |= {"scan": str(scan), "spawned_s": time.perf_counter()}
             command = [sys.executable, "-m", "edgeperc_bench.start", json.dumps(request)]
             done = subprocess.run(command, env=os.environ | cache, capture_output=True, text=True)
             if done.returncode:
                 raise WorkerError(
-                    f"a fresh process ended with exit code {done.returncode} before its first answer: "
-                    f"{done.stderr.strip()[-2000:] or 'it said nothing'}"
+                    f"a fresh process ended with exit code {done.returncode} before its first result: "
+                    f"{done.stderr.strip()[-2000:] or 'it printed nothing'}"
                 )
             steps: Mapping[str, Any] = json.loads(done.stdout)
-            told.append({"start": "first" if k == 0 else f"again ({k})", **steps})
-    return told
+            starts.append({"start": "first" if k == 0 else f"again ({k})", **steps})
+    return starts

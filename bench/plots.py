@@ -1,4 +1,4 @@
-"""Pictures of a measurement (extra ``view``)."""
+"""Plots of a measurement (extra ``view``)."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from edgeperc import MissingExtraError
 from .document import pooled, scenario_names, stage_medians
 from .samples import percentile
 
-__all__ = ["require_matplotlib"]
+__all__ = ["BLUE", "as_svg", "pictures", "require_matplotlib"]
+
+BLUE = "#3b6ea8"
 
 
 def require_matplotlib() -> None:
-    """Raise `MissingExtraError` before anything is measured that could not be drawn."""
+    """Raise `MissingExtraError` before anything is measured that cannot be drawn."""
     try:
         import matplotlib  # noqa: F401
     except ImportError as exc:
@@ -40,15 +42,15 @@ def _picture(setting: Mapping[str, Any]) -> str:
     for row, name in zip(figure.subplots(max(len(names), 1), 3, squeeze=False), names, strict=False):
         histogram, bars, series = row
         ms = np.asarray(pooled(setting, name))
-        # The longest hiccup would squeeze everything else into one bar: it counts with the last.
+        # One outlier would squeeze everything else into one bar: outliers count in the last bar.
         most = 3.0 * float(np.median(ms))
         n_beyond = int(np.count_nonzero(ms > most))
-        histogram.hist(np.minimum(ms, most), bins=min(60, max(10, len(ms) // 10)), color="#3b6ea8")
+        histogram.hist(np.minimum(ms, most), bins=min(60, max(10, len(ms) // 10)), color=BLUE)
         histogram.axvline(percentile(ms, 50.0), color="#b3452c", linewidth=1.0)
         beyond = f" ({n_beyond:,} beyond {most:.0f})" if n_beyond else ""
         histogram.set(title=f"{name}: {len(ms):,} scans", xlabel=f"ms{beyond}", ylabel="scans", xlim=(0.0, None))
         medians = stage_medians(setting, name)
-        drawn = bars.barh(list(medians)[::-1], list(medians.values())[::-1], color="#3b6ea8")
+        drawn = bars.barh(list(medians)[::-1], list(medians.values())[::-1], color=BLUE)
         bars.bar_label(drawn, fmt="%.2f", padding=3, fontsize="small")
         bars.set(title="median of each stage", xlabel="ms")
         bars.margins(x=0.15)

@@ -15,13 +15,13 @@ from .samples import summary
 
 __all__ = ["QUANTILES", "LiveTable", "Section", "html_page", "markdown", "number", "share", "text"]
 
-WORDY = 24  # characters from which a column holds words, not numbers
+TEXT_WIDTH = 24  # a longer cell makes its column one of text, not of numbers
 QUANTILES = ("p50", "p90", "p99", "p99.9", "max")
 
 
 @dataclass(frozen=True)
 class Section:
-    """A piece of a report, however it is shown: sentences, then a table whose first row is its head."""
+    """A section of a report: sentences, then a table whose first row is its head."""
 
     title: str
     sentences: Sequence[str] = ()
@@ -29,7 +29,7 @@ class Section:
 
 
 def text(parts: Iterable[Section]) -> str:
-    """For a terminal."""
+    """Sections for a terminal."""
     lines: list[str] = []
     for part in parts:
         lines += ["", part.title, *(f"  {sentence}" for sentence in part.sentences)]
@@ -41,7 +41,7 @@ def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     if not rows:
         return []
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    right = [k > 0 and width <= WORDY for k, width in enumerate(widths)]
+    right = [k > 0 and width <= TEXT_WIDTH for k, width in enumerate(widths)]
     cells = [
         [
             cell.rjust(width) if to_right else cell.ljust(width)
@@ -53,7 +53,7 @@ def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def markdown(parts: Iterable[Section], title: str) -> str:
-    """For a repository."""
+    """Sections as Markdown."""
 
     def plain(cell: str) -> str:
         return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", cell)
@@ -72,12 +72,12 @@ def markdown(parts: Iterable[Section], title: str) -> str:
 STYLE = """body{font:15px/1.45 system-ui,sans-serif;max-width:72rem;margin:2rem auto;padding:0 1rem;color:#1c2430}
 h2{margin-top:2.2rem}table{border-collapse:collapse;font-variant-numeric:tabular-nums}
 td,th{padding:.2rem .7rem;border-bottom:1px solid #d8dee6;text-align:right}
-td:first-child,th:first-child,.words{text-align:left}
+td:first-child,th:first-child,.text{text-align:left}
 svg{max-width:100%;height:auto}"""
 
 
 def html_page(parts: Iterable[Section], title: str, pictures: Sequence[str] = ()) -> str:
-    """A page that needs nothing from elsewhere.
+    """Sections as a page that loads nothing.
 
     Parameters
     ----------
@@ -86,11 +86,11 @@ def html_page(parts: Iterable[Section], title: str, pictures: Sequence[str] = ()
     pictures : sequence of str
         ``<svg>`` elements; shown after the second section.
     """
-    say = html.escape
-    body = [f"<h1>{say(title)}</h1>"]
+    escape = html.escape
+    body = [f"<h1>{escape(title)}</h1>"]
     for k, part in enumerate(parts):
-        body.append(f"<h2>{say(part.title)}</h2>")
-        body += [f"<p>{say(sentence)}</p>" for sentence in part.sentences]
+        body.append(f"<h2>{escape(part.title)}</h2>")
+        body += [f"<p>{escape(sentence)}</p>" for sentence in part.sentences]
         if part.rows:
             rows = [
                 "<tr>" + "".join(_cell(tag, cell) for cell in row) + "</tr>"
@@ -99,17 +99,17 @@ def html_page(parts: Iterable[Section], title: str, pictures: Sequence[str] = ()
             body.append(f"<table>{''.join(rows)}</table>")
         if k == 1:
             body += [f"<figure>{picture}</figure>" for picture in pictures]
-    head = f'<meta charset="utf-8"/><title>{say(title)}</title><style>{STYLE}</style>'
+    head = f'<meta charset="utf-8"/><title>{escape(title)}</title><style>{STYLE}</style>'
     return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>\n' + "\n".join(body) + "\n</body></html>\n"
 
 
-def _cell(tag: str, words: str) -> str:
-    style = ' class="words"' if len(words) > WORDY else ""
-    return f"<{tag}{style}>{html.escape(words)}</{tag}>"
+def _cell(tag: str, text: str) -> str:
+    style = ' class="text"' if len(text) > TEXT_WIDTH else ""
+    return f"<{tag}{style}>{html.escape(text)}</{tag}>"
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """A number of a table; a dash for what is unknown or not supported by the samples."""
+    """A number of a table; a dash if it is unknown or the samples do not support it."""
     return "-" if value is None or math.isnan(value) else f"{value:,.{digits}f}"
 
 
@@ -120,7 +120,7 @@ def share(value: float | None) -> str:
 
 @dataclass
 class LiveTable:
-    """The samples so far, on a terminal; where there is none, a line whenever something is done."""
+    """The samples so far, redrawn on a terminal; elsewhere only the notes are printed."""
 
     stream: TextIO = field(default_factory=lambda: sys.stderr)
     ms: dict[str, list[float]] = field(default_factory=dict)
@@ -128,7 +128,7 @@ class LiveTable:
     _next_s: float = 0.0
 
     def __call__(self, name: str, ms: Sequence[float]) -> None:
-        """Take in the milliseconds of some calls of a scenario, and show it twice a second."""
+        """Add the milliseconds of some calls of a scenario, and draw the table twice a second."""
         self.ms.setdefault(name, []).extend(ms)
         now = time.perf_counter()
         if self.stream.isatty() and now >= self._next_s:
@@ -136,12 +136,12 @@ class LiveTable:
             self.clear()
             rows = [["scenario", "scans", *QUANTILES, "last"]]
             for each, values in self.ms.items():
-                told = summary(values)
+                figures = summary(values)
                 rows.append(
                     [
                         each,
                         f"{len(values):,}",
-                        *(number(told[q]) for q in QUANTILES),
+                        *(number(figures[q]) for q in QUANTILES),
                         number(values[-1] if values else None),
                     ]
                 )
@@ -150,14 +150,14 @@ class LiveTable:
             self.stream.flush()
             self._lines = len(lines)
 
-    def say(self, words: str) -> None:
-        """A line that stays."""
+    def note(self, line: str) -> None:
+        """Print a line that stays."""
         self.clear()
-        self.stream.write(f"edgeperc-bench: {words}\n")
+        self.stream.write(f"edgeperc-bench: {line}\n")
         self.stream.flush()
 
     def clear(self) -> None:
-        """Take the table away again."""
+        """Erase the table."""
         if self._lines:
             self.stream.write(f"\x1b[{self._lines}A\x1b[J")
             self.stream.flush()

@@ -1,10 +1,4 @@
-"""What was measured, as a document: JSON that holds every sample, and tables and pages made from it.
-
-The JSON (``schema`` 1) has ``kind`` (run, matrix, scaling, soak, peers), ``command``, ``complete``, ``machine``,
-``software``, ``input``, ``spoilers`` and, by kind, ``settings`` (a list: models, provider, threads, ``repeats`` with
-all samples, ``accuracy``, ``offline``, ``cold_start``, ``loadgen``), ``skipped``, ``recommended``, ``tables``, ``soak``
-or ``peers`` (by table, of each contender the samples of each round). All that is shown is computed from it.
-"""
+"""A document as sections of sentences and tables, for `render`."""
 
 from __future__ import annotations
 
@@ -12,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .document import latency, pooled, scenario_names, stage_medians
+from .document import latency, pooled, scenario_names, setting_label, stage_medians
 from .render import QUANTILES, Section, number, share
 from .samples import percentile
 
@@ -20,7 +14,7 @@ __all__ = ["sections"]
 
 
 def sections(document: Mapping[str, Any]) -> list[Section]:
-    """A document in words and tables."""
+    """Every section of a document, in the order of showing."""
     parts = [_reliability(document)]
     if document["kind"] == "matrix":
         parts.append(_matrix(document))
@@ -34,14 +28,14 @@ def sections(document: Mapping[str, Any]) -> list[Section]:
 
 
 def _reliability(document: Mapping[str, Any]) -> Section:
-    sentences = [] if document["complete"] else ["interrupted: what follows is what there was by then"]
-    sentences += [f"disturbed: {words}" for words in document["spoilers"]]
-    return Section("How far to trust this", sentences or ["nothing was seen that disturbs the measurement"])
+    sentences = [] if document["complete"] else ["interrupted: only what was measured before is shown"]
+    sentences += [f"disturbed: {each}" for each in document["disturbances"]]
+    return Section("Reliability", sentences or ["no disturbance was seen"])
 
 
 def _setting(setting: Mapping[str, Any]) -> list[Section]:
     names = scenario_names(setting)
-    told = {name: latency(setting, name) for name in names}
+    figures = {name: latency(setting, name) for name in names}
     parts: list[Section] = []
     if names:
         head = ["scenario", "scans", *QUANTILES, "noise", "CPU s/scan", "cores", "RSS MB"]
@@ -50,21 +44,23 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
                 *(name, f"{t['n']:,}", *(number(t[q]) for q in QUANTILES), share(t["noise"])),
                 *(number(t["cpu_s_per_scan"], 4), number(t["cores"]), number(t["rss_mb"], 0)),
             ]
-            for name, t in told.items()
+            for name, t in figures.items()
         ]
         n = len(setting["repeats"])
-        words = [
-            f"scan in, answer out, in ms; {n} repeat{'s' * (n != 1)}, each a fresh process; a dash where the samples "
-            "support no such percentile; noise: spread of the repeats' medians"
+        sentences = [
+            f"from scan to result in ms; {n} repeat{'s' * (n != 1)}, each in a fresh process; a dash: too few samples "
+            "for this percentile; noise: spread of the repeats' medians"
         ]
-        for name, t in told.items():
+        for name, t in figures.items():
             if t["energy_j_per_scan"]:
                 rails = ", ".join(f"{rail} {joules:.3f} J" for rail, joules in t["energy_j_per_scan"].items())
-                words.append(f"energy a scan, {name}, the whole package or board with all that ran on it: {rails}")
-        if all(not t["energy_j_per_scan"] for t in told.values()):
-            words.append("energy: this machine exposes no counter that can be read")
-        parts.append(Section("Latency", words, [head, *rows]))
-    paces = {name: t for name, t in told.items() if t["rate_hz"]}
+                sentences.append(
+                    f"energy of a scan, {name}, of the whole package or board with all that ran on it: {rails}"
+                )
+        if all(not t["energy_j_per_scan"] for t in figures.values()):
+            sentences.append("energy: this machine has no counter that can be read")
+        parts.append(Section("Latency", sentences, [head, *rows]))
+    paces = {name: t for name, t in figures.items() if t["rate_hz"]}
     if paces:
         head = ["scenario", *QUANTILES, "missed", "skipped", "start late, max"]
         rows = []
@@ -72,12 +68,12 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
             late = [age - ms for age, ms in zip(pooled(setting, name, "age_ms"), pooled(setting, name), strict=True)]
             counts = [f"{t['missed']:,}", f"{t['skipped']:,}", number(max(late, default=None))]
             rows.append([name, *(number(t["age"][q]) for q in QUANTILES), *counts])
-        words = [
-            "age of an answer when it is there, in ms since its scan arrived; missed: not there when the next scan "
-            "came; skipped: overtaken by a newer scan; between scans the process sleeps, on an absolute monotonic "
+        sentences = [
+            "age of a result when it is complete, in ms since its scan arrived; missed: not complete when the next "
+            "scan arrived; skipped: overtaken by a newer scan; between scans the process sleeps on an absolute "
             "schedule"
         ]
-        parts.append(Section("Paced", words, [head, *rows]))
+        parts.append(Section("Paced", sentences, [head, *rows]))
     if names:
         parts += [_stages(setting, names), _starts(setting)]
     if setting.get("offline"):
@@ -90,7 +86,11 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
             for o in setting["offline"]
         ]
         parts.append(
-            Section("Offline", ["several processes at once, back to back, while all of them run"], [head, *rows])
+            Section(
+                "Offline",
+                ["several processes at once, each back to back; counted while all of them run"],
+                [head, *rows],
+            )
         )
     if setting.get("cold_start"):
         steps = ("interpreter_s", "import_s", "read_s", "construct_s", "first_call_s", "total_s")
@@ -99,14 +99,14 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
             [each["start"], *(number(each[step], 3) for step in steps), number(each["peak_rss_mb"], 0)]
             for each in setting["cold_start"]
         ]
-        words = ["seconds from starting a process to its first answer; the first start finds no compiled kernels"]
-        parts.append(Section("Cold start", words, [head, *rows]))
+        sentences = ["seconds from starting a process to its first result; the first start finds no compiled kernels"]
+        parts.append(Section("Cold start", sentences, [head, *rows]))
     if setting.get("loadgen"):
-        told_by = setting["loadgen"]
-        quantiles = ", ".join(f"{key} {value:.2f} ms" for key, value in told_by.items() if key.startswith("p"))
-        parts.append(Section("MLPerf LoadGen, single stream", [f"result {told_by['result']}: {quantiles}"]))
+        summary = setting["loadgen"]
+        quantiles = ", ".join(f"{key} {value:.2f} ms" for key, value in summary.items() if key.startswith("p"))
+        parts.append(Section("MLPerf LoadGen, single stream", [f"result {summary['result']}: {quantiles}"]))
     if setting.get("accuracy"):
-        parts.append(Section("Accuracy of these answers", accuracy_sentences(setting["accuracy"])))
+        parts.append(Section("Accuracy of these results", accuracy_sentences(setting["accuracy"])))
     return parts
 
 
@@ -124,7 +124,7 @@ def _stages(setting: Mapping[str, Any], names: Sequence[str]) -> Section:
 
 def _starts(setting: Mapping[str, Any]) -> Section:
     rows = [
-        ["repeat", "construct s", "first call ms", "warm-up scans", "warm-up p50 ms", "peak RSS MB", "of it scans MB"]
+        ["repeat", "construct s", "first call ms", "warm-up scans", "warm-up p50 ms", "peak RSS MB", "thereof scans MB"]
     ]
     for k, repeat in enumerate(setting["repeats"], start=1):
         warm = [ms for each in repeat["scenarios"].values() for ms in each["warm_up_ms"]]
@@ -134,37 +134,37 @@ def _starts(setting: Mapping[str, Any]) -> Section:
                 *(number(percentile(warm, 50.0)), number(repeat["peak_rss_mb"], 0), number(repeat["scans_mb"], 0)),
             ]
         )
-    return Section("Before the samples", ["none of this is part of the figures above"], rows)
+    return Section("Start and warm-up", ["not part of the figures above"], rows)
 
 
 def accuracy_sentences(accuracy: Mapping[str, Any]) -> list[str]:
-    """Of one setting."""
-    told = accuracy["agreement"]
-    words = []
+    """How far the results of one setting are those of the reference, and of the ground truth."""
+    found = accuracy["agreement"]
+    parts = []
     for kind in ("points", "cells"):
-        if told[kind] is not None:
-            words.append(
-                f"{share(told[kind]['equal'])} of the {kind}' labels equal, mean IoU {share(told[kind]['mean_iou'])}"
+        if found[kind] is not None:
+            parts.append(
+                f"{share(found[kind]['equal'])} of the {kind}' labels equal, mean IoU {share(found[kind]['mean_iou'])}"
             )
-    if told["boxes"] is not None:
-        words.append(
-            "{n_both} boxes in common of {n_found} found and {n_reference} of the reference".format(**told["boxes"])
+    if found["boxes"] is not None:
+        parts.append(
+            "{n_both} common boxes of {n_found} found and {n_reference} of the reference".format(**found["boxes"])
         )
-    sentences = [f"against fp32 on the stock CPU provider, {told['n_scans']} scans: " + "; ".join(words)]
+    reference = "; ".join(accuracy["reference"])
+    sentences = [f"compared with {reference} on {found['n_scans']} scans: {'; '.join(parts)}"]
     if accuracy["truth"] is None:
-        return [*sentences, "no truth is known of these scans: edgeperc eval has figures on labelled ones"]
-    for name, kept in (("against the truth", "truth"), ("the reference against the truth", "reference_truth")):
+        return [*sentences, "these scans have no ground truth; edgeperc eval evaluates labelled scans"]
+    for name, kept in (("ground truth", "truth"), ("ground truth, reference", "reference_truth")):
         figures = [f"{key.replace('_', ' ')} {share(v)}" for key, v in accuracy[kept].items() if v is not None]
         sentences.append(f"{name}: " + ", ".join(figures))
-    return [*sentences, "a few scans check an engine; how good a model is, edgeperc eval tells"]
+    return [*sentences, "a few scans only check an engine; edgeperc eval evaluates a model"]
 
 
 def _matrix(document: Mapping[str, Any]) -> Section:
     rows = [
         [
             "model",
-            "provider",
-            "threads",
+            "ran as",
             "p50",
             "p90",
             "p99",
@@ -184,44 +184,44 @@ def _matrix(document: Mapping[str, Any]) -> Section:
             peaks = [repeat["peak_rss_mb"] or math.nan for repeat in setting["repeats"]]
             rows.append(
                 [
-                    *("+".join(setting["models"]), setting["provider"], str(setting["n_threads"] or "its choice")),
+                    *("+".join(setting["models"]), setting_label(setting)),
                     *(number(t["p50"]), number(t["p90"]), number(t["p99"]), share(t["noise"])),
                     *(number(t["cpu_s_per_scan"], 4), number(max(peaks), 0), share(min(equal, default=None))),
                     "yes" if accuracy["agrees"] else "no",
                 ]
             )
-    words = [f"skipped: {each}" for each in document["skipped"]]
-    words += [f"recommended for {each['name']}: {each['words']}" for each in document["recommended"]]
-    return Section("Settings, back to back, ms", words, rows if len(rows) > 1 else [])
+    sentences = [f"skipped: {each}" for each in document["skipped"]]
+    sentences += [f"recommended for {each['name']}: {each['text']}" for each in document["recommended"]]
+    return Section("Settings, back to back, ms", sentences, rows if len(rows) > 1 else [])
 
 
 def _context(document: Mapping[str, Any]) -> list[Section]:
     rows = [["what", "how"]]
     engines = {
-        (e["name"], e["sha256"], e["provider"], str(e["options"])): e
+        (e["sha256"], e["precision"], e["provider"], str(e["options"])): e
         for setting in document.get("settings", ())
         for repeat in setting["repeats"]
         for e in repeat["engines"]
     }
     for e in engines.values():
         options = ", ".join(f"{key} {value}" for key, value in e["options"].items())
-        how = f"{e['provider']}, {options}, SHA-256 {e['sha256']}"
-        rows.append([f"{e['name']} {e['version']}", how])
+        how = f"{e['precision']}, {e['provider']}, {options}, SHA-256 {e['sha256']}"
+        rows.append([f"{e['name']}:{e['variant']} {e['version']}", how])
     rows += (
         [["input", f"{document['input']['source']}; sensor {document['input']['sensor']}"]] if document["input"] else []
     )
     if document["input"]:
         points = document["input"]["n_points"]
-        rows.append(["points a scan", f"{min(points):,} to {max(points):,}"])
+        rows.append(["points per scan", f"{min(points):,} to {max(points):,}"])
         rows.append(["input SHA-256", document["input"]["sha256"]])
     for group in ("machine", "software"):
-        rows += [[key.replace("_", " "), _told(value)] for key, value in document[group].items()]
+        rows += [[key.replace("_", " "), _shown(value)] for key, value in document[group].items()]
     rows.append(["command", document["command"]])
-    heard = [words for setting in document.get("settings", ()) for r in setting["repeats"] for words in r["warnings"]]
+    heard = [text for setting in document.get("settings", ()) for r in setting["repeats"] for text in r["warnings"]]
     return [Section("Context", list(dict.fromkeys(heard)), rows)]
 
 
-def _told(value: Any) -> str:
+def _shown(value: Any) -> str:
     if value is None:
         return "not exposed"
     if isinstance(value, dict):

@@ -1,10 +1,10 @@
-"""What samples can tell: percentiles they support, run-to-run noise, a verdict on two runs, a trend with its error.
+"""Statistics of samples: percentiles they support, run-to-run noise, a verdict on two runs, a trend with its error.
 
-A percentile is the smallest sample that at least so many per cent do not exceed (nearest rank): a time that was really
-measured. It is told only where at least ten samples are expected above it, n >= 10 / (1 - p): 20 for the median, 100
-for p90, 1,000 for p99, 10,000 for p99.9. How many samples lie above a percentile is binomial, so ten of them place it
-in the tail to within a third (1 / sqrt(10)); with one or two a single hiccup decides. MLPerf's early stopping asks for
-64, 662 and 6,636 queries for p90, p99 and p99.9.
+A percentile is the smallest sample that at least so many per cent do not exceed (nearest rank), so it is a time that
+was measured. It is shown only if at least ten samples are expected above it, n >= 10 / (1 - p): 20 for the median, 100
+for p90, 1,000 for p99, 10,000 for p99.9. The number of samples above a percentile is binomial: ten of them fix the
+share of the tail to within a third (1 / sqrt(10)); with one or two, a single outlier decides. MLPerf's early stopping
+asks for 64, 662 and 6,636 queries for p90, p99 and p99.9.
 """
 
 from __future__ import annotations
@@ -25,34 +25,34 @@ N_RESAMPLES = 2000
 
 
 def percentile(values: ArrayLike, p: float) -> float:
-    """The smallest value that at least ``p`` per cent do not exceed; NaN of nothing."""
+    """The smallest value that at least ``p`` per cent do not exceed; NaN without values."""
     ordered = np.sort(np.asarray(values, np.float64))
-    # Rounded, as 99.9 / 100 * 10,000 comes out a hair above 9,990.
+    # Rounded, because 99.9 / 100 * 10,000 comes out slightly above 9,990.
     return float(ordered[max(math.ceil(round(p * len(ordered) / 100.0, 9)), 1) - 1]) if len(ordered) else math.nan
 
 
 def supported(p: float, n: int) -> bool:
-    """Whether ``n`` samples say anything about percentile ``p``."""
+    """Whether ``n`` samples are enough for percentile ``p``."""
     return n * (100.0 - p) >= 100.0 * SAMPLES_ABOVE - 1e-6
 
 
 def summary(values: ArrayLike) -> dict[str, float | int | None]:
     """``n``, ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max``; None for what the samples do not support."""
     array = np.asarray(values, np.float64)
-    told: dict[str, float | int | None] = {"n": len(array)}
-    told |= {f"p{p:g}": percentile(array, p) if supported(p, len(array)) else None for p in PERCENTILES}
-    return told | {"max": float(array.max()) if len(array) else None}
+    found: dict[str, float | int | None] = {"n": len(array)}
+    found |= {f"p{p:g}": percentile(array, p) if supported(p, len(array)) else None for p in PERCENTILES}
+    return found | {"max": float(array.max()) if len(array) else None}
 
 
 def noise_floor(repeats: Sequence[ArrayLike]) -> float | None:
-    """Largest difference between the medians of repeated runs, as a share of their median; None of fewer than two."""
+    """Largest difference between the medians of repeated runs, as a share of their median; None for fewer than two."""
     medians = [percentile(repeat, 50.0) for repeat in repeats if np.size(repeat)]
     return (max(medians) - min(medians)) / float(np.median(medians)) if len(medians) > 1 else None
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How a run B did against a run A.
+    """Result of comparing a run B with a run A.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Verdict:
     interval : tuple of 2 float
         95 % bootstrap interval of the ratio.
     noise : float
-        The larger of both runs' `noise_floor`; NaN where a run was not repeated.
+        The larger `noise_floor` of the two runs; NaN if a run was not repeated.
     """
 
     word: str
@@ -72,24 +72,24 @@ class Verdict:
 
 
 def compare(a: Sequence[ArrayLike], b: Sequence[ArrayLike], seed: int = 0) -> Verdict:
-    """Hold the repeats of run B against those of run A.
+    """Compare the repeats of run B with those of run A.
 
-    There is a difference where the interval of the ratio leaves out 1 *and* the medians are farther apart than those of
-    either run's own repeats. The bootstrap draws repeats, and of each repeat medians of stretches of consecutive
-    samples, for neighbours in time resemble one another. With three repeats it alone would be too sure of itself; hence
-    the second condition.
+    The runs differ if the interval of the ratio excludes 1 *and* their medians are farther apart than those of either
+    run's own repeats. The bootstrap draws repeats, and from each repeat medians of blocks of consecutive samples,
+    because neighbors in time are correlated. With three repeats the bootstrap alone is overconfident; hence the second
+    condition.
 
     Parameters
     ----------
     a, b : sequence of array_like
         Milliseconds of each repeat, in the order of measuring.
     seed : int
-        Of the bootstrap.
+        Seed of the bootstrap.
 
     Returns
     -------
     Verdict
-        ``"unusable"`` where a run has fewer than two repeats: nothing is known of its noise then.
+        ``"unusable"`` if a run has fewer than two repeats, because its noise is unknown.
     """
     noises = [noise_floor(a), noise_floor(b)]
     if None in noises:
@@ -109,7 +109,7 @@ def _middle(repeats: Sequence[ArrayLike]) -> float:
 
 
 def _resampled(repeats: Sequence[ArrayLike], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Medians of repeats drawn anew, (N_RESAMPLES,)."""
+    """Bootstrap medians, (N_RESAMPLES,)."""
     arrays = [np.asarray(repeat, np.float64) for repeat in repeats if np.size(repeat)]
     n_blocks = min(N_BLOCKS, *map(len, arrays))
     blocks = np.array([[np.median(block) for block in np.array_split(array, n_blocks)] for array in arrays])
@@ -130,7 +130,7 @@ class Trend:
         Half of the slope's 95 % interval.
     intercept : float
     r2 : float
-        Share of the variance that the line explains; NaN where there is none.
+        Share of the variance that the line explains; NaN if the variance is 0.
     """
 
     slope: float
@@ -140,18 +140,18 @@ class Trend:
 
 
 def trend(x: ArrayLike, y: ArrayLike) -> Trend:
-    """Least squares, its uncertainty widened where residuals resemble their neighbours.
+    """Least squares, with an interval that accounts for correlated residuals.
 
-    Neighbouring samples of, say, memory are no independent ones: with a lag-1 correlation r of the residuals, n of them
-    count as n (1 - r) / (1 + r). NaN throughout for fewer than three samples.
+    Consecutive samples of memory are not independent: with a lag-1 correlation r of the residuals, n samples count as
+    n (1 - r) / (1 + r). All NaN for fewer than three samples.
     """
     t, values = np.asarray(x, np.float64), np.asarray(y, np.float64)
     if len(t) < 3 or np.ptp(t) == 0.0:
         return Trend(math.nan, math.nan, math.nan, math.nan)
-    centred = t - t.mean()
-    spread, variance = float(centred @ centred), float(np.sum((values - values.mean()) ** 2))
-    slope = float(centred @ values) / spread
-    left = values - values.mean() - slope * centred
+    centered = t - t.mean()
+    spread, variance = float(centered @ centered), float(np.sum((values - values.mean()) ** 2))
+    slope = float(centered @ values) / spread
+    left = values - values.mean() - slope * centered
     squares = float(left @ left)
     alike = min(max(float(left[1:] @ left[:-1]) / squares, 0.0), 0.99) if squares > 0.0 else 0.0
     free = max(len(t) * (1.0 - alike) / (1.0 + alike) - 2.0, 1.0)

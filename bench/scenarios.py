@@ -1,6 +1,6 @@
 """How scans arrive: back to back, or paced at a sensor's rate. A scenario knows no models, processes or reports.
 
-It is given a callable, scans, and a clock, and goes on until it has both the least number of scans and the least time.
+It takes a callable, scans and a clock, and ends when it has both the least number of scans and the least time.
 """
 
 from __future__ import annotations
@@ -14,36 +14,36 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Clock", "KeepGoing", "Limits", "Perceive", "Samples", "back_to_back", "paced", "throughput"]
+__all__ = ["Clock", "KeepGoing", "Limits", "Perceive", "Timings", "back_to_back", "paced", "throughput"]
 
 Perceive = Callable[[NDArray[np.float32]], Any]
 
 
 class Clock:
-    """The computer's monotonic clock; tests have one of their own."""
+    """The computer's monotonic clock; tests replace it."""
 
     def now(self) -> float:
-        """Seconds since some moment, the same for all processes of this computer."""
+        """Seconds since a moment that is the same for all processes of this computer."""
         return time.perf_counter()
 
     def sleep_until(self, due_s: float) -> None:
-        """Sleep, so that cores may idle, until a moment on this clock."""
+        """Sleep until a moment on this clock, so that cores can idle."""
         if (left := due_s - self.now()) > 0.0:
             time.sleep(left)
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How long a scenario goes on: until all are reached.
+    """How long a scenario lasts: until all are reached.
 
     Attributes
     ----------
     min_scans : int
     min_seconds : float
     warm_up_scans : int
-        Scans before those that count, in the same manner; kept apart.
+        Scans before those that count; kept apart.
     stride : int
-        Of so many scans one leaves a sample: in a long run samples would be the memory that grows.
+        One of so many scans leaves a sample; in a long run the samples would be the memory that grows.
     """
 
     min_scans: int = 100
@@ -53,31 +53,31 @@ class Limits:
 
 
 @dataclass
-class Samples:
-    """What one scenario measured, a number a scan, in order.
+class Timings:
+    """Measurements of one scenario, one number per scan, in order.
 
     Attributes
     ----------
     n : int
-        Scans perceived, not counting warm-up.
+        Scans perceived, without the warm-up.
     stride : int
-        Of so many, the first has a sample.
+        One of so many scans has a sample.
     first_s : float
-        When the first scan that counts was due, on the clock.
+        When the first scan that counts arrived, on the clock.
     start_s : list of float
-        When each call began, since then [s].
+        Start of each call since then [s].
     ms : list of float
-        Wall time of each call: scan in, answer out.
+        Wall time of each call, from scan to result.
     age_ms : list of float
-        Of each answer when it was there, since its scan arrived; as ``ms`` where scans do not arrive by the clock.
+        From the arrival of each scan to its result; as ``ms`` if scans do not arrive by the clock.
     stage_ms : dict of str to list of float
-        As the perceptions have it.
+        As `edgeperc.Perception.stage_ms`.
     warm_up_ms : list of float
-        Of the calls before.
+        Wall time of the calls before those that count.
     missed : int
-        Answers that were not there when the next scan arrived.
+        Results that were not complete when the next scan arrived.
     skipped : int
-        Scans that a newer one had overtaken when their turn came; they have no sample.
+        Scans left out because a newer one had arrived before their turn; they have no sample.
     """
 
     n: int = 0
@@ -92,7 +92,7 @@ class Samples:
     skipped: int = 0
 
     def add(self, start_s: float, ms: float, age_ms: float, stage_ms: Mapping[str, float]) -> None:
-        """Take down one call."""
+        """Record one call."""
         self.n += 1
         if (self.n - 1) % self.stride:
             return
@@ -104,22 +104,22 @@ class Samples:
 
 
 class KeepGoing(Protocol):
-    """Told after every scan, warm-up included; False ends the scenario, and what was measured stays."""
+    """Called after every scan, with warm-up; False ends the scenario, whose measurements stay."""
 
-    def __call__(self, samples: Samples) -> bool: ...
+    def __call__(self, timings: Timings) -> bool: ...
 
 
 def _warm_up(
     perceive: Perceive, scans: Sequence[NDArray[np.float32]], limits: Limits, clock: Clock, keep_going: KeepGoing
-) -> Samples:
-    samples = Samples(stride=limits.stride)
+) -> Timings:
+    timings = Timings(stride=limits.stride)
     for k in range(limits.warm_up_scans):
         began = clock.now()
         perceive(scans[k % len(scans)])
-        samples.warm_up_ms.append(1e3 * (clock.now() - began))
-        if not keep_going(samples):
+        timings.warm_up_ms.append(1e3 * (clock.now() - began))
+        if not keep_going(timings):
             break
-    return samples
+    return timings
 
 
 def back_to_back(
@@ -128,33 +128,33 @@ def back_to_back(
     limits: Limits,
     *,
     clock: Clock | None = None,
-    keep_going: KeepGoing = lambda samples: True,
+    keep_going: KeepGoing = lambda timings: True,
     on_start: Callable[[], None] = lambda: None,
-) -> Samples:
-    """Perceive one scan after the other, the next as soon as an answer is there (MLPerf's single stream).
+) -> Timings:
+    """Perceive one scan after the other, the next as soon as there is a result (MLPerf's single stream).
 
     Parameters
     ----------
     perceive : callable
     scans : sequence of (n, 4) float32
-        Taken in turn.
+        Used in turn.
     limits : Limits
     clock : Clock, optional
     keep_going : callable
     on_start : callable
-        Told between the warm-up and the first scan that counts.
+        Called between the warm-up and the first scan that counts.
     """
     clock = clock or Clock()
-    samples = _warm_up(perceive, scans, limits, clock, keep_going)
+    timings = _warm_up(perceive, scans, limits, clock, keep_going)
     on_start()
-    first = samples.first_s = clock.now()
-    while keep_going(samples) and (samples.n < limits.min_scans or clock.now() - first < limits.min_seconds):
-        scan = scans[samples.n % len(scans)]
+    first = timings.first_s = clock.now()
+    while keep_going(timings) and (timings.n < limits.min_scans or clock.now() - first < limits.min_seconds):
+        scan = scans[timings.n % len(scans)]
         began = clock.now()
         found = perceive(scan)
         took_ms = 1e3 * (clock.now() - began)
-        samples.add(began - first, took_ms, took_ms, found.stage_ms)
-    return samples
+        timings.add(began - first, took_ms, took_ms, found.stage_ms)
+    return timings
 
 
 def paced(
@@ -164,14 +164,14 @@ def paced(
     limits: Limits,
     *,
     clock: Clock | None = None,
-    keep_going: KeepGoing = lambda samples: True,
+    keep_going: KeepGoing = lambda timings: True,
     on_start: Callable[[], None] = lambda: None,
-) -> Samples:
-    """Perceive scans as they arrive, ``rate_hz`` a second.
+) -> Timings:
+    """Perceive scans as they arrive, ``rate_hz`` per second.
 
-    Scan k arrives at the first one's time plus k / rate on the monotonic clock, whatever happened before: nothing
-    drifts. Until then the thread sleeps, so that cores idle and clocks fall as they do in a vehicle. When an answer
-    comes late, the newest scan that has arrived is taken and those before it are skipped.
+    Scan k arrives at the first one's time plus k / rate on the monotonic clock, so the schedule does not drift. Until
+    then the thread sleeps, so that cores idle and clocks fall as they do in a vehicle. After a late result, the newest
+    scan that has arrived is next and those before it are skipped.
 
     Parameters
     ----------
@@ -180,28 +180,28 @@ def paced(
         As in `back_to_back`. Warm-up is back to back.
     """
     clock = clock or Clock()
-    samples = _warm_up(perceive, scans, limits, clock, keep_going)
+    timings = _warm_up(perceive, scans, limits, clock, keep_going)
     on_start()
-    first = samples.first_s = clock.now()
+    first = timings.first_s = clock.now()
     k = 0
-    while keep_going(samples) and (samples.n < limits.min_scans or clock.now() - first < limits.min_seconds):
+    while keep_going(timings) and (timings.n < limits.min_scans or clock.now() - first < limits.min_seconds):
         newest = math.floor((clock.now() - first) * rate_hz + 1e-9)
         if newest > k:
-            samples.skipped += newest - k
+            timings.skipped += newest - k
             k = newest
         scan, due = scans[k % len(scans)], first + k / rate_hz
         clock.sleep_until(due)
         began = clock.now()
         found = perceive(scan)
         done = clock.now()
-        samples.missed += done > due + 1.0 / rate_hz
-        samples.add(began - first, 1e3 * (done - began), 1e3 * (done - due), found.stage_ms)
+        timings.missed += done > due + 1.0 / rate_hz
+        timings.add(began - first, 1e3 * (done - began), 1e3 * (done - due), found.stage_ms)
         k += 1
-    return samples
+    return timings
 
 
 def throughput(calls: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[float, float]:
-    """Scans a second of several processes together, while all of them were at work.
+    """Scans per second of several processes together, while all of them were at work.
 
     Parameters
     ----------
@@ -211,9 +211,9 @@ def throughput(calls: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tupl
     Returns
     -------
     scans_per_s : float
-        NaN where there was no such time.
+        NaN if there was no such time.
     seconds : float
-        How long that was.
+        Length of that time.
     """
     ends = [np.asarray(start) + np.asarray(ms) / 1e3 for start, ms in calls]
     if not ends or not all(map(len, ends)):
@@ -223,7 +223,7 @@ def throughput(calls: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tupl
         return math.nan, 0.0
     n = 0.0
     for (start, _), finish in zip(calls, ends, strict=True):
-        # A call that sticks out of the window counts with the share that lies within.
+        # A call that is partly outside the window counts with its share inside.
         shares = (np.minimum(finish, end) - np.maximum(start, begin)) / (finish - np.asarray(start))
         n += float(np.clip(shares, 0.0, 1.0).sum())
     return n / (end - begin), end - begin

@@ -1,4 +1,7 @@
-"""A process that starts, perceives one scan and says how long it took: ``python -m edgeperc_bench.start JSON``."""
+"""A process that starts, perceives one scan and prints how long each step took.
+
+Run as ``python -m edgeperc_bench.start JSON``.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ __all__ = ["main"]
 
 
 def main() -> None:
-    """Print one line of JSON; the argument has ``spawned_s`` (the parent's clock), ``scan`` and a Perceiver's own."""
+    """Print one line of JSON; the argument has ``spawned_s`` (the parent's clock), ``scan`` and Perceiver's options."""
     request = json.loads(sys.argv[1])
     stamps_s = [request.pop("spawned_s"), BEGAN_S]
     from edgeperc import Perceiver, read_points

@@ -1,8 +1,7 @@
 """Fresh processes that measure, and the parent's side of them.
 
-Every repeat is a process of its own (spawned, never forked), so that repeats differ by what processes differ by: where
-memory lies, which cores threads land on. What a process has resident is the Perceiver, the scans, and nothing of its
-parent.
+Every repeat is a process of its own (spawned, never forked), so that the noise includes what differs between processes:
+the place of memory, the cores of the threads. A process holds a Perceiver and the scans, and nothing of its parent.
 """
 
 from __future__ import annotations
@@ -27,13 +26,22 @@ from edgeperc import EdgepercError, Perceiver
 
 from .context import EnergyMeter, conditions, peak_rss_mb, rss_mb
 from .loadgen import single_stream
-from .scenarios import Limits, Perceive, Samples, back_to_back, paced
+from .scenarios import Limits, Perceive, Timings, back_to_back, paced
 
-__all__ = ["MEMORY_SAMPLES", "Answer", "Job", "OnTick", "Scenario", "WorkerError", "measure"]
+__all__ = [
+    "MEMORY_SAMPLES",
+    "Job",
+    "OnTick",
+    "Prediction",
+    "Scenario",
+    "WorkerError",
+    "measure",
+    "perceiver_arguments",
+]
 
 TICK_S = 0.25
 MEMORY_SAMPLES = 500  # at most, in a scenario: a longer list would itself be growth
-# What a process may take to end its scan and answer after it was asked to stop.
+# Time for a process to end its scan and send its results after it was asked to stop.
 STOP_S = 30.0
 
 
@@ -49,7 +57,7 @@ class Scenario:
     ----------
     name : str
     scans : tuple of Path
-        .npy files, (n, 4) float32 each, in the sensor's raw unit of remission.
+        .npy files, (n, 4) float32 each, with remission in the sensor's raw unit.
     limits : Limits
     rate_hz : float or None
         None for back to back.
@@ -63,33 +71,34 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Job:
-    """What a process is to do.
+    """The work of one process.
 
     Attributes
     ----------
     models : tuple of str
-    provider, n_threads, sensor
-        As `Perceiver` has them.
+    provider, precision, n_threads, sensor
+        As in `Perceiver`.
     scenarios : tuple of Scenario
         One after the other.
-    answers : tuple of Path
-        Scans whose answers are wanted after everything else.
+    predict : tuple of Path
+        Scans whose predictions are returned; perceived after everything else.
     loadgen : Path or None
-        Where MLPerf LoadGen's logs go; it then drives the first scenario in place of `back_to_back`.
+        Folder for MLPerf LoadGen's logs; if given, LoadGen drives the scenarios in place of `back_to_back`.
     """
 
     models: tuple[str, ...]
     provider: str = "auto"
+    precision: str = "auto"
     n_threads: int | None = None
     sensor: str = "hdl-64e"
     scenarios: tuple[Scenario, ...] = ()
-    answers: tuple[Path, ...] = ()
+    predict: tuple[Path, ...] = ()
     loadgen: Path | None = None
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What of a perception is held against another's."""
+class Prediction:
+    """The parts of a perception that are compared with another's."""
 
     points: edgeperc.PointLabels | None
     top_view: edgeperc.TopView | None
@@ -99,21 +108,32 @@ class Answer:
 OnTick = Callable[[str, Sequence[float]], None]
 
 
+def perceiver_arguments(job: Job) -> dict[str, Any]:
+    """The arguments of the Perceiver that a job asks for, which are JSON."""
+    return {
+        "models": list(job.models),
+        "sensor": job.sensor,
+        "provider": job.provider,
+        "precision": job.precision,
+        "n_threads": job.n_threads,
+    }
+
+
 def make_perceiver(job: Job) -> Perceiver:
-    """The Perceiver that a job asks for; every fault of the request is an `EdgepercError`."""
-    return Perceiver(list(job.models), sensor=job.sensor, provider=job.provider, n_threads=job.n_threads)
+    """The Perceiver that a job asks for."""
+    return Perceiver(**perceiver_arguments(job))
 
 
 def serve(connection: Any, job: Job) -> None:
-    """What the process does: gets ready, waits for the word, measures, and sends what it has."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and asks for what there is
+    """Main function of a measuring process: get ready, wait for the start, measure, and send the results."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and asks for the results so far
     try:
         try:
             connection.send(("done", _work(connection, job)))
         except EdgepercError as exc:
             connection.send(("failed", (type(exc).__name__, str(exc))))
     except (BrokenPipeError, ConnectionResetError, EOFError):
-        return  # the parent is gone
+        return  # the parent has ended
 
 
 def _work(connection: Any, job: Job) -> dict[str, Any]:
@@ -122,12 +142,12 @@ def _work(connection: Any, job: Job) -> dict[str, Any]:
         began = time.perf_counter()
         perceive = make_perceiver(job)
         result: dict[str, Any] = {"construct_s": time.perf_counter() - began, "first_call_ms": None}
-        scans = {path: np.load(path) for path in dict.fromkeys((*_paths(job), *job.answers))}
+        scans = {path: np.load(path) for path in dict.fromkeys((*_paths(job), *job.predict))}
         if scans:
             began = time.perf_counter()
             perceive(next(iter(scans.values())))
             result["first_call_ms"] = 1e3 * (time.perf_counter() - began)
-        result |= {"engines": _engines(perceive), "scenarios": {}, "interrupted": False, "answers": []}
+        result |= {"engines": _engines(perceive), "scenarios": {}, "interrupted": False, "predictions": []}
         result["scans_mb"] = sum(scan.nbytes for scan in scans.values()) / 1e6
         connection.send(("ready", None))
         stopped = connection.recv() == "stop"
@@ -137,15 +157,15 @@ def _work(connection: Any, job: Job) -> dict[str, Any]:
             watch = _Watch(connection, scenario)
             own = [scans[path] for path in scenario.scans]
             if job.loadgen is not None:
-                run: Callable[..., Samples] = partial(single_stream, folder=job.loadgen)
+                run: Callable[..., Timings] = partial(single_stream, folder=job.loadgen)
             else:
                 run = back_to_back if scenario.rate_hz is None else partial(paced, rate_hz=scenario.rate_hz)
-            samples = run(perceive, own, limits=scenario.limits, keep_going=watch, on_start=watch.start)
-            result["scenarios"][scenario.name] = watch.told(samples)
+            timings = run(perceive, own, limits=scenario.limits, keep_going=watch, on_start=watch.start)
+            result["scenarios"][scenario.name] = watch.record(timings)
             stopped = watch.stopped
         result |= {"interrupted": stopped, "rss_mb": rss_mb(), "peak_rss_mb": peak_rss_mb()}
         if not stopped:
-            result["answers"] = [_answer(perceive, scans[path]) for path in job.answers]
+            result["predictions"] = [_predict(perceive, scans[path]) for path in job.predict]
     result["warnings"] = list(dict.fromkeys(str(each.message) for each in caught))
     return result
 
@@ -155,64 +175,68 @@ def _paths(job: Job) -> Iterator[Path]:
         yield from scenario.scans
 
 
-def _answer(perceive: Perceive, scan: NDArray[np.float32]) -> Answer:
+def _predict(perceive: Perceive, scan: NDArray[np.float32]) -> Prediction:
     found = perceive(scan)
-    return Answer(found.points, found.top_view, found.boxes)
+    return Prediction(found.points, found.top_view, found.boxes)
 
 
 def _engines(perceive: Perceiver) -> list[dict[str, Any]]:
-    """What really runs, by network."""
-    told = []
-    for session in perceive.sessions:
-        told.append(
-            {
-                "name": session.card.name,
-                "version": session.card.version,
-                "sha256": session.sha256,
-                "provider": session.provider,
-                "options": session.options,
-                "golden_deviation": None if np.isnan(session.golden_deviation) else session.golden_deviation,
-            }
-        )
-    return told
+    """What really runs, one record per network."""
+    return [
+        {
+            "name": session.card.name,
+            "variant": session.card.precision,
+            "version": session.card.version,
+            "sha256": session.sha256,
+            "digest": session.digest,
+            "provider": session.provider,
+            "precision": session.precision,
+            "description": session.description,
+            "options": session.options,
+            "golden_deviation": None if np.isnan(session.golden_deviation) else session.golden_deviation,
+        }
+        for session in perceive.sessions
+    ]
 
 
 class _Watch:
-    """Looks up from measuring a few times a second: tells the parent, and asks whether to stop. Never within a call."""
+    """Between calls, a few times a second: reports to the parent, and asks whether to stop."""
 
     def __init__(self, connection: Any, scenario: Scenario) -> None:
         self.connection, self.scenario, self.stopped = connection, scenario, False
         self.rss: list[tuple[int, float]] = []
-        self._told = 0
+        self._n_sent = 0
         self._next_s = time.perf_counter() + TICK_S
         self.start()
 
     def start(self) -> None:
+        """Begin with the first scan that counts."""
         self.rss.clear()
         self.energy = EnergyMeter()
         self.before = conditions()
         self._wall_s, self._cpu_s = time.perf_counter(), time.process_time()
 
-    def __call__(self, samples: Samples) -> bool:
+    def __call__(self, timings: Timings) -> bool:
         now = time.perf_counter()
         if now >= self._next_s:
             self._next_s = now + TICK_S
             self.energy.tick()
-            if not self.rss or samples.n >= self.rss[-1][0] + self.scenario.limits.min_scans / MEMORY_SAMPLES:
-                self.rss.append((samples.n, round(rss_mb(), 3)))
-            self.connection.send(("tick", (self.scenario.name, samples.ms[self._told :])))
-            self._told = len(samples.ms)
+            if not self.rss or timings.n >= self.rss[-1][0] + self.scenario.limits.min_scans / MEMORY_SAMPLES:
+                self.rss.append((timings.n, round(rss_mb(), 3)))
+            self.connection.send(("tick", (self.scenario.name, timings.ms[self._n_sent :])))
+            self._n_sent = len(timings.ms)
             self.stopped = self.stopped or (self.connection.poll() and self.connection.recv() == "stop")
         return not self.stopped
 
-    def told(self, samples: Samples) -> dict[str, Any]:
+    def record(self, timings: Timings) -> dict[str, Any]:
+        """The record of the scenario."""
         cpu_s, wall_s = time.process_time() - self._cpu_s, time.perf_counter() - self._wall_s
         self.energy.tick()
-        self.rss.append((samples.n, round(rss_mb(), 3)))
+        self.rss.append((timings.n, round(rss_mb(), 3)))
         return {
             "rate_hz": self.scenario.rate_hz,
             "limits": asdict(self.scenario.limits),
-            **_rounded(asdict(samples)),
+            **_rounded(asdict(timings)),
             "wall_s": wall_s,
             "cpu_s": cpu_s,
             "rss_mb": [list(each) for each in self.rss],
@@ -232,7 +256,7 @@ def _rounded(value: Any) -> Any:
 
 
 class _Interrupts:
-    """The first Ctrl-C is a request, the second one an exception: no message is cut in two by it."""
+    """Ctrl-C: the first sets ``asked``, the second raises, so that the first does not cut a message in two."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -254,27 +278,27 @@ def _interrupts() -> Iterator[_Interrupts]:
 
 
 def measure(jobs: Sequence[Job], on_tick: OnTick = lambda name, ms: None) -> list[dict[str, Any]]:
-    """Do several jobs at once, each in a fresh process; all begin when all are ready.
+    """Do several jobs at once, each in a fresh process; all start when all are ready.
 
-    Ctrl-C asks the processes for what they have, which is returned with ``"interrupted"`` set; a second one ends them.
-    To be called from the main thread.
+    Ctrl-C asks the processes for their results so far, which are returned with ``"interrupted"`` set; a second one ends
+    them. Call this from the main thread.
 
     Parameters
     ----------
     jobs : sequence of Job
     on_tick : callable
-        Told the name of a scenario and the milliseconds of calls since it was told last.
+        Called with the name of a scenario and the milliseconds of its calls since the last time.
 
     Returns
     -------
     list of dict
-        Of each job: ``engines``, ``construct_s``, ``first_call_ms``, ``scenarios``, ``rss_mb``, ``peak_rss_mb``,
-        ``answers`` and so on.
+        By job: ``engines``, ``construct_s``, ``first_call_ms``, ``scenarios``, ``rss_mb``, ``peak_rss_mb``,
+        ``predictions`` and so on.
 
     Raises
     ------
     EdgepercError
-        Whatever a process raised, or `WorkerError` where it died.
+        Raised in a process; `WorkerError` if a process died.
     """
     spawn = multiprocessing.get_context("spawn")
     workers = []
@@ -289,9 +313,10 @@ def measure(jobs: Sequence[Job], on_tick: OnTick = lambda name, ms: None) -> lis
                 workers.append((process, here))
             n_ready, stop_by_s = 0, 0.0
             while len(results) < len(jobs):
-                pending = {here: k for k, (_, here) in enumerate(workers) if k not in results}
-                for here in wait(list(pending), timeout=TICK_S):
-                    kind, content = _receive(here, workers[pending[here]][0])
+                pending: dict[Any, int] = {here: k for k, (_, here) in enumerate(workers) if k not in results}
+                for ready in wait(list(pending), timeout=TICK_S):
+                    k = pending[ready]
+                    kind, content = _receive(workers[k][1], workers[k][0])
                     if kind == "ready":
                         n_ready += 1
                         if n_ready == len(jobs):
@@ -300,11 +325,11 @@ def measure(jobs: Sequence[Job], on_tick: OnTick = lambda name, ms: None) -> lis
                     elif kind == "tick":
                         on_tick(*content)
                     else:
-                        results[pending[here]] = content
+                        results[k] = content
                 if interrupts.asked and not stop_by_s:
                     stop_by_s = time.perf_counter() + STOP_S
                     for each in pending:
-                        with suppress(OSError):  # it has just ended
+                        with suppress(OSError):  # the process has just ended
                             each.send("stop")
                 if stop_by_s and time.perf_counter() > stop_by_s:
                     raise KeyboardInterrupt
@@ -325,8 +350,8 @@ def _receive(connection: Any, process: Any) -> tuple[str, Any]:
     except EOFError as exc:
         process.join()
         raise WorkerError(
-            f"a measuring process ended with exit code {process.exitcode} before it had an answer; look at its last "
-            "words above, or whether memory ran out"
+            f"a measuring process ended with exit code {process.exitcode} before it had a result; see its "
+            "messages above, and check whether memory ran out"
         ) from exc
     if kind == "failed":
         name, message = content

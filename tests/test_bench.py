@@ -1,16 +1,18 @@
-"""The latency harness: its arithmetic by hand, its schedule by a clock of its own, and one true run of a few scans."""
+"""The latency harness: its statistics by hand, its schedule with a fake clock, and a real run of a few scans."""
 
 from __future__ import annotations
 
+import argparse
 import html
 import importlib.util
 import io
 import json
 import re
 import signal
+import subprocess
 import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,21 +20,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("psutil")
-
-from edgeperc import tuning as settings
-from edgeperc.errors import MissingExtraError, ModelFileError, PointsError
+from edgeperc import tuning
+from edgeperc.errors import MissingExtraError, ModelFileError, PointsError, ProviderError
 from edgeperc.perception import Box, PointLabels, TopView
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import TOP_VIEW_CLASSES
 from edgeperc_bench import accuracy, cli, context, inputs, loadgen, measure, render, report, worker
-from edgeperc_bench.commands.matrix import _recommended, settings_to_try
+from edgeperc_bench.commands.matrix import recommend, settings_to_try
 from edgeperc_bench.commands.soak import memory_growth
-from edgeperc_bench.document import ReportError, read_report, write_report
+from edgeperc_bench.document import ReportError, latency, read_report, stage_medians, write_report
 from edgeperc_bench.plots import pictures
 from edgeperc_bench.render import LiveTable, html_page, markdown
 from edgeperc_bench.samples import compare, noise_floor, percentile, summary, supported, trend
-from edgeperc_bench.scenarios import Clock, Limits, Samples, back_to_back, paced, throughput
+from edgeperc_bench.scenarios import Clock, Limits, Timings, back_to_back, paced, throughput
 
 # samples
 
@@ -94,11 +94,11 @@ def test_the_same_samples_never_differ_and_single_runs_say_nothing() -> None:
 
 def test_most_runs_of_the_same_thing_show_no_difference() -> None:
     rng = np.random.default_rng(5)
-    words = []
-    for seed in range(60):
+    verdicts = []
+    for seed in range(40):
         medians = rng.normal(20.0, 0.3, (2, 3))
-        words.append(compare(repeats(medians[0], 0.5, seed), repeats(medians[1], 0.5, 1000 + seed)).word)
-    assert words.count("no difference") >= 45
+        verdicts.append(compare(repeats(medians[0], 0.5, seed), repeats(medians[1], 0.5, 1000 + seed)).word)
+    assert verdicts.count("no difference") >= 30
 
 
 def test_a_trend_is_least_squares() -> None:
@@ -121,9 +121,9 @@ def test_a_trends_error_grows_where_neighbours_are_alike() -> None:
 def test_a_soak_tells_growth_from_noise(slope: float, verdict: str) -> None:
     done = np.linspace(0, 18_000, 500)
     mb = 300.0 + slope * done + np.random.default_rng(2).normal(0.0, 0.3, 500)
-    told = memory_growth(np.stack([done, mb], axis=1).tolist(), 2000)
-    assert told["verdict"] == verdict
-    assert told["growth_mb"] == pytest.approx(slope * 18_000, abs=0.3)
+    growth = memory_growth(np.stack([done, mb], axis=1).tolist(), 2000)
+    assert growth["verdict"] == verdict
+    assert growth["growth_mb"] == pytest.approx(slope * 18_000, abs=0.3)
 
 
 def test_a_soak_may_be_undecided() -> None:
@@ -223,13 +223,23 @@ def test_throughput_counts_the_time_that_all_share() -> None:
 # context
 
 
-def test_the_machine_is_told_in_json() -> None:
-    told = context.machine()
-    json.dumps(told, allow_nan=False)
-    assert told["logical_cores"] >= 1
+@pytest.fixture
+def psutil() -> None:
+    """For tests that measure: skips them where only the runtime is installed."""
+    pytest.importorskip("psutil")
+
+
+def test_the_machine_is_described_in_json(psutil: None) -> None:
+    machine = context.machine()
+    json.dumps(machine, allow_nan=False)
+    assert machine["logical_cores"] >= 1
     assert context.software()["numpy"] == np.__version__
     assert context.rss_mb() > 10.0
-    assert (context.peak_rss_mb() or 1e9) >= 10.0
+    peak = context.peak_rss_mb()
+    assert peak is None or peak > 10.0
+    before, after = context.conditions(), context.conditions()
+    assert after["at_s"] > before["at_s"]
+    assert after["busy_s"] >= before["busy_s"] > 0.0
 
 
 def quiet(**changed: Any) -> dict[str, Any]:
@@ -237,10 +247,10 @@ def quiet(**changed: Any) -> dict[str, Any]:
     return state | {"throttle_count": 7, "quota_throttled": 0, "load_average": 0.1, "on_battery": False} | changed
 
 
-def test_what_disturbs_is_said_out_loud() -> None:
+def test_every_disturbance_is_reported() -> None:
     hardware = {"logical_cores": 4}
     fine = quiet(at_s=10.0, busy_s=8.5)
-    assert context.spoilers(hardware, quiet(), fine, 8.0) == []
+    assert context.disturbances(hardware, quiet(), fine, 8.0) == []
     loud = quiet(
         at_s=10.0,
         busy_s=28.0,
@@ -251,17 +261,17 @@ def test_what_disturbs_is_said_out_loud() -> None:
         temperature_c=95.0,
         on_battery=True,
     )
-    told = "\n".join(context.spoilers(hardware, quiet(), loud, 8.0))
-    for words in (
-        "2.0 of 4 cores",
-        "5% of the CPU time",
-        "heat 2 times",
-        "quota stopped it 3 times",
-        "95 C",
-        "2000 MHz",
-    ):
-        assert words in told
-    assert "battery" in told
+    found = "\n".join(context.disturbances(hardware, quiet(), loud, 8.0))
+    for part in ("2.0 of 4 cores", "5% of the CPU time", "heat 2 times", "quota paused it 3 times", "95 C", "2000 MHz"):
+        assert part in found
+    assert "battery" in found
+
+
+def test_what_lasts_is_reported_too() -> None:
+    calm = {"governor": "performance", "turbo": False, "cpu_quota": None, "hypervisor": False}
+    assert context.lasting_disturbances(calm, []) == []
+    wild = {"governor": "powersave", "turbo": True, "cpu_quota": "1 2", "hypervisor": True}
+    assert len(context.lasting_disturbances(wild, [{"name": "cc", "cores": 1.0}])) == 5
 
 
 def test_energy_counters_wrap_and_rails_integrate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -288,10 +298,10 @@ def test_energy_counters_wrap_and_rails_integrate(tmp_path: Path, monkeypatch: p
 # accuracy
 
 
-def answer(labels: Sequence[int], cells: int, boxes: Sequence[Box]) -> worker.Answer:
+def prediction(labels: Sequence[int], cells: int, boxes: Sequence[Box]) -> worker.Prediction:
     points = PointLabels(np.array(labels, np.uint8), np.array([True, True, True, False]), ("background", "car"))
     top_view = TopView(np.full((2, 2), cells, np.uint8), ("background", "drivable"), 0.1, (6.0, 6.2), (-0.1, 0.1))
-    return worker.Answer(points, top_view, tuple(boxes))
+    return worker.Prediction(points, top_view, tuple(boxes))
 
 
 def test_agreement_counts_labels_and_boxes() -> None:
@@ -299,16 +309,18 @@ def test_agreement_counts_labels_and_boxes() -> None:
         Box("car", 0.9, (20.0, 0.0, -1.0), (4.0, 2.0, 1.5), 0.0),
         Box("car", 0.9, (30.0, 0.0, -1.0), (4.0, 2.0, 1.5), 0.0),
     )
-    right, guess = [answer([0, 1, 1, 0], 1, [car])], [answer([0, 1, 0, 1], 1, [car, far])]
-    told = accuracy.agreement(right, guess)
+    right, guess = [prediction([0, 1, 1, 0], 1, [car])], [prediction([0, 1, 0, 1], 1, [car, far])]
+    same = accuracy.agreement(right, guess)
     # The last point is out of view; background: 1 of 2, car: 1 of 2.
-    assert told["points"] == pytest.approx({"equal": 2.0 / 3.0, "mean_iou": 0.5}, abs=1e-6)
-    assert told["cells"]["equal"] == 1.0
-    assert told["boxes"] == pytest.approx({"n_reference": 1, "n_found": 2, "n_both": 1, "f1": 2.0 / 3.0})
-    same = {"agreement": accuracy.agreement(right, right), "truth": None, "reference_truth": None}
-    assert accuracy.agrees(same)
-    assert not accuracy.agrees(same | {"agreement": told})
-    assert not accuracy.agrees(same | {"truth": {"points_mean_iou": 0.58}, "reference_truth": {"points_mean_iou": 0.6}})
+    assert same["points"] == pytest.approx({"equal": 2.0 / 3.0, "mean_iou": 0.5}, abs=1e-6)
+    assert same["cells"]["equal"] == 1.0
+    assert same["boxes"] == pytest.approx({"n_reference": 1, "n_found": 2, "n_both": 1, "f1": 2.0 / 3.0})
+    equal = {"agreement": accuracy.agreement(right, right), "truth": None, "reference_truth": None}
+    assert accuracy.agrees(equal)
+    assert not accuracy.agrees(equal | {"agreement": same})
+    assert not accuracy.agrees(
+        equal | {"truth": {"points_mean_iou": 0.58}, "reference_truth": {"points_mean_iou": 0.6}}
+    )
 
 
 def test_correctness_of_the_truth_itself_is_full() -> None:
@@ -320,37 +332,31 @@ def test_correctness_of_the_truth_itself_is_full() -> None:
         if n >= 3 and box.label in ("car", "van", "truck")
     ]
     inside = [box for box in boxes if 6.0 <= box.center[0] < 46.0 and abs(box.center[1]) < 10.0]
-    told = accuracy.correctness([worker.Answer(None, geometry, tuple(inside))], [scan])
-    assert told["cells_mean_iou"] == 1.0
-    assert told["vehicle_ap50"] == (1.0 if inside else None)
-    assert told["points_mean_iou"] is None
+    assert inside
+    figures = accuracy.correctness([worker.Prediction(None, geometry, tuple(inside))], [scan])
+    assert figures == {"points_mean_iou": None, "cells_mean_iou": 1.0, "vehicle_ap50": 1.0}
 
 
 # reports
 
 
 def samples_document(ms: Sequence[float], rate_hz: float | None = None) -> dict[str, Any]:
-    samples = Samples(start_s=[0.1 * k for k in range(len(ms))], ms=[*ms], age_ms=[v + 1.0 for v in ms])
-    samples.n = len(ms)
-    samples.stage_ms = {"project": [1.0] * len(ms), "infer": [v - 2.0 for v in ms]}
+    timings = Timings(start_s=[0.1 * k for k in range(len(ms))], ms=[*ms], age_ms=[v + 1.0 for v in ms])
+    timings.n = len(ms)
+    timings.stage_ms = {"project": [1.0] * len(ms), "infer": [v - 2.0 for v in ms]}
     return {
-        **{"rate_hz": rate_hz, "limits": {}, **vars(samples), "wall_s": 2.0, "cpu_s": 1.0, "rss_mb": [[0, 300.0]]},
+        **{"rate_hz": rate_hz, "limits": {}, **vars(timings), "wall_s": 2.0, "cpu_s": 1.0, "rss_mb": [[0, 300.0]]},
         **{"energy_j": {"<rail>": 5.0}, "before": {}, "after": {}, "interrupted": False},
     }
 
 
 def document(*medians: float, sha256: str = "s", spread: float = 0.2) -> dict[str, Any]:
-    engine = {"name": "pointseg", "version": "1", "sha256": "f" * 64, "provider": "CPU", "options": {"threads": "1"}}
+    engine = {"name": "pointseg", "variant": "fp32", "version": "1", "sha256": "f" * 64, "digest": "d" * 64}
+    engine |= {"precision": "fp32", "provider": "CPU", "options": {"threads": "1"}}  # type: ignore[dict-item]
     drawn = repeats(medians, spread, 3, n=120)
     setting = {
-        **{
-            "models": ["pointseg"],
-            "provider": "cpu",
-            "n_threads": 1,
-            "sensor": "hdl-64e",
-            "offline": [],
-            "cold_start": [],
-        },
+        **{"models": ["pointseg"], "provider": "cpu", "precision": "fp32", "n_threads": 1, "sensor": "hdl-64e"},
+        **{"offline": [], "cold_start": []},
         "accuracy": None,
         "loadgen": None,
         "repeats": [
@@ -370,12 +376,18 @@ def document(*medians: float, sha256: str = "s", spread: float = 0.2) -> dict[st
     }
     given = {"source": "two <b>scans</b>", "sensor": "hdl-64e", "n_points": [5, 6], "sha256": sha256}
     return {
-        **{"schema": 1, "kind": "run", "command": "edgeperc-bench run", "complete": True, "input": given},
+        **{"schema": 2, "kind": "run", "command": "edgeperc-bench run", "complete": True, "input": given},
         **{
             "machine": {"cpu": "A <fast> & quiet CPU", "fingerprint": "m"},
             "software": {"numpy": "2", "environment": {}},
         },
-        **{"spoilers": ["others | are busy"], "settings": [setting], "skipped": [], "recommended": [], "tables": []},
+        **{
+            "disturbances": ["others | are busy"],
+            "settings": [setting],
+            "skipped": [],
+            "recommended": [],
+            "tables": [],
+        },
         "soak": None,
     }
 
@@ -388,7 +400,7 @@ def test_json_comes_back_as_it_went(tmp_path: Path) -> None:
     written = plain(document(20.0, 20.1))
     write_report(written, tmp_path / "a.json")
     assert read_report(tmp_path / "a.json") == written
-    for k, text in enumerate(("nonsense", "[]", '{"schema": 99, "kind": "run"}')):
+    for k, text in enumerate(("nonsense", "[]", '{"schema": 1, "kind": "run"}')):
         (tmp_path / f"{k}.json").write_text(text)
         with pytest.raises(ReportError, match=rf"{k}\.json"):
             read_report(tmp_path / f"{k}.json")
@@ -396,20 +408,20 @@ def test_json_comes_back_as_it_went(tmp_path: Path) -> None:
 
 def test_figures_of_a_scenario_are_of_all_repeats() -> None:
     setting = document(20.0, 22.0)["settings"][0]
-    told = report.latency(setting, "single-stream")
-    assert told["n"] == 240
-    assert told["p99"] is None
-    assert told["noise"] == pytest.approx(0.1, abs=0.02)
-    assert told["cpu_s_per_scan"] == pytest.approx(2.0 / 240)
-    assert told["energy_j_per_scan"] == pytest.approx({"<rail>": 10.0 / 240})
-    assert told["age"]["p50"] == pytest.approx(told["p50"] + 1.0)
-    stages = report.stage_medians(setting, "single-stream")
+    figures = latency(setting, "single-stream")
+    assert figures["n"] == 240
+    assert figures["p99"] is None
+    assert figures["noise"] == pytest.approx(0.1, abs=0.02)
+    assert figures["cpu_s_per_scan"] == pytest.approx(2.0 / 240)
+    assert figures["energy_j_per_scan"] == pytest.approx({"<rail>": 10.0 / 240})
+    assert figures["age"]["p50"] == pytest.approx(figures["p50"] + 1.0)
+    stages = stage_medians(setting, "single-stream")
     assert stages["project"] == stages["outside"] == pytest.approx(1.0)
 
 
 def test_a_page_is_well_formed_and_needs_nothing_from_elsewhere(matplotlib: None) -> None:
-    told = document(20.0, 20.1)
-    page = html_page(report.sections(told), "<title>", pictures(told))
+    shown = document(20.0, 20.1)
+    page = html_page(report.sections(shown), "<title>", pictures(shown))
     root = ET.fromstring(page.partition("\n")[2])
     assert len([element for element in root.iter() if element.tag.endswith("svg")]) == 1
     assert "A <fast> & quiet CPU" in "".join(root.itertext())
@@ -422,13 +434,13 @@ def test_a_page_is_well_formed_and_needs_nothing_from_elsewhere(matplotlib: None
             assert local not in {"src", "srcset", "action"}
             assert local != "href" or value.startswith("#"), value
             assert "url(" not in value or "url(#" in value
-    # Names of namespaces are no addresses that anybody asks.
+    # The names of namespaces are never loaded.
     addresses = set(re.findall(r"(?:https?:)?//[^\"'\s<)]+", html.unescape(page)))
     assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
     assert "@import" not in page
 
 
-def test_words_and_tables_hold_what_was_measured() -> None:
+def test_text_and_tables_hold_what_was_measured() -> None:
     parts = report.sections(document(20.0, 20.1))
     shown = render.text(parts)
     assert "disturbed: others | are busy" in shown
@@ -451,7 +463,7 @@ def test_a_live_table_replaces_itself_on_a_terminal_only() -> None:
     live, file = LiveTable(Terminal()), LiveTable(io.StringIO())
     for table in (live, file):
         table("single-stream", [3.0] * 30)
-        table.say("next")
+        table.note("next")
     shown = live.stream.getvalue()
     assert re.search(r"single-stream +30 +3\.00 +- ", shown)
     assert "\x1b[2A\x1b[J" in shown  # the head and one row are taken away before the next line
@@ -487,8 +499,21 @@ def test_compare_answers_by_its_exit_code(reports: Any, capsys: pytest.CaptureFi
     assert "nowhere.json" in capsys.readouterr().err
 
 
+def test_compare_wants_the_same_setting_or_one_of_each(reports: Any, tmp_path: Path) -> None:
+    one = plain(document(20.0, 20.1))
+    for key, value, code in (("precision", "int8", 0), ("provider", "openvino", 0), ("models", ["ssadnet"], 2)):
+        changed = plain(document(20.0, 20.1))
+        changed["settings"][0][key] = value
+        write_report(changed, tmp_path / "b.json")
+        assert cli.main(["compare", reports("a.json", 20.0, 20.1), str(tmp_path / "b.json")]) == code
+        # With several settings in a report only equal ones are compared.
+        both = one | {"settings": [*one["settings"], *one["settings"]]}
+        write_report(both, tmp_path / "several.json")
+        assert cli.main(["compare", str(tmp_path / "several.json"), str(tmp_path / "b.json")]) == 2
+
+
 @pytest.mark.parametrize(
-    "words",
+    "options",
     [
         ["--scenario", "paced:0"],
         ["--scenario", "offline:x"],
@@ -496,40 +521,106 @@ def test_compare_answers_by_its_exit_code(reports: Any, capsys: pytest.CaptureFi
         ["--threads", "none"],
         ["matrix", "--providers", "abacus"],
         ["--precisions", "fp7"],
+        ["--provider", "abacus"],
+        ["--provider", "openvino:bf16"],
+        ["--precision", "bf17"],
         ["scaling", "--cars", "29"],
         ["soak", "--scans", "3"],
         ["compare", "only-one.json"],
     ],
 )
-def test_wrong_words_are_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_options_are_refused(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
-        cli.main(words)
+        cli.main(options)
     assert left.value.code == 2
-    assert "edgeperc-bench" in capsys.readouterr().err
+    message = capsys.readouterr().err
+    assert "edgeperc-bench" in message
+    assert ":" not in options[-1] or options[0] == "--scenario" or "--provider openvino --precision bf16" in message
 
 
-def test_the_matrix_skips_nothing_silently() -> None:
-    settings, skipped = settings_to_try(["all"], ["fp32", "bf16"], ("openvino", "cpu"))
-    assert settings == ["openvino:fp32", "openvino:bf16", "cpu"]
-    told = "\n".join(skipped)
-    assert "cuda: not available" in told
-    assert "cpu in bf16" in told
-    assert settings_to_try(["cpu"], ["bf16"], ("cpu",))[0] == []
+def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    yield parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            assert set(action.choices) == {each.dest for each in action._choices_actions}, (
+                "a command without a help text"
+            )
+            for command in action.choices.values():
+                yield from parsers(command)
+
+
+def test_every_option_has_a_help_text() -> None:
+    every = list(parsers(cli.parser()))
+    assert len(every) == 1 + len(cli.COMMANDS)
+    for parser in every:
+        assert parser.description
+        for action in parser._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                continue
+            assert action.help, f"{parser.prog} {action.dest}"
+            takes_value = action.option_strings and action.nargs != 0
+            assert "default" in action.help or not takes_value or action.default in (None, argparse.SUPPRESS)
+        assert "%(" not in parser.format_help()
+
+
+@pytest.mark.parametrize(
+    ("options", "command"),
+    [([], "run"), (["--threads", "2"], "run"), (["--precision", "int8"], "run"), (["--precisions", "int8"], "matrix")],
+)
+def test_without_a_command_it_runs_or_measures_a_matrix(
+    options: list[str], command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    for name in ("run", "matrix"):
+        module = cli.COMMANDS[name]
+        monkeypatch.setattr(module, "run_command", lambda arguments, name=name: asked.append(name) or 0)
+    assert cli.main(options) == 0
+    assert asked == [command]
+
+
+def test_without_psutil_only_measuring_fails(tmp_path: Path, reports: Any) -> None:
+    """In a process of its own, where psutil cannot be imported."""
+    block = (
+        "import sys; sys.modules['psutil'] = None; from edgeperc_bench.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
+    report = reports("a.json", 20.0, 20.1)
+    for options, code in (["--version"], 0), (["--help"], 0), (["compare", report, report], 0), (["soak"], 2):
+        done = subprocess.run([sys.executable, "-c", block, *options], capture_output=True, text=True)
+        assert done.returncode == code, done.stderr
+        assert ("pip install 'edgeperc[bench]'" in done.stderr) == (code == 2)
+
+
+def test_the_matrix_skips_nothing_silently(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A processor of which nothing is known is asked for everything.
+    monkeypatch.setattr("edgeperc_bench.commands.matrix.cpu_features", frozenset)
+    settings, skipped = settings_to_try("pointseg", ["cuda", "openvino", "cpu"], ["fp32", "bf16"], ("openvino", "cpu"))
+    assert settings == [("openvino", "fp32"), ("openvino", "bf16"), ("cpu", "fp32")]
+    assert len(skipped) == 2
+    assert "pointseg on cuda: not available" in skipped[0]
+    assert "pointseg on cpu in bf16: " in skipped[1]
+    assert settings_to_try("pointseg:int8", ["cpu"], ["fp32", "int8"], ("cpu",))[0] == [("cpu", "int8")]
+    with pytest.raises(ModelFileError):
+        settings_to_try("nobody", ["cpu"], ["fp32"], ("cpu",))
 
 
 def test_the_matrix_recommends_the_fastest_that_agrees() -> None:
     settings = []
-    for provider, median, agrees in (("cpu", 30.0, True), ("openvino:fp32", 20.0, True), ("openvino:bf16", 9.0, False)):
+    for provider, precision, median, agrees in (
+        ("cpu", "fp32", 30.0, True),
+        ("openvino", "fp32", 20.0, True),
+        ("openvino", "bf16", 9.0, False),
+    ):
         (setting,) = document(median, median + 0.1)["settings"]
-        settings.append(setting | {"provider": provider, "accuracy": {"agrees": agrees}})
-    told = {"settings": settings, "machine": {"cpu": "c"}, "software": {"onnxruntime": "1", "taken": "t"}}
-    (found,) = _recommended(told)
-    assert found["entry"]["provider"] == "openvino:fp32"
-    assert found["sha256"] == "f" * 64
-    assert "is slower" in found["words"]
+        settings.append(setting | {"provider": provider, "precision": precision, "accuracy": {"agrees": agrees}})
+    measured = {"settings": settings, "machine": {"cpu": "c"}, "software": {"onnxruntime": "1", "measured": "t"}}
+    (best,) = recommend(measured)
+    assert (best["entry"]["provider"], best["entry"]["precision"]) == ("openvino", "fp32")
+    assert best["digest"] == "d" * 64
+    assert "Perceiver('pointseg', provider='openvino', precision='fp32', n_threads=1)" in best["text"]
+    assert "is slower" in best["text"]
     for setting in settings:
         setting["accuracy"] = {"agrees": False}
-    assert _recommended(told) == []
+    assert recommend(measured) == []
 
 
 def test_scans_are_sized_and_crowded(tmp_path: Path) -> None:
@@ -537,15 +628,15 @@ def test_scans_are_sized_and_crowded(tmp_path: Path) -> None:
     assert inputs.sized(150_000, "hdl-64e").shape == (150_000, 4)
     assert len(inputs.crowd(4, "hdl-64e")) > 50_000
     with pytest.raises(PointsError, match="holds no scan"):
-        inputs.read(tmp_path, [tmp_path], "hdl-64e")
+        inputs.read_input(tmp_path, [tmp_path], "hdl-64e")
 
 
 def test_simulated_scans_come_in_the_sensors_own_unit(tmp_path: Path) -> None:
-    given = inputs.simulate(tmp_path, 1, "os1-64")
-    raw = np.load(given.files[0])
+    scans = inputs.simulated_input(tmp_path, 1, "os1-64")
+    raw = np.load(scans.files[0])
     profile = inputs.get_sensor("os1-64")
     back = (raw[:, 3] + np.float32(profile.remission_offset)) * np.float32(profile.remission_scale)
-    np.testing.assert_allclose(back, given.truth[0].points[:, 3], atol=1e-4)
+    np.testing.assert_allclose(back, scans.truth[0].points[:, 3], atol=1e-4)
 
 
 def test_loadgen_absent_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -562,8 +653,8 @@ def test_loadgens_summary_is_read(tmp_path: Path) -> None:
         "99.90 percentile latency (ns)   : 2500000",
     ]
     (tmp_path / loadgen.SUMMARY).write_text("\n".join(lines))
-    told = loadgen.told(tmp_path)
-    assert (told["p50"], told["p99.9"], told["result"]) == (1.5, 2.5, "VALID")
+    summary = loadgen.read_summary(tmp_path)
+    assert (summary["p50"], summary["p99.9"], summary["result"]) == (1.5, 2.5, "VALID")
 
 
 def test_loadgen_drives_the_single_stream(tmp_path: Path) -> None:
@@ -575,11 +666,11 @@ def test_loadgen_drives_the_single_stream(tmp_path: Path) -> None:
     samples = loadgen.single_stream(
         perceive, scans, Limits(30, 0.0, 2), folder=tmp_path, on_start=lambda: started.append(len(perceive.seen))
     )
-    told = loadgen.told(tmp_path)
+    summary = loadgen.read_summary(tmp_path)
     assert started == [2]
     assert len(samples.ms) == samples.n >= 30
-    assert {"p50", "p90", "p99.9"} <= told.keys()
-    assert told["result"] in ("VALID", "INVALID")
+    assert {"p50", "p90", "p99.9"} <= summary.keys()
+    assert summary["result"] in ("VALID", "INVALID")
 
     def fails(scan: Any) -> Any:
         raise ModelFileError("the model is gone")
@@ -589,7 +680,7 @@ def test_loadgen_drives_the_single_stream(tmp_path: Path) -> None:
 
 
 class Street:
-    """In the place of a Perceiver: every answer the same."""
+    """In place of a Perceiver: every result is the same."""
 
     def __call__(self, scan: np.ndarray) -> Any:
         points = PointLabels(np.zeros(len(scan), np.uint8), np.ones(len(scan), bool), ("background", "car"))
@@ -604,12 +695,14 @@ def in_process(no_wait: None, monkeypatch: pytest.MonkeyPatch) -> list[worker.Jo
 
     def measured(asked: Sequence[worker.Job], on_tick: Any = None) -> list[dict[str, Any]]:
         jobs.extend(asked)
-        if any(job.provider == "openvino:bf16" for job in asked):
-            raise ModelFileError("cannot run this model")
+        if any((job.provider, job.precision) == ("openvino", "bf16") for job in asked):
+            raise ProviderError("cannot run this model")
         return [worker._work(connection, job) for job in asked]
 
     def engines(perceive: Street) -> list[dict[str, Any]]:
-        return [{"name": "n", "version": "1", "sha256": "a" * 64, "provider": "P", "options": {"threads": "1"}}]
+        engine = {"name": "n", "variant": "fp32", "version": "1", "sha256": "b" * 64, "digest": "a" * 64}
+        engine |= {"precision": "fp32", "provider": "P", "description": "n fp32, P"}
+        return [engine | {"options": {"threads": "1"}}]
 
     monkeypatch.setattr(worker, "make_perceiver", lambda job: Street())
     monkeypatch.setattr(worker, "_engines", engines)
@@ -621,34 +714,37 @@ def test_a_matrix_measures_every_setting_and_keeps_the_best(
     in_process: list[worker.Job], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("edgeperc_bench.commands.matrix.available_providers", lambda: ("openvino", "cpu"))
+    monkeypatch.setattr("edgeperc_bench.commands.matrix.cpu_features", frozenset)
     np.save(tmp_path / "own.npy", np.ones((50, 4), np.float32))
-    words = ["--model", "pointseg", "--providers", "all", "--precisions", "fp32,bf16", "--threads", "1,2"]
-    words += ["--min-scans", "20", "--min-seconds", "0", "--input", str(tmp_path / "own.npy")]
-    assert cli.main([*words, "--recommend", str(tmp_path / "r.json"), "--json", str(tmp_path / "m.json")]) == 0
-    told = read_report(tmp_path / "m.json")
-    assert [(s["provider"], s["n_threads"]) for s in told["settings"]] == [
-        ("openvino:fp32", 1),
-        ("openvino:fp32", 2),
-        ("cpu", 1),
-        ("cpu", 2),
+    options = ["--model", "pointseg", "--providers", "all", "--precisions", "fp32,bf16", "--threads", "1,2"]
+    options += ["--min-scans", "20", "--min-seconds", "0", "--input", str(tmp_path / "own.npy")]
+    assert cli.main([*options, "--recommend", str(tmp_path / "r.json"), "--json", str(tmp_path / "m.json")]) == 0
+    measured = read_report(tmp_path / "m.json")
+    assert [(s["provider"], s["precision"], s["n_threads"]) for s in measured["settings"]] == [
+        ("openvino", "fp32", 1),
+        ("openvino", "fp32", 2),
+        ("cpu", "fp32", 1),
+        ("cpu", "fp32", 2),
     ]
-    skipped = "\n".join(told["skipped"])
-    for words_ in ("cuda: not available", "cpu in bf16", "openvino:bf16, 1 threads: cannot run this model"):
-        assert words_ in skipped
-    machine = told["machine"]["fingerprint"]
-    kept = settings.read_setting(tmp_path / "r.json", machine, "a" * 64)
-    assert kept is not None
-    assert kept["provider"] in ("openvino:fp32", "cpu")
+    assert in_process[0] == worker.Job(("pointseg:fp32",), "cpu", predict=in_process[0].predict)  # the reference
+    assert measured["settings"][0]["accuracy"]["reference"] == ["n fp32, P"]
+    skipped = "\n".join(measured["skipped"])
+    for part in ("cuda: not available", "cpu in bf16", "openvino in bf16, 1 threads: cannot run this model"):
+        assert part in skipped
+    saved = tuning.read_setting(tmp_path / "r.json", measured["machine"]["fingerprint"], "a" * 64)
+    assert saved is not None
+    assert saved["provider"] in ("openvino", "cpu")
+    assert saved["precision"] == "fp32"
     assert "recommended for n" in capsys.readouterr().out
 
 
-def test_scaling_tells_points_cars_sizes_and_processes(
+def test_scaling_measures_points_cars_sizes_and_processes(
     in_process: list[worker.Job], tmp_path: Path, matplotlib: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["scaling", "--points", "1000,2000,4000", "--cars", "0,2", "--sizes", "100", "--processes", "1,2"]
-    words += ["--min-scans", "20"]
+    options = ["scaling", "--points", "1000,2000,4000", "--cars", "0,2", "--sizes", "100", "--processes", "1,2"]
+    options += ["--min-scans", "20"]
     plot = tmp_path / "new" / "growth.svg"
-    assert cli.main([*words, "--min-seconds", "0", "--plot", str(plot), "--json", str(tmp_path / "s.json")]) == 0
+    assert cli.main([*options, "--min-seconds", "0", "--plot", str(plot), "--json", str(tmp_path / "s.json")]) == 0
     tables = read_report(tmp_path / "s.json")["tables"]
     assert [[row[0] for row in table["rows"]] for table in tables] == [
         ["1,000", "2,000", "4,000"],
@@ -665,32 +761,20 @@ def test_a_soak_reports_memory(
     in_process: list[worker.Job], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["soak", "--scans", "1000", "--json", str(tmp_path / "s.json")]) == 0
-    told = read_report(tmp_path / "s.json")
-    samples = told["settings"][0]["repeats"][0]["scenarios"]["soak"]
-    assert (samples["n"], len(samples["warm_up_ms"]), len(samples["ms"])) == (900, 100, 450)
-    assert told["soak"]["verdict"] in ("level", "grows", "undecided")
+    measured = read_report(tmp_path / "s.json")
+    timings = measured["settings"][0]["repeats"][0]["scenarios"]["soak"]
+    assert (timings["n"], len(timings["warm_up_ms"]), len(timings["ms"])) == (900, 100, 450)
+    assert measured["soak"] == memory_growth(timings["rss_mb"], 100)
     assert "Memory over a long run" in capsys.readouterr().out
 
 
 HAS_EXPORT = all(importlib.util.find_spec(name) for name in ("torch", "onnx"))
-FEW = [
-    "--model",
-    "pointseg",
-    "--provider",
-    "cpu",
-    "--threads",
-    "1",
-    "--repeats",
-    "1",
-    "--warm-up",
-    "1",
-    "--min-seconds",
-    "0",
-]
+FEW = ["--model", "pointseg", "--provider", "cpu", "--precision", "fp32", "--threads", "1", "--repeats", "1"]
+FEW += ["--warm-up", "1", "--min-seconds", "0"]
 
 
 @pytest.fixture
-def no_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_wait(psutil: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(context, "busiest", lambda: [])
 
 
@@ -699,40 +783,51 @@ def test_a_run_from_scans_to_files(no_wait: None, tmp_path: Path, capsys: pytest
     files = ["--json", str(tmp_path / "a.json"), "--markdown", str(tmp_path / "a.md")]
     wanted = ["--scenario", "single-stream", "--scenario", "paced:20", "--min-scans", "3"]
     assert cli.main(["run", *FEW, *wanted, *files, "--input", str(tmp_path / "own.bin")]) == 0
-    told = read_report(tmp_path / "a.json")
-    assert told["complete"]
-    (setting,) = told["settings"]
+    measured = read_report(tmp_path / "a.json")
+    assert measured["complete"]
+    (setting,) = measured["settings"]
     (only,) = setting["repeats"]
     assert [len(each["ms"]) for each in only["scenarios"].values()] == [3, 3]
-    assert only["engines"][0]["provider"] == "CPUExecutionProvider (fp32)"
-    assert len(only["engines"][0]["sha256"]) == 64
+    (engine,) = only["engines"]
+    ran = [engine[key] for key in ("name", "variant", "precision", "provider")]
+    assert ran == ["pointseg", "fp32", "fp32", "CPUExecutionProvider"]
+    assert len(engine["sha256"]) == 64
+    assert setting["accuracy"]["reference"] == ["pointseg fp32, CPUExecutionProvider"]
     assert setting["accuracy"]["agreement"]["points"]["equal"] == 1.0
     assert setting["accuracy"]["truth"] is None
-    assert told["input"]["source"] == "1 scan: own.bin"
-    assert "CPUExecutionProvider (fp32)" in capsys.readouterr().out
+    assert measured["input"]["source"] == "1 scan: own.bin"
+    assert "pointseg:fp32" in capsys.readouterr().out
     assert "## Latency" in (tmp_path / "a.md").read_text()
 
 
+@pytest.fixture
+def foreground() -> Iterator[None]:
+    """Ctrl-C works, even where a shell started the tests in the background and so with SIGINT ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def test_an_interrupted_run_writes_what_it_has(
-    no_wait: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    no_wait: None, foreground: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     np.save(tmp_path / "own.npy", simulated_scan(5).points[::10])
 
-    told_once = []
+    calls = []
 
     def interrupt(live: LiveTable, name: str, ms: Sequence[float]) -> None:
-        if not told_once:  # a second Ctrl-C would end it at once
-            told_once.append(name)
+        calls.append(name)
+        if len(calls) == 1:  # a second Ctrl-C would end it at once
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(LiveTable, "__call__", interrupt)
-    given = ["--input", str(tmp_path / "own.npy"), "--json", str(tmp_path / "a.json")]
-    # Far more scans than anybody has time for: without the interruption this would not end.
-    assert cli.main(["run", *FEW, *given, "--scenario", "single-stream", "--min-scans", "1000000000"]) == 130
-    told = read_report(tmp_path / "a.json")
-    assert not told["complete"]
-    assert told["settings"][0]["repeats"][0]["interrupted"]
-    assert "interrupted: what follows" in capsys.readouterr().out
+    files = ["--input", str(tmp_path / "own.npy"), "--json", str(tmp_path / "a.json")]
+    # Without the interruption this would not end.
+    assert cli.main(["run", *FEW, *files, "--scenario", "single-stream", "--min-scans", "1000000000"]) == 130
+    measured = read_report(tmp_path / "a.json")
+    assert not measured["complete"]
+    assert measured["settings"][0]["repeats"][0]["interrupted"]
+    assert "interrupted: only what was measured" in capsys.readouterr().out
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
@@ -741,7 +836,7 @@ def test_errors_of_a_process_arrive_as_they_were() -> None:
         worker.measure([worker.Job(("nobody",), "cpu")])
 
 
-def test_a_dead_process_is_no_answer() -> None:
+def test_a_dead_process_is_an_error() -> None:
     class Dead:
         exitcode = -9
 
@@ -756,18 +851,20 @@ def test_a_dead_process_is_no_answer() -> None:
         worker._receive(Silent(), Dead())
 
 
-def test_a_cold_start_is_told_step_by_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cold_start_is_measured_step_by_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     steps = {"interpreter_s": 0.1, "total_s": 1.0}
     caches = []
 
     def start(command: list[str], env: dict[str, str], **_: Any) -> Any:
-        assert json.loads(command[-1])["models"] == ["pointseg"]
+        request = json.loads(command[-1])
+        assert request["models"] == ["pointseg"]
+        assert request["precision"] == "int8"
         caches.append(env["NUMBA_CACHE_DIR"])
         return SimpleNamespace(returncode=0, stdout=json.dumps(steps), stderr="")
 
     monkeypatch.setattr(measure.subprocess, "run", start)
-    told = measure.cold_starts(worker.Job(("pointseg",)), tmp_path / "scan.npy", 3)
-    assert [each["start"] for each in told] == ["first", "again (1)", "again (2)"]
+    starts = measure.cold_starts(worker.Job(("pointseg",), precision="int8"), tmp_path / "scan.npy", 3)
+    assert [each["start"] for each in starts] == ["first", "again (1)", "again (2)"]
     assert len(set(caches)) == 1
     monkeypatch.setattr(
         measure.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1, stderr="no such model")

@@ -1,80 +1,132 @@
-"""What every command does: start a document, write it, prepare the scans."""
+"""What several commands do: start a document and write it, prepare the scans, measure several processes at once."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from edgeperc.atomic import write_whole
 from edgeperc.tuning import fingerprint
+from edgeperc.zoo import DEFAULT
 
-from .. import context, report
+from .. import context, plots
+from ..document import SCHEMA, write_report
+from ..render import LiveTable, html_page, markdown, text
+from ..report import sections
+from ..scenarios import Limits
+from ..worker import Job
 
 if TYPE_CHECKING:
     from ..inputs import Input
 
-__all__ = ["new_document", "prepare_input"]
+__all__ = ["job_of", "limits_of", "measure_offline", "new_document", "prepare_input"]
 
 
 @contextmanager
-def new_document(kind: str, arguments: argparse.Namespace) -> Iterator[tuple[dict[str, Any], report.LiveTable]]:
-    """A report to be filled in; what is in it is shown and written however the measuring ends."""
-    if arguments.html:
-        report.require_matplotlib()
-    for file in filter(None, (arguments.json, arguments.markdown, arguments.html)):
+def new_document(kind: str, arguments: argparse.Namespace) -> Iterator[tuple[dict[str, Any], LiveTable]]:
+    """An empty report; what it holds at the end is printed and written, even when measuring is interrupted."""
+    html = getattr(arguments, "html", None)  # not every command has a page
+    if html:
+        plots.require_matplotlib()
+    for file in filter(None, (arguments.json, arguments.markdown, html)):
         file.parent.mkdir(parents=True, exist_ok=True)
     hardware = context.machine()
     document: dict[str, Any] = {
-        "schema": report.SCHEMA,
+        "schema": SCHEMA,
         "kind": kind,
-        "command": arguments.typed,
+        "command": arguments.command_line,
         "complete": False,
         "machine": hardware | {"fingerprint": fingerprint(), "load_average": context.conditions()["load_average"]},
         "software": context.software(),
         "input": None,
-        "spoilers": context.standing_spoilers(hardware, context.busiest()),
+        "disturbances": context.lasting_disturbances(hardware, context.busiest()),
         "settings": [],
         "skipped": [],
         "recommended": [],
         "tables": [],
         "soak": None,
     }
-    live = report.LiveTable()
-    for words in document["spoilers"]:
-        live.say(f"note: {words}")
+    live = LiveTable()
+    for disturbance in document["disturbances"]:
+        live.note(disturbance)
     try:
         yield document, live
         document["complete"] = True
     finally:
         live.clear()
         if any(setting["repeats"] for setting in document["settings"]) or document["tables"]:
-            _write(document, arguments)
+            _write(document, arguments.json, arguments.markdown, html)
 
 
-def _write(document: Mapping[str, Any], arguments: argparse.Namespace) -> None:
-    parts = report.sections(document)
+def _write(document: Mapping[str, Any], json: Path | None, md: Path | None, html: Path | None) -> None:
+    parts = sections(document)
     title = f"edgeperc-bench {document['kind']}: {document['machine']['cpu']}"
-    print(report.text(parts))
-    if arguments.json:
-        report.write_report(document, arguments.json)
-    if arguments.markdown:
-        arguments.markdown.write_text(report.markdown(parts, title), encoding="utf-8")
-    if arguments.html:
-        page = report.html_page(parts, title, report.pictures(document))
-        arguments.html.write_text(page, encoding="utf-8")
+    print(text(parts))
+    if json:
+        write_report(document, json)
+    if md:
+        write_whole(md, markdown(parts, title).encode())
+    if html:
+        write_whole(html, html_page(parts, title, plots.pictures(document)).encode())
 
 
-def prepare_input(
-    arguments: argparse.Namespace, folder: Path, document: dict[str, Any], live: report.LiveTable
-) -> Input:
+def prepare_input(arguments: argparse.Namespace, folder: Path, document: dict[str, Any], live: LiveTable) -> Input:
+    """The scans that ``--input`` or ``--scans`` ask for, as files in ``folder``, and their place in the report."""
     from .. import inputs
 
     if arguments.input:
-        given = inputs.read(folder, arguments.input, arguments.sensor)
+        scans = inputs.read_input(folder, arguments.input, arguments.sensor)
     else:
-        live.say(f"simulating {arguments.scans} scans")
-        given = inputs.simulate(folder, arguments.scans, arguments.sensor)
-    document["input"] = given.told
-    return given
+        live.note(f"simulating {arguments.scans} scans")
+        scans = inputs.simulated_input(folder, arguments.scans, arguments.sensor)
+    document["input"] = scans.record
+    return scans
+
+
+def job_of(arguments: argparse.Namespace) -> Job:
+    """The job that ``--model``, ``--provider``, ``--precision``, ``--threads`` and ``--sensor`` ask for."""
+    return Job(
+        tuple(arguments.model or DEFAULT),
+        provider=arguments.provider,
+        precision=arguments.precision,
+        n_threads=arguments.threads,
+        sensor=arguments.sensor,
+    )
+
+
+def limits_of(arguments: argparse.Namespace) -> Limits:
+    """What ``--min-scans``, ``--min-seconds`` and ``--warm-up`` ask for."""
+    return Limits(arguments.min_scans, arguments.min_seconds, arguments.warm_up)
+
+
+def measure_offline(
+    setting: dict[str, Any],
+    job: Job,
+    files: Sequence[Path],
+    n_processes: int,
+    limits: Limits,
+    document: dict[str, Any],
+    live: LiveTable,
+) -> None:
+    """Measure the throughput of several processes into ``setting``.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After what was measured by then is in ``setting``.
+    """
+    from ..measure import offline
+
+    live.note(f"offline, {n_processes} processes")
+    measured = offline(job, files, n_processes, limits, live)
+    setting["offline"].append(measured)
+    cpu_s = sum(part["cpu_s"] for part in measured["parts"])
+    for disturbance in context.disturbances(document["machine"], measured["before"], measured["after"], cpu_s):
+        # The start of the measuring processes would count as other processes' work.
+        if not disturbance.startswith("other processes"):
+            document["disturbances"].append(f"offline x {n_processes}: {disturbance}")
+    if measured["interrupted"]:
+        raise KeyboardInterrupt

@@ -3,58 +3,68 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-from .. import report
-from ..options import complain
+from ..document import read_report, repeats_ms, scenario_names, setting_label
+from ..options import Subparsers, print_error
 from ..samples import compare
 
-__all__ = ["compare_command", "setting_label"]
-
-# compare
+__all__ = ["add_parser", "run_command"]
 
 
-def compare_command(arguments: argparse.Namespace) -> int:
-    a, b = report.read_report(arguments.a), report.read_report(arguments.b)
+def add_parser(subparsers: Subparsers) -> None:
+    """Declare the command."""
+    parser = subparsers.add_parser(
+        "compare",
+        help="tell whether report B is faster or slower than report A",
+        description="Compare two reports of the same scans, setting by setting. A difference counts only if it is "
+        "larger than the noise of both. Exit code: 0 no difference or faster, 1 slower, 2 not comparable.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("a", type=Path, metavar="A.json", help="the report to compare with, written by --json")
+    parser.add_argument("b", type=Path, metavar="B.json", help="the report that may be faster or slower")
+    parser.set_defaults(run=run_command)
+
+
+def run_command(arguments: argparse.Namespace) -> int:
+    """Print a verdict for each setting and scenario that both reports have."""
+    a, b = read_report(arguments.a), read_report(arguments.b)
     if not a["input"] or not b["input"] or a["input"]["sha256"] != b["input"]["sha256"]:
-        complain("the reports are of different scans; measure both with the same --input, --scans and --sensor")
+        print_error("the reports are of different scans; measure both with the same --input, --scans and --sensor")
         return 2
     if a["machine"]["fingerprint"] != b["machine"]["fingerprint"]:
-        print(f"other machines: A on {a['machine']['cpu']}, B on {b['machine']['cpu']}")
-    found = []
+        print(f"different machines: A on {a['machine']['cpu']}, B on {b['machine']['cpu']}")
+    verdicts = []
     for one, other in _pairs(a["settings"], b["settings"]):
-        for name in report.scenario_names(one):
-            if name not in report.scenario_names(other):
+        for name in scenario_names(one):
+            if name not in scenario_names(other):
                 continue
-            verdict = compare(report.repeats_ms(one, name), report.repeats_ms(other, name))
-            found.append(verdict.word)
-            words = f"{'+'.join(one['models'])}, {name}: {setting_label(one)} -> {setting_label(other)}: {verdict.word}"
+            verdict = compare(repeats_ms(one, name), repeats_ms(other, name))
+            verdicts.append(verdict.word)
+            line = f"{'+'.join(one['models'])}, {name}: {setting_label(one)} -> {setting_label(other)}: {verdict.word}"
             if verdict.word == "unusable":
-                print(f"{words}; a run of one repeat says nothing of its noise: measure with --repeats 3")
+                print(f"{line}; one repeat does not show the noise: measure with --repeats 3")
                 continue
             low, high = verdict.interval
             print(
-                f"{words}; median x {verdict.ratio:.3f} (95 %: {low:.3f} to {high:.3f}), "
+                f"{line}; median x {verdict.ratio:.3f} (95 %: {low:.3f} to {high:.3f}), "
                 f"noise {100.0 * verdict.noise:.1f} %"
             )
     for letter, document in (("A", a), ("B", b)):
-        for words in document["spoilers"][:5]:
-            print(f"{letter} was disturbed: {words}")
-    if not found or "unusable" in found:
-        complain("not everything could be compared" if found else "the reports have no setting and scenario in common")
+        for disturbance in document["disturbances"][:5]:
+            print(f"{letter} was disturbed: {disturbance}")
+    if not verdicts or "unusable" in verdicts:
+        print_error("not everything could be compared" if verdicts else "the reports share no setting and scenario")
         return 2
-    return 1 if "slower" in found else 0
+    return 1 if "slower" in verdicts else 0
 
 
 def _pairs(a: Sequence[dict[str, Any]], b: Sequence[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Settings that are compared: the same ones, or, where each report has but one, of the same models."""
-    keys = ("models", "provider", "n_threads")
+    """The settings to compare: equal ones, or, if each report has only one, two settings of the same models."""
+    keys = ("models", "provider", "precision", "n_threads")
     same = [(one, other) for one in a for other in b if all(one[key] == other[key] for key in keys)]
     if same or len(a) != 1 or len(b) != 1:
         return same
     return [(a[0], b[0])] if a[0]["models"] == b[0]["models"] else []
-
-
-def setting_label(setting: Mapping[str, Any]) -> str:
-    return f"{setting['provider']}, {setting['n_threads'] or 'default'} threads"

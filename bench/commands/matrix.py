@@ -1,8 +1,9 @@
-"""``edgeperc-bench matrix``: every combination of providers, precisions and threads; the recommended one."""
+"""``edgeperc-bench matrix``: measure every combination of provider, precision and threads, and recommend one."""
 
 from __future__ import annotations
 
 import argparse
+import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -11,123 +12,187 @@ from typing import TYPE_CHECKING, Any
 
 from edgeperc import EdgepercError
 from edgeperc.session import PRECISIONS, PROVIDERS, available_providers
-from edgeperc.tuning import write_settings
-from edgeperc.zoo import DEFAULT
+from edgeperc.tuning import cpu_features, settings_path, write_settings
+from edgeperc.zoo import DEFAULT, choose, resolve
 
-from .. import report
-from ..options import SINGLE_STREAM
+from ..document import pooled, repeats_ms, setting_label
+from ..options import (
+    SINGLE_STREAM,
+    Subparsers,
+    add_limits,
+    choices,
+    model_options,
+    numbers,
+    output_options,
+    scan_options,
+)
+from ..render import LiveTable
 from ..samples import compare, percentile
-from ..scenarios import Limits
-from ..worker import Answer, Job, Scenario
-from .common import new_document, prepare_input
-from .compare import setting_label
+from ..worker import Job, Prediction, Scenario
+from .common import limits_of, new_document, prepare_input
 
 if TYPE_CHECKING:
     from ..inputs import Input
+    from ..measure import Reference
 
-__all__ = ["matrix_command"]
-
-
-# matrix
+__all__ = ["add_parser", "recommend", "run_command", "settings_to_try"]
 
 
-def matrix_command(arguments: argparse.Namespace) -> int:
+def add_parser(subparsers: Subparsers) -> None:
+    """Declare the command."""
+    parser = subparsers.add_parser(
+        "matrix",
+        parents=[model_options(), scan_options(), output_options()],
+        help="measure many settings and recommend the fastest",
+        description="Measure each model on every provider, in every precision and with every number of threads, and "
+        "recommend the fastest setting whose results agree with fp32 on the CPU.",
+        allow_abbrev=False,
+    )
+    add_limits(parser, min_scans=50, min_seconds=3.0, repeats=2)
+    parser.add_argument(
+        "--providers",
+        type=choices(tuple(PROVIDERS)),
+        default=list(PROVIDERS),
+        metavar="A,B",
+        help=f"execution providers with commas between them, or all; one of {', '.join(PROVIDERS)} (default: all)",
+    )
+    parser.add_argument(
+        "--precisions",
+        type=choices(tuple(PRECISIONS)),
+        default=list(PRECISIONS),
+        metavar="A,B",
+        help=f"precisions with commas between them, or all; one of {', '.join(PRECISIONS)} (default: all)",
+    )
+    parser.add_argument(
+        "--threads",
+        type=numbers(1),
+        default=list(dict.fromkeys([1, os.cpu_count() or 1])),
+        metavar="1,2,4",
+        help="numbers of threads with commas between them (default: 1 and the number of cores)",
+    )
+    parser.add_argument(
+        "--recommend",
+        type=Path,
+        nargs="?",
+        const=settings_path(),
+        metavar="FILE",
+        help="save the recommendation to FILE; without FILE, where Perceiver(provider='auto') finds it "
+        f"({settings_path()})",
+    )
+    parser.set_defaults(run=run_command)
+
+
+def run_command(arguments: argparse.Namespace) -> int:
+    """Measure all settings, one model at a time."""
     from ..measure import reference
 
-    limits = Limits(arguments.min_scans, arguments.min_seconds, arguments.warm_up)
     with new_document("matrix", arguments) as (document, live), tempfile.TemporaryDirectory() as folder:
-        providers, skipped = settings_to_try(arguments.providers, arguments.precisions, available_providers())
-        for words in skipped:
-            document["skipped"].append(words)
-            live.say(f"skipped: {words}")
-        given = prepare_input(arguments, Path(folder), document, live)
+        scans = prepare_input(arguments, Path(folder), document, live)
+        scenario = Scenario(SINGLE_STREAM, scans.files, limits_of(arguments))
         for model in dict.fromkeys(arguments.model or DEFAULT):
-            base = Job((model,), sensor=arguments.sensor)
-            right = reference(base, given.files)
-            for provider in providers:
+            settings, skipped = settings_to_try(model, arguments.providers, arguments.precisions, available_providers())
+            for reason in skipped:
+                _skip(reason, document, live)
+            base = Job((model,), sensor=arguments.sensor, scenarios=(scenario,))
+            right = reference(base, scans.files)
+            for provider, precision in settings:
                 for n_threads in arguments.threads:
-                    scenario = Scenario(SINGLE_STREAM, given.files, limits)
-                    job = replace(base, provider=provider, n_threads=n_threads, scenarios=(scenario,))
-                    _try(job, right, given, arguments.repeats, document, live)
-        document["recommended"] = _recommended(document)
+                    job = replace(base, provider=provider, precision=precision, n_threads=n_threads)
+                    _try(job, right, scans, arguments.repeats, document, live)
+        document["recommended"] = recommend(document)
         if arguments.recommend and document["recommended"]:
-            entries = {each["sha256"]: each["entry"] for each in document["recommended"]}
+            entries = {each["digest"]: each["entry"] for each in document["recommended"]}
             write_settings(arguments.recommend, document["machine"]["fingerprint"], entries)
-            live.say(f"kept in {arguments.recommend}")
+            live.note(f"saved in {arguments.recommend}")
     return 0 if document["recommended"] else 2
 
 
 def settings_to_try(
-    providers: Sequence[str], precisions: Sequence[str], present: Sequence[str]
-) -> tuple[list[str], list[str]]:
-    """What `Perceiver` is to be asked for, and a sentence for everything asked for that cannot be had here."""
-    wanted = list(PROVIDERS) if "all" in providers else list(dict.fromkeys(providers))
-    kinds = list(PRECISIONS) if "all" in precisions else list(dict.fromkeys(precisions))
+    model: str, providers: Sequence[str], precisions: Sequence[str], present: Sequence[str]
+) -> tuple[list[tuple[str, str]], list[str]]:
+    """Which settings of a model this computer can run.
+
+    Parameters
+    ----------
+    model : str
+        As `edgeperc.Perceiver` takes it.
+    providers, precisions : sequence of str
+        What the user asked for.
+    present : sequence of str
+        The providers of this computer.
+
+    Returns
+    -------
+    settings : list of (provider, precision)
+    skipped : list of str
+        One sentence for everything that the user asked for and this computer cannot run.
+    """
+    variants = resolve(model)
     settings, skipped = [], []
-    for provider in wanted:
+    for provider in providers:
         if provider not in present:
-            skipped.append(f"{provider}: not available on this computer (present: {', '.join(present)})")
-        elif provider == "openvino":
-            settings += [f"{provider}:{kind}" for kind in kinds]
-        else:
-            skipped += [
-                f"{provider} in {k}: it runs a model in the precision of its file" for k in kinds if k != "fp32"
-            ]
-            settings += [provider] * ("fp32" in kinds)
+            skipped.append(f"{model} on {provider}: not available on this computer (present: {', '.join(present)})")
+            continue
+        for precision in precisions:
+            try:
+                choose(variants, provider, precision, cpu_features())
+            except EdgepercError as exc:
+                skipped.append(f"{model} on {provider} in {precision}: {exc}")
+            else:
+                settings.append((provider, precision))
     return settings, skipped
 
 
-def _try(
-    job: Job,
-    right: Sequence[Answer],
-    given: Input,
-    n_repeats: int,
-    document: dict[str, Any],
-    live: report.LiveTable,
-) -> None:
-    from ..measure import judged, new_setting, repeat
+def _skip(reason: str, document: dict[str, Any], live: LiveTable) -> None:
+    if reason not in document["skipped"]:
+        document["skipped"].append(reason)
+        live.note(f"skipped: {reason}")
+
+
+def _try(job: Job, right: Reference, scans: Input, n_repeats: int, document: dict[str, Any], live: LiveTable) -> None:
+    from ..measure import accuracy_of, new_setting, repeat
 
     setting = new_setting(job)
-    words = f"{'+'.join(job.models)} on {job.provider}, {job.n_threads} threads"
+    name = f"{'+'.join(job.models)} on {job.provider} in {job.precision}, {job.n_threads} threads"
     live.ms.clear()
     try:
-        found = repeat(setting, replace(job, answers=given.files), n_repeats, document, live)
+        predictions: list[Prediction] = repeat(setting, replace(job, predict=scans.files), n_repeats, document, live)
     except EdgepercError as exc:
-        sentence = f"{words}: {' '.join(str(exc).split())}"
-        document["skipped"].append(sentence)
-        live.say(f"skipped: {sentence}")
+        _skip(f"{name}: {' '.join(str(exc).split())}", document, live)
         return
-    # Only now, so that a setting that was broken off recommends nothing.
-    setting["accuracy"] = judged(right, found, given.truth)
+    # Only now: an interrupted setting must not be recommended.
+    setting["accuracy"] = accuracy_of(right, predictions, scans.truth)
     document["settings"].append(setting)
-    ms = percentile(report.pooled(setting, SINGLE_STREAM), 50.0)
-    live.say(f"{words}: median {ms:.2f} ms, {'agrees' if setting['accuracy']['agrees'] else 'answers differ'}")
+    ms = percentile(pooled(setting, SINGLE_STREAM), 50.0)
+    live.note(f"{name}: median {ms:.2f} ms, {'agrees' if setting['accuracy']['agrees'] else 'results differ'}")
 
 
-def _recommended(document: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """For each model the setting of the least median whose answers agree, and whether the next best is truly slower."""
-    told = []
+def recommend(document: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """For each model the fastest setting whose results agree, and whether the next fastest is really slower."""
+
+    def median_ms(setting: Mapping[str, Any]) -> float:
+        return percentile(pooled(setting, SINGLE_STREAM), 50.0)
+
+    recommended = []
     for models in dict.fromkeys(tuple(setting["models"]) for setting in document["settings"]):
         agreeing = [s for s in document["settings"] if tuple(s["models"]) == models and s["accuracy"]["agrees"]]
-        ranked = sorted(agreeing, key=lambda setting: percentile(report.pooled(setting, SINGLE_STREAM), 50.0))
+        ranked = sorted(agreeing, key=median_ms)
         if not ranked:
             continue
         best, (engine,) = ranked[0], ranked[0]["repeats"][0]["engines"]
-        ms = percentile(report.pooled(best, SINGLE_STREAM), 50.0)
-        asked = f"provider={best['provider']!r}, n_threads={best['n_threads']}"
-        words = f"Perceiver({engine['name']!r}, {asked}), median {ms:.2f} ms"
+        chosen = {key: best[key] for key in ("provider", "precision", "n_threads")}
+        call = ", ".join([repr(best["models"][0]), *(f"{key}={value!r}" for key, value in chosen.items())])
+        sentence = f"Perceiver({call}), median {median_ms(best):.2f} ms"
         if len(ranked) > 1:
-            verdict = compare(report.repeats_ms(best, SINGLE_STREAM), report.repeats_ms(ranked[1], SINGLE_STREAM))
-            sure = "is slower" if verdict.word == "slower" else "is no slower as far as the noise lets one say"
-            words += f"; the next, {setting_label(ranked[1])}, {sure}"
-        entry = {
+            verdict = compare(repeats_ms(best, SINGLE_STREAM), repeats_ms(ranked[1], SINGLE_STREAM))
+            result = "is slower" if verdict.word == "slower" else "is not slower within the noise"
+            sentence += f"; the next, {setting_label(ranked[1])}, {result}"
+        entry = chosen | {
             "name": engine["name"],
-            "provider": best["provider"],
-            "n_threads": best["n_threads"],
-            "p50_ms": round(ms, 4),
+            "p50_ms": round(median_ms(best), 4),
             "cpu": document["machine"]["cpu"],
             "onnxruntime": document["software"]["onnxruntime"],
-            "measured": document["software"]["taken"],
+            "measured": document["software"]["measured"],
         }
-        told.append({"name": engine["name"], "sha256": engine["sha256"], "words": words, "entry": entry})
-    return told
+        recommended.append({"name": engine["name"], "digest": engine["digest"], "text": sentence, "entry": entry})
+    return recommended

@@ -7,27 +7,50 @@ import os
 import tempfile
 from pathlib import Path
 
+from ..options import Subparsers, at_least, engine_options, model_options, output_options, scan_options
 from .common import new_document, prepare_input
 
-__all__ = ["peers_command"]
-
-# peers
+__all__ = ["add_parser", "run_command"]
 
 
-def peers_command(arguments: argparse.Namespace) -> int:
-    from ..peers import contenders as peers
+def add_parser(subparsers: Subparsers) -> None:
+    """Declare the command."""
+    parser = subparsers.add_parser(
+        "peers",
+        parents=[model_options(), scan_options(), engine_options(), output_options()],
+        help="measure edgeperc beside torch, other engines and numpy (extra 'peers')",
+        description="Measure edgeperc, the same networks in torch, torch.compile, onnxruntime and OpenVINO with a "
+        "pipeline in numpy, and the fastest matrix products and memory copies of this computer, all in turns. What is "
+        "not installed is listed and left out.",
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "--rounds",
+        type=at_least(1),
+        default=25,
+        metavar="N",
+        help="how often each contender takes its turn with all scans (default: %(default)s)",
+    )
+    parser.set_defaults(run=run_command)
+
+
+def run_command(arguments: argparse.Namespace) -> int:
+    """Measure every table, one after the other."""
+    from ..peers.contenders import default_models
+    from ..peers.turns import run
 
     with new_document("peers", arguments) as (document, live), tempfile.TemporaryDirectory() as folder:
-        given = prepare_input(arguments, Path(folder), document, live)
-        peers.run(
+        scans = prepare_input(arguments, Path(folder), document, live)
+        run(
             document,
-            given.files,
+            scans.files,
             Path(folder),
-            models=arguments.model or peers.default_models(),
+            models=arguments.model or default_models(),
             provider=arguments.provider,
+            precision=arguments.precision,
             sensor=arguments.sensor,
             n_threads=arguments.threads or document["machine"]["usable_cores"] or os.cpu_count() or 1,
             n_rounds=arguments.rounds,
-            say=live.say,
+            note=live.note,
         )
     return 0

@@ -10,84 +10,99 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from edgeperc.zoo import DEFAULT
-
-from .. import context, loadgen, report
-from ..options import DEFAULT_SCENARIOS, SINGLE_STREAM
+from .. import loadgen
+from ..options import (
+    SINGLE_STREAM,
+    Subparsers,
+    add_limits,
+    engine_options,
+    model_options,
+    output_options,
+    scan_options,
+    scenario,
+)
+from ..render import LiveTable
 from ..scenarios import Limits
 from ..worker import Job, Scenario
-from .common import new_document, prepare_input
+from .common import job_of, limits_of, measure_offline, new_document, prepare_input
 
-__all__ = ["measure_offline", "run_command"]
+__all__ = ["add_parser", "run_command"]
 
-# run
+DEFAULT_SCENARIOS = (SINGLE_STREAM, "paced:10", "paced:20", "offline", "cold-start")
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Declare the command."""
+    parser = subparsers.add_parser(
+        "run",
+        parents=[model_options(), scan_options(), engine_options(), output_options()],
+        help="measure one setting (the default command)",
+        description="Measure the latency of one setting, each scenario in fresh processes, and compare its results "
+        "with fp32 on the CPU.",
+        allow_abbrev=False,
+    )
+    add_limits(parser, min_scans=100, min_seconds=10.0, repeats=3)
+    parser.add_argument(
+        "--scenario",
+        action="append",
+        type=scenario,
+        metavar="S",
+        help=f"{SINGLE_STREAM} (back to back), paced:HZ (scans arrive at this rate), offline or offline:PROCESSES "
+        "(throughput of several processes), cold-start (from starting a process to its first answer); may be repeated "
+        f"(default: {', '.join(DEFAULT_SCENARIOS)})",
+    )
+    parser.add_argument(
+        "--loadgen",
+        type=Path,
+        metavar="DIR",
+        help="measure with MLPerf LoadGen, too, and keep its logs in DIR (needs the extra 'loadgen')",
+    )
+    parser.set_defaults(run=run_command)
 
 
 def run_command(arguments: argparse.Namespace) -> int:
-    from ..measure import cold_starts, judged, new_setting, reference, repeat
+    """Measure the scenarios one after the other."""
+    from ..measure import accuracy_of, cold_starts, new_setting, reference, repeat
 
     if arguments.loadgen:
         loadgen.require()
         arguments.loadgen.mkdir(parents=True, exist_ok=True)
-    wanted = list(dict.fromkeys(arguments.scenario or DEFAULT_SCENARIOS))
-    limits = Limits(arguments.min_scans, arguments.min_seconds, arguments.warm_up)
+    names = list(dict.fromkeys(arguments.scenario or DEFAULT_SCENARIOS))
+    limits = limits_of(arguments)
     with new_document("run", arguments) as (document, live), tempfile.TemporaryDirectory() as folder:
-        given = prepare_input(arguments, Path(folder), document, live)
-        arriving = tuple(
-            Scenario(name, given.files, limits, float(name.partition(":")[2]) if name != SINGLE_STREAM else None)
-            for name in wanted
+        scans = prepare_input(arguments, Path(folder), document, live)
+        scenarios = tuple(
+            Scenario(name, scans.files, limits, float(name.partition(":")[2]) if name != SINGLE_STREAM else None)
+            for name in names
             if name == SINGLE_STREAM or name.startswith("paced")
         )
-        job = Job(tuple(arguments.model or DEFAULT), arguments.provider, arguments.threads, arguments.sensor, arriving)
+        job = replace(job_of(arguments), scenarios=scenarios)
         setting = new_setting(job)
         document["settings"].append(setting)
-        live.say(f"{arguments.repeats} repeats of {', '.join(s.name for s in arriving) or 'nothing but the start'}")
-        answers = repeat(setting, replace(job, answers=given.files), arguments.repeats, document, live)
-        live.say("comparing the answers with fp32 on the stock CPU provider")
-        setting["accuracy"] = judged(reference(job, given.files), answers, given.truth)
-        for name in wanted:
+        live.note(f"{arguments.repeats} repeats of {', '.join(s.name for s in scenarios) or 'nothing but the start'}")
+        predictions = repeat(setting, replace(job, predict=scans.files), arguments.repeats, document, live)
+        live.note("comparing the results with fp32 on the CPU provider")
+        setting["accuracy"] = accuracy_of(reference(job, scans.files), predictions, scans.truth)
+        for name in names:
             kind, _, value = name.partition(":")
             if kind == "offline":
                 n = int(value or document["machine"]["usable_cores"] or os.cpu_count() or 1)
-                measure_offline(setting, job, given.files, n, limits, document, live)
+                measure_offline(setting, job, scans.files, n, limits, document, live)
             elif kind == "cold-start":
-                live.say("cold starts")
-                setting["cold_start"] = cold_starts(job, given.files[0], 1 + arguments.repeats)
+                live.note("cold starts")
+                setting["cold_start"] = cold_starts(job, scans.files[0], 1 + arguments.repeats)
         if arguments.loadgen:
-            _loadgen(setting, job, given.files, limits, arguments.loadgen, live)
+            _loadgen(setting, job, scans.files, limits, arguments.loadgen, live)
     return 0
 
 
-def measure_offline(
-    setting: dict[str, Any],
-    job: Job,
-    files: Sequence[Path],
-    n: int,
-    limits: Limits,
-    document: dict[str, Any],
-    live: report.LiveTable,
-) -> None:
-    from ..measure import offline
-
-    live.say(f"offline, {n} processes")
-    told = offline(job, files, n, limits, live)
-    setting["offline"].append(told)
-    cpu_s = sum(part["cpu_s"] for part in told["parts"])
-    for words in context.spoilers(document["machine"], told["before"], told["after"], cpu_s):
-        # What the processes take to get ready is other processes' work by this count.
-        if not words.startswith("other processes"):
-            document["spoilers"].append(f"offline x {n}: {words}")
-    if told["interrupted"]:
-        raise KeyboardInterrupt
-
-
 def _loadgen(
-    setting: dict[str, Any], job: Job, files: Sequence[Path], limits: Limits, folder: Path, live: report.LiveTable
+    setting: dict[str, Any], job: Job, files: Sequence[Path], limits: Limits, folder: Path, live: LiveTable
 ) -> None:
     from ..measure import new_setting, repeat
 
-    live.say(f"MLPerf LoadGen, logs in {folder}")
+    live.note(f"MLPerf LoadGen, logs in {folder}")
     driven = replace(job, scenarios=(Scenario("loadgen", tuple(files), limits),), loadgen=folder)
     scratch = new_setting(driven)
-    repeat(scratch, driven, 1, {"machine": {"logical_cores": os.cpu_count()}, "spoilers": []}, live)
-    setting["loadgen"] = loadgen.told(folder) | {"samples": scratch["repeats"][0]["scenarios"]["loadgen"]}
+    repeat(scratch, driven, 1, {"machine": {"logical_cores": os.cpu_count()}, "disturbances": []}, live)
+    setting["loadgen"] = loadgen.read_summary(folder) | {"samples": scratch["repeats"][0]["scenarios"]["loadgen"]}

@@ -14,64 +14,93 @@ from typing import Any
 
 import numpy as np
 
-from edgeperc.zoo import DEFAULT
+from edgeperc.atomic import write_whole
 
-from .. import report
-from ..samples import percentile, trend
-from ..scenarios import Limits
+from .. import plots
+from ..document import latency, stage_medians
+from ..options import Subparsers, add_limits, engine_options, model_options, numbers, output_options
+from ..render import LiveTable, number
+from ..samples import trend
 from ..worker import Job, Scenario
-from .common import new_document
-from .run import measure_offline
+from .common import job_of, limits_of, measure_offline, new_document
 
-__all__ = ["scaling_command"]
+__all__ = ["add_parser", "run_command"]
 
-# scaling
+POINT_COUNTS = (10_000, 20_000, 50_000, 100_000, 200_000, 500_000, 1_000_000, 2_000_000)
+CAR_COUNTS = (0, 4, 8, 16, 28)
+SIZES = (50, 100, 200, 400)
+Curve = list[tuple[float, float]]
 
 
-def scaling_command(arguments: argparse.Namespace) -> int:
+def add_parser(subparsers: Subparsers) -> None:
+    """Declare the command."""
+    parser = subparsers.add_parser(
+        "scaling",
+        parents=[model_options(), engine_options(), output_options(html=False)],
+        help="measure how the time grows with points, cars, image size and processes",
+        description="Measure how the time of a scan grows with its number of points, with the number of cars in it, "
+        "with the size of the networks' images and with the number of processes.",
+        allow_abbrev=False,
+    )
+    add_limits(parser, min_scans=20, min_seconds=1.0, repeats=1)
+
+    def add_counts(option: str, least: int, most: int | None, default: Sequence[int] | None, text: str) -> None:
+        shown = "1, 2, 4 .. up to the cores" if default is None else ",".join(map(str, default))
+        kwargs: dict[str, Any] = {"type": numbers(least, most), "default": default, "metavar": "N,N"}
+        parser.add_argument(option, help=f"{text}, with commas between them (default: {shown})", **kwargs)
+
+    add_counts("--points", 100, None, POINT_COUNTS, "numbers of points in a scan")
+    add_counts("--cars", 0, CAR_COUNTS[-1], CAR_COUNTS, f"numbers of cars in a scan, {CAR_COUNTS[-1]} at most")
+    add_counts(
+        "--sizes", 25, 1600, SIZES,
+        "image sizes in per cent of the model's own pixels, with random weights (needs the extra 'export')",
+    )  # fmt: skip
+    add_counts("--processes", 1, None, None, "numbers of processes at once")
+    parser.add_argument(
+        "--plot", type=Path, metavar="FILE", help="draw the curves to a .svg or .png file (needs the extra 'view')"
+    )
+    parser.set_defaults(run=run_command)
+
+
+def run_command(arguments: argparse.Namespace) -> int:
+    """Measure the four curves."""
     from .. import inputs
     from ..measure import new_setting, repeat
 
     if arguments.plot:
-        report.require_matplotlib()
+        plots.require_matplotlib()
         arguments.plot.parent.mkdir(parents=True, exist_ok=True)
-    limits = Limits(arguments.min_scans, arguments.min_seconds, min(arguments.warm_up, 5))
+    limits = limits_of(arguments)
+    limits = replace(limits, warm_up_scans=min(limits.warm_up_scans, 5))
     with new_document("scaling", arguments) as (document, live), tempfile.TemporaryDirectory() as folder:
-        live.say("simulating scans")
-        makers = [("points", n, inputs.sized) for n in arguments.points] + [
-            ("cars", n, inputs.crowd) for n in arguments.cars
-        ]
-        files = {
-            (kind, n): inputs.store(Path(folder), f"{kind}{n}", make(n, arguments.sensor)) for kind, n, make in makers
+        live.note("simulating scans")
+        scenarios = {
+            (kind, n): Scenario(
+                f"{n:,} {kind}", (inputs.store(Path(folder), f"{kind}{n}", make(n, arguments.sensor)),), limits
+            )
+            for kind, counts, make in (
+                ("points", arguments.points, inputs.sized),
+                ("cars", arguments.cars, inputs.crowd),
+            )
+            for n in counts
         }
-        scenarios = {key: Scenario(f"{key[1]:,} {key[0]}", (file,), limits) for key, file in files.items()}
-        job = Job(tuple(arguments.model or DEFAULT), arguments.provider, arguments.threads, arguments.sensor)
+        job = job_of(arguments)
         setting = new_setting(job)
         document["settings"].append(setting)
         repeat(setting, replace(job, scenarios=tuple(scenarios.values())), arguments.repeats, document, live)
-        curves: dict[str, list[tuple[float, float]]] = {}
-        for kind, unit in (("points", "1,000 points"), ("cars", "car")):
-            counts = [n for of, n in scenarios if of == kind]
-            ms = [percentile(report.pooled(setting, scenarios[kind, n].name), 50.0) for n in counts]
-            curves[kind] = list(zip(counts, ms, strict=True))
-            rows = []
-            for n in counts:
-                told = report.latency(setting, scenarios[kind, n].name)
-                own = report.stage_medians(setting, scenarios[kind, n].name)
-                beside = sum(took for stage, took in own.items() if stage != "infer")
-                rows.append([f"{n:,}", *(report.number(told[q]) for q in ("p50", "p90")), report.number(beside)])
-            words = _line(curves[kind], unit, 1000.0 if kind == "points" else 1.0)
-            head = [kind, "p50 ms", "p90 ms", "beside the network ms"]
-            document["tables"].append({"title": f"Growth with {kind}", "sentences": words, "head": head, "rows": rows})
-        middle = min(files, key=lambda key: (key[0] != "points", abs(key[1] - 100_000)))
-        curves["pixels %"] = _growth_with_images(document, live, job, arguments, Path(folder), files[middle], limits)
-        most = document["machine"]["usable_cores"] or os.cpu_count() or 1
-        counts = arguments.processes or sorted({*(2**k for k in range(most.bit_length())), most})
-        for n in counts:
-            measure_offline(setting, job, [files[middle]], n, limits, document, live)
-        curves["processes"] = [(told["processes"], told["scans_per_s"] or math.nan) for told in setting["offline"]]
+        curves: dict[str, Curve] = {}
+        for kind, unit, per in (("points", "1,000 points", 1000.0), ("cars", "car", 1.0)):
+            settings = [(n, setting, scenarios[of, n].name) for of, n in scenarios if of == kind]
+            curves[kind] = _add_table(document, kind, settings, unit, per)
+        middle = min(scenarios, key=lambda key: (key[0] != "points", abs(key[1] - 100_000)))
+        scan = scenarios[middle].scans[0]
+        curves["pixels %"] = _growth_with_images(document, live, job, arguments, Path(folder), scan)
+        cores = document["machine"]["usable_cores"] or os.cpu_count() or 1
+        for n in arguments.processes or sorted({*(2**k for k in range(cores.bit_length())), cores}):
+            measure_offline(setting, job, [scan], n, limits, document, live)
+        curves["processes"] = [(each["processes"], each["scans_per_s"] or math.nan) for each in setting["offline"]]
         one = curves["processes"][0][1] / curves["processes"][0][0]
-        rows = [[str(n), report.number(rate), report.number(rate / one)] for n, rate in curves["processes"]]
+        rows = [[f"{n}", number(rate), number(rate / one)] for n, rate in curves["processes"]]
         head = ["processes", "scans/s", "times one"]
         document["tables"].append({"title": "Growth with processes", "sentences": [], "head": head, "rows": rows})
         if arguments.plot:
@@ -79,58 +108,71 @@ def scaling_command(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _growth_with_images(
+def _add_table(
     document: dict[str, Any],
-    live: report.LiveTable,
-    job: Job,
-    arguments: argparse.Namespace,
-    folder: Path,
-    scan: Path,
-    limits: Limits,
-) -> list[tuple[float, float]]:
-    """The same networks, for views of more or fewer pixels."""
-    from ..measure import new_setting, repeat
-
-    head = ["pixels %", "p50 ms", "p90 ms", "beside the network ms"]
-    table: dict[str, Any] = {"title": "Growth with image size", "sentences": [], "head": head, "rows": []}
-    document["tables"].append(table)
-    if not all(importlib.util.find_spec(name) for name in ("torch", "onnx")):
-        table["sentences"] = ["not measured: pip install 'edgeperc[export]'"]
-        return []
-    from ..peers.networks import resized
-
-    curve = []
-    for percent in arguments.sizes:
-        live.say(f"making networks for {percent} % of the pixels")
-        models = tuple(str(resized(name, percent / 100.0, folder)) for name in job.models)
-        scenario = Scenario(f"{percent} % of the pixels", (scan,), limits)
-        setting = new_setting(own := replace(job, models=models, scenarios=(scenario,)))
-        document["settings"].append(setting)
-        repeat(setting, own, arguments.repeats, document, live)
-        told, stages = report.latency(setting, scenario.name), report.stage_medians(setting, scenario.name)
-        beside = sum(took for stage, took in stages.items() if stage != "infer")
-        table["rows"].append([f"{percent}", *(report.number(told[q]) for q in ("p50", "p90")), report.number(beside)])
-        curve.append((float(percent), float(told["p50"])))
-    table["sentences"] = ["networks made anew, in fp32", *_line(curve, "per cent of the model's own image")]
+    kind: str,
+    settings: Sequence[tuple[int, Mapping[str, Any], str]],
+    unit: str,
+    per: float = 1.0,
+    sentences: Sequence[str] = (),
+) -> Curve:
+    """Add the table of one curve, (count, setting, scenario) by row, with a straight line through its medians."""
+    rows, curve = [], []
+    for n, setting, scenario in settings:
+        measured, stages = latency(setting, scenario), stage_medians(setting, scenario)
+        beside = sum(ms for stage, ms in stages.items() if stage != "infer")
+        rows.append([f"{n:,}", number(measured["p50"]), number(measured["p90"]), number(beside)])
+        curve.append((float(n), math.nan if measured["p50"] is None else float(measured["p50"])))
+    line = trend(*(np.array(curve, np.float64).reshape(-1, 2) / (per, 1.0)).T)
+    fitted = f"{line.intercept:.2f} ms + {line.slope:.4f} ms per {unit} (+- {line.error:.4f}), R2 {line.r2:.4f}"
+    document["tables"].append(
+        {
+            "title": f"Growth with {kind}",
+            "sentences": [
+                *sentences,
+                *([] if math.isnan(line.slope) else [f"a straight line through the medians: {fitted}"]),
+            ],
+            "head": [kind, "p50 ms", "p90 ms", "beside the network ms"],
+            "rows": rows,
+        }
+    )
     return curve
 
 
-def _line(curve: Sequence[tuple[float, float]], unit: str, per: float = 1.0) -> list[str]:
-    line = trend(*(np.array(curve, np.float64).reshape(-1, 2) / (per, 1.0)).T)
-    if math.isnan(line.slope):
-        return []
-    told = f"{line.intercept:.2f} ms + {line.slope:.4f} ms per {unit} (+- {line.error:.4f}), R2 {line.r2:.4f}"
-    return [f"a line through the medians: {told}"]
+def _growth_with_images(
+    document: dict[str, Any], live: LiveTable, job: Job, arguments: argparse.Namespace, folder: Path, scan: Path
+) -> Curve:
+    """The same networks, for views of more or fewer pixels."""
+    from ..measure import new_setting, repeat
+
+    unit = "per cent of the model's own image"
+    if not all(importlib.util.find_spec(name) for name in ("torch", "onnx")):
+        return _add_table(document, "pixels %", [], unit, sentences=["not measured: pip install 'edgeperc[export]'"])
+    from ..peers.networks import resized
+
+    limits, settings = limits_of(arguments), []
+    for percent in arguments.sizes:
+        live.note(f"making networks for {percent} % of the pixels")
+        models = tuple(str(resized(name, percent / 100.0, folder)) for name in job.models)
+        scenario = Scenario(f"{percent} % of the pixels", (scan,), limits)
+        own = replace(job, models=models, scenarios=(scenario,))
+        setting = new_setting(own)
+        document["settings"].append(setting)
+        repeat(setting, own, arguments.repeats, document, live)
+        settings.append((percent, setting, scenario.name))
+    return _add_table(
+        document, "pixels %", settings, unit, sentences=["new networks with random weights, stored in fp32"]
+    )
 
 
-def _plot(curves: Mapping[str, Sequence[tuple[float, float]]], path: Path) -> None:
+def _plot(curves: Mapping[str, Curve], path: Path) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12.0, 3.6), layout="constrained")
     for axes, (kind, curve) in zip(figure.subplots(1, len(curves)), curves.items(), strict=True):
-        axes.plot(*np.array(curve, np.float64).reshape(-1, 2).T, marker="o", color="#3b6ea8")
+        axes.plot(*np.array(curve, np.float64).reshape(-1, 2).T, marker="o", color=plots.BLUE)
         axes.set(xlabel=kind, ylabel="scans a second" if kind == "processes" else "median ms", ylim=(0.0, None))
     if path.suffix == ".svg":
-        path.write_text(report.as_svg(figure), encoding="utf-8")
+        write_whole(path, plots.as_svg(figure).encode())
     else:
         figure.savefig(path, dpi=150)

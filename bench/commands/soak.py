@@ -6,46 +6,56 @@ import argparse
 import math
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from edgeperc.zoo import DEFAULT
-
+from ..options import Subparsers, at_least, engine_options, model_options, output_options
 from ..samples import trend
 from ..scenarios import Limits
-from ..worker import MEMORY_SAMPLES, Job, Scenario
-from .common import new_document
+from ..worker import MEMORY_SAMPLES, Scenario
+from .common import job_of, new_document
 
-__all__ = ["soak_command"]
+__all__ = ["add_parser", "memory_growth", "run_command"]
 
-# Memory that a run may gain and still be called level [MB]; an allocator's pages come and go by about so much.
+# A run may gain this much memory and still be level [MB]: an allocator's pages come and go by about as much.
 LEVEL_MB = 1.0
-
-# Of a long run, the share that counts as warm-up of the allocator.
+# The share of the scans during which the allocator settles.
 SETTLING_SHARE = 0.1
 
 
-# soak
+def add_parser(subparsers: Subparsers) -> None:
+    """Declare the command."""
+    parser = subparsers.add_parser(
+        "soak",
+        parents=[model_options(), engine_options(), output_options(html=False)],
+        help="tell whether memory grows over a long run",
+        description="Run many simulated scans in one process and fit a line to its memory.",
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "--scans",
+        type=at_least(1000),
+        default=20_000,
+        metavar="N",
+        help="the number of scans, 1000 at least (default: %(default)s)",
+    )
+    parser.set_defaults(run=run_command)
 
 
-def soak_command(arguments: argparse.Namespace) -> int:
+def run_command(arguments: argparse.Namespace) -> int:
+    """Run the scans, and report on the memory even when they are interrupted."""
     from .. import inputs
     from ..measure import new_setting, repeat
 
     settling = round(SETTLING_SHARE * arguments.scans)
     with new_document("soak", arguments) as (document, live), tempfile.TemporaryDirectory() as folder:
-        given = inputs.simulate(Path(folder), 8, arguments.sensor)
-        document["input"] = given.told
-        scenario = Scenario(
-            "soak",
-            given.files,
-            Limits(arguments.scans - settling, 0.0, settling, max(1, arguments.scans // MEMORY_SAMPLES)),
-        )
-        job = Job(
-            tuple(arguments.model or DEFAULT), arguments.provider, arguments.threads, arguments.sensor, (scenario,)
-        )
+        scans = inputs.simulated_input(Path(folder), 8, arguments.sensor)
+        document["input"] = scans.record
+        limits = Limits(arguments.scans - settling, 0.0, settling, max(1, arguments.scans // MEMORY_SAMPLES))
+        job = replace(job_of(arguments), scenarios=(Scenario("soak", scans.files, limits),))
         setting = new_setting(job)
         document["settings"].append(setting)
         try:
@@ -70,29 +80,29 @@ def memory_growth(rss_mb: Sequence[Sequence[float]], settling: int) -> dict[str,
     -------
     dict
         ``verdict`` (grows, level, undecided), ``growth_mb`` over the run by a straight line and its ``growth_error_mb``
-        (half of a 95 % interval), ``last_minus_first_mb``, ``sentences``. It grows where the interval lies above 0 and
-        the growth above `LEVEL_MB`; it is level where the interval ends below `LEVEL_MB`.
+        (half of a 95 % interval), ``last_minus_first_mb``, ``sentences``. Memory grows if the interval lies above 0 and
+        the growth above `LEVEL_MB`; it is level if the interval ends below `LEVEL_MB`.
     """
     done, mb = np.asarray(rss_mb, np.float64).reshape(-1, 2).T
     line = trend(done, mb)
-    told: dict[str, Any] = {
-        "verdict": "undecided",
-        "growth_mb": None,
-        "growth_error_mb": None,
-        "last_minus_first_mb": None,
-    }
     if math.isnan(line.slope):
-        return told | {"sentences": ["undecided: too few samples of the memory for a line"]}
+        unknown = dict.fromkeys(("growth_mb", "growth_error_mb", "last_minus_first_mb"))
+        return {"verdict": "undecided", **unknown, "sentences": ["undecided: too few samples of the memory for a line"]}
     span = float(done[-1] - done[0])
     growth, error = line.slope * span, line.error * span
+    verdict = "undecided"
     if growth + error <= LEVEL_MB:
-        told["verdict"] = "level"
+        verdict = "level"
     elif growth - error > 0.0 and growth > LEVEL_MB:
-        told["verdict"] = "grows"
-    told |= {"growth_mb": growth, "growth_error_mb": error, "last_minus_first_mb": float(mb[-1] - mb[0])}
-    sentences = [
-        f"{told['verdict']}: {growth:+.3f} MB (+- {error:.3f}) over {span:,.0f} scans, after {settling:,} to settle",
-        f"resident {mb[0]:.1f} MB first, {mb[-1]:.1f} MB last, {mb.max():.1f} MB at most; "
-        f"slope {1e3 * line.slope:+.5f} MB per 1,000 scans (+- {1e3 * line.error:.5f}), from {len(mb):,} samples",
-    ]
-    return told | {"sentences": sentences}
+        verdict = "grows"
+    return {
+        "verdict": verdict,
+        "growth_mb": growth,
+        "growth_error_mb": error,
+        "last_minus_first_mb": float(mb[-1] - mb[0]),
+        "sentences": [
+            f"{verdict}: {growth:+.3f} MB (+- {error:.3f}) over {span:,.0f} scans, after {settling:,} to settle",
+            f"resident memory: {mb[0]:.1f} MB first, {mb[-1]:.1f} MB last, {mb.max():.1f} MB at most; "
+            f"slope {1e3 * line.slope:+.5f} MB per 1,000 scans (+- {1e3 * line.error:.5f}), from {len(mb):,} samples",
+        ],
+    }

@@ -1,9 +1,9 @@
-"""What a network costs at least, and what this machine can do at most: the floor under every latency.
+"""The least work of a network and the peak of this machine, which together bound every latency from below.
 
-A network's multiplications are those of its convolutions and matrix products, counted one by one from the ONNX graph;
-taps that meet nothing but padding are told apart, for nobody has to compute them. What a machine can do is measured
-where the networks are, and by the libraries that are there: large matrix products, and a copy of more memory than any
-cache holds. The floor holds for direct convolution: Winograd's takes fewer multiplications and more of everything else.
+A network's multiplications are those of its convolutions and matrix products, counted from the ONNX graph; taps that
+only meet padding are counted separately, because an engine can skip them. The machine's peak is measured beside the
+networks, with the installed libraries: large matrix products, and a copy of more memory than any cache holds. The bound
+is that of direct convolution: Winograd's method takes fewer multiplications and more of everything else.
 """
 
 from __future__ import annotations
@@ -19,7 +19,16 @@ import numpy as np
 
 from edgeperc import ModelError
 
-__all__ = ["COPY_BYTES", "PRODUCT_SIZE", "Cost", "cost", "matrix_product", "memory_copy", "openvino_request"]
+__all__ = [
+    "COPY_BYTES",
+    "PRODUCT_SIZE",
+    "Cost",
+    "cost",
+    "matrix_product",
+    "memory_copy",
+    "n_taps_inside",
+    "openvino_request",
+]
 
 PRODUCT_SIZE = 1536
 COPY_BYTES = 1 << 28
@@ -27,16 +36,16 @@ COPY_BYTES = 1 << 28
 
 @dataclass(frozen=True)
 class Cost:
-    """What a network takes, in numbers, not bytes.
+    """The work of a network, counted in values, not bytes.
 
     Attributes
     ----------
     macs : int
-        Multiply-accumulates, padding included, as networks are usually compared.
+        Multiply-accumulates, with padding, the usual figure.
     padding_macs : int
-        Those of them that meet nothing but padding.
+        Those of them that only meet padding.
     weights, activations : int
-        Read, and read and written, by convolutions and matrix products; all else can be fused into these.
+        Values that convolutions and matrix products read, and read or write; other operators can be fused into them.
     """
 
     macs: int
@@ -55,7 +64,7 @@ def cost(model: Path | Any) -> Cost:
     Raises
     ------
     ModelError
-        A shape is not known beforehand, or padding is left to the engine.
+        A shape is not fixed, or padding is left to the engine.
     """
     import onnx
 
@@ -67,28 +76,28 @@ def cost(model: Path | Any) -> Cost:
     constant = {t.name for t in graph.initializer}
     macs = inside = weights = activations = 0
     for node in graph.node:
-        if all(name in constant for name in node.input):  # weights on their way from half precision or int8
+        if all(name in constant for name in node.input):  # weights converted from half precision or int8
             constant.update(node.output)
         if node.op_type not in ("Conv", "ConvTranspose", "Gemm", "MatMul"):
             continue
         if not all(math.prod(shapes.get(name, (0,))) for name in (*filter(None, node.input), *node.output)):
-            raise ModelError(f"{node.op_type} {node.name}: a shape is not known beforehand; export with fixed shapes")
-        set_up = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
+            raise ModelError(f"{node.op_type} {node.name}: a shape is not fixed; export with fixed shapes")
+        attributes = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
         x, w, y = shapes[node.input[0]], shapes[node.input[1]], shapes[node.output[0]]
         if node.op_type in ("Conv", "ConvTranspose"):
-            if set_up.get("auto_pad", b"NOTSET") != b"NOTSET":
-                raise ModelError(f"{node.op_type} {node.name} pads as the engine likes; export with explicit pads")
-            # Seen from where a tap is multiplied once: a convolution's outputs, a transposed one's inputs.
+            if attributes.get("auto_pad", b"NOTSET") != b"NOTSET":
+                raise ModelError(f"{node.op_type} {node.name} leaves padding to the engine; export with explicit pads")
+            # The side where each tap is multiplied once: a convolution's outputs, a transposed one's inputs.
             here, there = (y, x) if node.op_type == "Conv" else (x, y)
             axes = range(len(w) - 2)
-            strides, dilations = (set_up.get(name, [1 for _ in axes]) for name in ("strides", "dilations"))
-            pads = set_up.get("pads", [0 for _ in axes])
-            met = [n_met(here[2 + k], there[2 + k], w[2 + k], strides[k], pads[k], dilations[k]) for k in axes]
+            strides, dilations = (attributes.get(name, [1 for _ in axes]) for name in ("strides", "dilations"))
+            pads = attributes.get("pads", [0 for _ in axes])
+            met = [n_taps_inside(here[2 + k], there[2 + k], w[2 + k], strides[k], pads[k], dilations[k]) for k in axes]
             channels = here[0] * here[1] * w[1]
             macs += channels * math.prod(here[2:]) * math.prod(w[2:])
             inside += channels * math.prod(met)
         else:
-            depth = x[0] if set_up.get("transA") else x[-1]
+            depth = x[0] if attributes.get("transA") else x[-1]
             macs += math.prod(y) * depth
             inside += math.prod(y) * depth
         weights += sum(math.prod(shapes[name]) for name in node.input if name in constant)
@@ -97,8 +106,8 @@ def cost(model: Path | Any) -> Cost:
     return Cost(macs, macs - inside, weights, activations)
 
 
-def n_met(n_here: int, n_there: int, kernel: int, stride: int, pad: int, dilation: int) -> int:
-    """Pairs of a position and a tap, along one axis, that meet a position on the other side and no padding."""
+def n_taps_inside(n_here: int, n_there: int, kernel: int, stride: int, pad: int, dilation: int) -> int:
+    """Pairs of a position and a tap, along one axis, that meet a position of the other side, not padding."""
     at = np.arange(n_here)[:, None] * stride - pad + np.arange(kernel) * dilation
     return int(np.count_nonzero((at >= 0) & (at < n_there)))
 
@@ -106,7 +115,7 @@ def n_met(n_here: int, n_there: int, kernel: int, stride: int, pad: int, dilatio
 def matrix_product(library: str, precision: str, n_threads: int) -> Callable[[], object]:
     """A square matrix product of `PRODUCT_SIZE` ** 3 multiplications, by numpy, torch or openvino.
 
-    numpy's threads are set in the environment of the process, before it starts.
+    numpy takes its number of threads from the environment when the process starts.
     """
     n = PRODUCT_SIZE
     a, b = np.random.default_rng(0).standard_normal((2, n, n), np.float32)
@@ -134,7 +143,7 @@ def matrix_product(library: str, precision: str, n_threads: int) -> Callable[[],
 
 
 def openvino_request(model: Any, precision: str, n_threads: int) -> Any:
-    """A model in OpenVINO's own API, set up for the least latency on the CPU."""
+    """A model in OpenVINO's own API, configured for low latency on the CPU."""
     import openvino
 
     settings = {
@@ -146,7 +155,7 @@ def openvino_request(model: Any, precision: str, n_threads: int) -> Any:
 
 
 def memory_copy(n_threads: int) -> Callable[[], object]:
-    """Copy `COPY_BYTES`, every thread its part."""
+    """A copy of `COPY_BYTES`, an equal part for each thread."""
     source, target = np.ones(COPY_BYTES // 8), np.zeros(COPY_BYTES // 8)
     parts: Sequence[Any] = list(zip(np.array_split(target, n_threads), np.array_split(source, n_threads), strict=True))
     pool = ThreadPoolExecutor(n_threads)

@@ -1,9 +1,9 @@
-"""edgeperc beside what else one could run: torch, other engines, a pipeline in numpy, two networks in place of one.
+"""What is measured beside edgeperc: torch, other engines, a pipeline in numpy, two networks in place of one.
 
-Every contender is a process of its own, so that libraries do not meet in one address space and memory can be told. The
-contenders of a table take turns, in an order drawn anew each round, so that whatever drifts treats them all alike. In
-its turn a contender handles every scan once, after one that does not count: others ran meanwhile, and their threads
-may still be spinning. Machine peaks are measured by contenders too, in the same rounds as the networks.
+Every contender is a process of its own, so that libraries do not share an address space and memory can be measured. The
+contenders of a table take turns in a new random order each round, so that drift affects all of them alike. In its turn
+a contender handles every scan once, after a call that does not count, because the threads of the contender before may
+still be spinning. The peaks of the machine are contenders, too, measured in the same rounds as the networks.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from pathlib import Path
 
 import numpy as np
 
-from edgeperc import ModelCard
 from edgeperc.adapt import condition
+from edgeperc.card import ModelCard
 from edgeperc.projection import make_projector
 from edgeperc.sensor import get_sensor
-from edgeperc.session import Session, available_providers
-from edgeperc.zoo import DEFAULT, listed, model_path
+from edgeperc.session import available_providers
+from edgeperc.zoo import DEFAULT, Variant, listed, resolve
 
 from ..samples import percentile
-from ..worker import Answer
+from ..worker import Prediction
 
-__all__ = ["INSTALL", "OPENVINO", "Contender", "Found", "absent", "default_models", "groups"]
+__all__ = ["INSTALL", "OPENVINO", "PEAKS", "Contender", "Measured", "default_models", "groups", "why_missing"]
 
 INSTALL = "not installed: pip install 'edgeperc[peers]'"
-TORCH = ("torch:fp32", "torch.compile:fp32", "torch:bf16", "torch.compile:bf16")
-OPENVINO = ("openvino:fp32", "openvino:bf16")
+TORCH = (("torch", "fp32"), ("torch.compile", "fp32"), ("torch", "bf16"), ("torch.compile", "bf16"))
+OPENVINO = (("openvino", "fp32"), ("openvino", "bf16"))
 NEEDS = {"openvino": ("openvino",), "torch": ("torch", "onnx"), "torch.compile": ("torch", "onnx")}
-PEAKS = ("numpy:fp32", "torch:fp32", "torch:bf16", "torch:int8", "openvino:fp32", "openvino:bf16")
+PEAKS = (("numpy", "fp32"), ("torch", "fp32"), ("torch", "bf16"), ("torch", "int8"), *OPENVINO)
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,15 @@ class Contender:
     ----------
     name : str
     kind : str
-        A key of `MAKERS`.
+        A key of `turns.MAKERS`.
     engine : str
-        A provider for kind ``"edgeperc"``, else as `open_engine` or `matrix_product` have it.
+        A provider for the kinds ``"edgeperc"`` and ``"session"``, else as `open_engine` or `matrix_product` take it.
+    precision : str
+        As the provider or the engine takes it; empty if it has no choice.
     paths : tuple of Path
         Models.
     cards : tuple of str
-        Of the models, JSON.
+        The models' cards, JSON.
     image : Path or None
         Input of a network alone, .npy.
     """
@@ -56,126 +58,142 @@ class Contender:
     name: str
     kind: str
     engine: str = ""
+    precision: str = ""
     paths: tuple[Path, ...] = ()
     cards: tuple[str, ...] = ()
     image: Path | None = None
 
 
 @dataclass
-class Found:
-    """What was measured of a contender: milliseconds by round, memory, answers, or why there are none."""
+class Measured:
+    """Measurements of a contender: milliseconds by round, memory, predictions, or why there are none."""
 
     contender: Contender
     rounds: list[list[float]] = field(default_factory=list)
     rss_mb: float | None = None
-    answers: list[Answer] = field(default_factory=list)
-    why_not: str = ""
+    predictions: list[Prediction] = field(default_factory=list)
+    missing: str = ""
 
     @property
     def ms(self) -> list[float]:
+        """All milliseconds, in the order of measuring."""
         return [ms for each in self.rounds for ms in each]
 
     @property
     def p50(self) -> float:
+        """Their median."""
         return percentile(self.ms, 50.0)
 
 
-def absent(contender: Contender) -> str:
-    """Why a contender cannot run here; empty where it can."""
-    library = contender.engine.partition(":")[0]
-    if contender.kind == "edgeperc":
-        known = library in ("auto", *available_providers())
+def why_missing(contender: Contender) -> str:
+    """Why a contender cannot run here; empty if it can."""
+    if contender.kind in ("edgeperc", "session"):
+        known = contender.engine in ("auto", *available_providers())
         return "" if known else "onnxruntime offers no such provider on this computer"
-    needed = NEEDS.get(library, ())
-    # Networks cut out of others are only there where onnx is.
+    needed = NEEDS.get(contender.engine, ())
+    # The parts of a network exist only if onnx is installed.
     here = all(importlib.util.find_spec(name) for name in needed) and all(path.exists() for path in contender.paths)
     return "" if here else INSTALL
 
 
-# Who is measured
-
-
 def default_models() -> list[str]:
-    """The shipped models that are measured unless others are named."""
+    """The shipped models that are measured by default: every variant of the default pair."""
     return [str(variant) for variant in listed() if variant.name in DEFAULT]
 
 
-def groups(models: Sequence[str], provider: str, folder: Path, scan: Path, sensor: str) -> dict[str, list[Contender]]:
+def groups(
+    models: Sequence[str], provider: str, precision: str, folder: Path, scan: Path, sensor: str
+) -> dict[str, list[Contender]]:
     """All contenders, by the title of their table.
 
     Parameters
     ----------
     models : sequence of str
-        Names or paths; those of a range image are paired with those of a top view, first with first.
-    provider : str
-        edgeperc's own.
+        Names or paths; a name stands for its variant in fp32. Range-image models are paired with top-view models, the
+        first with the first.
+    provider, precision : str
+        Of edgeperc itself.
     folder : Path
         For inputs and for the two networks in place of one.
     scan : Path
-        What networks alone see.
+        Input of networks alone.
     sensor : str
     """
-    profile, points = get_sensor(sensor), np.load(scan)
-    views: dict[str, list[tuple[str, Path, ModelCard]]] = {"range_image": [], "top_view": []}
+    points, _ = condition(np.load(scan), get_sensor(sensor), rendered=False)
+    views: dict[str, list[Variant]] = {"range_image": [], "top_view": []}
     for name in models:
-        path = Path(name) if name.endswith(".onnx") else model_path(name)
-        card = Session(path, "cpu").card
-        views[card.view.kind].append((f"{card.name}-{card.precision}", path, card))
-    told: dict[str, list[Contender]] = {}
-    for name, path, card in (*views["range_image"], *views["top_view"]):
-        image = folder / f"{name}-input.npy"
-        projector = make_projector(card.view, card.input)
-        np.save(image, projector.project(condition(points, profile)[0]).image)
-        alone = [Contender("onnxruntime CPU, network alone", "session", "cpu", (path,), image=image)]
-        if provider not in ("auto", "cpu"):
-            alone.append(Contender(f"onnxruntime {provider}, network alone", "session", provider, (path,), image=image))
-        for engine in OPENVINO:
-            alone.append(Contender(f"OpenVINO API {engine[9:]}, network alone", "network", engine, (path,), (), image))
-        peaks = [Contender(f"peak {engine}", "peak", engine) for engine in (*PEAKS, "copy")]
-        full = [model for model in views[card.view.kind] if name.startswith(f"{model[0]}-edge") and model[0] in DEFAULT]
-        told[f"Scan to answer: {name}"] = [*whole([(name, path, card)], provider), *larger(full), *alone, *peaks]
+        variant = resolve(name)[0]
+        views[variant.card.view.kind].append(variant)
+    tables: dict[str, list[Contender]] = {}
+    for variant in (*views["range_image"], *views["top_view"]):
+        card, paths = variant.card, (variant.path,)
+        image = folder / f"{variant.path.stem}-input.npy"
+        np.save(image, make_projector(card.view, card.input).project(points).image)
+        alone = [
+            Contender(f"onnxruntime {own}, network alone", "session", own, "auto", paths, image=image)
+            for own in dict.fromkeys(("cpu", provider))
+            if own != "auto"
+        ]
+        alone += [
+            Contender(f"OpenVINO API {kind}, network alone", "network", engine, kind, paths, image=image)
+            for engine, kind in OPENVINO
+        ]
+        peaks = [
+            Contender(f"peak {engine} {kind}".strip(), "peak", engine, kind) for engine, kind in (*PEAKS, ("copy", ""))
+        ]
+        tables[f"Scan to result: {variant}"] = [
+            *_pipelines([variant], provider, precision), *_full_network(variant), *alone, *peaks
+        ]  # fmt: skip
     for pair in zip(views["range_image"], views["top_view"], strict=False):
-        told[f"Scan to answer: {pair[0][0]} and {pair[1][0]}"] = whole(pair, provider)
+        tables[f"Scan to result: {pair[0]} and {pair[1]}"] = _pipelines(pair, provider, precision)
     for view in ("range image", "top view"):
         rows = ("edgeperc, numba", view), ("numpy", f"{view}, numpy")
-        told[f"Projection: {view}"] = [Contender(name, "projection", call) for name, call in rows]
-    for name, path, card in views["top_view"]:
-        if any(o.kind == "box_dense" for o in card.outputs):
-            told[f"One network or two: {name}"] = one_or_two(name, path, card, folder)
-    return told
+        tables[f"Projection: {view}"] = [Contender(name, "projection", call) for name, call in rows]
+    for variant in views["top_view"]:
+        if any(output.kind == "box_dense" for output in variant.card.outputs):
+            tables[f"One network or two: {variant}"] = _one_or_two(variant, folder)
+    return tables
 
 
-def whole(models: Sequence[tuple[str, Path, ModelCard]], provider: str) -> list[Contender]:
-    """Ways from scan to answer; the first is edgeperc's, to which all others are held."""
-    paths, cards = tuple(path for _, path, _ in models), tuple(card.to_json() for _, _, card in models)
-    own = dict.fromkeys((provider, "cpu", *OPENVINO))
-    if provider == "auto" and available_providers() == ("cpu",):
-        del own["cpu"]  # it is what auto takes
-    rounded = any(card.training.get("precision") == "int8" for _, _, card in models)
-    rivals = ("onnxruntime", *OPENVINO, *(() if rounded else TORCH))  # torch has no such networks
+def _pipelines(models: Sequence[Variant], provider: str, precision: str) -> list[Contender]:
+    """Every way from scan to result; the first is edgeperc's, to which the ratios refer."""
+    paths, cards = tuple(each.path for each in models), tuple(each.card.to_json() for each in models)
+    int8 = any(each.precision == "int8" for each in models)
+    own = dict.fromkeys(((provider, precision), ("cpu", "auto"), *([("openvino", "auto")] if int8 else OPENVINO)))
+    if (provider, precision) == ("auto", "auto") and available_providers() == ("cpu",):
+        del own["cpu", "auto"]  # the same as auto
+    others = (("onnxruntime", ""), *OPENVINO, *(() if int8 else TORCH))  # torch cannot run the int8 graphs
     return [
-        *(Contender(f"edgeperc, {name}", "edgeperc", name, paths) for name in own),
-        *(Contender(f"numpy + {name}", "rival", name, paths, cards) for name in rivals),
+        *(Contender(f"edgeperc, {_label(name, kind)}", "edgeperc", name, kind, paths) for name, kind in own),
+        *(Contender(f"numpy + {_label(name, kind)}", "pipeline", name, kind, paths, cards) for name, kind in others),
     ]
 
 
-def larger(models: Sequence[tuple[str, Path, ModelCard]]) -> list[Contender]:
-    """The full network in torch, beside the one for small computers that was made of it."""
-    return [
-        Contender(f"numpy + {TORCH[0]}, {name}", "rival", TORCH[0], (path,), (card.to_json(),))
-        for name, path, card in models
-    ]
+def _label(engine: str, precision: str) -> str:
+    return f"{engine} {precision}".strip() if precision != "auto" else engine
 
 
-def one_or_two(name: str, path: Path, card: ModelCard, folder: Path) -> list[Contender]:
-    """SSADNet, and two networks of its very parts: segmentation alone, and detection on a trunk of its own.
+def _full_network(variant: Variant) -> list[Contender]:
+    """The full network that a shipped one was distilled from, in torch; only a source checkout has its file."""
+    path = variant.path.parent / "research" / f"{variant.name}-full.onnx"
+    if not path.exists():
+        return []
+    name, card = f"numpy + torch fp32, {path.stem}", ModelCard.read(path).to_json()
+    return [Contender(name, "pipeline", "torch", "fp32", (path,), (card,))]
 
-    Together they give SSADNet's own answers. Whoever would give a detector less has the third row: the boxes' head on
-    the bare input, without a trunk, its weights random.
+
+def _one_or_two(variant: Variant, folder: Path) -> list[Contender]:
+    """SSADNet, and two networks made of its parts: segmentation alone, and detection on a trunk of its own.
+
+    Together the two give SSADNet's own results. The third row is a lower bound for any detector: the box head on the
+    bare input, without a trunk, with random weights.
     """
-    image = folder / f"{name}-input.npy"
-    segmentation, detection, lean = (folder / f"{name}-{part}.onnx" for part in ("segmentation", "detection", "lean"))
-    if not absent(Contender("", "network", "torch")):
+    card, path = variant.card, variant.path
+    image = folder / f"{path.stem}-input.npy"
+    segmentation, detection, lean = (
+        folder / f"{path.stem}-{part}.onnx" for part in ("segmentation", "detection", "lean")
+    )
+    if not why_missing(Contender("", "network", "torch")):
         import onnx
 
         from edgeperc_export.networks.ssadnet import DenseHead
@@ -193,4 +211,4 @@ def one_or_two(name: str, path: Path, card: ModelCard, folder: Path) -> list[Con
         "segmentation alone": (segmentation,),
         "detection alone": (detection,),
     }
-    return [Contender(words, "network", "onnxruntime", files, image=image) for words, files in parts.items()]
+    return [Contender(name, "network", "onnxruntime", paths=paths, image=image) for name, paths in parts.items()]

@@ -26,32 +26,32 @@ class Engine:
     input : (C, H, W) float32
         Write here, then `run`.
     run : callable
-        Answers by the names of the graph's outputs, without the batch axis.
+        Returns the outputs by their names in the graph, without the batch axis.
     """
 
     input: NDArray[np.float32]
     run: Callable[[], Mapping[str, NDArray[np.float32]]]
 
 
-def open_engine(name: str, path: Path, n_threads: int) -> Engine:
+def open_engine(library: str, precision: str, path: Path, n_threads: int) -> Engine:
     """A model in an engine.
 
     Parameters
     ----------
-    name : str
-        ``"onnxruntime"`` (its stock CPU provider), ``"openvino:fp32"``, ``"openvino:bf16"``, ``"torch:fp32"``,
-        ``"torch:bf16"`` (autocast), or ``"torch.compile:"`` and a precision.
+    library : {"onnxruntime", "openvino", "torch", "torch.compile"}
+        onnxruntime is its CPU provider.
+    precision : str
+        ``"fp32"`` or ``"bf16"``, in torch by autocast; onnxruntime ignores it.
     path : Path
     n_threads : int
     """
-    library, _, precision = name.partition(":")
     if library == "onnxruntime":
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = n_threads
-        # As edgeperc has it: without it, the threads of one network go on spinning while another's want the cores, and
-        # two small networks took 77 ms that take 25 one at a time.
+        # As in edgeperc: otherwise the threads of one network spin while another's need the cores, and two networks
+        # took 77 ms that take 25 ms one at a time.
         options.add_session_config_entry("session.force_spinning_stop", "1")
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
         (entry,) = session.get_inputs()
@@ -81,14 +81,14 @@ def open_engine(name: str, path: Path, n_threads: int) -> Engine:
     if library == "torch.compile":
         import torch._inductor.config as inductor
 
-        inductor.compile_threads = 1  # no pool of processes that would outlive this one
+        inductor.compile_threads = 1  # a pool of processes would outlive this one
         network = torch.compile(network)
     tensor = torch.zeros(shape)
 
     def by_torch() -> dict[str, NDArray[np.float32]]:
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
-            answers = network(tensor)
-        return {n: a[0].float().numpy() for n, a in zip(names, answers, strict=True)}
+            outputs = network(tensor)
+        return {n: a[0].float().numpy() for n, a in zip(names, outputs, strict=True)}
 
     return Engine(tensor.numpy()[0], by_torch)
 
@@ -99,21 +99,21 @@ def torch_network(path: Path) -> tuple[Any, tuple[int, ...], list[str]]:
     Raises
     ------
     ModelError
-        The graph has an operator that none of this project's float networks has.
+        The graph has an operator that is not translated here.
     """
     import onnx
     import torch
 
     graph = onnx.load(path).graph
     root, traced = torch.nn.Module(), torch.fx.Graph()
-    # Constants are tensors, all else nodes of the traced graph.
+    # Constants are tensors, everything else is a node of the traced graph.
     values: dict[str, Any] = {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in graph.initializer}
     (entry,) = graph.input
     values[entry.name] = traced.placeholder("x")
     for k, node in enumerate(graph.node):
-        set_up = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
+        attributes = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
         inputs = [values[name] if name else None for name in node.input]
-        function, arguments = _in_torch(node.op_type, inputs, set_up)
+        function, arguments = _in_torch(node.op_type, inputs, attributes)
         if all(isinstance(value, torch.Tensor) for value in inputs):
             values[node.output[0]] = function(*arguments)
             continue
@@ -127,16 +127,16 @@ def torch_network(path: Path) -> tuple[Any, tuple[int, ...], list[str]]:
     return torch.fx.GraphModule(root, traced).eval(), shape, [o.name for o in graph.output]
 
 
-def _in_torch(op: str, inputs: Sequence[Any], set_up: Mapping[str, Any]) -> tuple[Callable[..., Any], list[Any]]:
-    """The function of torch that does what an ONNX operator does, and its arguments in order."""
+def _in_torch(op: str, inputs: Sequence[Any], attributes: Mapping[str, Any]) -> tuple[Callable[..., Any], list[Any]]:
+    """The torch function of an ONNX operator, and its arguments in order."""
     import torch
     import torch.nn.functional as F
 
     x, *others = inputs
-    pads = set_up.get("pads", [0, 0, 0, 0])
+    pads = attributes.get("pads", [0, 0, 0, 0])
     if pads[:2] != pads[2:]:
-        raise ModelError(f"{op} pads {pads}, other before than behind; no torch function does")
-    plain = {
+        raise ModelError(f"{op} pads {pads}, not the same on both sides; no torch function does")
+    plain: dict[str, Callable[..., Any]] = {
         "Add": torch.add, "Equal": torch.eq, "Mul": torch.mul, "Relu": torch.relu, "Sigmoid": torch.sigmoid,
         "Where": torch.where,
     }  # fmt: skip
@@ -144,34 +144,42 @@ def _in_torch(op: str, inputs: Sequence[Any], set_up: Mapping[str, Any]) -> tupl
         return plain[op], list(inputs)
     if op == "Conv":
         bias = others[1] if len(others) > 1 else None
-        return F.conv2d, [x, others[0], bias, set_up["strides"], pads[:2], set_up["dilations"], set_up["group"]]
+        return F.conv2d, [
+            x,
+            others[0],
+            bias,
+            attributes["strides"],
+            pads[:2],
+            attributes["dilations"],
+            attributes["group"],
+        ]
     if op == "ConvTranspose":
         bias = others[1] if len(others) > 1 else None
-        extra = set_up.get("output_padding", [0, 0])
-        last = [extra, set_up.get("group", 1), set_up.get("dilations", [1, 1])]
-        return F.conv_transpose2d, [x, others[0], bias, set_up["strides"], pads[:2], *last]
+        extra = attributes.get("output_padding", [0, 0])
+        last = [extra, attributes.get("group", 1), attributes.get("dilations", [1, 1])]
+        return F.conv_transpose2d, [x, others[0], bias, attributes["strides"], pads[:2], *last]
     if op == "Elu":
-        return F.elu, [x, set_up.get("alpha", 1.0)]
-    if op == "MaxPool" and not set_up.get("ceil_mode") and set(set_up.get("dilations", [1])) == {1}:
-        return F.max_pool2d, [x, set_up["kernel_shape"], set_up["strides"], pads[:2]]
+        return F.elu, [x, attributes.get("alpha", 1.0)]
+    if op == "MaxPool" and not attributes.get("ceil_mode") and set(attributes.get("dilations", [1])) == {1}:
+        return F.max_pool2d, [x, attributes["kernel_shape"], attributes["strides"], pads[:2]]
     if op == "Concat":
-        return torch.cat, [list(inputs), set_up["axis"]]
+        return torch.cat, [list(inputs), attributes["axis"]]
     if op == "ReduceMean":
-        return torch.mean, [x, others[0].tolist(), bool(set_up.get("keepdims", 1))]
+        return torch.mean, [x, others[0].tolist(), bool(attributes.get("keepdims", 1))]
     if op == "Expand":
         return torch.Tensor.expand, [x, [-1 if n == 1 else n for n in others[0].tolist()]]
-    if op == "Resize" and set_up.get("mode") == b"nearest":
+    if op == "Resize" and attributes.get("mode") == b"nearest":
         _, scales, *sizes = others
         size = sizes[0].tolist()[2:] if sizes else None
         return F.interpolate, [x, size, None if sizes else scales.tolist()[2:], "nearest"]
-    if op == "DepthToSpace" and set_up.get("mode") == b"CRD":
-        return F.pixel_shuffle, [x, set_up["blocksize"]]
+    if op == "DepthToSpace" and attributes.get("mode") == b"CRD":
+        return F.pixel_shuffle, [x, attributes["blocksize"]]
     if op == "Reshape":
         return torch.reshape, [x, others[0].tolist()]
     if op == "Transpose":
-        return torch.permute, [x, set_up["perm"]]
+        return torch.permute, [x, attributes["perm"]]
     if op == "Cast" and isinstance(x, torch.Tensor):
         return torch.Tensor.float, [x]
-    if op == "Cast":  # a mask, by which torch multiplies as it is
+    if op == "Cast":  # a mask; torch multiplies by it as it is
         return torch.Tensor.contiguous, [x]
     raise ModelError(f"operator {op} has no translation to torch here")

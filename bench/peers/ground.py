@@ -1,34 +1,31 @@
-"""How long it takes to tell the ground and to cluster what stands on it, beside other libraries, and how well.
+"""How long it takes to find the ground and to cluster the rest, beside other libraries, and how well it is done.
 
-Run as ``python -m edgeperc_bench.peers.ground [SCAN]``.
+This module is a command of its own: ``python -m edgeperc_bench.peers.ground [SCAN]``.
 
-Every round handles the same scan once with each of these, in an
-order drawn anew, so that whatever else keeps the computer busy treats them all alike:
+Every round handles the same scan once with each of these, in a new random order:
 
 - `find_ground`, and its single plane; Open3D's ``segment_plane`` (100 iterations, 0.15 m) and Patchwork++
-- on the points that `find_ground` left, `find_clusters` with the distance that grows with the range, and with 0.5 m
-  throughout; scikit-learn's and Open3D's DBSCAN with 0.5 m and one sample, which is the same question. Before anything
-  is timed, their clusters are compared with ours, point by point
+- on the points that `find_ground` leaves: `find_clusters` with the distance that grows with the range, and with 0.5 m
+  everywhere; scikit-learn's and Open3D's DBSCAN with 0.5 m and one sample, which is the same problem. Their clusters
+  are first compared with ours, point by point
 
-Whatever is not installed is left out and named, with the line that installs it. ``OMP_NUM_THREADS=1`` holds Open3D to
-one core, as ours always is.
+What is not installed is listed with the line that installs it, and left out. ``OMP_NUM_THREADS=1`` restricts Open3D to
+one core, as edgeperc always is.
 
-Of every way to find the ground the recall and precision are given for the scan, by the labels beside it where it is one
-of SemanticKITTI's (``sequences/00/velodyne/000000.bin``), and by the simulator where none is given. Vegetation and
-what is unlabelled do not count. ``--accuracy`` takes more scans, over which the means are given, too.
+For every ground finder the command prints recall and precision, from the labels beside a SemanticKITTI scan
+(``sequences/00/velodyne/000000.bin``), or from the simulator if no scan is given. Vegetation and unlabeled points do
+not count. ``--accuracy`` takes more scans and prints the means.
 """
 
 from __future__ import annotations
 
 import argparse
-import platform
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,25 +36,26 @@ from edgeperc.sensor import get_sensor
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
 
-from .projection import measure
+from ..render import Section, number, share, text
+from .rounds import measure, versions
 
 __all__ = ["main"]
 
 SENSOR = get_sensor("hdl-64e")
 DISTANCE_M = 0.5
-
-# SemanticKITTI: road, parking, pavement, other ground, lane marking, terrain; unlabelled, outlier, vegetation.
-GROUND_IDS, UNJUDGED_IDS = (40, 44, 48, 49, 60, 72), (0, 1, 70)
-
-# Nearer to the simulator's ground than this is ground, [m].
+# SemanticKITTI: road, parking, pavement, other ground, lane marking, terrain; unlabeled, outlier, vegetation.
+GROUND_IDS, IGNORED_IDS = (40, 44, 48, 49, 60, 72), (0, 1, 70)
+# Points nearer than this to the simulator's ground are ground [m].
 ON_GROUND_M = 0.06
 PEERS = {"open3d": "open3d", "pypatchworkpp": "pypatchworkpp", "sklearn": "scikit-learn"}
-Truth = tuple[NDArray[np.bool_], NDArray[np.bool_]]
-Calls = dict[str, Callable[[], NDArray]]
+Scan = NDArray[np.float32]
+Truth = tuple[NDArray[np.bool_], NDArray[np.bool_]]  # which points are ground, which points count
+Finder = Callable[[Scan], Callable[[], NDArray[np.bool_]]]
+Clusterer = Callable[[], NDArray[np.signedinteger[Any]]]
 
 
-def installed_peers() -> dict[str, ModuleType]:
-    """The rivals that can be imported; says how to install the others."""
+def installed_peers() -> dict[str, Any]:
+    """The other libraries that can be imported; prints how to install the rest."""
     peers = {}
     for module, package in PEERS.items():
         if find_spec(module) is None:
@@ -65,41 +63,41 @@ def installed_peers() -> dict[str, ModuleType]:
             continue
         try:
             peers[module] = import_module(module)
-        except ImportError as exc:  # Open3D wants libraries of the system, too
+        except ImportError as exc:  # Open3D needs libraries of the system, too
             print(f"{package} is left out: {exc}. On Debian: apt-get install libgl1 libgomp1 libusb-1.0-0")
     return peers
 
 
-def ground_finders(peers: dict[str, ModuleType]) -> dict[str, Callable[[NDArray[np.float32]], Callable[[], NDArray]]]:
-    """By name, what turns a scan into a call that finds its ground, (n,) bool. What only prepares is done before."""
+def ground_finders(peers: Mapping[str, Any]) -> dict[str, Finder]:
+    """By name, what turns a scan into a call that finds its ground, (n,) bool; preparation is not measured."""
 
-    def ours(regions: bool):
+    def edgeperc(regions: bool) -> Finder:
         return lambda points: lambda: find_ground(points, mount_height_m=SENSOR.mount_height_m, regions=regions).mask
 
-    def by_rows(n: int, rows) -> NDArray[np.bool_]:
+    def by_rows(n: int, rows: Any) -> NDArray[np.bool_]:
         mask = np.zeros(n, bool)
         mask[np.asarray(rows, dtype=np.int64).ravel()] = True
         return mask
 
-    def open3d(points):
+    def open3d(points: Scan) -> Callable[[], NDArray[np.bool_]]:
         cloud = peers["open3d"].geometry.PointCloud(peers["open3d"].utility.Vector3dVector(points[:, :3].astype(float)))
         peers["open3d"].utility.random.seed(0)
         return lambda: by_rows(len(points), cloud.segment_plane(0.15, 3, 100)[1])
 
-    def patchwork(points):
+    def patchwork(points: Scan) -> Callable[[], NDArray[np.bool_]]:
         parameters = peers["pypatchworkpp"].Parameters()
         parameters.verbose = False
         parameters.sensor_height = SENSOR.mount_height_m
-        # It learns thresholds from scan to scan; every scan that is judged gets one that has seen no other.
+        # It adapts its thresholds from scan to scan; every scan that is evaluated gets a new one.
         finder = peers["pypatchworkpp"].patchworkpp(parameters)
 
-        def call():
+        def call() -> NDArray[np.bool_]:
             finder.estimateGround(points)
             return by_rows(len(points), finder.getGroundIndices())
 
         return call
 
-    finders = {"find_ground": ours(True), "find_ground, one plane": ours(False)}
+    finders = {"find_ground": edgeperc(True), "find_ground, one plane": edgeperc(False)}
     if "open3d" in peers:
         finders["Open3D segment_plane"] = open3d
     if "pypatchworkpp" in peers:
@@ -107,9 +105,15 @@ def ground_finders(peers: dict[str, ModuleType]) -> dict[str, Callable[[NDArray[
     return finders
 
 
-def clusterers(points: NDArray[np.float32], peers: dict[str, ModuleType]) -> Calls:
-    """By name, what clusters points, (n,) int."""
-    calls: Calls = {
+def clusterers(points: Scan, peers: Mapping[str, Any]) -> dict[str, Clusterer]:
+    """By name, what clusters points, (n,) int.
+
+    Raises
+    ------
+    AssertionError
+        DBSCAN finds other clusters than `find_clusters`.
+    """
+    calls: dict[str, Clusterer] = {
         "find_clusters": lambda: find_clusters(points),
         "find_clusters, 0.5 m": lambda: find_clusters(
             points, min_distance_m=DISTANCE_M, distance_per_m=0.0, max_range_m=200.0, min_points=1
@@ -122,31 +126,32 @@ def clusterers(points: NDArray[np.float32], peers: dict[str, ModuleType]) -> Cal
     if "open3d" in peers:
         cloud = peers["open3d"].geometry.PointCloud(peers["open3d"].utility.Vector3dVector(xyz))
         calls["Open3D DBSCAN"] = lambda: np.asarray(cloud.cluster_dbscan(DISTANCE_M, 1))
-    expected = canonical(calls["find_clusters, 0.5 m"]())
+    expected = by_first_point(calls["find_clusters, 0.5 m"]())
     for name in ("scikit-learn DBSCAN", "Open3D DBSCAN"):
-        if name in calls and not np.array_equal(canonical(calls[name]()), expected):
+        if name in calls and not np.array_equal(by_first_point(calls[name]()), expected):
             raise AssertionError(f"{name} finds other clusters than find_clusters")
     return calls
 
 
-def canonical(clusters: NDArray) -> NDArray[np.int64]:
-    """Clusters by their first points, so that numbering does not matter."""
+def by_first_point(clusters: NDArray[np.signedinteger[Any]]) -> NDArray[np.int64]:
+    """Clusters numbered by their first points, so that two numberings can be compared."""
     _, first, inverse = np.unique(clusters, return_index=True, return_inverse=True)
     return first[inverse]
 
 
 def read_truth(scan: Path, n: int) -> Truth | None:
-    """Which points are ground and which are judged, from the labels beside a SemanticKITTI scan."""
+    """The ground truth of a SemanticKITTI scan, from the labels beside it; None if there are none."""
     path = scan.parent.parent / "labels" / f"{scan.stem}.label"
     if not path.is_file():
         return None
     labels = np.fromfile(path, np.uint32) & 0xFFFF
     if len(labels) != n:
         raise SystemExit(f"{path} holds {len(labels)} labels for a scan of {n} points")
-    return np.isin(labels, GROUND_IDS), ~np.isin(labels, UNJUDGED_IDS)
+    return np.isin(labels, GROUND_IDS), ~np.isin(labels, IGNORED_IDS)
 
 
-def simulated() -> tuple[NDArray[np.float32], Truth]:
+def simulated() -> tuple[Scan, Truth]:
+    """A simulated scan and its ground truth."""
     scan = simulate(random_scene(3), SENSOR, 0)
     world = scan.points[:, :3] @ scan.T_world_sensor[:3, :3].T + scan.T_world_sensor[:3, 3]
     above = world[:, 2] - [scan.scene.ground_height(x, y) for x, y in world[:, :2]]
@@ -154,58 +159,72 @@ def simulated() -> tuple[NDArray[np.float32], Truth]:
 
 
 def recall_and_precision(mask: NDArray[np.bool_], truth: Truth) -> tuple[float, float]:
-    ground, judged = truth
-    right = np.count_nonzero(mask & ground & judged)
-    return right / max(np.count_nonzero(ground & judged), 1), right / max(np.count_nonzero(mask & judged), 1)
+    """Of the points that count."""
+    ground, counts = truth
+    right, n_ground, n_found = (int(np.count_nonzero(of & counts)) for of in (mask & ground, ground, mask))
+    return right / max(n_ground, 1), right / max(n_found, 1)
 
 
-def table(took: dict[str, NDArray[np.float64]], ours: str) -> str:
-    lines = [f"{'':<24}{'minimum, ms':>12}{'median':>10}{'minimum x ours':>16}{'median':>8}"]
-    for name, ms in took.items():
-        least, middle = np.min(ms), np.median(ms)
-        times = f"{least / np.min(took[ours]):16.1f}{middle / np.median(took[ours]):8.1f}"
-        lines.append(f"{name:<24}{least:12.2f}{middle:10.2f}{times}")
-    return "\n".join(lines)
+def table(title: str, ms: Mapping[str, NDArray[np.float64]], reference: str) -> Section:
+    """Minimum and median of each call, and their ratios to the reference's."""
+    rows = [["", "minimum, ms", "median, ms", "minimum x edgeperc", "median x edgeperc"]]
+    for name, of_call in ms.items():
+        figures = [(float(of(of_call)), float(of(ms[reference]))) for of in (np.min, np.median)]
+        rows.append([name, *(number(own) for own, _ in figures), *(number(own / theirs, 1) for own, theirs in figures)])
+    return Section(title, (), rows)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m edgeperc_bench.peers.ground", description=__doc__.splitlines()[0])
-    parser.add_argument("scan", nargs="?", type=Path, help="a file that read_points reads; default: a simulated scan")
-    parser.add_argument("--rounds", type=int, default=20, help="how often each is timed (default: %(default)s)")
-    parser.add_argument("--accuracy", nargs="*", type=Path, default=[], help="more scans with labels beside them")
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m edgeperc_bench.peers.ground", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("scan", nargs="?", type=Path, help="a scan file (default: a simulated scan)")
+    parser.add_argument(
+        "--rounds", type=int, default=20, metavar="N", help="how often each is measured (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--accuracy",
+        nargs="*",
+        type=Path,
+        default=[],
+        metavar="SCAN",
+        help="more SemanticKITTI scans with labels, for recall and precision",
+    )
     arguments = parser.parse_args()
     peers = installed_peers()
+    scans: list[tuple[Scan, Truth]] = []
     if arguments.scan is None:
-        name, (points, truth) = "a simulated scan", simulated()
+        name = "a simulated scan"
+        points, truth = simulated()
+        scans.append((points, truth))
     else:
         name, points = str(arguments.scan), read_points(arguments.scan)
-        truth = read_truth(arguments.scan, len(points))
-
-    finders = ground_finders(peers)
-    took = measure({each: prepare(points) for each, prepare in finders.items()}, arguments.rounds)
-    standing = points[~find_ground(points, mount_height_m=SENSOR.mount_height_m).mask]
-    took_clusters = measure(clusterers(standing, peers), arguments.rounds)
-    print(f"{len(points):,} points of {name}, {len(standing):,} of them not ground; {arguments.rounds} rounds")
-    print(
-        f"numpy {np.__version__}, numba {numba.__version__}, Python {platform.python_version()}, {platform.machine()}",
-        *(f", {PEERS[module]} {peer.__version__}" for module, peer in peers.items()),
-        sep="",
-    )
-    print("\nground\n" + table(took, "find_ground"))
-    print("\nclusters; DBSCAN's are those of find_clusters, 0.5 m\n" + table(took_clusters, "find_clusters, 0.5 m"))
-
-    scans = [] if truth is None else [(points, truth)]
+        if (known := read_truth(arguments.scan, len(points))) is not None:
+            scans.append((points, known))
     for path in arguments.accuracy:
         more = read_points(path)
         if (known := read_truth(path, len(more))) is None:
             raise SystemExit(f"{path} has no labels beside it: expected ../labels/{path.stem}.label")
         scans.append((more, known))
+
+    finders = ground_finders(peers)
+    ground_ms = measure({each: prepare(points) for each, prepare in finders.items()}, arguments.rounds)
+    standing = points[~find_ground(points, mount_height_m=SENSOR.mount_height_m).mask]
+    cluster_ms = measure(clusterers(standing, peers), arguments.rounds)
+    print(f"{len(points):,} points of {name}, {len(standing):,} of them not ground; {arguments.rounds} rounds")
+    print(versions(**{PEERS[module]: peer.__version__ for module, peer in peers.items()}))
+    parts = [
+        table("Ground", ground_ms, "find_ground"),
+        table("Clusters (DBSCAN's are those of find_clusters, 0.5 m)", cluster_ms, "find_clusters, 0.5 m"),
+    ]
     if scans:
-        print(f"\nground, means over {len(scans)} scans" + f"\n{'':<24}{'recall':>8}{'precision':>11}")
+        rows = [["", "recall", "precision"]]
         for each, prepare in finders.items():
-            figures = [recall_and_precision(prepare(scan)(), known) for scan, known in scans]
-            recall, precision = np.mean(figures, axis=0)
-            print(f"{each:<24}{recall:8.4f}{precision:11.4f}")
+            figures = [recall_and_precision(prepare(scan)(), truth) for scan, truth in scans]
+            rows.append([each, *(share(float(mean)) for mean in np.mean(figures, axis=0))])
+        parts.append(Section(f"Ground, means over {len(scans)} scans", (), rows))
+    print(text(parts))
 
 
 if __name__ == "__main__":

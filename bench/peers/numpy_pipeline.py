@@ -1,11 +1,11 @@
-"""The whole way from scan to answer as one would write it without edgeperc: numpy around a network in some engine.
+"""The whole way from scan to result as one would write it without edgeperc: numpy around a network in some engine.
 
-Projections are those of `projection`. Labels are an argmax; boxes are peaks of the heat map, decoded, thinned
-out by their overlap and classified; hidden points vote among their neighbours: all on whole arrays at once. PointSeg's
-removal of outliers is left out, for searching components point by point is no work for numpy: rivals do less.
+Projections are those of `projection`. Labels are an argmax; boxes are peaks of the heat map, decoded, suppressed by
+their overlap and classified; hidden points vote among their neighbors; everything on whole arrays at once. PointSeg's
+removal of outliers is left out, because numpy has no fast search for components: the pipeline does less than edgeperc.
 
 Engines are onnxruntime, OpenVINO's own API, and torch, whose network is the model's own graph, translated: the same
-weights, batch norm folded in, as good as a network written by hand.
+weights with batch norm folded in, as fast as a network written by hand.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from edgeperc.card import ModelCard, TopViewGeometry
 from edgeperc.geometry import draw_footprints
 from edgeperc.sensor import SensorProfile
 
-from ..worker import Answer
+from ..worker import Prediction
 from .engines import Engine
 from .projection import NumpyRangeImage, NumpyTopView
 
-__all__ = ["Rival"]
+__all__ = ["NumpyPipeline", "iou"]
 
 STRIDE, MAX_BOXES = 4, 100
 WINDOW, N_VOTES, MAX_RANGE_GAP_M = 2, 5, 1.0
 
 
-class Rival:
+class NumpyPipeline:
     """`edgeperc.Perceiver` without edgeperc's stages.
 
     Parameters
     ----------
     cards : sequence of ModelCard
-        The front quarter as a range image, or a top view with dense boxes.
+        Each of the front quarter as a range image, or of a top view with dense boxes.
     engines : sequence of Engine
-        As many.
+        One for each card.
     sensor : SensorProfile
     """
 
@@ -47,21 +47,26 @@ class Rival:
         self.sensor = sensor
         self.networks = []
         for card, engine in zip(cards, engines, strict=True):
-            projector = NumpyTopView if isinstance(card.view, TopViewGeometry) else NumpyRangeImage
+            projector: NumpyTopView | NumpyRangeImage
+            if isinstance(card.view, TopViewGeometry):
+                projector = NumpyTopView(card.view, card.input)
+            else:
+                projector = NumpyRangeImage(card.view, card.input)
             index = np.empty(engine.input.shape[1:], np.int32)
-            self.networks.append((card, engine, projector(card.view, card.input), index))
+            self.networks.append((card, engine, projector, index))
 
-    def __call__(self, points: NDArray[np.float32]) -> Answer:
-        """Labels and boxes of a scan (n, 4)."""
+    def __call__(self, points: NDArray[np.float32]) -> Prediction:
+        """Labels and boxes of a scan (n, 4) with remission in the sensor's raw unit."""
         scale, offset = np.float32(self.sensor.remission_scale), np.float32(self.sensor.remission_offset)
         if (scale, offset) != (1.0, 0.0):
             points = np.column_stack((points[:, :3], (points[:, 3] + offset) * scale))
-        labelled, top_view, boxes = None, None, ()
+        labeled, top_view = None, None
+        boxes: tuple[Box, ...] = ()
         for card, engine, projector, index in self.networks:
             pixel = np.empty(len(points), np.int32)
             projector.fill(points, engine.input, index, pixel)
-            answers = engine.run()
-            outputs = {o.kind: answers[o.name] for o in card.outputs}
+            by_name = engine.run()
+            outputs = {o.kind: by_name[o.name] for o in card.outputs}
             logits = next(v for kind, v in outputs.items() if kind.startswith("class_"))
             labels = logits.argmax(axis=0).astype(np.uint8)
             if isinstance(card.view, TopViewGeometry):
@@ -72,8 +77,8 @@ class Rival:
                 top_view = TopView(labels, card.classes, card.view.cell_m, card.view.x_range_m, card.view.y_range_m)
             else:
                 found = vote(points, pixel, index, labels, len(card.classes))
-                labelled = PointLabels(found, pixel >= 0, card.classes)
-        return Answer(labelled, top_view, boxes)
+                labeled = PointLabels(found, pixel >= 0, card.classes)
+        return Prediction(labeled, top_view, boxes)
 
 
 def vote(
@@ -83,7 +88,7 @@ def vote(
     labels: NDArray[np.uint8],
     n_classes: int,
 ) -> NDArray[np.uint8]:
-    """`edgeperc.refine.label_points` of a view that is no full turn, in numpy."""
+    """`edgeperc.refine.label_points` of a view that is not a full turn, in numpy."""
     found = np.where(pixel >= 0, labels.reshape(-1)[pixel], 0).astype(np.uint8)
     hidden = np.flatnonzero((pixel >= 0) & (index.reshape(-1)[pixel] != np.arange(len(points))))
     distance = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
@@ -119,11 +124,11 @@ def dense_boxes(card: ModelCard, logits: NDArray[np.float32], dense: NDArray[np.
     x, y = view.x_range_m[1] - (rows + 0.5 + d_row) * cell_m, view.y_range_m[1] - (cols + 0.5 + d_col) * cell_m
     sizes, yaw = np.exp([log_l, log_w, log_h]).T, 0.5 * np.arctan2(sin, cos)
     boxes: list[Box] = []
-    all_x, all_y = (centres.reshape(-1) for centres in view.cell_centres())
+    all_x, all_y = (centers.reshape(-1) for centers in view.cell_centres())
     for k in range(len(rows)):
         place, size = (float(x[k]), float(y[k]), float(z[k])), tuple(sizes[k].tolist())
         box = Box("", float(1.0 / (1.0 + math.exp(-score[k]))), place, size, float(yaw[k]))
-        if any(overlap(box, kept) > card.nms_iou for kept in boxes):
+        if any(iou(box, kept) > card.nms_iou for kept in boxes):
             continue
         reach = math.hypot(*size[:2]) / 2.0
         near_rows, near_cols = np.flatnonzero(abs(all_x - x[k]) < reach), np.flatnonzero(abs(all_y - y[k]) < reach)
@@ -146,8 +151,8 @@ def _evidence(card: ModelCard, name: str, share: float, size: Sequence[float]) -
     return float(np.log(max(share, 1e-300)) - 0.5 * ((off / spread) ** 2).sum() - np.log(spread).sum())
 
 
-def overlap(a: Box, b: Box) -> float:
-    """Intersection over union of two footprints: one polygon clipped by the other's sides."""
+def iou(a: Box, b: Box) -> float:
+    """Intersection over union of two footprints, by clipping one polygon with the sides of the other."""
     reach = math.hypot(*a.size[:2]) / 2.0 + math.hypot(*b.size[:2]) / 2.0
     if math.hypot(a.center[0] - b.center[0], a.center[1] - b.center[1]) >= reach:
         return 0.0

@@ -1,30 +1,26 @@
-"""How long it takes to turn a scan into the networks' inputs.
+"""How long it takes to turn a scan into the networks' inputs, in edgeperc's kernels and in numpy.
 
-Run as ``python -m edgeperc_bench.peers.projection [SCAN]``.
+This module is a command of its own: ``python -m edgeperc_bench.peers.projection [SCAN]``.
 
-Every round handles the same scan once with each of these, in an
-order drawn anew, so that caches, and whatever else keeps the computer busy, treat them all alike:
+Every round handles the same scan once with each of these, in a new random order:
 
-- a compiled loop that copies the points, (n, 4) into (n, 4), for scale
+- a compiled loop that copies the points, (n, 4) to (n, 4), for scale
 - `TopViewProjector.fill`, and `RangeImageProjector.fill` for the front quarter (64 x 512) and the full turn
-  (64 x 2048), their arguments checked, into buffers that exist already: what `Perceiver` does
-- the same top view and front quarter in vectorised numpy; before anything is timed, their answers are compared with the
-  kernels', bit by bit
+  (64 x 2048), with the checks of their arguments, into existing buffers: what `Perceiver` does
+- the same top view and front quarter in vectorized numpy; their results are first compared with the kernels', bit by
+  bit
 
 The kernels compile before the first round that counts. The table shows minimum and median in milliseconds, both as
-multiples of the copy loop's, and how many times numpy's time they are below. On a busy computer the minima are the ones
-to compare.
+multiples of the copy loop's, and numpy's time as a multiple of the kernel's. On a busy computer compare the minima.
 """
 
 from __future__ import annotations
 
 import argparse
-import platform
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from time import perf_counter_ns
 
-import numba
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -36,10 +32,12 @@ from edgeperc.sensor import get_sensor
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
 
-__all__ = ["NumpyRangeImage", "NumpyTopView", "main", "measure"]
+from ..render import Section, number, text
+from .rounds import measure, versions
+
+__all__ = ["NumpyRangeImage", "NumpyTopView", "contenders", "main"]
 
 SENSOR = "hdl-64e"
-N_WARM_UP = 3
 TOP_VIEW = TopViewGeometry()
 RANGE_IMAGE = RangeImageGeometry(get_sensor(SENSOR).elevations_deg)
 FULL_TURN = RangeImageGeometry(get_sensor(SENSOR).elevations_deg, 2048, 180.0, -180.0)
@@ -50,7 +48,7 @@ RANGE_IMAGE_INPUT = InputSpec(
 
 
 @njit(cache=True, nogil=True)
-def fill_copy(points, copy):
+def fill_copy(points: NDArray[np.float32], copy: NDArray[np.float32]) -> None:
     """Copy the points, number by number.
 
     Parameters
@@ -63,14 +61,12 @@ def fill_copy(points, copy):
             copy[i, k] = points[i, k]
 
 
-class NumpyTopView:
-    """`TopViewProjector` in numpy: the same decisions, in float32, on all points at once."""
+class _NumpyProjector:
+    """A projector in numpy: the kernel's decisions, in float32, on all points at once."""
 
-    def __init__(self, view: TopViewGeometry, input: InputSpec) -> None:
+    def __init__(self, view: TopViewGeometry | RangeImageGeometry, input: InputSpec) -> None:
         self.shape = (len(input.channels), view.height, view.width)
-        self.low, self.high = np.float32([view.x_range_m, view.y_range_m, view.z_range_m]).T
-        self.cells_per_m = np.float32(1.0 / view.cell_m)
-        self.mean, self.std = np.float32(input.mean)[:, None], np.float32(input.std)[:, None]
+        self.mean, self.std = (np.array(of, np.float32)[:, None] for of in (input.mean, input.std))
 
     def fill(
         self,
@@ -79,6 +75,42 @@ class NumpyTopView:
         index: NDArray[np.int32],
         pixel: NDArray[np.int32],
     ) -> None:
+        """Project into the caller's buffers, as `TopViewProjector.fill`."""
+        rows, flat, rank = self.select(points)
+        pixel[:] = -1
+        pixel[rows] = flat
+        seen, winner = winners(flat, rank, index.reshape(-1), rows)
+        image[:] = 0.0
+        image.reshape(len(image), -1)[:, seen] = (self.planes(*points[winner].T) - self.mean) / self.std
+
+    def select(self, points: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32]]:
+        """Rows in view, the flat pixel of each, and its rank: the smallest rank wins the pixel."""
+        raise NotImplementedError
+
+    def planes(
+        self, x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], remission: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Channels of the points that won a pixel, not normalized yet."""
+        raise NotImplementedError
+
+
+class NumpyTopView(_NumpyProjector):
+    """`TopViewProjector` in numpy.
+
+    Parameters
+    ----------
+    view : TopViewGeometry
+    input : InputSpec
+        Channels distance, remission, height.
+    """
+
+    def __init__(self, view: TopViewGeometry, input: InputSpec) -> None:
+        super().__init__(view, input)
+        self.low, self.high = np.array([view.x_range_m, view.y_range_m, view.z_range_m], np.float32).T
+        self.cells_per_m = np.float32(1.0 / view.cell_m)
+
+    def select(self, points: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32]]:
+        """See `_NumpyProjector.select`; the highest point wins."""
         _, height, width = self.shape
         x, y, z, remission = points.T
         rows = np.flatnonzero((x >= self.low[0]) & (x < self.high[0]) & (y >= self.low[1]) & (y < self.high[1]))
@@ -87,32 +119,32 @@ class NumpyTopView:
         rows, x, y, z = rows[inside], x[inside], y[inside], z[inside]
         ahead = np.minimum(((x - self.low[0]) * self.cells_per_m).astype(np.int32), height - 1)
         left = np.minimum(((y - self.low[1]) * self.cells_per_m).astype(np.int32), width - 1)
-        flat = (height - 1 - ahead) * width + (width - 1 - left)
-        pixel[:] = -1
-        pixel[rows] = flat
-        seen, winner = winners(flat, -z, index.reshape(-1), rows)
-        x, y, z, remission = points[winner].T
-        image[:] = 0.0
-        planes = np.stack((np.sqrt(x * x + y * y), remission, z))
-        image.reshape(len(image), -1)[:, seen] = (planes - self.mean) / self.std
+        flat: NDArray[np.int32] = (height - 1 - ahead) * width + (width - 1 - left)
+        return rows, flat, -z
+
+    def planes(
+        self, x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], remission: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """See `_NumpyProjector.planes`."""
+        return np.stack((np.sqrt(x * x + y * y), remission, z))
 
 
-class NumpyRangeImage:
-    """`RangeImageProjector` in numpy: the same decisions, in float32, on all points of the front quarter at once."""
+class NumpyRangeImage(_NumpyProjector):
+    """`RangeImageProjector` in numpy, for the front quarter.
+
+    Parameters
+    ----------
+    view : RangeImageGeometry
+    input : InputSpec
+        Channels x, y, z, remission, range.
+    """
 
     def __init__(self, view: RangeImageGeometry, input: InputSpec) -> None:
-        self.shape = (len(input.channels), view.height, view.width)
+        super().__init__(view, input)
         self.rows, self.cols = tabulate(row_edges(view), "rows"), tabulate(column_edges(view), "columns")
-        self.mean, self.std = np.float32(input.mean)[:, None], np.float32(input.std)[:, None]
 
-    def fill(
-        self,
-        points: NDArray[np.float32],
-        image: NDArray[np.float32],
-        index: NDArray[np.int32],
-        pixel: NDArray[np.int32],
-    ) -> None:
-        width = self.shape[2]
+    def select(self, points: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32]]:
+        """See `_NumpyProjector.select`; the nearest point wins."""
         rows = np.flatnonzero((points[:, 0] > 0.0) & (np.abs(points[:, 1]) <= points[:, 0]))
         x, y, z, remission = points[rows].T
         squared_distance = x * x + y * y
@@ -121,21 +153,20 @@ class NumpyRangeImage:
         (top, bottom, _), (left, right, _) = self.rows[0], self.cols[0]
         inside = (elevation <= top) & (elevation > bottom) & (azimuth <= left) & (azimuth > right)
         inside &= np.isfinite(squared_range) & np.isfinite(remission)
-        rows, squared_range = rows[inside], squared_range[inside]
-        flat = look_up(elevation[inside], self.rows) * width + look_up(azimuth[inside], self.cols)
-        pixel[:] = -1
-        pixel[rows] = flat
-        seen, winner = winners(flat, squared_range, index.reshape(-1), rows)
-        x, y, z, remission = points[winner].T
-        image[:] = 0.0
-        planes = np.stack((x, y, z, remission, np.sqrt(x * x + y * y + z * z)))
-        image.reshape(len(image), -1)[:, seen] = (planes - self.mean) / self.std
+        flat = look_up(elevation[inside], self.rows) * self.shape[2] + look_up(azimuth[inside], self.cols)
+        return rows[inside], flat, squared_range[inside]
+
+    def planes(
+        self, x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], remission: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """See `_NumpyProjector.planes`."""
+        return np.stack((x, y, z, remission, np.sqrt(x * x + y * y + z * z)))
 
 
 def look_up(
     values: NDArray[np.float32], table: tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]
 ) -> NDArray[np.int32]:
-    """Intervals of the values, by `tabulate`'s table: a third of the time that searchsorted takes."""
+    """Intervals of the values, by `tabulate`'s table: a third of searchsorted's time."""
     (first, _, cells_per_unit), base, split = table
     cells = ((first - values) * cells_per_unit).astype(np.int32)
     return base[cells] + (values <= split[cells])
@@ -144,7 +175,7 @@ def look_up(
 def winners(
     flat: NDArray[np.int32], rank: NDArray[np.float32], index: NDArray[np.int32], rows: NDArray[np.intp]
 ) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
-    """Write the row of the smallest rank, or the earlier of two, into ``index``: pixels seen and the rows there."""
+    """Write into ``index`` the row of the smallest rank, the earlier of two; return the pixels seen and their rows."""
     best = np.full(len(index), np.inf, np.float32)
     np.minimum.at(best, flat, rank)
     # Of several values assigned to one pixel numpy keeps the last.
@@ -156,76 +187,63 @@ def winners(
 
 
 def contenders(points: NDArray[np.float32]) -> dict[str, Callable[[], object]]:
-    """What is measured, by the names in the table, each with buffers of its own."""
+    """What is measured, by the names in the table, each with buffers of its own.
+
+    Raises
+    ------
+    AssertionError
+        numpy and the kernels give different results.
+    """
     copy = np.empty_like(points)
     calls: dict[str, Callable[[], object]] = {"copy loop": lambda: fill_copy(points, copy)}
 
-    def add(
-        name: str, kernels: TopViewProjector | RangeImageProjector, by_numpy: NumpyTopView | NumpyRangeImage | None
-    ):
-        answers = []
-        for _ in range(2):
-            image, index = np.empty(kernels.shape, np.float32), np.empty(kernels.shape[1:], np.int32)
-            answers.append((image, index, np.empty(len(points), np.int32)))
-        calls[name] = lambda: kernels.fill(points, *answers[0])
-        if by_numpy is None:
-            return
-        calls[f"{name}, numpy"] = lambda: by_numpy.fill(points, *answers[1])
-        calls[name]()
-        calls[f"{name}, numpy"]()
-        if not all(np.array_equal(a, b) for a, b in zip(*answers, strict=True)):
-            raise AssertionError(f"{name}: numpy answers other pixels than the kernels")
+    def add(name: str, *projectors: TopViewProjector | RangeImageProjector | _NumpyProjector) -> None:
+        results = []
+        for suffix, projector in zip(("", ", numpy"), projectors, strict=False):
+            image, index = np.empty(projector.shape, np.float32), np.empty(projector.shape[1:], np.int32)
+            buffers = image, index, np.empty(len(points), np.int32)
+            results.append(buffers)
+            calls[name + suffix] = partial(projector.fill, points, *buffers)
+            calls[name + suffix]()
+        if not all(np.array_equal(of[0], each) for of in zip(*results, strict=True) for each in of):
+            raise AssertionError(f"{name}: numpy gives other pixels than the kernels")
 
     add("top view", TopViewProjector(TOP_VIEW, TOP_VIEW_INPUT), NumpyTopView(TOP_VIEW, TOP_VIEW_INPUT))
-    range_image = RangeImageProjector(RANGE_IMAGE, RANGE_IMAGE_INPUT)
-    add("range image", range_image, NumpyRangeImage(RANGE_IMAGE, RANGE_IMAGE_INPUT))
-    add("range image 360", RangeImageProjector(FULL_TURN, RANGE_IMAGE_INPUT), None)
+    kernels, by_numpy = (of(RANGE_IMAGE, RANGE_IMAGE_INPUT) for of in (RangeImageProjector, NumpyRangeImage))
+    add("range image", kernels, by_numpy)
+    add("range image 360", RangeImageProjector(FULL_TURN, RANGE_IMAGE_INPUT))
     return calls
 
 
-def measure(calls: dict[str, Callable[[], object]], n_rounds: int) -> dict[str, NDArray[np.float64]]:
-    """Milliseconds of each call in each round."""
-    took = {name: np.empty(N_WARM_UP + n_rounds) for name in calls}
-    rng = np.random.default_rng(0)
-    for k in range(N_WARM_UP + n_rounds):
-        for name in rng.permutation(list(calls)):
-            start = perf_counter_ns()
-            calls[name]()
-            took[name][k] = (perf_counter_ns() - start) / 1e6
-    return {name: ms[N_WARM_UP:] for name, ms in took.items()}
-
-
-def table(took: dict[str, NDArray[np.float64]]) -> str:
-    blocks = ("minimum", np.min), ("median", np.median)
-    head = " " * 22 + "".join(f"{name:>8}, ms{'x copy':>8}{'numpy /':>9}" for name, _ in blocks)
-    lines = [head]
-    for name, ms in took.items():
-        line = f"{name:<22}"
-        for _, of in blocks:
-            line += f"{of(ms):12.3f}{of(ms) / of(took['copy loop']):8.2f}"
-            by_numpy = took.get(f"{name}, numpy")
-            line += " " * 9 if by_numpy is None else f"{of(by_numpy) / of(ms):9.1f}"
-        lines.append(line.rstrip())
-    return "\n".join(lines)
+def table(ms: Mapping[str, NDArray[np.float64]]) -> Section:
+    """Minimum and median of each call, and their ratios."""
+    rows = [["", *(f"{name}{of}" for name in ("minimum", "median") for of in (", ms", " x copy", " numpy /"))]]
+    for name, of_call in ms.items():
+        row, by_numpy = [name], ms.get(f"{name}, numpy")
+        for middle in (np.min, np.median):
+            row += [number(middle(of_call), 3), number(middle(of_call) / middle(ms["copy loop"]))]
+            row.append("-" if by_numpy is None else number(middle(by_numpy) / middle(of_call), 1))
+        rows.append(row)
+    return Section("Projection", (), rows)
 
 
 def main() -> None:
+    """Run the command line."""
     parser = argparse.ArgumentParser(
-        prog="python -m edgeperc_bench.peers.projection", description=__doc__.splitlines()[0]
+        prog="python -m edgeperc_bench.peers.projection", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("scan", nargs="?", type=Path, help="a file that read_points reads; default: a simulated scan")
-    parser.add_argument("--rounds", type=int, default=300, help="how often each is timed (default: %(default)s)")
+    parser.add_argument("scan", nargs="?", type=Path, help="a scan file (default: a simulated scan)")
+    parser.add_argument(
+        "--rounds", type=int, default=300, metavar="N", help="how often each is measured (default: %(default)s)"
+    )
     arguments = parser.parse_args()
     if arguments.scan is None:
-        name, points = "a simulated scan", simulate(random_scene(3), SENSOR, 0).points
+        name, points = "a simulated scan", simulate(random_scene(3), get_sensor(SENSOR), 0).points
     else:
         name, points = str(arguments.scan), read_points(arguments.scan)
-    took = measure(contenders(points), arguments.rounds)
-    print(f"{len(points):,} points of {name}; {arguments.rounds} rounds")
-    print(
-        f"numpy {np.__version__}, numba {numba.__version__}, Python {platform.python_version()}, {platform.machine()}"
-    )
-    print(table(took))
+    ms = measure(contenders(points), arguments.rounds)
+    print(f"{len(points):,} points of {name}; {arguments.rounds} rounds; {versions()}")
+    print(text([table(ms)]))
 
 
 if __name__ == "__main__":

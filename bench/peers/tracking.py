@@ -1,40 +1,47 @@
-"""How many scans a second the tracker follows, and Stone Soup's JPDA on the same boxes.
+"""How many scans per second the tracker follows, and Stone Soup's JPDA on the same boxes.
 
-Run as ``python -m edgeperc_bench.peers.tracking [ROOT] [--sequence SEQ]``. ROOT holds KITTI's tracking sequences with
-detections (``label_02``, ``calib``, ``detections/DETECTOR_CLASS``); without it, a street of parked and moving cars is
-drawn from a seed. What is timed is one thread in `Tracker.update` alone, boxes in and tracks out, over whole sequences:
+This module is a command of its own: ``python -m edgeperc_bench.peers.tracking [ROOT] [--sequence SEQ]``.
 
-- every class for itself, and all classes together; the kernels compile before the first scan that counts
-- one sequence of cars (``--sequence``) by the tracker and by Stone Soup, the same boxes for both, those whose score is
-  above ``--score``. Stone Soup's is a JPDA over unscented filters of one motion, constant velocity, in x and y; it runs
-  for at most ``--seconds``, and what it did by then counts
-- ``--crossing N``: N scans of 200 targets (``--targets``) that cross and hide one another among half as many false
-  alarms, what a scan takes at the worst, and whether memory grows
-- ``--every-second-beam OUT``: nothing is timed; from ROOT, here an object set with track ids, the same drives as a
-  coarser sensor with another remission would have seen them, for ``edgeperc adapt fit`` and ``eval tracking --adapt``
+ROOT holds KITTI's tracking sequences with detections (``label_02``, ``calib``, ``detections/DETECTOR_CLASS``); without
+it, a street of parked and moving cars is drawn from a seed. Only `Tracker.update` is measured, in one thread, boxes in
+and tracks out, over whole sequences:
 
-The table shows wall time and the time that the processor spent, which a busy computer stretches less.
+- each class alone, and all classes together; the kernels compile before the first scan that counts
+- one sequence of cars (``--sequence``) by the tracker and by Stone Soup, with the same boxes, those with a score above
+  ``--score``. Stone Soup runs a JPDA over unscented filters with one motion model, constant velocity, in x and y, for
+  at most ``--seconds``; the scans that it did by then count
+- ``--crossing N``: N scans of 200 targets (``--targets``) that cross and occlude each other among half as many false
+  alarms, the longest time of a scan, and whether memory grows
+- ``--every-second-beam OUT`` measures nothing: from ROOT, here an object set with track ids, it writes the same drives
+  as a coarser sensor with another remission would record them, for ``edgeperc fit-sensor`` and ``edgeperc
+  eval-tracking --adapt``
+
+The table shows wall time and processor time; other busy processes lengthen the processor time less.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.metadata
+import importlib.util
 import math
-import platform
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta
+from functools import partial
 from pathlib import Path
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import Box, Tracker
 from edgeperc.evaluation.tracking import CLASSES, FRAME_S, read_sequence, sequence_names, sequence_scans
 from edgeperc.sensor import get_sensor
+
+from ..render import Section, number, text
+from .rounds import elapsed_ms, versions
 
 __all__ = ["crossing", "every_second_beam", "main"]
 
@@ -60,9 +67,9 @@ def drawn_street(n_scans: int = 400, seed: int = 0) -> list[list[Box]]:
 def crossing(
     n_scans: int, n_targets: int = 200, n_false: int = 100, seed: int = 0
 ) -> Iterator[tuple[list[Box], NDArray[np.float64]]]:
-    """Boxes, and true places (n_targets, 2), of cars that cross in 120 m by 120 m and turn round at its edges.
+    """Boxes, and true places (n_targets, 2), of cars that cross in 120 m by 120 m and turn around at its edges.
 
-    Every other one is overlooked in three scans of ten; false alarms lie anywhere.
+    Every other car is missed in three scans of ten; false alarms lie anywhere.
     """
     rng = np.random.default_rng(seed)
     places, heading = rng.uniform(-60.0, 60.0, (n_targets, 2)), rng.uniform(-math.pi, math.pi, n_targets)
@@ -80,14 +87,14 @@ def crossing(
 
 
 def every_second_beam(root: Path, out: Path) -> None:
-    """Write the drives of an HDL-64E as if it had half the beams and told the square of its remission, as a byte.
+    """Write the drives of an HDL-64E as if it had half the beams and its remission were squared, as a byte.
 
     Parameters
     ----------
     root : Path
-        An object set with track ids; its scans hold one beam after the other, each a turn from ahead, as KITTI's do.
+        An object set with track ids; its scans hold one beam after the other, each a turn from ahead, as KITTI's.
     out : Path
-        Becomes an object set; ``sensor.json`` in it is the imagined sensor, whose remission nobody has fitted.
+        Becomes an object set; its ``sensor.json`` is the coarser sensor, without a fitted remission function.
     """
     for folder in ("label_2", "track_id", "calib"):
         shutil.copytree(root / "training" / folder, out / "training" / folder)
@@ -112,33 +119,25 @@ def every_second_beam(root: Path, out: Path) -> None:
 
 
 def endurance(n_scans: int, n_targets: int) -> str:
-    """What a scan of crossing targets takes, and how much memory grows from a tenth of the scans on."""
-    from ..context import rss_mb  # of the extra 'bench'
+    """The time of a scan of crossing targets, and the growth of memory after a tenth of the scans."""
+    from ..context import rss_mb  # needs the extra 'bench'
 
-    ours([drawn_street(30)])  # the kernels load before the first scan that counts
-    tracker, took, early = Tracker(), np.empty(n_scans), 0.0
+    follow([drawn_street(30)])  # the kernels load before the first scan that counts
+    tracker, ms, early_mb = Tracker(), np.empty(n_scans), 0.0
     for k, (boxes, _) in enumerate(crossing(n_scans, n_targets, n_targets // 2)):
-        start = time.perf_counter()
-        tracker.update(boxes, k * FRAME_S, np.eye(4))
-        took[k] = 1e3 * (time.perf_counter() - start)
+        ms[k] = elapsed_ms(partial(tracker.update, boxes, k * FRAME_S, np.eye(4)))
         if k == n_scans // 10:
-            early = rss_mb()
-    median, late, worst = np.quantile(took, [0.5, 0.99, 1.0])
+            early_mb = rss_mb()
+    median, late, worst = np.quantile(ms, [0.5, 0.99, 1.0])
     return (
         f"{n_scans:,} scans of {n_targets} crossing targets and {n_targets // 2} false alarms: median {median:.2f} ms, "
         f"99 % {late:.2f} ms, worst {worst:.2f} ms; "
-        f"memory {early:.1f} MB after {n_scans // 10:,} scans, {rss_mb():.1f} MB at the end"
+        f"memory {early_mb:.1f} MB after {n_scans // 10:,} scans, {rss_mb():.1f} MB at the end"
     )
 
 
-def timed(run: Callable[[], int]) -> tuple[int, float, float]:
-    """Scans done, seconds on the wall, seconds of the processor."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    done = run()
-    return done, time.perf_counter() - wall, time.process_time() - cpu
-
-
-def ours(sequences: Sequence[Scans]) -> int:
+def follow(sequences: Sequence[Scans]) -> int:
+    """Track every sequence from its beginning; scans done."""
     for scans in sequences:
         tracker = Tracker()
         for k, boxes in enumerate(scans):
@@ -192,17 +191,28 @@ def stone_soup(scans: Scans, seconds: float) -> int:
 
 
 def main() -> None:
+    """Run the command line."""
     parser = argparse.ArgumentParser(
-        prog="python -m edgeperc_bench.peers.tracking", description=__doc__.splitlines()[0]
+        prog="python -m edgeperc_bench.peers.tracking", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("root", nargs="?", type=Path, help="KITTI's tracking sequences; default: a drawn street")
-    parser.add_argument("--sequence", default="0004", metavar="SEQ", help="the one for both (default: %(default)s)")
-    parser.add_argument("--score", type=float, default=0.5, help="boxes for both have more (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=60.0, help="Stone Soup's time (default: %(default)s)")
-    parser.add_argument("--crossing", type=int, metavar="N", help="scans of crossing targets, instead of all else")
-    parser.add_argument("--targets", type=int, default=200, metavar="N", help="that cross (default: %(default)s)")
+    parser.add_argument("root", nargs="?", type=Path, help="KITTI's tracking sequences (default: a drawn street)")
+    parser.add_argument("--sequence", default="0004", metavar="SEQ", help="measured with both (default: %(default)s)")
     parser.add_argument(
-        "--every-second-beam", type=Path, metavar="OUT", help="make a coarser sensor's drives of ROOT's"
+        "--score",
+        type=float,
+        default=0.5,
+        metavar="X",
+        help="both get the boxes of --sequence with a higher score (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=60.0, metavar="S", help="run Stone Soup this long (default: %(default)s)"
+    )
+    parser.add_argument("--crossing", type=int, metavar="N", help="measure only N scans of crossing targets")
+    parser.add_argument(
+        "--targets", type=int, default=200, metavar="N", help="the number of crossing targets (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--every-second-beam", type=Path, metavar="OUT", help="only write the drives of ROOT as of a coarser sensor"
     )
     arguments = parser.parse_args()
     if arguments.crossing:
@@ -214,43 +224,47 @@ def main() -> None:
         every_second_beam(arguments.root, arguments.every_second_beam)
         return
 
+    of_class: dict[str, Sequence[Scans]]
     if arguments.root is None:
-        of_class = {"car (drawn)": [drawn_street()]}
-        shared = of_class["car (drawn)"][0]
+        street = drawn_street()
+        of_class, cars = {"car (drawn)": [street]}, street
     else:
-        names = sorted(path.stem for path in (arguments.root / "label_02").glob("*.txt"))
-        read = {name: read_sequence(arguments.root, name).detections for name in names}
-        of_class = {
-            of: [[[box for box in scan if box.label == of] for scan in scans] for scans in read.values()]
-            for of in CLASSES
+        read = {
+            path.stem: read_sequence(arguments.root, path.stem).detections
+            for path in sorted((arguments.root / "label_02").glob("*.txt"))
         }
-        of_class["all together"] = [list(scans) for scans in read.values()]
-        shared = of_class["car"][names.index(arguments.sequence)]
-    shared = [[box for box in scan if box.score > arguments.score] for scan in shared]
+        of_class = {
+            label: [[[box for box in scan if box.label == label] for scan in scans] for scans in read.values()]
+            for label in CLASSES
+        }
+        of_class["all together"] = list(read.values())
+        cars = [[box for box in scan if box.label == "car"] for scan in read[arguments.sequence]]
+    shared = [[box for box in scan if box.score > arguments.score] for scan in cars]
 
-    ours([drawn_street(30)])
-    print(f"numba {numba.__version__}, Python {platform.python_version()}, {platform.machine()}, one thread")
-    print(f"{'':24}{'scans':>8}{'boxes/scan':>12}{'scans/s':>10}{'by processor time':>20}")
+    follow([drawn_street(30)])
+    rows = [["", "scans", "boxes/scan", "scans/s", "by processor time"]]
 
-    def line(name: str, scans: int, boxes: float, wall: float, cpu: float) -> None:
-        print(f"{name:24}{scans:>8,}{boxes:>12.1f}{scans / wall:>10,.0f}{scans / cpu:>20,.0f}")
+    def add(name: str, run: Callable[[], int], boxes_per_scan: float) -> float:
+        """Measure a run, which returns the scans done; processor time of a scan [s]."""
+        wall_s, cpu_s = time.perf_counter(), time.process_time()
+        done = run()
+        wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
+        rows.append([name, f"{done:,}", number(boxes_per_scan, 1), number(done / wall_s, 0), number(done / cpu_s, 0)])
+        return cpu_s / max(done, 1)
 
     for name, sequences in of_class.items():
-        done, wall, cpu = timed(lambda sequences=sequences: ours(sequences))
-        line(name, done, sum(len(scan) for scans in sequences for scan in scans) / done, wall, cpu)
-
+        n_boxes, n_scans = sum(len(scan) for scans in sequences for scan in scans), sum(map(len, sequences))
+        add(name, partial(follow, sequences), n_boxes / n_scans)
     each = sum(map(len, shared)) / len(shared)
-    done, wall, cpu = timed(lambda: ours([shared] * 5))
-    line(f"one sequence, score > {arguments.score}", done, each, wall, cpu)
-    try:
-        import stonesoup
-    except ImportError:
-        print("Stone Soup's JPDA is not installed. Run: pip install 'edgeperc[peers]'")
-        return
-    done, theirs_wall, theirs_cpu = timed(lambda: stone_soup(shared, arguments.seconds))
-    line(f"Stone Soup {stonesoup.__version__} JPDA", done, each, theirs_wall, theirs_cpu)
-    times = theirs_cpu / max(done, 1) / (cpu / (5 * len(shared)))
-    print(f"Stone Soup takes {times:,.0f} times as long a scan" if math.isfinite(times) else "")
+    own_s = add(f"one sequence, score > {arguments.score}", partial(follow, [shared] * 5), each)
+    sentences = [f"one thread; {versions()}"]
+    if importlib.util.find_spec("stonesoup"):
+        name = f"Stone Soup {importlib.metadata.version('stonesoup')} JPDA"
+        theirs_s = add(name, partial(stone_soup, shared, arguments.seconds), each)
+        sentences.append(f"Stone Soup takes {theirs_s / own_s:,.0f} times as long for a scan")
+    else:
+        sentences.append("Stone Soup's JPDA is not installed. Run: pip install 'edgeperc[peers]'")
+    print(text([Section("Tracking", sentences, rows)]))
 
 
 if __name__ == "__main__":

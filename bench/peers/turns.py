@@ -1,8 +1,8 @@
-"""Contenders run in turns, each in a process of its own."""
+"""Run the contenders in turns, each in a process of its own."""
 
 from __future__ import annotations
 
-import importlib.util
+import importlib.metadata
 import multiprocessing
 import os
 import signal
@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,73 +22,77 @@ from edgeperc import ModelCard, Perceiver
 from edgeperc.sensor import get_sensor
 from edgeperc.session import Session
 
-from ..context import conditions, rss_mb, spoilers
-from ..worker import Answer
+from ..context import conditions, disturbances, rss_mb
+from ..worker import Prediction
 from . import projection
 from .arithmetic import matrix_product, memory_copy
-from .contenders import Contender, Found, absent, groups
-from .engines import open_engine
-from .numpy_pipeline import Rival
+from .contenders import Contender, Measured, groups, why_missing
+from .engines import Engine, open_engine
+from .numpy_pipeline import NumpyPipeline
+from .rounds import elapsed_ms
 from .tables import floor_table, latency_table
 
 __all__ = ["measure", "run"]
 
-PAUSE_S = 0.02  # threads of the contender before go on spinning for some milliseconds
+PAUSE_S = 0.02  # the threads of the contender before spin on for some milliseconds
 Calls = list[Callable[[], object]]
 
 
-# What runs in a contender's process
+# What runs in a contender's process: each function returns one call per scan
 
 
 def make_perceiver(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
+    """edgeperc itself."""
     perceive = Perceiver(
         list(contender.paths),
         sensor=sensor,
         provider=contender.engine,
+        precision=contender.precision,
         n_threads=n_threads,
         on_mismatch="ignore",
-        boxes_from="network",  # as the rivals
+        boxes_from="network",  # as the numpy pipelines
     )
-    return [lambda scan=scan: perceive(scan) for scan in scans]  # type: ignore[misc]
+    return [partial(perceive, scan) for scan in scans]
 
 
-def make_rival(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
-    engines = [open_engine(contender.engine, path, n_threads) for path in contender.paths]
-    rival = Rival([ModelCard.from_json(card) for card in contender.cards], engines, get_sensor(sensor))
-    return [lambda scan=scan: rival(scan) for scan in scans]  # type: ignore[misc]
+def make_pipeline(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
+    """The pipeline in numpy around another engine."""
+    engines = [open_engine(contender.engine, contender.precision, path, n_threads) for path in contender.paths]
+    pipeline = NumpyPipeline([ModelCard.from_json(card) for card in contender.cards], engines, get_sensor(sensor))
+    return [partial(pipeline, scan) for scan in scans]
 
 
 def make_network(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
-    """Networks alone, one after the other, their input in place."""
+    """Networks alone, one after the other, with their input already written."""
     assert contender.image is not None
     image = np.load(contender.image)
     runs: Calls = []
     for path in contender.paths:
-        # edgeperc's Session has `input` and `run` too
-        network: Any
+        network: Session | Engine
         if contender.kind == "session":
-            network = Session(path, contender.engine, n_threads=n_threads)
+            network = Session(path, contender.engine, precision=contender.precision, n_threads=n_threads)
         else:
-            network = open_engine(contender.engine, path, n_threads)
+            network = open_engine(contender.engine, contender.precision, path, n_threads)
         network.input[:] = image
         runs.append(network.run)
     return [lambda: [run() for run in runs]] * len(scans)
 
 
 def make_projection(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
+    """One projection of a scan."""
     return [projection.contenders(np.ascontiguousarray(scan))[contender.engine] for scan in scans]
 
 
 def make_peak(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
+    """A peak of the machine: a memory copy or a matrix product."""
     if contender.engine == "copy":
         return [memory_copy(n_threads)]
-    library, _, precision = contender.engine.partition(":")
-    return [matrix_product(library, precision, n_threads)] * 2
+    return [matrix_product(contender.engine, contender.precision, n_threads)] * 2
 
 
 MAKERS: Mapping[str, Callable[[Contender, Sequence[NDArray[np.float32]], str, int], Calls]] = {
     "edgeperc": make_perceiver,
-    "rival": make_rival,
+    "pipeline": make_pipeline,
     "session": make_network,
     "network": make_network,
     "projection": make_projection,
@@ -96,26 +101,21 @@ MAKERS: Mapping[str, Callable[[Contender, Sequence[NDArray[np.float32]], str, in
 
 
 def serve(connection: Any, contender: Contender, files: Sequence[Path], sensor: str, n_threads: int) -> None:
-    """Get ready, tell the answers, and take turns until told otherwise."""
+    """Main function of a contender's process: get ready, send the predictions, and take turns until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends this process
-    warnings.simplefilter("ignore")  # libraries speak of their own future
+    warnings.simplefilter("ignore")  # deprecations of the libraries
     try:
         calls = MAKERS[contender.kind](contender, [np.load(file) for file in files], sensor, n_threads)
-        answers: list[Any] = [call() for call in calls]
-        told = [Answer(a.points, a.top_view, a.boxes) for a in answers if hasattr(a, "top_view")]
-        connection.send(("ready", told, rss_mb()))
-        del answers, told
+        results: list[Any] = [call() for call in calls]
+        predictions = [Prediction(r.points, r.top_view, r.boxes) for r in results if hasattr(r, "top_view")]
+        connection.send(("ready", predictions, rss_mb()))
+        del results, predictions
         while connection.recv() == "turn":
             calls[-1]()
-            took = []
-            for call in calls:
-                began = time.perf_counter_ns()
-                call()
-                took.append(round((time.perf_counter_ns() - began) / 1e6, 4))
-            connection.send(("took", took, rss_mb()))
+            connection.send(("took", [round(elapsed_ms(call), 4) for call in calls], rss_mb()))
     except EOFError:
-        return  # the parent is gone
-    except Exception as exc:  # rivals' errors share no base but Exception
+        return  # the parent has ended
+    except Exception as exc:  # the libraries' errors share no base but Exception
         connection.send(("failed", f"{type(exc).__name__}: {' '.join(str(exc).split())[:160]}", 0.0))
 
 
@@ -124,7 +124,7 @@ def serve(connection: Any, contender: Contender, files: Sequence[Path], sensor: 
 
 @contextmanager
 def _threads(n: int) -> Iterator[None]:
-    """Tell libraries that ask the environment, when a process starts, how many threads to use."""
+    """Set the environment from which libraries take their number of threads when a process starts."""
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(dict.fromkeys(names, str(n)))
@@ -142,9 +142,9 @@ def measure(
     sensor: str = "hdl-64e",
     n_threads: int = 1,
     n_rounds: int = 1,
-    say: Callable[[str], None] = print,
-    found: list[Found] | None = None,
-) -> list[Found]:
+    note: Callable[[str], None] = print,
+    measured: list[Measured] | None = None,
+) -> list[Measured]:
     """Let contenders take turns.
 
     Parameters
@@ -154,27 +154,27 @@ def measure(
         Scans, .npy (n, 4), in the sensor's raw unit of remission.
     sensor : str
     n_threads : int
-        For every library alike.
+        The same for every library.
     n_rounds : int
-    say : callable
-        Told who gets ready.
-    found : list, optional
-        Filled as it goes, so that something is left after an interruption.
+    note : callable
+        Called with the name of each contender before it starts.
+    measured : list, optional
+        Filled while measuring, so that the results so far are left after an interruption.
 
     Returns
     -------
-    list of Found
-        In the order of ``contenders``; who is absent, fails or dies says so in ``why_not``.
+    list of Measured
+        In the order of ``contenders``; ``missing`` says why a contender has no results.
     """
-    found = [] if found is None else found
+    measured = [] if measured is None else measured
     spawn, rng = multiprocessing.get_context("spawn"), np.random.default_rng(0)
-    running: list[tuple[Found, Any, Any]] = []
+    running: list[tuple[Measured, Any, Any]] = []
     try:
         for contender in contenders:
-            found.append(each := Found(contender, why_not=absent(contender)))
-            if each.why_not:
+            measured.append(each := Measured(contender, missing=why_missing(contender)))
+            if each.missing:
                 continue
-            say(contender.name)
+            note(contender.name)
             here, there = spawn.Pipe()
             process = spawn.Process(target=serve, args=(there, contender, tuple(files), sensor, n_threads))
             with _threads(n_threads):
@@ -182,11 +182,11 @@ def measure(
             there.close()
             running.append((each, here, process))
             if (content := _receive(each, here)) is not None:
-                each.answers = content
+                each.predictions = content
         for _ in range(n_rounds):
             for k in rng.permutation(len(running)):
                 each, here, _ = running[k]
-                if each.why_not:
+                if each.missing:
                     continue
                 time.sleep(PAUSE_S)
                 here.send("turn")
@@ -200,22 +200,19 @@ def measure(
             if process.is_alive():
                 process.kill()
                 process.join()
-    return found
+    return measured
 
 
-def _receive(each: Found, here: Any) -> Any:
+def _receive(each: Measured, here: Any) -> Any:
     try:
-        word, content, mb = here.recv()
+        kind, content, mb = here.recv()
     except (EOFError, ConnectionResetError):
-        word, content, mb = "failed", "its process died", 0.0
-    if word == "failed":
-        each.why_not = f"failed: {content}"
+        kind, content, mb = "failed", "its process died", 0.0
+    if kind == "failed":
+        each.missing = f"failed: {content}"
         return None
     each.rss_mb = mb
     return content
-
-
-# What is told
 
 
 def run(
@@ -225,19 +222,20 @@ def run(
     *,
     models: Sequence[str],
     provider: str,
+    precision: str,
     sensor: str,
     n_threads: int,
     n_rounds: int,
-    say: Callable[[str], None],
+    note: Callable[[str], None],
 ) -> None:
-    """Measure every table, one after the other, into a report's document."""
+    """Measure every table, one after the other, and record it in a report's document."""
     document["peers"] = {}
     for package in ("onnx", "openvino", "torch"):
         with suppress(importlib.metadata.PackageNotFoundError):
             document["software"][package] = importlib.metadata.version(package)
-    for title, contenders in groups(models, provider, folder, files[0], sensor).items():
-        say(f"{title}: {len(contenders)} contenders")
-        before, spent_s, found = conditions(), _cpu_s(), list[Found]()
+    for title, contenders in groups(models, provider, precision, folder, files[0], sensor).items():
+        note(f"{title}: {len(contenders)} contenders")
+        before, spent_s, measured = conditions(), _cpu_s(), list[Measured]()
         try:
             measure(
                 contenders,
@@ -245,26 +243,26 @@ def run(
                 sensor=sensor,
                 n_threads=n_threads,
                 n_rounds=n_rounds,
-                say=lambda name: say(f"  starting {name}"),
-                found=found,
+                note=lambda name: note(f"  starting {name}"),
+                measured=measured,
             )
         finally:
             own_s = _cpu_s() - spent_s
-            document["spoilers"] += [
-                f"{title}: {words}" for words in spoilers(document["machine"], before, conditions(), own_s)
+            document["disturbances"] += [
+                f"{title}: {each}" for each in disturbances(document["machine"], before, conditions(), own_s)
             ]
             document["peers"][title] = [
                 asdict(replace(each.contender, paths=(), cards=(), image=None))
                 | {"models": [path.name for path in each.contender.paths]}
-                | {"rounds": each.rounds, "rss_mb": each.rss_mb, "why_not": each.why_not}
-                for each in found
+                | {"rounds": each.rounds, "rss_mb": each.rss_mb, "missing": each.missing}
+                for each in measured
             ]
-            if any(each.rounds for each in found):
-                document["tables"].append(latency_table(title, found, n_threads))
-                if any(each.contender.kind == "peak" for each in found):
-                    document["tables"].append(floor_table(title, found))
+            if any(each.rounds for each in measured):
+                document["tables"].append(latency_table(title, measured, n_threads))
+                if any(each.contender.kind == "peak" for each in measured):
+                    document["tables"].append(floor_table(title, measured))
 
 
 def _cpu_s() -> float:
-    """CPU time of this process and of those it has ended [s]."""
+    """CPU time of this process and of its ended children [s]."""
     return sum(os.times()[:4])

@@ -1,0 +1,42 @@
+"""Timing of calls in rounds, for the commands of this package."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Mapping
+from time import perf_counter_ns
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["elapsed_ms", "measure", "versions"]
+
+N_WARM_UP = 3
+
+
+def elapsed_ms(call: Callable[[], object]) -> float:
+    """Wall time of one call [ms]."""
+    start = perf_counter_ns()
+    call()
+    return (perf_counter_ns() - start) / 1e6
+
+
+def measure(calls: Mapping[str, Callable[[], object]], n_rounds: int) -> dict[str, NDArray[np.float64]]:
+    """Milliseconds of each call in each round, by name.
+
+    Each round makes every call once, in a new random order, so that caches and other busy processes affect all of them
+    alike. The first `N_WARM_UP` rounds do not count.
+    """
+    ms = {name: np.empty(N_WARM_UP + n_rounds) for name in calls}
+    rng = np.random.default_rng(0)
+    for k in range(N_WARM_UP + n_rounds):
+        for name in rng.permutation(list(calls)):
+            ms[name][k] = elapsed_ms(calls[name])
+    return {name: of_call[N_WARM_UP:] for name, of_call in ms.items()}
+
+
+def versions(**others: str) -> str:
+    """Versions of numpy, numba, Python and other packages, and the processor's architecture."""
+    packages = {"numpy": np.__version__, "numba": numba.__version__, "Python": platform.python_version()} | others
+    return ", ".join([*(f"{name} {version}" for name, version in packages.items()), platform.machine()])
