@@ -768,8 +768,9 @@ def test_models_are_listed_with_what_was_measured_here(capsys: pytest.CaptureFix
     assert "boxes of car, van" in ssadnet
     assert run("models", "--json") == 0
     first, second = map(json.loads, capsys.readouterr().out.splitlines())
-    assert (first["name"], first["ms"], first["default"]) == ("pointseg", 7.25, True)
-    assert second["ms"] is None
+    assert (first["name"], first["measured"], first["default"]) == ("pointseg", entry, True)
+    assert first["variants"] == {"fp32": 2.5, "int8": 0.7}
+    assert second["measured"] is None
 
 
 def test_sensors_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -780,7 +781,7 @@ def test_sensors_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("sensors", "--json") == 0
     records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [record["name"] for record in records] == [*SENSORS]
-    assert records[0]["n_beams"] == 64
+    assert records[0]["beams"] == 64
 
 
 def test_providers_are_listed(capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 __all__ = [
     "DEFAULT",
+    "DEFAULT_SENSOR",
     "PRECISIONS",
     "PROVIDERS",
     "Commands",
@@ -32,6 +33,7 @@ _WIDTH = 78
 
 # As in `edgeperc.zoo` and `edgeperc.session`. They import numpy, and a help page has to come at once.
 DEFAULT = ("ssadnet", "pointseg")
+DEFAULT_SENSOR = "hdl-64e"
 PROVIDERS = ("auto", "cpu", "openvino", "cuda", "tensorrt", "tensorrt-rtx", "coreml", "directml")
 PRECISIONS = ("auto", "fp32", "bf16", "int8")
 
@@ -94,7 +96,7 @@ def add_sensor(group: Any, *, required: bool = False) -> None:
     group.add_argument(
         "--sensor",
         required=required,
-        default=None if required else "hdl-64e",
+        default=None if required else DEFAULT_SENSOR,
         metavar="SENSOR",
         help="the LiDAR that recorded the scans: a name from 'edgeperc sensors', or a .json file written by "
         "'edgeperc fit-sensor'" + (" (required)" if required else " (default: %(default)s)"),

@@ -135,7 +135,8 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
         rows.append(("boxes", f"{', '.join(card.box_classes)}, score from {card.score_threshold:g}"))
     rows += [(key, str(card.training[key])) for key in ("data", "licence") if key in card.training]
     rows += _accuracy_rows(card.metrics)
-    for precision, agreement in card.precisions.items():
+    reduced = {name: of for variant in variants for name, of in variant.card.precisions.items() if name != "fp32"}
+    for precision, agreement in reduced.items():
         loss, same = agreement.get("loss"), agreement.get("label_agreement")
         if isinstance(same, float):
             lost = f", {loss:.2g} points lost" if isinstance(loss, float) else ""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
-from .arguments import DEFAULT, Commands, add_command
+from .arguments import DEFAULT_SENSOR, Commands, add_command
 from .output import print_columns, say
 
 __all__ = ["add_parser", "models_command", "providers_command", "sensors_command"]
@@ -28,14 +29,14 @@ def add_parser(commands: Commands) -> None:
             sensors_command,
             "the built-in sensors: beams, field of view, remission",
             "List the built-in sensors. The names are for --sensor; another sensor is described by a .json file, see "
-            "'edgeperc fit-sensor'. 'adapted' says whether its remission is mapped to the training sensor's.",
+            "'edgeperc fit-sensor'. 'mapped to' names the sensor to whose remission its own is mapped.",
         ),
         (
             "providers",
             providers_command,
-            "the execution providers: which of them run on this computer",
-            "List onnxruntime's execution providers. The names are for --provider. The first available one of cuda, "
-            "openvino and cpu is taken by --provider auto if nothing was measured here.",
+            "the execution providers: which of them this computer has, and what installs the others",
+            "List onnxruntime's execution providers. The names are for --provider. If nothing was measured here, "
+            "--provider auto takes the first available one of cuda, openvino and cpu.",
         ),
     ):
         parser = add_command(
@@ -51,46 +52,83 @@ def add_parser(commands: Commands) -> None:
 
 
 def models_command(arguments: argparse.Namespace) -> int:
-    """Print the installed models."""
-    columns = {
-        "name": lambda of: of["name"],
-        "default": lambda of: _mark(of["default"]),
-        "for": lambda of: of["task"],
-        "size [MB]": lambda of: ", ".join(f"{name} {size:.1f}" for name, size in of["size_mb"].items()),
-        "measured here": lambda of: "-" if of["ms"] is None else f"{of['ms']:.1f} ms, {of['setting']}",
-        "licence": lambda of: str(of["licence"]).partition(",")[0],
-    }
-    return _print(_models(), columns, arguments)
+    """Print `edgeperc.models`, with the fastest setting measured on this computer."""
+    from ..listing import models
+    from ..tuning import fingerprint, read_setting, settings_path
+    from ..zoo import digest, resolve
+
+    machine = fingerprint()
+    return _print(
+        [
+            {**_fields(model), "measured": read_setting(settings_path(), machine, digest(resolve(model.name)))}
+            for model in models()
+        ],
+        {
+            "name": lambda of: of["name"],
+            "default": lambda of: _mark(of["default"]),
+            "for": lambda of: of["purpose"],
+            "size [MB]": lambda of: ", ".join(f"{precision} {mb:.1f}" for precision, mb in of["variants"].items()),
+            "measured here": lambda of: _measured(of["measured"]),
+            "licence": lambda of: of["licence"].partition(",")[0],
+        },
+        arguments,
+    )
 
 
 def sensors_command(arguments: argparse.Namespace) -> int:
-    """Print the built-in sensors."""
-    columns = {
-        "name": lambda of: of["name"],
-        "default": lambda of: _mark(of["default"]),
-        "beams": lambda of: str(of["n_beams"]),
-        "elevations [deg]": lambda of: f"{of['fov_down_deg']:g} .. {of['fov_up_deg']:g}",
-        "columns": lambda of: str(of["columns"]),
-        "remission": lambda of: "{:g} .. {:g}".format(*of["remission_range"]),
-        "range [m]": lambda of: f"{of['min_range_m']:g} .. {of['max_range_m']:g}",
-        "height [m]": lambda of: f"{of['mount_height_m']:g}",
-        "adapted": lambda of: _mark(of["adapted"]),
-    }
-    return _print(_sensors(), columns, arguments)
+    """Print `edgeperc.sensors`."""
+    from ..listing import sensors
+
+    return _print(
+        [{**_fields(sensor), "default": sensor.name == DEFAULT_SENSOR} for sensor in sensors()],
+        {
+            "name": lambda of: of["name"],
+            "default": lambda of: _mark(of["default"]),
+            "beams": lambda of: str(of["beams"]),
+            "elevations [deg]": lambda of: "{:g} .. {:g}".format(*of["field_of_view_deg"]),
+            "columns": lambda of: str(of["columns"]),
+            "remission": lambda of: "{:g} .. {:g}".format(*of["remission_range"]),
+            "range [m]": lambda of: "{:g} .. {:g}".format(*of["range_m"]),
+            "height [m]": lambda of: f"{of['mount_height_m']:g}",
+            "mapped to": lambda of: of["rendered_as"] or "-",
+        },
+        arguments,
+    )
 
 
 def providers_command(arguments: argparse.Namespace) -> int:
-    """Print the execution providers."""
-    columns = {
-        "name": lambda of: of["name"],
-        "available": lambda of: _mark(of["available"]),
-        "onnxruntime's name": lambda of: of["onnxruntime"],
-    }
-    return _print(_providers(), columns, arguments)
+    """Print `edgeperc.providers`."""
+    from ..listing import providers
+
+    return _print(
+        [_fields(provider) for provider in providers()],
+        {
+            "name": lambda of: of["name"],
+            "available": lambda of: _mark(of["available"]),
+            "installed by": lambda of: of["installed_by"],
+        },
+        arguments,
+    )
+
+
+def _fields(record: Any) -> dict[str, Any]:
+    return {field.name: getattr(record, field.name) for field in fields(record)}
+
+
+def _measured(setting: Mapping[str, Any] | None) -> str:
+    if setting is None:
+        return "-"
+    ran = " ".join(str(setting[key]) for key in ("provider", "precision") if key in setting)
+    return f"{setting['p50_ms']:.1f} ms, {ran}" if "p50_ms" in setting else ran
 
 
 def _mark(flag: bool) -> str:
     return "yes" if flag else "-"
+
+
+def _plain(value: object) -> object:
+    """What JSON has for a mapping that is no dict, and for a path."""
+    return dict(value) if isinstance(value, Mapping) else str(value)
 
 
 def _print(
@@ -100,55 +138,7 @@ def _print(
 ) -> int:
     if arguments.json:
         for record in records:
-            say(json.dumps(record, allow_nan=False))
+            say(json.dumps(record, allow_nan=False, default=_plain))
     else:
         print_columns([*columns], [[cell(record) for cell in columns.values()] for record in records])
     return 0
-
-
-def _models() -> list[dict[str, Any]]:
-    from ..listing import purpose
-    from ..tuning import fingerprint, read_setting, settings_path
-    from ..zoo import digest, resolve, shipped_models
-
-    machine, records = fingerprint(), []
-    for name in shipped_models():
-        variants = resolve(name)
-        card = variants[0].card
-        setting = read_setting(settings_path(), machine, digest(variants)) or {}
-        records.append(
-            {
-                "name": name,
-                "version": card.version,
-                "default": name in DEFAULT,
-                "task": purpose(card),
-                "size_mb": {variant.precision: round(variant.path.stat().st_size / 1e6, 2) for variant in variants},
-                "licence": card.training.get("licence", "not said"),
-                "ms": setting.get("p50_ms"),
-                "setting": " ".join(str(setting[key]) for key in ("provider", "precision") if key in setting) or None,
-                "path": str(variants[0].path),
-            }
-        )
-    return records
-
-
-def _sensors() -> list[dict[str, Any]]:
-    from ..sensor import SENSORS
-
-    keys = ("n_beams", "fov_up_deg", "fov_down_deg", "columns", "remission_range", "min_range_m", "max_range_m")
-    return [
-        {
-            "name": profile.name,
-            "default": profile.name == "hdl-64e",
-            **{key: getattr(profile, key) for key in (*keys, "mount_height_m")},
-            "adapted": profile.remission is not None,
-        }
-        for profile in SENSORS.values()
-    ]
-
-
-def _providers() -> list[dict[str, Any]]:
-    from ..session import PROVIDERS, available_providers
-
-    present = available_providers()
-    return [{"name": name, "available": name in present, "onnxruntime": full} for name, full in PROVIDERS.items()]
