@@ -21,6 +21,7 @@ __all__ = [
     "add_axes",
     "area_of",
     "as_png",
+    "free_place",
     "new_figure",
     "place_labels",
     "shorten",
@@ -164,7 +165,7 @@ def place_labels(
     n_omitted : int
         Labels for which there was no place.
     """
-    figure, panel, step, gap = axes.figure, axes.get_window_extent(), 5.0, 4.0
+    figure, panel, gap = axes.figure, axes.get_window_extent(), 4.0
     taken = np.array([*(label.area for label in labels), *avoid], dtype=np.float64).reshape(-1, 4)
     n_omitted = max(0, len(labels) - _MOST_LABELS)
     for label in labels[:_MOST_LABELS]:
@@ -173,42 +174,65 @@ def place_labels(
         )
         extent = text.get_window_extent()
         half = np.array([extent.width / 2.0 + gap, extent.height / 2.0 + gap])
-        x, y = (
-            np.arange(low + at, high - at, step)
-            for low, high, at in ((panel.x0, panel.x1, half[0]), (panel.y0, panel.y1, half[1]))
-        )
-        middles = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        free = ~_meets(middles, half, taken)
-        area = np.array(label.area).reshape(2, 2)
-        # Distance between the rectangles first, between their middles second.
-        apart = np.maximum(np.maximum(area[0] - middles - half, middles - half - area[1]), 0.0)
-        cost = np.hypot(*apart.T) + 0.08 * np.hypot(*(middles - area.mean(axis=0)).T)
-        free &= np.hypot(*apart.T) < _FARTHEST
-        if not free.any():
+        found = free_place(label.area, half, taken, (panel.x0, panel.y0, panel.x1, panel.y1))
+        if found is None:
             text.remove()
             n_omitted += 1
             continue
-        best = int(np.argmin(np.where(free, cost, np.inf)))
-        middle = middles[best]
+        middle, apart = found
         text.set(position=tuple(middle), ha="center", va="center")
         text.set_bbox({"facecolor": PANEL, "edgecolor": "none", "alpha": 0.8, "pad": 2.0})
         taken = np.vstack([taken, [*(middle - half), *(middle + half)]])
-        if np.hypot(*apart[best]) > 3.0 * gap:
+        if apart > 3.0 * gap:
+            area = np.array(label.area).reshape(2, 2)
             _draw_leader(figure, np.clip(area.mean(axis=0), middle - half, middle + half), area, label.color)
     return n_omitted
 
 
-def _meets(middles: NDArray[np.float64], half: NDArray[np.float64], taken: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which rectangles around ``middles`` overlap one of those taken, (n,)."""
-    met = np.zeros(len(middles), np.bool_)
+def free_place(
+    area: Sequence[float], half: NDArray[np.float64], taken: NDArray[np.float64], panel: Sequence[float]
+) -> tuple[NDArray[np.float64], float] | None:
+    """The place for a label nearest to what it names.
+
+    Parameters
+    ----------
+    area : sequence of 4 float
+        What it names [px]: smallest x and y, largest x and y.
+    half : (2,) float64
+        Half the label's width and height [px].
+    taken : (k, 4) float64
+        Rectangles that it must not cover.
+    panel : sequence of 4 float
+        Rectangle that it must not leave.
+
+    Returns
+    -------
+    middle : (2,) float64
+    apart : float
+        Distance between label and area [px].
+
+    None where there is no free place near.
+    """
+    named = np.array(area, dtype=np.float64).reshape(2, 2)
+    low = np.maximum(np.array(panel[:2]) + half, named[0] - half - _FARTHEST)
+    high = np.minimum(np.array(panel[2:]) - half, named[1] + half + _FARTHEST)
+    x, y = (np.arange(low[k], high[k], 5.0) for k in (0, 1))
+    middles = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    free = np.ones(len(middles), np.bool_)
     for left, bottom, right, top in taken.tolist():
-        met |= (
-            (middles[:, 0] + half[0] > left)
-            & (middles[:, 0] - half[0] < right)
-            & (middles[:, 1] + half[1] > bottom)
-            & (middles[:, 1] - half[1] < top)
+        free &= (
+            (middles[:, 0] + half[0] <= left)
+            | (middles[:, 0] - half[0] >= right)
+            | (middles[:, 1] + half[1] <= bottom)
+            | (middles[:, 1] - half[1] >= top)
         )
-    return met
+    if not free.any():
+        return None
+    middles = middles[free]
+    apart = np.hypot(*np.maximum(np.maximum(named[0] - middles - half, middles - half - named[1]), 0.0).T)
+    # Distance between the rectangles first, between their middles second.
+    best = int(np.argmin(apart + 0.08 * np.hypot(*(middles - named.mean(axis=0)).T)))
+    return (middles[best], float(apart[best])) if apart[best] < _FARTHEST else None
 
 
 def _draw_leader(figure: Any, start: NDArray[np.float64], area: NDArray[np.float64], color: str) -> None:

@@ -45,7 +45,7 @@ def check_points(points: NDArray[np.float32], perception: Perception) -> None:
 
 def drawable_points(points: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Rows that are finite and no farther than any sensor reaches, (n,)."""
-    return np.isfinite(points).all(axis=1) & (np.abs(points[:, :3]) < _REACH_M).all(axis=1)
+    return np.asarray(np.isfinite(points).all(axis=1) & (np.abs(points[:, :3]) < _REACH_M).all(axis=1))
 
 
 def drawable_boxes(boxes: Iterable[Box]) -> list[Box]:
@@ -117,15 +117,15 @@ def fit_ground(points: NDArray[np.float32], names: list[str], painted: NDArray[n
     if "drivable" in names:
         road = points[painted == names.index("drivable"), :3].astype(np.float64)
         if len(road) >= 50:
+            level = float(np.median(road[:, 2])), 0.0, 0.0
             # A second fit without what stands out of the first.
             for _ in range(2):
+                if len(road) < 50 or road[:, :2].std(axis=0).min() < 1.0:
+                    return level
                 known = np.column_stack([np.ones(len(road)), road[:, :2]])
                 plane = np.linalg.lstsq(known, road[:, 2], rcond=None)[0]
                 road = road[np.abs(known @ plane - road[:, 2]) < 0.3]
-                if len(road) < 50:
-                    break
-            if np.abs(plane[1:]).max() < 0.2:
-                return float(plane[0]), float(plane[1]), float(plane[2])
+            return (float(plane[0]), float(plane[1]), float(plane[2])) if np.abs(plane[1:]).max() < 0.2 else level
     near = np.hypot(points[:, 0], points[:, 1]) < 30.0
     return (float(np.percentile(points[near, 2], 15.0)) if near.any() else -1.73), 0.0, 0.0
 

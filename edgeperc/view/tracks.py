@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,104 +13,259 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import write_whole
-from ..errors import MissingExtraError
-from .colors import FAINT, INK, PANEL, color_of
+from ..errors import MissingExtraError, TrackingError
+from ..perception import Perception
+from .canvas import free_place
+from .colors import CLASS_COLORS, FAINT, FRAME, GROUND, HIGH, INK, LOW, PANEL, color_of, rgb
+from .content import drawable_boxes, drawable_points, fit_ground, paint_points
 
 if TYPE_CHECKING:
-    from ..tracking.tracks import Tracks
+    from ..tracking.tracks import Track, Tracks
 
-__all__ = ["draw_tracks"]
+__all__ = ["draw_tracks", "flatten_scan"]
+
+# Ahead is to the right, left is up. All in pixels, 10 a meter; drawn twice as large and reduced, for smooth edges.
+_PX_PER_M, _FINE = 10, 2
+_BEHIND_M, _BESIDE_M = 22, 28
+_WIDTH, _HEIGHT, _HEAD, _FOOT = 960, 560, 44, 38
+# What a pixel of a flattened scan may be: nothing, road, a point low, higher and high above the ground, a class.
+_ROAD, _POINT, _CLASS = 1, 2, 5
+_OTHER = _CLASS + len(CLASS_COLORS)
+
+
+def flatten_scan(points: NDArray[np.float32], perception: Perception | None = None) -> bytes:
+    """Reduce a scan to what `draw_tracks` shows of it under the tracks: some 20 kB.
+
+    Parameters
+    ----------
+    points : (n, 4) float32
+        x, y, z [m] in the sensor frame, remission.
+    perception : Perception, optional
+        Of these points; without it, no point has a class and no road is shown.
+
+    Returns
+    -------
+    flat : bytes
+        For `draw_tracks`.
+    """
+    image = np.zeros((_HEIGHT, _WIDTH), np.uint8)
+    names, painted = ["background"], np.zeros(len(points), np.uint8)
+    if perception is not None:
+        names, painted = paint_points(points, perception)
+        if perception.top_view is not None:
+            view = perception.top_view
+            x = (np.arange(_WIDTH) + 0.5) / _PX_PER_M - _BEHIND_M
+            y = _BESIDE_M - (np.arange(_HEIGHT) + 0.5) / _PX_PER_M
+            row = np.floor((view.x_range_m[1] - x) / view.cell_m)
+            col = np.floor((view.y_range_m[1] - y) / view.cell_m)[:, None]
+            inside = (row >= 0) & (row < view.labels.shape[0]) & (col >= 0) & (col < view.labels.shape[1])
+            row, col = np.broadcast_arrays(row, col)
+            image[inside] = _ROAD * view.drivable[row[inside].astype(np.intp), col[inside].astype(np.intp)]
+    seen = drawable_points(points)
+    points, painted = points[seen], painted[seen]
+    a, b, c = fit_ground(points, names, painted)
+    x, y, z = points[:, :3].astype(np.float64).T
+    level = np.clip(np.floor((z - a - b * x - c * y) / 1.2 + 0.75), 0, 2)
+    order = [*CLASS_COLORS]
+    as_pixel = np.array([_CLASS + order.index(name) if name in order else _OTHER for name in names], np.uint8)
+    value = np.where(painted == 0, _POINT + level.astype(np.uint8), as_pixel[painted])
+    col, row = np.floor((x + _BEHIND_M) * _PX_PER_M), np.floor((_BESIDE_M - y) * _PX_PER_M)
+    # Points of the road add nothing to it, and those of the ground beside it little: every second line of them.
+    inside = (col >= 0) & (col < _WIDTH) & (row >= 0) & (row < _HEIGHT) & (value != _CLASS + order.index("drivable"))
+    shown = np.flatnonzero(inside)
+    shown = shown[np.argsort(value[shown], kind="stable")]  # classes over the background
+    image[row[shown].astype(np.intp), col[shown].astype(np.intp)] = value[shown]
+    return zlib.compress(image.tobytes(), 1)
 
 
 def draw_tracks(
     scans: Sequence[Tracks],
     path: str | Path | None = None,
     *,
+    under: Sequence[bytes] = (),
     title: str = "",
     tail_s: float = 2.0,
-    range_m: tuple[float, float] = (70.0, 30.0),
 ) -> bytes:
-    """Draw tracks from above, scan by scan: footprints, where each goes in the next second, and where it was.
+    """Draw tracks from above, scan by scan: boxes, ids, speeds, where each goes in the next second, and where it was.
 
     Parameters
     ----------
     scans : sequence of Tracks
-        In order; one of them a picture, shown for as long as it lasted.
+        In order, two or more; each is shown for as long as it lasted.
     path : str or Path, optional
         Where to write the animation as well; an existing file is replaced whole.
+    under : sequence of bytes
+        What to show under the tracks: `flatten_scan` of each scan. Empty: the tracks alone.
     title : str
     tail_s : float
-        How long a track's way behind it is shown [s].
-    range_m : tuple of 2 float
-        How far ahead, and how far to each side, is shown [m]; behind, as far as there are tracks, 10 to 40 m.
+        How long the trail behind a track is [s].
 
     Returns
     -------
     gif : bytes
-        Empty where there is no scan.
+        960 by 642 pixels: 22 m behind the sensor to 74 m ahead, 28 m to each side.
 
     Raises
     ------
     MissingExtraError
         pillow is not installed.
+    TrackingError
+        There are fewer than two scans, which are no animation, or not as many in ``under``.
     OSError
         The file cannot be written.
     """
     try:
-        from PIL import Image, ImageDraw
+        from PIL import Image, ImageDraw, ImageFont
     except ImportError as exc:
         raise MissingExtraError("pillow", "view", "Drawing an animation") from exc
-    px_per_m = 8.0
-    # A detector that looks all around has tracks behind; of others nothing is to be seen there.
-    behind_m = min(max([10.0, *(5.0 - float(tracks.boxes[:, 0].min()) for tracks in scans if len(tracks))]), 40.0)
-    size = round(2.0 * range_m[1] * px_per_m), round((range_m[0] + behind_m) * px_per_m)
-
-    def pixels(places: NDArray[np.float64]) -> list[tuple[float, float]]:
-        """x, y in the sensor's frame -> pixels: ahead is up, left is left."""
-        return [((range_m[1] - y) * px_per_m, (range_m[0] - x) * px_per_m) for x, y in places[:, :2].tolist()]
-
+    if len(scans) < 2:
+        raise TrackingError(
+            f"got {len(scans)} scan{'s' * (len(scans) != 1)} for an animation; expected two or more of a drive. "
+            "A single scan is drawn by edgeperc.draw, or run --png"
+        )
+    if under and len(under) != len(scans):
+        raise TrackingError(f"got {len(under)} flattened scans with tracks of {len(scans)}; expected one for each")
+    fonts = {size: ImageFont.load_default(_FINE * size) for size in (13, 14, 17)}
+    palette = _palette(Image)
+    trails: dict[int, list[tuple[float, float, float, float]]] = {}
     pictures: list[Any] = []
-    ways: dict[int, list[tuple[float, float, float, float]]] = {}
-    for tracks in scans:
-        picture = Image.new("RGB", size, PANEL)
+    for k, tracks in enumerate(scans):
+        flat = np.frombuffer(zlib.decompress(under[k]), np.uint8).reshape(_HEIGHT, _WIDTH) if under else None
+        layer = _layer_colors()[np.zeros((_HEIGHT, _WIDTH), np.uint8) if flat is None else flat]
+        picture = Image.new("RGB", (_FINE * _WIDTH, _FINE * (_HEAD + _HEIGHT + _FOOT)), GROUND)
+        picture.paste(
+            Image.fromarray(layer).resize((_FINE * _WIDTH, _FINE * _HEIGHT), Image.Resampling.NEAREST),
+            (0, _FINE * _HEAD),
+        )
         pen = ImageDraw.Draw(picture)
-        (middle,) = pixels(np.zeros((1, 2)))
-        for ring_m in (20.0, 40.0, 60.0):
-            reach = ring_m * px_per_m
-            pen.ellipse([middle[0] - reach, middle[1] - reach, middle[0] + reach, middle[1] + reach], outline="#2a343f")
-            pen.text((middle[0] + 3.0, middle[1] - reach), f"{ring_m:.0f} m", fill=FAINT)
-        pen.polygon(pixels(np.array([[1.5, 0.0], [-1.5, 0.9], [-1.5, -0.9]])), outline=FAINT)
-        R, t = tracks.T_world_sensor[:3, :3], tracks.T_world_sensor[:3, 3]
+        _draw_rings(pen, fonts[13])
         here = {track.id for track in tracks}
-        ways = {name: way for name, way in ways.items() if name in here or way[-1][3] > tracks.stamp_s - tail_s}
+        begin_s = tracks.stamp_s - tail_s
+        trails = {name: trail for name, trail in trails.items() if name in here or trail[-1][3] > begin_s}
         for track in tracks:
-            ways.setdefault(track.id, []).append((*track.world_box.center, tracks.stamp_s))
-            way = ways[track.id] = [place for place in ways[track.id] if place[3] > tracks.stamp_s - tail_s]
-            colour = color_of(track.label)
-            if len(way) > 1:
-                pen.line(pixels((np.array(way)[:, :3] - t) @ R), fill=colour)
-            pen.polygon(pixels(track.box.corners()), outline=colour, width=1 if track.coasting else 2)
-            ahead = np.array([track.box.center[:2], np.array(track.box.center[:2]) + track.velocity])
-            pen.line(pixels(ahead), fill=INK)
-        for track in tracks:  # names last, on a ground of their own, or neighbours' could not be told apart
-            x, y = pixels(np.array([track.box.center]))[0]
-            speed = math.hypot(*track.velocity)
-            name = f"#{track.id}" + (f" {3.6 * speed:.0f} km/h" if speed > 1.0 else "")
-            pen.rectangle(pen.textbbox((x + 10.0, y - 6.0), name), fill=PANEL)
-            pen.text((x + 10.0, y - 6.0), name, fill=INK)
-        told = f"{title}  {tracks.stamp_s:.1f} s  {len(tracks)} track{'s' * (len(tracks) != 1)}"
-        pen.text((10.0, 8.0), told.strip(), fill=INK)
-        for line, label in enumerate(sorted({*tracks.labels})):
-            pen.text((10.0, 24.0 + 14.0 * line), label, fill=color_of(label))
-        pictures.append(picture.quantize(64))
-    if not pictures:
-        return b""
+            trail = [*trails.get(track.id, ()), (*track.world_box.center, tracks.stamp_s)]
+            trails[track.id] = [place for place in trail if place[3] > begin_s]
+        R, t = tracks.T_world_sensor[:3, :3], tracks.T_world_sensor[:3, 3]
+        drawn = [track for track in tracks if drawable_boxes([track.box])]
+        for track in drawn:
+            _draw_track(pen, track, (np.array(trails[track.id])[:, :3] - t) @ R)
+        _write_names(pen, drawn, fonts[14])
+        facts = f"{tracks.stamp_s - scans[0].stamp_s:.1f} s · {len(tracks)} track{'s' * (len(tracks) != 1)}"
+        _write_frame(
+            pen, title or "Tracks", facts, sorted({label for of in scans for label in of.labels}), fonts, tail_s
+        )
+        pictures.append(picture.reduce(_FINE).quantize(palette=palette, dither=Image.Dither.NONE))
     stamps = [tracks.stamp_s for tracks in scans]
     lasted = [round(1e3 * (b - a)) for a, b in zip(stamps, [*stamps[1:], stamps[-1] + 1.0], strict=True)]
     stream = io.BytesIO()
     pictures[0].save(
-        stream, "GIF", save_all=True, append_images=pictures[1:], duration=[max(20, ms) for ms in lasted], loop=0
+        stream,
+        "GIF",
+        save_all=True,
+        append_images=pictures[1:],
+        duration=[max(20, ms) for ms in lasted],
+        loop=0,
+        optimize=False,
     )
     if path is not None:
         write_whole(path, stream.getvalue())
     return stream.getvalue()
+
+
+def _layer_colors() -> NDArray[np.uint8]:
+    """Color of each value of a flattened scan, (values, 3)."""
+    panel, low, high, drivable = rgb([PANEL, LOW, HIGH, CLASS_COLORS["drivable"]])
+    points = [panel + share * (color - panel) for color, share in ((low, 0.5), (low, 0.95), (high, 0.6))]
+    classes = [panel + 0.85 * (color - panel) for color in rgb([*CLASS_COLORS.values(), color_of("")])]
+    colors = [panel, panel + 0.55 * (drivable - panel), *points, *classes]
+    return np.asarray((255.0 * np.array(colors)).round(), np.uint8)
+
+
+def _palette(Image: Any) -> Any:
+    """A picture with the palette of all frames: every color that is drawn, and its edges on every ground."""
+    front = np.concatenate([rgb([INK, FAINT, *CLASS_COLORS.values(), color_of("")]), _layer_colors()[_POINT:] / 255.0])
+    ground = np.concatenate([rgb([PANEL, GROUND, FRAME]), _layer_colors()[[_ROAD]] / 255.0])
+    edges = [back + share * (front - back) for back in ground for share in (0.35, 0.7)]
+    colors = np.unique((255.0 * np.concatenate([ground, front, *edges])).round().astype(np.uint8), axis=0)[:256]
+    picture = Image.new("P", (1, 1))
+    picture.putpalette(colors.tobytes() + bytes(768 - colors.size))
+    return picture
+
+
+def _pixels(places: NDArray[np.float64]) -> list[tuple[float, float]]:
+    """x, y [m] in the sensor frame -> pixels of the large picture."""
+    places = places[:, :2].clip(-1e3, 1e3)
+    return [
+        (_FINE * _PX_PER_M * (x + _BEHIND_M), _FINE * (_HEAD + _PX_PER_M * (_BESIDE_M - y))) for x, y in places.tolist()
+    ]
+
+
+def _draw_rings(pen: Any, font: Any) -> None:
+    (middle,) = _pixels(np.zeros((1, 2)))
+    for ring_m in (20, 40, 60):
+        reach = ring_m * _PX_PER_M * _FINE
+        # The part in view; head and foot are drawn over the rest.
+        pen.arc(
+            [middle[0] - reach, middle[1] - reach, middle[0] + reach, middle[1] + reach], -90, 90, FRAME, width=_FINE
+        )
+        y = min(24.0, 0.8 * ring_m)  # beside the road, where no names are
+        (at,) = _pixels(np.array([[math.sqrt(ring_m**2 - y**2), y]]))
+        pen.text(at, f" {ring_m} m", fill=FAINT, font=font)
+    pen.polygon(_pixels(np.array([[2.2, 0.0], [-1.4, 0.9], [-1.4, -0.9]])), fill=INK)
+
+
+def _draw_track(pen: Any, track: Track, trail: NDArray[np.float64]) -> None:
+    """Trail, box and velocity."""
+    color = color_of(track.label)
+    if len(trail) > 1:
+        pen.line(_pixels(trail), fill=color, width=_FINE + 1, joint="curve")
+    pen.polygon(_pixels(track.box.corners()), outline=color, width=(1 if track.coasting else 2) * _FINE)
+    speed = math.hypot(*track.velocity)
+    if speed > 0.5:
+        start = np.array(track.box.center[:2])
+        along = np.asarray(track.velocity) / speed
+        tip, neck = start + track.velocity, start + along * max(0.0, speed - 1.2)
+        side = 0.6 * np.array([-along[1], along[0]])
+        pen.line(_pixels(np.array([start, neck])), fill=INK, width=2 * _FINE)
+        pen.polygon(_pixels(np.array([tip, neck + side, neck - side])), fill=INK)
+
+
+def _write_names(pen: Any, tracks: Sequence[Track], font: Any) -> None:
+    """Ids and speeds, none on a box or on another."""
+    areas = [np.array(_pixels(track.box.corners())) for track in tracks]
+    panel = (0.0, float(_FINE * _HEAD), float(_FINE * _WIDTH), float(_FINE * (_HEAD + _HEIGHT)))
+    taken = [(*area.min(axis=0).tolist(), *area.max(axis=0).tolist()) for area in areas]
+    for track, area in zip(tracks, list(taken), strict=True):
+        if area[2] < panel[0] or area[0] > panel[2] or area[3] < panel[1] or area[1] > panel[3]:
+            continue
+        speed = math.hypot(*track.velocity)
+        text = f"{track.id}" + (f" · {3.6 * speed:.0f} km/h" if speed > 0.5 else "")
+        left, top, right, bottom = pen.textbbox((0, 0), text, font=font, anchor="mm")
+        half = np.array([(right - left) / 2.0 + 6.0, (bottom - top) / 2.0 + 6.0])
+        found = free_place(area, half, np.array(taken), panel)
+        if found is not None:
+            middle, _ = found
+            taken.append((*(middle - half).tolist(), *(middle + half).tolist()))
+            pen.rectangle(taken[-1], fill=PANEL)
+            pen.text(tuple(middle.tolist()), text, fill=color_of(track.label), font=font, anchor="mm")
+
+
+def _write_frame(pen: Any, title: str, facts: str, labels: Sequence[str], fonts: dict[int, Any], tail_s: float) -> None:
+    """Head and foot: title, time, classes and what the lines mean."""
+    width, head, foot = _FINE * _WIDTH, _FINE * _HEAD, _FINE * (_HEAD + _HEIGHT)
+    pen.rectangle([0, 0, width, head], fill=GROUND)
+    pen.rectangle([0, foot, width, foot + _FINE * _FOOT], fill=GROUND)
+    middle = head // 2
+    title = "".join(c if c.isprintable() and ord(c) < 256 else "?" for c in title)
+    facts_left = width - 32 - pen.textlength(facts, font=fonts[17])
+    while len(title) > 1 and pen.textlength(title, font=fonts[17]) > facts_left - 64:
+        title = f"{title[:-4]}..."
+    pen.text((32, middle), title, fill=INK, font=fonts[17], anchor="lm")
+    pen.text((width - 32, middle), facts, fill=FAINT, font=fonts[17], anchor="rm")
+    x, middle = 32.0, foot + _FINE * _FOOT // 2
+    for label in [label for label in CLASS_COLORS if label in labels]:
+        pen.rectangle([x, middle - 10, x + 20, middle + 10], fill=color_of(label))
+        pen.text((x + 30, middle), label, fill=INK, font=fonts[14], anchor="lm")
+        x += 30 + pen.textlength(label, font=fonts[14]) + 36
+    meaning = f"line: last {tail_s:g} s · arrow: next second · thin box: not detected now"
+    pen.text((width - 32, middle), meaning, fill=FAINT, font=fonts[13], anchor="rm")
