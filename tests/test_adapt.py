@@ -14,10 +14,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import twins.adapt
-from edgeperc import Perceiver
-from edgeperc.adapt import Interpolator, render
+from edgeperc import Perceiver, cli
+from edgeperc.adapt import Interpolator, condition, render
 from edgeperc.card import InputSpec, RangeImageGeometry
-from edgeperc import cli
 from edgeperc.errors import PointsError, SensorError
 from edgeperc.evaluation.transfer import compare
 from edgeperc.projection import RangeImageProjector
@@ -549,3 +548,61 @@ def test_a_model_without_points_is_refused() -> None:
 
     with pytest.raises(ModelError, match="labels no points"):
         compare(["hdl-32e=simulation:1"], "ssadnet")
+
+
+# --- the door ---------------------------------------------------------------------------------------------------------
+
+RAW = replace(get_sensor("hdl-64e"), remission_range=(-3.0, 252.0))
+
+
+def some_scan(n=300):
+    rng = np.random.default_rng(n)
+    points = rng.normal((0.0, 0.0, 0.0, 100.0), 10.0, (n, 4)).astype(np.float32)
+    points[:: max(1, n // 20), rng.integers(0, 4)] = rng.choice([np.nan, np.inf, -np.inf])
+    return points
+
+
+@pytest.mark.parametrize("sensor", [get_sensor("hdl-64e"), RAW, get_sensor("vlp-16")], ids=lambda s: s.name)
+@pytest.mark.parametrize("rendered", [True, False])
+@pytest.mark.parametrize("n", [0, 1, 300])
+def test_a_conditioned_scan_is_finite_or_nowhere_and_read_only(sensor, rendered, n):
+    points = some_scan(n)
+    before = points.copy()
+    scan, n_dropped = condition(points, sensor, rendered=rendered)
+    np.testing.assert_array_equal(points, before)
+    assert (scan.shape, scan.dtype) == ((n, 4), np.float32)
+    assert scan.flags.c_contiguous
+    assert scan.flags.aligned
+    assert not scan.flags.writeable
+    dropped = ~np.isfinite(points).all(axis=1)
+    assert n_dropped == np.count_nonzero(dropped)
+    assert np.isnan(scan[dropped]).all()
+    np.testing.assert_array_equal(scan[~dropped, :3], points[~dropped, :3])
+    if sensor.remission is not None and rendered:
+        expected = render(points, sensor)[:, 3]
+    else:  # one rounding an operation, in float32
+        expected = (points[:, 3] + np.float32(sensor.remission_offset)) * np.float32(sensor.remission_scale)
+    np.testing.assert_array_equal(scan[~dropped, 3], expected[~dropped])
+
+
+def test_a_scan_that_is_ready_is_not_copied():
+    points = some_scan()[1:2].copy()
+    scan, _ = condition(points, get_sensor("hdl-64e"))
+    assert np.shares_memory(scan, points)
+    assert points.flags.writeable
+    again, _ = condition(scan, get_sensor("hdl-64e"))
+    assert np.shares_memory(again, points)
+
+
+def test_a_remission_that_overflows_is_not_finite():
+    points = np.array([[1, 2, 3, 3e38], [1, 2, 3, 0.5]], np.float32)
+    scan, n_dropped = condition(points, replace(RAW, remission_range=(0.0, 0.5)))
+    assert n_dropped == 1
+    assert np.isnan(scan[0]).all()
+    assert scan[1, 3] == 1.0
+
+
+@pytest.mark.parametrize("bad", [np.zeros((5, 2)), "scan", None, np.zeros((2, 5, 4))])
+def test_what_is_no_scan_does_not_pass_the_door(bad):
+    with pytest.raises(PointsError):
+        condition(bad, RAW)

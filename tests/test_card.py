@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import json
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edgeperc.card import Golden, InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
-from edgeperc.errors import CardError
+from edgeperc.card import CARD_KEY, Golden, InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.errors import CardError, ModelFileError
+
+REPOSITORY = Path(__file__).resolve().parent.parent
 
 TOP_VIEW_CARD = ModelCard(
     name="network",
@@ -158,3 +163,125 @@ def test_any_value_anywhere_is_read_or_refused(key: str, value: object) -> None:
     document = json.loads(TOP_VIEW_CARD.to_json()) | {key: value}
     with contextlib.suppress(CardError):
         ModelCard.from_json(json.dumps(document))
+
+
+def test_places_and_cells_agree() -> None:
+    view = TopViewGeometry()
+    x, y = view.cell_centres()
+    rows, cols, in_view = view.cells(x, y)
+    assert in_view.all()
+    np.testing.assert_array_equal(rows, np.broadcast_to(np.arange(400)[:, None], (400, 200))[:, :1])
+    np.testing.assert_array_equal(cols[0], np.arange(200))
+    places = np.array([[46.0, 10.0], [46.01, 0.0], [6.0, 0.0], [5.99, 0.0], [20.0, -10.0], [np.nan, 0.0], [1e30, 0.0]])
+    rows, cols, in_view = view.cells(*places.T)
+    assert in_view.tolist() == [True, False, False, False, False, False, False]
+    assert (rows[0], cols[0]) == (0, 0)  # a cell holds its far and left edges
+
+
+# --- a card in its file ----------------------------------------------------------------------------------------------
+
+
+def varint(value: int) -> bytes:
+    groups = []
+    while True:
+        value, group = value >> 7, value & 0x7F
+        groups.append(group | (0x80 if value else 0))
+        if not value:
+            return bytes(groups)
+
+
+def field(number: int, content: bytes) -> bytes:
+    return varint(number << 3 | 2) + varint(len(content)) + content
+
+
+def entry(key: str, value: bytes) -> bytes:
+    return field(14, field(1, key.encode()) + field(2, value))
+
+
+CARD = entry(CARD_KEY, TOP_VIEW_CARD.to_json().encode())
+GRAPH = varint(1 << 3) + varint(8) + field(2, b"pytorch") + field(7, bytes(range(256)) * 40)
+
+
+def write(folder: Path, content: bytes) -> Path:
+    path = folder / "model.onnx"
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        GRAPH + CARD,
+        CARD + GRAPH,
+        GRAPH + entry("author", b"nobody") + CARD + entry("edgeperc.cards", b"{}"),
+        entry(CARD_KEY, b"an older one") + CARD,  # the last one counts
+        GRAPH + field(14, field(2, TOP_VIEW_CARD.to_json().encode()) + field(1, CARD_KEY.encode())),
+        varint(9 << 3 | 1) + bytes(8) + varint(10 << 3 | 5) + bytes(4) + CARD,  # fields of fixed length
+    ],
+)
+def test_a_card_is_found_in_a_file(tmp_path: Path, content: bytes) -> None:
+    assert ModelCard.read(write(tmp_path, content)) == TOP_VIEW_CARD
+
+
+@pytest.mark.parametrize("content", [b"", GRAPH, entry("author", b"nobody"), field(7, CARD)])
+def test_a_file_without_a_card_says_so(tmp_path: Path, content: bytes) -> None:
+    with pytest.raises(CardError, match=r"model\.onnx has no card; write one"):
+        ModelCard.read(write(tmp_path, content))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        GRAPH[:-1],
+        (GRAPH + CARD)[:-1],
+        varint(7 << 3 | 2) + varint(2**40),
+        varint(7 << 3 | 2) + b"\xff" * 11,
+        varint(7 << 3 | 3),  # groups are no part of an .onnx
+        varint(7 << 3 | 7),
+        b"\x00",
+        b"\x80",
+        entry(CARD_KEY, b"\xff\xfe"),
+        field(14, varint(1 << 3 | 2) + varint(5)),
+        (varint(9 << 3) + b"\x00") * 20_000,
+    ],
+)
+def test_a_damaged_file_is_a_card_error(tmp_path: Path, content: bytes) -> None:
+    with pytest.raises(CardError, match=r"model\.onnx is no complete \.onnx file"):
+        ModelCard.read(write(tmp_path, content))
+
+
+def test_a_damaged_card_names_its_file(tmp_path: Path) -> None:
+    with pytest.raises(CardError, match=r"model\.onnx: the card is no JSON"):
+        ModelCard.read(write(tmp_path, entry(CARD_KEY, b"{")))
+
+
+def test_a_missing_file_is_a_model_file_error(tmp_path: Path) -> None:
+    for path in (tmp_path / "model.onnx", tmp_path):
+        with pytest.raises(ModelFileError, match="cannot be read"):
+            ModelCard.read(path)
+
+
+@given(st.data())
+def test_any_bytes_are_a_card_or_an_error(data: st.DataObject) -> None:
+    content = bytearray(GRAPH[-300:] + CARD if data.draw(st.booleans()) else GRAPH + CARD)
+    for _ in range(data.draw(st.integers(0, 4))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        kind = data.draw(st.sampled_from(["set", "cut", "insert"]))
+        if kind == "set":
+            content[at] = data.draw(st.integers(0, 255))
+        elif kind == "cut":
+            del content[at : at + data.draw(st.integers(1, 40))]
+        else:
+            content[at:at] = data.draw(st.binary(max_size=20))
+        if not content:
+            break
+    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(CardError):
+        ModelCard.read(write(Path(folder), bytes(content)))
+
+
+@pytest.mark.parametrize("path", sorted((REPOSITORY / "models").rglob("*.onnx")), ids=lambda path: path.stem)
+def test_every_models_card_is_the_one_that_onnxruntime_finds(path: Path) -> None:
+    onnxruntime = pytest.importorskip("onnxruntime")
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    text = session.get_modelmeta().custom_metadata_map[CARD_KEY]
+    assert ModelCard.read(path) == ModelCard.from_json(text)

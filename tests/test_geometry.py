@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 import twins.decode
 from edgeperc import geometry
 from edgeperc.errors import PointsError
-from edgeperc.geometry import bounding_rectangles, oriented_iou, suppress_overlaps
+from edgeperc.geometry import bounding_rectangles, oriented_iou, rectangles, shared_area, suppress_overlaps
+from edgeperc.perception import Box
 
 
 def some_rectangles(rng, n):
@@ -125,3 +126,20 @@ def test_kernels_do_uncompiled_what_they_do_compiled():
     geometry.fill_oriented_iou(a, a, compiled)
     getattr(geometry.fill_oriented_iou, "py_func", geometry.fill_oriented_iou)(a, a, interpreted)
     np.testing.assert_allclose(compiled, interpreted, atol=1e-13)
+
+
+def test_rectangles_are_the_boxes_footprints():
+    boxes = [Box("car", 1.0, (10.0, -2.0, -1.0), (4.0, 1.7, 1.5), 0.3), Box("van", 0.5, (7, 3, 0), (5, 2, 2), -1)]
+    np.testing.assert_array_equal(rectangles(boxes), [[10.0, -2.0, 4.0, 1.7, 0.3], [7, 3, 5, 2, -1]])
+    assert rectangles([]).shape == (0, 5)
+    assert rectangles(iter(boxes)).dtype == np.float64
+
+
+def test_shared_areas_are_those_of_the_overlap():
+    a = np.array([[0.0, 0.0, 4.0, 2.0, 0.0]])
+    b = np.array([[1.0, 0.0, 4.0, 2.0, 0.0], [0.0, 0.0, 2.0, 1.0, 0.0], [9.0, 9.0, 4.0, 2.0, 0.0]])
+    np.testing.assert_allclose(shared_area(oriented_iou(a, b), a, b), [[6.0, 2.0, 0.0]], rtol=1e-12)
+    rng = np.random.default_rng(1)
+    c, d = some_rectangles(rng, 20), some_rectangles(rng, 20)
+    shared = shared_area(oriented_iou(c, d), c, d)
+    assert (shared <= np.minimum.outer(c[:, 2] * c[:, 3], d[:, 2] * d[:, 3]) * (1.0 + 1e-12)).all()

@@ -2,18 +2,40 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 import threading
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 import edgeperc
-from edgeperc import Box, FitnessError, Perceiver, Perception, PointsError, cluster, ground
+from edgeperc import (
+    Box,
+    FitnessError,
+    ModelFileError,
+    OptionError,
+    Perceiver,
+    Perception,
+    PointsError,
+    ProviderError,
+    SensorError,
+    adapt,
+    cluster,
+    decode,
+    drivable,
+    fitness,
+    geometry,
+    ground,
+    projection,
+    refine,
+)
 from edgeperc.card import RangeImageGeometry, TopViewGeometry
 from edgeperc.geometry import inside, oriented_iou
 from edgeperc.perception import PointLabels
@@ -85,7 +107,9 @@ def test_the_rest_of_the_perception(perception: Perception, perceive: Perceiver)
     assert perception.top_view.to_metres(399, 0) == pytest.approx((6.05, 9.95))
     assert set(perception.stage_ms) == {"check", "project", "infer", "decode", "refine", "cluster"}
     assert all(v >= 0.0 for v in perception.stage_ms.values())
-    assert perception.providers == {n: "CPUExecutionProvider (fp32)" for n in ("ssadnet", "pointseg")}
+    assert [*perception.providers] == ["ssadnet", "pointseg"]
+    for name, text in perception.providers.items():
+        assert re.fullmatch(rf"{name} (fp32|int8), CPUExecutionProvider", text)
     assert [c.name for c in perceive.cards] == ["ssadnet", "pointseg"]
     scores = [b.score for b in perception.boxes]
     assert scores == sorted(scores, reverse=True)
@@ -319,22 +343,69 @@ def test_the_road_alone(scan: SimulatedScan) -> None:
 
 
 def test_two_models_of_one_view_are_refused() -> None:
-    with pytest.raises(ValueError, match="at most one a view"):
+    with pytest.raises(OptionError, match="at most one a view"):
         Perceiver(["pointseg", model_path("pointseg")], provider="cpu")
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "message"),
     [
-        ({"on_mismatch": "panic"}, "on_mismatch is 'panic'"),
+        ({"on_mismatch": "panic"}, "on_mismatch is 'panic'; expected warn, raise or ignore"),
         ({"score_threshold": 2.0}, "score_threshold is 2.0"),
-        ({"sensor": "radar"}, "hdl-64e"),
+        ({"score_threshold": float("nan")}, "score_threshold is nan"),
+        ({"score_threshold": "high"}, "score_threshold is 'high'"),
         ({"boxes_from": "thin air"}, "boxes_from is 'thin air'"),
+        ({"full_turn": "yes"}, "full_turn is 'yes'; expected True or False"),
+        ({"n_threads": 0}, "n_threads is 0"),
+        ({"n_threads": "two"}, "n_threads is 'two'"),
+        ({"provider": 3}, "provider is 3"),
+        ({"precision": None}, "precision is None"),
+        ({"models": []}, r"models is \[\]"),
+        ({"models": 5}, "models is 5"),
+        ({"models": ["pointseg", 5]}, "models is .*5"),
+        ({"adapt": "some"}, "adapt is 'some'; expected none, remission, interpolation or both"),
+        ({"adapt": "neither"}, "pass adapt='none'"),
+        ({"all_around": True}, "pass full_turn=True"),
     ],
 )
-def test_wrong_arguments_are_named(arguments: dict[str, object], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        Perceiver("pointseg", **arguments)  # type: ignore[arg-type]
+def test_wrong_options_are_named(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        Perceiver(**({"models": "pointseg"} | arguments))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        ({"sensor": "radar"}, SensorError),
+        ({"sensor": 5}, SensorError),
+        ({"models": "pointsegg"}, ModelFileError),
+        ({"models": "nowhere.onnx"}, ModelFileError),
+        ({"models": ""}, ModelFileError),
+        ({"provider": "abacus"}, ProviderError),
+        ({"precision": "fp4"}, ProviderError),
+    ],
+)
+def test_what_is_not_there_has_its_own_error(arguments: dict[str, object], error: type[Exception]) -> None:
+    with pytest.raises(error):
+        Perceiver(**({"models": "pointseg"} | arguments))  # type: ignore[arg-type]
+
+
+def test_options_are_fixed_at_construction(perceive: Perceiver) -> None:
+    for name in ("sensor", "on_mismatch", "score_threshold", "adapt", "boxes_from", "full_turn", "cards", "providers"):
+        before = getattr(perceive, name)
+        with pytest.raises(AttributeError, match=f"{name} of a Perceiver cannot be set.*make another"):
+            setattr(perceive, name, "both")
+        assert getattr(perceive, name) == before
+    with pytest.raises(AttributeError, match="score_treshold"):
+        perceive.score_treshold = 0.5  # type: ignore[attr-defined]
+
+
+def test_the_signature_is_the_documented_one() -> None:
+    names = [*inspect.signature(Perceiver).parameters]
+    assert names[0] == "models"
+    assert {"sensor", "provider", "precision", "adapt", "boxes_from", "full_turn"} < {*names}
+    for name in names:
+        assert re.search(rf"^    {name} : ", str(inspect.getdoc(Perceiver)).replace("\n", "\n    "), re.MULTILINE), name
 
 
 def test_a_threshold_of_ones_own(scan: SimulatedScan) -> None:
@@ -453,22 +524,47 @@ def test_boxes_all_around_the_vehicle(scan: SimulatedScan) -> None:
     assert any(box.center[0] < 0.0 for box in every.boxes)
 
 
-def test_a_perceiver_meets_no_uncompiled_kernel(scan: SimulatedScan) -> None:
-    """The first call would wait for numba: construction has to compile what stands behind boxes of clusters, too."""
-    kernels = [
-        kernel
-        for module in (cluster, ground)
-        for kernel in vars(module).values()
+LAYOUTS: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = {
+    "writable": np.copy,
+    "read-only": lambda p: np.frombuffer(p.tobytes(), np.float32).reshape(-1, 4),
+    "unaligned": lambda p: np.frombuffer(b"x" + p.tobytes(), np.float32, offset=1).reshape(-1, 4),
+    "by columns": np.asfortranarray,
+    "double precision": lambda p: p.astype(np.float64),
+    "one point": lambda p: p[:1],
+    "empty": lambda p: p[:0],
+    "not finite": lambda p: np.where(np.arange(len(p))[:, None] % 7, p, np.nan).astype(np.float32),
+}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"models": ["ssadnet", "pointseg"]},
+        {"models": "pointseg", "full_turn": True},
+        {"models": "pointseg", "sensor": "vlp-16"},
+        {"models": "pointseg", "sensor": "os1-64", "adapt": "none"},
+    ],
+)
+def test_the_first_call_compiles_nothing(scan: SimulatedScan, options: dict[str, Any]) -> None:
+    """Construction compiles every kernel that a call needs, whatever the layout of the scan in memory."""
+    kernels = {
+        f"{module.__name__}.{name}": kernel
+        for module in (adapt, cluster, decode, drivable, fitness, geometry, ground, projection, refine)
+        for name, kernel in vars(module).items()
         if hasattr(kernel, "signatures") and kernel.__module__ == module.__name__
-    ]
+    }
     if not kernels:
         pytest.skip("numba compiles nothing")
-    perceive = Perceiver("pointseg", provider="cpu")
-    compiled = [list(kernel.signatures) for kernel in kernels]
-    perceive(scan.points)
-    assert [list(kernel.signatures) for kernel in kernels] == compiled
+    perceive = Perceiver(**options, provider="cpu", n_threads=1)
+    compiled = {name: list(kernel.signatures) for name, kernel in kernels.items()}
+    for layout, change in LAYOUTS.items():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # some of these are unlike the training scans
+            perceive(change(scan.points))
+        for name, kernel in kernels.items():
+            assert list(kernel.signatures) == compiled[name], f"a {layout} scan compiled {name} again"
 
 
 def test_clusters_want_a_class_for_every_point() -> None:
-    with pytest.raises(ValueError, match="range-image model"):
+    with pytest.raises(OptionError, match="range-image model"):
         Perceiver("ssadnet", provider="cpu", boxes_from="clusters")

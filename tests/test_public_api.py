@@ -7,6 +7,8 @@ import importlib.metadata
 import inspect
 import pkgutil
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,9 @@ import pytest
 import edgeperc
 import edgeperc.errors
 import edgeperc.zoo
+from edgeperc import listing, session
 from edgeperc.errors import ModelFileError
+from edgeperc.sensor import SENSORS
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 MODULES = sorted(
@@ -76,9 +80,57 @@ def test_shipped_models_are_found_by_name() -> None:
         assert path.name == f"{name}.onnx"
 
 
-@pytest.mark.parametrize("name", ["pointsegg", "", "../models/pointseg", "pointseg.onnx"])
+@pytest.mark.parametrize("name", ["pointsegg", "", "../models/pointseg"])
 def test_an_unknown_model_lists_those_there_are(name: str) -> None:
     with pytest.raises(ModelFileError) as caught:
         edgeperc.zoo.model_path(name)
     for shipped in edgeperc.zoo.shipped_models():
         assert shipped in str(caught.value)
+
+
+def test_models_agree_with_the_zoo() -> None:
+    found = {model.name: model for model in edgeperc.models()}
+    assert tuple(found) == edgeperc.zoo.shipped_models()
+    assert {name for name, model in found.items() if model.default} == {*edgeperc.zoo.DEFAULT}
+    for name, model in found.items():
+        assert [f"{name}:{precision}" for precision in model.variants] == [str(v) for v in edgeperc.zoo.resolve(name)]
+        assert model.path.stat().st_size == pytest.approx(1e6 * model.size_mb, abs=5e3)
+        assert model.licence
+    assert found["pointseg"].purpose == "a class for every point (car, pedestrian, cyclist)"
+    assert found["ssadnet"].purpose == "drivable area and boxes of car, van, truck"
+    assert found["lodnn"].purpose == "drivable area"
+
+
+def test_sensors_agree_with_the_profiles() -> None:
+    assert [sensor.name for sensor in edgeperc.sensors()] == [*SENSORS]
+    for sensor in edgeperc.sensors():
+        profile = SENSORS[sensor.name]
+        assert (sensor.beams, sensor.columns) == (len(profile.elevations_deg), profile.columns)
+        assert sensor.field_of_view_deg == (min(profile.elevations_deg), max(profile.elevations_deg))
+        assert sensor.remission_range == profile.remission_range
+        assert sensor.mount_height_m == profile.mount_height_m
+        assert (sensor.rendered_as is None) == (profile.remission is None)
+
+
+def test_providers_agree_with_onnxruntime(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("onnxruntime")
+    assert tuple(p.name for p in edgeperc.providers() if p.available) == session.available_providers()
+    assert {p.name: p.installed_by for p in edgeperc.providers()} == {**listing.INSTALLED_BY}
+    assert {*listing.INSTALLED_BY} == {*session.PROVIDERS}
+
+    def missing() -> None:
+        raise edgeperc.MissingExtraError("onnxruntime", "cpu", "Running a model")
+
+    monkeypatch.setattr(session, "_onnxruntime", missing)
+    assert not any(provider.available for provider in edgeperc.providers())
+
+
+def test_listings_cannot_be_changed() -> None:
+    for record in (edgeperc.models()[0], edgeperc.sensors()[0], edgeperc.providers()[0]):
+        with pytest.raises(AttributeError):
+            record.name = "another"  # type: ignore[misc]
+
+
+def test_the_package_is_a_command() -> None:
+    done = subprocess.run([sys.executable, "-m", "edgeperc", "--version"], capture_output=True, text=True, check=True)
+    assert edgeperc.__version__ in done.stdout

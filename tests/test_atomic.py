@@ -1,0 +1,47 @@
+"""A file is there as a whole, or as it was before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from edgeperc.atomic import open_whole, write_whole
+
+
+def test_a_written_file_replaces_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "file.bin"
+    for content in (b"old", b"new", b""):
+        write_whole(str(path), content)
+        assert path.read_bytes() == content
+    assert [*tmp_path.iterdir()] == [path]
+
+
+def test_readers_see_the_old_file_until_the_new_one_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "file.txt"
+    write_whole(path, b"old")
+    with open_whole(path, "w") as file:
+        file.write("Straße")
+        file.flush()
+        assert path.read_bytes() == b"old"
+    assert path.read_bytes() == "Straße".encode()
+
+
+def write_half(path: Path) -> None:
+    with open_whole(path) as file:
+        file.write(b"half")
+        raise KeyError
+
+
+def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "file.bin"
+    write_whole(path, b"old")
+    with pytest.raises(KeyError):
+        write_half(path)
+    assert path.read_bytes() == b"old"
+    assert [*tmp_path.iterdir()] == [path]
+
+
+def test_a_folder_that_is_not_there_is_an_os_error(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="nowhere"):
+        write_whole(tmp_path / "nowhere" / "file.bin", b"")

@@ -1,0 +1,140 @@
+"""Results and their JSON: what is written is read back, and every wrong record has its own error."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edgeperc import Box, Perception, PointLabels, PointsError, TopView, Tracker, TrackingError
+from edgeperc.records import SCAN_KEYS, read_boxes, scan_record
+
+CAR = Box("car", 0.87654321, (12.34567, -1.5, -0.9), (4.1, 1.7, 1.5), 0.1234567)
+VIEW = (0.1, (0.0, 40.0), (-10.0, 10.0))
+
+
+def perception_of(*boxes: Box, stamp_s: float | None = None, labels: bool = True) -> Perception:
+    road = np.zeros((400, 200), np.uint8)
+    road[:, 60:140] = 1
+    seen = PointLabels(np.array([0, 1, 1, 0], np.uint8), np.array([True, True, True, False]), ("background", "car"))
+    return Perception(
+        n_points=4,
+        n_dropped=1,
+        points=seen if labels else None,
+        top_view=TopView(road, ("background", "drivable"), *VIEW) if labels else None,
+        boxes=boxes,
+        stage_ms={"infer": 1.23456},
+        providers={"network": "network fp32, CPUExecutionProvider"},
+        fitness=("The ground is missing.",),
+        stamp_s=stamp_s,
+    )
+
+
+def test_a_box_is_read_back_as_it_was_written() -> None:
+    again = Box.from_dict(json.loads(json.dumps(CAR.to_dict())))
+    assert again == Box("car", 0.8765, (12.3457, -1.5, -0.9), (4.1, 1.7, 1.5), 0.12346)
+    assert Box.from_dict(again.to_dict()) == again
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"label": None}, "label None"),
+        ({"score": "high"}, "high"),
+        ({"center": [1.0, 2.0]}, "not enough values"),
+        ({"center": 3.0}, "TypeError"),
+        ({"size": [1.0, 2.0, 3.0, 4.0]}, "too many values"),
+        ({"yaw": None}, "TypeError"),
+    ],
+)
+def test_a_wrong_box_is_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(PointsError, match=message):
+        Box.from_dict(CAR.to_dict() | change)
+
+
+@pytest.mark.parametrize("key", ["label", "score", "center", "size", "yaw"])
+def test_a_box_without_a_key_is_refused(key: str) -> None:
+    document = CAR.to_dict()
+    del document[key]
+    with pytest.raises(PointsError, match=key):
+        Box.from_dict(document)
+
+
+@given(
+    st.dictionaries(st.sampled_from(["label", "score", "center", "size", "yaw"]), st.text() | st.floats() | st.none())
+)
+def test_anything_is_a_box_or_a_points_error(change: dict[str, Any]) -> None:
+    try:
+        box = Box.from_dict(CAR.to_dict() | change)
+    except PointsError:
+        return
+    assert isinstance(box.label, str)
+
+
+def test_a_perception_as_json_counts_what_it_does_not_list() -> None:
+    document = perception_of(CAR, stamp_s=12.5).to_dict()
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    assert document["stamp_s"] == 12.5
+    assert document["point_counts"] == {"background": 1, "car": 2}
+    assert document["drivable_area_m2"] == 320.0
+    assert document["boxes"] == [CAR.to_dict()]
+    assert document["stage_ms"] == {"infer": 1.235}
+    empty = perception_of(labels=False).to_dict()
+    assert empty.keys() == document.keys()
+    assert empty["point_counts"] is empty["drivable_area_m2"] is empty["stamp_s"] is None
+
+
+def test_a_record_adds_road_and_tracks() -> None:
+    tracker = Tracker()
+    for k in range(5):
+        tracks = tracker.update([CAR], 0.1 * k, np.eye(4))
+    record = scan_record(perception_of(CAR), tracks)
+    assert tuple(record) == SCAN_KEYS
+    assert record["road"]["free_ahead_m"] == pytest.approx(10.34, abs=0.5)  # up to the car's rear
+    (track,) = tracks
+    assert record["tracks"] == [track.to_dict()]
+    assert Box.from_dict(track.to_dict()) == Box.from_dict(track.box.to_dict())
+    without = scan_record(perception_of(labels=False))
+    assert tuple(without) == SCAN_KEYS
+    assert without["road"] is None
+    assert without["tracks"] == []
+
+
+def test_a_track_is_used_like_a_box() -> None:
+    tracker = Tracker()
+    for k in range(5):
+        tracks = tracker.update([CAR], 0.1 * k, np.eye(4))
+    (track,) = tracks
+    for name in ("label", "score", "center", "size", "yaw"):
+        assert getattr(track, name) == getattr(track.box, name)
+    assert math.hypot(track.center[0] - CAR.center[0], track.center[1] - CAR.center[1]) < 0.1
+
+
+def test_boxes_are_read_from_what_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "drive.jsonl"
+    scans = [perception_of(CAR), perception_of(), perception_of(CAR, CAR)]
+    path.write_text("".join(json.dumps(scan_record(scan)) + "\n" for scan in scans), encoding="utf-8")
+    once = Box.from_dict(CAR.to_dict())
+    assert read_boxes(path) == [[once], [], [once, once]]
+
+
+@pytest.mark.parametrize("line", ["{}", "[]", "null", '{"boxes": 3}', '{"boxes": [{}]}', "no JSON", '{"error": "x"}'])
+def test_what_is_no_record_is_a_tracking_error(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "drive.jsonl"
+    path.write_text(line, encoding="utf-8")
+    with pytest.raises(TrackingError, match=r"drive\.jsonl holds no boxes"):
+        read_boxes(path)
+
+
+def test_a_top_view_knows_where_its_cells_lie() -> None:
+    view = TopView(np.zeros((400, 200), np.uint8), ("background", "drivable"), *VIEW)
+    assert (view.geometry.height, view.geometry.width) == view.labels.shape
+    for cell in ((0, 0), (399, 199), (17, 101)):
+        row, col, in_view = view.geometry.cells(*view.to_metres(*cell))
+        assert ((int(row), int(col)), bool(in_view)) == (cell, True)
