@@ -295,7 +295,6 @@ def _each(
 ) -> Iterator[tuple[Path, Perception | Exception, Tracks | None, bytes | None]]:
     """Every scan of a file, those of a capture numbered, with its perception or the error."""
     from ..readers.captures import is_capture, read_scans
-    from ..view.tracks import flatten_scan
 
     try:
         numbered = is_capture(path)
@@ -310,7 +309,7 @@ def _each(
             except (EdgepercError, OSError) as exc:
                 yield name, exc, None, None
             else:
-                yield name, perception, tracks, flatten_scan(points, perception) if arguments.gif else None
+                yield name, perception, tracks, _under(points, perception) if arguments.gif else None
     except (EdgepercError, OSError) as exc:
         yield path, exc, None, None
 
@@ -350,6 +349,12 @@ def _write(points: NDArray[np.float32], perception: Perception, wanted: Mapping[
         view.write_labels(perception, wanted["labels"])
     if "ply" in wanted:
         view.write_ply(points, perception, wanted["ply"])
+
+
+def _under(points: NDArray[np.float32], perception: Perception) -> bytes:
+    from ..view import flatten_scan
+
+    return flatten_scan(points, perception)
 
 
 def _timing(answer: Answer) -> dict[str, Any]:
