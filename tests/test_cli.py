@@ -19,7 +19,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from edgeperc import __version__, cli, session, tuning, zoo
+from edgeperc import __version__, cli, listing, session, tuning, zoo
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.cli.arguments import DEFAULT, PRECISIONS, PROVIDERS
 from edgeperc.cli.eval import _figure_lines
@@ -642,6 +642,7 @@ def fake_models(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         return found
 
     monkeypatch.setattr(zoo, "listed", listed)
+    monkeypatch.setattr(listing, "listed", listed)
     monkeypatch.setattr(zoo, "resolve", resolve)
 
 
