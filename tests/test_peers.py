@@ -1,16 +1,15 @@
-"""Who is measured beside edgeperc: counted by hand, agreeing with the runtime, and told of where it is absent."""
+"""What is measured beside edgeperc: counted by hand, agreeing with the runtime, and reported where it is missing."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-pytest.importorskip("psutil")
-
-from edgeperc import Perceiver
+from edgeperc import ModelCard, Perceiver
 from edgeperc.perception import Box
 from edgeperc.sensor import get_sensor
 from edgeperc.session import Session, golden_input
@@ -18,17 +17,18 @@ from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.zoo import model_path
 from edgeperc_bench import cli
 from edgeperc_bench.accuracy import agreement
+from edgeperc_bench.peers import arithmetic
 from edgeperc_bench.peers import contenders as peers
-from edgeperc_bench.peers.arithmetic import PRODUCT_SIZE, cost, matrix_product, n_met
+from edgeperc_bench.peers.arithmetic import PRODUCT_SIZE, cost, matrix_product, n_taps_inside
 from edgeperc_bench.peers.engines import open_engine, torch_network
 from edgeperc_bench.peers.networks import resized
-from edgeperc_bench.peers.numpy_pipeline import Rival, overlap
-from edgeperc_bench.peers.projection import measure
+from edgeperc_bench.peers.numpy_pipeline import NumpyPipeline, iou
 from edgeperc_bench.peers.tables import floor_table, latency_table
-from edgeperc_bench.worker import Answer
+from edgeperc_bench.peers.turns import measure
+from edgeperc_bench.worker import Prediction
 from twins.decode import oriented_iou
 
-NAMES = ("pointseg", "ssadnet")
+NAMES = ("pointseg:fp32", "ssadnet:fp32")
 
 
 @pytest.fixture(scope="module")
@@ -37,22 +37,23 @@ def scan() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def right(scan: np.ndarray) -> Answer:
+def right(scan: np.ndarray) -> Prediction:
     found = Perceiver(NAMES, provider="cpu", on_mismatch="ignore", boxes_from="network")(scan)
-    return Answer(found.points, found.top_view, found.boxes)
+    return Prediction(found.points, found.top_view, found.boxes)
 
 
-def answer_of(engine: str, scan: np.ndarray) -> Answer:
-    cards = [Session(model_path(name), "cpu").card for name in NAMES]
-    return Rival(cards, [open_engine(engine, model_path(name), 1) for name in NAMES], get_sensor("hdl-64e"))(scan)
+def predict(engine: str, precision: str, scan: np.ndarray) -> Prediction:
+    paths = [model_path(name) for name in NAMES]
+    engines = [open_engine(engine, precision, path, 1) for path in paths]
+    return NumpyPipeline([ModelCard.read(path) for path in paths], engines, get_sensor("hdl-64e"))(scan)
 
 
-def assert_agrees(right: Answer, found: Answer) -> None:
-    told = agreement([right], [found])
-    assert told["points"]["equal"] > 0.99
-    assert told["cells"]["equal"] > 0.99
-    assert told["boxes"]["n_reference"] > 0
-    assert told["boxes"]["f1"] > 0.9
+def assert_agrees(right: Prediction, found: Prediction) -> None:
+    same = agreement([right], [found])
+    assert same["points"]["equal"] > 0.99
+    assert same["cells"]["equal"] > 0.99
+    assert same["boxes"]["n_reference"] > 0
+    assert same["boxes"]["f1"] > 0.9
 
 
 # arithmetic
@@ -62,15 +63,15 @@ def assert_agrees(right: Answer, found: Answer) -> None:
     ("n_here", "n_there", "kernel", "stride", "pad", "dilation", "expected"),
     [
         (5, 5, 3, 1, 1, 1, 13),  # both ends miss one tap
-        (5, 5, 3, 1, 4, 4, 7),  # but for the middle tap only the outermost positions see each other
+        (5, 5, 3, 1, 4, 4, 7),  # except for the middle tap, only the outermost positions meet
         (2, 5, 3, 2, 0, 1, 6),
         (2, 4, 4, 2, 1, 1, 6),  # a transposed convolution that doubles: its first and last taps are cut off
     ],
 )
-def test_taps_on_padding_are_told_apart(
+def test_taps_on_padding_are_counted_separately(
     n_here: int, n_there: int, kernel: int, stride: int, pad: int, dilation: int, expected: int
 ) -> None:
-    assert n_met(n_here, n_there, kernel, stride, pad, dilation) == expected
+    assert n_taps_inside(n_here, n_there, kernel, stride, pad, dilation) == expected
 
 
 def test_multiplications_are_counted_by_hand() -> None:
@@ -117,60 +118,54 @@ def test_open_shapes_are_refused() -> None:
     matrices = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", "n"]) for name in "xyz"]
     node = helper.make_node("MatMul", ["x", "y"], ["z"])
     model = helper.make_model(helper.make_graph([node], "open", matrices[:2], matrices[2:]))
-    with pytest.raises(ModelError, match="not known beforehand"):
+    with pytest.raises(ModelError, match="not fixed"):
         cost(model)
 
 
-@pytest.mark.parametrize("engine", peers.PEAKS)
-def test_every_library_multiplies_the_same_matrices(engine: str) -> None:
-    library, _, precision = engine.partition(":")
+@pytest.mark.parametrize(("library", "precision"), peers.PEAKS)
+def test_every_library_multiplies_the_same_matrices(
+    library: str, precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip(library)
+    monkeypatch.setattr(arithmetic, "PRODUCT_SIZE", 256)
     made = matrix_product(library, precision, 1)()
-    # OpenVINO answers by output; whole numbers are 32 times as large on either side, and rounded.
+    # OpenVINO returns its outputs by name; int8 values are 32 times as large on either side, and rounded.
     made = next(iter(made.values())) if library == "openvino" else made  # type: ignore[attr-defined]
     product = made if isinstance(made, np.ndarray) else made.float().numpy()  # type: ignore[attr-defined]
     product = product / (1024.0 if precision == "int8" else 1.0)
-    right = matrix_product("numpy", "fp32", 1)()
-    assert product.shape == (PRODUCT_SIZE, PRODUCT_SIZE)
-    assert np.corrcoef(product.reshape(-1), np.reshape(right, -1))[0, 1] > 0.999
-    assert product.std() == pytest.approx(np.std(right), rel=0.05)
+    a, b = np.random.default_rng(0).standard_normal((2, 256, 256), np.float32)
+    right = a.astype(np.float64) @ b
+    assert product.shape == right.shape
+    tolerance = {"fp32": 1e-4, "bf16": 0.02, "int8": 0.05}[precision]
+    assert np.linalg.norm(product - right) < tolerance * np.linalg.norm(right)
 
 
-# rivals
+# the pipeline in numpy
 
 
-def test_the_pipeline_in_numpy_agrees(scan: np.ndarray, right: Answer) -> None:
-    pytest.importorskip("onnxruntime")
-    assert_agrees(right, answer_of("onnxruntime", scan))
+@pytest.mark.parametrize("engine", ["onnxruntime", "torch", "openvino"])
+def test_the_pipeline_in_numpy_agrees(engine: str, scan: np.ndarray, right: Prediction) -> None:
+    for package in (engine, *peers.NEEDS.get(engine, ())):
+        pytest.importorskip(package)
+    assert_agrees(right, predict(engine, "fp32", scan))
 
 
-def test_torch_agrees(scan: np.ndarray, right: Answer) -> None:
-    pytest.importorskip("torch")
-    pytest.importorskip("onnx")
-    assert_agrees(right, answer_of("torch:fp32", scan))
-
-
-def test_openvino_agrees(scan: np.ndarray, right: Answer) -> None:
-    pytest.importorskip("openvino")
-    assert_agrees(right, answer_of("openvino:fp32", scan))
-
-
-@pytest.mark.parametrize("name", [*NAMES, *(f"{name}-edge" for name in NAMES)])
+@pytest.mark.parametrize("name", NAMES)
 def test_torch_has_the_very_network(name: str) -> None:
     torch = pytest.importorskip("torch")
     pytest.importorskip("onnx")
     network, shape, outputs = torch_network(model_path(name))
-    session = Session(model_path(name), "cpu", 1)
+    session = Session(name, "cpu", n_threads=1)
     image = golden_input(0, shape)
     session.input[:] = image[0]
     with torch.inference_mode():
-        answers = network(torch.from_numpy(image))
-    for spec, answer in zip(session.card.outputs, answers, strict=True):
-        want = session.run()[spec.kind]
-        apart = np.abs(answer[0].numpy() - want)
-        # Where two maxima are a rounding apart, unpooling may put either back, and the cells around differ.
-        assert np.median(apart) < 1e-3 * want.std()
-        assert np.quantile(apart, 0.9) < 1e-2 * want.std()
+        computed = network(torch.from_numpy(image))
+    for spec, output in zip(session.card.outputs, computed, strict=True):
+        expected = session.run()[spec.kind]
+        apart = np.abs(output[0].numpy() - expected)
+        # Where two maxima differ by a rounding, unpooling may put either back, and the cells around differ.
+        assert np.median(apart) < 1e-3 * expected.std()
+        assert np.quantile(apart, 0.9) < 1e-2 * expected.std()
     assert outputs == [spec.name for spec in session.card.outputs]
 
 
@@ -178,74 +173,93 @@ def test_overlaps_are_those_of_the_reference() -> None:
     rng = np.random.default_rng(0)
     rows = np.column_stack((rng.uniform(-2, 2, (12, 2)), rng.uniform(0.5, 4, (12, 2)), rng.uniform(-3, 3, 12)))
     boxes = [Box("car", 1.0, (x, y, 0.0), (length, width, 1.5), yaw) for x, y, length, width, yaw in rows.tolist()]
-    found = [[overlap(a, b) for b in boxes] for a in boxes]
+    found = [[iou(a, b) for b in boxes] for a in boxes]
     np.testing.assert_allclose(found, oriented_iou(rows, rows), atol=1e-9)
 
 
 # tables
 
 
-def found(name: str, kind: str, engine: str, ms: float, **more: object) -> peers.Found:
-    contender = peers.Contender(name, kind, engine, (model_path("pointseg"),))
-    return peers.Found(contender, [[ms] * 10] * 12 if ms else [], **more)  # type: ignore[arg-type]
+def measured(name: str, kind: str, engine: str, precision: str, ms: float, **more: object) -> peers.Measured:
+    contender = peers.Contender(name, kind, engine, precision, (model_path("pointseg"),))
+    return peers.Measured(contender, [[ms] * 10] * 12 if ms else [], **more)  # type: ignore[arg-type]
 
 
 def test_ratios_are_to_the_first_row() -> None:
     rows = [
-        found("edgeperc, auto", "edgeperc", "auto", 10.0, rss_mb=100.0),
-        found("numpy + torch", "rival", "torch:fp32", 80.0, rss_mb=500.0),
-        found("OpenVINO API fp32, network alone", "network", "openvino:fp32", 8.0),
-        found("numpy + openvino:bf16", "rival", "openvino:bf16", 0.0, why_not=peers.INSTALL),
-        found("peak numpy:fp32", "peak", "numpy:fp32", 1.0),
+        measured("edgeperc, auto", "edgeperc", "auto", "auto", 10.0, rss_mb=100.0),
+        measured("numpy + torch fp32", "pipeline", "torch", "fp32", 80.0, rss_mb=500.0),
+        measured("OpenVINO API fp32, network alone", "network", "openvino", "fp32", 8.0),
+        measured("numpy + openvino bf16", "pipeline", "openvino", "bf16", 0.0, missing=peers.INSTALL),
+        measured("peak numpy fp32", "peak", "numpy", "fp32", 1.0),
     ]
-    table = latency_table("Scan to answer: pointseg", rows, 2)
+    table = latency_table("Scan to result: pointseg:fp32", rows, 2)
     column = dict(zip(table["head"], zip(*table["rows"], strict=True), strict=True))
     assert column["x edgeperc"] == ("1.00", "8.00", "0.80", "-")
     assert column["p50"] == ("10.00", "80.00", "8.00", "-")
     assert column["note"] == ("-", "-", "-", "not installed: pip install 'edgeperc[peers]'")
-    assert "whole way / OpenVINO API fp32, network alone: edgeperc, auto 1.25" in table["sentences"]
+    assert "scan to result / OpenVINO API fp32, network alone: edgeperc, auto 1.25" in table["sentences"]
 
 
-def test_the_floor_is_arithmetic_over_peak() -> None:
+@pytest.mark.parametrize("variant", ["fp32", "int8"])
+def test_the_floor_is_arithmetic_over_peak(variant: str) -> None:
     pytest.importorskip("onnx")
-    needs = cost(model_path("pointseg"))
+    path = model_path(f"pointseg:{variant}")
+    work = cost(path)
     rows = [
-        found("onnxruntime CPU, network alone", "session", "cpu", 50.0),
-        found("OpenVINO API bf16, network alone", "network", "openvino:bf16", 20.0),
-        found("peak numpy:fp32", "peak", "numpy:fp32", 40.0),
-        found("peak torch:fp32", "peak", "torch:fp32", 30.0),
-        found("peak copy", "peak", "copy", 20.0),
+        measured("onnxruntime cpu, network alone", "session", "cpu", "auto", 50.0),
+        measured("OpenVINO API bf16, network alone", "network", "openvino", "bf16", 20.0),
+        measured("peak numpy fp32", "peak", "numpy", "fp32", 40.0),
+        measured("peak torch fp32", "peak", "torch", "fp32", 30.0),
+        measured("peak copy", "peak", "copy", "", 20.0),
     ]
-    table = floor_table("Scan to answer: pointseg", rows)
+    for row in rows:
+        row.contender = replace(row.contender, paths=(path,))
+    table = floor_table(f"Scan to result: pointseg:{variant}", rows)
+    assert table["title"] == f"Floor: pointseg:{variant}"
     fp32, bf16, int8 = table["rows"]
-    floor = (needs.macs - needs.padding_macs) * 30.0 / PRODUCT_SIZE**3
+    floor = (work.macs - work.padding_macs) * 30.0 / PRODUCT_SIZE**3
     assert fp32[2:4] == ["torch", f"{floor:.2f}"]
-    assert fp32[-2:] == ["onnxruntime CPU, network alone", f"{2.0 * floor:.1f} %"]
-    assert bf16[1:4] == ["-", "-", "-"]
+    assert bf16[1:4] == int8[1:4] == ["-", "-", "-"]
+    if variant == "int8":  # every engine runs the stored int8 weights
+        assert fp32[-2:] == bf16[-2:] == ["-", "-"]
+        assert int8[5:7] == ["20.00", "OpenVINO API bf16, network alone"]
+        return
+    assert fp32[-2:] == ["onnxruntime cpu, network alone", f"{2.0 * floor:.1f} %"]
     assert bf16[5] == "20.00"
-    assert set(int8[1:]) == {"-"} | {int8[4]}  # traffic alone is known
+    assert set(int8[1:]) == {"-"} | {int8[4]}  # only the traffic is known
 
 
 # the command
 
 
-def test_two_networks_give_the_answers_of_one(tmp_path: Path, scan: np.ndarray) -> None:
+@pytest.fixture
+def alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing but onnxruntime's CPU provider and numpy, on any computer."""
+    monkeypatch.setattr(peers, "NEEDS", dict.fromkeys(("openvino", "torch", "torch.compile"), ("no_such_package",)))
+    monkeypatch.setattr(peers, "available_providers", lambda: ("cpu",))
+
+
+def made(models: list[str], folder: Path, scan: np.ndarray, provider: str = "cpu") -> dict[str, list[peers.Contender]]:
+    np.save(folder / "scan.npy", scan)
+    return peers.groups(models, provider, "auto", folder, folder / "scan.npy", "hdl-64e")
+
+
+def test_two_networks_give_the_results_of_one(tmp_path: Path, scan: np.ndarray) -> None:
     for package in ("onnx", "onnxscript", "torch", "tqdm"):
         pytest.importorskip(package)
-    np.save(tmp_path / "scan.npy", scan)
-    told = peers.groups(["ssadnet"], "auto", tmp_path, tmp_path / "scan.npy", "hdl-64e")
-    one, two, lean, *_ = told["One network or two: ssadnet"]
+    one, two, lean, *_ = made(["ssadnet"], tmp_path, scan)["One network or two: ssadnet:fp32"]
     assert one.image is not None
-    answers = []
+    outputs = []
     for contender in (one, two, lean):
-        answers.append([])
+        outputs.append([])
         for path in contender.paths:
-            engine = open_engine(contender.engine, path, 1)
+            engine = open_engine(contender.engine, contender.precision, path, 1)
             engine.input[:] = np.load(one.image)
-            answers[-1] += engine.run().values()
-    for a, b in zip(answers[0], answers[1], strict=True):
+            outputs[-1] += engine.run().values()
+    for a, b in zip(outputs[0], outputs[1], strict=True):
         np.testing.assert_allclose(a, b, atol=1e-3 * a.std())
-    assert [a.shape for a in answers[2]] == [a.shape for a in answers[0]]
+    assert [a.shape for a in outputs[2]] == [a.shape for a in outputs[0]]
 
 
 @pytest.mark.parametrize(("name", "shape"), [("pointseg", (64, 256)), ("ssadnet", (200, 200))])
@@ -254,62 +268,86 @@ def test_the_same_network_for_half_the_image(
 ) -> None:
     for package in ("onnx", "onnxscript", "torch", "tqdm"):
         pytest.importorskip(package)
-    made = resized(name, 0.5, tmp_path)
-    macs, whole = (cost(path).macs for path in (made, model_path(name)))
-    assert macs == pytest.approx(0.5 * whole, rel=0.01)
-    perceive = Perceiver([made], provider="cpu", n_threads=1, on_mismatch="ignore")
+    half = resized(name, 0.5, tmp_path)
+    assert cost(half).macs == pytest.approx(0.5 * cost(model_path(name)).macs, rel=0.01)
+    perceive = Perceiver([half], provider="cpu", n_threads=1, on_mismatch="ignore")
     assert perceive.sessions[0].input.shape[1:] == shape
-    perceive(scan)
-
-
-@pytest.fixture
-def alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing beside onnxruntime and numpy."""
-    monkeypatch.setattr(peers, "NEEDS", dict.fromkeys(("openvino", "torch", "torch.compile"), ("no_such_package",)))
+    found = perceive(scan)
+    assert found.points is not None or found.top_view is not None
 
 
 def test_networks_are_measured_alone_and_in_pairs(alone: None, tmp_path: Path, scan: np.ndarray) -> None:
-    np.save(tmp_path / "scan.npy", scan)
-    told = peers.groups(["ssadnet", "pointseg"], "cpu", tmp_path, tmp_path / "scan.npy", "hdl-64e")
-    assert list(told) == [
-        "Scan to answer: pointseg",
-        "Scan to answer: ssadnet",
-        "Scan to answer: pointseg and ssadnet",
+    tables = made(["ssadnet", "pointseg:int8"], tmp_path, scan)
+    assert list(tables) == [
+        "Scan to result: pointseg:int8",
+        "Scan to result: ssadnet:fp32",
+        "Scan to result: pointseg:int8 and ssadnet:fp32",
         "Projection: range image",
         "Projection: top view",
-        "One network or two: ssadnet",
+        "One network or two: ssadnet:fp32",
     ]
-    both = told["Scan to answer: pointseg and ssadnet"]
-    assert {c.paths for c in both} == {(model_path("pointseg"), model_path("ssadnet"))}
-    assert [c.name for c in both if not peers.absent(c)] == ["edgeperc, cpu", "numpy + onnxruntime"]
+    both = tables["Scan to result: pointseg:int8 and ssadnet:fp32"]
+    assert {c.paths for c in both} == {(model_path("pointseg:int8"), model_path("ssadnet"))}
+    assert [c.name for c in both if not peers.why_missing(c)] == ["edgeperc, cpu", "numpy + onnxruntime"]
 
 
-def test_what_is_absent_is_told(alone: None, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_edgeperc_runs_in_every_precision_of_a_provider(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scan: np.ndarray
+) -> None:
+    monkeypatch.setattr(peers, "available_providers", lambda: ("openvino", "cpu"))
+    of_fp32, of_int8 = (
+        [
+            c.name
+            for c in made([name], tmp_path, scan, "auto")[f"Scan to result: {name}"]
+            if c.kind == "edgeperc" and not peers.why_missing(c)
+        ]
+        for name in ("pointseg:fp32", "pointseg:int8")
+    )
+    assert of_fp32 == ["edgeperc, auto", "edgeperc, cpu", "edgeperc, openvino fp32", "edgeperc, openvino bf16"]
+    assert of_int8 == ["edgeperc, auto", "edgeperc, cpu", "edgeperc, openvino"]
+
+
+def test_what_is_missing_is_reported(alone: None, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    pytest.importorskip("psutil")
     file = tmp_path / "peers.json"
-    command = ["peers", "--model", "ssadnet", "--scans", "1", "--rounds", "1", "--threads", "1", "--json", str(file)]
-    assert cli.main(command) == 0
+    command = [
+        "peers",
+        "--model",
+        "ssadnet:fp32",
+        "--provider",
+        "cpu",
+        "--scans",
+        "1",
+        "--rounds",
+        "1",
+        "--threads",
+        "1",
+    ]
+    assert cli.main([*command, "--json", str(file)]) == 0
     document = json.loads(file.read_text("utf-8"))
     assert document["complete"]
     for title, contenders in document["peers"].items():
         for contender in contenders:
-            rival = contender["engine"].startswith(("torch", "openvino"))
-            if rival or (title.startswith("One") and contender["name"] != "one network"):
-                assert contender["why_not"]
+            missing = contender["engine"].startswith(("torch", "openvino"))
+            if missing or (title.startswith("One") and contender["name"] != "one network"):
+                assert contender["missing"]
                 assert not contender["rounds"]
             else:
-                assert not contender["why_not"], contender
+                assert not contender["missing"], contender
                 assert min(contender["rounds"][0]) > 0.0
                 assert contender["rss_mb"] > 10.0
     printed = capsys.readouterr().out
     assert printed.count(peers.INSTALL) > 10
-    assert "Floor: ssadnet" in printed
+    assert "Floor: ssadnet:fp32" in printed
 
 
 def test_a_contender_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
+    pytest.importorskip("psutil")
     (tmp_path / "broken.onnx").write_bytes(b"no model")
     np.save(tmp_path / "scan.npy", np.zeros((2, 4), np.float32))
-    broken = peers.Contender("broken", "session", "cpu", (tmp_path / "broken.onnx",), image=tmp_path / "scan.npy")
-    peak = peers.Contender("peak", "peak", "numpy:fp32")
-    first, second = measure([broken, peak], [tmp_path / "scan.npy"], say=lambda words: None)
-    assert first.why_not.startswith("failed: ")
+    paths, image = (tmp_path / "broken.onnx",), tmp_path / "scan.npy"
+    broken = peers.Contender("broken", "session", "cpu", "auto", paths, image=image)
+    peak = peers.Contender("peak", "peak", "numpy", "fp32")
+    first, second = measure([broken, peak], [tmp_path / "scan.npy"], note=lambda name: None)
+    assert first.missing.startswith("failed: ")
     assert len(second.ms) == 2
