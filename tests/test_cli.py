@@ -18,6 +18,8 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from edgeperc import __version__, cli, listing, session, tuning, zoo
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
@@ -173,6 +175,25 @@ def test_eval_needs_matplotlib_for_a_picture_before_any_work(
     assert run("eval", "simulation:1", "--worst", tmp_path / "worst.png", "--json", tmp_path / "out" / "a.json") == 2
     assert "pip install 'edgeperc[view]'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_eval_passes_its_options_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = []
+
+    def evaluate(datasets: list[str], models: tuple[str, ...], **options: object) -> tuple[dict, list]:
+        asked.append((datasets, models, options))
+        return {"models": {"x": "1"}, "providers": {"x": "x fp32, cpu"}, "split": "test", "fold": None}, []
+
+    monkeypatch.setitem(sys.modules, "edgeperc.evaluation.evaluate", SimpleNamespace(evaluate=evaluate))
+    assert run("eval", "KITTI", "simulation:2") == 0
+    assert (
+        run("eval", "x", "--model", "a", "--provider", "openvino", "--precision", "bf16", "--boxes-from", "both") == 0
+    )
+    (datasets, models, first), (_, own, second) = asked
+    assert (datasets, models, own) == (["KITTI", "simulation:2"], zoo.DEFAULT, ["a"])
+    assert [first[key] for key in ("provider", "precision", "boxes_from")] == ["cpu", "auto", "network"]
+    assert [second[key] for key in ("provider", "precision", "boxes_from")] == ["openvino", "bf16", "both"]
+    assert capsys.readouterr().out.splitlines()[1] == "ran as x fp32, cpu"
 
 
 def test_tables_of_figures() -> None:
@@ -429,6 +450,23 @@ def test_scans_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
 )
 def testoutput_names(given: list[str], names: list[str]) -> None:
     assert [name.as_posix() for name in output_names([Path(scan) for scan in given])] == names
+
+
+FOLDERS = st.lists(st.sampled_from(["a", "b", "velodyne", "data", "A"]), max_size=3)
+
+
+@given(
+    st.lists(st.tuples(FOLDERS, st.sampled_from(["0", "1", "x"]), st.sampled_from([".bin", ".pcd", ".pcd.bin"]))),
+    st.booleans(),
+)
+def test_output_names_never_collide(scans: list[tuple[list[str], str, str]], keep_folder: bool) -> None:
+    paths = [Path("/", *folders, stem + suffix) for folders, stem, suffix in scans]
+    paths = list({str(path).casefold(): path for path in paths}.values())
+    names = output_names(paths, keep_folder=keep_folder)
+    assert len({str(name).casefold() for name in names}) == len(paths)
+    for path, name in zip(paths, names, strict=True):
+        assert path.name.startswith(name.name)
+        assert not name.is_absolute()
 
 
 def test_a_scan_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
