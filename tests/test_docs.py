@@ -1,0 +1,195 @@
+"""README and documentation are true: every block of Python runs, every command runs or is parsed by its program."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import re
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from edgeperc import cli
+from edgeperc.cli.main import build_parser
+from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.scene import simulate
+
+if sys.version_info >= (3, 11):
+    import tomllib
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
+MODULES_WITH_PARSERS = {"edgeperc-bench": "edgeperc_bench.cli", "edgeperc-export": "edgeperc_export.cli"}
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page, and the comment above it that says why it is not run."""
+
+    page: Path
+    line: int
+    language: str
+    text: str
+    excuse: str
+
+    def __str__(self) -> str:
+        return f"{self.page.relative_to(REPOSITORY).as_posix()}:{self.line}"
+
+
+def blocks_of(page: Path, *languages: str) -> list[Block]:
+    """The fenced blocks of a page in some languages, indented ones too."""
+    pattern = r"^(?:<!-- ([^\n]*?) -->\n)?( *)```(\w+)\n(.*?)^\2```$"
+    text, found = page.read_text("utf-8"), []
+    for match in re.finditer(pattern, text, flags=re.DOTALL | re.MULTILINE):
+        excuse, indent, language, body = match.groups()
+        if language in languages:
+            line = text.count("\n", 0, match.start(3)) + 1
+            found.append(Block(page, line, language, re.sub(rf"^{indent}", "", body, flags=re.M), excuse or ""))
+    return found
+
+
+COMMANDS = [
+    (block, line[2:])
+    for page in PAGES
+    for block in blocks_of(page, "console")
+    for line in block.text.splitlines()
+    if line.startswith("$ ")
+]
+PYTHON_PAGES = [page for page in PAGES if blocks_of(page, "python")]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what the pages speak of: a scan, a drive, a stream, the research models."""
+    folder = tmp_path_factory.mktemp("docs")
+    for name in ("scan.bin", "drive/0.bin", "drive/1.bin", "velodyne/0.bin", "velodyne/1.bin"):
+        seed = 4 + len(name)
+        (folder / name).parent.mkdir(exist_ok=True)
+        simulate(random_scene(seed, "urban"), "hdl-64e", seed=seed).points.tofile(folder / name)
+    if sys.platform != "win32":
+        (folder / "models").symlink_to(REPOSITORY / "models")
+    return folder
+
+
+@pytest.mark.parametrize("page", PYTHON_PAGES, ids=lambda page: page.relative_to(REPOSITORY).as_posix())
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_python_runs(page: Path, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The blocks of a page run in their order, in one namespace."""
+    monkeypatch.chdir(place)
+    if "draw(" in page.read_text("utf-8"):
+        pytest.importorskip("matplotlib")
+    names: dict[str, object] = {"__name__": "page"}
+    for block in blocks_of(page, "python"):
+        if block.excuse.startswith("not run:"):
+            compile(block.text, str(block), "exec")
+            continue
+        with contextlib.redirect_stdout(io.StringIO()):
+            exec(compile(block.text, str(block), "exec"), names)
+
+
+@pytest.mark.parametrize(("block", "line"), COMMANDS, ids=[f"{block} {line}" for block, line in COMMANDS])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_commands_run(block: Block, line: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``edgeperc`` runs; pip and make are held against what they install; a block that cannot run here says why."""
+    program, *arguments = shlex.split(line.partition(" > ")[0], comments=True)
+    monkeypatch.chdir(place)
+    if program == "pip":
+        assert wanted_extras(line) <= declared_extras(), line
+    elif program == "make":
+        targets = re.findall(r"^([\w-]+):", (REPOSITORY / "Makefile").read_text("utf-8"), flags=re.M)
+        assert {word for word in arguments if "=" not in word} <= {*targets}
+    elif program == "git":
+        assert arguments[0] == "clone"
+    elif program == "python":
+        assert arguments[0] == "-m"
+        assert (
+            (REPOSITORY / arguments[1].replace(".", "/").replace("edgeperc_bench", "bench")).with_suffix(".py").exists()
+        )
+    elif block.excuse.startswith("parsed only:") or program != "edgeperc":
+        assert block.excuse.startswith("parsed only:") or arguments in (["--help"], ["--version"]), (
+            "say why it is not run"
+        )
+        parse(program, arguments)
+    else:
+        if {"--png", "--gif", "demo"} & {*arguments}:
+            pytest.importorskip("matplotlib")
+        if sys.platform == "win32" and "models/research" in line:
+            pytest.skip("no symbolic links")
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            assert cli.main(arguments) == 0, printed.getvalue()
+
+
+def parse(program: str, arguments: list[str]) -> None:
+    """Let a program's own parser read a command; nothing runs."""
+    if program == "edgeperc":
+        parser: argparse.ArgumentParser = build_parser()
+    else:
+        pytest.importorskip("torch" if program == "edgeperc-export" else "psutil")
+        module = __import__(MODULES_WITH_PARSERS[program], fromlist=["build_parser"])
+        parser = module.build_parser()
+        if program == "edgeperc-bench":
+            arguments = module.with_command(arguments)
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as said:
+        try:
+            parser.parse_args(arguments)
+        except SystemExit as exc:
+            code = exc.code
+        else:
+            code = 0
+    assert not code, said.getvalue()
+
+
+def declared_extras() -> set[str]:
+    if sys.version_info < (3, 11):
+        pytest.skip("no tomllib")
+    return {*tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]}
+
+
+def wanted_extras(line: str) -> set[str]:
+    return {extra for group in re.findall(r"\[([\w,]+)\]", line) for extra in group.split(",")}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(REPOSITORY).as_posix())
+def test_links_and_pictures_are_there(page: Path) -> None:
+    text = page.read_text("utf-8")
+    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text) + re.findall(r"```\{(?:image|include)\} (\S+)", text):
+        if not target.startswith(("http", "mailto:")):
+            assert (page.parent / target).exists(), target
+    for target in re.findall(r"\{doc\}`([^`<]+)`", text):
+        assert (page.parent / f"{target}.md").exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(REPOSITORY).as_posix())
+def test_extras_exist(page: Path) -> None:
+    named = re.findall(r"edgeperc\[([\w,]+)\]", page.read_text("utf-8"))
+    assert {extra for group in named for extra in group.split(",")} <= declared_extras()
+
+
+def test_the_readme_is_read_in_a_minute() -> None:
+    readme = (REPOSITORY / "README.md").read_text("utf-8")
+    assert readme.count("\n") <= 130
+    (example,) = re.findall(r"```python\n(.*?)```", readme, flags=re.DOTALL)
+    assert len([line for line in example.splitlines() if line.strip()]) <= 10
+
+
+def test_files_named_in_contributing_are_there() -> None:
+    """The table "to change X, open Y"."""
+    text = (REPOSITORY / "CONTRIBUTING.md").read_text("utf-8")
+    for path in re.findall(r"`((?:edgeperc|export|bench|models|tests|docs)/[\w/.*]+)`", text):
+        assert [*REPOSITORY.glob(path)], path
+
+
+def test_pages_of_the_documentation_are_reachable() -> None:
+    """Every page stands in a table of contents."""
+    listed: set[Path] = set()
+    for page in PAGES:
+        for tree in re.findall(r"```\{toctree\}\n(.*?)```", page.read_text("utf-8"), flags=re.DOTALL):
+            listed |= {
+                (page.parent / f"{line.strip()}.md").resolve() for line in tree.splitlines() if line[:1].isalnum()
+            }
+    pages = {page for page in PAGES if page.is_relative_to(REPOSITORY / "docs")} - {REPOSITORY / "docs" / "index.md"}
+    assert pages == listed
