@@ -1,134 +1,266 @@
-"""models/MODELS.md, written from the cards and from ablation.json and folds.json beside them, for people to read."""
+"""models/MODELS.md, written from the cards and from validation.json, ablation.json and folds.json beside them."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from edgeperc.card import ModelCard, TopViewGeometry
-from edgeperc.evaluation.splits import FOLDS, TEST_DRIVES
+from edgeperc.evaluation.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES
 from edgeperc.evaluation.tables import BANDS
-from edgeperc.session import Session
+from edgeperc.zoo import DEFAULT, MAX_LOSS, Variant, digest, resolve
+
+from .recipe import Recipe
 
 __all__ = ["models_page"]
 
+SEES = {"range_image": "a class for every point", "top_view": "drivable area and vehicles ahead"}
+SOURCES = {"real": "real", "semantickitti": "SemanticKITTI", "simulated": "simulated"}
+ALL_RANGES = ("all",)
+
 
 def models_page(folder: Path) -> str:
-    """The page for every .onnx in a folder, by name."""
+    """The page for the models of a folder: those in it are shipped, those in its ``research`` are not."""
+    shipped, research = (
+        sorted((variant for path in sorted(of.glob("*.onnx")) for variant in resolve(path)), key=str)
+        for of in (folder, folder / "research")
+    )
     lines = [
         "# Models",
         "",
-        "Written by `edgeperc-export models models` from the cards in the files; `edgeperc info NAME` prints a card,",
-        "`edgeperc-export make NAME OUT --kitti KITTI --layouts KITTI_LABELS` makes a model again. Figures are of the",
-        f"test drives ({', '.join(sorted(TEST_DRIVES))}; `edgeperc/splits.py`),",
-        "by which nothing was trained or chosen. All are percentages, in brackets their 95 % bootstrap intervals over",
-        "drives (over scenes for simulation), where two or more have what is judged. Real and simulated scans are",
-        "never put together.",
+        "Written by `edgeperc-export models models` from the cards in the files. `edgeperc info NAME` prints a card;",
+        "`edgeperc-export make NAME OUT --kitti KITTI --layouts KITTI_LABELS` trains a model again.",
+        "",
+        *_shipped(shipped),
+        *_precisions(shipped),
+        *_free(research),
+        *_validation(folder / "validation.json"),
+        "",
+        "## Figures of the shipped models",
+        "",
+        f"On the test drives ({', '.join(sorted(TEST_DRIVES))}),",
+        "on which nothing was trained or chosen, and on simulated scans. All figures are percentages. In brackets: 95 % bootstrap intervals over drives",
+        "(over scenes for simulation), if two or more have the class. Do not average tables of real and simulated scans.",
     ]
-    for path in sorted(folder.glob("*.onnx")):
-        session = Session(path, "cpu")
-        lines += ["", *_model(session.card, session.sha256, path.stat().st_size)]
+    for variant in shipped:
+        fp32 = variant.precision == "fp32"
+        lines += ["", *_model(variant), *_figures_of(variant.card, tuple(BANDS) if fp32 else ALL_RANGES)]
+    lines += [
+        "",
+        "## Research models",
+        "",
+        "Teachers of the shipped models, the papers' own networks, and models trained on simulation alone. They are in the",
+        "repository and the source distribution, not in the wheel; use one by its path, `--model models/research/NAME.onnx`.",
+    ]
+    for variant in research:
+        lines += ["", *_model(variant), *_figures_of(variant.card, ALL_RANGES)]
     lines += _folds(_read(folder / "folds.json"))
     lines += _ablations(_read(folder / "ablation.json"))
     return "\n".join(lines) + "\n"
 
 
-def _read(path: Path) -> list[dict[str, Any]]:
+def _read(path: Path) -> Any:
     return json.loads(path.read_text()) if path.exists() else []
 
 
-def _model(card: ModelCard, sha256: str, size: int) -> Iterable[str]:
+def _size(variant: Variant) -> str:
+    return f"{variant.path.stat().st_size / 1e6:.1f} MB"
+
+
+def _shipped(variants: Sequence[Variant]) -> Iterable[str]:
+    yield "A name stands for one network and its variants. `Perceiver()` and `edgeperc run PATH` take"
+    yield f"{' and '.join(f'`{name}`' for name in DEFAULT)}. `NAME:fp32` and `NAME:int8` ask for one variant."
+    yield from _head("name", ["answers", "classes", "view", "files", "terms of the weights"])
+    for name in dict.fromkeys(variant.name for variant in variants):
+        own = [variant for variant in variants if variant.name == name]
+        card = own[0].card
+        sees = "drivable area ahead" if not card.box_classes and card.view.kind == "top_view" else SEES[card.view.kind]
+        files = ", ".join(f"{variant.precision} {_size(variant)}" for variant in own)
+        yield _row(f"`{name}`", sees, ", ".join(card.classes), _view(card), files, card.training.get("licence", "-"))
+
+
+def _view(card: ModelCard) -> str:
     view = card.view
     if isinstance(view, TopViewGeometry):
-        place = (
-            f"x {view.x_range_m[0]:g} to {view.x_range_m[1]:g} m, y {view.y_range_m[0]:g} to {view.y_range_m[1]:g} m"
-        )
-        shape = f"top view, {view.height} x {view.width} cells of {view.cell_m:g} m, {place}"
-    else:
-        azimuths = f"azimuth {view.azimuth_left_deg:g} to {view.azimuth_right_deg:g} degrees"
-        shape = f"range image, {view.height} x {view.width}, {azimuths}"
-    training, metrics = card.training, card.metrics
-    yield f"## {card.name} {card.version}"
+        (near, far), (right, left) = view.x_range_m, view.y_range_m
+        return f"{view.height} x {view.width} cells of {view.cell_m:g} m, x {near:g} to {far:g} m, y {right:g} to {left:g} m"
+    return f"{view.height} x {view.width} pixels, azimuth {view.azimuth_left_deg:g} to {view.azimuth_right_deg:g} degrees"
+
+
+def _precisions(variants: Sequence[Variant]) -> Iterable[str]:
+    yield from (
+        "",
+        "## Precision",
+        "",
+        "How answers in each precision agree with fp32, after post-processing, on labelled real scans. `precision=auto`",
+        f"takes a reduced precision only if its loss (of mean IoU or of AP, whichever is larger) is at most {MAX_LOSS} points and",
+        "the processor has instructions for it: int8 on the CPU provider and OpenVINO (VNNI, AMX, or Arm's dot product),",
+        "bf16 on OpenVINO (AMX or AVX-512). `precision=fp32` forbids it. What ran is in `perception.providers`.",
+    )
+    yield from _head("model", ["equal labels", "mean IoU", "fp32", "AP50", "fp32", "loss", "scans", "measured with"])
+    for variant in variants:
+        for precision, record in variant.card.precisions.items():
+            if precision != "fp32":
+                yield _row(
+                    *(f"{variant.name} {precision}", f"{100 * record['label_agreement']:.2f}"),
+                    *(_share(record[key], 2) for key in ("mean_iou", "fp32_mean_iou", "ap", "fp32_ap")),
+                    *(f"{record['loss']:.2f}", record["n_scans"], record["by"]),
+                )
+    commands = sorted({record["command"] for v in variants for record in v.card.precisions.values()})
+    yield from (
+        "",
+        f"Mean IoU is of points without background, or of vehicles and road. Made by {', '.join(f'`{c}`' for c in commands)}.",
+        "Scans of SemanticKITTI are of a test drive; they serve here only to compare precisions of one network.",
+    )
+
+
+def _free(research: Sequence[Variant]) -> Iterable[str]:
+    free = [variant for variant in research if "KITTI" not in variant.card.training.get("licence", "")]
+    if not free:
+        return
+    options = " ".join(f"--model models/research/{variant.path.name}" for variant in reversed(free))
+    yield from (
+        "",
+        "## Weights free of KITTI's terms",
+        "",
+        "The shipped models were trained on KITTI's scans, whose terms exclude commercial use. For commercial use take the",
+        "models that were trained on simulation alone, from the repository or the source distribution:",
+        "",
+        f"    edgeperc run PATH {options}",
+        "",
+        f"They are less accurate ({', '.join(variant.name for variant in free)} below). The wheel leaves them out to stay small:",
+        f"they take {sum(variant.path.stat().st_size for variant in free) / 1e6:.1f} MB, the shipped models together less.",
+    )
+
+
+def _validation(path: Path) -> Iterable[str]:
+    table = _read(path)
+    if not table:
+        return
+    rows = table["rows"]
+    yield from (
+        "",
+        "## How the names were given",
+        "",
+        f"A name went to the network that is most accurate on {rows[0]['n_scans']} scans of {len(VALIDATION_DRIVES)} validation drives, which neither",
+        "the training scans nor the test drives contain (`edgeperc/evaluation/splits.py`); speed decides between equals. 107 of",
+        "the scans are of one drive, 2011_09_26_drive_0001, with 12 cars, 2 cyclists and 1 tram, so the intervals over",
+        "drives are wide. The drives' boxes, not their scans, are among the layouts of the simulated training scenes.",
+        "Relative time: of the network alone in stock onnxruntime, two threads, divided by that of the name's fp32 file,",
+        "measured in turn on a busy computer (`bench/RESULTS.md` has times).",
+    )
+    for title, key, columns in (
+        ("points", "points", ("car", "pedestrian", "cyclist")),
+        ("vehicles", "vehicles", ("ap", "precision", "recall", "iou")),
+    ):
+        own = [row for row in rows if key in row]
+        if key == "points":
+            head = [f"IoU {name}" for name in columns]
+            counts = [f"{own[0][key][c]['n_points']:,} points of {own[0][key][c]['n_objects']} {c}s" for c in columns]
+        else:
+            head = ["AP50", "precision", "recall", "IoU of cells"]
+            counts = [f"{own[0][key]['n_boxes']} boxes", f"{own[0][key]['n_cells']:,} cells"]
+        yield from _head(f"{title} ({', '.join(counts)})", [*head, "relative time"])
+        for row in own:
+            if key == "points":
+                cells = [_percent(row[key][name], "iou") for name in columns]
+            else:
+                cells = [_percent(row[key], name) for name in columns]
+            yield _row(f"`{row['file']}`", *cells, f"{row['relative_time']:.1f}")
+    yield from ("", f"Made by `{table['command']}`.")
+
+
+def _model(variant: Variant) -> Iterable[str]:
+    card, training = variant.card, variant.card.training
+    yield f"### {variant} {card.version}"
     yield ""
-    yield f"- View: {shape}; channels {', '.join(card.input.channels)}"
-    yield f"- Classes: {', '.join(card.classes)}"
-    yield f"- Outputs: {', '.join(f'{o.name} ({o.kind})' for o in card.outputs)}"
-    yield f"- Trained on: {training.get('data', 'unknown')}; recipe {_flat(training.get('recipe', {}))}"
-    for before in training.get("started_from", []):
-        yield f"- Before that: {_flat(before)}"
-    yield f"- Licence of the weights: {training.get('licence', 'unknown')}"
-    yield f"- Parity with torch: {_flat(card.parity)}"
-    yield f"- {size / 1e6:.1f} MB, SHA-256 `{sha256}`"
-    if "command" in metrics:
-        yield f"- Figures made by: `{metrics['command']}`"
-    for source, title in (("real", "real"), ("semantickitti", "SemanticKITTI"), ("simulated", "simulated")):
-        if source in metrics:
-            yield from _figures(metrics[source], f"{metrics[source]['n_frames']} {title} scans")
-    yield from _curve(training.get("curve", []))
+    yield f"- {_size(variant)}, SHA-256 `{digest([variant])}`"
+    yield f"- Input: {_view(card)}; channels {', '.join(card.input.channels)}. Outputs: " + ", ".join(
+        f"{output.name} ({output.kind})" for output in card.outputs
+    )
+    if "quantized" in training:
+        quantized = training["quantized"]
+        yield (
+            f"- Quantized from {quantized['from']} (fp32), calibrated on {quantized['calibration']}, weights of "
+            f"{quantized['weight_bits']} bits, {len(quantized['left_alone'])} convolutions in fp32"
+        )
+    else:
+        yield f"- Trained on {training.get('data', 'unknown data')}: {_recipe(training.get('recipe', {}))}"
+        for before in training.get("started_from", []):
+            yield f"- Started from: {_recipe(before)}"
+    yield f"- Terms of the weights: {training.get('licence', 'unknown')}"
+    yield f"- Parity with {'fp32' if 'quantized' in training else 'torch'}: {_flat(card.parity)}"
 
 
-def _figures(figures: Mapping[str, Any], scans: str) -> Iterable[str]:
+def _recipe(recipe: Mapping[str, Any]) -> str:
+    """What differs from the defaults of `Recipe`."""
+    usual = {field.name: field.default for field in fields(Recipe)}
+    return _flat({name: value for name, value in recipe.items() if name not in usual or value != usual[name]})
+
+
+def _figures_of(card: ModelCard, bands: Sequence[str]) -> Iterable[str]:
+    if "command" in card.metrics:
+        yield f"- Figures made by `{card.metrics['command']}`"
+    for source, title in SOURCES.items():
+        if source in card.metrics:
+            of = card.metrics[source]
+            yield from _figures(of, f"{of['n_frames']} {title} scans", bands if source != "simulated" else ALL_RANGES)
+
+
+def _figures(figures: Mapping[str, Any], scans: str, bands: Sequence[str]) -> Iterable[str]:
     if "points" in figures:
         yield from _head(f"points, {scans}", ["range", "precision", "recall", "IoU", "points", "objects"])
-        for band, rows in _by_band(figures["points"]):
+        for band, rows in _by_band(figures["points"], bands):
             for name, row in rows.items():
                 rates = [_percent(row, key) for key in ("precision", "recall", "iou")]
                 yield _row(name, band, *rates, f"{row['n_points']:,}", row["n_objects"] or "-")
-    for kind, bands in figures.get("boxes", {}).items():
+    for kind, of_kind in figures.get("boxes", {}).items():
         head = ["range", "AP50", "precision", "recall", "mIoU@0.5", "mIoU@0.7", "boxes"]
         yield from _head(f"{kind} boxes, {scans}", head)
-        for band, rows in _by_band(bands):
+        for band, rows in _by_band(of_kind, bands):
             yield _row("mean of classes (mAP50)", band, _percent(rows, "mean_ap"), *["-"] * 5)
             for name, row in rows.items():
                 if isinstance(row, Mapping):
                     keys = ("ap", "precision", "recall", "mean_iou_50", "mean_iou_70")
                     yield _row(name, band, *(_percent(row, key) for key in keys), row["n_truth"])
-    for table, bands in figures.get("segmentation", {}).items():
-        classes = list(next(iter(bands.values()))["iou"])
+    for table, of_table in figures.get("segmentation", {}).items():
+        classes = list(next(iter(of_table.values()))["iou"])
         yield from _head(
             f"segmentation, {table}, {scans}", ["ACC", "mAP", "mIoU", *(f"IoU {c}" for c in classes), "cells"]
         )
-        for band, row in _by_band(bands):
+        for band, row in _by_band(of_table, bands):
             rates = [_percent(row, key) for key in ("accuracy", "mean_ap", "mean_iou")]
             yield _row(band, *rates, *(_share(row["iou"][c]) for c in classes), f"{row['n_cells']:,}")
     if "road" in figures:
         yield from _head(f"road, {scans}", ["F1", "best F1", "AP", "ACC", "PRE", "REC", "IoU", "cells"])
-        for band, row in _by_band(figures["road"]):
+        for band, row in _by_band(figures["road"], bands):
             keys = ("f1", "max_f1", "ap", "accuracy", "precision", "recall", "iou")
             yield _row(band, *(_percent(row, key) for key in keys), f"{row['n_cells']:,}")
 
 
-def _by_band(rows: Mapping[str, Any]) -> Iterable[tuple[str, Any]]:
+def _by_band(rows: Mapping[str, Any], bands: Sequence[str]) -> Iterable[tuple[str, Any]]:
     """In the order of the bands, which a card's sorted keys lose."""
-    return ((band, rows[band]) for band in BANDS if band in rows)
-
-
-def _curve(curve: Sequence[Mapping[str, Any]]) -> Iterable[str]:
-    if not curve:
-        return
-    watched = list(curve[-1].get("validation", {}))
-    yield from _head("training: step", ["loss", *(f"watched {name}" for name in watched)])
-    for line in curve[:: max(1, len(curve) // 8)]:
-        yield _row(line["step"], f"{line['loss']:.3f}", *(_share(line["validation"][name]) for name in watched))
+    return ((band, rows[band]) for band in BANDS if band in rows and band in bands)
 
 
 def _folds(rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
-    """What models made without a fold of the training drives reach on it."""
+    """Figures of models that were trained without one fold, on that fold."""
     if not rows:
         return
     yield from (
         "",
         "## Over folds",
         "",
-        f"Each model was made without one of the {len(FOLDS)} folds of the training drives, by",
-        "`edgeperc-export make NAME OUT --fold K --steps N`, and judged on that fold, grade A frames. The steps are",
-        "fewer than the shipped models', and so are the drives.",
+        f"Each model was trained without one of the {len(FOLDS)} folds of the training drives, by",
+        "`edgeperc-export make NAME OUT --fold K --steps N`, and evaluated on that fold, frames of grade A, with fewer",
+        "steps and fewer drives than the model of the same name.",
     )
     for row in rows:
         made = f"{row['name']} without fold {row['fold']}, {row['steps']} steps of {row['batch']}"
-        yield from _figures(row["real"], f"{made}, {row['real']['n_frames']} real scans")
+        yield from _figures(row["real"], f"{made}, {row['real']['n_frames']} real scans", ALL_RANGES)
 
 
 def _ablations(rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
@@ -136,11 +268,11 @@ def _ablations(rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
         return
     yield from (
         "",
-        "## What each part is worth",
+        "## Ablations",
         "",
-        "Short runs from the simulation-only weights (LoDNN's from nothing), each with one thing changed, judged on a",
-        "fold of the training drives that the run has not seen (`edgeperc-export ablate`): IoU of pixel labels, and",
-        "AP50 of all vehicles as one class.",
+        "Short runs from the weights trained on simulation alone (LoDNN: from scratch), each with one change, evaluated on",
+        "a fold that the run has not seen (`edgeperc-export ablate`): IoU of pixel labels, and AP50 of all vehicles as",
+        "one class.",
     )
     for network, fold, steps in sorted({(r["network"], r["fold"], r["steps"]) for r in rows}):
         here = [r for r in rows if (r["network"], r["fold"], r["steps"]) == (network, fold, steps)]
@@ -158,8 +290,8 @@ def _row(*cells: object) -> str:
     return f"| {' | '.join(map(str, cells))} |"
 
 
-def _share(value: float | None) -> str:
-    return "-" if value is None else f"{100.0 * value:.1f}"
+def _share(value: float | None, digits: int = 1) -> str:
+    return "-" if value is None else f"{100.0 * value:.{digits}f}"
 
 
 def _percent(row: Mapping[str, Any], key: str) -> str:

@@ -244,9 +244,9 @@ def test_calibration_never_sees_test_drives(tmp_path: Path, scans: list[np.ndarr
     (labels / "000007.txt").touch()
     (tmp_path / "objects/frames.csv").write_text("name,drive\n000007,2011_09_26_drive_0015\n")
     for file, drive in ((raw, "26_drive_0011"), (objects, "26_drive_0015"), (sequence, "03_drive_0027")):
-        with pytest.raises(SplitError, match=f"is of test drive .*{drive}"):
+        with pytest.raises(SplitError, match=f"is of drive .*{drive}"):
             calibration_scans([file])
-        with pytest.raises(SplitError, match=f"is of test drive .*{drive}"):
+        with pytest.raises(SplitError, match=f"is of drive .*{drive}"):
             calibration_scans([file.parents[2]], n_simulated=1)
     found, hashes = calibration_scans([training, nowhere.parent])
     assert [len(points) for points in found] == [len(scans[0])] * 2
