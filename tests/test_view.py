@@ -86,7 +86,7 @@ def near(picture: np.ndarray, name: str, tolerance: int = 12) -> np.ndarray:
 
 @pytest.mark.usefixtures("matplotlib")
 def test_picture_shows_classes_where_they_are(scan: np.ndarray, perception: Perception) -> None:
-    picture = pixels(view.draw(scan, perception, title="a scan"))
+    picture = pixels(view.draw(perception, scan, title="a scan"))
     assert picture.shape == (1106, 1600, 3)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 500
     # The panel from above begins at pixel column 90 and row 128 with x = 48 and y = 14, 14.65 pixels a meter.
@@ -106,9 +106,9 @@ def test_picture_shows_classes_where_they_are(scan: np.ndarray, perception: Perc
 
 @pytest.mark.usefixtures("matplotlib")
 def test_picture_grows_with_its_warnings(scan: np.ndarray, perception: Perception) -> None:
-    quiet = pixels(view.draw(scan, replace(perception, fitness=())))
+    quiet = pixels(view.draw(replace(perception, fitness=()), scan))
     assert quiet.shape == (1080, 1600, 3)
-    many = pixels(view.draw(scan, replace(perception, fitness=("a warning", "words " * 100))))
+    many = pixels(view.draw(replace(perception, fitness=("a warning", "words " * 100)), scan))
     assert many.shape[0] > 1080 + 3 * 26
     amber = (np.abs(many - [0xFF, 0xC4, 0x6B]) <= 12).all(axis=2)
     assert not amber[1080 - 60 :, 1572:].any()
@@ -118,10 +118,10 @@ def test_picture_grows_with_its_warnings(scan: np.ndarray, perception: Perceptio
 
 @pytest.mark.usefixtures("matplotlib")
 def test_picture_of_one_view(scan: np.ndarray, perception: Perception) -> None:
-    points_alone = pixels(view.draw(scan, replace(perception, top_view=None, boxes=())))
+    points_alone = pixels(view.draw(replace(perception, top_view=None, boxes=()), scan))
     assert near(points_alone, "pedestrian").sum() > 100
     assert not near(points_alone, "drivable").any()
-    top_alone = pixels(view.draw(scan, replace(perception, points=None)))
+    top_alone = pixels(view.draw(replace(perception, points=None), scan))
     assert near(top_alone, "van").sum() > 100
     assert not near(top_alone, "pedestrian").any()
     assert points_alone.shape[1] == top_alone.shape[1] == 1600
@@ -129,9 +129,9 @@ def test_picture_of_one_view(scan: np.ndarray, perception: Perception) -> None:
 
 @pytest.mark.usefixtures("matplotlib")
 def test_picture_is_the_same_again_and_in_other_threads(scan: np.ndarray, perception: Perception) -> None:
-    wanted = view.draw(scan, perception)
+    wanted = view.draw(perception, scan)
     got: list[bytes] = []
-    threads = [threading.Thread(target=lambda: got.append(view.draw(scan, perception))) for _ in range(3)]
+    threads = [threading.Thread(target=lambda: got.append(view.draw(perception, scan))) for _ in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -146,9 +146,9 @@ def test_tiny_scans(n: int, tmp_path, scan: np.ndarray) -> None:
     for points in (scan[:n], np.full((n, 4), np.nan, dtype=np.float32)):
         labels = PointLabels(np.zeros(n, np.uint8), np.zeros(n, bool), POINT_CLASSES)
         perception = replace(whole, n_points=n, points=labels, stage_ms={}, providers={}, fitness=())
-        assert pixels(view.draw(points, perception)).shape == (1080, 1600, 3)
-        write_html(points, perception, tmp_path / "page.html")
-        write_ply(points, perception, tmp_path / "points.ply")
+        assert pixels(view.draw(perception, points)).shape == (1080, 1600, 3)
+        write_html(perception, points, tmp_path / "page.html")
+        write_ply(perception, points, tmp_path / "points.ply")
         write_labels(perception, tmp_path / "points.label")
         assert (tmp_path / "points.label").stat().st_size == 4 * n
 
@@ -158,13 +158,13 @@ def test_strange_titles_and_classes(scan: np.ndarray, perception: Perception, tm
     strange = "$\\frac{ <script>alert(1)</script> 走 \n \udcff @@SCENE@@" + "x" * 200
     classes = (*POINT_CLASSES[:3], "</script> & tram\nelement vertex 3")
     perception = replace(perception, points=replace(perception.points, classes=classes))
-    assert pixels(view.draw(scan, perception, title=strange)).shape[1] == 1600
-    write_html(scan, perception, tmp_path / "page.html", title=strange)
+    assert pixels(view.draw(perception, scan, title=strange)).shape[1] == 1600
+    write_html(perception, scan, tmp_path / "page.html", title=strange)
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert text.count("<script") == 2
     assert text.count("</script>") == 2
     assert "&lt;script&gt;alert(1)" in text
-    write_ply(scan, perception, tmp_path / "points.ply")
+    write_ply(perception, scan, tmp_path / "points.ply")
     header = (tmp_path / "points.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
     assert [line for line in header if line.startswith("element")] == [f"element vertex {len(scan)}"]
 
@@ -173,10 +173,10 @@ def test_strange_titles_and_classes(scan: np.ndarray, perception: Perception, tm
 def test_file_is_replaced_whole(scan: np.ndarray, perception: Perception, tmp_path) -> None:
     target = tmp_path / "scan.png"
     target.write_bytes(b"old")
-    png = view.draw(scan, perception, target)
+    png = view.draw(perception, scan, target)
     assert target.read_bytes() == png
     with pytest.raises(OSError, match="absent"):
-        view.draw(scan, perception, tmp_path / "absent" / "scan.png")
+        view.draw(perception, scan, tmp_path / "absent" / "scan.png")
     folder = tmp_path / "scan.label"
     folder.mkdir()
     with pytest.raises(OSError, match=r"scan\.label"):
@@ -186,7 +186,7 @@ def test_file_is_replaced_whole(scan: np.ndarray, perception: Perception, tmp_pa
 
 def test_html_holds_every_finite_point_and_no_address(scan: np.ndarray, perception: Perception, tmp_path) -> None:
     bright = scan * np.array([1, 1, 1, 200], dtype=np.float32)
-    write_html(bright, perception, tmp_path / "page.html", title="a scan")
+    write_html(perception, bright, tmp_path / "page.html", title="a scan")
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert not re.search(r"https?:|src=|@@", text)
     scene = json.loads(re.search(r'type="application/json">(.*?)</script>', text, re.DOTALL).group(1))
@@ -225,7 +225,7 @@ def test_leaves_above_the_road_are_not_road(perception: Perception) -> None:
 
 
 def test_ply_reads_back(scan: np.ndarray, perception: Perception, tmp_path) -> None:
-    write_ply(scan, perception, tmp_path / "points.ply")
+    write_ply(perception, scan, tmp_path / "points.ply")
     header, body = (tmp_path / "points.ply").read_bytes().split(b"end_header\n", 1)
     kinds = {"float": "<f4", "uchar": "u1"}
     properties = re.findall(r"property (\w+) (\w+)", header.decode("ascii"))
@@ -252,12 +252,12 @@ def test_refusals(scan: np.ndarray, perception: Perception, tmp_path) -> None:
     with pytest.raises(PointsError, match="pointseg"):
         write_labels(top_alone, tmp_path / "a.label")
     with pytest.raises(PointsError, match="pointseg"):
-        write_ply(scan, top_alone, tmp_path / "a.ply")
+        write_ply(top_alone, scan, tmp_path / "a.ply")
     for writer in (write_html, write_ply, view.draw):
         with pytest.raises(PointsError, match="expected the scan that was perceived"):
-            writer(scan[1:], perception, tmp_path / "a")
+            writer(perception, scan[1:], tmp_path / "a")
         with pytest.raises(PointsError, match=r"\(n, 4\)"):
-            writer(scan[:, :3], perception, tmp_path / "a")
+            writer(perception, scan[:, :3], tmp_path / "a")
     assert not list(tmp_path.iterdir())
 
 
@@ -265,7 +265,7 @@ def test_missing_matplotlib_names_the_line(scan: np.ndarray, perception: Percept
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(MissingExtraError, match=r"pip install 'edgeperc\[view\]'"):
-        view.draw(scan, perception)
+        view.draw(perception, scan)
 
 
 def test_import_loads_no_matplotlib() -> None:
@@ -276,7 +276,7 @@ def test_import_loads_no_matplotlib() -> None:
 @pytest.mark.usefixtures("matplotlib")
 def test_drawing_uses_no_pyplot(scan: np.ndarray, perception: Perception) -> None:
     before = "matplotlib.pyplot" in sys.modules
-    view.draw(scan, perception)
+    view.draw(perception, scan)
     assert ("matplotlib.pyplot" in sys.modules) == before
 
 
@@ -367,9 +367,9 @@ def test_anything_is_drawn(tmp_path_factory, points: np.ndarray, boxes: list[Box
     n = len(points)
     labels = PointLabels((np.arange(n) % 4).astype(np.uint8), np.ones(n, bool), POINT_CLASSES)
     perception = replace(a_perception(a_scan()), n_points=n, points=labels, boxes=tuple(boxes))
-    assert pixels(view.draw(points, perception)).shape[1] == 1600
-    write_html(points, perception, folder / "page.html")
-    write_ply(points, perception, folder / "points.ply")
+    assert pixels(view.draw(perception, points)).shape[1] == 1600
+    write_html(perception, points, folder / "page.html")
+    write_ply(perception, points, folder / "points.ply")
     assert flatten_scan(points, perception)
     mistakes = some_mistakes(points, found=tuple(boxes), missed=tuple((box, 3) for box in boxes), false=tuple(boxes))
     assert pixels(draw_mistakes([mistakes])).shape[1] == 1600
@@ -378,7 +378,7 @@ def test_anything_is_drawn(tmp_path_factory, points: np.ndarray, boxes: list[Box
 def test_boxes_reach_behind_the_camera(scan: np.ndarray, perception: Perception) -> None:
     pytest.importorskip("matplotlib")
     long = Box("truck", 0.5, (0.0, 0.0, 0.0), (60.0, 3.0, 3.0), 0.0)
-    picture = pixels(view.draw(scan, replace(perception, boxes=(long,))))
+    picture = pixels(view.draw(replace(perception, boxes=(long,)), scan))
     assert near(picture[128:648, 560:], "truck").sum() > 200
 
 
@@ -484,7 +484,7 @@ def test_page_shows_and_hides(scan: np.ndarray, perception: Perception, tmp_path
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if chromium is None:
         pytest.skip("no chromium, chromium-browser or google-chrome on the path")
-    write_html(scan, perception, tmp_path / "page.html", title="a <b>scan</b>")
+    write_html(perception, scan, tmp_path / "page.html", title="a <b>scan</b>")
     wrong: list[str] = []
     with playwright.sync_playwright() as play:
         browser = play.chromium.launch(

@@ -80,9 +80,9 @@ def demo_command(arguments: argparse.Namespace) -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     page, picture = arguments.out / "scene.html", arguments.out / "scene.png"
     title = "edgeperc demo: a simulated street"
-    view.write_html(scan.points, perception, page, title=title)
+    view.write_html(perception, scan.points, page, title=title)
     try:
-        view.draw(scan.points, perception, picture, title=title)
+        view.draw(perception, scan.points, picture, title=title)
         rows.append(("picture", str(picture)))
     except MissingExtraError as exc:
         rows.append(("picture", one_line(exc)))

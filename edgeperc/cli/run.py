@@ -342,13 +342,13 @@ def _write(points: NDArray[np.float32], perception: Perception, wanted: Mapping[
     from .. import view
 
     if "png" in wanted:
-        view.draw(points, perception, wanted["png"], title=title)
+        view.draw(perception, points, wanted["png"], title=title)
     if "html" in wanted:
-        view.write_html(points, perception, wanted["html"], title=title)
+        view.write_html(perception, points, wanted["html"], title=title)
     if "labels" in wanted:
         view.write_labels(perception, wanted["labels"])
     if "ply" in wanted:
-        view.write_ply(points, perception, wanted["ply"])
+        view.write_ply(perception, points, wanted["ply"])
 
 
 def _under(points: NDArray[np.float32], perception: Perception) -> bytes:

@@ -145,7 +145,7 @@ def class_facts(perception: Perception) -> dict[str, list[str]]:
     order = [*CLASS_COLORS][1:]
     for name in sorted(known, key=lambda name: (order.index(name) if name in order else len(order), name)):
         facts[name] = []
-        if name == "drivable" and perception.top_view is not None:
+        if name == "drivable" and perception.top_view is not None and perception.top_view.drivable.any():
             facts[name].append(f"{perception.top_view.drivable_area_m2:.0f} m²")
         if name in labels:
             facts[name].append(f"{labels.count(name)} box{'es' * (labels.count(name) > 1)}")

@@ -28,7 +28,7 @@ SEMANTICKITTI_IDS = {
 _OTHER_ID = 99
 
 
-def write_ply(points: NDArray[np.float32], perception: Perception, path: str | Path) -> None:
+def write_ply(perception: Perception, points: NDArray[np.float32], path: str | Path) -> None:
     """Write the labeled scan as a binary PLY file.
 
     One row per input point, in input order: x, y, z, remission (float), label, red, green, blue (uchar). Comments in
@@ -36,9 +36,9 @@ def write_ply(points: NDArray[np.float32], perception: Perception, path: str | P
 
     Parameters
     ----------
+    perception : Perception
     points : (n, 4) float32
         The scan that was perceived: x, y, z [m] in the sensor frame, remission.
-    perception : Perception
     path : str or Path
         An existing file is replaced whole.
 

@@ -31,15 +31,15 @@ from .content import (
 __all__ = ["write_html"]
 
 
-def write_html(points: NDArray[np.float32], perception: Perception, path: str | Path, *, title: str = "") -> None:
+def write_html(perception: Perception, points: NDArray[np.float32], path: str | Path, *, title: str = "") -> None:
     """Write one page that shows the labeled points in a browser, to turn, zoom and pan. It needs no network.
 
     Parameters
     ----------
+    perception : Perception
     points : (n, 4) float32
         The scan that was perceived: x, y, z [m] in the sensor frame, remission. Rows that are not finite are left out,
         and so are points and boxes at impossible places.
-    perception : Perception
     path : str or Path
         An existing file is replaced whole.
     title : str

@@ -38,17 +38,17 @@ _HALF_STRIP_M = 1.0
 
 
 def draw(
-    points: NDArray[np.float32], perception: Perception, path: str | Path | None = None, *, title: str = ""
+    perception: Perception, points: NDArray[np.float32], path: str | Path | None = None, *, title: str = ""
 ) -> bytes:
     """Draw a scan and what was perceived in it.
 
     Parameters
     ----------
+    perception : Perception
+        Without a top view, the picture has no panel from above.
     points : (n, 4) float32
         The scan that was perceived: x, y, z [m] in the sensor frame, remission. Rows that are not finite are left out,
         and so are points and boxes at impossible places.
-    perception : Perception
-        Without a top view, the picture has no panel from above.
     path : str or Path, optional
         Where to write the picture as well; an existing file is replaced whole.
     title : str
