@@ -153,7 +153,7 @@ def accuracy_sentences(accuracy: Mapping[str, Any]) -> list[str]:
     reference = "; ".join(accuracy["reference"])
     sentences = [f"compared with {reference} on {found['n_scans']} scans: {'; '.join(parts)}"]
     if accuracy["truth"] is None:
-        return [*sentences, "these scans have no ground truth; edgeperc eval evaluates labelled scans"]
+        return [*sentences, "these scans have no ground truth; edgeperc eval evaluates labeled scans"]
     for name, kept in (("ground truth", "truth"), ("ground truth, reference", "reference_truth")):
         figures = [f"{key.replace('_', ' ')} {share(v)}" for key, v in accuracy[kept].items() if v is not None]
         sentences.append(f"{name}: " + ", ".join(figures))
