@@ -170,7 +170,7 @@ _COUNT_COLUMNS = (
 
 def _tracking_lines(figures: Mapping[str, Any]) -> list[str]:
     rows = [(("", name), without_nan({**of, **of["best"], **of["hota"]})) for name, of in figures["classes"].items()]
-    every = [(("", name), without_nan({**of, **of["told"]})) for name, of in figures["classes"].items()]
+    every = [(("", name), without_nan({**of, **of["all_tracks"]})) for name, of in figures["classes"].items()]
     return [
         f"{many(len(figures['sequences']), 'sequence')}, {figures['of']}, 3-D IoU {figures['iou_threshold']}; "
         f"{figures['frames_per_s']:,.0f} scans a second in the tracker; shares in per cent",

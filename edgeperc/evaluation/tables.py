@@ -1,7 +1,7 @@
-"""Records of judged scans -> the papers' figures, with intervals over drives.
+"""Records of evaluated scans -> the papers' figures, with 95 % intervals.
 
-A figure is computed from the counts of all its scans put together. For its interval, drives are drawn anew and the same
-figure is computed again: frames of one drive look alike, so that it is drives that differ by chance.
+A figure is computed from the summed counts of its scans. Its interval comes from a bootstrap over drives, not frames,
+because frames of one drive look alike.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["BANDS", "VEHICLES", "Record", "banded", "figures", "within"]
 
 VEHICLES = ("car", "van", "truck")
 
-# Horizontal distances [m] of points, of cells' centres and of boxes' centres.
+# Ranges of horizontal distance [m] of points, of centers of cells and of centers of boxes.
 BANDS = {
     "all": (0.0, math.inf),
     "0-15 m": (0.0, 15.0),
@@ -35,7 +35,7 @@ Tallies = Mapping[tuple[str, ...], Any]
 
 @dataclass(frozen=True)
 class Record:
-    """What judging one scan left: counts that add up, by the place of their figures in the result."""
+    """Counts of one evaluated scan, by the place of their figures in the result. Counts of scans can be added."""
 
     name: str
     drive: str
@@ -43,7 +43,7 @@ class Record:
 
 
 def within(range_m: Any, within_m: tuple[float, float]) -> Any:
-    """Whether distances lie in a band, the nearer bound included."""
+    """Whether distances lie in a band, the lower bound included."""
     return (range_m >= within_m[0]) & (range_m < within_m[1])
 
 
@@ -54,7 +54,7 @@ def banded(
     right: NDArray[np.uint8],
     range_m: NDArray[Any],
 ) -> dict[tuple[str, ...], Confusion]:
-    """A confusion of each band, by ``table`` and band. Labels where the truth is 255 are not counted."""
+    """The confusion of each band, by ``(*table, band)``. Labels with an unknown truth (255) are not counted."""
     known = right != 255
     labels, right, range_m = labels[known], right[known], range_m[known]
     confusions: dict[tuple[str, ...], Confusion] = {}
@@ -67,29 +67,34 @@ def banded(
 
 
 def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any]:
-    """Every figure of some records, and how many scans and drives they are of.
+    """All figures of some records, and the numbers of their scans and drives.
 
     Parameters
     ----------
     records : iterable of Record
     n_resamples : int
-        How often the drives are drawn anew, with replacement, for the 95 % intervals (``"iou_interval"`` beside
-        ``"iou"``); None in place of an interval where fewer than two drives have what is judged.
+        Number of bootstrap resamples of the drives, for the 95 % intervals (``"iou_interval"`` beside ``"iou"``). An
+        interval is None if fewer than two drives have data for the figure.
+
+    Returns
+    -------
+    dict
+        For JSON: numbers with four decimals, None for NaN.
     """
     by_drive: dict[str, list[Tallies]] = {}
     for record in records:
         by_drive.setdefault(record.drive, []).append(record.tallies)
-    drives = [_together(tallies) for tallies in by_drive.values()]
-    whole = _figures(_together(drives))
+    drives = [_summed(tallies) for tallies in by_drive.values()]
+    whole = _figures(_summed(drives))
     draws = np.random.default_rng(0).integers(len(drives), size=(n_resamples if len(drives) > 1 else 0, len(drives)))
-    # Three drives can be drawn in ten ways only.
+    # Few drives have few different resamples: three drives have ten.
     different, times = np.unique(np.sort(draws, axis=1), axis=0, return_counts=True)
-    samples = [_figures(_together([drives[k] for k in draw])) for draw in different]
+    samples = [_figures(_summed([drives[k] for k in draw])) for draw in different]
     _add_intervals(whole, [_figures(drive) for drive in drives], samples, times)
     return _plain(whole) | {"n_frames": sum(map(len, by_drive.values())), "n_drives": len(drives)}
 
 
-def _together(parts: Sequence[Tallies]) -> Tallies:
+def _summed(parts: Sequence[Tallies]) -> Tallies:
     keys = dict.fromkeys(key for part in parts for key in part)
     return {key: reduce(add, [part[key] for part in parts if key in part]) for key in keys}
 
@@ -125,7 +130,7 @@ def _box_rows(evaluator: BoxEvaluator, within_m: tuple[float, float]) -> dict[st
 
 
 def _map_row(confusion: Confusion) -> dict[str, Any]:
-    """Accuracy, mAP (its meaning is SSADNet's table 3) and mIoU; van and car put together in ``"vehicle"`` only."""
+    """Accuracy, mAP as SSADNet's table 3 defines it, mIoU; ``"vehicle"`` joins car, van and truck."""
     classes = confusion.classes
     iou = dict(zip(classes, confusion.iou().tolist(), strict=True))
     n_cells = dict(zip(classes, confusion.counts.sum(axis=1).tolist(), strict=True))
@@ -144,9 +149,9 @@ def _map_row(confusion: Confusion) -> dict[str, Any]:
 
 
 def _road_row(sweep: ProbabilitySweep, decision: Confusion) -> dict[str, Any]:
-    """As the model decides, and the best F1 and the average precision over thresholds of its probability.
+    """Figures at the model's own decision, and best F1 and average precision over thresholds of its probability.
 
-    ``"confusion"`` holds shares of all cells, rows the truth (Figure 21 of the top-view database's paper).
+    ``"confusion"`` has shares of all cells, rows are the truth (Figure 21 of the top-view database's paper).
     """
     (_, false), (missed, hits) = decision.counts.tolist()
     return {
@@ -166,7 +171,7 @@ def _road_row(sweep: ProbabilitySweep, decision: Confusion) -> dict[str, Any]:
 def _add_intervals(
     whole: dict[str, Any], drives: Sequence[dict[str, Any]], samples: Sequence[dict[str, Any]], times: NDArray[Any]
 ) -> None:
-    """Put an interval beside every figure that has one, in place; ``drives`` say how many have what is judged."""
+    """Add the interval of each figure, in place; ``drives`` are the figures of single drives."""
     for key, value in list(whole.items()):
         of_drives, of_samples = [each.get(key, {}) for each in drives], [each.get(key, {}) for each in samples]
         if key == "iou" and isinstance(value, dict):
@@ -181,7 +186,7 @@ def _add_intervals(
             values = [each.get(key, math.nan) for each in samples]
             whole[f"{key}_interval"] = _interval([each.get(count, 0) for each in drives], values, times)
     for mean in ("mean_iou", "mean_ap"):
-        # A mean over other classes is another figure: only drives that have them all can be compared.
+        # Means over different classes are not comparable: only drives and resamples with all classes count.
         meant = [name for name, (value, _) in _parts(whole, mean).items() if not math.isnan(value)]
         if meant:
             parts = [[_parts(each, mean).get(name, (math.nan, 0)) for name in meant] for each in (*drives, *samples)]
@@ -192,7 +197,7 @@ def _add_intervals(
 
 
 def _parts(row: Mapping[str, Any], mean: str) -> dict[str, tuple[float, int]]:
-    """What a mean over classes is of, and how many cells or boxes each class has."""
+    """The value of each class in a mean over classes, and its number of cells or boxes."""
     if mean == "mean_iou" and "iou" in row and "n_cells_of" in row:
         return {name: (value, row["n_cells_of"][name]) for name, value in row["iou"].items() if name != "vehicle"}
     if mean == "mean_ap" and mean in row:
@@ -202,7 +207,7 @@ def _parts(row: Mapping[str, Any], mean: str) -> dict[str, tuple[float, int]]:
 
 
 def _interval(counts: Sequence[int], values: Sequence[float], times: NDArray[Any]) -> list[float] | None:
-    """2.5 and 97.5 % of a figure's values; None unless two drives or more count."""
+    """2.5 and 97.5 % quantiles of the resampled values; None with data from fewer than two drives."""
     if sum(n > 0 for n in counts) < 2:
         return None
     every = np.repeat(np.asarray(values, np.float64), times)
@@ -211,7 +216,7 @@ def _interval(counts: Sequence[int], values: Sequence[float], times: NDArray[Any
 
 
 def _plain(value: Any) -> Any:
-    """For JSON: four decimals, None where there was nothing to count."""
+    """For JSON: four decimals, None for NaN."""
     if isinstance(value, dict):
         return {key: _plain(inner) for key, inner in value.items()}
     if isinstance(value, list):

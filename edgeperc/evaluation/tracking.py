@@ -1,4 +1,4 @@
-"""KITTI's tracking sequences: labels and detections in, the tables of AB3DMOT's protocol and KUL-Seg's Table 7 out."""
+"""Evaluate the tracker on KITTI's tracking sequences, by AB3DMOT's protocol and as in KUL-Seg's Table 7."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ __all__ = [
 
 CLASSES = ("car", "pedestrian", "cyclist")
 
-# What counts as each class; KUL-Seg's Table 7 knows vehicles alone.
+# Labels of each evaluated class; KUL-Seg's Table 7 evaluates vehicles.
 KINDS = {**{of: (of,) for of in CLASSES}, "vehicle": ("car", "van", "truck")}
 
-# KITTI's evaluation: what may be taken for each class unpunished, and what is too hidden or too small to be asked for.
+# From KITTI's evaluation: labels that may be confused with each class, and limits of objects to find.
 NEIGHBOURS = {"car": ("van",), "pedestrian": ("person", "person_sitting"), "cyclist": (), "vehicle": ("tram", "misc")}
 MAX_OCCLUSION, MAX_TRUNCATION, MIN_HEIGHT_PX, MIN_UNLABELLED = 2, 0, 25.0, 0.5
 FRAME_S = 0.1
@@ -48,17 +48,17 @@ FRAME_S = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackingSequence:
-    """One sequence: what was detected, and what there is.
+    """One sequence: detections and truth.
 
     Attributes
     ----------
     name : str
     detections : tuple of tuple of Box
-        By frame, of all classes asked for, in the sensor's frame. Scores are in 0..1.
+        By frame, of all classes, in the sensor frame. Scores are in 0..1.
     truth : mapping of str to tuple of FrameTruth
         By class and frame.
     unlabelled : tuple of (k, 4) float64
-        By frame: image rectangles (left, top, right, bottom) in which nothing was labelled (DontCare).
+        By frame: image rectangles (left, top, right, bottom) without labels (DontCare).
     calibration : Calibration
     """
 
@@ -70,12 +70,12 @@ class TrackingSequence:
 
 
 def sequence_names(root: Path | str) -> list[str]:
-    """What can be judged below ``root``: KITTI's tracking sequences, or drives of an object set with track ids.
+    """Names of the sequences below ``root``: KITTI's tracking sequences, or drives of an object set with track ids.
 
     Parameters
     ----------
     root : str or Path
-        Holds ``label_02/NAME.txt``, or ``training/label_2``, ``training/track_id`` (a line for each label's) and
+        Has ``label_02/NAME.txt``, or ``training/label_2``, ``training/track_id`` (one line for each label) and
         ``frames.csv`` (`edgeperc.evaluation.datasets.KittiObjects`).
 
     Returns
@@ -85,7 +85,7 @@ def sequence_names(root: Path | str) -> list[str]:
     Raises
     ------
     TrackingError
-        There is neither.
+        ``root`` has neither.
     """
     root = Path(root)
     names = sorted(path.stem for path in (root / "label_02").glob("*.txt"))
@@ -94,14 +94,14 @@ def sequence_names(root: Path | str) -> list[str]:
         names = sorted({drives[path.stem] for path in (root / "training/track_id").glob("*.txt")})
     if not names:
         raise TrackingError(
-            f"{root} holds no label_02/*.txt and no training/track_id/*.txt; pass the root of KITTI's tracking "
+            f"{root} has no label_02/*.txt and no training/track_id/*.txt; pass the root of KITTI's tracking "
             "sequences, or of an object set with track ids"
         )
     return names
 
 
 def sequence_scans(root: Path | str, name: str) -> dict[int, Path]:
-    """Files of a sequence's scans by frame, ``velodyne/NAME/FRAME.bin`` below ``root`` or those of the drive.
+    """Files of the scans of a sequence, by frame: ``velodyne/NAME/FRAME.bin``, or the scans of the drive.
 
     Parameters
     ----------
@@ -112,19 +112,19 @@ def sequence_scans(root: Path | str, name: str) -> dict[int, Path]:
     Returns
     -------
     dict of int to Path
-        Empty where there are none.
+        Empty if there are no scans.
     """
     root = Path(root)
     if (root / "label_02").is_dir():
         return {int(path.stem): path for path in sorted((root / "velodyne" / name).glob("*.bin"))}
     training = root / "training"
     names = [of for of, drive in KittiObjects(root).drives.items() if drive == name]
-    told = (of for of in names if (training / "track_id" / f"{of}.txt").exists())
-    return {frame: training / "velodyne" / f"{of}.bin" for frame, of in enumerate(told)}
+    with_ids = (of for of in names if (training / "track_id" / f"{of}.txt").exists())
+    return {frame: training / "velodyne" / f"{of}.bin" for frame, of in enumerate(with_ids)}
 
 
 def _labels(root: Path, name: str) -> tuple[Path, list[list[str]], Calibration]:
-    """Where the labels are, the words of KITTI's 17 columns, and the calibration."""
+    """Path of the labels, KITTI's 17 columns of each label as text, and the calibration."""
     path = root / "label_02" / f"{name}.txt"
     if path.parent.is_dir():
         lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
@@ -135,7 +135,9 @@ def _labels(root: Path, name: str) -> tuple[Path, list[list[str]], Calibration]:
         labels = (path / f"{stem}.txt").read_text().splitlines()
         ids = (root / "training/track_id" / f"{stem}.txt").read_text().split()
         if len(ids) != len(labels):
-            raise TrackingError(f"{path}/{stem}.txt has {len(labels)} labels, and {len(ids)} track ids; pass one each")
+            raise TrackingError(
+                f"{path}/{stem}.txt has {len(labels)} labels, and {len(ids)} track ids; expected as many"
+            )
         lines += [[str(frame), one, *label.split()] for one, label in zip(ids, labels, strict=True)]
     return path, lines, Calibration.read(root / "training/calib" / f"{stem}.txt")
 
@@ -148,13 +150,13 @@ def read_sequence(
     Parameters
     ----------
     root : str or Path
-        As `sequence_names` takes it.
+        As in `sequence_names`.
     name : str
         Such as ``"0000"``.
     classes : sequence of str
         Of `KINDS`.
     boxes : sequence of sequence of Box, optional
-        By frame: detections to take in place of the files.
+        Detections by frame, instead of the files.
 
     Returns
     -------
@@ -163,23 +165,25 @@ def read_sequence(
     Raises
     ------
     TrackingError
-        A file is not laid out as KITTI's are, a class has no folder of detections, or there are not as many frames of
-        boxes as of labels.
+        A file does not have KITTI's format, a class has no folder of detections, or there are fewer frames of boxes
+        than of labels.
     OSError
         A file cannot be read.
     """
     root = Path(root)
     label_path, labels, calibration = _labels(root, name)
     try:
-        values = np.array([[*words[:2], *words[3:17]] for words in labels], np.float64).reshape(-1, 16)
+        values = np.array([[*columns[:2], *columns[3:17]] for columns in labels], np.float64).reshape(-1, 16)
     except ValueError as exc:
-        raise TrackingError(f"{label_path} holds no KITTI tracking labels; expected 17 columns") from exc
-    kinds = np.array([words[2].lower() for words in labels], np.str_)
+        raise TrackingError(f"{label_path} is not a file of KITTI tracking labels; expected 17 columns") from exc
+    kinds = np.array([columns[2].lower() for columns in labels], np.str_)
     n_frames = 1 + int(values[:, 0].max(initial=-1.0))
     if boxes is None:
         detections = _read_detections(root, name, classes, calibration, n_frames)
     elif len(boxes) < n_frames:
-        raise TrackingError(f"got boxes of {len(boxes)} frames for {n_frames} of {label_path}; pass one line a frame")
+        raise TrackingError(
+            f"got boxes of {len(boxes)} frames for {n_frames} of {label_path}; pass one line for each frame"
+        )
     else:
         detections = [list(of_frame) for of_frame in boxes]
     n_frames = len(detections)
@@ -211,13 +215,13 @@ def _read_detections(
     for of in classes:
         folders = sorted((root / "detections").glob(f"*_{of.capitalize()}"))
         if not folders:
-            raise TrackingError(f"{root}/detections has no folder *_{of.capitalize()}; expected one for every class")
+            raise TrackingError(f"{root}/detections has no folder *_{of.capitalize()}; expected one for each class")
         path = folders[0] / f"{name}.txt"
         try:
             lines = [line.split(",") for line in path.read_text().splitlines() if line.strip()]
             rows = np.array(lines, np.float64).reshape(-1, 15)
         except ValueError as exc:
-            raise TrackingError(f"{path} holds no detections; expected 15 comma-separated columns") from exc
+            raise TrackingError(f"{path} is not a file of detections; expected 15 comma-separated columns") from exc
         detections += [[] for _ in range(len(detections), 1 + int(rows[:, 0].max(initial=-1.0)))]
         scores = 1.0 / (1.0 + np.exp(-rows[:, 6]))
         placed = calibration.sensor_boxes(rows[:, 7:14])
@@ -239,11 +243,11 @@ def track_sequence(
     Returns
     -------
     tracks : list of Tracks
-        A frame each.
+        One for each frame.
     seconds : float
-        Spent in the tracker.
+        Time spent in the tracker.
     """
-    # The labels and these detections cover what the left colour camera sees.
+    # Labels and detections cover the field of view of the left color camera.
     (fx, _, cx), width_px = sequence.calibration.P2[0, :3], IMAGE_SIZE[0]
     edges = math.degrees(math.atan(cx / fx)), -math.degrees(math.atan((width_px - cx) / fx))
     tracker = Tracker(parameters, field_of_view_deg=edges)
@@ -254,23 +258,23 @@ def track_sequence(
     return tracks, time.perf_counter() - start
 
 
-def judged(sequence: TrackingSequence, tracks: Sequence[Tracks], of: str) -> list[FrameTracks]:
-    """The tracks of one class as the metrics take them, by frame; which are excused is said by the image."""
+def _frame_tracks(sequence: TrackingSequence, tracks: Sequence[Tracks], of: str) -> list[FrameTracks]:
+    """The tracks of one class by frame, for the metrics."""
     frames = []
-    for told, unlabelled in zip(tracks, sequence.unlabelled, strict=True):
-        mine = np.flatnonzero([label in KINDS[of] for label in told.labels])
-        boxes = told.boxes[mine]
+    for in_frame, unlabelled in zip(tracks, sequence.unlabelled, strict=True):
+        mine = np.flatnonzero([label in KINDS[of] for label in in_frame.labels])
+        boxes = in_frame.boxes[mine]
         excused = _excused(boxes, unlabelled, sequence.calibration)
-        with np.errstate(divide="ignore"):  # log odds, as the detections have them: shares near 1 lie too close
-            scores = np.log(told.scores[mine]) - np.log1p(-told.scores[mine])
-        frames.append(FrameTracks(told.ids[mine], boxes, np.clip(scores, -36.0, 36.0), excused))
+        with np.errstate(divide="ignore"):  # log odds, like the detections' scores: probabilities near 1 are too close
+            scores = np.log(in_frame.scores[mine]) - np.log1p(-in_frame.scores[mine])
+        frames.append(FrameTracks(in_frame.ids[mine], boxes, np.clip(scores, -36.0, 36.0), excused))
     return frames
 
 
 def _excused(
     boxes: NDArray[np.float64], unlabelled: NDArray[np.float64], calibration: Calibration
 ) -> NDArray[np.bool_]:
-    """Boxes that look no larger than 25 pixels, or lie by more than half in a region where nothing was labelled."""
+    """Boxes at most 25 pixels high in the image, or with more than half of their image area in DontCare."""
     signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
     local = signs[None] * boxes[:, None, 3:6]
     cos, sin = np.cos(boxes[:, 6])[:, None], np.sin(boxes[:, 6])[:, None]
@@ -279,15 +283,15 @@ def _excused(
     corners = np.stack([x, y, boxes[:, 2:3] + local[..., 2]], axis=-1)
     pixel, depth = calibration.to_image(corners.reshape(-1, 3))
     pixel, depth = pixel.reshape(-1, 8, 2), depth.reshape(-1, 8)
-    ahead = depth > 0.1  # a corner beside or behind the camera has no pixel
+    ahead = depth > 0.1  # a corner behind the camera has no pixel
     low = np.where(ahead[..., None], pixel, np.inf).min(axis=1).clip(0.0, IMAGE_SIZE)
     high = np.where(ahead[..., None], pixel, -np.inf).max(axis=1).clip(0.0, IMAGE_SIZE)
     size = np.maximum(high - low, 0.0)
     hidden = (size[:, 1] <= MIN_HEIGHT_PX) | (size[:, 0] <= 0.0)
     for left, top, right, bottom in unlabelled:
         shared = np.minimum(high, [right, bottom]) - np.maximum(low, [left, top])
-        inside = np.where((shared > 0.0).all(axis=1), shared.prod(axis=1), 0.0)
-        hidden |= inside > MIN_UNLABELLED * np.maximum(size.prod(axis=1), 1e-9)
+        overlap = np.where((shared > 0.0).all(axis=1), shared.prod(axis=1), 0.0)
+        hidden |= overlap > MIN_UNLABELLED * np.maximum(size.prod(axis=1), 1e-9)
     return hidden
 
 
@@ -301,35 +305,34 @@ def evaluate_kitti(
     iou_threshold: float = 0.25,
     on_sequence: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Track KITTI's sequences and hold the tracks against the labels.
+    """Run the tracker over KITTI's sequences and evaluate the tracks.
 
-    One tracker follows all classes together; no ego poses are used.
+    One tracker tracks all classes together, without ego poses.
 
     Parameters
     ----------
     root : str or Path
-        As `sequence_names` takes it, with ``detections`` or with ``boxes``.
+        As in `sequence_names`, with ``detections`` unless ``boxes`` are passed.
     sequences : sequence of str, optional
-        By default all that have labels.
+        Default: all with labels.
     classes : sequence of str
     parameters : mapping of str to ClassParameters, optional
     boxes : mapping of str to sequence of sequence of Box, optional
-        By sequence and frame: detections to take in place of the files.
+        Detections by sequence and frame, instead of the files.
     iou_threshold : float
-        3-D overlap that makes a match.
+        Least 3-D IoU of a match.
     on_sequence : callable, optional
-        Called with sequences done and sequences there are.
+        Called with the number of sequences done and the number of all sequences.
 
     Returns
     -------
     dict
-        ``sequences``, ``iou_threshold``, ``frames_per_s``, and by class the figures of `TrackingScores`. Numbers and
-        strings alone, fit for JSON.
+        For JSON: ``sequences``, ``iou_threshold``, ``frames_per_s``, and in ``classes`` the `TrackingScores` of each.
 
     Raises
     ------
     TrackingError
-        There is no such data, or a file cannot be understood.
+        There is no such data, or a file is malformed.
     """
     root = Path(root)
     names = list(sequences or sequence_names(root))
@@ -341,7 +344,7 @@ def evaluate_kitti(
         tracks, took = track_sequence(sequence, parameters)
         n_frames, seconds = n_frames + len(tracks), seconds + took
         for of in classes:
-            pairs[of].append((sequence.truth[of], judged(sequence, tracks, of)))
+            pairs[of].append((sequence.truth[of], _frame_tracks(sequence, tracks, of)))
         if on_sequence is not None:
             on_sequence(done, len(names))
     return {
@@ -355,7 +358,7 @@ def evaluate_kitti(
 def perceive_drive(
     perceive: Perceiver, scans: Mapping[int, Path], drive: str, on_scan: Callable[[], None] = lambda: None
 ) -> list[list[Box]]:
-    """Boxes that a perceiver finds in the scans of a drive, by frame.
+    """Boxes that a perceiver detects in the scans of a drive, by frame.
 
     Parameters
     ----------
@@ -364,7 +367,7 @@ def perceive_drive(
         By frame; a frame without a scan has no boxes.
     drive : str
     on_scan : callable
-        Called after each.
+        Called after each scan.
 
     Returns
     -------

@@ -1,6 +1,6 @@
-"""How right tracks are: CLEAR-MOT, its averages over recall (AB3DMOT), HOTA.
+"""Tracking metrics: CLEAR-MOT, its averages over recall (AB3DMOT), HOTA.
 
-A box is a row ``x, y, z, length, width, height, yaw``: middle [m], extents [m], heading about +z from +x [rad].
+A box is a row ``x, y, z, length, width, height, yaw``: center [m], extents [m], heading about +z from +x [rad].
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ HOTA_ALPHAS = np.linspace(0.05, 0.95, 19)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTruth:
-    """What there is in one frame.
+    """True objects of one frame.
 
     Attributes
     ----------
     ids : (n,) int64
-        Which object each box is of; the same from frame to frame.
+        Object of each box, the same in all frames.
     boxes : (n, 7) float64
     ignored : (n,) bool
-        Objects that need not be found and may be: hidden, cut by the image, of a neighbouring class.
+        Objects that need not be found but may be: occluded, truncated, or of a neighboring class.
     """
 
     ids: NDArray[np.int64]
@@ -54,16 +54,16 @@ class FrameTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTracks:
-    """What a tracker said of one frame.
+    """Tracks of one frame.
 
     Attributes
     ----------
     ids : (m,) int64
     boxes : (m, 7) float64
     scores : (m,) float64
-        A track is judged by the mean of its scores over all its frames.
+        The score of a track is the mean of its scores over all its frames.
     excused : (m,) bool
-        Boxes that are no mistake where they match nothing: too small to be seen, or where nothing was labelled.
+        Boxes that are no false positive if they match nothing: too small in the image, or in a region without labels.
     """
 
     ids: NDArray[np.int64]
@@ -74,22 +74,22 @@ class FrameTracks:
 
 @dataclass(frozen=True, slots=True)
 class Clear:
-    """CLEAR-MOT counts of the tracks above one score; KUL-Seg's Table 7 calls them false alarms, missed and ID SW.
+    """CLEAR-MOT counts of the tracks above one score (in KUL-Seg's Table 7: false alarms, missed, ID SW).
 
     Attributes
     ----------
     threshold : float
-        Smallest mean score of the tracks that were counted.
+        Lowest mean score of a counted track.
     n_truth : int
-        Boxes to be found, without those ignored.
+        True boxes, without ignored ones.
     n_found : int
-        Matched boxes, with those ignored.
+        Matched true boxes, with ignored ones.
     n_false, n_missed : int
         False alarms and missed detections.
     n_switches, n_fragments : int
-        How often an object changed its track from one frame to the next; how often its track was taken up again.
+        How often the track of an object changed from one frame to the next; how often it was resumed after a gap.
     mota, motp : float
-        Accuracy, 1 - (missed + false + switches) / truth; mean overlap of the matches. NaN where nothing was there.
+        Accuracy, 1 - (missed + false + switches) / truth; mean IoU of the matches. NaN without true boxes, or matches.
     """
 
     threshold: float
@@ -103,19 +103,19 @@ class Clear:
     motp: float
 
     def scaled_mota(self, recall: float) -> float:
-        """MOTA of which the objects beyond ``recall`` are not held against the tracker, in 0..1 (AB3DMOT, sMOTA)."""
+        """MOTA that does not count objects beyond ``recall`` as missed, in 0..1 (AB3DMOT's sMOTA)."""
         errors = self.n_missed + self.n_false + self.n_switches - (1.0 - recall) * self.n_truth
         return min(1.0, max(0.0, 1.0 - errors / (recall * self.n_truth)))
 
 
 @dataclass(frozen=True, slots=True)
 class Hota:
-    """Higher order tracking accuracy, means over the overlaps 0.05, 0.10 .. 0.95 (Luiten et al., IJCV 2020).
+    """Higher order tracking accuracy, mean over the IoU thresholds 0.05, 0.10 .. 0.95 (Luiten et al., IJCV 2020).
 
     Attributes
     ----------
     hota, deta, assa : float
-        The whole, its detection and its association accuracy, in 0..1; NaN where nothing was there.
+        HOTA, detection accuracy and association accuracy, in 0..1; NaN without truth and tracks.
     """
 
     hota: float
@@ -125,27 +125,26 @@ class Hota:
 
 @dataclass(frozen=True, slots=True)
 class TrackingScores:
-    """Every figure of one class.
+    """All figures of one class.
 
     Attributes
     ----------
     samota, amota, amotp : float
-        Means over forty recalls of the scaled MOTA, of MOTA and of MOTP (AB3DMOT); recalls that are never reached
-        count as 0.
-    told : Clear
-        Of every track, whatever its score: what a user of the tracker sees.
+        Means over forty recalls of scaled MOTA, MOTA and MOTP (AB3DMOT); a recall that is never reached counts as 0.
+    all_tracks : Clear
+        Of all reported tracks, with any score.
     best : Clear
         At the score threshold with the highest MOTA.
     hota : Hota
-        There too.
+        At the same threshold.
     n_frames, n_objects : int
-        Frames judged, objects (tracks of the truth) in them that are not ignored throughout.
+        Number of frames, and of true objects that are not ignored in all of them.
     """
 
     samota: float
     amota: float
     amotp: float
-    told: Clear
+    all_tracks: Clear
     best: Clear
     hota: Hota
     n_frames: int
@@ -153,7 +152,7 @@ class TrackingScores:
 
 
 def box_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
-    """Share of space that every box of ``a`` has in common with every one of ``b``: 3-D intersection over union.
+    """3-D intersection over union of each box of ``a`` with each box of ``b``.
 
     Parameters
     ----------
@@ -163,7 +162,7 @@ def box_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     Returns
     -------
     (n, m) float64
-        In 0..1; 0 where a box is not finite or has no volume.
+        In 0..1; 0 if a box is not finite or has no volume.
     """
     first = np.asarray(a, dtype=np.float64).reshape(-1, 7)
     second = np.asarray(b, dtype=np.float64).reshape(-1, 7)
@@ -179,24 +178,24 @@ def box_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
 
 
 def recall_thresholds(scores: ArrayLike, n_truth: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Scores at which the recall comes nearest to 1/40, 2/40 .. 1 (AB3DMOT's protocol, after KITTI's).
+    """Scores at which the recall is nearest to 1/40, 2/40 .. 1 (AB3DMOT's protocol, after KITTI's).
 
     Parameters
     ----------
     scores : (n,) array_like
-        Of the tracks that were matched, one for each match.
+        Score of the matched track, for each match.
     n_truth : int
-        Matches there could have been.
+        Number of possible matches.
 
     Returns
     -------
     thresholds, recalls : (k,) float64
-        k up to 40, thresholds falling. The lowest score stands for the first recall that is not reached.
+        k is at most 40, thresholds fall. The lowest score stands for the first recall that is not reached.
     """
     falling = np.sort(np.asarray(scores, dtype=np.float64))[::-1]
     at: list[int] = []
     for k in range(N_RECALLS + 1):
-        # Of the ranks on both sides of the recall wanted, the nearer; every rank serves once.
+        # The rank nearest to the recall; each rank is used once.
         rank = max(at[-1] + 1 if at else 0, math.ceil(k * n_truth / N_RECALLS - 1.5))
         if rank >= len(falling) - 1:
             if len(falling) and (not at or at[-1] < len(falling) - 1):
@@ -209,18 +208,18 @@ def recall_thresholds(scores: ArrayLike, n_truth: int) -> tuple[NDArray[np.float
 def evaluate_tracks(
     sequences: Sequence[tuple[Sequence[FrameTruth], Sequence[FrameTracks]]], iou_threshold: float = 0.25
 ) -> TrackingScores:
-    """Hold the tracks of any number of sequences against the truth, as AB3DMOT's protocol does.
+    """Evaluate the tracks of any number of sequences by AB3DMOT's protocol.
 
-    In each frame truth and tracks are paired so that as many overlap by ``iou_threshold`` as can, and among such
-    pairings so that they overlap most. All tracks take part first; then, for forty recalls, those whose mean score
-    reaches the threshold of that recall.
+    In each frame, true boxes and tracks are matched for the largest number of pairs with at least ``iou_threshold``,
+    and among those for the largest sum of IoU. This is done for all tracks, and then for each of forty recalls, with
+    the tracks whose mean score reaches the threshold of that recall.
 
     Parameters
     ----------
     sequences : sequence of (sequence of FrameTruth, sequence of FrameTracks)
-        Frames in order, as many of the one as of the other.
+        Frames in order, as many of truth as of tracks.
     iou_threshold : float
-        3-D overlap that makes a match.
+        Least 3-D IoU of a match.
 
     Returns
     -------
@@ -229,7 +228,7 @@ def evaluate_tracks(
     Raises
     ------
     TrackingError
-        A sequence has not as many frames of tracks as of truth.
+        A sequence has more or fewer frames of tracks than of truth.
     """
     packed = [_Packed(truth, tracks, iou_threshold) for truth, tracks in sequences]
     everything, scores = _clear(packed, -math.inf)
@@ -247,7 +246,7 @@ def evaluate_tracks(
         samota=samota,
         amota=amota,
         amotp=amotp,
-        told=everything,
+        all_tracks=everything,
         best=best,
         hota=_hota(packed, best.threshold),
         n_frames=sum(len(of.shapes) for of in packed),
@@ -256,11 +255,11 @@ def evaluate_tracks(
 
 
 class _Packed:
-    """The frames of one sequence end to end, ids counted from 0, and every pair of truth and track of one frame."""
+    """All frames of one sequence concatenated, ids counted from 0, with all pairs of true box and track of a frame."""
 
     def __init__(self, truth: Sequence[FrameTruth], tracks: Sequence[FrameTracks], iou_threshold: float) -> None:
         if len(truth) != len(tracks):
-            raise TrackingError(f"got {len(tracks)} frames of tracks for {len(truth)} of truth; pass one a frame")
+            raise TrackingError(f"got {len(tracks)} frames of tracks for {len(truth)} of truth; pass one for each")
         self.iou_threshold = iou_threshold
         n_truth, n_tracks = ([len(frame.ids) for frame in frames] for frames in (truth, tracks))
         self.shapes = np.array([n_truth, n_tracks], np.int64).T.reshape(-1, 2)
@@ -270,7 +269,7 @@ class _Packed:
         self.excused = np.concatenate([np.zeros(0, np.bool_), *(frame.excused for frame in tracks)])
         overlaps = [box_iou(a.boxes, b.boxes).ravel() for a, b in zip(truth, tracks, strict=True)]
         self.iou = np.concatenate([np.zeros(0), *overlaps])
-        # Rows of each pair among all true boxes and among all tracks' boxes, in the order of the overlaps.
+        # Rows of each pair among all true boxes and among all boxes of tracks, in the order of ``iou``.
         self.row = np.repeat(np.arange(len(self.truth)), np.repeat(n_tracks, n_truth))
         first = np.repeat(np.cumsum([0, *n_tracks])[:-1], np.multiply(n_truth, n_tracks))
         begun = np.repeat(np.cumsum([0, *np.repeat(n_tracks, n_truth)])[:-1], np.repeat(n_tracks, n_truth))
@@ -280,14 +279,14 @@ class _Packed:
         self.mean_score = np.bincount(self.track, scores, self.n_tracks) / np.maximum(counts, 1)
 
     def matched(self, threshold: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """The pairs made, and which tracks' boxes counted."""
+        """The matched pairs, and which boxes of tracks count."""
         kept = (self.mean_score >= threshold)[self.track]
-        most = 1.0 + float(self.shapes[:, 0].max(initial=0))  # so one pair more outweighs any overlap
+        most = 1.0 + float(self.shapes[:, 0].max(initial=0))  # one more pair outweighs any IoU
         may = kept[self.column] & (self.iou >= self.iou_threshold)
         return self.assigned(np.where(may, most + self.iou, 0.0)), kept
 
     def assigned(self, gain: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Pairs that bring the most gain in every frame, each box in one at most."""
+        """Pairs with the largest sum of gains in each frame; each box is in one pair at most."""
         pair = np.empty(len(self.truth), np.int64)
         fill_pairs(self.shapes, gain, pair)
         return pair[pair >= 0]
@@ -299,7 +298,7 @@ def _counted(ids: Sequence[NDArray[np.int64]]) -> tuple[NDArray[np.int64], int]:
 
 
 def _clear(packed: Sequence[_Packed], threshold: float) -> tuple[Clear, NDArray[np.float64]]:
-    """Counts of the tracks whose mean score reaches the threshold, and the scores of all matches."""
+    """CLEAR-MOT of the tracks whose mean score reaches the threshold, and the scores of all matches."""
     n_truth = n_found = n_false = n_missed = n_switches = n_fragments = 0
     total_overlap = 0.0
     scores = [np.zeros(0)]
@@ -324,19 +323,19 @@ def _clear(packed: Sequence[_Packed], threshold: float) -> tuple[Clear, NDArray[
 
 
 def _hota(packed: Sequence[_Packed], threshold: float) -> Hota:
-    """Ignored truth, what was matched to it, and what is excused take no part."""
+    """HOTA, without ignored true boxes, the tracks matched to them, and excused boxes of tracks."""
     n_found, n_truth, n_tracked = np.zeros(len(HOTA_ALPHAS)), 0, 0
     associated = np.zeros(len(HOTA_ALPHAS))
     for of in packed:
         pair, kept = of.matched(threshold)
-        real, judged = ~of.ignored, kept & ~of.excused
-        judged[of.column[pair]] = real[of.row[pair]]
+        real, counted = ~of.ignored, kept & ~of.excused
+        counted[of.column[pair]] = real[of.row[pair]]
         in_truth = np.bincount(of.truth[real], minlength=int(of.truth.max(initial=-1)) + 1).astype(np.float64)
-        in_track = np.bincount(of.track[judged], minlength=of.n_tracks).astype(np.float64)
+        in_track = np.bincount(of.track[counted], minlength=of.n_tracks).astype(np.float64)
         either = in_truth[:, None] + in_track[None, :]
 
-        # How well each object and each track go together over the whole sequence: HOTA's global alignment.
-        shared = of.iou * real[of.row] * judged[of.column]
+        # HOTA's global alignment: the overlap of each object with each track over the whole sequence.
+        shared = of.iou * real[of.row] * counted[of.column]
         of_truth = np.bincount(of.row, shared, len(of.truth))[of.row]
         of_track = np.bincount(of.column, shared, len(of.track))[of.column]
         names = of.truth[of.row], of.track[of.column]
@@ -352,7 +351,7 @@ def _hota(packed: Sequence[_Packed], threshold: float) -> Hota:
             n_found[k] += len(found)
             associated[k] += (counts * counts / np.maximum(either - counts, 1.0)).sum()
         n_truth += int(np.count_nonzero(real))
-        n_tracked += int(np.count_nonzero(judged))
+        n_tracked += int(np.count_nonzero(counted))
     if n_truth + n_tracked == 0:
         return Hota(math.nan, math.nan, math.nan)
     detection = n_found / (n_truth + n_tracked - n_found)
@@ -362,21 +361,21 @@ def _hota(packed: Sequence[_Packed], threshold: float) -> Hota:
 
 @njit(cache=True, nogil=True)
 def fill_assignment(gain: NDArray[np.float64], column: NDArray[np.int64]) -> None:
-    """Write the column of each row, so that the gains sum to the most; -1 for rows better left alone.
+    """Assign columns to rows for the largest sum of gains; -1 for rows without a column.
 
-    Shortest augmenting paths (Jonker and Volgenant 1987) over the columns and one spare for each row.
+    Shortest augmenting paths (Jonker and Volgenant 1987) over the columns and one dummy column for each row.
 
     Parameters
     ----------
     gain : (n, m) float64
-        Pairs with no gain above 0 are never made.
+        A pair whose gain is not above 0 is never made.
     column : (n,) int64, overwritten
     """
     n, m = gain.shape
     width = m + n
     row_price = np.zeros(n + 1)
     price = np.zeros(width + 1)
-    owner = np.full(width + 1, -1, np.int64)  # the last column is where each search starts
+    owner = np.full(width + 1, -1, np.int64)  # each search starts at the last column
     for start in range(n):
         owner[width] = start
         reached = np.full(width, np.inf)
@@ -419,16 +418,16 @@ def fill_assignment(gain: NDArray[np.float64], column: NDArray[np.int64]) -> Non
 
 @njit(cache=True, nogil=True)
 def fill_pairs(shapes: NDArray[np.int64], gain: NDArray[np.float64], pair: NDArray[np.int64]) -> None:
-    """Pair truth and tracks of every frame so that the gains sum to the most.
+    """Match true boxes and tracks in each frame for the largest sum of gains.
 
     Parameters
     ----------
     shapes : (frames, 2) int64
-        True boxes and tracks' boxes of each frame.
+        Number of true boxes and of tracks in each frame.
     gain : (pairs,) float64
-        Of every pair of one frame, truth by truth; none of 0 is made.
+        Gain of each pair of a frame, ordered by true box; a pair whose gain is not above 0 is never made.
     pair : (truths,) int64, overwritten
-        Which pair was made with each true box; -1 for none.
+        Index of the pair of each true box; -1 for none.
     """
     first, begun = 0, 0
     for n, m in shapes:
@@ -442,21 +441,21 @@ def fill_pairs(shapes: NDArray[np.int64], gain: NDArray[np.float64], pair: NDArr
 
 @njit(cache=True, nogil=True)
 def count_breaks(truth: NDArray[np.int64], ids: NDArray[np.int64], ignored: NDArray[np.bool_]) -> tuple[int, int]:
-    """ID switches and fragments, counted as KITTI's and AB3DMOT's evaluation do.
+    """Count ID switches and fragments as in KITTI's and AB3DMOT's evaluation.
 
     Parameters
     ----------
     truth : (n,) int64
-        Object of each true box, frame after frame.
+        Object of each true box, in the order of frames.
     ids : (n,) int64
-        Track that it was matched to; -1 for none.
+        Track matched to each true box; -1 for none.
     ignored : (n,) bool
 
     Returns
     -------
     switches, fragments : int
-        A switch: tracked in this frame and the last, by different tracks. A fragment: taken up by another track, or
-        again, and kept for the next frame too. An ignored box makes a new beginning.
+        A switch: the object is tracked in this and the previous frame, by different tracks. A fragment: it is tracked
+        by another track than before, or again after a gap, and in the next frame too. An ignored box resets both.
     """
     switches = 0
     fragments = 0

@@ -1,8 +1,9 @@
-"""From boxes, scan by scan, to objects with identity and speed: IMM-UKF-JPDA (KUL-Seg, section 6).
+"""Multi-object tracking: boxes of successive scans -> tracks with identity and velocity (IMM-UKF-JPDA, KUL-Seg 6).
 
-`Tracker` joins the stages: `imm` mixes three motions, `ukf` predicts and updates each by sigma points, `jpda` says
-which detection is of which track, `egomotion` finds the sensor's own motion where nobody gives it. `metrics` and
-`kitti` judge what comes out.
+`tracker` runs the method step by step. `imm` mixes three motion models, `ukf` predicts and updates each of them by
+sigma points, `jpda` associates detections with tracks, `lives` begins and ends tracks, and `egomotion` estimates the
+motion of the sensor if no poses are given. `tracks` holds the results and the parameters of each class.
+`edgeperc.evaluation.tracking` evaluates the tracks.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The sensor's own motion, from what stands still around it: a robust rigid fit on the ground.
+"""The motion of the sensor on the ground, by a robust rigid fit to tracked objects.
 
-Where nobody gives poses, tracked objects are the landmarks. What the fit yields is the motion that carries most of the
-detections onto the places their tracks predict; objects that move otherwise have little say.
+Used if no poses are given. The fit finds the motion that moves most detections to the places that their tracks predict.
+Objects that move on their own are outliers with little weight.
 """
 
 from __future__ import annotations
@@ -27,34 +27,34 @@ def fit_motion(
     motion: NDArray[np.float64],
     covariance: NDArray[np.float64],
 ) -> int:
-    """Fit the rigid motion that lays detections onto the predicted places of tracks.
+    """Fit the rigid motion that moves detections to the predicted places of tracks.
 
     Parameters
     ----------
     landmarks : (n, 4) float64
-        x, y [m] of tracks as predicted, in the sensor's frame of the scan before, the variance of either coordinate
-        [m2], and the group of classes that may be taken for one another.
+        Predicted x, y [m] of tracks in the previous sensor frame, the variance of each coordinate [m2], and the group
+        of classes that may be confused.
     detections : (m, 4) float64
-        Likewise, in the sensor's frame of now.
+        The same columns, in the current sensor frame.
     prior : (3,) float64
-        Motion expected: x, y [m], turn [rad] of the sensor now, in its frame of before.
+        Expected motion: x, y [m] and turn [rad] of the sensor in its previous frame.
     prior_variances : (3,) float64
     motion : (3,) float64, overwritten
-        The fit; the prior where no detection fits any track.
+        The fit; the prior if no detection fits any track.
     covariance : (3, 3) float64, overwritten
         Of the fit.
 
     Returns
     -------
     n_pairs : int
-        Tracks that were laid onto a detection.
+        Tracks that were matched to a detection.
 
     Notes
     -----
-    Every pair proposes the shift and the turn that lay the one onto the other, if within three standard deviations of
-    the prior, at most 256 in all; the proposal that fits best as a whole (`support`) starts Gauss and Newton's
-    iteration, in which each track follows its nearest detection with the weight of Geman and McClure,
-    1 / (1 + r2 / 9)^2, r the distance in standard deviations.
+    Each pair proposes the shift, and the turn, that moves the detection to the track, if it lies within three standard
+    deviations of the prior; there are at most 256 proposals. A Gauss-Newton iteration starts from the proposal with the
+    largest `support`. In it, each track is matched to its nearest detection with the weight of Geman and McClure,
+    1 / (1 + r2 / 9)^2, where r is the distance in standard deviations.
     """
     motion[:] = prior
     best = support(landmarks, detections, prior, prior_variances, motion)
@@ -67,7 +67,7 @@ def fit_motion(
             x, y = detections[j, 0], detections[j, 1]
             if landmarks[i, 3] != detections[j, 3]:
                 continue
-            # A shift alone or a turn alone: far away a turn moves a landmark by more than any drive does.
+            # Either a shift or a turn: far away, a small turn moves a landmark more than any shift does.
             shift_x = landmarks[i, 0] - prior[0] - (cos * x - sin * y)
             shift_y = landmarks[i, 1] - prior[1] - (sin * x + cos * y)
             turn = math.atan2(landmarks[i, 1] - prior[1], landmarks[i, 0] - prior[0]) - math.atan2(y, x) - prior[2]
@@ -137,9 +137,10 @@ def support(
     prior_variances: NDArray[np.float64],
     motion: NDArray[np.float64],
 ) -> float:
-    """How well a motion fits: minus its departure from the prior and the robust distances of all tracks.
+    """Score of a motion, at most 0: minus its distance from the prior, minus the robust distances of all tracks.
 
-    The robust distance is Geman and McClure's r2 / (1 + r2 / 9) / 2, at most 4.5; a track without detection has that.
+    The robust distance is Geman and McClure's r2 / (1 + r2 / 9) / 2, which stays below 4.5, the cost of a track without
+    a detection.
     """
     total = 0.0
     for a in range(3):
@@ -154,7 +155,7 @@ def support(
 def nearest_detection(
     landmark: NDArray[np.float64], detections: NDArray[np.float64], motion: NDArray[np.float64]
 ) -> tuple[int, float]:
-    """The detection nearest to a landmark under a motion, and their squared distance in variances; -1 for none."""
+    """The detection nearest to a landmark under a motion, -1 for none, and their squared distance in variances."""
     cos, sin = math.cos(motion[2]), math.sin(motion[2])
     nearest, smallest = -1, np.inf
     for j in range(len(detections)):
@@ -168,6 +169,7 @@ def nearest_detection(
     return nearest, smallest
 
 
+# As in `ukf`: a cached kernel that called a kernel of another file would not notice changes of that file.
 @njit(cache=True, nogil=True)
 def fill_inverse(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> None:
     """Invert a symmetric positive definite (3, 3) matrix by its cofactors."""

@@ -1,4 +1,4 @@
-"""The interacting multiple model: interaction, mode probabilities, combination (KUL-Seg, section 6 and Figure 10)."""
+"""The interacting multiple model: interaction, mode probabilities, combination (KUL-Seg 6 and Figure 10)."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ def fill_interaction(
     mixed_covariances: NDArray[np.float64],
     prior: NDArray[np.float64],
 ) -> None:
-    """Mix the motions' estimates by a Markov chain (KUL-Seg's "interaction").
+    """Mix the estimates of the motion models by a Markov chain (KUL-Seg's "interaction").
 
     Parameters
     ----------
     states : (n, k, s) float64
-        Of k motions.
+        One for each of k motion models.
     covariances : (n, k, s, s) float64
     probabilities : (n, k) float64
-        Of each motion after the last update.
+        Of each motion model after the last update.
     stay : (n,) float64
-        Probability that a track keeps its motion; the others share the rest.
+        Probability that a track keeps its motion model; the others share the rest.
     mixed : (n, k, s) float64, overwritten
-        Where each motion's filter starts from: x0_j = sum_i w_ij x_i with w_ij = p_ij mu_i / prior_j.
+        Initial state of each filter: x0_j = sum_i w_ij x_i with w_ij = p_ij mu_i / prior_j.
     mixed_covariances : (n, k, s, s) float64, overwritten
         sum_i w_ij (P_i + (x_i - x0_j)(x_i - x0_j)')
     prior : (n, k) float64, overwritten
@@ -66,21 +66,21 @@ def fill_mode_probabilities(
     shares: NDArray[np.float64],
     probabilities: NDArray[np.float64],
 ) -> None:
-    """Share the association among the motions, and weigh the motions by it (KUL-Seg's "mode probability update").
+    """Update the probability of each motion model by the association (KUL-Seg's "mode probability update").
 
-    Bayes' rule for motion j and detection d together: P(j, d) = beta_d prior_j L_jd / sum_i prior_i L_id. Its sums
-    over d are the motions' probabilities, its shares within a motion the association that the motion's filter sees.
+    Bayes' rule for motion model j and detection d: P(j, d) = beta_d prior_j L_jd / sum_i prior_i L_id. The sum over d
+    is the probability of model j. P(j, d) divided by that sum is the association that the filter of model j uses.
 
     Parameters
     ----------
     prior : (n, k) float64
         From `fill_interaction`.
     likelihoods : (n, k, m) float64
-        Of each detection under each motion; 0 out of the gate.
+        Of each detection under each motion model; 0 outside the gate.
     beta : (n, m + 1) float64
-        Probability that the track was not detected, and that each detection is the track's.
+        Probability that the track was not detected, and that each detection belongs to it.
     shares : (n, k, m + 1) float64, overwritten
-        Of each motion, summing to 1.
+        Association for each motion model, summing to 1.
     probabilities : (n, k) float64, overwritten
     """
     n, k, m = likelihoods.shape
@@ -107,7 +107,7 @@ def fill_mode_probabilities(
                     shares[t, j, d] /= total
             else:
                 shares[t, j, 0] = 1.0
-            # A motion that no longer has any weight could never come back, and its share would be 0 / 0.
+            # A model with probability 0 could never recover, and its association would be 0 / 0.
             probabilities[t, j] = max(total, 1e-12)
         probabilities[t] /= probabilities[t].sum()
 
@@ -120,7 +120,7 @@ def fill_combined(
     state: NDArray[np.float64],
     covariance: NDArray[np.float64],
 ) -> None:
-    """Join the motions' estimates into one a track (KUL-Seg's "combination").
+    """Combine the estimates of the motion models into one for each track (KUL-Seg's "combination").
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Joint probabilistic data association: which detection is of which track (KUL-Seg, section 6).
+"""Joint probabilistic data association of detections with tracks (KUL-Seg 6).
 
-Tracks that share no detection in their gates are solved apart. A cluster of few joint events is solved by going through
-all of them, a larger one by loopy belief propagation (Williams and Lau, "Approximate evaluation of marginal association
-probabilities with belief propagation", IEEE Trans. AES 2014), so the time a frame takes is bounded.
+Clusters of tracks that share no detection are solved separately. A cluster with few joint events is solved exactly, by
+enumeration. A larger one is approximated by loopy belief propagation (Williams and Lau, "Approximate evaluation of
+marginal association probabilities with belief propagation", IEEE Trans. AES 2014), so the time of a scan is bounded.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["MAX_EVENTS", "fill_association", "fill_by_propagation", "fill_likeli
 MAX_EVENTS = 4096
 MAX_ROUNDS = 200
 TOLERANCE = 1e-6
-LARGEST_WEIGHT = 1e15  # surer than sure; keeps the products of a cluster finite
+LARGEST_WEIGHT = 1e15  # practically certain; keeps the products of a cluster finite
 
 
 @njit(cache=True, nogil=True)
@@ -35,41 +35,41 @@ def fill_likelihoods(
     likelihoods: NDArray[np.float64],
     weights: NDArray[np.float64],
 ) -> None:
-    """Write the likelihood of every detection under every motion of every track, and what it weighs in all.
+    """Write the likelihood of each detection under each motion model of each track, and its association weight.
 
     Parameters
     ----------
     means : (n, 3, 5) float64
     predicted : (n, 3, 5, 5) float64
-        Of x, y, v, heading, turn rate.
+        Covariances of x, y, v, heading, turn rate.
     sigmas : (n, 3) float64
         Standard deviations of a detection along and across the heading [m] and of the heading [rad].
     prior : (n, 3) float64
-        Probability of each motion.
+        Probability of each motion model.
     odds : (n,) float64
         P_D / ((1 - P_D) lambda) [m2 rad]: detection probability, density of clutter.
     groups : (n,) int64
-        Classes that may be mistaken for one another; others never meet.
+        Group of classes that may be confused; a detection of another group is never associated.
     detections : (m, 3) float64
         x, y [m], heading [rad].
     detection_groups : (m,) int64
     gates : (n,) float64
-        Largest Mahalanobis distance of the place from the nearest of the motions.
+        Largest Mahalanobis distance of the place from the nearest motion model.
     likelihoods : (n, 3, m) float64, overwritten
-        [1/(m2 rad)]; 0 for all motions out of the gate.
+        [1/(m2 rad)]; 0 for all motion models if the detection is outside the gate.
     weights : (n, m) float64, overwritten
         odds_t sum_k prior_tk L_tkj, as `fill_association` takes them.
 
     Notes
     -----
-    A heading counts modulo pi, for a box looks the same from behind. Detectors are at times wrong by a right angle, so
-    a deviation of more than three standard deviations counts as three.
+    A heading counts modulo pi, because a box looks the same from behind. Detectors are sometimes wrong by a right
+    angle, so a deviation of more than three standard deviations counts as three.
     """
     n, m = len(groups), len(detection_groups)
     likelihoods[:] = 0.0
     weights[:] = 0.0
-    # Of each motion: the covariance of the place, the heading's pull by the place, its variance, limit and norm. Pairs
-    # that are out of the gate, as most are, cost no sine, root or exponential.
+    # For each motion model: covariance of the place, regression of the heading on the place, variance, limit and norm.
+    # Computed once, so that pairs outside the gate, which most are, need no sine, root or exponential.
     forms = np.empty((3, 9))
     for i in range(n):
         gate, reach, apart = gates[i], 0.0, 0.0
@@ -125,16 +125,16 @@ def fill_likelihoods(
 def fill_association(weights: NDArray[np.float64], max_events: int, beta: NDArray[np.float64]) -> int:
     """Write the marginal association probabilities.
 
-    A joint event gives each track one detection or none and each detection to one track at most; its probability is in
-    proportion to the product of the weights of its pairs.
+    A joint event assigns at most one detection to each track and at most one track to each detection. Its probability
+    is proportional to the product of the weights of its pairs.
 
     Parameters
     ----------
     weights : (n, m) float64
-        How much likelier it is that the track made the detection than that the track was missed and the detection is
-        clutter; 0 out of the gate.
+        Likelihood ratio: the track made the detection, over the track was missed and the detection is clutter; 0
+        outside the gate.
     max_events : int
-        A cluster that may have more joint events than this is solved by belief propagation.
+        A cluster whose bound on joint events is larger is solved by belief propagation.
     beta : (n, m + 1) float64, overwritten
         Column 0: the track was not detected. Rows sum to 1.
 
@@ -153,7 +153,7 @@ def fill_association(weights: NDArray[np.float64], max_events: int, beta: NDArra
     for first in range(n):
         if done[first]:
             continue
-        # The cluster: everything that can be reached from here over gated pairs.
+        # The cluster: everything reachable from this track over gated pairs.
         done[first] = True
         rows[0] = first
         n_rows, n_columns, at = 1, 0, 0
@@ -187,7 +187,7 @@ def fill_association(weights: NDArray[np.float64], max_events: int, beta: NDArra
 def fill_by_events(
     weights: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArray[np.int64], beta: NDArray[np.float64]
 ) -> None:
-    """Go through every joint event of one cluster, depth first.
+    """Solve one cluster exactly: enumerate its joint events, depth first.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def fill_by_propagation(
     weights, rows, columns, beta
         As in `fill_by_events`.
     """
-    # Gated pairs alone: in a large cluster they are few of all.
+    # Only gated pairs: they are few in a large cluster.
     n_pairs = 0
     for i in range(len(rows)):
         for j in range(len(columns)):

@@ -1,4 +1,4 @@
-"""Births, lives and views of tracks (kernels)."""
+"""Birth, update and reporting of tracks (kernels)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = [
     "update_shapes",
 ]
 
-# One row a track. Everything the tracker knows of it is here, so that a frame that fails leaves no trace.
+# State of a track. All of it is here, so a scan that raises an error leaves the tracker unchanged.
 TRACK = np.dtype(
     [
         ("id", np.int64),
@@ -48,7 +48,7 @@ TRACK = np.dtype(
     ]
 )
 
-# One row a class seen so far: its parameters as the kernels take them.
+# Parameters of a class, as the kernels use them.
 CLASS = np.dtype(
     [
         ("group", np.int64),
@@ -73,11 +73,12 @@ CLASS = np.dtype(
     ]
 )
 
-# Existence, as log odds: a track is told of above 0 and given up below the least. A detection counts by its score, and
-# for lying where it was expected; without a most, what was long there would be told of long after it is gone.
+# Existence is the log odds that the object is there: a track is reported above 0 and deleted below LEAST_EXISTENCE. A
+# detection adds its score, and EXPECTED for lying in the gate. Without the maximum, an object that was tracked for long
+# would be reported long after it is gone.
 EXPECTED, MOST_EXISTENCE, LEAST_EXISTENCE = 1.0, 5.0, -6.0
 
-# What covers a track may be covering it by a little less than its own box says.
+# An occluding box may be a little larger than its object, so no track counts as wholly hidden.
 MOST_HIDDEN = 0.9
 
 
@@ -92,19 +93,19 @@ def fill_newborn(
     ranges: NDArray[np.float64],
     tracks: NDArray[np.void],
 ) -> None:
-    """Begin a track with each detection; it stands still until the next scan.
+    """Begin a track with each detection, with speed 0.
 
     Parameters
     ----------
     first_id : int
     kinds : (n,) int64
-        Labels.
+        Class of each detection.
     classes : (n,) record
         Parameters of each detection's class.
     detections : (n, 3) float64
         x, y [m], heading [rad].
     shapes : (n, 4) float64
-        Height of the middle, length, width, height [m].
+        Height of the center, length, width, height [m].
     logits : (n,) float64
         Scores.
     ranges : (n,) float64
@@ -143,9 +144,9 @@ def fill_newborn(
 
 @njit(cache=True, nogil=True)
 def mark_out_of_view(
-    tracks: NDArray[np.void], pose: NDArray[np.float64], left: float, right: float, told: NDArray[np.bool_]
+    tracks: NDArray[np.void], pose: NDArray[np.float64], left: float, right: float, reported: NDArray[np.bool_]
 ) -> None:
-    """Leave out tracks that were not detected and of whose footprint a corner lies beyond the field of view.
+    """Do not report undetected tracks with a corner of the footprint outside the field of view.
 
     Parameters
     ----------
@@ -154,11 +155,11 @@ def mark_out_of_view(
         T_world_sensor.
     left, right : float
         Azimuths of the edges [rad].
-    told : (n,) bool
-        Those left out become False.
+    reported : (n,) bool
+        Set to False for these tracks.
     """
     for i in range(len(tracks)):
-        if not told[i] or tracks[i]["misses"] == 0:
+        if not reported[i] or tracks[i]["misses"] == 0:
             continue
         state, shape = tracks[i]["state"], tracks[i]["shape"]
         cos, sin = math.cos(state[3]), math.sin(state[3])
@@ -169,7 +170,7 @@ def mark_out_of_view(
             y = state[1] + along * sin + across * cos - pose[1, 3]
             azimuth = math.atan2(x * pose[0, 1] + y * pose[1, 1], x * pose[0, 0] + y * pose[1, 0])
             if not right <= azimuth <= left:
-                told[i] = False
+                reported[i] = False
 
 
 @njit(cache=True, nogil=True)
@@ -180,20 +181,20 @@ def fill_hidden(
     sensor: NDArray[np.float64],
     hidden: NDArray[np.float64],
 ) -> None:
-    """Write which share of each track stands behind others, seen from the sensor.
+    """Write the share of each track that others hide from the sensor.
 
     Parameters
     ----------
     state : (n, 5) float64
         x, y, v, heading, turn rate.
     shape : (n, 4) float64
-        Height of the middle, length, width, height.
+        Height of the center, length, width, height.
     seen : (n,) bool
-        Tracks detected in this scan; these cover others, and are covered by none.
+        Tracks detected in this scan; they hide others and count as visible.
     sensor : (2,) float64
         x, y [m].
     hidden : (n,) float64, overwritten
-        In 0..1, of nine rays over the width of the footprint.
+        In 0..1: share of nine rays over the width of the footprint.
     """
     n = len(hidden)
     azimuth, half, distance = np.empty(n), np.empty(n), np.empty(n)
@@ -211,7 +212,7 @@ def fill_hidden(
             at = azimuth[i] + half[i] * (0.25 * ray - 1.0)
             for j in range(n):
                 off = at - azimuth[j]
-                off -= 2.0 * math.pi * math.floor(off / (2.0 * math.pi) + 0.5)
+                off -= 2.0 * math.pi * np.floor(off / (2.0 * math.pi) + 0.5)  # math.floor raises on NaN
                 if seen[j] and distance[j] < distance[i] - 1.0 and abs(off) <= half[j]:
                     hidden[i] += 1.0 / 9.0
                     break
@@ -219,41 +220,41 @@ def fill_hidden(
 
 @njit(cache=True, nogil=True)
 def mark_rivals(
-    state: NDArray[np.float64], shape: NDArray[np.float64], strength: NDArray[np.float64], told: NDArray[np.bool_]
+    state: NDArray[np.float64], shape: NDArray[np.float64], strength: NDArray[np.float64], reported: NDArray[np.bool_]
 ) -> None:
-    """Leave out tracks whose middle lies in a stronger one's footprint, or the other way round.
+    """Do not report a track if its center lies in the footprint of a stronger track, or the other way round.
 
-    No two things share a place, whatever a detector calls them: a cyclist is often found as a pedestrian, too.
+    Two objects cannot share a place: a cyclist, for example, is often detected as a pedestrian too.
 
     Parameters
     ----------
     state : (n, 5) float64
         x, y, v, heading, turn rate.
     shape : (n, 4) float64
-        Height of the middle, length, width, height.
+        Height of the center, length, width, height.
     strength : (n,) float64
-        Of equals the earlier stays.
-    told : (n,) bool
-        Those left out become False.
+        Of equally strong tracks, the first is reported.
+    reported : (n,) bool
+        Set to False for these tracks.
     """
-    # All of the stronger ones of a track stand before it in this order, so their verdicts are final.
+    # In this order all stronger tracks come before a track, so their flags are final.
     order = np.argsort(-strength, kind="mergesort")
     for b in range(len(order)):
         weak = order[b]
         for a in range(b):
             strong = order[a]
-            if not told[weak]:
+            if not reported[weak]:
                 break
-            if not told[strong]:
+            if not reported[strong]:
                 continue
             dx, dy = state[weak, 0] - state[strong, 0], state[weak, 1] - state[strong, 1]
             reach = 0.5 * max(shape[weak, 1] + shape[weak, 2], shape[strong, 1] + shape[strong, 2])
-            if abs(dx) > reach or abs(dy) > reach:  # as nearly all are, in a tenth of the time
+            if abs(dx) > reach or abs(dy) > reach:  # true of nearly all pairs, and ten times faster
                 continue
             for i in (weak, strong):
                 cos, sin = math.cos(state[i, 3]), math.sin(state[i, 3])
                 if abs(dx * cos + dy * sin) < 0.5 * shape[i, 1] and abs(dy * cos - dx * sin) < 0.5 * shape[i, 2]:
-                    told[weak] = False
+                    reported[weak] = False
 
 
 @njit(cache=True, nogil=True)
@@ -268,25 +269,25 @@ def update_shapes(
     variance: NDArray[np.float64],
     front: NDArray[np.float64],
 ) -> None:
-    """Smooth middle height and size by a Kalman filter each, and vote on which end is the front; in place.
+    """Smooth the height of the center and the size by Kalman filters, and vote for the front end; in place.
 
     Parameters
     ----------
     state : (n, 5) float64
         x, y, v, heading, turn rate after the update.
     beta : (n, m + 1) float64
-        Probability that the track was not detected, and that each detection is the track's.
+        Probability that the track was not detected, and that each detection belongs to it.
     detections : (m, 3) float64
         x, y [m], heading [rad].
     shapes : (m, 4) float64
-        Height of the middle, length, width, height [m].
+        Height of the center, length, width, height [m].
     sigmas : (n, 4) float64
-        Their standard deviations [m].
+        Standard deviations of ``shapes`` [m].
     walk : (4,) float64
-        How far they walk between the scans [m].
+        Standard deviations of their random walks between the scans [m].
     shape, variance : (n, 4) float64
     front : (n,) float64
-        Votes, in -10..10; below 0 the front is behind. What moves, mostly moves forward.
+        Votes, in -10..10; below 0 the heading points to the rear. Most objects move forward.
     """
     for i in range(len(front)):
         vote = 0.5 * math.tanh(state[i, 2] / 3.0)
@@ -316,7 +317,7 @@ def update_lives(
     kinds: NDArray[np.int64],
     dt: float,
 ) -> None:
-    """Count hits and misses, take the label of the majority, weigh how likely each is still there; in place.
+    """Update hits and misses, the label by majority, and the existence of each track; in place.
 
     Parameters
     ----------
@@ -324,13 +325,13 @@ def update_lives(
     classes : (n,) record
         Parameters of each track's class.
     beta : (n, m + 1) float64
-        Probability that the track was not detected, and that each detection is the track's.
+        Probability that the track was not detected, and that each detection belongs to it.
     hidden : (n,) float64
         From `fill_hidden`.
     logits : (m,) float64
         Scores of the detections.
     kinds : (m,) int64
-        Their labels.
+        Classes of the detections.
     dt : float
     """
     for i in range(len(tracks)):
@@ -340,7 +341,7 @@ def update_lives(
             track["chances"] += 1.0 - MOST_HIDDEN * hidden[i]
             track["misses"] += 1
             track["missed_s"] += dt
-            # The odds go by how likely a miss is if something is there, over 1 if nothing is.
+            # Likelihood ratio of a miss: if the object is there, over 1 if it is not.
             track["existence"] += math.log(1.0 - of["detection"] * (1.0 - MOST_HIDDEN * hidden[i]))
             continue
         best = np.argmax(beta[i, 1:])
@@ -348,11 +349,11 @@ def update_lives(
         track["hits"] += 1
         track["chances"] += 1.0
         track["logit_sum"] += logits[best]
-        # Boyer and Moore's vote: a label goes when the others have outnumbered it.
+        # Boyer-Moore majority vote: a label is replaced when the others outnumber it.
         weight = track["label_weight"] + (1.0 if track["label"] == kinds[best] else -1.0)
         if weight < 0.0:
             track["label"] = kinds[best]
         track["label_weight"] = min(abs(weight), 20.0)
-        # What is seen again is worth no less than what is seen for the first time.
+        # A repeated detection counts no less than a first one.
         existence = max(track["existence"], -of["sure_logit"]) + max(logits[best], 0.0) + EXPECTED
         track["existence"] = min(existence, MOST_EXISTENCE)

@@ -1,7 +1,7 @@
-"""The tracker: interaction, prediction, association, mode update, combination, and the life of a track.
+"""The tracker: interaction, prediction, association, mode update, combination, and the life of tracks.
 
-Tracks live in a frame that stands still: the world of the poses given with the scans or, where none are given, the
-sensor's frame of the first scan, followed by what `edgeperc.tracking.egomotion` makes of the objects.
+Tracks are kept in a fixed frame: the world frame of the given poses or, without poses, the sensor frame of the first
+scan, relative to which `edgeperc.tracking.egomotion` estimates the sensor's motion.
 """
 
 from __future__ import annotations
@@ -34,31 +34,33 @@ from .ukf import fill_predictions, fill_updates
 
 __all__ = ["Tracker"]
 
-SMALLEST_SHARE = 1e-13  # scores of 0 and 1 are no surer than that
-SHAPE_WALK_M = np.array([0.5, 0.1, 0.05, 0.05])  # of middle height, length, width and height in a second
+SMALLEST_SHARE = 1e-13  # scores are clipped to this distance from 0 and 1
+SHAPE_WALK_M = np.array([0.5, 0.1, 0.05, 0.05])  # height of the center, length, width and height, after one second
 
-# A vehicle begins anywhere up to motorway speed, and straight ahead; then its speed and turn rate walk.
+# Standard deviations of the sensor's speed along x and y [m/s] and turn rate [rad/s]: at first, up to motorway speed
+# and straight ahead; then of their random walks after one second.
 FIRST_TWIST = np.array([15.0, 1.0, 0.3])
-TWIST_WALK = np.array([4.0, 0.5, 0.5])  # in a second
-TURN_MEMORY_S = 2.0  # a turn that nothing speaks for any longer ends
+TWIST_WALK = np.array([4.0, 0.5, 0.5])
+TURN_MEMORY_S = 2.0  # without evidence, the estimated turn rate decays with this time constant
 MAX_LANDMARKS = 48
 
 
 class Tracker:
-    """Follow objects from scan to scan.
+    """Track objects from scan to scan.
 
-    Takes the boxes of any detector. One instance follows one stream, in one thread; results are yours. An error leaves
-    it as it was before the call.
+    Takes the boxes of any detector. One instance tracks one stream, in one thread. The caller owns the results. An
+    error leaves the tracker unchanged.
 
     Parameters
     ----------
     parameters : mapping of str to ClassParameters, optional
-        By class; those not named keep their defaults, and classes without any are followed like cars, apart from them.
+        By class. Other classes keep their defaults; a class without defaults gets those of cars, in a group of its own.
     field_of_view_deg : tuple of 2 float
-        Azimuths of the detector's left and right edge, counter-clockwise from ahead. What leaves it is not told of any
-        longer. By default all around.
+        Azimuths of the left and right edge of the detector's view, counter-clockwise from ahead. A track that leaves it
+        is no longer reported. Default: the full turn.
     max_tracks : int
-        Tracks kept at a time, tentative ones included; beyond, the weakest go. Bounds memory and the time a scan takes.
+        Largest number of tracks kept, tentative ones included; the least likely are deleted. Bounds the memory and the
+        time of a scan.
 
     Examples
     --------
@@ -82,7 +84,7 @@ class Tracker:
         self.reset()
 
     def reset(self) -> None:
-        """Forget every track, the time and the pose."""
+        """Delete all tracks, and forget the time and the pose."""
         self._labels: list[str] = []
         self._groups: list[str] = []
         self._tracks = np.zeros(0, TRACK)
@@ -90,13 +92,13 @@ class Tracker:
         self._stamp_s = -math.inf
         self._T_world_sensor = np.eye(4)
         self._posed: bool | None = None
-        # Without poses: speed along x and y, turn rate of the sensor, and their variances.
+        # Without poses: the sensor's speed along x and y, turn rate, and their variances.
         self._twist = np.zeros(3)
         self._twist_variances = FIRST_TWIST**2
         self._classes = np.zeros(0, CLASS)
 
     def __call__(self, perception: Perception, T_world_sensor: ArrayLike | None = None) -> Tracks:
-        """Follow the boxes of a perception, at the time that was given with its scan.
+        """Track the boxes of a perception, at the time ``perception.stamp_s``.
 
         Parameters
         ----------
@@ -111,7 +113,7 @@ class Tracker:
         Raises
         ------
         StampError
-            The perception has no stamp, or one that is no later than the last.
+            The perception has no stamp, or one not later than that of the last scan.
         TrackingError
             As in `update`.
         """
@@ -120,31 +122,31 @@ class Tracker:
         return self.update(perception.boxes, perception.stamp_s, T_world_sensor)
 
     def update(self, boxes: Iterable[Box], stamp_s: float, T_world_sensor: ArrayLike | None = None) -> Tracks:
-        """Take in one scan's boxes.
+        """Track the boxes of one scan.
 
         Parameters
         ----------
         boxes : iterable of Box
-            Any detector's, in the sensor's frame; there may be none.
+            From any detector, in the sensor frame; may be empty.
         stamp_s : float
-            When the scan was taken [s]; later than the last.
+            Time of the scan [s], later than that of the last scan.
         T_world_sensor : (4, 4) array_like, optional
-            Pose of the sensor, rigid. Give it with every scan or with none; without, the sensor's motion on the ground
-            is estimated from the objects that stand still. Where only one or two objects are seen, theirs and the
-            sensor's motion cannot be told apart: tracks keep their identity, and speeds over ground mean little.
+            Rigid pose of the sensor. Pass it with every scan or with none. Without poses, the sensor's motion on the
+            ground is estimated from the static objects. With only one or two objects in view, their motion cannot be
+            separated from the sensor's: tracks keep their identity, but speeds over ground are unreliable.
 
         Returns
         -------
         Tracks
-            Those more likely there than not. One that is not detected coasts, in plain sight for a few scans, behind
-            another track for longer.
+            Tracks that are more likely there than not. A track without a detection coasts: for a few scans if it is
+            visible, for longer behind another track.
 
         Raises
         ------
         StampError
-            ``stamp_s`` is not finite, or no later than that of the last scan.
+            ``stamp_s`` is not finite, or not later than that of the last scan.
         TrackingError
-            A box or the pose is not finite or none, or poses come with some scans only.
+            A box or the pose is malformed or not finite, or poses are passed with some scans only.
         """
         stamp_s = float(stamp_s)
         if not math.isfinite(stamp_s) or stamp_s <= self._stamp_s:
@@ -229,11 +231,11 @@ class Tracker:
         logits = _logit(given[:, 7])
         update_lives(tracks, of, beta, hidden, logits, kinds, dt)
 
-        # A detection that is most likely nobody's begins a track.
+        # A detection that most likely belongs to no track begins one.
         own = np.flatnonzero((beta[:, 1:].sum(axis=0) < 0.5) & (logits >= classes["birth_logit"]))
         if len(own):
             ranges = np.hypot(given[own, 0], given[own, 1])
-            joined = np.zeros(n + len(own), TRACK)  # concatenate takes ten times as long over named fields
+            joined = np.zeros(n + len(own), TRACK)  # np.concatenate takes ten times as long with named fields
             joined[:n] = tracks
             fill_newborn(
                 self._next_id, kinds[own], classes[own], detections[own], shapes[own], logits[own], ranges, joined[n:]
@@ -244,15 +246,14 @@ class Tracker:
         self._posed, self._stamp_s, self._tracks, self._T_world_sensor = posed, stamp_s, tracks, pose
         self._next_id += len(own)
         self._twist, self._twist_variances = twist, twist_variances
-        told = tracks["existence"] > 0.0
-        mark_out_of_view(tracks, pose, self._left, self._right, told)
-        mark_rivals(tracks["state"], tracks["shape"], strength_of(tracks), told)
-        return Tracks(
-            tracks[told], self._labels, stamp_s, pose.copy(), int(len(tracks) - np.count_nonzero(told)), n_approximated
-        )
+        reported = tracks["existence"] > 0.0
+        mark_out_of_view(tracks, pose, self._left, self._right, reported)
+        mark_rivals(tracks["state"], tracks["shape"], strength_of(tracks), reported)
+        n_tentative = int(len(tracks) - np.count_nonzero(reported))
+        return Tracks(tracks[reported], self._labels, stamp_s, pose.copy(), n_tentative, n_approximated)
 
     def _kinds(self, names: Sequence[str]) -> NDArray[np.int64]:
-        """Row of each box's class, which is made when it is first met."""
+        """Row of the class of each box; a new class gets a row."""
         for name in names:
             if name in self._labels:
                 continue
@@ -282,7 +283,7 @@ class Tracker:
         classes: NDArray[np.void],
         dt: float,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Where the sensor is by now, how it moves (x, y [m/s], turn [rad/s]) and with what variances."""
+        """Pose of the sensor, its motion (x, y [m/s], turn [rad/s]) and the variances of the motion."""
         if dt == 0.0:
             return self._T_world_sensor, self._twist, self._twist_variances
         seen = np.flatnonzero(tracks["misses"] == 0)
@@ -307,7 +308,7 @@ class Tracker:
         return self._T_world_sensor @ step, motion / dt, np.minimum(np.diag(spread) / dt**2, FIRST_TWIST**2)
 
     def _living(self, tracks: NDArray[np.void]) -> NDArray[np.void]:
-        """Tracks that are not given up; of too many, the likeliest."""
+        """Tracks to keep: above `LEAST_EXISTENCE`, and at most ``max_tracks`` of them."""
         stays = tracks["existence"] > LEAST_EXISTENCE
         if not stays.all():
             tracks = tracks[stays]
@@ -324,7 +325,7 @@ def _checked_boxes(boxes: Iterable[Box]) -> tuple[NDArray[np.float64], list[str]
         rows = np.array([(*box.center, *box.size, box.yaw, box.score) for box in given], np.float64).reshape(-1, 8)
         names = [box.label for box in given]
     except (AttributeError, TypeError, ValueError) as exc:
-        raise TrackingError(f"got boxes that are none ({exc}); pass edgeperc.Box objects") from exc
+        raise TrackingError(f"got boxes that are not edgeperc.Box objects ({exc}); pass edgeperc.Box objects") from exc
     right = np.isfinite(rows).all(axis=1) & (rows[:, 3:6] > 0.0).all(axis=1) & (rows[:, 7] >= 0.0) & (rows[:, 7] <= 1.0)
     if not right.all():
         wrong = given[int(np.argmin(right))]
@@ -338,7 +339,7 @@ def _checked_pose(given: ArrayLike) -> NDArray[np.float64]:
     try:
         pose = np.array(given, np.float64)
     except (TypeError, ValueError) as exc:
-        raise TrackingError(f"got a T_world_sensor that is no matrix ({exc}); expected (4, 4) numbers") from exc
+        raise TrackingError(f"got a T_world_sensor that is not a matrix ({exc}); expected (4, 4) numbers") from exc
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise TrackingError(f"got a T_world_sensor of shape {pose.shape}; expected (4, 4) finite numbers")
     off = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max()
@@ -348,7 +349,7 @@ def _checked_pose(given: ArrayLike) -> NDArray[np.float64]:
 
 
 def _in_world(given: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """x, y and heading (m, 3), and the heights of the middles (m,), in the world's frame."""
+    """x, y and heading (m, 3), and the heights of the centers (m,), in the world frame."""
     placed = given[:, :3] @ pose[:3, :3].T + pose[:3, 3]
     cos, sin = np.cos(given[:, 6]), np.sin(given[:, 6])
     heights = placed[:, 2].copy()

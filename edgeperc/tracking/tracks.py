@@ -1,4 +1,4 @@
-"""What a tracker returns, and its parameters by class."""
+"""The result of a tracker, and its parameters for each class."""
 
 from __future__ import annotations
 
@@ -18,39 +18,39 @@ __all__ = ["PARAMETERS", "ClassParameters", "Track", "Tracks", "strength_of"]
 
 @dataclass(frozen=True, slots=True)
 class ClassParameters:
-    """How objects of a class move, how well they are detected, and how long a track of one lives.
+    """Motion, detection and track life of one class of objects.
 
     Attributes
     ----------
     group : str
-        Classes of one group may be taken for one another; a track keeps to its group.
+        Classes of one group may be confused; a track stays in its group.
     acceleration_mps2, turn_acceleration_rps2 : float
         Standard deviations of the white accelerations of constant velocity and CTRV.
     walk_m, wander_rad : float
-        Random motion: how far place and heading walk in a second.
+        Random motion: standard deviations of the random walks of place and heading after one second.
     still_mps : float
-        Random motion: speed of what in truth stands still.
+        Random motion: standard deviation of the speed.
     birth_speed_mps, birth_turn_rps : float
-        How fast a newborn track may be.
+        Standard deviations of speed and turn rate of a new track.
     keep_motion_s : float
-        Mean time for which a track keeps its motion.
+        Mean time for which a track keeps its motion model.
     along_m, across_m, heading_rad : float
-        Standard deviations of a detection beside the sensor; they grow by their own size every ``range_m``.
+        Standard deviations of a detection next to the sensor; they grow linearly, and are doubled at ``range_m``.
     shape_m : tuple of 4 float
-        Likewise of middle height, length, width and height.
+        The same, of the height of the center, length, width and height.
     range_m : float
     detection : float
-        Probability that an object in plain sight is detected in a scan.
+        Probability that a visible object is detected in a scan.
     clutter : float
         False detections and new objects per square metre and radian.
     gate : float
-        Mahalanobis distance beyond which a detection is none of a track's.
+        Largest Mahalanobis distance between a track and a detection of it.
     birth_score : float
-        Detections with a lower score begin no track.
+        Lowest score of a detection that begins a track.
     sure_score : float
-        One detection with this score is told of at once, without a second.
+        A detection with this score confirms a track immediately.
     memory_s : float
-        A track that is not detected is forgotten after this time, if it was not given up before.
+        A track without detections is deleted after this time at the latest.
     """
 
     group: str
@@ -105,7 +105,7 @@ PARAMETERS: Mapping[str, ClassParameters] = {
     "pedestrian": _PEDESTRIAN,
     "cyclist": _CYCLIST,
 }
-DOUBT = 10.0
+DOUBT = 10.0  # scans of even odds before the first detection, in the score of a track
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,19 +181,19 @@ class Track:
 
 
 class Tracks(Sequence[Track]):
-    """The tracks that are told of after one scan, in the order of their ids; `Track` objects are made when asked for.
+    """The reported tracks after one scan, in the order of their ids. `Track` objects are made on access.
 
     Attributes
     ----------
     stamp_s : float
     T_world_sensor : (4, 4) float64
-        As given, or as estimated.
+        As passed to the tracker, or estimated.
     ids : (n,) int64
     boxes : (n, 7) float64
         x, y, z, length, width, height [m], yaw [rad], in the sensor's frame of this scan.
     scores : (n,) float64
     n_tentative : int
-        Tracks too doubtful to be told of: new ones, and those not detected for too long.
+        Tracks that are not reported: new, not detected for some time, out of view, or in the place of another track.
     n_approximated : int
         Tracks whose association was solved by belief propagation.
     """
@@ -240,7 +240,7 @@ class Tracks(Sequence[Track]):
 
     @property
     def labels(self) -> list[str]:
-        """Class of each track."""
+        """The class of each track."""
         return [self._labels[k] for k in self._rows["label"].tolist()]
 
     def __len__(self) -> int:
@@ -282,9 +282,9 @@ def _box(label: str, score: float, row: NDArray[np.float64]) -> Box:
 
 
 def strength_of(tracks: NDArray[np.void]) -> NDArray[np.float64]:
-    """Log odds of a track: the mean of its detections', scans without one and `DOUBT` scans before it being even.
+    """Log odds of tracks (n,): mean over the log odds of their detections, 0 for a scan without one.
 
-    A scan in which others hid it counts by how much of it was to be seen.
+    `DOUBT` scans with log odds 0 are added. A scan in which others hid a track counts by its visible share.
     """
     return np.asarray(tracks["logit_sum"] / (tracks["chances"] + DOUBT))
 

@@ -1,8 +1,8 @@
-"""Unscented filters of three motions (KUL-Seg, section 6 and Figure 10: prediction and measurement update).
+"""Unscented Kalman filters of three motion models (KUL-Seg 6 and Figure 10: prediction and measurement update).
 
-The state is ``x, y, v, heading, turn rate`` [m, m, m/s, rad, rad/s]; v is along the heading and may be negative. A
-measurement is ``x, y, heading``. Constant velocity, constant turn rate and velocity (CTRV) and random motion share
-both.
+The models are constant velocity, constant turn rate and velocity (CTRV) and random motion. All have the state
+``x, y, v, heading, turn rate`` [m, m, m/s, rad, rad/s], where v is along the heading and may be negative, and the
+measurement ``x, y, heading``.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ __all__ = ["CONSTANT_VELOCITY", "CTRV", "MODES", "RANDOM_MOTION", "fill_predicti
 CONSTANT_VELOCITY, CTRV, RANDOM_MOTION = 0, 1, 2
 MODES = ("constant_velocity", "constant_turn", "random_motion")
 
-# n + kappa of the unscented transform. With kappa = 1 every weight is positive, so no covariance can lose its rank.
+# n + kappa of the unscented transform. With kappa = 1 every weight is positive, so covariances stay positive definite.
 SPREAD = 6.0
-STRAIGHT_RAD_S = 1e-4  # below this turn rate the arc and its tangent differ by less than rounding does
+STRAIGHT_RAD_S = 1e-4  # below this turn rate, arc and chord differ by less than the rounding error
 
 
 @njit(cache=True, nogil=True)
@@ -32,12 +32,12 @@ def fill_predictions(
     means: NDArray[np.float64],
     predicted: NDArray[np.float64],
 ) -> None:
-    """Predict every motion of every track by its sigma points (KUL-Seg's "prediction").
+    """Predict each motion model of each track by sigma points (KUL-Seg's "prediction").
 
     Parameters
     ----------
     states : (n, 3, 5) float64
-        Of constant velocity, CTRV and random motion.
+        One for each motion model: constant velocity, CTRV, random motion.
     covariances : (n, 3, 5, 5) float64
     noise : (n, 5) float64
         Standard deviations: acceleration [m/s2], turn acceleration [rad/s2], random walk of the place [m/s^0.5], of the
@@ -46,7 +46,7 @@ def fill_predictions(
         [s], not negative.
     means : (n, 3, 5) float64, overwritten
     predicted : (n, 3, 5, 5) float64, overwritten
-        Additive process noise included.
+        With additive process noise.
 
     Notes
     -----
@@ -83,7 +83,7 @@ def fill_predictions(
 
 @njit(cache=True, nogil=True)
 def move(mode: int, state: NDArray[np.float64], dt: float) -> None:
-    """Move one state (5,) on by ``dt`` [s], in place; neither random motion nor a straight line keeps a turn rate."""
+    """Predict one state (5,) by ``dt`` [s], in place; only CTRV keeps a turn rate."""
     v, heading, turn = state[2], state[3], state[4]
     if mode == CONSTANT_VELOCITY:
         state[0] += v * math.cos(heading) * dt
@@ -108,13 +108,13 @@ def move(mode: int, state: NDArray[np.float64], dt: float) -> None:
 def fill_process_noise(
     mode: int, heading: float, noise: NDArray[np.float64], dt: float, process: NDArray[np.float64]
 ) -> None:
-    """Write the process noise (5, 5) of one motion: white accelerations, and walks of place and heading.
+    """Write the process noise (5, 5) of one motion model: white accelerations, random walks of place and heading.
 
     Parameters
     ----------
     mode : int
     heading : float
-        [rad] before the motion.
+        [rad] before the prediction.
     noise : (5,) float64
         As in `fill_predictions`.
     dt : float
@@ -127,7 +127,7 @@ def fill_process_noise(
         process[0, 0] = process[1, 1] = walk * walk * dt
         process[2, 2] = speed * speed
     else:
-        # Hundredfold below random motion: what the road and the sensor's own estimated motion add.
+        # A hundredth of random motion's: errors of the road model and of the estimated sensor motion.
         process[0, 0] = process[1, 1] = 0.01 * walk * walk * dt
         push = np.zeros(5)
         push[0] = 0.5 * dt * dt * math.cos(heading)
@@ -141,7 +141,7 @@ def fill_process_noise(
         process[3, 4] = process[4, 3] = 0.5 * dt**3 * turn * turn
         process[4, 4] = dt * dt * turn * turn
     else:
-        process[4, 4] = 0.01 * turn * turn  # what a turn rate may be when turning begins
+        process[4, 4] = 0.01 * turn * turn  # turn rate at the beginning of a turn
 
 
 @njit(cache=True, nogil=True)
@@ -154,26 +154,26 @@ def fill_updates(
     states: NDArray[np.float64],
     covariances: NDArray[np.float64],
 ) -> None:
-    """Update every motion of every track with its share of every detection: a PDA filter each.
+    """Update each motion model of each track with all detections, weighted by association: one PDA filter each.
 
     Parameters
     ----------
     means, predicted
-        What `fill_predictions` wrote.
+        From `fill_predictions`.
     detections : (m, 3) float64
         x, y [m], heading [rad], in the frame of the states.
     sigmas : (n, 3) float64
-        Standard deviations of a detection along and across its heading [m] and of the heading [rad].
+        Standard deviations of a detection along and across its heading [m] and of its heading [rad].
     beta : (n, 3, m + 1) float64
-        Probability, by motion, that the track was not detected, and that each detection is the track's.
+        For each motion model: probability that the track was not detected, and that each detection belongs to it.
     states : (n, 3, 5) float64, overwritten
     covariances : (n, 3, 5, 5) float64, overwritten
 
     Notes
     -----
-    The measurement is a part of the state, for which the unscented sums of the cross-covariance and of the innovation's
-    covariance are exact: they are columns and a block of the predicted covariance. A heading counts modulo pi, and a
-    deviation of more than three standard deviations counts as three (see `edgeperc.tracking.jpda`).
+    The measurement is part of the state. The unscented cross-covariance and innovation covariance are therefore exactly
+    columns and a block of the predicted covariance. A heading counts modulo pi, and a deviation of more than three
+    standard deviations counts as three (see `edgeperc.tracking.jpda`).
     """
     innovation = np.empty((3, 3))
     inverse = np.empty((3, 3))
@@ -213,7 +213,7 @@ def fill_updates(
             detected = 1.0 - beta[i, mode, 0]
             for a in range(3):
                 for b in range(a, 3):
-                    # Gain times (spread - detected * innovation) times gain joins the PDA filter's three terms.
+                    # gain @ (spread - detected * innovation) @ gain.T is the sum of the PDA filter's three terms.
                     spread[a, b] -= shift[a] * shift[b] + detected * innovation[a, b]
                     spread[b, a] = spread[a, b]
             for a in range(5):
@@ -231,7 +231,7 @@ def fill_updates(
 def fill_innovation(
     heading: float, cov: NDArray[np.float64], sigmas: NDArray[np.float64], innovation: NDArray[np.float64]
 ) -> None:
-    """Write the covariance (3, 3) of a detection about its prediction; its noise lies along and across the heading."""
+    """Write the innovation covariance (3, 3); the noise of a detection is along and across the heading."""
     cos, sin = math.cos(heading), math.sin(heading)
     along, across, turn = sigmas[0] * sigmas[0], sigmas[1] * sigmas[1], sigmas[2] * sigmas[2]
     innovation[0, 0] = cov[0, 0] + along * cos * cos + across * sin * sin
@@ -258,7 +258,7 @@ def fill_inverse(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> N
 
 @njit(cache=True, nogil=True)
 def fill_cholesky(matrix: NDArray[np.float64], root: NDArray[np.float64]) -> None:
-    """Write the lower root (5, 5) of a covariance; a direction that rounding left without variance gets none."""
+    """Write the lower Cholesky root (5, 5); a pivot that rounding made negative counts as 0."""
     root[:] = 0.0
     for a in range(5):
         for b in range(a + 1):
@@ -274,4 +274,4 @@ def fill_cholesky(matrix: NDArray[np.float64], root: NDArray[np.float64]) -> Non
 @njit(cache=True, nogil=True)
 def half_turn(angle: float) -> float:
     """The angle modulo pi, in -pi/2..pi/2: a box looks the same from behind."""
-    return angle - math.pi * math.floor(angle / math.pi + 0.5)
+    return angle - math.pi * float(np.floor(angle / math.pi + 0.5))  # math.floor raises on NaN

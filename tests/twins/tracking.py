@@ -1,4 +1,4 @@
-"""Slow twins of tracking: prediction, association, lives and metrics."""
+"""Slow twins of the kernels of tracking and of its metrics."""
 
 from __future__ import annotations
 
@@ -146,9 +146,57 @@ def motion_support(landmarks, detections, prior, spread, motion):
     total = -0.5 * ((motion - prior) ** 2 / spread).sum()
     for x, y, variance, group in landmarks:
         r2 = ((turned - [x, y]) ** 2).sum(axis=1) / (variance + detections[:, 2])
-        r2 = r2[detections[:, 3] == group]
+        r2 = r2[(detections[:, 3] == group) & ~np.isnan(r2)]
         total -= 0.5 * r2.min() / (1 + r2.min() / 9) if len(r2) else 4.5
     return total
+
+
+def nearest(landmarks, detections, motion):
+    """Twin of `edgeperc.tracking.egomotion.nearest_detection`, for all landmarks: indices and squared distances."""
+    cos, sin = math.cos(motion[2]), math.sin(motion[2])
+    turned = detections[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + motion[:2]
+    squared = ((landmarks[:, None, :2] - turned) ** 2).sum(axis=2) / (landmarks[:, None, 2] + detections[:, 2])
+    squared = np.where((landmarks[:, None, 3] == detections[:, 3]) & ~np.isnan(squared), squared, np.inf)
+    if len(detections) == 0:
+        return np.full(len(landmarks), -1), np.full(len(landmarks), np.inf)
+    smallest = squared.min(axis=1)
+    return np.where(np.isinf(smallest), -1, squared.argmin(axis=1)), smallest
+
+
+def fitted_motion(landmarks, detections, prior, variances):
+    """Twin of `edgeperc.tracking.egomotion.fit_motion`: motion, covariance and pairs."""
+    proposals = [prior]
+    cos, sin = math.cos(prior[2]), math.sin(prior[2])
+    for landmark, detection in itertools.product(landmarks, detections):
+        if landmark[3] != detection[3]:
+            continue
+        shift = landmark[:2] - prior[:2] - np.array([[cos, -sin], [sin, cos]]) @ detection[:2]
+        turn = np.arctan2(landmark[1] - prior[1], landmark[0] - prior[0]) - np.arctan2(*detection[1::-1]) - prior[2]
+        turn = np.angle(np.exp(1j * turn))
+        if np.hypot(*shift) < 3 * math.sqrt(variances[0] + variances[1]) + 3 * math.sqrt(landmark[2]):
+            proposals.append(prior + np.array([*shift, 0.0]))
+        if abs(turn) < 3 * math.sqrt(variances[2]):
+            proposals.append(prior + np.array([0.0, 0.0, turn]))
+    fits = [motion_support(landmarks, detections, prior, variances, motion) for motion in proposals[:257]]
+    motion = proposals[int(np.argmax(fits))]
+    for _ in range(12):
+        which, squared = nearest(landmarks, detections, motion)
+        paired = (which >= 0) & (squared <= 25)
+        x, y = detections[which[paired], :2].T if paired.any() else np.zeros((2, 0))
+        cos, sin = math.cos(motion[2]), math.sin(motion[2])
+        turned = np.stack([cos * x - sin * y, sin * x + cos * y])
+        off = (landmarks[paired, :2] - motion[:2]).T - turned
+        variance = landmarks[paired, 2] + detections[which[paired], 2] if paired.any() else np.zeros(0)
+        weight = 1 / (1 + squared[paired] / 9) ** 2 / variance
+        slopes = np.array([[[1, 0, -b], [0, 1, a]] for a, b in turned.T]).reshape(-1, 2, 3)
+        information = np.diag(1 / variances) + np.einsum("k,kca,kcb->ab", weight, slopes, slopes)
+        slope = (prior - motion) / variances + np.einsum("k,kca,ck->a", weight, slopes, off)
+        covariance = np.linalg.inv(information)
+        change = covariance @ slope
+        motion = motion + change
+        if np.abs(change).max() < 1e-9:
+            break
+    return motion, covariance, int(paired.sum())
 
 
 def hidden(state, shape, seen, sensor):
@@ -233,10 +281,10 @@ def in_view(tracks, pose, left, right):
     return ((azimuth <= left) & (azimuth >= right)).all(axis=1)
 
 
-def rivals(state, shape, strength, told):
-    """Twin of `edgeperc.tracking.lives.mark_rivals`: which are told of."""
+def rivals(state, shape, strength, reported):
+    """Twin of `edgeperc.tracking.lives.mark_rivals`: rows of the tracks that stay."""
     kept = []
-    for i in sorted(np.flatnonzero(told), key=lambda i: -strength[i]):
+    for i in sorted(np.flatnonzero(reported), key=lambda i: -strength[i]):
         for j in kept:
             off = state[i, :2] - state[j, :2]
             for k in (i, j):
@@ -269,6 +317,16 @@ def breaks(truth, ids, ignored):
             fragments += own[f - 1] != own[f] and -1 not in (last, own[f], following)
             last = own[f] if own[f] != -1 else last
     return switches, fragments
+
+
+def best_gain(gain):
+    """Twin of `edgeperc.evaluation.tracking_metrics.fill_assignment`: the largest sum, over all assignments."""
+    n, m = gain.shape
+    padded = np.hstack([gain, np.zeros((n, n))])
+    return max(
+        (sum(padded[i, j] for i, j in enumerate(event)) for event in itertools.permutations(range(n + m), n)),
+        default=0.0,
+    )
 
 
 def thresholds_by_walking(scores, n_truth):
