@@ -16,19 +16,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+import edgeperc.zoo
 from edgeperc import cli
+from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.errors import ModelError, PointsError, SplitError
 from edgeperc.evaluation import evaluate
-from edgeperc.evaluation.datasets import Calibration, Frame, KittiObjects, RoadFrame, SemanticKitti
+from edgeperc.evaluation.datasets import Calibration, Frame, KittiObjects, RoadFrame, SemanticKitti, scan_hash
 from edgeperc.evaluation.judge import Judge
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
 from edgeperc.evaluation.tables import BANDS, Record, banded, figures
 from edgeperc.evaluation.unseen import training_scans_of
 from edgeperc.perception import Box, Perception, PointLabels, TopView
-from edgeperc.session import Session
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE
-from edgeperc.zoo import model_path, shipped_models
+from edgeperc.zoo import shipped_models
 
 VIEW = TopViewGeometry()
 POINTS = ("background", "car", "pedestrian", "cyclist")
@@ -559,17 +559,21 @@ def test_the_command_on_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 def test_no_shipped_model_was_trained_on_a_test_scan(kitti_root: Path, semantickitti_root: Path) -> None:
     objects, sequences = KittiObjects(kitti_root), SemanticKitti(semantickitti_root)
-    scans = [objects.frame(name).points for name in objects.names("test", grades="AB")]
-    scans += [sequences.frame(name).points for name in sequences.names("test")]
-    assert len(scans) > 35
-    tested = {hashlib.sha256(points.tobytes()).hexdigest()[:16] for points in scans}
-    for name in shipped_models():
-        card = Session(model_path(name), "cpu").card
+    held_back = [*objects.names("test", grades="AB"), *objects.names("validation", grades="AB")]
+    files = [kitti_root / f"training/velodyne/{name}.bin" for name in held_back]
+    files += [semantickitti_root / f"sequences/00/velodyne/{name[3:]}.bin" for name in sequences.names("test")]
+    assert len(files) > 35 + 100
+    hashes = {scan_hash(np.fromfile(file, np.float32)) for file in files}
+    assert scan_hash(objects.frame(held_back[0]).points) in hashes
+    models = sorted(Path(edgeperc.zoo.__file__).parent.rglob("*.onnx"))
+    assert len(models) >= len(shipped_models())
+    for path in models:
+        card = ModelCard.read(path)
         (trained_on,) = training_scans_of([card]).values()
         only_simulated = card.training["recipe"]["simulated_share"] == 1.0
-        assert len(trained_on) > 100 or only_simulated, f"{name} does not say what it was trained on"
-        assert name.endswith("-sim") == only_simulated == (not trained_on)
-        assert not tested & trained_on
+        assert len(trained_on) > 100 or only_simulated, f"{path} does not say what it was trained on"
+        assert path.stem.endswith("-sim") == only_simulated == (not trained_on)
+        assert not hashes & trained_on
 
 
 def test_shipped_models_refuse_their_training_scans(kitti_root: Path) -> None:
