@@ -65,7 +65,9 @@ def draw_mistakes(
     height = round(width * (_FAR_M + 3.0) / (2.0 * _RIGHT_M))
     rows = -(-len(wrong) // columns)
     figure = new_figure(_WIDTH, _TOP + (rows * (height + _CAPTION + _GAP) if wrong else 90))
-    heading = f"{len(wrong)} scan{'s' * (len(wrong) != 1)} with mistakes, of {len(scans)}"
+    heading = f"{len(wrong)} scan{'s' * (len(wrong) != 1)} with mistakes"
+    if len(wrong) < len(scans):
+        heading += f", {len(scans) - len(wrong)} without"
     style = {"fontsize": 21.0, "fontweight": "bold"}
     end = write_at(figure, _MARGIN, 42, heading, **style) + 18
     write_at(figure, end, 43, shorten(figure, title, _WIDTH - _MARGIN - end, fontsize=16.0), fontsize=16.0, color=FAINT)
