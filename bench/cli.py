@@ -17,7 +17,7 @@ from edgeperc import EdgepercError, __version__
 from .commands import compare, matrix, peers, run, scaling, soak
 from .options import print_error
 
-__all__ = ["main", "parser"]
+__all__ = ["build_parser", "main", "with_command"]
 
 COMMANDS = {"run": run, "compare": compare, "matrix": matrix, "scaling": scaling, "soak": soak, "peers": peers}
 
@@ -35,12 +35,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     code : int
         The exit code. Wrong usage ends by argparse's ``SystemExit(2)``.
     """
-    typed = sys.argv[1:] if argv is None else list(argv)
-    if not typed or typed[0] not in (*COMMANDS, "-h", "--help", "--version"):
-        several = any(option.startswith(("--providers", "--precisions")) for option in typed)
-        typed = ["matrix" if several else "run", *typed]
+    typed = with_command(sys.argv[1:] if argv is None else argv)
     command_line = shlex.join(["edgeperc-bench", *typed])
-    arguments = parser().parse_args(typed, argparse.Namespace(command_line=command_line))
+    arguments = build_parser().parse_args(typed, argparse.Namespace(command_line=command_line))
     try:
         code: int = arguments.run(arguments)
         sys.stdout.flush()
@@ -53,7 +50,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
-def parser() -> argparse.ArgumentParser:
+def with_command(typed: Sequence[str]) -> list[str]:
+    """The arguments with the command that they stand for, if none was typed."""
+    if typed and typed[0] in (*COMMANDS, "-h", "--help", "--version"):
+        return list(typed)
+    several = any(option.startswith(("--providers", "--precisions")) for option in typed)
+    return ["matrix" if several else "run", *typed]
+
+
+def build_parser() -> argparse.ArgumentParser:
     """The parser of the whole command line."""
     whole = argparse.ArgumentParser(
         prog="edgeperc-bench",

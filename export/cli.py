@@ -16,7 +16,7 @@ from edgeperc.errors import EdgepercError, MissingExtraError
 from .database.cli import add_database_commands
 from .recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe
 
-__all__ = ["main"]
+__all__ = ["build_parser", "main"]
 
 KITTI = "KITTI object set: a folder of training/velodyne, label_2, calib and of frames.csv"
 LAYOUTS = "folder of KITTI's label_2, calib and frames.csv: half of the simulated scenes get their boxes"
@@ -36,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         0 for success, 1 if a model was refused or a scene left out, 2 for wrong usage or unusable files.
     """
-    parser, words = _parser(), list(sys.argv[1:] if argv is None else argv)
+    parser, words = build_parser(), list(sys.argv[1:] if argv is None else argv)
     if words[:1] == ["database"]:
         parser.error(f'"{" ".join(words[:2])}" is now written {"-".join(words[:2])}; see edgeperc-export --help')
     args = parser.parse_args(words)
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1 if type(exc).__name__ in ("ParityError", "RefusedError") else 2
 
 
-def _parser() -> argparse.ArgumentParser:
+def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="edgeperc-export", description=__doc__)
     parser.add_argument("--version", action="version", version=f"edgeperc {__version__}")
     parser.set_defaults(extra="export")
@@ -339,6 +339,7 @@ def _quantize(args: argparse.Namespace) -> int:
         f"{args.out}: {card.name} {card.version}, kept in fp32: {', '.join(card.training['quantized']['left_alone'])}"
     )
     print(json.dumps(dict(card.parity)))
+    print(f"precision auto takes it once its answers are measured: edgeperc-export agree {args.model} {args.out}")
     return 0
 
 

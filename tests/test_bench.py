@@ -550,7 +550,7 @@ def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser
 
 
 def test_every_option_has_a_help_text() -> None:
-    every = list(parsers(cli.parser()))
+    every = list(parsers(cli.build_parser()))
     assert len(every) == 1 + len(cli.COMMANDS)
     for parser in every:
         assert parser.description
