@@ -70,7 +70,7 @@ def flatten_scan(points: NDArray[np.float32], perception: Perception | None = No
     as_pixel = np.array([_CLASS + order.index(name) if name in order else _OTHER for name in names], np.uint8)
     value = np.where(painted == 0, _POINT + level.astype(np.uint8), as_pixel[painted])
     col, row = np.floor((x + _BEHIND_M) * _PX_PER_M), np.floor((_BESIDE_M - y) * _PX_PER_M)
-    # Points of the road add nothing to it, and those of the ground beside it little: every second line of them.
+    # The road is shown as a surface: its points would only make the file larger.
     inside = (col >= 0) & (col < _WIDTH) & (row >= 0) & (row < _HEIGHT) & (value != _CLASS + order.index("drivable"))
     shown = np.flatnonzero(inside)
     shown = shown[np.argsort(value[shown], kind="stable")]  # classes over the background
