@@ -70,7 +70,7 @@ def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True
 
 
 def render(points: NDArray[np.float32], sensor: SensorProfile) -> NDArray[np.float32]:
-    """The points with their remission as the sensor that models were trained on would report it, 0..1.
+    """Replace the remission by what the sensor that the models were trained on would report, 0..1.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def fill_rendered(
     rendered : (n, 4) float32, overwritten
         A remission that is not finite becomes NaN.
     """
-    # Most sensors give whole numbers up to 255, each worth one logarithm a scan: seven times as fast.
+    # Most sensors report whole numbers up to 255. Computing each of them once per scan is seven times as fast.
     whole = np.empty(256)
     for k in range(len(whole)):
         whole[k] = rendered_at(float(k), kind, coefficients)
@@ -150,7 +150,7 @@ def fill_rendered(
 
 @njit(cache=True, nogil=True)
 def rendered_at(x: float, kind: int, coefficients: NDArray[np.float64]) -> float:
-    """What `RemissionFunction` says of a finite x."""
+    """Value of a `RemissionFunction` at a finite x."""
     a, b, c = coefficients[0], coefficients[1], coefficients[2]
     value = a + b * math.log1p(max(x, 0.0)) if kind == 2 else a + (b + c * x) * x
     return min(max(value, 0.0), 1.0)
@@ -164,12 +164,13 @@ def rendered_at(x: float, kind: int, coefficients: NDArray[np.float64]) -> float
 MIN_ANGLE_DEG = 5.0
 MAX_STEP_M = 0.5
 
-# Neighbouring rings on the road are metres apart: both near the ground, and the line between them level.
+# Neighbouring rings on the road are metres apart. They are joined if both are near the ground and the line between them
+# is level.
 GROUND_M = 0.3
 GROUND_PER_M = 0.02  # of range; the sensor is not quite level, nor is the road
 GROUND_SLOPE = 0.1
 
-# A sensor's spacing up to this many pixels leaves no gaps between neighbours.
+# Up to this many pixels between neighbouring beams or columns there is no gap to fill.
 NO_GAP = 1.1
 
 
@@ -179,14 +180,14 @@ class Interpolator:
     Parameters
     ----------
     view : RangeImageGeometry
-        Of the model.
+        The model's view.
     sensor : SensorProfile
-        What takes the scans; its mounting height tells the ground.
+        The sensor that takes the scans; the ground lies its mounting height below it.
 
     Attributes
     ----------
     needed : bool
-        Whether the sensor is coarser than the view, anywhere in it.
+        Whether the sensor is coarser than some part of the view.
     """
 
     def __init__(self, view: RangeImageGeometry, sensor: SensorProfile) -> None:
@@ -196,7 +197,7 @@ class Interpolator:
         self._row_slopes = np.tan(np.radians(rows))
         self._directions = np.stack([np.cos(azimuths), np.sin(azimuths)])
         self._ground_z = -sensor.mount_height_m
-        # Beams in fractions of rows, then how many rows lie between each row's beam and the next.
+        # The beams' places in rows, then the number of rows between each row's beam and the next beam.
         places = np.interp(-np.array(sensor.elevations_deg), -rows, np.arange(len(rows)), left=-1.0, right=len(rows))
         self._row_reach = np.zeros(len(rows), np.int64)
         for upper, lower in pairwise(places.tolist()):
@@ -222,10 +223,10 @@ class Interpolator:
         Returns
         -------
         points : (n + m, 4) float32
-            The points given, then the ones between, each on the line between two neighbours and in the middle of its
-            pixel along it.
+            The given points, then the interpolated ones: each on the line between two neighbours, in the middle of its
+            pixel.
         index : (H, W) int32
-            Of these; from n on, a pixel is interpolated.
+            Rows of these points; from n on, a pixel is interpolated.
 
         Raises
         ------
@@ -250,7 +251,7 @@ class Interpolator:
 
 @njit(cache=True, nogil=True)
 def on_one_surface(points: NDArray[np.float32], i: int, j: int, ground_z: float) -> bool:
-    """Whether nothing but one surface, or the ground, is to be expected between two neighbouring returns."""
+    """Whether two neighbouring returns lie on one surface, or both on the ground."""
     xi, yi, zi = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
     xj, yj, zj = np.float64(points[j, 0]), np.float64(points[j, 1]), np.float64(points[j, 2])
     range_i = math.sqrt(xi * xi + yi * yi + zi * zi)

@@ -1,7 +1,6 @@
-"""ModelCard: what an .onnx says about itself. The only reader and writer of the card's JSON.
+"""ModelCard: geometry, normalisation, classes and origin of a model. The only reader and writer of the card's JSON.
 
-A card lives in the model file, under one ``metadata_props`` key, so that geometry, normalisation and classes can
-never be separated from the weights they belong to.
+A card is stored in the model file, under one ``metadata_props`` key, so that it cannot be separated from the weights.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ class TopViewGeometry:
         return round((self.y_range_m[1] - self.y_range_m[0]) / self.cell_m)
 
     def holds(self, x: float, y: float) -> bool:
-        """Whether a place is in view."""
+        """Whether a place x, y [m] is in view."""
         (near, far), (right, left) = self.x_range_m, self.y_range_m
         return near <= x < far and right <= y < left
 
@@ -112,7 +111,7 @@ class RangeImageGeometry:
     Attributes
     ----------
     row_elevations_deg : tuple of float
-        Elevation of every row [deg], top to bottom, strictly decreasing. Uneven beams are welcome.
+        Elevation of every row [deg], top to bottom, strictly decreasing, not necessarily evenly spaced.
     width : int
         Columns, evenly spread over the azimuths.
     azimuth_left_deg, azimuth_right_deg : float
@@ -183,7 +182,7 @@ class OutputSpec:
 
 @dataclass(frozen=True, slots=True)
 class Golden:
-    """A known input and what the exporting computer answered to it.
+    """A known input, and the exporting computer's answers to it.
 
     The input is uniform noise in -1..1 from ``numpy.random.PCG64(seed)``. At samples of every output
     (flat positions) the answers are kept, so that any runtime can be held against the exporter's.

@@ -1,8 +1,8 @@
-"""Points that stand together are an object: Euclidean clusters, the share of a class in each, boxes around them.
+"""Euclidean clusters of points, the share of each class in them, and boxes around them.
 
-KUL-Seg (section 5.2) clusters what stands on the ground and keeps a cluster for tracking when more than 70 % of its
-points carry one class, so that what a network smears over walls and trees comes to nothing. `objects_from_points` does
-so, and fits a box to every cluster kept: there are boxes for every class of points then, and all around the vehicle.
+KUL-Seg (section 5.2) clusters the points above the ground and keeps a cluster for tracking if more than 70 % of its
+points have one class, which removes labels smeared over walls and trees. `objects_from_points` does the same and fits a
+box to every kept cluster: boxes of every class of points, all around the vehicle.
 """
 
 from __future__ import annotations
@@ -33,12 +33,13 @@ OBJECT_SIZE_M: Mapping[str, tuple[float, float, float]] = MappingProxyType(
     }
 )
 L_SHAPED = frozenset({"car", "van", "truck"})
-# A rider is a person too: a network calls many of a cyclist's points a pedestrian's.
+# Networks label many of a cyclist's points as pedestrian.
 PART_OF = MappingProxyType({"pedestrian": "cyclist"})
-MIN_OF_WHOLE = 0.25  # of both classes' points, for those of the part to count as the whole's
+# A cluster is a cyclist if at least 25 % of its pedestrian and cyclist points are cyclist.
+MIN_OF_WHOLE = 0.25
 
-# A column's edge is a little more than half the distance, so that linked points are at most 2 columns apart. And points
-# of one column are linked where their heights differ by 0.7 of the distance or less: 2 * 0.50005^2 + 0.7^2 < 1.
+# A column's edge is slightly more than half the distance, so that linked points are at most 2 columns apart. Points of
+# one column are linked if their heights differ by at most 0.7 of the distance: 2 * 0.50005^2 + 0.7^2 < 1.
 COLUMN_EDGE = 0.50005
 RUN_GAP = 0.7
 MAX_COLUMNS = 2**26
@@ -47,7 +48,7 @@ N_LAYERS = 1024  # each half a gap high, so that points of neighbouring layers o
 N_ANGLES = 90
 MAX_FITTED = 256  # points that vote for a rectangle's heading
 MIN_SIDE_M = 0.1
-MAX_OVERLAP = 0.1  # between objects; pieces of one, each made whole, overlap by more
+MAX_OVERLAP = 0.1  # between two objects; completed boxes of two pieces of one object overlap by more
 MAX_INSIDE = 0.5  # of the smaller of two footprints
 EVIDENCE = 10.0  # points with which half a score is reached
 MIN_SCORE = 0.3  # precision of cars on KITTI's drive 0005 rose from 0.24 to 0.57, recall stayed at 0.70
@@ -62,22 +63,22 @@ def find_clusters(
     max_range_m: float = 100.0,
     min_points: int = 5,
 ) -> NDArray[np.int32]:
-    """Number the groups of points that hang together.
+    """Number the groups of linked points.
 
     Parameters
     ----------
     points : (n, 3 or more) float32
         x, y, z [m] in the sensor frame.
     among : (n,) bool, optional
-        The points to cluster, such as those that are not on the ground; all by default.
+        The points to cluster, such as those above the ground; all by default.
     min_distance_m, distance_per_m : float
-        Two points are linked when they are no farther apart than ``max(min_distance_m, distance_per_m * range)`` of the
-        one nearer to the sensor. ``distance_per_m`` is twice the angle [rad] between neighbouring beams, so that beams
-        far out still meet: 0.015 for an HDL-64E, 0.07 for a VLP-16. 0 is the same distance everywhere.
+        Two points are linked if their distance is at most ``max(min_distance_m, distance_per_m * range)``, with the
+        range of the nearer one. ``distance_per_m`` is twice the angle [rad] between neighbouring beams, so that points
+        of neighbouring beams are linked at any range: 0.015 for an HDL-64E, 0.07 for a VLP-16. 0: one distance.
     max_range_m : float
-        Points with an x or y beyond are in no cluster.
+        Points with a larger x or y are in no cluster.
     min_points : int
-        Smaller clusters are none.
+        Smaller clusters are dropped.
 
     Returns
     -------
@@ -93,11 +94,10 @@ def find_clusters(
 
     Notes
     -----
-    With ``distance_per_m=0`` and ``min_points=1`` these are DBSCAN's clusters of ``min_samples=1``, exactly. No pair of
-    points is skipped that could decide; most need no look: points fall into columns of half the distance, and within
-    one those that follow each other closely in height are linked for sure. Such runs are then joined over neighbouring
-    columns, where their bounds are near enough, by the first pair that is. Of 60,000 points, of which 8,000 are runs,
-    60,000 pairs are looked at.
+    With ``distance_per_m=0`` and ``min_points=1`` these are exactly DBSCAN's clusters of ``min_samples=1``. Points are
+    sorted into columns of half the distance; points of a column that follow each other closely in height are linked
+    without a test and form a run. Runs of neighbouring columns whose bounds are near enough are joined by the first
+    pair of points that is. For 60,000 points in 8,000 runs, 60,000 pairs are tested.
     """
     if points.ndim != 2 or points.shape[1] < 3:
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
@@ -138,13 +138,13 @@ def cluster_labels(
     min_share : float
         In 0..1.
     part_of : mapping of int to int
-        Class to the class it may be a part of: where a quarter of both or more carry the latter, all of them count as
-        the latter's.
+        Class to the class that it may be a part of: if at least a quarter of the points of both have the second class,
+        all of them count as the second class.
 
     Returns
     -------
     classes : (k,) uint8
-        Class of every cluster, the smaller of two equally frequent; 0 where no class of objects has the share.
+        Class of every cluster, the smaller of two equally frequent ones; 0 where no class has the share.
     shares : (k,) float64
         Share of the cluster's points that carry its most frequent class of objects.
 
@@ -186,7 +186,7 @@ def objects_from_points(
     min_score: float = MIN_SCORE,
     size_m: Mapping[str, tuple[float, float, float]] = OBJECT_SIZE_M,
 ) -> tuple[Box, ...]:
-    """Boxes around the clusters that one class prevails in.
+    """Boxes around the clusters in which one class prevails.
 
     Parameters
     ----------
@@ -196,26 +196,25 @@ def objects_from_points(
         Index into ``classes`` of every point; 0 is the background.
     classes : sequence of str
     among : (n,) bool, optional
-        Points to cluster, all by default: those not on the ground (`Ground.mask`), for it joins what stands on it, and
-        seen by who labelled them (`PointLabels.in_view`).
+        Points to cluster, all by default. Leave out the ground (`Ground.mask`), which would join everything on it.
     height_m : (n,) float32, optional
         Height above the ground (`Ground.height_m`), down to which a box reaches; without, to its lowest point.
     min_share : float
-        A cluster is kept when more than this share of its points carries one class (KUL-Seg 5.2). A pedestrian's
-        points count as a cyclist's where a quarter of both are a cyclist's, for a rider is a person too.
+        A cluster is kept if more than this share of its points has one class (KUL-Seg 5.2). Pedestrian points count as
+        cyclist if at least a quarter of the pedestrian and cyclist points are cyclist.
     min_distance_m, distance_per_m, min_points
         As in `find_clusters`.
     min_score : float
-        Boxes with less are left out.
+        Boxes with a lower score are dropped.
     size_m : mapping
-        Class to usual length, width, height [m]. Boxes of other classes are as large as what was seen.
+        Class to usual length, width, height [m]. Boxes of other classes have the size of their points.
 
     Returns
     -------
     tuple of Box
-        Best score first. The score is the class's share, times n / (n + 10) for n points, times the square of what was
-        seen of the usual height, or of the usual in what was seen of a person, times what the longer side seen from
-        above has of the usual width. The heading is known up to a half turn: yaw is in -pi/2..pi/2.
+        Best score first. The score is the product of the class's share; n / (n + 10) for n points; the square of the
+        height over the usual height, at most 1 (for persons the inverse if they are too tall); and the longer side seen
+        from above over the usual width, at most 1. The heading is known up to a half turn: yaw is in -pi/2..pi/2.
 
     Raises
     ------
@@ -225,14 +224,15 @@ def objects_from_points(
     Notes
     -----
     The heading of cars, vans and trucks is that of the L-shape along whose sides most points lie (Zhang et al. 2017,
-    closeness), of others that of the smallest rectangle. The longer side is the length, unless both may be a front or
-    a rear, no longer than 1.25 usual widths: then that which is less like the usual width. A side shorter than usual
-    was not seen whole: it is made as long as usual, away from the sensor, or to both ends where the sensor stands
-    beside it. So is the height, upwards. A longer side stays. Of boxes that overlap by more than 0.1, or of which one
-    has more than half its footprint in the other, the better stays: they are pieces of one object.
+    closeness), of others that of the smallest rectangle. The longer side is the length, unless both sides may be a
+    front or a rear (at most 1.25 usual widths): then the length is the side that differs more from the usual width. A
+    side shorter than usual was only seen in part: it is extended to the usual length away from the sensor, or to both
+    ends if the sensor is beside it. The height is extended upwards likewise. Longer sides are kept. Of two boxes that
+    overlap by more than 0.1, or of which one has more than half its footprint in the other, the better one is kept:
+    they are pieces of one object.
 
-    All of this was chosen on KITTI's training drives (`evaluation.splits.FOLDS`), by labels of networks
-    that had not seen them. ``bench/RESULTS.md`` has what comes of it on the test drives.
+    Parameters were chosen on KITTI's training drives (`edgeperc.evaluation.splits.FOLDS`), with labels of networks that
+    were not trained on them. ``bench/RESULTS.md`` has the results on the test drives.
     """
     if labels.shape != (len(points),):
         raise PointsError(f"got labels of shape {labels.shape} for {len(points)} points; expected one a point")
@@ -267,8 +267,8 @@ def objects_from_points(
         score = float(shares[k]) * len(members) / (len(members) + EVIDENCE)
         if name in size_m:
             _, width, height = size_m[name]
-            seen = max(top - bottom, 0.0) / height  # below what is taken for the ground there are reflections
-            # Whoever is taller than people are may be a pole; a car, a van.
+            seen = max(top - bottom, 0.0) / height  # points below the ground are reflections
+            # Too tall for a person: probably a pole. Too tall for a car: may be a van, so no penalty.
             score *= (min(seen, 1.0) if name in L_SHAPED or seen <= 1.0 else 1.0 / seen) ** 2
             score *= min(1.0, float(max(rectangle[2:4])) / width)
         if score >= min_score:
@@ -283,9 +283,10 @@ def objects_from_points(
 
 
 def join_boxes(first: Sequence[Box], second: Sequence[Box]) -> tuple[Box, ...]:
-    """Boxes of two origins without doubles: all of ``first``, and of ``second`` what is none of them again.
+    """All boxes of ``first``, and those of ``second`` that are not the same object as one of ``first``.
 
-    Best score first. Doubles overlap by more than 0.1, or one has more than half its footprint in the other.
+    Best score first. Two boxes are one object if they overlap by more than 0.1, or if more than half of one's footprint
+    lies in the other.
     """
     doubles = _doubles(second, first)
     others = [box for row, box in enumerate(second) if not doubles[row].any()]
@@ -293,7 +294,7 @@ def join_boxes(first: Sequence[Box], second: Sequence[Box]) -> tuple[Box, ...]:
 
 
 def _doubles(first: Sequence[Box], second: Sequence[Box]) -> NDArray[np.bool_]:
-    """Which boxes of two lists are of one object, (n, m) bool."""
+    """Which boxes of two lists are the same object, (n, m) bool."""
     a, b = rectangles(first), rectangles(second)
     overlap = oriented_iou(a, b)
     smaller = np.minimum.outer(a[:, 2] * a[:, 3], b[:, 2] * b[:, 3])
@@ -309,7 +310,7 @@ def _completed(
     top: float,
     usual: tuple[float, float, float],
 ) -> Box:
-    """The box of a rectangle of points, made whole by the class's usual size."""
+    """The box around a rectangle of points, completed to the usual size of the class."""
     x, y, along, across, yaw = rectangle.tolist()
     if across > along:
         along, across, yaw = across, along, yaw + math.pi / 2.0
@@ -319,7 +320,7 @@ def _completed(
     sides = []
     for extent, typical, axis_x, axis_y in ((along, usual[0], cos, sin), (across, usual[1], -sin, cos)):
         size = max(extent, typical, MIN_SIDE_M)
-        # The sensor is at 0: what it saw is the near end, unless it stands beside the object.
+        # The sensor is at 0 and saw the near end, unless it is beside the object.
         away = x * axis_x + y * axis_y
         if abs(away) > 0.5 * extent:
             sides.append((size, math.copysign(0.5 * (size - extent), away)))
@@ -371,8 +372,8 @@ def fill_clusters(
     n_rows = int((high_x - low_x) * columns_per_m) + 1
     n_cols = int((high_y - low_y) * columns_per_m) + 1
 
-    # Points by layer, and then by column, so that those of a column follow each other upwards. Those beyond the layers
-    # do so in any order, which makes more runs, and costs time, but changes nothing.
+    # Points sorted by layer, then by column, so that those of a column are in upward order. Points beyond the layers
+    # are in any order: that makes more runs and costs time, but does not change the clusters.
     layer = np.empty(m, dtype=np.int32)
     column = np.empty(m, dtype=np.int32)
     layer_starts = np.zeros(N_LAYERS + 1, dtype=np.int32)
@@ -400,7 +401,7 @@ def fill_clusters(
         order[place] = i
         xyz[place, 0], xyz[place, 1], xyz[place, 2] = points[i, 0], points[i, 1], points[i, 2]
 
-    # Runs: points of one column, each linked for sure with the one before. From here on starts is each column's first.
+    # Runs: points of one column, each linked with the one before. From here on starts holds each column's first run.
     run_starts = np.empty(m + 1, dtype=np.int32)
     run_column = np.empty(m, dtype=np.int32)
     n_runs = 0
@@ -417,7 +418,7 @@ def fill_clusters(
     starts[n_rows * n_cols] = n_runs
     run_starts[n_runs] = m
 
-    # A point's reach is how far those it is linked to may be, a run's that of its farthest point.
+    # The reach of a point is the distance up to which it is linked; the reach of a run is that of its farthest point.
     reach = np.empty(m)
     run_reach = np.empty(n_runs)
     bounds = np.empty((n_runs, 6))
@@ -439,10 +440,10 @@ def fill_clusters(
     parent = np.arange(n_runs).astype(np.int32)
     for run in range(n_runs):
         row, col = run_column[run] // n_cols, run_column[run] % n_cols
-        far = int(run_reach[run] * columns_per_m + 1e-9) + 1  # whatever was rounded
+        far = int(run_reach[run] * columns_per_m + 1e-9) + 1  # safe against rounding
         root = root_of(parent, run)
         for near_row in range(row, min(row + far + 1, n_rows)):
-            # Of two runs the earlier looks for the later, so in its own row it looks on from itself.
+            # Each pair of runs is tested once, from the earlier one.
             first = run + 1 if near_row == row else starts[near_row * n_cols + max(col - far, 0)]
             last = starts[near_row * n_cols + min(col + far, n_cols - 1) + 1]
             for other in range(first, last):
@@ -475,7 +476,7 @@ def fill_clusters(
 
 @njit(cache=True, nogil=True)
 def root_of(parent: NDArray[np.int32], run: int) -> int:
-    """The run that stands for all those joined with this one."""
+    """The root of the runs that are joined with this one."""
     while parent[run] != run:
         parent[run] = parent[parent[run]]
         run = parent[run]

@@ -17,14 +17,14 @@ from .perception import Box
 __all__ = ["decode_classes", "decode_dense", "decode_slots", "decode_top_view"]
 
 STRIDE = 4  # cells of the top view behind one cell of a box_dense output, along each axis
-MIN_EXTENT_M = 0.5  # a slot below this holds no vehicle
-SIZE_RANGE_M = (0.2, 40.0)  # where the exponential of a network's logarithm is still a road user
+MIN_EXTENT_M = 0.5  # smaller slots are empty
+SIZE_RANGE_M = (0.2, 40.0)  # boxes are clipped to these sizes
 
 
 def decode_classes(
     output: NDArray[np.float32], kind: str, *, model: str = "the model"
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The likeliest class of every pixel, and how likely it is.
+    """The most probable class of every pixel, and its probability.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def decode_classes(
     Returns
     -------
     labels : (H, W) uint8
-        Of equally likely classes the lower.
+        The lower of equally probable classes.
     scores : (H, W) float32
         Softmax probability of that class, or the probability as given.
 
@@ -46,7 +46,7 @@ def decode_classes(
     InferenceError
         The output holds values that are not finite.
     CardMismatchError
-        The output has another shape, or ``kind`` is no class output.
+        The output has another shape, or ``kind`` is not a class output.
     """
     values = _class_values(output, kind, model)
     labels = np.empty(values.shape[1:], dtype=np.uint8)
@@ -69,7 +69,7 @@ def decode_slots(
     *,
     model: str = "the model",
 ) -> list[Box]:
-    """Boxes as the paper has them: axis-aligned, and of the class that the segmentation shows at their centre.
+    """Boxes as in the paper: axis-aligned, with the class that the segmentation has at their centre.
 
     Parameters
     ----------
@@ -169,13 +169,13 @@ def decode_dense(
         Classes that boxes may have.
     box_size_priors, box_size_spreads : mapping, optional
         Usual length, width and height [m] of each box class, and the deviations of their logarithms. Without spreads
-        the map alone tells classes apart.
+        only the segmentation decides the class.
     score_threshold : float
         Least score, in 0..1.
     iou_threshold : float
-        Of two boxes that overlap more, the one with the lower score goes, whatever their classes.
+        Of two boxes that overlap more, the one with the lower score is dropped, also if their classes differ.
     max_boxes : int
-        At most this many peaks of the heat map are looked at, the highest.
+        Only this many peaks of the heat map are decoded, the highest ones.
     model : str
         Name for messages.
 
@@ -183,7 +183,7 @@ def decode_dense(
     -------
     list of Box
         Best score first; of equal scores the one farther ahead, then the one farther left. The score is the heat
-        map's; the yaw lies in -pi/2..pi/2, for the network tells front from rear no more than the paper's does.
+        map's; the yaw lies in -pi/2..pi/2: the network, like the paper's, does not tell front from rear.
 
     Raises
     ------
@@ -196,8 +196,8 @@ def decode_dense(
     -----
     The paper reads a box's class at its centre pixel of the segmentation map. Here the probabilities of the box
     classes are summed over all pixels of the footprint and the largest sum wins (the earlier box class on ties), so
-    that one pixel, a hole in the roof or an edge between two classes, does not decide. With spreads, each sum is
-    weighed by how likely the measured size is for the class (log-normal): from above a van is a car but for its size.
+    that one pixel, such as a hole in the roof or an edge between two classes, does not decide. With spreads, each sum
+    is multiplied by the likelihood of the measured size (log-normal): from above, vans and cars differ only in size.
     """
     maps = dense[0] if dense.ndim == 4 and dense.shape[0] == 1 else dense
     height, width = geometry.height, geometry.width
@@ -289,7 +289,7 @@ def _check_finite(values: NDArray[np.float32], kind: str, model: str) -> None:
 def _raise_not_finite(n_bad: int, n: int, kind: str, model: str) -> None:
     raise InferenceError(
         f"{model}: {n_bad} of {n} values of {kind} are not finite; expected numbers. "
-        "Check the scan's units, or run the model with provider='cpu' to see whether its precision is to blame"
+        "Check the scan's units, or run the model with provider='cpu' and precision='fp32'"
     )
 
 
@@ -319,7 +319,7 @@ def fill_classes(
     Returns
     -------
     n_bad : int
-        Values that are not finite; where there are any, the outputs mean nothing.
+        Values that are not finite; if there are any, the outputs are undefined.
     """
     n_classes, height, width = values.shape
     n_bad = 0
@@ -370,7 +370,7 @@ def mark_peaks(heat: NDArray[np.float32], threshold: float, peak: NDArray[np.boo
     ----------
     heat : (H, W) float32
     threshold : float
-        Cells below are no peaks.
+        Cells below it are not peaks.
     peak : (H, W) bool, overwritten
         Of equal neighbours the earlier, row by row, is the peak.
     """
@@ -412,7 +412,7 @@ def fill_footprint_sums(
     cell : float
         Edge of a pixel [m].
     sums : (n, C) float64, overwritten
-        A rectangle without a pixel's centre has the nearest pixel in view instead.
+        For a rectangle without a pixel's centre, the nearest pixel in view is taken.
     """
     n_classes, height, width = values.shape
     pixel = np.empty(n_classes)

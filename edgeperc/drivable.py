@@ -1,7 +1,7 @@
-"""What a planner asks of a top view: the road as a polygon, how far it is free, how wide a lane is.
+"""The road in a top view for a planner: its outline as a polygon, the free distance, the lane width.
 
-Everything is in the sensor frame, metres: x forward, y left. A cell is road or it is not: what the sensor did not see
-is what the network took it for, and what lies beyond the view is unknown.
+Everything is in the sensor frame, metres: x forward, y left. Cells without returns have the class that the network gave
+them; nothing is known outside the view.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from .perception import Box, TopView
 __all__ = ["RoadAhead", "fill_corridor", "fill_free", "fill_rings", "mark_connected", "mark_kept", "road_ahead"]
 
 USUAL_LANE_M = 3.25
-"""Lanes of towns and country roads are 2.75 to 3.75 m wide; a road has as many as come nearest to this."""
+"""Lanes of towns and country roads are 2.75 to 3.75 m wide. A road is divided into lanes nearest to this width."""
 LANE_RANGE_M = 20.0
 BESIDE_M = 2.0
-"""As far to the side of the sensor's axis the road is looked for."""
+"""The corridor must begin within this distance of the sensor's axis."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,26 +34,25 @@ class RoadAhead:
     Attributes
     ----------
     outline : (k, 2) float64
-        Corners x, y of the road that is nearest to the sensor, counter-clockwise seen from above, the first not
-        repeated. Cells that share no more than a corner are not connected. (0, 2) where no cell is drivable.
+        Corners x, y of the connected road nearest to the sensor, counter-clockwise seen from above, the first not
+        repeated. Cells that share only a corner are not connected. (0, 2) if no cell is drivable.
     holes : tuple of (k, 2) float64
-        What lies inside the outline and is no road, vehicles among it; clockwise.
+        Areas inside the outline that are not road, such as vehicles; clockwise.
     y_m : (columns,) float64
         Middles of the top view's columns, leftmost first.
     free_m : (columns,) float64
-        How far ahead of the sensor (x) each column is drivable without a gap, from the near edge of the view on. The
-        near edge itself where the nearest cell is not drivable, the far edge where all are: it is never less known
-        than that, and says nothing of what lies beyond the view.
+        x up to which each column is drivable without a gap, from the near edge of the view on. The near edge itself if
+        the nearest cell is not drivable, the far edge if all cells are.
     x_m : (rows,) float64
         Middles of the top view's rows, nearest first.
     left_m, right_m : (rows,) float64
-        y of the edges of the corridor ahead: in every row the drivable cells without a gap that go on from the row
-        before. NaN before the corridor begins and after it ends, and everywhere where none begins within 2 m of the
+        y of the edges of the corridor ahead: in every row the run of drivable cells that continues that of the row
+        before. NaN before the corridor begins and after it ends, and everywhere if none begins within 2 m of the
         sensor's axis.
     lane_width_m : float
-        Estimate: the corridor's width across its direction, median of the nearest 20 m of view, divided into as many
-        lanes as come nearest to 3.25 m each, at least one. A map without markings tells no more. NaN where both edges
-        are nowhere in view.
+        Estimate: the corridor's width across its direction, median of the nearest 20 m of view, divided by the number
+        of lanes (at least one) that brings it nearest to 3.25 m; the map has no lane markings. NaN if the two edges
+        are nowhere in view together.
     """
 
     outline: NDArray[np.float64]
@@ -71,31 +70,31 @@ class RoadAhead:
         return self.left_m - self.right_m
 
     def free_ahead_m(self, half_width_m: float = 1.0) -> float:
-        """How far ahead (x) a strip as wide as a vehicle is free: the least of `free_m` so near to the sensor's axis.
+        """x up to which a strip as wide as a vehicle is free: the least `free_m` within ``half_width_m`` of the axis.
 
-        NaN where the view has no column as near.
+        NaN if the view has no column there.
         """
         near = np.abs(self.y_m) <= half_width_m
         return float(self.free_m[near].min()) if near.any() else math.nan
 
 
 def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: float = 0.1) -> RoadAhead:
-    """Road polygon, free distance and lane width of a top view, of whatever model.
+    """Road polygon, free distance and lane width of a top view.
 
     Parameters
     ----------
     top_view : TopView
     boxes : iterable of Box
-        What stands in the way, whatever the map says, such as `Perception.boxes`: a top view knows no pedestrians.
+        Obstacles that are not road, such as `Perception.boxes`: the top view has no class for pedestrians.
     tolerance_m : float
-        How far the polygon may leave the edges of the cells (Douglas and Peucker, 1973); 0 keeps every corner. The
-        default is a cell of the shipped models, which takes the steps out of a slanting edge. Of rings simplified by
-        more than a cell, edges may cross.
+        Largest distance of the polygon from the edges of the cells (Douglas and Peucker, 1973); 0 keeps every corner.
+        The default is a cell of the shipped models, which removes the steps of a slanting edge. With more than a
+        cell, edges of a ring may cross.
 
     Raises
     ------
     PointsError
-        The tolerance is negative or no number.
+        The tolerance is negative or NaN.
 
     Examples
     --------
@@ -134,7 +133,7 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
         _simplified(np.column_stack([x_far - ring[:, 0] * cell_m, y_left - ring[:, 1] * cell_m]), tolerance_m)
         for ring in _rings(_nearest_part(drivable, y_m, x_m[::-1]))
     ]
-    # One ring goes round the part and everything else in it; walked with the road to the left, it alone is positive.
+    # With the road to the left, only the ring around everything else has a positive area.
     areas = [_area(ring) for ring in rings]
     outer = int(np.argmax(areas)) if rings else -1
     return RoadAhead(
@@ -152,7 +151,7 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
 def _lane_width(x: NDArray[np.float64], left: NDArray[np.float64], right: NDArray[np.float64]) -> float:
     if len(x) == 0:
         return math.nan
-    # A road at an angle is narrower than it is along y. Its slope is a median, which what stands on it does not move.
+    # A road at an angle is narrower than its width along y. The median slope is robust against vehicles on the road.
     half = len(x) // 2
     middle = 0.5 * (left + right)
     slope = float(np.median((middle[-half:] - middle[:half]) / (x[-half:] - x[:half]))) if half else 0.0
@@ -182,7 +181,7 @@ def _rings(part: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
 def _simplified(ring: NDArray[np.float64], tolerance_m: float) -> NDArray[np.float64]:
     kept = np.empty(len(ring), np.bool_)
     mark_kept(ring, tolerance_m, kept)
-    # Of fewer than three corners there is no ring.
+    # Fewer than three corners are no ring.
     return ring[kept] if np.count_nonzero(kept) >= 3 else ring
 
 
@@ -222,8 +221,8 @@ def fill_corridor(drivable: NDArray[np.bool_], first: float, last: float, bounds
 
     Notes
     -----
-    It begins in the last row that has a run of drivable cells between ``first`` and ``last``, and goes on with the run
-    that shares most columns with the row before, of equal ones the left one. It ends where none shares any.
+    It begins in the last row with a run of drivable cells between ``first`` and ``last``, and continues with the run
+    that shares most columns with the row before, the left one of equals. It ends where no run shares a column.
     """
     height, width = drivable.shape
     bounds[:] = -1
@@ -253,13 +252,13 @@ def fill_corridor(drivable: NDArray[np.bool_], first: float, last: float, bounds
 
 @njit(cache=True, nogil=True)
 def mark_connected(cells: NDArray[np.bool_], row: int, col: int, part: NDArray[np.bool_]) -> None:
-    """Mark the cells that a walk over shared sides reaches.
+    """Mark the cells connected to one over shared sides.
 
     Parameters
     ----------
     cells : (rows, columns) bool
     row, col : int
-        Where the walk begins; a marked cell of ``cells``.
+        A marked cell of ``cells``, where the search begins.
     part : (rows, columns) bool, overwritten
     """
     height, width = cells.shape
@@ -282,7 +281,7 @@ def mark_connected(cells: NDArray[np.bool_], row: int, col: int, part: NDArray[n
 
 @njit(cache=True, nogil=True)
 def fill_rings(cells: NDArray[np.bool_], corners: NDArray[np.int64], ends: NDArray[np.int64]) -> int:
-    """Walk along the edges of some cells, with the cells to the left.
+    """Walk along the edges of marked cells, with the cells to the left.
 
     Parameters
     ----------
@@ -341,7 +340,7 @@ def mark_kept(ring: NDArray[np.float64], tolerance: float, kept: NDArray[np.bool
     ring : (n, 2) float64
         At least one corner; the first is not repeated.
     tolerance : float
-        Every corner left out lies within it of the edge in its place.
+        Every corner left out lies within this distance of the edge that replaces it.
     kept : (n,) bool, overwritten
     """
     n = ring.shape[0]

@@ -3,12 +3,12 @@
 ::
 
     EdgepercError
-    ├── OptionError (ValueError)      a setting that a function or a class cannot have
-    ├── PointsError (ValueError)      an array or a sensor file that is no scan
+    ├── OptionError (ValueError)      an unknown option, or a value out of its range
+    ├── PointsError (ValueError)      an array or a sensor file that is not a scan
     ├── SensorError (ValueError)      an unknown or impossible sensor profile
-    ├── SettingsError (ValueError)    the file of this computer's settings is unreadable
-    ├── SplitError (ValueError)       a model is to be judged by a scan that it was trained on
-    ├── TrackingError (ValueError)    boxes or a pose that no tracker can follow
+    ├── SettingsError (ValueError)    the file with this computer's settings cannot be read
+    ├── SplitError (ValueError)       a model would be evaluated on a scan that it was trained on
+    ├── TrackingError (ValueError)    boxes or a pose that cannot be tracked
     │   └── StampError                a scan that is no later than the one before it
     ├── FitnessError                  a scan unlike those a model was trained on, and on_mismatch="raise"
     ├── ModelError
@@ -19,7 +19,7 @@
     ├── InferenceError                the session failed on a valid tensor
     └── MissingExtraError (ImportError)   an optional dependency is absent; says which line installs it
 
-Each message says what came, what was expected and what to do about it.
+Each message says what was given, what was expected and what to do.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ class EdgepercError(Exception):
 
 
 class OptionError(EdgepercError, ValueError):
-    """A setting is unknown, out of its range, or excludes another setting."""
+    """An option is unknown, has a value out of its range, or excludes another option."""
 
 
 class PointsError(EdgepercError, ValueError):
-    """An array or a sensor file is no scan: wrong shape, dtype, fields or length."""
+    """An array or a sensor file is not a scan: wrong shape, dtype, fields or length."""
 
 
 class SensorError(EdgepercError, ValueError):
@@ -61,11 +61,11 @@ class SensorError(EdgepercError, ValueError):
 
 
 class SettingsError(EdgepercError, ValueError):
-    """The file that keeps settings of this computer is unreadable or of another schema."""
+    """The file with this computer's settings cannot be read, or has another schema."""
 
 
 class SplitError(EdgepercError, ValueError):
-    """A model is to be judged by a scan that it was trained on."""
+    """A model would be evaluated on a scan that it was trained on."""
 
 
 class TrackingError(EdgepercError, ValueError):

@@ -1,4 +1,4 @@
-"""Is this scan like the scans a model was trained on?"""
+"""Is a scan like the scans that a model was trained on?"""
 
 from __future__ import annotations
 
@@ -17,13 +17,11 @@ from .sensor import SensorProfile
 
 __all__ = ["FitnessProfile", "check_fitness", "fill_scan_sums"]
 
-# --- fitness ---------------------------------------------------------------------------------------------------------
-
-# Some 6,000 points tell what is asked here; a prime step does not fall in with the rows of an organised scan.
+# About 6,000 points are enough. Steps are prime, so that they do not align with the rows of an organised scan.
 _STEPS = np.array([1, 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 53, 61, 71, 83, 97, 127, 167, 223, 307, 401])
 _SAMPLE, _BEAM_SAMPLE = 6000, 130_000
 
-# Where the ground shows as a peak among the heights of near points; KITTI scans: 0.18 (5th percentile) and above.
+# Least share of the near points at one height that counts as ground; KITTI scans have 0.18 (5th percentile) and more.
 _GROUND_SHARE = 0.15
 
 
@@ -42,7 +40,7 @@ def fill_scan_sums(
     n_rows: NDArray[np.int64],
     sums: NDArray[np.float64],
 ) -> None:
-    """Histograms of every ``step``-th point, from which `check_fitness` judges a scan. Points not finite are skipped.
+    """Histograms of every ``step``-th point, for `check_fitness`. Points that are not finite are skipped.
 
     Parameters
     ----------
@@ -61,11 +59,11 @@ def fill_scan_sums(
     heights : (3, 100) int64, overwritten
         x, y and z of the points 3 to 25 m away, bins of 0.2 m from -10 m.
     rows : (8, 1024) float64, overwritten
-        Elevation [deg] of the points exactly ahead, left, behind, right and halfway between.
+        Elevation [deg] of the points in the eight directions ahead, left, behind, right and halfway between.
     n_rows : (8,) int64, overwritten
     sums : (8,) float64, overwritten
         0 points that are finite; 1 of these, in the view; 2 sixty-fourths of the turn that hold points; 3 of those
-        in the view, the share that holds points; 4 how much more is in the way to the sides than ahead and behind;
+        in the view, the share that holds points; 4 logarithm of the obstacles at the sides over those ahead and behind;
         5 lowest and 6 highest remission; 7 points 3 to 25 m away.
     """
     n = points.shape[0]
@@ -125,7 +123,7 @@ def fill_scan_sums(
             in_view_seen += seen[sector]
     sums[3] = in_view_seen / max(in_view, 1)
 
-    # What stands on the ground, in corridors 4 m wide to the four sides, and how well its sides line up with the axes.
+    # Points above the ground in corridors 4 m wide to the four sides, and how well they align with the axes.
     ground = np.argmax(heights[2]) * 0.2 - 9.9
     ways = np.zeros(4)
     along_x = np.zeros(120)
@@ -221,7 +219,7 @@ def _measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> _
     n_finite = sums[0]
     if n_finite == 0.0:
         return None
-    # In one direction, returns of one beam lie closer than 0.1 deg, those of neighbours farther apart.
+    # In one direction, returns of one beam are less than 0.1 deg apart, returns of two beams more.
     beams = [
         np.count_nonzero(np.diff(np.sort(row[:count])) > 0.1) + 1
         for row, count in zip(rows, n_rows, strict=True)
@@ -244,14 +242,14 @@ def _measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> _
         beams_per_deg=n_beams / (high - low + 1.0),
         range_median_m=10.0 ** (_quantile(ranges, 0.5) / 20.0 - 3.0),
         ground_m=round(int(heights[2].argmax()) * 0.2 - 9.9, 1) if has_ground else None,
-        # 58 of 64 sectors: a full turn with a pillar or two in it.
+        # 58 of 64 sectors: a full turn, of which a pillar or two may hide a part.
         road_ahead=float(sums[4]) if has_ground and sums[2] >= 58 else None,
         n_sampled=float(n_finite),
         remission_low=float(sums[5]),
         remission_high=float(sums[6]),
         remission_beyond=float(remissions[257] / n_finite),
         remission_alike=float(remissions.max() / n_finite),
-        # Facades make y flat, too, but only a road ahead of a camera's z spreads the elevations so far.
+        # Facades are flat along y too, but only the ground along a camera's axis spreads the elevations so far.
         flat_axis=flattest if peaks[flattest] >= max(_GROUND_SHARE, 1.5 * peaks[2]) and high - low > 60.0 else None,
         flat_m=round(int(heights[flattest].argmax()) * 0.2 - 9.9, 1),
     )
@@ -262,9 +260,9 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class FitnessProfile:
-    """What the scans a model was trained on look like: lowest and highest value of each measure over the scans.
+    """Lowest and highest value of each measure over the training scans.
 
-    Goes into the model's card, so that `check_fitness` can tell when a scan is unlike them.
+    The model's card holds it; `check_fitness` compares scans with it.
 
     Attributes
     ----------
@@ -274,7 +272,7 @@ class FitnessProfile:
     points_in_view : tuple of 2 float
         Points in that view.
     view_covered : tuple of 2 float
-        Share of the view, in steps of 1/64 turn, from which anything returned.
+        Share of the view with returns, in steps of 1/64 turn.
     remission_median, remission_p99, remission_zeros : tuple of 2 float
         Of remission scaled to 0..1: median, 99th percentile, share of points with none.
     elevation_p01_deg, elevation_p99_deg : tuple of 2 float
@@ -286,8 +284,7 @@ class FitnessProfile:
     ground_m : tuple of 2 float, or None
         Height of the ground in the sensor's frame; None where no scan shows it.
     road_ahead : tuple of 2 float, or None
-        Logarithm of how much more stands in the way to the sides than ahead and behind; None where no scan is a
-        full turn.
+        Logarithm of the ratio of obstacles at the sides to those ahead and behind; None where no scan is a full turn.
     """
 
     n_scans: int
@@ -321,7 +318,7 @@ class FitnessProfile:
         Raises
         ------
         PointsError
-            When there is no scan with a finite point, or an array is no scan.
+            No scan has a finite point, or an array is not a scan.
         """
         measures = [measure for scan in scans if (measure := _measure(scan, azimuth_deg)) is not None]
         if not measures:
@@ -369,11 +366,11 @@ _MEASURED = tuple(field.name for field in fields(FitnessProfile) if field.name n
 
 
 def check_fitness(points: NDArray[np.float32], profile: FitnessProfile, sensor: SensorProfile) -> tuple[str, ...]:
-    """Say in plain words what is unlike the scans a model was trained on, and what to do about it.
+    """List how a scan differs from the scans that a model was trained on, and what to do about it.
 
-    Margins are wide: this is to find gross mistakes (axes, units, remission scale, another sensor), and to stay quiet
-    about ordinary scans of the right sensor, those cropped to the model's view among them. What it cannot see: a scan
-    turned by 180 degrees, one mirrored left to right, and in one scan of nine (measured on KITTI) one turned by 90.
+    Margins are wide: the check finds gross mistakes (axes, units, remission scale, another sensor) and accepts ordinary
+    scans of the right sensor, also scans cropped to the model's view. It does not find scans turned by 180 degrees or
+    mirrored left to right, and misses one of nine scans turned by 90 degrees (measured on KITTI).
 
     Parameters
     ----------
@@ -381,12 +378,12 @@ def check_fitness(points: NDArray[np.float32], profile: FitnessProfile, sensor: 
         x, y, z [m], remission scaled to 0..1 by ``sensor``. Points not finite are skipped.
     profile : FitnessProfile
     sensor : SensorProfile
-        What the scan is said to come from.
+        The sensor that the scan is said to come from.
 
     Returns
     -------
     tuple of str
-        One sentence a finding; empty when all is well.
+        One sentence for each difference; empty if there is none.
 
     Raises
     ------
@@ -397,7 +394,7 @@ def check_fitness(points: NDArray[np.float32], profile: FitnessProfile, sensor: 
     if scan is None:
         return ("The scan holds no finite point: is the sensor connected and its driver running?",)
     if scan.n_sampled < 300.0 and scan.points_in_view < 0.2 * profile.points_in_view[0]:
-        return (_too_few(scan, profile),)  # too few to tell anything else
+        return (_too_few(scan, profile),)  # too few points for the other checks
     return (*_geometry_findings(scan, profile, sensor), *_remission_findings(scan, profile, sensor))
 
 
@@ -465,12 +462,12 @@ def _geometry_findings(scan: _Measures, profile: FitnessProfile, sensor: SensorP
         and scan.road_ahead < min(-0.5, profile.road_ahead[0] - 0.3)
     ):
         findings.append(
-            "More stands in the way ahead and behind than to the sides, as if the road ran along y: if x does not "
+            "There are more obstacles ahead and behind than to the sides, as if the road ran along y: if x does not "
             "point forward, turn the points (from x right, y forward: pass y, -x, z). Across a road this may be right."
         )
 
     few_rows = scan.beams < 0.75 * profile.beams[0] and scan.beams_per_deg < 0.65 * profile.beams_per_deg[0]
-    if few_rows and has_ground:  # from a wrong origin, rows are not to be told apart
+    if few_rows and has_ground:  # seen from a wrong origin, rows cannot be separated
         findings.append(
             f"The scan has about {scan.beams:.0f} rows of points (sensor {sensor.name}: {sensor.n_beams}), in training "
             f"it had at least {profile.beams[0]:.0f}: expect to lose far and small objects, or use a model trained for "
@@ -492,12 +489,12 @@ def _remission_findings(scan: _Measures, profile: FitnessProfile, sensor: Sensor
     raw_low, raw_high, raw_p99 = (
         value * (high - low) + low for value in (scan.remission_low, scan.remission_high, scan.remission_p99)
     )
-    told = f"the profile {sensor.name} says {low:g} to {high:g}"
+    stated = f"the profile {sensor.name} says {low:g} to {high:g}"
     useless = max(0.9, profile.remission_zeros[1] + 0.05)
     if scan.remission_beyond > 0.01 or scan.remission_low < -0.05:
         likely = next((f"(0, {top})" for top in (1, 255, 65535) if raw_low >= 0.0 and raw_high <= top), "that")
         return [
-            f"Remission runs from {raw_low:g} to {raw_high:g}, but {told}: pass sensor= a profile whose "
+            f"Remission runs from {raw_low:g} to {raw_high:g}, but {stated}: pass sensor= a profile whose "
             f"remission_range is {likely}."
         ]
     if scan.remission_zeros > useless:
@@ -507,7 +504,7 @@ def _remission_findings(scan: _Measures, profile: FitnessProfile, sensor: Sensor
         ]
     if scan.remission_p99 < 0.2 * profile.remission_p99[0]:
         return [
-            f"Remission hardly exceeds {raw_p99:.2g}, but {told}: pass sensor= a profile with the remission_range of "
+            f"Remission hardly exceeds {raw_p99:.2g}, but {stated}: pass sensor= a profile with the remission_range of "
             "this data, (0, 1) if it is scaled already."
         ]
     if scan.remission_alike > useless:

@@ -1,4 +1,4 @@
-"""Rectangles on the ground: overlap, suppression and drawing, shared by several stages.
+"""Rectangles on the ground: overlap, suppression, drawing, points inside.
 
 A rectangle is a row ``x, y, length, width, yaw``: centre [m], extent along and across the heading [m], heading about
 +z from +x [rad].
@@ -44,7 +44,7 @@ def draw_footprints(
     boxes : iterable of Box
     view : TopViewGeometry
     classes : sequence of str
-        What the labels are called; a footprint gets the number of its box's class.
+        Names of the labels; a footprint gets the number of its box's class.
     """
     all_x, all_y = view.cell_centres()
     for box in sorted(boxes, key=lambda box: -math.hypot(box.center[0], box.center[1])):
@@ -86,7 +86,7 @@ def oriented_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     Raises
     ------
     PointsError
-        ``a`` or ``b`` is no (n, 5) array.
+        ``a`` or ``b`` is not an (n, 5) array.
     """
     first, second = _as_rectangles(a), _as_rectangles(b)
     iou = np.empty((len(first), len(second)))
@@ -121,7 +121,7 @@ def suppress_overlaps(rectangles: ArrayLike, scores: ArrayLike, iou_threshold: f
         x, y, length, width [m], yaw [rad].
     scores : (n,) array_like
     iou_threshold : float
-        A rectangle goes when it overlaps a kept one with a better score by more than this.
+        A rectangle is dropped when it overlaps a kept one with a better score by more than this.
 
     Returns
     -------
@@ -132,7 +132,7 @@ def suppress_overlaps(rectangles: ArrayLike, scores: ArrayLike, iou_threshold: f
     Raises
     ------
     PointsError
-        ``rectangles`` is no (n, 5) array, or ``scores`` has another length.
+        ``rectangles`` is not an (n, 5) array, or ``scores`` has another length.
     """
     rows = _as_rectangles(rectangles)
     values = np.asarray(scores, dtype=np.float64)
@@ -160,7 +160,7 @@ def bounding_rectangles(rectangles: ArrayLike) -> NDArray[np.float64]:
     Raises
     ------
     PointsError
-        ``rectangles`` is no (n, 5) array.
+        ``rectangles`` is not an (n, 5) array.
     """
     rows = _as_rectangles(rectangles)
     cos, sin = np.abs(np.cos(rows[:, 4])), np.abs(np.sin(rows[:, 4]))
@@ -231,8 +231,8 @@ def pair_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     center_x = dx * cos_a + dy * sin_a
     center_y = dy * cos_a - dx * sin_a
     cos_r, sin_r = math.cos(b[4] - a[4]), math.sin(b[4] - a[4])
-    # Four clips leave at most 8 corners, and never more than 20 however the corners round.
-    # Columns 0, 1 and columns 2, 3 take turns.
+    # Four clips leave at most 8 corners, and at most 20 with rounding.
+    # Source and target alternate between columns 0, 1 and columns 2, 3.
     corners = np.empty((20, 4))
     for k in range(4):
         along = 0.5 * b[2] if k == 0 or k == 3 else -0.5 * b[2]
@@ -267,7 +267,7 @@ def pair_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     for k in range(n):
         last = n - 1 if k == 0 else k - 1
         twice += corners[last, source] * corners[k, source + 1] - corners[k, source] * corners[last, source + 1]
-    # Rounding leaves a sliver's area below zero, and that of equal rectangles above their own.
+    # With rounding, the area of a sliver may be below zero, and that of equal rectangles above their own.
     shared = min(max(0.5 * twice, 0.0), area_a, area_b)
     return float(shared / (area_a + area_b - shared))
 

@@ -1,9 +1,9 @@
-"""Which points are ground, and how high the others stand: RANSAC in every region of the street.
+"""Ground points, and the height of the others above the ground: RANSAC in every region of the street.
 
-One plane fits a car park; a street climbs, leans and has kerbs. `find_ground` lays a grid over the scan and keeps the
-lowest return of every cell. RANSAC fits a plane to these in each region, from the vehicle outwards, so that what is
-known nearby says where to look next; where the lowest returns of a few cells agree on a step off the plane, such as a
-pavement's, the ground follows them.
+One plane fits a car park; a street climbs, leans and has kerbs. `find_ground` divides the scan into cells and keeps the
+lowest return of each. RANSAC fits a plane to these in each region, from the vehicle outwards; each region starts from
+the planes of its neighbours. Where the lowest returns of a few cells agree on a step off the plane, such as a
+pavement, the ground follows them.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from .points import read_only
 
 __all__ = ["Ground", "find_ground"]
 
-# Cells of half a metre, 256 x 256 of them; regions of 16 x 16 cells, 16 x 16 of them. Farther out hardly a ray meets
-# the ground.
+# 256 x 256 cells of half a metre, in 16 x 16 regions of 16 x 16 cells. Farther out, few rays meet the ground.
 CELL_M = 0.5
 N_CELLS = 256
 CELLS_A_REGION = 16
@@ -29,20 +28,20 @@ N_REGIONS = N_CELLS // CELLS_A_REGION
 REGION_M = CELL_M * CELLS_A_REGION
 REACH_M = 0.5 * CELL_M * N_CELLS
 
-# The plane around the vehicle. The sensor may lean, and stand on another vehicle than its profile says.
+# The plane around the vehicle. The sensor may lean, and its mounting height may differ from the profile's.
 FIRST_REACH_M = 20.0
 MAX_SLOPE = 0.3
 MAX_MOUNT_ERROR_M = 0.5
 MIN_FIRST_SUPPORT = 30  # cells
 N_FIRST_HYPOTHESES = 100
 
-# The planes of the regions, each against the one that its neighbours lead to expect.
+# The planes of the regions, relative to the plane expected from their neighbours.
 MAX_BEND = 0.12  # change of slope
 MAX_SHIFT_M = 0.5
-BAND_M = 0.8  # cells farther off take no part
+BAND_M = 0.8  # cells farther from the expected plane are ignored
 MIN_SUPPORT = 6  # cells
 N_HYPOTHESES = 24
-PRIOR_CELLS = 4  # what the expected slope weighs in the least squares
+PRIOR_CELLS = 4  # weight of the expected slope in the least squares
 
 TOLERANCE_M = 0.1
 MIN_AREA_M2 = 1.0  # twice the triangle of a hypothesis, seen from above
@@ -51,19 +50,19 @@ MAX_TESTED = 1024  # cells a hypothesis is tested on
 # Steps: 5 x 5 cells; recall and precision rose by 0.007 and 0.001 on simulated scans, 0.027 and 0.002 on HDL-32E ones.
 WINDOW = 2
 MAX_STEP_M = 0.3
-MAX_DEPTH_M = 0.5  # what lies deeper was reflected
+MAX_DEPTH_M = 0.5  # deeper points are reflections
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ground:
-    """What `find_ground` found.
+    """Result of `find_ground`.
 
     Attributes
     ----------
     mask : (n,) bool
         Points on the ground, in input order.
     height_m : (n,) float32
-        Height of every point above the ground at its place [m]; NaN for points that are not finite.
+        Height of every point above the ground below it [m]; NaN for points that are not finite.
     plane : tuple of 3 float, or None
         a, b, c of z = a x + b y + c [m] around the vehicle. None where no ground was found: then no point is ground,
         and heights are those above a level plane at the mounting height.
@@ -81,24 +80,24 @@ def find_ground(
     max_height_m: float = 0.125,
     regions: bool = True,
 ) -> Ground:
-    """Tell the ground from what stands on it.
+    """Separate the ground from what stands on it.
 
     Parameters
     ----------
     points : (n, 3 or more) float32
         x, y, z [m] in the sensor frame.
     mount_height_m : float
-        Height of the sensor above the ground, right to half a metre (`SensorProfile.mount_height_m`).
+        Height of the sensor above the ground, with an error of at most 0.5 m (`SensorProfile.mount_height_m`).
     max_height_m : float
         Points up to this above the ground are ground, and those down to 0.5 m below it.
     regions : bool
-        False fits the one plane around the vehicle, and nothing else.
+        False fits only the plane around the vehicle.
 
     Returns
     -------
     Ground
-        The same scan gives the same answer. An empty scan, or one without ground such as a wall's, is no error:
-        ``plane`` is None then.
+        The same scan gives the same answer. For an empty scan, or one without ground such as that of a wall,
+        ``plane`` is None.
 
     Raises
     ------
@@ -107,18 +106,19 @@ def find_ground(
 
     Notes
     -----
-    KUL-Seg (section 5.2) removes the ground by RANSAC and says no more; this is ours. A hypothesis is the plane through
-    the lowest returns of three cells. For it speaks every cell whose lowest return lies within 0.1 m of it, against it
-    every one whose lowest return lies below: nothing is seen under the ground, so hedges or a row of car roofs win only
-    where they hide more than two thirds of the cells. The first plane is sought within 20 m of the sensor, near the
-    mounting height. Each region of 8 x 8 m then starts from the mean of its solved neighbours, bends by 0.12 at most,
-    and is refined by least squares, with the neighbours' slope as a weak prior: far out, a region may hold a single
-    ring of returns. Between the middles of regions heights are interpolated. Last, the ground moves to the mean of the
-    lowest returns in 5 x 5 cells, as far as they are within 0.3 m: so it follows kerbs and banks.
+    KUL-Seg (section 5.2) removes the ground by RANSAC without details; this method is our own. A hypothesis is the
+    plane through the lowest returns of three cells. A cell whose lowest return is within 0.1 m of the plane votes for
+    it; a cell whose lowest return is below votes against it. Nothing is seen under the ground, so a plane through
+    hedges or a row of car roofs wins only where they hide more than two thirds of the cells. The first plane is
+    searched within 20 m of the sensor, near the mounting height. Each region of 8 x 8 m then starts from the mean of
+    its solved neighbours, may differ in slope by 0.12, and is refined by least squares with the neighbours' slope as a
+    weak prior, because a far region may hold a single ring of returns. Heights are interpolated between the middles of
+    regions. Last, the ground moves to the mean of the lowest returns within 0.3 m in 5 x 5 cells, so that it follows
+    kerbs and banks.
 
-    All of this was chosen on simulated HDL-64E and VLP-16 scans and on HDL-32E scans of nuScenes. On 16 scans of
-    SemanticKITTI (ground: road, parking, pavement, other ground, terrain, lane marking; vegetation left out, for its
-    grass may be either) recall is 0.998 and precision 0.983; Patchwork++'s are 0.996 and 0.977.
+    Parameters were chosen on simulated HDL-64E and VLP-16 scans and on HDL-32E scans of nuScenes. On 16 scans of
+    SemanticKITTI (ground: road, parking, pavement, other ground, terrain, lane marking; vegetation is left out, because
+    its grass may be either) recall is 0.998 and precision 0.983; Patchwork++ has 0.996 and 0.977.
     """
     if points.ndim != 2 or points.shape[1] < 3:
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
@@ -163,13 +163,13 @@ def fill_lowest(points: NDArray[np.float32], cell: NDArray[np.int32], lowest: ND
     flat = lowest.reshape(-1)
     reach = np.float32(REACH_M)
     cells_per_m = np.float32(1.0 / CELL_M)  # a power of two: no rounding
-    # Backwards, for most sensors' lowest beam comes last: fewer points are the lowest so far, which saves a fifth.
+    # Backwards: the lowest beam of most sensors comes last, so the minimum changes less often. Saves a fifth.
     for i in range(points.shape[0] - 1, -1, -1):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         if not (abs(x) < reach and abs(y) < reach and abs(z) < math.inf):
             cell[i] = -1
             continue
-        # Rounding may carry the last float below the edge onto it.
+        # The last float below the edge may be rounded onto it.
         row = min(int((x + reach) * cells_per_m), N_CELLS - 1)
         col = min(int((y + reach) * cells_per_m), N_CELLS - 1)
         at = row * N_CELLS + col
@@ -181,7 +181,7 @@ def fill_lowest(points: NDArray[np.float32], cell: NDArray[np.int32], lowest: ND
 
 @njit(cache=True, nogil=True)
 def fit_first_plane(points: NDArray[np.float32], lowest: NDArray[np.int32], plane: NDArray[np.float64]) -> bool:
-    """Replace ``plane`` (3,), the expected a, b, c, by the one around the vehicle; False where there is none."""
+    """Replace ``plane`` (3,), the expected a, b, c, by the plane around the vehicle; False if there is none."""
     size = 2 * int(FIRST_REACH_M / CELL_M)
     start = (N_CELLS - size) // 2
     residuals = np.empty((size * size, 3))
@@ -210,7 +210,7 @@ def fill_planes(
     first : (3,) float64
         a, b, c around the vehicle.
     planes : (N_REGIONS, N_REGIONS, 3) float64, overwritten
-        Slopes along x and y, and height in the region's middle [m]; the expected one where too few cells agree.
+        Slopes along x and y, and height in the region's middle [m]; as expected where too few cells agree.
     """
     solved = np.zeros((N_REGIONS, N_REGIONS))  # 1 and the cells that agree
     residuals = np.empty((CELLS_A_REGION * CELLS_A_REGION, 3))
@@ -346,7 +346,7 @@ def refine_plane(
 ) -> int:
     """Replace ``plane`` by the least squares of the cells on it, and return how many there are; 0 without a plane.
 
-    ``prior`` [m2] is what no slope at all weighs.
+    ``prior`` [m2] is the weight of a slope of zero.
     """
     count = 0
     sx, sy, sz = 0.0, 0.0, 0.0
@@ -395,7 +395,7 @@ def fill_levels(
     level : (N_CELLS, N_CELLS) float32, overwritten
         z [m]; NaN where no point is.
     """
-    # Zeros, and room around them, spare the sums below every question: half the time.
+    # Padded with zeros, so that the sums below need no checks: half the time.
     step = np.zeros((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), dtype=np.float32)
     counts = np.zeros((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), dtype=np.float32)
     for row in range(N_CELLS):

@@ -1,4 +1,4 @@
-"""Scans as they come, answers as fast as they can be had: the newest scan wins, and nothing queues up."""
+"""Live sources: perceive the newest scan, drop older ones, never queue."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from .errors import PointsError
+from .errors import OptionError, PointsError
 from .perception import Perception
 from .readers.captures import read_scans
 
@@ -20,31 +20,31 @@ __all__ = ["Answer", "Health", "Stream", "stream"]
 
 Health = Literal["OK", "LATE", "STALE"]
 
-# How long `Stream.close` waits for a source that is busy reading.
+# Time that `Stream.close` waits for a source that is reading.
 _PATIENCE_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """What is known of the newest scan, and how old that is.
+    """The perception of the newest scan, and its age.
 
     Attributes
     ----------
     points : array_like
-        The scan as it came; ``perception.points.labels`` holds a label for each of its points.
+        The scan as given; ``perception.points.labels`` holds a label for each of its points.
     perception : Perception
     tracks : object
-        What the tracker made of the perception; None without one.
+        What the tracker returned; None without a tracker.
     stamp_s : float
         The time given with the scan [s]; without one, that of its arrival on this computer's monotonic clock.
     age_s : float
-        How long ago the scan arrived, when the answer was ready [s].
+        Time from the arrival of the scan until the answer was ready [s].
     health : {"OK", "LATE", "STALE"}
-        Of this age, see `Stream`.
+        By ``age_s``, see `Stream`.
     n_scans : int
-        Scans that had come when this one was taken up.
+        Scans that had arrived when this one was taken.
     n_dropped : int
-        How many of these nobody looked at, as a newer one was there.
+        Scans of these that were dropped because a newer one had arrived.
     """
 
     points: Any
@@ -67,31 +67,31 @@ def stream(
     stale_after_s: float | None = None,
     topic: str | None = None,
 ) -> Stream:
-    """Answers to a live source, each to the newest scan there is; reading begins at once.
+    """Perceive a live source, always its newest scan; reading begins at once.
 
     Parameters
     ----------
     source : iterable, str or path
-        Any iterable of scans, each as points or as a tuple (stamp_s, points); a thread of its own reads it, as fast as
-        it gives, and a scan once given must not be written to. Or a scan, a folder or a capture
-        (`edgeperc.read_scans`), replayed in its own time: by its stamps or, where it has none, at ``rate_hz``.
+        Any iterable of scans, each as points or as a tuple (stamp_s, points). A thread reads it as fast as it gives;
+        scans must not be changed afterwards. Or a scan, a folder or a capture (`edgeperc.read_scans`), replayed in real
+        time: by its stamps or, without stamps, at ``rate_hz``.
     perceiver : callable
         ``perceiver(points, stamp_s=stamp_s) -> Perception``, such as a `Perceiver`.
     tracker : callable, optional
         ``tracker(perception) -> tracks``.
     rate_hz : float
-        Of the sensor.
+        Scans a second of the sensor.
     late_after_s, stale_after_s : float, optional
-        Ages above which what is known is late or stale; by default two and five periods of the sensor.
+        Ages above which an answer is late or stale; by default two and five periods of the sensor.
     topic : str, optional
         As in `edgeperc.read_scans`.
 
     Raises
     ------
     PointsError
-        When the source is no iterable, no path, or a path of nothing.
-    ValueError
-        When the rate is not above 0, or not 0 < late_after_s <= stale_after_s.
+        The source is neither iterable nor a path, or nothing is at the path.
+    OptionError
+        The rate is not above 0, or not 0 < late_after_s <= stale_after_s.
 
     Examples
     --------
@@ -100,11 +100,11 @@ def stream(
     ...         print(answer.age_s, answer.health, answer.n_dropped, answer.perception.boxes)
     """
     if not 0.0 < rate_hz < math.inf:
-        raise ValueError(f"rate_hz is {rate_hz}; expected scans a second, above 0")
+        raise OptionError(f"rate_hz is {rate_hz}; expected scans a second, above 0")
     late_s = 2.0 / rate_hz if late_after_s is None else late_after_s
     stale_s = max(5.0 / rate_hz, late_s) if stale_after_s is None else stale_after_s
     if not 0.0 < late_s <= stale_s:
-        raise ValueError(f"late_after_s is {late_s} and stale_after_s {stale_s}; expected 0 < late <= stale")
+        raise OptionError(f"late_after_s is {late_s} and stale_after_s {stale_s}; expected 0 < late <= stale")
     inbox = _Inbox()
     if isinstance(source, str | os.PathLike):
         scans: Iterator[Any] = _paced(read_scans(Path(source), topic=topic), rate_hz, inbox.stopped)
@@ -119,17 +119,17 @@ def stream(
 class Stream:
     """An iterator of `Answer` that reads its source in a thread; made by `stream`.
 
-    Of the scans that came the newest alone is kept. Perceiver and tracker run in the caller's thread, when the next
-    answer is asked for. Their errors arise there, and the scan after can be asked for as ever. So does an error of the
-    source, behind the answer to the last scan before it; then the stream is at its end.
+    Only the newest scan is kept. Perceiver and tracker run in the caller's thread when the next answer is requested.
+    Their errors are raised there, and the next scan can still be requested. An error of the source is raised after the
+    answer to the last scan before it; then the stream is at its end.
 
-    Health goes by age alone: ``"OK"`` up to ``late_after_s``, ``"LATE"`` up to ``stale_after_s``, then ``"STALE"``. An
-    answer has the health it had when it was ready. That of the stream is the newest answer's now, so it tells when the
-    source has fallen silent, too; any thread may ask, while another waits for an answer.
+    Health depends on age only: ``"OK"`` up to ``late_after_s``, ``"LATE"`` up to ``stale_after_s``, then ``"STALE"``.
+    An answer has the health it had when it was ready. The health of the stream is that of the newest answer now, so it
+    also shows that a source has stopped; any thread may read it while another waits for an answer.
 
-    Leave the ``with`` block, call `close` or let go of the stream, and reading stops. A source that blocks for ever
-    cannot be interrupted; its thread holds neither perceiver nor results, ends with the next scan that the source
-    gives, and does not keep the process alive.
+    Reading stops when the ``with`` block is left, when `close` is called, and when the stream is deleted. A source that
+    blocks for ever cannot be interrupted; its thread holds neither perceiver nor results, ends with the next scan that
+    the source gives, and does not keep the process alive.
 
     Attributes
     ----------
@@ -161,24 +161,24 @@ class Stream:
         return answer
 
     def take(self, timeout_s: float | None = None) -> Answer | None:
-        """The answer to the newest scan that has not been looked at, as ``next()`` gives it, but waiting no longer.
+        """Like ``next()``, with a time limit.
 
         Parameters
         ----------
         timeout_s : float, optional
-            How long to wait for a scan; the time to perceive it comes on top.
+            Longest wait for a scan, without the time to perceive it.
 
         Returns
         -------
         Answer or None
-            None when no scan came in time.
+            None if no scan arrived in time.
 
         Raises
         ------
         StopIteration
             The source is at its end, or the stream is closed.
         Exception
-            Whatever the source, the perceiver or the tracker raised.
+            An error of the source, the perceiver or the tracker.
         """
         taken = self._inbox.take(timeout_s)
         if taken is None:
@@ -192,12 +192,12 @@ class Stream:
 
     @property
     def age_s(self) -> float:
-        """How long ago the scan arrived that was answered last [s]; infinite before the first."""
+        """Time since the arrival of the newest answered scan [s]; infinite before the first."""
         return time.monotonic() - self._newest_s
 
     @property
     def health(self) -> Health:
-        """Of this age."""
+        """Health at the present `age_s`."""
         return self._health_at(self.age_s)
 
     def _health_at(self, age_s: float) -> Health:
@@ -207,16 +207,16 @@ class Stream:
 
     @property
     def n_scans(self) -> int:
-        """Scans that have come."""
+        """Scans that have arrived."""
         return self._inbox.n_scans
 
     @property
     def n_dropped(self) -> int:
-        """How many of these nobody looked at, as a newer one was there."""
+        """Scans dropped because a newer one had arrived."""
         return self._inbox.n_dropped
 
     def close(self) -> None:
-        """Stop reading; whoever waits for an answer gets none. Waits for the thread unless its source blocks."""
+        """Stop reading, and wait for the thread unless its source blocks. Calls that wait raise StopIteration."""
         self._inbox.stop()
         self._thread.join(_PATIENCE_S)
 
@@ -272,14 +272,14 @@ class _Inbox:
 
 
 def _read(scans: Iterator[Any], inbox: _Inbox) -> None:
-    """Run in the thread: every scan into the inbox, and at last the end or the error."""
+    """Run in the thread: put every scan into the inbox, then the end or the error."""
     error: BaseException | None = None
     try:
         for scan in scans:
             if inbox.stopped.is_set():
                 break
             inbox.put(*_stamped(scan))
-    except BaseException as exc:  # handed to whoever asks for the next answer
+    except BaseException as exc:  # raised by the next `take`
         error = exc
     inbox.end(error)
 
@@ -291,19 +291,19 @@ def _stamped(scan: Any) -> tuple[Any, float | None]:
         stamp_s, points = scan
         return points, None if stamp_s is None else float(stamp_s)
     except (TypeError, ValueError) as exc:
-        raise PointsError(f"got a tuple that is no scan ({exc}); expected points or (stamp_s, points)") from exc
+        raise PointsError(f"got a tuple that is not a scan ({exc}); expected points or (stamp_s, points)") from exc
 
 
 def _paced(
     scans: Iterator[tuple[float | None, Any]], rate_hz: float, stopped: threading.Event
 ) -> Iterator[tuple[float, Any]]:
-    """Recorded scans when they are due: by their stamps or, without, at the sensor's rate; a late one comes at once."""
+    """Recorded scans in real time: by their stamps or else at the sensor's rate. Late scans come at once."""
     started_s = time.monotonic()
     first_s: float | None = None
     for k, (stamp_s, points) in enumerate(scans):
         moment_s = k / rate_hz if stamp_s is None else stamp_s
         if first_s is None:
-            # The first scan is read, and whatever reads it imported, before the clock starts.
+            # Reading the first scan may import libraries: the clock starts after it.
             started_s, first_s = time.monotonic(), moment_s
         if stopped.wait(max(0.0, started_s + moment_s - first_s - time.monotonic())):
             return

@@ -1,4 +1,4 @@
-"""What comes out: frozen results, in the sensor frame (x forward, y left, z up, metres, radians)."""
+"""Frozen results, in the sensor frame (x forward, y left, z up, metres, radians)."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ class Box:
             label = document["label"]
         except (KeyError, TypeError, ValueError) as exc:
             raise PointsError(
-                f"got a box that cannot be read ({type(exc).__name__}: {exc}); expected label, score, center (x, y, z), "
-                "size (length, width, height) and yaw"
+                f"got a box that cannot be read ({type(exc).__name__}: {exc}); expected label, score, yaw, center "
+                "(x, y, z) and size (length, width, height)"
             ) from exc
         if not isinstance(label, str):
             raise PointsError(f"got a box with label {label!r}; expected a str")
@@ -108,7 +108,7 @@ class TopView:
 
     @property
     def drivable(self) -> NDArray[np.bool_]:
-        """Cells labelled drivable, (rows, columns) bool; all False where the model knows no such class."""
+        """Cells labelled drivable, (rows, columns) bool; all False if the model has no such class."""
         if "drivable" not in self.classes:
             return np.zeros(self.labels.shape, dtype=np.bool_)
         return self.labels == self.classes.index("drivable")
@@ -132,7 +132,7 @@ class PointLabels:
     labels : (n,) uint8
         Index into ``classes``; 0 for points out of the network's view and for points that are not finite.
     in_view : (n,) bool
-        False where the network could not see the point, so that its 0 is no verdict.
+        False where the point is out of the network's view; its label 0 then means nothing.
     classes : tuple of str
     """
 
@@ -155,19 +155,20 @@ class Perception:
     n_points : int
         Points in the input.
     n_dropped : int
-        Input points that are not finite; they are labelled 0 and take part in nothing.
+        Input points that are not finite; they are labelled 0 and otherwise ignored.
     points : PointLabels or None
-        From a range-image model; None where the Perceiver holds none.
+        From a range-image model; None without one.
     top_view : TopView or None
-        From a top-view model; None where the Perceiver holds none.
+        From a top-view model; None without one.
     boxes : tuple of Box
         Best score first.
     stage_ms : mapping
-        Wall time of ``project``, ``infer``, ``decode``, ``refine`` and ``check`` [ms].
+        Wall time of ``check``, ``project``, ``infer``, ``decode``, ``refine`` and ``cluster`` [ms], and of ``adapt``
+        for sensors that are adapted.
     providers : mapping
-        What really ran, by model name, e.g. ``"CPUExecutionProvider (fp32)"``.
+        What ran, by model name, e.g. ``"pointseg int8, CPUExecutionProvider"``.
     fitness : tuple of str
-        What is unlike the scans the models were trained on, in plain words; empty when nothing is.
+        How the scan differs from the training scans, a sentence each; empty if it does not.
     stamp_s : float or None
         The time given with the scan [s].
     """

@@ -31,7 +31,7 @@ def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArra
     Returns
     -------
     (n, 4) float32, C-contiguous
-        The very array, not a copy, where it is this already. Values beyond float32 become infinite.
+        The given array itself if it is this already. Values beyond float32 become infinite.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArra
     if isinstance(array, np.ma.MaskedArray):
         raise PointsError("got a masked array; fill it first, e.g. with array.filled(np.nan)")
     try:
-        # Ragged sequences raise ValueError; objects may raise whatever their __array__ raises.
+        # Ragged sequences raise ValueError; the __array__ of an object may raise anything.
         values = np.asarray(array)
     except Exception as exc:
         raise PointsError(f"got no array: {exc}; expected (n, 4) x, y, z, remission") from exc
@@ -86,7 +86,7 @@ def plain_name(name: str) -> str:
 
 
 def remission_name(names: Iterable[str], wanted: str | None) -> str | None:
-    """Which field is the remission: the one wanted, or the first known name that is present; None if there is none."""
+    """Name of the remission field: the wanted one, or the first known name that is present; None if there is none."""
     present = list(names)
     if wanted is None:
         return next((name for name in _REMISSION_NAMES if name in present), None)
@@ -98,7 +98,7 @@ def remission_name(names: Iterable[str], wanted: str | None) -> str | None:
 def assemble(
     n: int, fields: Mapping[str, NDArray[Any]], names: Sequence[str], remission_field: str | None
 ) -> NDArray[np.float32]:
-    """Gather named columns; ``names`` is what the source calls its fields, for the message."""
+    """Points from named columns; ``names`` are the fields of the source, for the message."""
     missing = [axis for axis in "xyz" if axis not in fields]
     if missing:
         raise PointsError(

@@ -69,11 +69,11 @@ class Projection:
 
 
 # The kernels take a block of points through short loops without branches, which compile to vector instructions, and
-# leave only the table look-ups and the contest for the pixel to scalar code. Three habits matter for that, each
+# leave only the table look-ups and the choice of a pixel's point to scalar code. Three habits matter for that, each
 # worth a factor of two to three in its loop: points are indexed flat (4 * i + 1, as the compiler does not know the
 # stride of points[i, 1]), all four values of a point are used (a gap in the loads stops it), and positions are kept
-# unsigned (a signed one costs a test for counting from the end). Choosing the points in
-# view stands in both kernels, for as a function of its own it made them 2 to 5 % slower.
+# unsigned (a signed one costs a test for counting from the end). The choice of the
+# points in view is repeated in both kernels: as a separate function it made them 2 to 5 % slower.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -174,8 +174,8 @@ def mark_range_image(
     points : (n, 4) float32, C-contiguous
         x, y, z [m] in the sensor frame, remission.
     wedge : (4,) float32
-        Coefficients of x, y, x, y in two sums, neither of them negative for any point in view; for a cheap first
-        look that spares three quarters of a full turn the divisions.
+        Coefficients of x, y, x, y in two sums that are not negative for any point in view: a cheap test that
+        saves the divisions for three quarters of a full turn.
     row_scale, col_scale : (3,) float32
     row_base, col_base : (cells + 2,) int32
     row_split, col_split : (cells + 2,) float32
@@ -242,7 +242,7 @@ def mark_range_image(
             angles[1, k] = azimuth
             cells[0, k] = np.uint32(np.int32((top - elevation) * row_cells))
             cells[1, k] = np.uint32(np.int32((left - azimuth) * col_cells))
-            # the bits of a positive float grow with it
+            # positive floats and their bits have the same order
             ranks[k] = np.float32(squared_range if inside else INFINITY).view(np.int32)
         for k in range(count):
             row_cell = cells[0, k]
@@ -400,14 +400,14 @@ class RangeImageProjector:
     Raises
     ------
     CardError
-        A channel is not one of these, or beams or columns lie too close to be told apart.
+        A channel is not one of these, or beams or columns lie too close to be separated.
 
     Notes
     -----
     PointSeg's equation 2 takes arcsin(y / sqrt(x^2 + y^2 + z^2)) for the azimuth. That is arcsin(sin(azimuth) *
     cos(elevation)), smaller than the azimuth by ever more as the beam points farther down: at azimuth 45 degrees a
-    beam at -24.8 degrees gets 39.9, which is 29 of 512 columns off, so upright edges would bend. The true azimuth
-    is used here.
+    beam at -24.8 degrees gets 39.9, which is 29 of 512 columns off, so upright edges would bend. This module uses
+    the true azimuth.
 
     No angle is computed for a point. Azimuth and elevation are replaced by y / (|x| + |y|), unfolded over the
     half-planes, and z / (sqrt(x^2 + y^2) + |z|), which grow with them, and compared with the pixels' edges in the
@@ -461,7 +461,7 @@ def make_projector(
     Raises
     ------
     CardError
-        The input has a channel that the view does not, or beams or columns lie too close to be told apart.
+        The input has a channel that the view does not, or beams or columns lie too close to be separated.
     """
     if isinstance(view, TopViewGeometry):
         return TopViewProjector(view, input)
@@ -486,7 +486,7 @@ def column_edges(view: RangeImageGeometry) -> NDArray[np.float32]:
 
 
 def wedge(view: RangeImageGeometry) -> NDArray[np.float32]:
-    """Coefficients of x, y, x, y in two sums, neither of them negative for any point in view, (4,) float32."""
+    """Coefficients of x, y, x, y in two sums that are not negative for any point in view, (4,) float32."""
     if view.azimuth_left_deg - view.azimuth_right_deg > 179.0:
         return np.zeros(4, dtype=np.float32)
     slack = 1e-5  # [rad] a hundred times what rounding can do to a sum
@@ -521,7 +521,7 @@ def tabulate(
     Raises
     ------
     CardError
-        Edges so close that 65,536 table cells do not part them.
+        Edges so close that 65,536 table cells do not separate them.
     """
     first, last = edges[0], edges[-1]
     inner = edges[1:-1]
@@ -533,11 +533,13 @@ def tabulate(
             base = np.searchsorted(at, np.arange(cells + 2)).astype(np.int32)
             split = np.full(cells + 2, -np.inf, dtype=np.float32)
             split[at] = inner
-            # -2 is straight behind, and what azimuths a hair to the left of that round to.
+            # -2 is straight behind; azimuths slightly to the left of that are rounded to it.
             open_end = np.float32(-3.0) if last == np.float32(-2.0) else last
             return np.array([first, open_end, cells_per_unit], dtype=np.float32), base, split
         cells *= 2
-    raise CardError(f"view has {edges.size - 1} {what}, some closer than float32 angles can part; expected wider ones")
+    raise CardError(
+        f"view has {edges.size - 1} {what}, some closer than float32 angles can separate; expected wider ones"
+    )
 
 
 def _channels(

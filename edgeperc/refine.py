@@ -1,8 +1,8 @@
-"""Pixel labels -> point labels: outliers removed by consensus (PointSeg 5.2), then every point asks its neighbours.
+"""Pixel labels -> point labels: outliers removed by consensus (PointSeg 5.2), then labels carried to all points.
 
-A network labels pixels, and its objects bleed over their edges onto what stands behind, because neighbouring pixels
-may be metres apart. `remove_outliers` takes the bleeding back; `label_points` then carries labels to all points,
-also to those that lost their pixel to a nearer one.
+A network labels pixels, and labels of objects bleed over their edges onto what is behind, because neighbouring pixels
+may be metres apart. `remove_outliers` removes this bleeding; `label_points` then carries the labels to all points,
+also to those that share a pixel with a nearer point.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from .points import read_only
 
 __all__ = ["OBJECT_RADIUS_M", "label_points", "remove_outliers"]
 
-# Half of an object's diagonal seen from above, with room for the visible side's mean not being its middle. On 90
-# labelled KITTI frames, car IoU was 0.888, 0.884, 0.878 and 0.872 for 2.5, 3, 3.5 and 4.5 m where masks were dilated
+# Half of an object's diagonal seen from above, and a margin because the mean of the visible side is not its middle. On
+# 90 labelled KITTI frames, car IoU was 0.888, 0.884, 0.878 and 0.872 for 2.5, 3, 3.5 and 4.5 m where masks were dilated
 # by a pixel, and 0.990, 0.991, 0.993 and 0.993 where they were right: below 3.5 m vans and trucks lose points.
 OBJECT_RADIUS_M: Mapping[str, float] = MappingProxyType({"car": 3.5, "pedestrian": 0.7, "cyclist": 1.2})
 
 N_HYPOTHESES = 16  # 8 to 64 differ by less than 0.002 in car IoU
-MAX_TESTED = 512  # points a hypothesis is tested on, so that a huge component costs no more than a large one
-MAX_OBJECTS = 64  # in one component; what is left after as many is no longer bleeding, and stays
+MAX_TESTED = 512  # points a hypothesis is tested on; bounds the time for huge components
+MAX_OBJECTS = 64  # in one component; pixels left after that keep their label
 MIN_OBJECT = 5  # points
-# Bleeding is a rim around an object, so a remainder is an object of its own when it is more than rim.
+# Bleeding is a rim around an object. A remainder that reaches beyond the rim is an object of its own.
 RIM = 2  # pixels
 MIN_BEYOND_RIM = 0.1
 
@@ -60,7 +60,7 @@ def remove_outliers(
     classes : sequence of str
     radius_m : mapping
         Class to the radius [m] around an object's middle, seen from above, that holds its visible points. Classes
-        that are not in it are left as they are.
+        that are not in it are not changed.
     full_turn : bool
         The image's left and right edges meet.
 
@@ -76,18 +76,18 @@ def remove_outliers(
 
     Notes
     -----
-    PointSeg 5.2 refines its back projection by RANSAC and names no model; this is ours. Connected pixels of one
-    label (8 neighbours) are a component, whatever their ranges, so that what bled stays with what it bled from. A
-    hypothesis says that an object is where a sampled point is; its consensus are the component's points within the
-    class's radius, seen from above, of the mean of the points within that radius of the sample. The largest
-    consensus is an object. What remains is searched likewise: it is another object (the next car of a row) when its
-    consensus has 5 points and a tenth of them farther than 2 pixels from the objects found before; otherwise all
-    of it goes. At least one object of every component stays.
+    PointSeg 5.2 refines its back projection by RANSAC but does not name a model; this one is our own. Connected
+    pixels of one label (8 neighbours), at any range, are a component, so that bleeding pixels stay with their object.
+    A hypothesis is a sampled point; its consensus are the component's points within the class's radius, seen from
+    above, of the mean of the points within that radius of the sample. The largest consensus is an object. The rest
+    is searched in the same way: it is another object (the next car of a row) if its consensus has 5 points and a
+    tenth of them are more than 2 pixels from the objects found before. Otherwise all of the rest becomes background.
+    At least one object of every component stays.
 
     On 90 labelled KITTI frames, followed by `label_points`, point IoU of car, pedestrian and cyclist rises from
     0.81, 0.63, 0.66 to 0.88, 0.86, 0.87 for masks dilated by one pixel, from 0.71, 0.47, 0.54 to 0.80, 0.74, 0.81
-    for two, and falls by at most 0.002 for masks that were right. A ground plane on top was tried: it took more from
-    the objects' feet than from the ground.
+    for two, and falls by at most 0.002 for masks that were right. Removing points near a ground plane as well took
+    more from the objects' feet than from the ground.
     """
     arrays = _check(points, index, labels)
     radii = np.array([radius_m.get(name, 0.0) for name in classes])
@@ -125,8 +125,8 @@ def label_points(
     -------
     (n,) uint8
         A point that won its pixel has the pixel's label. The others are hidden behind a nearer point, and take the
-        label that most of their nearest 5 pixels have, by difference in range, out of the 5 x 5 around and no
-        farther than 1 m; 0 where there is none. Of equal counts the label of the nearest pixel wins, of equal
+        label that most of their nearest 5 pixels have, by difference in range, of the 5 x 5 around and within
+        1 m; 0 where there is none. Of equal counts the label of the nearest pixel wins, of equal
         differences the pixel above, then left. Points out of view have 0.
 
     Raises
@@ -184,7 +184,7 @@ def fill_without_outliers(
     index : (H, W) int32
     labels : (H, W) uint8
     radii : (classes,) float64
-        0 leaves a class as it is.
+        Classes with 0 are not changed.
     full_turn : bool
     cleaned : (H, W) uint8, overwritten
     """
@@ -206,7 +206,7 @@ def fill_without_outliers(
                 ground[k, 0] = points[index[rows[k], cols[k]], 0]
                 ground[k, 1] = points[index[rows[k], cols[k]], 1]
             component = np.int32(first_row * width + first_col)
-            # The draws depend on the component alone: neither on other components nor on the clock.
+            # The draws depend on the component only, so that the answer is reproducible.
             draw = np.int64(component)
             squared_radius = radii[label] * radii[label]
             n_objects = 0
@@ -260,7 +260,7 @@ def collect_component(
     rows[0], cols[0] = first_row, first_col
     n_found = 1
     looked_at = 0
-    while looked_at < n_found:  # breadth first, so that what was looked at makes the list
+    while looked_at < n_found:  # breadth first; the list is the queue
         row, col = rows[looked_at], cols[looked_at]
         looked_at += 1
         for r in range(max(row - 1, 0), min(row + 2, height)):
@@ -286,7 +286,7 @@ def collect_component(
 def find_consensus(
     ground: NDArray[np.float64], n: int, squared_radius: float, draw: int, center: NDArray[np.float64]
 ) -> int:
-    """Write the best hypothesis' x, y into ``center`` (2,), and return where the draws have come to."""
+    """Write x, y of the best hypothesis into ``center`` (2,); return the state of the random draws."""
     step = (n + MAX_TESTED - 1) // MAX_TESTED
     n_tested = (n + step - 1) // step
     most = 0
@@ -344,8 +344,8 @@ def fill_point_labels(
     point_labels : (n,) uint8, overwritten
     """
     height, width = labels.shape
-    ranges = np.full((height, width), -1.0)  # of the pixels, once somebody asks
-    # Most hidden points see nothing but background around, and need no vote: 0.5 ms a scan in place of 1.0.
+    ranges = np.full((height, width), -1.0)  # of the pixels, computed when needed
+    # Most hidden points have only background around them and need no vote: 0.5 ms a scan instead of 1.0.
     contested = np.zeros((height, width), dtype=np.bool_)
     for row in range(height):
         for col in range(width):

@@ -1,4 +1,4 @@
-"""What a sensor is, and whether a scan is like those a model was trained on."""
+"""Sensor profiles: beams, columns, remission range and mounting height."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ REMISSION_KINDS = {"linear": 2, "polynomial": 3, "logarithm": 2}  # and how many
 
 @dataclass(frozen=True)
 class RemissionFunction:
-    """One sensor's remission as another sensor would report it (KUL-Seg 5).
+    """Maps the remission of one sensor to that of another (KUL-Seg 5).
 
     With ``x = full_scale * remission``, where remission is scaled to 0..1 by the profile's ``remission_range``, the
     other sensor's remission in 0..1 is a + b x (linear), a + b x + c x^2 (polynomial) or a + b ln(1 + x) (logarithm),
-    cut off at 0 and 1. `edgeperc.adapt` fits and applies it.
+    clipped to 0..1. `edgeperc.sensor_fit` fits it, `edgeperc.adapt` applies it.
 
     Attributes
     ----------
@@ -36,18 +36,18 @@ class RemissionFunction:
     coefficients : tuple of float
         a, b and, of a polynomial, c.
     full_scale : float
-        Raw values in the sensor's remission range when the function was fitted, 255 for a byte.
+        Width of the sensor's remission range when the function was fitted, 255 for a byte.
     to : str
-        The sensor whose remission comes out.
+        The sensor whose remission is the result.
     rmse : float
-        Root mean square error on samples held back, in shares of the other sensor's full scale.
+        Root mean square error on held-back samples, as a share of the other sensor's full scale.
     source : str
         What it was fitted to.
 
     Raises
     ------
     SensorError
-        When the values describe no such function.
+        The values do not describe such a function.
     """
 
     kind: str
@@ -81,12 +81,13 @@ class RemissionFunction:
 
 @dataclass(frozen=True)
 class SensorProfile:
-    """A spinning LiDAR, as far as the networks care.
+    """A spinning LiDAR.
 
-    A built-in one (`SENSORS`) fits one usual set-up of its model; change what differs with ``dataclasses.replace``,
-    e.g. ``replace(get_sensor("os1-64"), remission_range=(0, 65535), mount_height_m=2.1)`` for an Ouster whose 16-bit
-    signal is used instead of its 8-bit reflectivity. A sensor that is not built in is written down with
-    ``SensorProfile(...)``, or `SensorProfile.uniform` where the beams are evenly spaced.
+    A built-in profile (`SENSORS`) describes a usual set-up of the sensor. Change what differs with
+    ``dataclasses.replace``, e.g.
+    ``replace(get_sensor("os1-64"), remission_range=(0, 65535), mount_height_m=2.1)`` for an Ouster whose 16-bit
+    signal is used instead of its 8-bit reflectivity. Describe another sensor with ``SensorProfile(...)``, or with
+    `SensorProfile.uniform` if its beams are evenly spaced.
 
     Attributes
     ----------
@@ -96,19 +97,19 @@ class SensorProfile:
     columns : int
         Azimuth steps in one turn.
     remission_range : tuple of 2 float
-        Raw values of the sensor's fourth channel that mean 0 and 1 to a network.
+        Raw remissions that are scaled to 0 and 1.
     mount_height_m : float
         Height of the sensor above the road.
     min_range_m, max_range_m : float
         Nearest and farthest return to expect.
     remission : RemissionFunction or None
-        How this sensor's remission is rendered as that of the sensor that models were trained on; None where nothing
-        is known: it is then scaled by ``remission_range`` alone.
+        Maps this sensor's remission to that of the sensor that the models were trained on. None: remission is only
+        scaled by ``remission_range``.
 
     Raises
     ------
     SensorError
-        When the values describe no possible sensor.
+        The values do not describe a possible sensor.
     """
 
     name: str
@@ -154,7 +155,7 @@ class SensorProfile:
             raise SensorError(f"sensor {self.name!r}: remission is a RemissionFunction or None, got {self.remission!r}")
 
     def to_json(self) -> str:
-        """For a file that `get_sensor` reads."""
+        """JSON for a file that `get_sensor` reads."""
         return json.dumps({"schema": SCHEMA, **asdict(self)}, indent=1, ensure_ascii=False, allow_nan=False)
 
     @classmethod
@@ -164,12 +165,14 @@ class SensorProfile:
         Raises
         ------
         SensorError
-            No JSON, another schema, an entry that is missing, unknown or of another type.
+            Not JSON, another schema, or an entry that is missing, unknown or of another type.
         """
         try:
             document = json.loads(text)
         except (RecursionError, ValueError) as exc:
-            raise SensorError(f"the sensor profile is no JSON ({exc}); write it again with edgeperc fit-sensor") from exc
+            raise SensorError(
+                f"the sensor profile is no JSON ({exc}); write it again with edgeperc fit-sensor"
+            ) from exc
         if not isinstance(document, dict) or document.get("schema") != SCHEMA:
             found = document.get("schema") if isinstance(document, dict) else None
             raise SensorError(f"the sensor profile has schema {found!r}, this edgeperc reads {SCHEMA}")
@@ -202,7 +205,7 @@ class SensorProfile:
             raise SensorError(f"sensor {name!r}: fov_up_deg and fov_down_deg must be finite")
         return cls(
             name,
-            # Rounded, so that a card holds 2.3 and not 2.3000000000000003.
+            # Rounded: a card then holds 2.3 and not 2.3000000000000003.
             tuple(round(float(e), 4) for e in np.linspace(fov_up_deg, fov_down_deg, int(n_beams))),
             columns,
             remission_range,
@@ -350,7 +353,7 @@ def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
     Raises
     ------
     SensorError
-        When no built-in profile has that name, or the file holds none.
+        No built-in profile has this name, or the file holds no profile.
     """
     if isinstance(sensor, SensorProfile):
         return sensor
@@ -366,5 +369,5 @@ def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
     except (KeyError, TypeError):
         raise SensorError(
             f"no sensor {sensor!r} is built in; known are {', '.join(SENSORS)}. "
-            "Write down another with SensorProfile(...) or SensorProfile.uniform(...), or name a .json file."
+            "Describe another with SensorProfile(...) or SensorProfile.uniform(...), or name a .json file."
         ) from None

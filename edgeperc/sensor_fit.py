@@ -26,8 +26,8 @@ __all__ = [
 
 # --- remission -------------------------------------------------------------------------------------------------------
 
-# Strata in which remissions of similar streets are compared: by range [m], then by the cosine of the incidence, last
-# what is no surface (leaves, single beams). Quantiles at the middles of even shares stand for their share of a stratum.
+# Strata in which remissions of similar streets are compared: by range [m], then by the cosine of the incidence; the
+# last is no surface (leaves, single beams). Quantiles are taken at the middles of equal shares of a stratum.
 RANGE_EDGES_M = (3.0, 10.0, 25.0, 60.0)
 COSINE_EDGES = (0.0, 0.35, 1.0)
 N_STRATA = (len(RANGE_EDGES_M) - 1) * len(COSINE_EDGES)
@@ -61,7 +61,7 @@ REFERENCES: Mapping[str, tuple[tuple[float, tuple[float, ...]], ...]] = MappingP
         )
     }
 )
-"""By sensor that models are trained on: share of the points and remissions (0..1), stratum by stratum."""
+"""For each training sensor, share of the points and quantiles of remission (0..1) in every stratum."""
 
 
 def _terms(kind: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -74,7 +74,7 @@ def _terms(kind: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _least_squares(kind: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     terms = _terms(kind, x)
-    size = np.abs(terms).max(axis=0) + 1e-30  # x^2 of 16-bit values beside 1 would lose digits
+    size = np.abs(terms).max(axis=0) + 1e-30  # columns of very different size would lose digits
     return np.asarray(np.linalg.lstsq(terms / size, y, rcond=None)[0] / size, np.float64)
 
 
@@ -97,13 +97,13 @@ def fit_functions(
     full_scale : float
         Upper end of the raw values, e.g. 255.
     to, source : str
-        Of the functions.
+        Entries of the functions.
 
     Returns
     -------
     tuple of RemissionFunction
-        By ``rmse`` on pairs held back, every tenth in turn. On the pairs it was fitted to, a parabola is never behind
-        a line; on others it is what the paper found it to be, the worst (KUL-Seg, Table 5).
+        By ``rmse`` in ten-fold cross-validation. On the pairs it is fitted to, a parabola is never worse than a line;
+        on held-back pairs it is the worst, as in the paper (KUL-Seg, Table 5).
 
     Raises
     ------
@@ -154,7 +154,7 @@ def incidences(points: NDArray[np.float32], cell_m: float = 0.8) -> NDArray[np.f
         for j in range(3):
             spread[:, i, j] = np.bincount(cell, off[:, i] * off[:, j]) / count
     values, vectors = np.linalg.eigh(spread)
-    # The middle extent tells a surface from one beam's line, the least one from leaves.
+    # The middle extent separates surfaces from the line of one beam, the least one separates them from leaves.
     flat = (count >= 6) & (values[:, 1] > 0.0025) & (values[:, 0] < 0.1 * values[:, 1])
     range_m = np.linalg.norm(p, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -198,21 +198,21 @@ def remission_strata(scans: Iterable[NDArray[np.float32]]) -> list[tuple[float, 
 def match_quantiles(
     strata: Sequence[tuple[float, Sequence[float]]], reference: Sequence[tuple[float, Sequence[float]]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pairs of remissions without a place in common: the same share of both sensors' points is as dark.
+    """Match remissions of two sensors by quantile; no common scene is needed.
 
-    Both are taken to see the same mix of strata, each stratum as often as the one that sees it less, so that a wider
-    road or a sensor that looks higher up counts for nothing. Matching within each stratum was tried: a least-squares
-    curve through strata that lie beside one another is too flat, and car IoU on PandaSet 0.44 in place of 0.56.
+    Each stratum is weighted by the smaller of its two shares, so that a wider road or a sensor that looks higher up has
+    no influence. Matching within each stratum was worse: the least-squares curve through all strata is too flat, and
+    car IoU on PandaSet was 0.44 instead of 0.56.
 
     Parameters
     ----------
     strata, reference : sequence of (share, quantiles)
-        Of `remission_strata`, of scans and of another sensor in similar streets.
+        From `remission_strata`: of scans, and of another sensor in similar streets.
 
     Returns
     -------
     raw, wanted : (k,) float64
-        Rising; empty where no stratum is known of both.
+        Rising; empty where no stratum is known for both.
     """
     both = [
         (min(share, other_share), own, other)
@@ -227,7 +227,7 @@ def match_quantiles(
 
 
 def _mixed(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quantiles of weighted values at the middles of even shares."""
+    """Quantiles of weighted values at the middles of equal shares."""
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weights[order])
     shares = (np.arange(N_SHARES) + 0.5) / N_SHARES
@@ -237,25 +237,25 @@ def _mixed(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray
 def fit_sensor(
     scans: Sequence[NDArray[np.float32]], sensor: SensorProfile, to: str = "hdl-64e", *, source: str = ""
 ) -> tuple[SensorProfile, tuple[RemissionFunction, ...]]:
-    """A profile whose remission is rendered as another sensor's, from scans of any street.
+    """Fit the remission function of a sensor to scans of any street.
 
     Parameters
     ----------
     scans : sequence of (n, 4) float32
         With raw remissions.
     sensor : SensorProfile
-        What took them.
+        The sensor that took them.
     to : str
-        Of `REFERENCES`.
+        A key of `REFERENCES`.
     source : str
-        What the scans are; by default how many.
+        Description of the scans; by default their number.
 
     Returns
     -------
     profile : SensorProfile
-        ``sensor`` with the best function; no parabola that turns down before full scale.
+        ``sensor`` with the best function; a parabola that turns down before full scale is not taken.
     functions : tuple of RemissionFunction
-        All that were tried, best first.
+        All kinds, best first.
 
     Raises
     ------
@@ -268,13 +268,13 @@ def fit_sensor(
         raise SensorError(f"no reference remissions of {to!r}; known are {', '.join(REFERENCES)}")
     low, high = sensor.remission_range
     raw, wanted = match_quantiles(remission_strata(scans), REFERENCES[to])
-    told = source or f"quantiles by range and incidence of {len(scans)} scans"
-    functions = fit_functions(raw - low, wanted, full_scale=high - low, to=to, source=told)
+    described = source or f"quantiles by range and incidence of {len(scans)} scans"
+    functions = fit_functions(raw - low, wanted, full_scale=high - low, to=to, source=described)
     best = next(f for f in functions if f.kind != "polynomial" or _rises(f))  # quantiles rise, so a line does
     return replace(sensor, remission=best), functions
 
 
 def _rises(parabola: RemissionFunction) -> bool:
-    """Whether brighter stays brighter up to full scale: it may turn down beyond the samples."""
+    """Whether the parabola rises up to full scale; beyond the samples it may turn down."""
     _, b, c = parabola.coefficients
     return b >= 0.0 and b + 2.0 * c * parabola.full_scale >= 0.0

@@ -87,7 +87,7 @@ def _value(function: RemissionFunction, x: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("raw", "wanted", "words"),
+    ("raw", "wanted", "message"),
     [
         ([1, 2, 3], [1, 2, 3], "3 finite pairs"),
         ([1, 2, 3, np.nan, 5], [1, 2, 3, 4, np.inf], "3 finite pairs"),
@@ -95,8 +95,8 @@ def _value(function: RemissionFunction, x: np.ndarray) -> np.ndarray:
         ([1, 2, 3, 4], [1, 2, 3], "4 raw values and 3 wanted ones"),
     ],
 )
-def test_too_little_to_fit(raw: list[float], wanted: list[float], words: str) -> None:
-    with pytest.raises(SensorError, match=words):
+def test_too_little_to_fit(raw: list[float], wanted: list[float], message: str) -> None:
+    with pytest.raises(SensorError, match=message):
         fit_functions(raw, wanted, full_scale=255.0, to="hdl-64e", source="")
 
 
@@ -143,10 +143,10 @@ def test_a_function_is_found_in_other_streets() -> None:
     scans = [street(k) for k in (11, 12, 13)]
     for scan in scans:
         scan[:, 3] = np.rint(np.expm1((scan[:, 3] + 0.1) / 0.15))
-    told = fit_sensor(scans, SensorProfile("mine", HDL.elevations_deg, 2083, (0.0, 255.0)))
-    best = told[1][0]
+    found = fit_sensor(scans, SensorProfile("mine", HDL.elevations_deg, 2083, (0.0, 255.0)))
+    best = found[1][0]
     assert best.kind == "logarithm"
-    assert told[0].remission is best
+    assert found[0].remission is best
     x = np.expm1((np.array([0.1, 0.2, 0.3, 0.4, 0.5]) + 0.1) / 0.15)
     # Simulated streets are not KITTI's; the same streets through `match_quantiles` below give 0.01.
     np.testing.assert_allclose(_value(best, x), [0.1, 0.2, 0.3, 0.4, 0.5], atol=0.08)
@@ -233,7 +233,7 @@ def test_where_the_built_in_functions_come_from() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "message"),
     [
         (lambda d: d.update(schema=2), "schema 2, this edgeperc reads 1"),
         (lambda d: d.pop("schema"), "schema None"),
@@ -255,12 +255,12 @@ def test_where_the_built_in_functions_come_from() -> None:
         (lambda d: d["remission"].update(to=7), "expected two str"),
     ],
 )
-def test_a_wrong_profile_says_what_is_wrong(change: object, words: str, tmp_path: Path) -> None:
+def test_a_wrong_profile_says_what_is_wrong(change: object, message: str, tmp_path: Path) -> None:
     document = json.loads(get_sensor("vlp-16").to_json())
     change(document)  # type: ignore[operator]
     file = tmp_path / "sensor.json"
     file.write_text(json.dumps(document), encoding="utf-8")
-    with pytest.raises(SensorError, match=words) as caught:
+    with pytest.raises(SensorError, match=message) as caught:
         get_sensor(file)
     assert str(caught.value).startswith(str(file))
 
@@ -294,7 +294,7 @@ def project(points: np.ndarray, view: RangeImageGeometry = VIEW) -> np.ndarray:
 
 
 def twin(points: np.ndarray, index: np.ndarray, view: RangeImageGeometry, sensor: SensorProfile):
-    """Reaches are computed here anew, beam by beam, from the rule in words."""
+    """Reaches are computed here anew, beam by beam, from the rule as it is written."""
     rows = np.array(view.row_elevations_deg)
     place = np.interp(-np.array(sensor.elevations_deg), -rows, np.arange(len(rows)), left=-1, right=len(rows))
     reach = np.zeros(len(rows), int)
@@ -478,10 +478,10 @@ def test_adapt_fit_writes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureF
         scan.tofile(scans / f"{k}.bin")
     fit = ["fit-sensor", str(scans), "--sensor", "vlp-16", "--to", "hdl-64e", "--out", str(out)]
     assert cli.main(fit) == 0
-    told = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in told] == [
+    found = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in found] == [
         "logarithm",
-        *sorted(line.split()[0] for line in told[1:3]),
+        *sorted(line.split()[0] for line in found[1:3]),
         "written",
     ]
     profile = get_sensor(out)
@@ -533,11 +533,11 @@ def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert simulated["n_scans"] == 1
     assert simulated["function"].startswith(("logarithm", "linear"))
     assert (boxed["n_scans"], pictured["n_scans"]) == (4, 4)
-    for told in (boxed, pictured):
-        assert told["function"] is None
-        assert told["both"] == told["none"] == told["remission"] == told["interpolation"]
-        assert told["both"]["iou"]["car"] > 0.5
-    assert pictured["both"]["iou"]["cyclist"] is None  # two-wheelers are not told apart from their riders
+    for found in (boxed, pictured):
+        assert found["function"] is None
+        assert found["both"] == found["none"] == found["remission"] == found["interpolation"]
+        assert found["both"]["iou"]["car"] > 0.5
+    assert pictured["both"]["iou"]["cyclist"] is None  # two-wheelers are not found apart from their riders
     for source in ("vlp-16", "vlp-16=simulation:0", f"vlp-16={tmp_path}", "vlp-17=simulation"):
         assert cli.main(["eval-sensors", source]) == 2
         assert capsys.readouterr().err.startswith("edgeperc: ")

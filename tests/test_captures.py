@@ -140,7 +140,7 @@ def test_a_cloud_of_no_points_is_a_scan(shape: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("changes", "error"),
     [
         ({"data": b"\0" * 63}, "holds 63 bytes; expected 64"),
         ({"width": 5}, "expected 80"),
@@ -159,10 +159,10 @@ def test_a_cloud_of_no_points_is_a_scan(shape: tuple[int, int]) -> None:
         ({"height": "many"}, "layout is impossible"),
     ],
 )
-def test_clouds_that_are_none(changes: dict[str, Any], words: str) -> None:
+def test_clouds_that_are_none(changes: dict[str, Any], error: str) -> None:
     message = cloud(POINTS)
     vars(message).update(changes)
-    with pytest.raises(PointsError, match=words):
+    with pytest.raises(PointsError, match=error):
         cloud_points(message)
     with pytest.raises(PointsError, match="layout is impossible"):
         cloud_points(object())
@@ -170,14 +170,14 @@ def test_clouds_that_are_none(changes: dict[str, Any], words: str) -> None:
 
 # --- bags ------------------------------------------------------------------------------------------------------------
 
-LIDAR, OTHER = "/lidar/points", "/imu/words"
+LIDAR, OTHER = "/lidar/points", "/imu/text"
 
 
 def messages(typesys: Any, ros: int) -> tuple[Any, list[tuple[str, str, int, Any]]]:
     """A type store, and (topic, type, time of recording [ns], message): three clouds and a word between."""
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if ros == 1 else typesys.Stores.ROS2_HUMBLE)
     types = store.types
-    told = []
+    sent = []
     for k in range(3):
         source = cloud(POINTS + np.float32(k), order="<>"[k % 2], padding=2)
         stamp = (
@@ -198,17 +198,17 @@ def messages(typesys: Any, ros: int) -> tuple[Any, list[tuple[str, str, int, Any
             np.frombuffer(source.data, np.uint8),
             False,
         )
-        told.append((LIDAR, "sensor_msgs/msg/PointCloud2", (200 + k) * 10**9, message))
-        told.append((OTHER, "std_msgs/msg/String", (200 + k) * 10**9 + 1, types["std_msgs/msg/String"]("word")))
-    return store, told
+        sent.append((LIDAR, "sensor_msgs/msg/PointCloud2", (200 + k) * 10**9, message))
+        sent.append((OTHER, "std_msgs/msg/String", (200 + k) * 10**9 + 1, types["std_msgs/msg/String"]("word")))
+    return store, sent
 
 
 def write_bag1(path: Path, renamed: Callable[[int, str], str] = lambda k, topic: topic) -> Path:
     typesys, rosbag1 = pytest.importorskip("rosbags.typesys"), pytest.importorskip("rosbags.rosbag1")
-    store, told = messages(typesys, 1)
+    store, sent = messages(typesys, 1)
     with rosbag1.Writer(path) as bag:
         connections: dict[str, Any] = {}
-        for k, (name, kind, stamp_ns, message) in enumerate(told):
+        for k, (name, kind, stamp_ns, message) in enumerate(sent):
             topic = renamed(k, name)
             if topic not in connections:
                 connections[topic] = bag.add_connection(topic, kind, typestore=store)
@@ -218,14 +218,14 @@ def write_bag1(path: Path, renamed: Callable[[int, str], str] = lambda k, topic:
 
 def write_bag2(folder: Path) -> Path:
     typesys, rosbag2 = pytest.importorskip("rosbags.typesys"), pytest.importorskip("rosbags.rosbag2")
-    store, told = messages(typesys, 2)
+    store, sent = messages(typesys, 2)
     newer = {"version": 8} if hasattr(rosbag2, "StoragePlugin") else {}
     with rosbag2.Writer(folder, **newer) as bag:
         connections = {
             topic: bag.add_connection(topic, kind, typestore=store)
-            for topic, kind in dict.fromkeys((topic, kind) for topic, kind, _, _ in told)
+            for topic, kind in dict.fromkeys((topic, kind) for topic, kind, _, _ in sent)
         }
-        for topic, kind, stamp_ns, message in told:
+        for topic, kind, stamp_ns, message in sent:
             bag.write(connections[topic], stamp_ns, store.serialize_cdr(message, kind))
     return folder
 
@@ -241,17 +241,17 @@ def record(opcode: int, content: bytes) -> bytes:
 def write_mcap(path: Path, profile: bytes = b"ros2") -> Path:
     """MCAP by its specification: header, schemas, channels and messages, without chunks or an index."""
     typesys = pytest.importorskip("rosbags.typesys")
-    store, told = messages(typesys, 2)
+    store, sent = messages(typesys, 2)
     magic = b"\x89MCAP0\r\n"
     content = magic + record(1, sized(profile) + sized(b"test"))
-    channels = [*dict.fromkeys((topic, kind) for topic, kind, _, _ in told)]
+    channels = [*dict.fromkeys((topic, kind) for topic, kind, _, _ in sent)]
     for k, (topic, kind) in enumerate(channels, start=1):
         definition, _ = store.generate_msgdef(kind, ros_version=2)
         content += record(
             3, struct.pack("<H", k) + sized(kind.encode()) + sized(b"ros2msg") + sized(definition.encode())
         )
         content += record(4, struct.pack("<HH", k, k) + sized(topic.encode()) + sized(b"cdr") + sized(b""))
-    for n, (topic, kind, stamp_ns, message) in enumerate(told):
+    for n, (topic, kind, stamp_ns, message) in enumerate(sent):
         header = struct.pack("<HIQQ", channels.index((topic, kind)) + 1, n, stamp_ns, stamp_ns)
         content += record(5, header + bytes(store.serialize_cdr(message, kind)))
     content += record(15, bytes(4)) + record(2, bytes(20)) + magic
@@ -297,34 +297,34 @@ def test_bags(tmp_path: Path, name: str) -> None:
         assert [stamp for stamp, _ in scans] == pytest.approx([100.5, 101.5, 202.0])
         for k, (_, points) in enumerate(scans):
             np.testing.assert_array_equal(points, POINTS + np.float32(k))
-    words = error_of(path, topic="/camera/points")
-    assert f"no topic of type sensor_msgs/PointCloud2 '/camera/points'; there are {LIDAR}" in words
-    assert f"of other types {OTHER} (std_msgs/msg/String)" in words
+    error = error_of(path, topic="/camera/points")
+    assert f"no topic of type sensor_msgs/PointCloud2 '/camera/points'; there are {LIDAR}" in error
+    assert f"of other types {OTHER} (std_msgs/msg/String)" in error
 
 
 def test_a_bag_with_several_lidars_asks_which(tmp_path: Path) -> None:
     path = write_bag1(tmp_path / "two.bag", lambda k, topic: "/rear/points" if k == 2 else topic)
-    words = error_of(path)
-    assert f"expected one topic of type sensor_msgs/PointCloud2, there are {LIDAR}, /rear/points" in words
-    assert "topic=" in words
+    error = error_of(path)
+    assert f"expected one topic of type sensor_msgs/PointCloud2, there are {LIDAR}, /rear/points" in error
+    assert "topic=" in error
     assert [stamp for stamp, _ in read_scans(path, topic="/rear/points")] == pytest.approx([101.5])
     assert len(list(read_scans(path, topic=LIDAR))) == 2
 
 
 def test_a_bag_without_lidar_says_what_it_holds(tmp_path: Path) -> None:
     typesys, rosbag1 = pytest.importorskip("rosbags.typesys"), pytest.importorskip("rosbags.rosbag1")
-    store, told = messages(typesys, 1)
-    path = tmp_path / "words.bag"
+    store, sent = messages(typesys, 1)
+    path = tmp_path / "text.bag"
     with rosbag1.Writer(path) as bag:
         connection = bag.add_connection(OTHER, "std_msgs/msg/String", typestore=store)
-        bag.write(connection, 1, store.serialize_ros1(told[1][3], "std_msgs/msg/String"))
-    words = error_of(path)
-    assert "expected one topic of type sensor_msgs/PointCloud2, there is none" in words
-    assert f"{OTHER} (std_msgs/msg/String)" in words
+        bag.write(connection, 1, store.serialize_ros1(sent[1][3], "std_msgs/msg/String"))
+    error = error_of(path)
+    assert "expected one topic of type sensor_msgs/PointCloud2, there is none" in error
+    assert f"{OTHER} (std_msgs/msg/String)" in error
     empty = tmp_path / "empty.bag"
     with rosbag1.Writer(empty) as bag:
         bag.add_connection(LIDAR, "sensor_msgs/msg/PointCloud2", typestore=store)
-    assert "damaged" in (words := error_of(empty)) or "no message" in words
+    assert "damaged" in (error := error_of(empty)) or "no message" in error
 
 
 @pytest.mark.parametrize("name", ["ros1.bag", "one.mcap"])
@@ -343,9 +343,9 @@ def test_a_database_that_is_cut_short(tmp_path: Path) -> None:
     content = database.read_bytes()
     for share in (0.0, 0.2, 0.8):
         database.write_bytes(content[: int(share * len(content))])
-        scans, words = read_until_error(folder)
+        scans, error = read_until_error(folder)
         assert len(scans) < 3
-        assert str(folder) in words
+        assert str(folder) in error
     (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
     error_of(folder)
 
@@ -429,9 +429,9 @@ def test_a_velodyne_capture_that_is_cut_short(tmp_path: Path) -> None:
     pytest.importorskip("velodyne_decoder")
     path = write_pcap(tmp_path / "cut.pcap", vlp16_packets(1.8))
     path.write_bytes(path.read_bytes()[:-300])
-    scans, words = read_until_error(path)
+    scans, error = read_until_error(path)
     assert len(scans) == 2
-    assert "the file ends inside packet 135" in words
+    assert "the file ends inside packet 135" in error
 
 
 @pytest.fixture(scope="module")
@@ -488,9 +488,9 @@ def test_an_ouster_capture(ouster: Path, name: str) -> None:
 def test_an_ouster_capture_without_its_metadata(ouster: Path, tmp_path: Path) -> None:
     path = tmp_path / "alone.pcap"
     path.write_bytes((ouster / "sphere.pcap").read_bytes())
-    words = error_of(path)
-    assert "metadata" in words
-    assert ".json whose name begins alike" in words
+    error = error_of(path)
+    assert "metadata" in error
+    assert ".json whose name begins alike" in error
     (tmp_path / "alone.json").write_text("{}")
     assert "cannot be read" in error_of(path)
 
@@ -500,10 +500,10 @@ def test_an_ouster_capture_that_is_cut_short(ouster: Path, tmp_path: Path) -> No
     content = (ouster / "sphere.pcap").read_bytes()
     path.write_bytes(content[: int(0.6 * len(content))])
     (tmp_path / "cut.json").write_text((ouster / "sphere.json").read_text())
-    scans, words = read_until_error(path)
+    scans, error = read_until_error(path)
     assert len(scans) == 2
     assert len(scans[0][1]) == 64 * 256 > len(scans[1][1]) > 0
-    assert "cut short or damaged: the file ends inside packet" in words
+    assert "cut short or damaged: the file ends inside packet" in error
 
 
 def test_a_damaged_osf_is_refused_before_it_can_do_harm(ouster: Path, tmp_path: Path) -> None:
@@ -534,28 +534,28 @@ def test_packets_of_no_lidar(tmp_path: Path, ouster: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "words"),
+    ("name", "content", "error"),
     [
         ("empty.pcap", b"", "cut short: 0 bytes"),
         ("header.pcap", struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1), "0 packets|cannot be read"),
         ("half.pcap", b"\xd4\xc3\xb2\xa1\x02\0\x04\0", "cut short: 8 bytes"),
-        ("words.pcap", b"no capture at all, but words", "no pcap file by its first bytes"),
+        ("text.pcap", b"no capture at all, but text", "not a pcap file by its first bytes"),
         ("new.pcapng", b"\n\r\r\n" + bytes(40), "editcap -F pcap"),
         ("new.pcap", b"\n\r\r\n" + bytes(40), "editcap -F pcap"),
-        ("words.bag", b"no bag at all", "damaged"),
+        ("text.bag", b"no bag at all", "damaged"),
         ("empty.bag", b"", "damaged"),
-        ("words.mcap", b"no capture at all", "damaged"),
-        ("words.osf", b"no capture at all", "damaged"),
+        ("text.mcap", b"no capture at all", "damaged"),
+        ("text.osf", b"no capture at all", "damaged"),
         ("empty.osf", b"", "damaged"),
-        ("words.db3", b"no database", "folder it lies in"),
+        ("text.db3", b"no database", "folder it lies in"),
     ],
 )
-def test_files_that_are_no_captures(tmp_path: Path, name: str, content: bytes, words: str) -> None:
+def test_files_that_are_no_captures(tmp_path: Path, name: str, content: bytes, error: str) -> None:
     for module in ("rosbags.highlevel", "ouster.sdk.pcap", "velodyne_decoder"):
         pytest.importorskip(module)
     path = tmp_path / name
     path.write_bytes(content)
-    with pytest.raises(PointsError, match=words):
+    with pytest.raises(PointsError, match=error):
         next(read_scans(path))
 
 
@@ -608,9 +608,9 @@ def test_a_folder_is_read_by_name(tmp_path: Path) -> None:
     assert [file.name for file in scan_files(tmp_path)] == ["a.NPY", "b.npy", "c.npy"]
     assert [len(points) for _, points in read_scans(tmp_path)] == [2, 1, 4]
     (tmp_path / "b.npy").write_bytes(b"damaged")
-    scans, words = read_until_error(tmp_path)
+    scans, error = read_until_error(tmp_path)
     assert len(scans) == 1
-    assert "b.npy" in words
+    assert "b.npy" in error
     with pytest.raises(PointsError, match="no scan in this folder"):
         next(read_scans(tmp_path / "folder.bin"))
 
@@ -658,4 +658,4 @@ def test_real_metadata_that_is_malformed(data_root: Callable[[str], Path], tmp_p
     path.write_bytes((folder / "OS-0-128-U1_v2.3.0_1024x10.pcap").read_bytes())
     for metadata in sorted((folder / "metadata_malformed").glob("*.json")):
         path.with_suffix(".json").write_bytes(metadata.read_bytes())
-        assert "LiDAR" in (words := error_of(path)) or "cannot be read" in words
+        assert "LiDAR" in (error := error_of(path)) or "cannot be read" in error

@@ -76,7 +76,7 @@ def test_no_key_is_defaulted(key: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "message"),
     [
         ({"schema": 4}, "schema 4.*upgrade edgeperc"),
         ({"precision": "fp8"}, "'fp8'; expected fp32 or int8"),
@@ -101,9 +101,9 @@ def test_no_key_is_defaulted(key: str) -> None:
         ({"input": {"name": "x", "channels": ["height"], "mean": [0], "std": [0]}}, "positive deviations"),
     ],
 )
-def test_each_corruption_is_named(change: dict[str, Any], words: str) -> None:
+def test_each_corruption_is_named(change: dict[str, Any], message: str) -> None:
     document = json.loads(TOP_VIEW_CARD.to_json()) | change
-    with pytest.raises(CardError, match=words):
+    with pytest.raises(CardError, match=message):
         ModelCard.from_json(json.dumps(document))
 
 

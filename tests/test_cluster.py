@@ -280,7 +280,7 @@ def test_a_class_without_usual_size_is_as_large_as_it_is_seen():
 
 
 @pytest.mark.parametrize(
-    ("labels", "options", "words"),
+    ("labels", "options", "message"),
     [
         (np.zeros(3, np.uint8), {}, "one a point"),
         (np.full(4, 9, np.uint8), {}, "label 9 for 4 classes"),
@@ -288,6 +288,6 @@ def test_a_class_without_usual_size_is_as_large_as_it_is_seen():
         (np.zeros(4, np.uint8), {"height_m": np.zeros(5, np.float32)}, "height_m"),
     ],
 )
-def test_arrays_of_another_scan_are_refused(labels, options, words):
-    with pytest.raises(PointsError, match=words):
+def test_arrays_of_another_scan_are_refused(labels, options, message):
+    with pytest.raises(PointsError, match=message):
         objects_from_points(np.zeros((4, 4), np.float32), labels, CLASSES, **options)

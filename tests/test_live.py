@@ -173,13 +173,13 @@ def test_health_goes_by_age(source: Source, monkeypatch: pytest.MonkeyPatch) -> 
     with stream(source, lambda *a, **k: take(next(ages))(*a, **k), rate_hz=10.0) as answers:
         assert (answers.late_after_s, answers.stale_after_s) == (0.2, 0.5)
         assert (answers.age_s, answers.health) == (np.inf, "STALE")
-        told = []
+        answered = []
         for k in (1, 2, 3):
             source.give(scan(k))
-            told.append(next(answers))
-        assert [answer.health for answer in told] == ["OK", "LATE", "STALE"]
-        assert [answer.age_s for answer in told] == pytest.approx([0.05, 0.25, 0.75])
-        assert told[0].stamp_s == 100.0  # of its arrival
+            answered.append(next(answers))
+        assert [answer.health for answer in answered] == ["OK", "LATE", "STALE"]
+        assert [answer.age_s for answer in answered] == pytest.approx([0.05, 0.25, 0.75])
+        assert answered[0].stamp_s == 100.0  # of its arrival
         assert answers.health == "STALE"
         ages = iter([0.0])
         source.give(scan(4))

@@ -313,8 +313,8 @@ def test_only_the_first_scans_are_checked(scan: SimulatedScan) -> None:
     bad = spoilt(scan.points, "no remission")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        told = [bool(perceive(bad).fitness) for _ in range(7)]
-    assert told == [True] * 5 + [False] * 2
+        checked = [bool(perceive(bad).fitness) for _ in range(7)]
+    assert checked == [True] * 5 + [False] * 2
     assert len(caught) >= 5
 
 

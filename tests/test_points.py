@@ -222,8 +222,8 @@ def test_unreadable_paths(tmp_path):
 BAD_FILES = {
     "cut.bin": (POINTS.tobytes()[:-3], "cut short"),
     "text.bin": (b"12.0 3.0 1.0 0.5\n" * 16, "text"),
-    "double.bin": (np.random.default_rng(0).normal(0, 20, (500, 4)).tobytes(), "no coordinates"),
-    "big_endian.bin": (np.random.default_rng(0).normal(0, 20, (500, 4)).astype(">f4").tobytes(), "no coordinates"),
+    "double.bin": (np.random.default_rng(0).normal(0, 20, (500, 4)).tobytes(), "not coordinates"),
+    "big_endian.bin": (np.random.default_rng(0).normal(0, 20, (500, 4)).astype(">f4").tobytes(), "not coordinates"),
     "five.bin": (
         np.random.default_rng(0).normal(0, 20, (500, 5)).astype("<f4") * [1, 1, 1, 1, 0] + [0, 0, 0, 0, 3],
         "columns=5",
@@ -245,7 +245,7 @@ BAD_FILES = {
     "half.pcd": (pcd("x y z", "F F F", "2 4 4", "1 1 1", 1, "ascii", b"1 2 3\n"), "TYPE and SIZE"),
     "counts.pcd": (pcd("x y z", "F F F", "4 4", "1 1 1", 1, "ascii", b"1 2 3\n"), "equal length"),
     "zero.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 0", 1, "ascii", b"1 2 3\n"), "COUNT"),
-    "words.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 1, "ascii", b"1 two 3\n"), "row"),
+    "text.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 1, "ascii", b"1 two 3\n"), "row"),
     "ragged.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 2, "ascii", b"1 2 3\n1 2\n"), "row"),
     "blank.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 2, "ascii", b"\n\n\n"), "none are there"),
     "disagree.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 2, "ascii", b"1 2 3\n", width=3), "must agree"),

@@ -251,7 +251,7 @@ def test_wrong_arrays_are_told():
     view = VIEWS["coarse top view"]
     projector = make_projector(view, spec_of(view))
     good = np.zeros((5, 4), np.float32)
-    for bad, words in (
+    for bad, message in (
         (good.astype(np.float64), "float64"),
         (good[:, :3], r"\(5, 3\)"),
         (good[::2], "C-contiguous: False"),
@@ -260,7 +260,7 @@ def test_wrong_arrays_are_told():
         (np.asfortranarray(good), "C-contiguous: False"),
         ([[1.0, 2.0, 3.0, 4.0]], "list"),
     ):
-        with pytest.raises(PointsError, match=words):
+        with pytest.raises(PointsError, match=message):
             projector.project(bad)
     seen = projector.project(good)
     locked = seen.pixel.copy()

@@ -1,4 +1,4 @@
-"""Sensor profiles are possible sensors; unlike scans are told in plain words, ordinary ones are not."""
+"""Sensor profiles are possible sensors; scans unlike the training's are reported, ordinary ones are not."""
 
 from __future__ import annotations
 
@@ -190,18 +190,20 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_faults_are_told(streets, profile, fault):
-    spoil, words = FAULTS[fault]
+    spoil, expected_text = FAULTS[fault]
     for scan in streets[3:]:
         findings = check_fitness(np.ascontiguousarray(spoil(scan)), profile, SENSOR)
         assert findings
-        assert re.search(words, " ".join(findings)), findings
+        assert re.search(expected_text, " ".join(findings)), findings
 
 
-@pytest.mark.parametrize(("name", "words"), [("vlp-16", "about 1[4-7] rows"), ("hdl-32e", "about (2[89]|3[0-3]) rows")])
-def test_fewer_beams_are_told(profile, name, words):
+@pytest.mark.parametrize(
+    ("name", "expected_text"), [("vlp-16", "about 1[4-7] rows"), ("hdl-32e", "about (2[89]|3[0-3]) rows")]
+)
+def test_fewer_beams_are_told(profile, name, expected_text):
     sensor = get_sensor(name)
     findings = " ".join(check_fitness(street(9, sensor), profile, sensor))
-    assert re.search(words, findings), findings
+    assert re.search(expected_text, findings), findings
     assert f"{name}: {sensor.n_beams}" in findings
 
 
@@ -313,23 +315,23 @@ def kitti_profile(kitti_scans):
 def test_every_kitti_scan_passes(kitti_scans, kitti_profile, semantickitti_root):
     frames, scans = kitti_scans
     assert len(scans) == 314
-    told = {
+    found = {
         frame["name"]: findings
         for frame, scan in zip(frames, scans, strict=True)
         if (findings := check_fitness(scan, kitti_profile, SENSOR))
     }
     more = sorted((semantickitti_root / "sequences" / "00" / "velodyne").glob("*.bin"))
     assert len(more) == 16
-    told |= {
+    found |= {
         path.name: findings for path in more if (findings := check_fitness(read_points(path), kitti_profile, SENSOR))
     }
-    assert told == {}
+    assert found == {}
 
 
 def test_kitti_scans_turned_by_90_degrees_are_mostly_told(kitti_scans, kitti_profile):
     full = [scan for frame, scan in zip(*kitti_scans, strict=True) if frame["crop"] == "0"]
-    told = sum(bool(check_fitness(in_nuscenes_axes(scan), kitti_profile, SENSOR)) for scan in full)
-    assert told / len(full) > 0.85
+    found = sum(bool(check_fitness(in_nuscenes_axes(scan), kitti_profile, SENSOR)) for scan in full)
+    assert found / len(full) > 0.85
 
 
 @pytest.mark.parametrize(
@@ -345,15 +347,15 @@ def test_kitti_scans_turned_by_90_degrees_are_mostly_told(kitti_scans, kitti_pro
     ],
 )
 def test_spoilt_kitti_scans_are_told(kitti_scans, kitti_profile, fault):
-    spoil, words = FAULTS[fault]
+    spoil, expected_text = FAULTS[fault]
     for frame, scan in list(zip(*kitti_scans, strict=True))[:307:9]:
         findings = check_fitness(np.ascontiguousarray(spoil(scan)), kitti_profile, SENSOR)
-        expected = "shift z|not the sensor" if fault == "ground at zero" else words
+        expected = "shift z|not the sensor" if fault == "ground at zero" else expected_text
         assert re.search(expected, " ".join(findings)), (frame["name"], findings)
 
 
 def test_the_nuscenes_sweep_is_told_apart(data_root, kitti_profile):
     (path,) = (data_root("other_sensors") / "nuscenes_sweep").glob("*.bin")
     findings = " ".join(check_fitness(read_points(path), kitti_profile, SENSOR))
-    for words in ("pass y, -x, z", "(0, 255)", "rows of points"):
-        assert words in findings
+    for expected_text in ("pass y, -x, z", "(0, 255)", "rows of points"):
+        assert expected_text in findings

@@ -1,4 +1,4 @@
-"""A recording becomes scans: folders of scan files, Velodyne and Ouster packet captures, ROS 1 and 2 bags and MCAP."""
+"""Recordings to scans: folders of scan files, Velodyne and Ouster packet captures, ROS 1 and 2 bags and MCAP."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Scan = tuple[float | None, NDArray[np.float32]]
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 CAPTURE_SUFFIXES = (".bag", ".db3", ".mcap", ".osf", ".pcap", ".pcapng")
 
-# What a capture begins with.
+# First bytes of captures.
 _MAGIC = {
     b"\xd4\xc3\xb2\xa1": ".pcap",
     b"\xa1\xb2\xc3\xd4": ".pcap",
@@ -41,7 +41,7 @@ _CLOUD = "sensor_msgs/msg/PointCloud2"
 _CLOUD_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _VELODYNE_BYTES = 1206
 
-# Enough to meet a LiDAR's packet among those of a GPS, and few enough to be read at once.
+# Enough to find a LiDAR's packet among those of a GPS, and quick to read.
 _SNIFFED_PACKETS = 2000
 
 
@@ -54,9 +54,9 @@ def read_scans(
     ----------
     source : str or path
         A scan file (`edgeperc.read_points`); a folder of scan files and captures, taken in the order of their names; a
-        Velodyne ``.pcap``; an Ouster ``.pcap``, with its metadata beside it in a ``.json`` whose name begins alike, or
-        ``.osf``; a ROS 1 ``.bag``, a ROS 2 bag's folder or one ``.mcap`` file, of whose messages those of type
-        ``sensor_msgs/PointCloud2`` count. What a file begins with decides, not its name.
+        Velodyne ``.pcap``; an Ouster ``.pcap``, with its metadata beside it in a ``.json`` whose name has the same
+        beginning, or ``.osf``; a ROS 1 ``.bag``, a ROS 2 bag's folder or one ``.mcap`` file, of which the messages of
+        type ``sensor_msgs/PointCloud2`` are read. The first bytes of a file decide, not its name.
     topic : str, optional
         Which topic of a bag that has several with point clouds; which sensor, by serial number, of an Ouster capture
         that has several.
@@ -66,20 +66,20 @@ def read_scans(
     Yields
     ------
     stamp_s : float or None
-        When the sensor says that the scan was taken [s], on whatever clock it has: of a Velodyne and an Ouster the end
-        of the scan, of a message its header's stamp. None for scan files.
+        Time of the scan by the sensor's own clock [s]: the end of the scan for a Velodyne and an Ouster, the header's
+        stamp for a message. None for scan files.
     points : (n, 4) float32, C-contiguous
-        x, y, z [m] in the sensor's frame, and remission as the sensor gave it, which the `Perceiver` scales by its
-        sensor's ``remission_range``: 0..255 of a Velodyne and of an Ouster's reflectivity, but 0..1 of an HDL-64E, as
-        in KITTI's files. The first and the last turn of a packet capture may be there in part.
+        x, y, z [m] in the sensor's frame, and the raw remission, which the `Perceiver` scales by its sensor's
+        ``remission_range``: 0..255 for a Velodyne and an Ouster's reflectivity, but 0..1 for an HDL-64E, as in KITTI's
+        files. The first and the last turn of a packet capture may be incomplete.
 
     Raises
     ------
     PointsError
-        When there is no such thing, it is damaged, or holds no LiDAR's scan. Of a packet capture that is cut short the
-        scans before the cut come first; other captures are refused whole.
+        The source does not exist, is damaged, or holds no scan of a LiDAR. Of a packet capture that is cut short, the
+        scans before the cut come first; other captures are refused as a whole.
     MissingExtraError
-        When what reads such a capture is not installed.
+        The library that reads this kind of capture is not installed.
     """
     path = Path(source)
     if not path.exists():
@@ -90,9 +90,9 @@ def read_scans(
     if kind == "folder":
         return _folder(path, topic, remission_field)
     if kind in (".pcap", ".osf"):
-        return _told(path, _packet_scans(path, kind, topic, remission_field))
+        return _naming(path, _packet_scans(path, kind, topic, remission_field))
     if kind in (".bag", ".mcap", "ros2"):
-        return _told(path, _bag_scans(path, kind, topic, remission_field))
+        return _naming(path, _bag_scans(path, kind, topic, remission_field))
     if kind == ".pcapng":
         raise PointsError(f"{path}: a pcapng file; expected pcap. Run: editcap -F pcap {path.name} {path.stem}.pcap")
     if kind == ".db3":
@@ -101,12 +101,12 @@ def read_scans(
 
 
 def is_capture(path: Path) -> bool:
-    """Whether this is one recording of many scans: a bag's folder, or a file that begins like a capture."""
+    """Whether a path is a recording of many scans: a bag's folder, or a file with the first bytes of a capture."""
     return _kind(path) not in ("scan", "folder")
 
 
 def scan_files(folder: Path) -> list[Path]:
-    """The scans and captures in a folder, by name; those that a dot hides are left out."""
+    """The scans and captures in a folder, by name, without hidden files."""
     return sorted(
         entry
         for entry in folder.iterdir()
@@ -115,7 +115,7 @@ def scan_files(folder: Path) -> list[Path]:
 
 
 def cloud_points(message: Any, *, remission_field: str | None = None) -> NDArray[np.float32]:
-    """Points of a ROS ``sensor_msgs/PointCloud2`` message, of whatever library it is an object.
+    """Points of a ROS ``sensor_msgs/PointCloud2`` message, as an object of any library.
 
     Parameters
     ----------
@@ -164,10 +164,10 @@ def cloud_points(message: Any, *, remission_field: str | None = None) -> NDArray
 
 
 def _kind(path: Path) -> str:
-    """``"scan"``, ``"folder"``, ``"ros2"`` or one of `CAPTURE_SUFFIXES`, by content; by name where that is mute."""
+    """``"scan"``, ``"folder"``, ``"ros2"`` or one of `CAPTURE_SUFFIXES`, by content or else by name."""
     if path.is_dir():
         return "ros2" if (path / "metadata.yaml").is_file() else "folder"
-    if not path.is_file():  # a pipe would be waited for
+    if not path.is_file():  # opening a pipe would block
         return "scan"
     try:
         with path.open("rb") as file:
@@ -191,8 +191,8 @@ def _folder(folder: Path, topic: str | None, remission_field: str | None) -> Ite
         yield from read_scans(file, topic=topic, remission_field=remission_field)
 
 
-def _told(path: Path, scans: Iterator[Scan]) -> Iterator[Scan]:
-    """The same scans; whatever goes wrong is told of by a `PointsError` that names the file."""
+def _naming(path: Path, scans: Iterator[Scan]) -> Iterator[Scan]:
+    """The same scans; every error becomes a `PointsError` that names the file."""
     n_scans = 0
     try:
         for scan in scans:
@@ -202,14 +202,14 @@ def _told(path: Path, scans: Iterator[Scan]) -> Iterator[Scan]:
         raise
     except PointsError as exc:
         raise PointsError(f"{path}: {exc}") from exc
-    except Exception as exc:  # three libraries' own errors, and what a damaged file makes of numpy, struct and sqlite
+    except Exception as exc:  # of three libraries, and of numpy, struct and sqlite on damaged files
         after = f"after {n_scans} scans " if n_scans else ""
-        words = " ".join(str(exc).split()) or type(exc).__name__
-        raise PointsError(f"{path}: {after}the capture cannot be read ({words}); it is damaged or cut short") from exc
+        reason = " ".join(str(exc).split()) or type(exc).__name__
+        raise PointsError(f"{path}: {after}the capture cannot be read ({reason}); it is damaged or cut short") from exc
 
 
 def _choose(what: str, names: Sequence[str], wanted: str | None, others: str = "") -> int:
-    """Which of several; `PointsError` says which there are."""
+    """Index of the wanted name, or of the only one; the `PointsError` lists the names."""
     if wanted in names:
         return names.index(str(wanted))
     there = f"there are {', '.join(names)}" if names else "there is none"
@@ -252,7 +252,7 @@ def _packet_scans(path: Path, kind: str, topic: str | None, remission_field: str
     for scan in scans:
         n_scans += 1
         yield scan
-    # Both libraries take a file that ends inside a packet, or holds no packets of theirs, for a short one.
+    # Both libraries silently stop at a file that ends inside a packet or holds no packets of theirs.
     n_packets = 0 if kind == ".osf" else sum(1 for _ in _packets(path))
     if not n_scans:
         held = "holds no scan" if kind == ".osf" else f"of its {n_packets} packets none is a LiDAR's that can be read"
@@ -260,14 +260,14 @@ def _packet_scans(path: Path, kind: str, topic: str | None, remission_field: str
 
 
 def _packets(path: Path, whole: bool = True) -> Iterator[memoryview]:
-    """What was captured, packet by packet, with the headers of the network; `PointsError` unless the file is whole."""
+    """The captured packets, with their network headers; `PointsError` if the file is incomplete."""
     size = path.stat().st_size
     if size < 24:
         raise PointsError(f"cut short: {size} bytes; expected a pcap file of 24 bytes and more")
     data = np.memmap(path, np.uint8, "r").data
     endian = "<" if bytes(data[:4]) in (b"\xd4\xc3\xb2\xa1", b"\x4d\x3c\xb2\xa1") else ">"
     if bytes(data[:4]) not in _MAGIC:
-        raise PointsError("no pcap file by its first bytes")
+        raise PointsError("not a pcap file by its first bytes")
     header = struct.Struct(f"{endian}8xI4x")
     at, n_packets = 24, 0
     while at < size:
@@ -309,7 +309,7 @@ def _velodyne_scans(path: Path) -> Iterator[Scan]:
     config = velodyne.Config()
     for stamp, points in velodyne.read_pcap(str(path), config):
         scan = as_points(points[:, :4])
-        # The decoder says by now which of the HDL-64E it is; other models it finds by itself.
+        # By now the decoder has found the model of the sensor.
         if config.model is not None and config.model.name.startswith("HDL64E"):
             scan[:, 3] /= 255.0
         yield stamp.device, scan
@@ -323,7 +323,7 @@ def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -
     name = (remission_field or "reflectivity").upper()
     for frame_set in frames:
         frame = frame_set[chosen]
-        if frame is None:  # this sensor said nothing in that turn
+        if frame is None:  # no packet of this sensor in this turn
             continue
         if name not in frame.fields:
             raise PointsError(f"there is no field {name!r} for the remission, only {', '.join(frame.fields)}")

@@ -32,12 +32,12 @@ def read_points(
 ) -> NDArray[np.float32]:
     """Points of one scan, from a file or an array.
 
-    A file that begins with a PCD header, ``ply``, NumPy's or zip's magic is read as that, whatever its name. Raw
-    float32 files have no header, so their name has to end in ``.bin`` (KITTI, SemanticKITTI: x, y, z, remission) or
-    ``.pcd.bin`` (nuScenes: the same and the ring), or ``columns`` says how many values a point has.
+    The first bytes of a file decide its format: a PCD header, ``ply``, NumPy's or zip's magic. Raw float32 files have
+    no header, so their name must end in ``.bin`` (KITTI, SemanticKITTI: x, y, z, remission) or ``.pcd.bin`` (nuScenes:
+    the same and the ring), or ``columns`` gives the number of values of a point.
 
-    Remission is never scaled here: the `Perceiver` does that, by its sensor's ``remission_range``. Where a file
-    holds none, it is 0. Rows that are not finite stay in place, so that labels keep the file's order.
+    Remission is not scaled here: the `Perceiver` does that, by its sensor's ``remission_range``. It is 0 if the file
+    holds none. Rows that are not finite stay in place, so that labels have the file's order.
 
     Parameters
     ----------
@@ -45,21 +45,21 @@ def read_points(
         ``.bin``, ``.pcd.bin``, ``.npy``, ``.npz`` (its only array, or the one called ``points``), ``.pcd`` (ascii,
         binary, binary_compressed), ``.ply`` (ascii, binary), or an array for `as_points`.
     columns : int, optional
-        float32 values a point in a file without a header, at least 3. Other files say it themselves.
+        Number of float32 values of a point in a file without a header, at least 3; ignored for other files.
     remission_field : str, optional
-        Which field is the remission, where fields have names; by default the first there is of remission,
+        Name of the remission field, for formats with named fields. By default the first existing one of remission,
         intensity, i, reflectivity, reflectance.
 
     Returns
     -------
     (n, 4) float32, C-contiguous
-        x, y, z [m] and remission as stored. An array that is this already is returned itself.
+        x, y, z [m] and remission as stored. An array that is this already is returned as it is.
 
     Raises
     ------
     PointsError
-        When the file cannot be read, is empty, cut short or no scan at all. A scan of no points is valid where the
-        file says so in a header; a file of 0 bytes is an error.
+        The file cannot be read, is empty, cut short or not a scan. A scan of no points is valid if a header says so;
+        a file of 0 bytes is an error.
     """
     if not isinstance(source, str | os.PathLike):
         return as_points(source, remission_field=remission_field)
@@ -114,12 +114,12 @@ def _parse_raw(data: NDArray[np.uint8], columns: int, by_name: bool) -> NDArray[
         )
     values = data.view("<f4").reshape(-1, columns)
     xyz = np.abs(values[:: max(1, len(values) // 4096), :3])
-    # Right values never look like this; float64, big-endian or other bytes taken for float32 do, in most rows.
+    # Coordinates never look like this; float64, big-endian or other bytes read as float32 do, in most rows.
     with np.errstate(invalid="ignore"):  # comparing signalling NaN
         absurd = ((xyz > 1e7) & (xyz < np.inf)) | ((xyz > 0.0) & (xyz < 1e-30))
     if absurd.any(axis=1).mean() > 0.2:
         raise PointsError(
-            "the values are no coordinates; expected little-endian float32 x, y, z, remission, not float64 nor "
+            "the values are not coordinates; expected little-endian float32 x, y, z, remission, not float64 nor "
             "another format"
         )
     if by_name and columns == 4 and data.size % 20 == 0:

@@ -21,15 +21,12 @@ _PCD_TYPES = {f"{kind}{size}": f"<{kind.lower()}{size}" for kind in "IU" for siz
 }
 
 
-# --- PCD -------------------------------------------------------------------------------------------------------------
-
-
 def begins_like_pcd(head: bytes) -> bool:
     """Whether the first lines are those of a PCD header."""
     for line in head.splitlines():
-        words = line.split()
-        if words and not words[0].startswith(b"#"):
-            return words[0] in (b"VERSION", b"FIELDS", b"COLUMNS")
+        tokens = line.split()
+        if tokens and not tokens[0].startswith(b"#"):
+            return tokens[0] in (b"VERSION", b"FIELDS", b"COLUMNS")
         if line.startswith(b"# .PCD"):
             return True
     return False
@@ -52,14 +49,14 @@ def _parse_pcd_header(head: bytes) -> _PcdHeader:
         end = head.find(b"\n", at)
         if end < 0:
             raise PointsError("the PCD header has no DATA line; the file is cut short or no PCD file")
-        words = head[at:end].decode("latin-1").split()
+        tokens = head[at:end].decode("latin-1").split()
         at = end + 1
-        if words and not words[0].startswith("#"):
-            entries[words[0]] = words[1:]
+        if tokens and not tokens[0].startswith("#"):
+            entries[tokens[0]] = tokens[1:]
     names = entries.get("FIELDS", entries.get("COLUMNS", []))
     try:
-        sizes = [whole_number(word) for word in entries.get("SIZE", [])]
-        counts = [whole_number(word) for word in entries.get("COUNT", ["1"] * len(names))]
+        sizes = [whole_number(token) for token in entries.get("SIZE", [])]
+        counts = [whole_number(token) for token in entries.get("COUNT", ["1"] * len(names))]
         width, height = (whole_number(entries[key][0]) if key in entries else None for key in ("WIDTH", "HEIGHT"))
         n_points = whole_number(entries["POINTS"][0]) if "POINTS" in entries else None
     except (ValueError, IndexError) as exc:
@@ -90,7 +87,7 @@ def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
     widths = [int(np.dtype(kind).itemsize) * count for kind, count in zip(header.types, header.counts, strict=True)]
     record = sum(widths)
     body = data[header.n_bytes :]
-    single: dict[str, int] = {}  # where each field of one value stands; padding is called "_" many times
+    single: dict[str, int] = {}  # place of each field of one value; padding fields are all called "_"
     for k, name in enumerate(header.names):
         if header.counts[k] == 1:
             single.setdefault(plain_name(name), k)
@@ -142,7 +139,7 @@ def fill_unpacked_lzf(packed: NDArray[np.uint8], unpacked: NDArray[np.uint8]) ->
     Returns
     -------
     int
-        Bytes written, or -1 where the data reads before its start, past its end or past the output.
+        Bytes written; -1 if a reference leaves the data or the output.
     """
     n_in = packed.shape[0]
     n_out = unpacked.shape[0]

@@ -21,9 +21,6 @@ _PLY_TYPES = {
 }
 
 
-# --- PLY -------------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _PlyElement:
     name: str
@@ -43,10 +40,10 @@ def _parse_ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
         end = head.find(b"\n", at)
         if end < 0:
             raise PointsError("the PLY header has no end_header line; the file is cut short or no PLY file")
-        words = head[at:end].decode("latin-1").split()
+        tokens = head[at:end].decode("latin-1").split()
         at = end + 1
         try:
-            match words:
+            match tokens:
                 case ["end_header"]:
                     break
                 case ["format", kind, *_]:
@@ -66,7 +63,7 @@ def _parse_ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
                 case _:
                     raise ValueError("an unknown line")
         except (ValueError, KeyError, IndexError) as exc:
-            raise PointsError(f"the PLY header line {' '.join(words)[:80]!r} cannot be read ({exc})") from exc
+            raise PointsError(f"the PLY header line {' '.join(tokens)[:80]!r} cannot be read ({exc})") from exc
     return encoding, elements, at
 
 
@@ -116,7 +113,7 @@ def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
 def _row_starts(
     body: NDArray[np.uint8], at: int, element: _PlyElement, order: str
 ) -> tuple[NDArray[np.int64] | None, int]:
-    """Where each property of each row begins, None where rows are of one length; and where the element ends."""
+    """Start of each property of each row, None if all rows have one length; and the end of the element."""
     if not element.has_lists:
         record = sum(int(np.dtype(kind).itemsize) for _, kind, _ in element.properties)
         end = at + element.count * record

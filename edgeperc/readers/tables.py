@@ -1,4 +1,4 @@
-"""Tables of points: text files with or without a header."""
+"""Parts that several formats share: columns of binary records, rows of text, numbers of headers."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ MAX_HEADER_BYTES = 65536
 
 
 def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int) -> NDArray[Any]:
-    """One field of binary records, as a view."""
+    """A field of binary records, as a view."""
     if n == 0:
         return np.empty(0, dtype=kind)
     column: NDArray[Any] = np.ndarray((n,), kind, data.data, offset, (stride,))
     return column
 
 
-def whole_number(word: str) -> int:
+def whole_number(text: str) -> int:
     """An integer of a header that fits 64 bits."""
-    value = int(word)
+    value = int(text)
     if abs(value) >= 1 << 63:
         raise ValueError("a number beyond 64 bits")
     return value
