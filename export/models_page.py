@@ -237,8 +237,8 @@ def _figures(figures: Mapping[str, Any], scans: str, bands: Sequence[str]) -> It
     if "road" in figures:
         yield from _head(f"road, {scans}", ["F1", "best F1", "AP", "ACC", "PRE", "REC", "IoU", "cells"])
         for band, row in _by_band(figures["road"], bands):
-            keys = ("f1", "max_f1", "ap", "accuracy", "precision", "recall", "iou")
-            yield _row(band, *(_percent(row, key) for key in keys), f"{row['n_cells']:,}")
+            rates = [_percent(row, k) for k in ("f1", "max_f1", "ap", "accuracy", "precision", "recall", "iou")]
+            yield _row(band, *rates, f"{row['n_cells']:,}")
 
 
 def _by_band(rows: Mapping[str, Any], bands: Sequence[str]) -> Iterable[tuple[str, Any]]:

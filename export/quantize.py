@@ -443,8 +443,8 @@ def quantize(
         if most >= 1.0:
             raise RefusedError(f"{path}: not faster here with {share}: {speed}; the time must be shorter beyond noise")
         simulated = f"simulation:{n_evaluated}"
-        datasets = {"KITTI": kitti, "SEMANTICKITTI": semantickitti, simulated: simulated}
-        datasets = {name: root for name, root in datasets.items() if root is not None}
+        given = {"KITTI": kitti, "SEMANTICKITTI": semantickitti, simulated: simulated}
+        datasets = {name: root for name, root in given.items() if root is not None}
         figures, before = (evaluate([*datasets.values()], [each])[0] for each in (trial, path))
         mine, theirs = _scores(figures), _scores(before)
         lost = {name: theirs[name] - mine.get(name, 0.0) for name in theirs}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
 
@@ -242,8 +242,8 @@ class Road(Task):
 
 def task_of(recipe: Recipe) -> Task:
     """The task of a recipe's network."""
-    kind = {"points": Points, "vehicles": Vehicles, "road": Road}[recipe.task]
-    return kind(recipe, card_of(recipe.network, recipe.head, version="0"))
+    tasks: dict[str, Callable[[Recipe, ModelCard], Task]] = {"points": Points, "vehicles": Vehicles, "road": Road}
+    return tasks[recipe.task](recipe, card_of(recipe.network, recipe.head, version="0"))
 
 
 def _logits(outputs: Outputs) -> Tensor:

@@ -126,7 +126,7 @@ def train(
     before: list[dict[str, object]] = []
     if start_from is not None:
         before = _start(network, start_from)
-    network = network.to(device, memory_format=torch.channels_last)
+    network = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in its stubs
     averaged = copy.deepcopy(network).eval()
     optimizer = _optimizer(recipe, network)
     checkpoint, step = out / "checkpoint.pt", 0

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
-from typing import TextIO
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +89,7 @@ def varied(
     return moved, np.where(inside, mask[row, col], IGNORE).astype(np.uint8), turn_deg, mirrored
 
 
-def write_database_coco(database: TopViewDatabase, file: TextIO) -> int:
+def write_database_coco(database: TopViewDatabase, file: IO[str]) -> int:
     """Write a database as COCO, one annotation for each vehicle and each scene's road; the number of annotations.
 
     Scenes are written one at a time, so that memory use does not grow with the database. Vehicles are complete, even if

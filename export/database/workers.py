@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
-from typing import Any
+from typing import Any, cast
 
 from edgeperc.errors import MissingExtraError
 
@@ -113,7 +113,9 @@ def _run_on_ray(plan: Plan, jobs: list[Job], workers: int) -> Iterator[tuple[str
         rows = ray.data.from_items(
             [{"job": json.dumps(asdict(job))} for job in jobs], override_num_blocks=min(len(jobs), 16 * workers)
         )
-        done = rows.map(RayWorker, fn_constructor_args=(plan,), num_cpus=1, concurrency=min(workers, len(jobs)))
+        done = rows.map(
+            cast(Any, RayWorker), fn_constructor_args=(plan,), num_cpus=1, concurrency=min(workers, len(jobs))
+        )
         for row in done.iter_rows():
             yield str(row["scene"]), str(row["reason"])
     finally:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from ..recipe import Recipe
+from ..recipe import Recipe, task_name
 from .edge import PointSegEdge, SSADNetEdge
 from .kulseg import KULSeg
 from .lodnn import LoDNN, LoDNNEdge
@@ -13,11 +13,20 @@ from .pointseg import PointSeg
 from .squeezesegv2 import SqueezeSegV2
 from .ssadnet import SSADNet
 
+__all__ = ["EDGE", "build"]
+
 EDGE: dict[str, type[nn.Module]] = {"lodnn": LoDNNEdge, "pointseg": PointSegEdge, "ssadnet": SSADNetEdge}
 
 
 def build(recipe: Recipe) -> nn.Module:
-    """The network of a recipe, its weights drawn from the recipe's seed."""
+    """The network of a recipe, with initial weights drawn from the recipe's seed.
+
+    Raises
+    ------
+    ValueError
+        There is no such network, no version of it for small computers, or no such head.
+    """
+    task_name(recipe.network)  # raises for an unknown one
     torch.manual_seed(recipe.seed)
     if recipe.edge:
         if recipe.network not in EDGE:
@@ -31,7 +40,5 @@ def build(recipe: Recipe) -> nn.Module:
         return KULSeg(dropout=recipe.dropout)
     if recipe.network == "lodnn":
         return LoDNN(context_width=recipe.context_width, batch_norm=recipe.batch_norm, dropout=recipe.dropout)
-    if recipe.network == "ssadnet":
-        width, norm = recipe.context_width, recipe.batch_norm
-        return SSADNet(head=recipe.head, context_width=width, batch_norm=norm, dropout=recipe.dropout)
-    raise ValueError(f"network is {recipe.network!r}; expected ssadnet, lodnn, pointseg, squeezesegv2 or kulseg")
+    width, norm = recipe.context_width, recipe.batch_norm
+    return SSADNet(head=recipe.head, context_width=width, batch_norm=norm, dropout=recipe.dropout)
