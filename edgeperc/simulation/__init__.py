@@ -1,7 +1,8 @@
 """A spinning-LiDAR simulator for the demo, the benchmark, tests and training.
 
-`drawn` and `layouts` make scenes, `scene` casts them into labelled scans with the kernels of `raycast`, and `samples`
-labels the scans as evaluation and training do.
+`drawn` makes random scenes and `layouts` scenes around real boxes, from the parts in `street` and `shapes`. `scene`
+turns a scene into a labeled scan with the ray-casting kernels of `raycast`. `samples` makes the scans of training and
+evaluation, labeled by boxes as KITTI's are.
 """
 
 from __future__ import annotations

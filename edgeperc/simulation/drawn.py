@@ -1,4 +1,4 @@
-"""Random scenes: streets, traffic, parked cars and people."""
+"""Random scenes: streets with traffic, parked cars and people."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ ENVIRONMENTS = ("urban", "residential", "junction", "rural", "highway")
 
 
 def random_scene(seed: int, environment: str | None = None) -> Scene:
-    """A street that might be.
+    """A random street.
 
     Parameters
     ----------
     seed : int
         The same seed gives the same scene.
     environment : str, optional
-        One of `ENVIRONMENTS`; drawn by default.
+        One of `ENVIRONMENTS`; random by default.
 
     Raises
     ------
     PointsError
-        ``environment`` is none of `ENVIRONMENTS`.
+        ``environment`` is not one of `ENVIRONMENTS`.
     """
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 104729))
     place = str(rng.choice(ENVIRONMENTS, p=[0.32, 0.28, 0.2, 0.12, 0.08])) if environment is None else environment

@@ -16,32 +16,32 @@ from .street import IN_BAYS, ROW_RANGE_M, Street, add_roadside, any_vehicle, ran
 __all__ = ["scene_from_boxes"]
 
 _VEHICLES = ("car", "van", "truck")
-_ROW_GAP_M = 9.0  # from one parked car's middle to the next one's
+_ROW_GAP_M = 9.0  # between the centers of two parked cars
 
 
 def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float = 1.73) -> Scene:
-    """A street around a real layout of objects.
+    """A street around a real layout of boxes.
 
     Parameters
     ----------
     boxes : sequence of Box
-        In a sensor frame whose origin is ``mount_height_m`` above the road. Boxes whose label is none of car, van,
-        truck, pedestrian and cyclist become obstacles of the background.
+        In a sensor frame whose origin is ``mount_height_m`` above the road. Boxes with other labels than car, van,
+        truck, pedestrian and cyclist become background obstacles.
     seed : int
-        Of everything the boxes do not say: the road's edges, what stands beside it, what lies outside the view.
+        Of everything else: the edges of the road, what stands beside it, what lies outside the labeled view.
     mount_height_m : float
 
     Returns
     -------
     Scene
-        Its first objects are ``boxes`` of the five labels, in order, standing on the scene's ground (so that their
-        height differs a little from the given one).
+        Its first objects are the ``boxes`` of the five labels, in order. They stand on the scene's ground, so their z
+        differs slightly from that of the boxes.
     """
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 15485863))
     vehicles = [box for box in boxes if box.label in _VEHICLES]
     heading, curvature = _road_direction(vehicles)
     lane = float(rng.uniform(2.9, 3.6))
-    # Those along the road widen it; those across stand on another road or in a yard.
+    # Vehicles along the road widen it; vehicles across it stand on another road or in a yard.
     beside: list[tuple[float, float, float, float]] = []
     across: list[float] = []
     for box in vehicles:
@@ -76,7 +76,7 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
     terrain[LANE] = lane
     bottoms = np.array([(b.center[0], b.center[1], b.center[2] - b.size[2] / 2 + mount_height_m) for b in vehicles])
     if len(bottoms) >= 3:
-        # Slopes that the boxes tell, drawn towards level by 1,000 m2.
+        # Slopes of the ground under the boxes, by least squares, regularized towards level by 1,000 m2.
         xy = bottoms[:, :2]
         slopes = np.linalg.solve(xy.T @ xy + 1000.0 * np.eye(2), xy.T @ bottoms[:, 2])
         terrain[[SLOPE_X, SLOPE_Y]] = np.clip(slopes, -0.04, 0.04)
@@ -103,14 +103,14 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
                 turned = block(int(row[1]), row[2], (box.center[0], box.center[1], z + row[6]),
                                 (2 / row[7], 2 / row[11], 2 / row[15]), yaw=box.yaw, density=row[3])  # fmt: skip
                 street.rows.append(turned)
-    # What is labelled was seen: mostly nothing new may stand in between.
+    # Labeled objects are visible, so mostly keep the line of sight to them free.
     for box in boxes:
         away = math.hypot(box.center[0], box.center[1])
         if away > 8.0 and rng.random() < 0.85:
             share = 0.5 + 2.0 / away
             x, y = box.center[0] * share, box.center[1] * share
             street.take(x, y, away - 4.0, 1.0, math.atan2(box.center[1], box.center[0]))
-    # Behind the sensor and far to the sides nothing is labelled: mirror what is seen, thinned.
+    # Nothing is labeled behind the sensor and far to its sides: mirror some of the labeled vehicles.
     for s, u, _, ahead in beside:
         if rng.random() < 0.7:
             x, y, yaw = street.on_strip(-s + float(rng.normal(0, 3.0)), u)
@@ -129,9 +129,9 @@ def _parking_rows(
     heading: float,
     curvature: float,
 ) -> tuple[float, float, list[Row]]:
-    """The road's edges without the outermost row of vehicles, where it looks parked, and bays for those rows.
+    """Edges of the road without an outermost row of parked vehicles, and bays for those rows.
 
-    Parked looks a row of two and more, some of them close behind each other, clear of the sensor's own lane.
+    A row counts as parked if it has at least two vehicles outside the sensor's lane, two of them close together.
     """
     edges, bays = {-1.0: -right, 1.0: left}, []
     for side in edges:
@@ -163,7 +163,7 @@ def _along(box: Box, heading: float, curvature: float) -> tuple[float, float]:
 
 
 def _road_direction(vehicles: Sequence[Box]) -> tuple[float, float]:
-    """Heading and curvature of the road that the vehicles near the sensor's lane suggest."""
+    """Heading and curvature of the road, from the headings of the vehicles near the sensor's lane."""
     leaning = []
     for box in vehicles:
         turn = wrapped(2.0 * box.yaw) / 2.0  # modulo pi
@@ -173,7 +173,7 @@ def _road_direction(vehicles: Sequence[Box]) -> tuple[float, float]:
         return 0.0, 0.0
     s, turn = np.array(leaning).T
     if len(leaning) >= 3 and np.ptp(s) > 15.0:
-        # Straight ahead at the sensor, more or less: the ego vehicle follows the road.
+        # Regularized towards straight ahead at the sensor, because the ego vehicle follows the road.
         weights = np.array([[60.0 + len(s) * 4.0, s.sum()], [s.sum(), (s * s).sum() + 3000.0]])
         heading, curvature = np.linalg.solve(weights, np.array([turn.sum(), (s * turn).sum()]))
         return float(np.clip(heading, -0.08, 0.08)), float(np.clip(curvature, -0.012, 0.012))

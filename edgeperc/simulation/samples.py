@@ -19,16 +19,22 @@ __all__ = ["FIRST_SEED", "IGNORE", "labels_by_boxes", "simulated_scan"]
 
 IGNORE = 255
 
-# Measured: the bottom of KITTI's boxes lies this far above the ground around them (median of 720 boxes).
+# Measured: height of the bottom of KITTI's boxes above the ground around them (median of 720 boxes).
 BOX_ABOVE_GROUND_M = 0.03
 
 
 def simulated_scan(
     seed: int, sensor: str | SensorProfile = "hdl-64e", boxes: Sequence[Box] | None = None
 ) -> SimulatedScan:
-    """One scan of a scene of its own, the vehicle a little off its lane, pitched and rolled as on a real road.
+    """One scan of a new scene. The sensor is a little off the middle of its lane, pitched and rolled.
 
-    ``boxes`` gives the scene a real layout; without, everything is drawn from the seed.
+    Parameters
+    ----------
+    seed : int
+        Of the scene, the pose and the noise.
+    sensor : str or SensorProfile
+    boxes : sequence of Box, optional
+        A real layout to build the scene around; by default the scene is random.
     """
     rng = np.random.default_rng((seed, 1))
     if boxes is None:
@@ -42,9 +48,9 @@ def simulated_scan(
 
 
 def labels_by_boxes(scan: SimulatedScan) -> NDArray[np.uint8]:
-    """A simulated scan's point labels (n,) as they would be in KITTI, where a box is all that is known of an object.
+    """Point labels (n,) uint8 of a simulated scan by its boxes, as in KITTI: index into `POINT_CLASSES`.
 
-    What lies in the box of an object that was hit is the object, the ground at its feet included.
+    Every point in the box of an object with returns gets the object's class, even the ground under it.
     """
     labels = scan.labels.copy()
     for box, returns in zip(scan.boxes, scan.box_points, strict=True):
@@ -54,4 +60,4 @@ def labels_by_boxes(scan: SimulatedScan) -> NDArray[np.uint8]:
     return labels
 
 
-FIRST_SEED = 2 * 10**9  # training draws its scenes from 0, proofs of exports from 10**9
+FIRST_SEED = 2 * 10**9  # of evaluated scenes; those of training start at 0, those that check exports at 10**9

@@ -46,20 +46,20 @@ POINT_CLASS_OF = {"car": 1, "van": 1, "truck": 1, "pedestrian": 2, "person_sitti
 
 @dataclass(frozen=True, slots=True)
 class SceneObject:
-    """Something with a box that may move.
+    """An object with a box, standing or moving.
 
     Attributes
     ----------
     label : str
         ``"car"``, ``"van"``, ``"truck"``, ``"pedestrian"`` or ``"cyclist"``.
     center : tuple of 3 float
-        Middle of the box [m], world frame.
+        Center of the box [m], world frame.
     size : tuple of 3 float
         Length, width, height [m].
     yaw : float
         Heading about +z from +x [rad].
     track_id : int
-        The same for as long as the scene lives.
+        The same at all times of the scene.
     speed_mps, yaw_rate_rps : float
         Along the heading [m/s]; [rad/s].
     """
@@ -81,13 +81,13 @@ class Scene:
     ----------
     objects : tuple of SceneObject
     primitives : (n, 20) float64
-        Shapes; those of an object in the frame of the object (origin in the middle of the footprint, on the ground).
+        Shapes; those of an object are in its frame (origin at the center of the footprint, on the ground).
     strips : (k, 10) float64
-        Road surfaces and parking bays; the first is the road the sensor is on.
-    terrain : (25,) float64
-        What the ground is like.
+        Road surfaces and parking bays; the first is the sensor's road.
+    terrain : (26,) float64
+        Parameters of the ground, by the constants of `raycast`.
     tile : (256, 256) float64
-        Noise in -1..1 that repeats; roughness and stains.
+        Periodic noise in -1..1, for roughness and stains.
     """
 
     objects: tuple[SceneObject, ...]
@@ -97,11 +97,11 @@ class Scene:
     tile: NDArray[np.float64]
 
     def at(self, t_s: float) -> Scene:
-        """The scene ``t_s`` seconds later: objects go on with constant speed and turn rate, over the ground."""
+        """The scene ``t_s`` seconds later: objects move on the ground with constant speed and turn rate."""
         moved = []
         for each in self.objects:
             turn = each.yaw_rate_rps * t_s
-            # Chord of the arc; sinc is 1 for a straight way.
+            # Chord of the arc; sinc is 1 for a straight line.
             way = each.speed_mps * t_s * float(np.sinc(turn / (2.0 * math.pi)))
             x = each.center[0] + way * math.cos(each.yaw + turn / 2.0)
             y = each.center[1] + way * math.sin(each.yaw + turn / 2.0)
@@ -114,24 +114,24 @@ class Scene:
         return float(ground_at(self.strips, self.terrain, self.tile, float(x), float(y))[0])
 
     def on_road(self, x: float, y: float) -> bool:
-        """Whether x, y lies on a road surface (parking bays are none)."""
+        """Whether x, y lies on a road surface, which excludes parking bays."""
         return bool(ground_at(self.strips, self.terrain, self.tile, float(x), float(y))[1] < 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedScan:
-    """One turn of the sensor and the truth about it, in the sensor frame.
+    """One scan and its truth, in the sensor frame.
 
     Attributes
     ----------
     points : (n, 4) float32
-        x, y, z [m], remission 0..0.99 in steps of 0.01; laser by laser from the top, each counter-clockwise from ahead.
+        x, y, z [m], remission 0..0.99 in steps of 0.01; beam by beam from the top, each counter-clockwise from ahead.
     labels : (n,) uint8
         Index into `POINT_CLASSES`.
     objects : (n,) int32
         Index into ``boxes``; -1 for the background.
     boxes : tuple of Box
-        Every object of the scene, seen or not.
+        All objects of the scene, visible or not.
     box_ids : tuple of int
         Track id of each box.
     box_points : tuple of int
@@ -150,7 +150,7 @@ class SimulatedScan:
     scene: Scene
 
     def top_view_labels(self, geometry: TopViewGeometry | None = None) -> NDArray[np.uint8]:
-        """Truth for every cell of a top view, seen or not.
+        """True class of each cell of a top view, visible or not.
 
         Parameters
         ----------
@@ -159,8 +159,8 @@ class SimulatedScan:
         Returns
         -------
         (rows, columns) uint8
-            Index into `TOP_VIEW_CLASSES`, by the cell's centre: road surface, over it the footprints of vehicles
-            (the nearer vehicle wins).
+            Index into `TOP_VIEW_CLASSES` at the center of the cell: the footprint of the nearest vehicle, else the road
+            surface.
         """
         view = TopViewGeometry() if geometry is None else geometry
         x, y = view.cell_centres()
@@ -186,7 +186,7 @@ def sensor_pose(
     Returns
     -------
     (4, 4) float64
-        Turned by roll about x, then pitch about y (nose down is positive), then yaw about z [rad].
+        Rotated by roll about x, then by pitch about y (nose down is positive), then by yaw about z [rad].
     """
     T_world_sensor = np.eye(4)
     cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
@@ -210,7 +210,7 @@ def simulate(
     noise: bool = True,
     ego_shadow: bool = True,
 ) -> SimulatedScan:
-    """Turn the sensor once.
+    """Simulate one scan.
 
     Parameters
     ----------
@@ -219,14 +219,13 @@ def simulate(
     seed : int
         Of noise, drop-out and leaves; the same seed gives the same bits.
     T_world_sensor : (4, 4) array_like, optional
-        By default level, looking along +x, ``mount_height_m`` above the ground at the origin. Tilts up to a few
-        degrees are meant.
+        Default: level, along +x, ``mount_height_m`` above the ground at the origin. For tilts of a few degrees at most.
     max_range_m : float
-        Nothing farther returns, nor anything beyond the sensor's own range. KITTI's files end at 80 m.
+        Longest range, limited by that of the sensor. KITTI's files end at 80 m.
     noise : bool
         False: exact ranges and azimuths, no drop-out, no beam offsets.
     ego_shadow : bool
-        Lower beams meet the roof of the sensor's own vehicle, as on KITTI's car. Never where ``noise`` is False.
+        The own vehicle hides some directions of the lower beams, as on KITTI's car. Not if ``noise`` is False.
 
     Returns
     -------
@@ -235,7 +234,7 @@ def simulate(
     Raises
     ------
     PointsError
-        ``T_world_sensor`` is no finite (4, 4) matrix.
+        ``T_world_sensor`` is not a finite (4, 4) matrix.
     """
     profile = get_sensor(sensor)
     pose = sensor_pose(scene, profile) if T_world_sensor is None else np.array(T_world_sensor, dtype=np.float64)
@@ -248,9 +247,9 @@ def simulate(
     range_offsets, remission_offsets = np.zeros(n_beams), np.zeros(n_beams)
     if noise:
         azimuths += rng.normal(0.0, 0.08, n_columns) * step
-        # Measured: a flat road's points lie 0.008 m off their neighbours of the same laser; lasers differ by more.
+        # Measured: points on a flat road are 0.008 m off their neighbors of the same beam; beams differ by more.
         range_offsets = rng.normal(0.0, 0.012, n_beams)
-        # Measured: mean remission of the road by laser spreads by 0.08, a few lasers almost blind.
+        # Measured: the mean remission of the road differs by 0.08 between beams; a few beams return almost none.
         remission_offsets = np.clip(rng.normal(-0.01, 0.075, n_beams), -0.25, 0.1)
     elevations = np.radians(np.asarray(profile.elevations_deg))
     reach = min(float(max_range_m), profile.max_range_m)
@@ -288,7 +287,7 @@ def simulate(
     counts = np.bincount(objects[objects >= 0], minlength=len(boxes))
     return SimulatedScan(
         points=points,
-        labels=lookup[objects],  # -1 finds the last entry, the background
+        labels=lookup[objects],  # -1 is the last entry, the background
         objects=objects,
         boxes=boxes,
         box_ids=tuple(each.track_id for each in scene.objects),
@@ -306,14 +305,14 @@ def simulate_sequence(
     ego_speed_mps: float = 0.0,
     seed: int = 0,
 ) -> Iterator[tuple[float, NDArray[np.float64], SimulatedScan]]:
-    """Drive along the scene's first road from the origin.
+    """Simulate scans of a sensor that drives along the scene's first road, from the origin.
 
     Yields
     ------
     stamp_s : float
     T_world_sensor : (4, 4) float64
     scan : SimulatedScan
-        ``scan.box_ids`` tell which object is which from scan to scan.
+        ``scan.box_ids`` identify objects across scans.
     """
     curvature = float(scene.strips[0, 4])
     heading = math.atan2(scene.strips[0, 3], scene.strips[0, 2])

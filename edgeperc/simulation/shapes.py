@@ -1,4 +1,4 @@
-"""Vehicles, people and bicycles as boxes, ellipsoids and cylinders."""
+"""Vehicles, people and bicycles made of boxes, ellipsoids and cylinders."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def blob(material: int, remission: float, center: Vector, size: Vector, density:
 
 
 def rod(remission: float, start: Vector, end: Vector, radius: float, material: int = MATTE) -> Row:
-    """A cylinder from point to point."""
+    """A cylinder between two points."""
     along = [e - s for s, e in zip(start, end, strict=True)]
     length = math.sqrt(sum(v * v for v in along))
     ax, ay, az = (v / length for v in along)
-    # Any two axes square to the first will do.
+    # Any two axes perpendicular to the first.
     ux, uy, uz = (0.0, az, -ay) if abs(ax) < 0.8 else (-az, 0.0, ax)
     norm = math.sqrt(ux * ux + uy * uy + uz * uz)
     ux, uy, uz = ux / norm, uy / norm, uz / norm
@@ -88,7 +88,7 @@ def _paint(rng: np.random.Generator, light_share: float) -> tuple[float, float]:
 
 
 def _cloth(rng: np.random.Generator) -> float:
-    # Measured: mean remission of people 0.29..0.47 with a twelfth at zero; most cloth is bright in the near infrared.
+    # Measured: mean remission of people is 0.29..0.47, and 0 for one in twelve; most cloth is bright in near infrared.
     return float(rng.uniform(0.0, 0.15) if rng.random() < 0.06 else rng.uniform(0.3, 0.6))
 
 
@@ -117,7 +117,7 @@ def _car(size: Vector, rng: np.random.Generator) -> list[Row]:
                density=rng.uniform(0.5, 0.97), taper=(screen * rise / half * 1.6, back * rise / half * 1.6, sides)),
         block(PAINT, paint, (0, 0, 0), (1, 1, 1), density=lost),
     ]  # fmt: skip
-    # The roof lies on the glass; pillars stand inside its edges.
+    # The roof lies on the glass; the pillars are inside its edges.
     front, rear = half * (1 - screen * rise / half * 1.6), half * (1 - back * rise / half * 1.6)
     rows[3] = block(
         PAINT, paint, (middle + (front - rear) / 2, 0, (roof + height) / 2),
@@ -243,7 +243,7 @@ def bicycle(length: float, half: float, rng: np.random.Generator, y: float = 0.0
 
     rows = []
     for s in (-1.0, 1.0):
-        # A wheel is spokes and a rim: most rays pass.
+        # A wheel is a rim with spokes: most rays pass through it.
         spokes = rod(0.2, to(s * axle, -0.02, r), to(s * axle, 0.02, r), r, POROUS)
         rows.append((*spokes[:3], 0.4, *spokes[4:]))
     seat, head, pedals = to(-0.2 * length, 0, 0.85), to(0.28 * length, 0, 0.85), to(-0.06 * length, 0, 0.3)

@@ -1,4 +1,4 @@
-"""The street under construction: ground, strips, what stands beside it."""
+"""Parts of a street scene: ground, road strips, objects and roadside."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ __all__ = [
 
 
 class Street:
-    """A scene in the making: puts things beside and on its roads, where nothing stands yet."""
+    """Builder of a scene: places objects on its roads and static shapes beside them, where the ground is free."""
 
     def __init__(self, rng: np.random.Generator, strips: list[Row], terrain: NDArray[np.float64]) -> None:
         self.rng = rng
@@ -79,18 +79,18 @@ class Street:
         return Scene(tuple(self.objects), rows, self.strips, self.terrain, self.tile)
 
     def ground(self, x: float, y: float) -> tuple[float, float]:
-        """Height, and distance out of the roads."""
+        """Height, and distance outside the roads (negative on a road) [m]."""
         z, outside, _, _, _ = ground_at(self.strips, self.terrain, self.tile, float(x), float(y))
         return z, outside
 
     def edge(self, road: int, side: float) -> float:
-        """How far a road reaches to the left (1) or right (-1) of its axis [m]; bays along the first one count."""
+        """Distance of a road's left (1) or right (-1) edge from its axis [m]; the first road includes its bays."""
         beside = self.strips[:, 9] > 0.0 if road == 0 else np.zeros(len(self.strips), np.bool_)
         beside[road] = True
         return float((side * self.strips[beside, 6 if side > 0 else 5]).max())
 
     def on_strip(self, s: float, u: float, strip: int = 0) -> Vector:
-        """x, y and direction of the road at s along, u to the left of a strip's axis."""
+        """x, y and direction of the strip at s along and u to the left of its axis."""
         x0, y0, cos, sin, curvature = self.strips[strip, :5]
         slope = curvature * s
         turn = math.atan(slope)
@@ -98,7 +98,7 @@ class Street:
         return x0 + cos * a - sin * b, y0 + sin * a + cos * b, math.atan2(sin, cos) + turn
 
     def free(self, x: float, y: float, length: float, width: float, yaw: float, gap: float = 0.25) -> bool:
-        """Whether a rectangle touches nothing that stands already, the sensor's vehicle included."""
+        """Whether a rectangle overlaps no occupied ground."""
         a, b = length / 2 + gap, width / 2 + gap
         cos, sin = math.cos(yaw), math.sin(yaw)
         reach = math.hypot(a, b)
@@ -134,7 +134,7 @@ class Street:
         *,
         force: bool = False,
     ) -> bool:
-        """Place a labelled object, if its ground is free."""
+        """Place a labeled object if its ground is free, or by ``force``; says whether it was placed."""
         if size is None:
             mean, spread = SIZES[label]
             shift = np.clip(self.rng.normal(size=3), -2, 2)
@@ -155,7 +155,7 @@ class Street:
     def add_static(
         self, rows: list[Row], x: float, y: float, length: float, width: float, yaw: float, off_road: float = 0.1
     ) -> bool:
-        """Rows are in a frame at x, y on the ground, turned by yaw. Stays clear of roads and of what stands there."""
+        """Place static shapes, given in a frame at x, y on the ground, if the ground is free and off the roads."""
         cos, sin = math.cos(yaw), math.sin(yaw)
         steps = max(1, math.ceil(length / 4.0))
         for k in range(-steps, steps + 1):
@@ -317,7 +317,7 @@ def strip_row(
     return (x, y, math.cos(yaw), math.sin(yaw), curvature, right, left, *s_range, float(bay))
 
 
-# A row of parked cars is as wide as this, and as often as this no part of the road: SemanticKITTI tells them apart.
+# Width of a parking row, and the probability that it is a bay rather than road (SemanticKITTI labels both).
 ROW_WIDTH_M = 2.1
 ROW_RANGE_M = (-70.0, 78.0)
 IN_BAYS = 0.75
