@@ -115,7 +115,7 @@ def hits(at: Box, n: int, label: int = 1) -> list[list[float]]:
     return [[at.center[0] + 0.1 * k, at.center[1], at.center[2], label] for k in range(n)]
 
 
-def judged(judge: Judge, *frames: Frame, n_resamples: int = 50) -> dict[str, Any]:
+def evaluated(judge: Judge, *frames: Frame, n_resamples: int = 50) -> dict[str, Any]:
     return figures([judge.record(judge.kitti(each))[0] for each in frames], n_resamples)
 
 
@@ -136,7 +136,7 @@ def test_points_by_hand(world: World) -> None:
         [-12.0, 5.0, -1.7, 1],  # behind the camera
         [np.nan, 5.0, -1.7, 0],
     ]
-    table = judged(Judge(["pointseg"]), frame(near, far, rider, van, points=points))["points"]
+    table = evaluated(Judge(["pointseg"]), frame(near, far, rider, van, points=points))["points"]
     assert set(table) == set(BANDS)
     car = table["all"]["car"]
     assert (car["n_points"], car["n_objects"]) == (4 + 2 + 3, 2)
@@ -172,7 +172,7 @@ def test_boxes_by_hand(world: World) -> None:
         box(35, -5, score=0.5),  # nothing there
         box(9, -9.9, score=0.4),  # out of the camera's sight
     )
-    table = judged(Judge(["ssadnet"]), frame(near, middle, far, hidden, beside, points=points))["boxes"]
+    table = evaluated(Judge(["ssadnet"]), frame(near, middle, far, hidden, beside, points=points))["boxes"]
     for kind in ("upright", "oriented"):
         every = table[kind]["all"]
         assert {key for key in every if not key.startswith("mean")} == {"car", "van", "vehicle"}
@@ -202,18 +202,18 @@ def test_boxes_of_clusters_by_hand(world: World) -> None:
         box(30, -13, score=0.7),
         box(20, 4, score=0.6),
     )
-    # Nobody told points of a van from those of a car: the box of one need not be found, and may be.
-    table = judged(Judge(["pointseg"], boxes_from="clusters"), frame_of_all)["boxes"]["oriented"]["all"]
+    # Point labels do not separate vans from cars: the box of a van is ignored.
+    table = evaluated(Judge(["pointseg"], boxes_from="clusters"), frame_of_all)["boxes"]["oriented"]["all"]
     counts = {name: [table[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in ("car", "pedestrian")}
     assert counts == {"car": [3, 2, 2], "pedestrian": [1, 1, 1]}
     # Beside a top-view model's they are, within its view.
-    table = judged(Judge(["pointseg", "ssadnet"], boxes_from="both"), frame_of_all)["boxes"]["oriented"]["all"]
+    table = evaluated(Judge(["pointseg", "ssadnet"], boxes_from="both"), frame_of_all)["boxes"]["oriented"]["all"]
     counts = {
         name: [table[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in ("car", "van", "pedestrian")
     }
     assert counts == {"car": [3, 3, 2], "van": [1, 0, 0], "pedestrian": [1, 1, 1]}
     assert [table["vehicle"][k] for k in ("n_truth", "n_predicted", "n_hits")] == [4, 3, 3]  # nobody on foot
-    assert "boxes" not in judged(Judge(["pointseg"]), frame_of_all)
+    assert "boxes" not in evaluated(Judge(["pointseg"]), frame_of_all)
 
 
 def test_cells_under_boxes(world: World) -> None:
@@ -221,9 +221,9 @@ def test_cells_under_boxes(world: World) -> None:
     world.cells["ssadnet"][240:280, 90:110] = 2  # x 18..22, y -1..1: the car to the cell
     world.cells["ssadnet"][100:110, 100:110] = 4
     tram = box(30, 5, "tram")
-    told = judged(Judge(["ssadnet"]), frame(box(20, 0), box(40, 5, "van"), tram))["segmentation"]
-    assert set(told) == {"vehicles from 3-D boxes"}
-    row = told["vehicles from 3-D boxes"]["all"]
+    result = evaluated(Judge(["ssadnet"]), frame(box(20, 0), box(40, 5, "van"), tram))["segmentation"]
+    assert set(result) == {"vehicles from 3-D boxes"}
+    row = result["vehicles from 3-D boxes"]["all"]
     assert row["n_cells_of"] == {
         "background": row["n_cells"] - 1600,
         "car": 800,
@@ -231,7 +231,7 @@ def test_cells_under_boxes(world: World) -> None:
         "truck": 0,
         "vehicle": 1600,
     }
-    assert 65_000 < row["n_cells"] < 80_000 - 800  # the camera does not see the nearest corners; trams are not judged
+    assert 65_000 < row["n_cells"] < 80_000 - 800  # the camera does not see the nearest corners; trams are not counted
     assert row["iou"]["car"] == 1.0
     assert row["iou"]["van"] == row["iou"]["truck"] == 0.0
     assert row["iou"]["vehicle"] == pytest.approx(800 / (1600 + 100), abs=1e-4)
@@ -242,7 +242,7 @@ def test_cells_under_boxes(world: World) -> None:
     # Vans were never predicted: what has no precision takes no part in the weighted mean.
     weights = (row["n_cells"] - 1600, 800)
     assert row["mean_ap"] == pytest.approx((weights[0] * rest / (rest + 800) + weights[1]) / sum(weights), abs=1e-4)
-    bands = told["vehicles from 3-D boxes"]
+    bands = result["vehicles from 3-D boxes"]
     assert [bands[b]["n_cells_of"]["car"] for b in BANDS] == [800, 0, 800, 0]
     assert sum(bands[b]["n_cells"] for b in list(BANDS)[1:]) < row["n_cells"]  # some corners lie beyond 46 m
 
@@ -260,9 +260,9 @@ def test_road_drawn_by_another_model(world: World) -> None:
     world.cells["lodnn"][:, 50:150] = 1
     world.cells["ssadnet"] = world.cells["lodnn"].copy()
     world.cells["ssadnet"][240:280, 90:110] = 2
-    told = judged(Judge(["ssadnet"], road_by="lodnn"), frame(box(20, 0)))["segmentation"]
-    assert list(told) == ["vehicles from 3-D boxes", "road drawn by lodnn 1.0.0"]
-    row = told["road drawn by lodnn 1.0.0"]["all"]
+    result = evaluated(Judge(["ssadnet"], road_by="lodnn"), frame(box(20, 0)))["segmentation"]
+    assert list(result) == ["vehicles from 3-D boxes", "road drawn by lodnn 1.0.0"]
+    row = result["road drawn by lodnn 1.0.0"]["all"]
     assert set(row["iou"]) == {*CELLS, "vehicle"}
     assert row["accuracy"] == row["iou"]["drivable"] == row["iou"]["car"] == row["mean_iou"] == 1.0
     assert row["iou"]["van"] is None
@@ -287,11 +287,11 @@ def test_road_by_hand(world: World) -> None:
     judge = Judge(["ssadnet"])
     record, mistakes = judge.record(judge.semantickitti(scan))
     assert mistakes is None
-    told = figures([record])
-    assert told["n_frames"] == told["n_drives"] == 1
-    road = told["road"]["all"]
-    assert road == told["road"]["15-30 m"]
-    assert told["road"]["0-15 m"]["iou"] is None
+    result = figures([record])
+    assert result["n_frames"] == result["n_drives"] == 1
+    road = result["road"]["all"]
+    assert road == result["road"]["15-30 m"]
+    assert result["road"]["0-15 m"]["iou"] is None
     assert (road["n_cells"], road["n_road"]) == (8, 4)
     assert [road[k] for k in ("precision", "recall", "iou", "f1")] == pytest.approx(
         [2 / 3, 2 / 4, 2 / 5, 4 / 7], abs=1e-4
@@ -301,12 +301,12 @@ def test_road_by_hand(world: World) -> None:
     # By falling probability: road, road, other, road, road. With all four taken: 4 of 5 right.
     assert road["max_f1"] == pytest.approx(8 / 9, abs=1e-4)
     assert road["ap"] == pytest.approx((6 * 1.0 + 5 * 4 / 5) / 11, abs=1e-4)
-    cells = told["segmentation"]["observed cells"]["all"]
+    cells = result["segmentation"]["observed cells"]["all"]
     assert cells["iou"] == {"other": pytest.approx(1 / 5), "road": 0.4, "vehicle": 0.5}
     assert cells["n_cells_of"] == {"other": 3, "road": 4, "vehicle": 1}
 
 
-def test_a_model_of_the_road_alone_is_not_asked_for_vehicles(world: World) -> None:
+def test_a_model_without_vehicles_is_evaluated_on_road_only(world: World) -> None:
     y = 5.05 - np.arange(5)
     points = np.stack([np.full(5, 20.05), y, np.full(5, -1.7), np.zeros(5)], axis=1).astype(np.float32)
     scan = RoadFrame("00/000000", "b", points, np.array([1, 1, 2, 0, IGNORE], np.uint8))
@@ -315,10 +315,10 @@ def test_a_model_of_the_road_alone_is_not_asked_for_vehicles(world: World) -> No
     world.cells["lodnn"][259, cols[[0, 2]]] = 1
     judge = Judge(["lodnn"])
     record, _ = judge.record(judge.semantickitti(scan))
-    told = figures([record])
-    cells = told["segmentation"]["observed cells"]["all"]
+    result = figures([record])
+    cells = result["segmentation"]["observed cells"]["all"]
     assert cells["iou"] == {"other": pytest.approx(1 / 3, abs=1e-4), "road": pytest.approx(1 / 3, abs=1e-4)}
-    assert told["road"]["all"]["confusion"] == [[0.25, 0.25], [0.25, 0.25]]
+    assert result["road"]["all"]["confusion"] == [[0.25, 0.25], [0.25, 0.25]]
     record, mistakes = judge.record(judge.kitti(frame(box(10, 0), points=hits(box(10, 0), 10))))
     assert record.tallies == {}  # boxes say nothing of the road
     assert mistakes is not None
@@ -332,15 +332,15 @@ def test_a_model_of_the_road_alone_is_not_asked_for_vehicles(world: World) -> No
 def test_intervals_are_over_drives(world: World) -> None:
     right = frame(box(10, 0), box(20, 3, "cyclist"), points=hits(box(10, 0), 10) + hits(box(20, 3), 3, 3), drive="b")
     half = frame(box(10, 0), points=hits(box(10, 0), 5) + hits(box(10, 0), 5, label=0))
-    told = judged(Judge(["pointseg"]), half, half, right, n_resamples=1000)
-    assert (told["n_frames"], told["n_drives"]) == (3, 2)
-    car, cyclist = told["points"]["all"]["car"], told["points"]["all"]["cyclist"]
+    result = evaluated(Judge(["pointseg"]), half, half, right, n_resamples=1000)
+    assert (result["n_frames"], result["n_drives"]) == (3, 2)
+    car, cyclist = result["points"]["all"]["car"], result["points"]["all"]["cyclist"]
     assert car["iou"] == pytest.approx(20 / 30, abs=1e-4)
     # A quarter of the draws takes the one drive twice, a quarter the other.
     assert car["iou_interval"] == [0.5, 1.0]
     assert cyclist["iou"] == 1.0
     assert cyclist["iou_interval"] is None  # in one drive only
-    assert judged(Judge(["pointseg"]), half, right, n_resamples=1000) == judged(
+    assert evaluated(Judge(["pointseg"]), half, right, n_resamples=1000) == evaluated(
         Judge(["pointseg"]), half, right, n_resamples=1000
     )
 
@@ -349,12 +349,12 @@ def test_a_mean_over_classes_needs_them_all_in_two_drives(world: World) -> None:
     world.cells["ssadnet"][240:280, 90:110] = 2
     judge = Judge(["ssadnet"])
     car, other = frame(box(20, 0)), frame(box(20, 0), drive="b")
-    assert judged(judge, car, other)["segmentation"]["vehicles from 3-D boxes"]["all"]["mean_iou_interval"] == [
+    assert evaluated(judge, car, other)["segmentation"]["vehicles from 3-D boxes"]["all"]["mean_iou_interval"] == [
         1.0,
         1.0,
     ]
     van = frame(box(20, 0), box(30, 3, "van"), drive="b")
-    row = judged(judge, car, van)["segmentation"]["vehicles from 3-D boxes"]["all"]
+    row = evaluated(judge, car, van)["segmentation"]["vehicles from 3-D boxes"]["all"]
     assert row["mean_iou_interval"] is None
     assert row["iou_interval"]["van"] is None
     assert row["iou_interval"]["car"] == [1.0, 1.0]
@@ -382,7 +382,7 @@ def test_records_put_together_say_what_one_pass_says(scans: list[Any]) -> None:
         evaluator.update(guesses, rights)
         together.update(said, right)
         records.append(Record(str(k), drive, tallies | {("boxes", "oriented"): own}))
-    told = figures(records, n_resamples=5)
+    result = figures(records, n_resamples=5)
     one = figures([Record("", "", {("segmentation", "t", "all"): together, ("boxes", "oriented"): evaluator})])
 
     def without_intervals(value: Any) -> Any:
@@ -390,8 +390,8 @@ def test_records_put_together_say_what_one_pass_says(scans: list[Any]) -> None:
             return {key: without_intervals(inner) for key, inner in value.items() if not key.endswith("_interval")}
         return value
 
-    assert without_intervals(told["boxes"]) == without_intervals(one["boxes"])
-    assert without_intervals(told["segmentation"]["t"]["all"]) == without_intervals(one["segmentation"]["t"]["all"])
+    assert without_intervals(result["boxes"]) == without_intervals(one["boxes"])
+    assert without_intervals(result["segmentation"]["t"]["all"]) == without_intervals(one["segmentation"]["t"]["all"])
 
 
 def kitti_set(root: Path, drives: dict[str, str] | None = None) -> Path:
@@ -427,30 +427,30 @@ def test_scans_of_a_split(world: World, tmp_path: Path) -> None:
         ({"split": "all"}, 3),
     ):
         done: list[int] = []
-        told, worst = evaluate.evaluate(
+        result, worst = evaluate.evaluate(
             [root], ["pointseg"], **asked, on_scan=lambda *counts, to=done: to.extend(counts)
         )
-        assert told["real"]["n_frames"] == len(worst) == n_frames
-        assert told["split"] == asked.get("split", "validation" if "fold" in asked else "test")
+        assert result["real"]["n_frames"] == len(worst) == n_frames
+        assert result["split"] == asked.get("split", "validation" if "fold" in asked else "test")
         assert done == [count for k in range(n_frames) for count in (k + 1, n_frames)]
     with pytest.raises(PointsError, match=r"no scans of the validation drives \(fold: 1\)"):
         evaluate.evaluate([root], ["pointseg"], fold=1)
 
 
-def test_scans_of_drives_named_nowhere_are_judged(world: World, tmp_path: Path) -> None:
-    told, _ = evaluate.evaluate([kitti_set(tmp_path)], ["pointseg"])
-    assert told["real"]["n_drives"] == 2
+def test_scans_of_drives_listed_nowhere_are_evaluated(world: World, tmp_path: Path) -> None:
+    result, _ = evaluate.evaluate([kitti_set(tmp_path)], ["pointseg"])
+    assert result["real"]["n_drives"] == 2
 
 
 @pytest.mark.parametrize("guilty", ["pointseg", "lodnn"])
-def test_training_scans_are_never_judged_in_silence(world: World, tmp_path: Path, guilty: str) -> None:
+def test_training_scans_are_refused_unless_asked_for(world: World, tmp_path: Path, guilty: str) -> None:
     root = kitti_set(tmp_path, {"000000": "2011_09_26_drive_0011", "000001": "2011_09_26_drive_0005"})
     seen = hashlib.sha256(KittiObjects(root).frame("000001").points.tobytes()).hexdigest()[:16]
     models = ["pointseg", "ssadnet"]
     # Whatever the scan was called when it was trained on.
     world.cards[guilty] = card(guilty, training={"frames": {"renamed": seen}})
-    told, _ = evaluate.evaluate([root], models, road_by="lodnn")
-    assert told["real"]["n_frames"] == 1
+    result, _ = evaluate.evaluate([root], models, road_by="lodnn")
+    assert result["real"]["n_frames"] == 1
     for asked in ({"split": "all"}, {"fold": 0}):
         with pytest.raises(SplitError, match=rf"{guilty} 1\.0\.0 was trained on scan 000001 of drive .*_0005.*'train'"):
             evaluate.evaluate([root], models, road_by="lodnn", **asked)
@@ -532,11 +532,11 @@ def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFi
     assert printed.err == ""
     for words in ("== simulated scans: 2 scans, 2 drives ==", "boxes, oriented", "top view, every cell", "MaxF"):
         assert words in printed.out
-    told = json.loads(out.read_text())
-    assert told["command"].startswith("edgeperc eval simulation:2 --json ")
-    assert set(told["models"]) == {"ssadnet", "pointseg"}
-    assert (told["split"], told["fold"]) == ("test", None)
-    simulated = told["simulated"]
+    result = json.loads(out.read_text())
+    assert result["command"].startswith("edgeperc eval simulation:2 --json ")
+    assert set(result["models"]) == {"ssadnet", "pointseg"}
+    assert (result["split"], result["fold"]) == ("test", None)
+    simulated = result["simulated"]
     assert set(simulated) == {"points", "pixels", "boxes", "segmentation", "road", "n_frames", "n_drives"}
     assert simulated["segmentation"]["every cell"]["all"]["n_cells"] == 160_000
     assert 0.5 < simulated["points"]["all"]["car"]["iou"] <= 1.0
@@ -584,15 +584,15 @@ def test_shipped_models_refuse_their_training_scans(kitti_root: Path) -> None:
 def test_real_scans(kitti_root: Path, semantickitti_root: Path) -> None:
     judge = Judge(["ssadnet", "pointseg"])
     objects, sequences = KittiObjects(kitti_root), SemanticKitti(semantickitti_root)
-    told = figures([judge.record(judge.kitti(objects.frame(name)))[0] for name in objects.names("test")[::7]], 100)
-    assert told["points"]["all"]["car"]["iou"] > 0.5
-    low, high = told["points"]["all"]["car"]["iou_interval"]
-    assert low <= told["points"]["all"]["car"]["iou"] <= high
-    assert told["boxes"]["oriented"]["all"]["vehicle"]["ap"] > 0.5
-    assert told["points"]["all"]["car"]["n_points"] > 1000
-    cells = told["segmentation"]["vehicles from 3-D boxes"]["all"]
+    result = figures([judge.record(judge.kitti(objects.frame(name)))[0] for name in objects.names("test")[::7]], 100)
+    assert result["points"]["all"]["car"]["iou"] > 0.5
+    low, high = result["points"]["all"]["car"]["iou_interval"]
+    assert low <= result["points"]["all"]["car"]["iou"] <= high
+    assert result["boxes"]["oriented"]["all"]["vehicle"]["ap"] > 0.5
+    assert result["points"]["all"]["car"]["n_points"] > 1000
+    cells = result["segmentation"]["vehicles from 3-D boxes"]["all"]
     assert cells["accuracy"] > 0.9
-    assert 70_000 < cells["n_cells"] / told["n_frames"] < 80_000
+    assert 70_000 < cells["n_cells"] / result["n_frames"] < 80_000
     road = figures([judge.record(judge.semantickitti(sequences.frame(sequences.names("test")[0])))[0]])["road"]["all"]
     assert road["f1"] > 0.7
     assert road["max_f1"] >= road["f1"] - 0.01

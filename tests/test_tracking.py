@@ -61,7 +61,7 @@ from edgeperc_bench.peers.tracking import crossing, every_second_beam
 
 NOISE = np.array([2.0, 0.4, 0.3, 0.1, 0.2])
 SIGMAS = np.array([0.2, 0.1, 0.08])
-STANDING = np.eye(4)  # a single object's motion cannot be told from the sensor's without
+STANDING = np.eye(4)  # without poses, the motion of a single object cannot be separated from the sensor's
 
 
 def rng_of(seed: int) -> np.random.Generator:
@@ -237,7 +237,7 @@ def test_all_motions_together_are_filterpys_imm() -> None:
         np.testing.assert_allclose(total[0], theirs.P, atol=1e-6)
 
 
-def test_a_track_that_is_not_finite_spoils_no_other() -> None:
+def test_a_track_that_is_not_finite_leaves_the_others_unchanged() -> None:
     rng = rng_of(9)
     states, covariance = some_tracks(rng, 3)
     states[1, :, 3], covariance[1, 2] = np.nan, np.nan
@@ -519,7 +519,7 @@ def test_birth_confirmation_coasting_memory_and_death() -> None:
         assert track.coasting
         assert track.box.center[0] == pytest.approx(10.0 + 0.5 * k, abs=0.3)
     for k in range(15, 18):
-        assert len(tracker.update([], 0.1 * k, STANDING)) == 0  # too often to be told of
+        assert len(tracker.update([], 0.1 * k, STANDING)) == 0  # too often to be reported
     (track,) = tracker.update([box("car", 19.0, 0.0, score=0.95)], 1.8, STANDING)
     assert track.id == 1  # but not forgotten
     assert len(tracker.update([], 4.5, STANDING)) == 0
@@ -528,7 +528,7 @@ def test_birth_confirmation_coasting_memory_and_death() -> None:
     assert track.id == 2
 
 
-def test_what_is_hidden_is_told_of_for_longer() -> None:
+def test_a_hidden_track_is_reported_for_longer() -> None:
     """One pedestrian walks past behind a car for a second; another one is no longer found beside it."""
     tracker = Tracker()
     for k in range(33):
@@ -556,7 +556,7 @@ def test_a_track_is_worth_more_hidden_than_overlooked() -> None:
     assert scores[0] > scores[1] + 0.02
 
 
-def test_a_sure_detection_is_told_of_at_once_and_a_doubtful_one_begins_nothing() -> None:
+def test_a_sure_detection_is_reported_at_once_and_a_doubtful_one_begins_no_track() -> None:
     parameters = {"car": replace(PARAMETERS["car"], birth_score=0.3)}
     tracker = Tracker(parameters)
     tracks = tracker.update([box("car", 10.0, 0.0, score=0.99), box("car", 20.0, 0.0, score=0.2)], 0.0, STANDING)
@@ -597,7 +597,7 @@ def test_labels_of_one_group_share_a_track_and_the_majority_names_it() -> None:
     assert tracks.labels == ["tram", "car"]
 
 
-def test_what_is_found_as_two_things_is_told_of_once() -> None:
+def test_an_object_detected_as_two_classes_is_reported_once() -> None:
     tracker = Tracker()
     for k in range(6):
         boxes = [box("pedestrian", 10.0, 0.0, score=0.8), box("cyclist", 10.1, 0.0, score=0.95)]
@@ -606,14 +606,14 @@ def test_what_is_found_as_two_things_is_told_of_once() -> None:
     assert tracks.n_tentative == 1
 
 
-def test_what_leaves_the_field_of_view_is_told_of_no_longer() -> None:
+def test_a_track_that_leaves_the_field_of_view_is_no_longer_reported() -> None:
     tracker, all_around = Tracker(field_of_view_deg=(45.0, -45.0)), Tracker()
     for k in range(8):
         boxes = [box("car", 12.0 - k, 9.0)] if k < 5 else []
-        seen, told = tracker.update(boxes, 0.1 * k, STANDING), all_around.update(boxes, 0.1 * k, STANDING)
-        assert len(seen) == len(told) == (k > 0) or k >= 5
+        seen, reported = tracker.update(boxes, 0.1 * k, STANDING), all_around.update(boxes, 0.1 * k, STANDING)
+        assert len(seen) == len(reported) == (k > 0) or k >= 5
     assert len(seen) == 0
-    assert len(told) == 1
+    assert len(reported) == 1
 
 
 def test_crossing_pedestrians_keep_their_identities() -> None:
@@ -691,8 +691,8 @@ def test_errors_leave_the_tracker_as_it_was(posed: bool) -> None:
     tracker, untroubled = Tracker(), Tracker()
     for k, (boxes, pose) in enumerate(drive(25)):
         given_pose = pose if posed else None
-        told = tracker.update(boxes, 0.1 * k, given_pose)
-        assert same(told, untroubled.update(boxes, 0.1 * k, given_pose))
+        reported = tracker.update(boxes, 0.1 * k, given_pose)
+        assert same(reported, untroubled.update(boxes, 0.1 * k, given_pose))
         for bad in BAD_BOXES:
             with pytest.raises(TrackingError, match="got"):
                 tracker.update([*boxes, bad], 0.1 * k + 0.05, given_pose)  # type: ignore[list-item]
@@ -789,10 +789,10 @@ def test_shapes_hiding_and_rivals_are_those_of_the_twins(n: int, m: int) -> None
     seen, sensor, shares = rng.random(n) < 0.7, np.array([3.0, -8.0]), np.empty(n)
     fill_hidden(10.0 * state, shape, seen, sensor, shares)
     np.testing.assert_allclose(shares, twins.tracking.hidden(10.0 * state, shape, seen, sensor))
-    strength, told = rng.permutation(n).astype(float), rng.random(n) < 0.8
-    wanted_rows = twins.tracking.rivals(state, shape, strength, told)
-    mark_rivals(state, shape, strength, told)
-    assert np.flatnonzero(told).tolist() == wanted_rows
+    strength, reported = rng.permutation(n).astype(float), rng.random(n) < 0.8
+    wanted_rows = twins.tracking.rivals(state, shape, strength, reported)
+    mark_rivals(state, shape, strength, reported)
+    assert np.flatnonzero(reported).tolist() == wanted_rows
 
 
 @pytest.mark.parametrize(("n", "m"), [(0, 0), (1, 0), (0, 2), (6, 4)])
@@ -816,10 +816,10 @@ def test_births_lives_and_views_are_those_of_the_twins(n: int, m: int) -> None:
         assert_same_tracks(tracks, wanted)
 
     pose = np.array([[0.8, -0.6, 0, 3.0], [0.6, 0.8, 0, -4.0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    told = rng.random(n) < 0.8
-    stays = told & ((tracks["misses"] == 0) | twins.tracking.in_view(tracks, pose, 0.9, -0.7))
-    mark_out_of_view(tracks, pose, 0.9, -0.7, told)
-    assert told.tolist() == stays.tolist()
+    reported = rng.random(n) < 0.8
+    stays = reported & ((tracks["misses"] == 0) | twins.tracking.in_view(tracks, pose, 0.9, -0.7))
+    mark_out_of_view(tracks, pose, 0.9, -0.7, reported)
+    assert reported.tolist() == stays.tolist()
 
 
 def assert_same_tracks(tracks: np.ndarray, wanted: np.ndarray) -> None:
@@ -1058,7 +1058,7 @@ def test_kitti_sequences_are_read_into_the_sensors_frame(kitti: Path) -> None:
     assert len(sequence.truth["pedestrian"][0].ids) == 0
 
 
-def test_kitti_is_judged_by_its_rules(kitti: Path) -> None:
+def test_kitti_is_evaluated_by_its_rules(kitti: Path) -> None:
     seen = []
     figures = evaluate_kitti(kitti, on_sequence=lambda done, total: seen.append((done, total)))
     car, pedestrian = figures["classes"]["car"], figures["classes"]["pedestrian"]
@@ -1095,7 +1095,7 @@ def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixt
     assert "no label_02" in capsys.readouterr().err
 
 
-def test_a_models_boxes_are_judged(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_models_boxes_are_evaluated(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What run --json prints takes the place of the detections, which need not be there."""
     detections = read_sequence(kitti, "0000").detections
     lines = [{"scan": "x", "boxes": [replace(one, label="van").to_dict() for one in of]} for of in detections]
@@ -1118,7 +1118,7 @@ def test_a_models_boxes_are_judged(kitti: Path, capsys: pytest.CaptureFixture[st
     figures = json.loads((kitti / "figures.json").read_text())["classes"]
     assert figures["vehicle"]["best"]["mota"] > 0.9  # the car and the van
     assert figures["vehicle"]["best"]["n_truth"] == 40
-    assert figures["car"]["best"]["n_missed"] == 20  # all were told to be vans
+    assert figures["car"]["best"]["n_missed"] == 20  # all were labeled as vans
     boxes.write_text("\n".join(map(json.dumps, lines[:-1])))
     assert cli.main(arguments) == 2
     assert "19 frames for 20" in capsys.readouterr().err
