@@ -220,15 +220,15 @@ class ModelCard:
     box_size_priors : mapping
         Class to usual (length, width, height) [m].
     box_size_spreads : mapping
-        Class to the standard deviations of their logarithms; empty where sizes do not tell classes apart.
+        Class to the standard deviations of their logarithms; empty where sizes do not separate classes.
     score_threshold, nms_iou : float
         Defaults for boxes.
     mount_height_m : float
         Height of the training sensor above the road [m].
     fitness : mapping or None
-        What the training scans looked like (`edgeperc.fitness.FitnessProfile`), or None where nobody measured.
+        Measures of the training scans (`edgeperc.fitness.FitnessProfile`); None if they were not measured.
     training : mapping
-        Data, licence, recipe, seed, frames' hashes: whatever whoever trained it says of it.
+        Free-form training metadata: data, licence, recipe, seed, hashes of the frames.
     metrics : mapping
         Measured figures.
     parity : mapping

@@ -166,7 +166,7 @@ def fill_scan_sums(
 
 @dataclass(frozen=True)
 class _Measures:
-    """What one scan looks like. None where the scan does not tell."""
+    """Measures of one scan; None where the scan does not determine one."""
 
     points_in_view: float
     view_covered: float
@@ -180,7 +180,7 @@ class _Measures:
     range_median_m: float
     ground_m: float | None
     road_ahead: float | None
-    # What follows is judged by itself, not against the training scans.
+    # The rest is checked by itself, not against the training scans.
     n_sampled: float
     remission_low: float
     remission_high: float
