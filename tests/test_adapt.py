@@ -447,7 +447,7 @@ def test_the_training_sensor_is_left_alone() -> None:
     ]
     np.testing.assert_array_equal(answers[0].points.labels, answers[1].points.labels)
     assert all("adapt" not in answer.stage_ms for answer in answers)
-    with pytest.raises(ValueError, match="adapt is 'all'; expected one of"):
+    with pytest.raises(ValueError, match="adapt is 'all'; expected none, remission"):
         Perceiver("pointseg", adapt="all")
 
 
