@@ -281,5 +281,5 @@ def test_the_command_refuses_with_1_and_writes_with_0(
     monkeypatch.setattr(module.quantize, "__kwdefaults__", settings)
     assert cli.main(words) == 0
     told = capsys.readouterr().out.splitlines()
-    assert "small 1.0.0, left alone: " in told[0]
+    assert "small 1.0.0, kept in fp32: " in told[0]
     assert json.loads(told[1])["n_scans"] == 4
