@@ -1,4 +1,4 @@
-"""How the answers of a network in bf16 and int8 agree with those in fp32, on labelled real scans: written into its cards.
+"""How a network's answers in bf16 and int8 agree with those in fp32, on labeled real scans: a record in its cards.
 
 `edgeperc.zoo.choose` reads this record: ``precision="auto"`` takes a reduced precision only where its loss is small.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from edgeperc.errors import ModelError, PointsError
 from edgeperc.evaluation.datasets import KittiObjects, SemanticKitti
 from edgeperc.evaluation.judge import Judge
 from edgeperc.evaluation.tables import Record, figures
+from edgeperc.evaluation.truth import Truth
 from edgeperc.perception import Perception
 from edgeperc.session import Session
 from edgeperc.tuning import cpu_features, cpu_model
@@ -86,8 +88,8 @@ def agree(
     names = {f"{variant.name} {variant.card.version}" for variant in variants.values()}
     if len(names) != 1 or "fp32" not in variants:
         raise ModelError(
-            f"got {', '.join(map(str, variants.values()))} of {', '.join(sorted(names))}; expected files of one network, "
-            "one of them in fp32"
+            f"got {', '.join(map(str, variants.values()))} of {', '.join(sorted(names))}; "
+            "expected files of one network, one of them in fp32"
         )
     runs: dict[str, Variant] = {"fp32": variants["fp32"]}
     if importlib.util.find_spec("openvino") is not None and not BF16_FEATURES.isdisjoint(cpu_features()):
@@ -100,11 +102,11 @@ def agree(
     options = [f"--kitti KITTI --split {split}"] * (kitti is not None)
     options += ["--semantickitti SEMANTICKITTI"] * (semantickitti is not None) + [f"--scans {n_scans}"] * bool(n_scans)
     command = " ".join(["edgeperc-export agree", variants["fp32"].name, *options])
-    told = {precision: _record(each, answers["fp32"], command) for precision, each in answers.items()}
+    records = {precision: _record(each, answers["fp32"], command) for precision, each in answers.items()}
     for variant in variants.values():
-        own = {precision: told[precision] for precision, each in runs.items() if each is variant}
+        own = {precision: records[precision] for precision, each in runs.items() if each is variant}
         write_card(onnx.load(variant.path), replace(variant.card, precisions=own), variant.path)
-    return told
+    return records
 
 
 def summary(precisions: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -150,17 +152,17 @@ def _answers(
     by = f"onnxruntime {onnxruntime.__version__}, {session.provider}"
     if precision == "bf16":
         by = _run_in_openvino(session)
-    truths: list[tuple[str, Callable[[], Any]]] = []
+    truths: list[tuple[str, Callable[[], Truth]]] = []
     if kitti is not None:
         objects = KittiObjects(kitti)
         names = _spread(objects.names(split), n_scans)
-        truths += [("real", lambda name=name: judge.kitti(objects.frame(name))) for name in names]  # type: ignore[misc]
+        truths += [("real", partial(_kitti, judge, objects, name)) for name in names]
     if semantickitti is not None and judge.from_above is not None:
         roads = SemanticKitti(semantickitti)
         names = _spread(roads.names("all"), n_scans)
-        truths += [("road", lambda name=name: judge.semantickitti(roads.frame(name))) for name in names]  # type: ignore[misc]
+        truths += [("road", partial(_semantickitti, judge, roads, name)) for name in names]
     if not truths:
-        raise PointsError(f"no labelled scan of {split} drives in {kitti}, {semantickitti}; name a KITTI object set")
+        raise PointsError(f"no labeled scan of {split} drives in {kitti}, {semantickitti}; name a KITTI object set")
     records: dict[str, list[Record]] = {}
     labels = []
     for block, read in truths:
@@ -172,6 +174,14 @@ def _answers(
     ious = [iou for of_block in measured for iou in _ious(of_block)]
     ap = [of_block["boxes"]["oriented"]["all"]["vehicle"]["ap"] for of_block in measured if "boxes" in of_block]
     return _Answers(labels, float(np.nanmean(ious)), ap[0] if ap else None, f"{by}, {cpu_model()}")
+
+
+def _kitti(judge: Judge, objects: KittiObjects, name: str) -> Truth:
+    return judge.kitti(objects.frame(name))
+
+
+def _semantickitti(judge: Judge, roads: SemanticKitti, name: str) -> Truth:
+    return judge.semantickitti(roads.frame(name))
 
 
 def _spread(names: Sequence[str], most: int | None) -> Sequence[str]:

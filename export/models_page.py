@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -31,8 +32,11 @@ def models_page(folder: Path) -> str:
     lines = [
         "# Models",
         "",
-        "Written by `edgeperc-export models models` from the cards in the files. `edgeperc info NAME` prints a card;",
-        "`edgeperc-export make NAME OUT --kitti KITTI --layouts KITTI_LABELS` trains a model again.",
+        *_prose(
+            "Written by `edgeperc-export models models` from the cards in the files. `edgeperc info NAME` prints "
+            "a card; "
+            "`edgeperc-export make NAME OUT --kitti KITTI --layouts KITTI_LABELS` trains a model again."
+        ),
         "",
         *_shipped(shipped),
         *_precisions(shipped),
@@ -41,9 +45,12 @@ def models_page(folder: Path) -> str:
         "",
         "## Figures of the shipped models",
         "",
-        f"On the test drives ({', '.join(sorted(TEST_DRIVES))}),",
-        "on which nothing was trained or chosen, and on simulated scans. All figures are percentages. In brackets: 95 % bootstrap intervals over drives",
-        "(over scenes for simulation), if two or more have the class. Do not average tables of real and simulated scans.",
+        *_prose(
+            f"On the test drives ({', '.join(sorted(TEST_DRIVES))}), on which nothing was trained or chosen, and on "
+            "simulated scans. All figures are percentages. In brackets: 95 % bootstrap intervals over drives "
+            "(over scenes "
+            "for simulation), if two or more have the class. Do not average tables of real and simulated scans."
+        ),
     ]
     for variant in shipped:
         fp32 = variant.precision == "fp32"
@@ -52,8 +59,12 @@ def models_page(folder: Path) -> str:
         "",
         "## Research models",
         "",
-        "Teachers of the shipped models, the papers' own networks, and models trained on simulation alone. They are in the",
-        "repository and the source distribution, not in the wheel; use one by its path, `--model models/research/NAME.onnx`.",
+        *_prose(
+            "Teachers of the shipped models, the papers' own networks, and models trained on simulation alone. "
+            "They are "
+            "in the repository and the source distribution, not in the wheel; use one by its path, `--model "
+            "models/research/NAME.onnx`."
+        ),
     ]
     for variant in research:
         lines += ["", *_model(variant), *_figures_of(variant.card, ALL_RANGES)]
@@ -66,13 +77,19 @@ def _read(path: Path) -> Any:
     return json.loads(path.read_text()) if path.exists() else []
 
 
+def _prose(text: str) -> list[str]:
+    return textwrap.wrap(text, 116, break_long_words=False, break_on_hyphens=False)
+
+
 def _size(variant: Variant) -> str:
     return f"{variant.path.stat().st_size / 1e6:.1f} MB"
 
 
 def _shipped(variants: Sequence[Variant]) -> Iterable[str]:
-    yield "A name stands for one network and its variants. `Perceiver()` and `edgeperc run PATH` take"
-    yield f"{' and '.join(f'`{name}`' for name in DEFAULT)}. `NAME:fp32` and `NAME:int8` ask for one variant."
+    yield from _prose(
+        "A name stands for one network and its variants. `Perceiver()` and `edgeperc run PATH` take "
+        f"{' and '.join(f'`{name}`' for name in DEFAULT)}. `NAME:fp32` and `NAME:int8` ask for one variant."
+    )
     yield from _head("name", ["answers", "classes", "view", "files", "terms of the weights"])
     for name in dict.fromkeys(variant.name for variant in variants):
         own = [variant for variant in variants if variant.name == name]
@@ -86,19 +103,22 @@ def _view(card: ModelCard) -> str:
     view = card.view
     if isinstance(view, TopViewGeometry):
         (near, far), (right, left) = view.x_range_m, view.y_range_m
-        return f"{view.height} x {view.width} cells of {view.cell_m:g} m, x {near:g} to {far:g} m, y {right:g} to {left:g} m"
-    return f"{view.height} x {view.width} pixels, azimuth {view.azimuth_left_deg:g} to {view.azimuth_right_deg:g} degrees"
+        ranges = f"x {near:g} to {far:g} m, y {right:g} to {left:g} m"
+        return f"{view.height} x {view.width} cells of {view.cell_m:g} m, {ranges}"
+    return (
+        f"{view.height} x {view.width} pixels, azimuth {view.azimuth_left_deg:g} to {view.azimuth_right_deg:g} degrees"
+    )
 
 
 def _precisions(variants: Sequence[Variant]) -> Iterable[str]:
-    yield from (
-        "",
-        "## Precision",
-        "",
-        "How answers in each precision agree with fp32, after post-processing, on labelled real scans. `precision=auto`",
-        f"takes a reduced precision only if its loss (of mean IoU or of AP, whichever is larger) is at most {MAX_LOSS} points and",
-        "the processor has instructions for it: int8 on the CPU provider and OpenVINO (VNNI, AMX, or Arm's dot product),",
-        "bf16 on OpenVINO (AMX or AVX-512). `precision=fp32` forbids it. What ran is in `perception.providers`.",
+    yield from ("", "## Precision", "")
+    yield from _prose(
+        "How answers in each precision agree with fp32, after post-processing, on labeled real scans. `precision=auto` "
+        f"takes a reduced precision only if its loss (of mean IoU or of AP, whichever is larger) is at most {MAX_LOSS} "
+        "points and the processor has instructions for it: int8 on the CPU provider and OpenVINO (VNNI, AMX, or Arm's "
+        "dot product), bf16 on OpenVINO (AMX or AVX-512). `precision=fp32` forbids it. `perception.providers` "
+        "says what "
+        "ran."
     )
     yield from _head("model", ["equal labels", "mean IoU", "fp32", "AP50", "fp32", "loss", "scans", "measured with"])
     for variant in variants:
@@ -110,10 +130,12 @@ def _precisions(variants: Sequence[Variant]) -> Iterable[str]:
                     *(f"{record['loss']:.2f}", record["n_scans"], record["by"]),
                 )
     commands = sorted({record["command"] for v in variants for record in v.card.precisions.values()})
-    yield from (
-        "",
-        f"Mean IoU is of points without background, or of vehicles and road. Made by {', '.join(f'`{c}`' for c in commands)}.",
-        "Scans of SemanticKITTI are of a test drive; they serve here only to compare precisions of one network.",
+    yield ""
+    yield from _prose(
+        "Mean IoU is of points without background, or of vehicles and road. Made by "
+        f"{', '.join(f'`{command}`' for command in commands)}. Scans of SemanticKITTI are of a test drive; they "
+        "serve here "
+        "only to compare precisions of one network."
     )
 
 
@@ -122,17 +144,17 @@ def _free(research: Sequence[Variant]) -> Iterable[str]:
     if not free:
         return
     options = " ".join(f"--model models/research/{variant.path.name}" for variant in reversed(free))
-    yield from (
-        "",
-        "## Weights free of KITTI's terms",
-        "",
-        "The shipped models were trained on KITTI's scans, whose terms exclude commercial use. For commercial use take the",
-        "models that were trained on simulation alone, from the repository or the source distribution:",
-        "",
-        f"    edgeperc run PATH {options}",
-        "",
-        f"They are less accurate ({', '.join(variant.name for variant in free)} below). The wheel leaves them out to stay small:",
-        f"they take {sum(variant.path.stat().st_size for variant in free) / 1e6:.1f} MB, the shipped models together less.",
+    yield from ("", "## Weights free of KITTI's terms", "")
+    yield from _prose(
+        "The shipped models were trained on KITTI's scans, whose terms exclude commercial use. For commercial use take "
+        "the models that were trained on simulation alone, from the repository or the source distribution:"
+    )
+    yield from ("", f"    edgeperc run PATH {options}", "")
+    size = sum(variant.path.stat().st_size for variant in free) / 1e6
+    yield from _prose(
+        f"They are less accurate ({', '.join(variant.name for variant in free)} below). At {size:.1f} MB they are "
+        "larger "
+        "than all shipped models together, so the wheel leaves them out."
     )
 
 
@@ -141,16 +163,16 @@ def _validation(path: Path) -> Iterable[str]:
     if not table:
         return
     rows = table["rows"]
-    yield from (
-        "",
-        "## How the names were given",
-        "",
-        f"A name went to the network that is most accurate on {rows[0]['n_scans']} scans of {len(VALIDATION_DRIVES)} validation drives, which neither",
-        "the training scans nor the test drives contain (`edgeperc/evaluation/splits.py`); speed decides between equals. 107 of",
-        "the scans are of one drive, 2011_09_26_drive_0001, with 12 cars, 2 cyclists and 1 tram, so the intervals over",
-        "drives are wide. The drives' boxes, not their scans, are among the layouts of the simulated training scenes.",
-        "Relative time: of the network alone in stock onnxruntime, two threads, divided by that of the name's fp32 file,",
-        "measured in turn on a busy computer (`bench/RESULTS.md` has times).",
+    yield from ("", "## How the names were given", "")
+    yield from _prose(
+        f"A name went to the network that is most accurate on {rows[0]['n_scans']} scans of {len(VALIDATION_DRIVES)} "
+        "validation drives, which neither the training scans nor the test drives contain "
+        "(`edgeperc/evaluation/splits.py`); speed decides between equals. 107 of the scans are of one drive, "
+        "2011_09_26_drive_0001, with 12 cars, 2 cyclists and 1 tram, so the intervals over drives are wide. The "
+        "drives' "
+        "boxes, not their scans, are among the layouts of the simulated training scenes. Relative time: of the network "
+        "alone in stock onnxruntime, two threads, divided by that of the name's fp32 file, measured in turn on a busy "
+        "computer (`bench/RESULTS.md` has times)."
     )
     for title, key, columns in (
         ("points", "points", ("car", "pedestrian", "cyclist")),
@@ -250,13 +272,13 @@ def _folds(rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
     """Figures of models that were trained without one fold, on that fold."""
     if not rows:
         return
-    yield from (
-        "",
-        "## Over folds",
-        "",
-        f"Each model was trained without one of the {len(FOLDS)} folds of the training drives, by",
-        "`edgeperc-export make NAME OUT --fold K --steps N`, and evaluated on that fold, frames of grade A, with fewer",
-        "steps and fewer drives than the model of the same name.",
+    yield from ("", "## Over folds", "")
+    yield from _prose(
+        f"Each model was trained without one of the {len(FOLDS)} folds of the training drives, by "
+        "`edgeperc-export make "
+        "NAME OUT --fold K --steps N`, and evaluated on that fold, frames of grade A, with fewer steps and fewer "
+        "drives "
+        "than the model of the same name."
     )
     for row in rows:
         made = f"{row['name']} without fold {row['fold']}, {row['steps']} steps of {row['batch']}"
@@ -266,13 +288,12 @@ def _folds(rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
 def _ablations(rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
     if not rows:
         return
-    yield from (
-        "",
-        "## Ablations",
-        "",
-        "Short runs from the weights trained on simulation alone (LoDNN: from scratch), each with one change, evaluated on",
-        "a fold that the run has not seen (`edgeperc-export ablate`): IoU of pixel labels, and AP50 of all vehicles as",
-        "one class.",
+    yield from ("", "## Ablations", "")
+    yield from _prose(
+        "Short runs from the weights trained on simulation alone (LoDNN: from scratch), each with one change, "
+        "evaluated "
+        "on a fold that the run has not seen (`edgeperc-export ablate`): IoU of pixel labels, and AP50 of all vehicles "
+        "as one class."
     )
     for network, fold, steps in sorted({(r["network"], r["fold"], r["steps"]) for r in rows}):
         here = [r for r in rows if (r["network"], r["fold"], r["steps"]) == (network, fold, steps)]

@@ -266,7 +266,7 @@ def _disagreement(fp32: _Calibrated, answers: Sequence[Mapping[str, NDArray[np.f
 
 
 def _candidates(graph: onnx.GraphProto, exclude: Collection[str]) -> list[str]:
-    """Convolutions that may be rounded: all except the excluded, the first after an input, the last before an output."""
+    """Convolutions that may be rounded: not excluded, not the first after an input or the last before an output."""
     unknown = set(exclude) - {node.name for node in graph.node}
     if unknown:
         raise OptionError(f"no node is called {', '.join(sorted(unknown))}; expected names of the graph's nodes")

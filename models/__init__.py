@@ -41,8 +41,8 @@ MAX_LOSS = 0.3
 INT8_FEATURES = frozenset({"avx512_vnni", "avx_vnni", "amx_int8", "asimddp"})
 BF16_FEATURES = frozenset({"amx_bf16", "avx512_bf16"})
 BF16_PROVIDERS = ("openvino",)
-# The reduced precisions of a provider, the fastest first. Measured on two cores with avx512_vnni and avx512_bf16, fastest
-# engine of each precision, fp32 / bf16 / int8: pointseg 9.8 / 5.5 / 3.3 ms, ssadnet 15.5 / 8.4 / 5.2 ms.
+# The reduced precisions of a provider, the fastest first. Measured on two cores with avx512_vnni and avx512_bf16, each
+# in its fastest engine, fp32 / bf16 / int8: pointseg 9.8 / 5.5 / 3.3 ms, ssadnet 15.5 / 8.4 / 5.2 ms.
 FASTEST = {"cpu": ("int8",), "openvino": ("int8", "bf16")}
 
 RENAMED = {
@@ -131,7 +131,8 @@ def resolve(model: str | os.PathLike[str]) -> tuple[Variant, ...]:
 
 def _unknown(name: str) -> str:
     if name in RENAMED:
-        return f"model {name!r} is now called {RENAMED[name]!r}; {RENAMED[name].partition(':')[0]!r} takes the best variant"
+        new = RENAMED[name]
+        return f"model {name!r} is now called {new!r}; {new.partition(':')[0]!r} takes the best variant"
     if name in RESEARCH:
         return (
             f"{name!r} is a research model and is not installed; give the path models/research/{name}.onnx "

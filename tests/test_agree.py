@@ -25,7 +25,8 @@ def answers(labels: list[int], mean_iou: float, ap: float | None) -> module._Ans
 
 
 @pytest.mark.parametrize(
-    ("mean_iou", "ap", "loss"), [(0.8, 0.6, 0.0), (0.79, 0.6, 1.0), (0.9, 0.58, 2.0), (0.79, 0.58, 2.0), (0.9, 0.7, 0.0)]
+    ("mean_iou", "ap", "loss"),
+    [(0.8, 0.6, 0.0), (0.79, 0.6, 1.0), (0.9, 0.58, 2.0), (0.79, 0.58, 2.0), (0.9, 0.7, 0.0)],
 )
 def test_the_loss_is_the_larger_of_both_in_points(mean_iou: float, ap: float, loss: float) -> None:
     record = module._record(answers([0, 1, 2, 3], mean_iou, ap), answers([0, 1, 2, 2], 0.8, 0.6), "a command")

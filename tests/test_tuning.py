@@ -20,7 +20,6 @@ from edgeperc.tuning import (
     write_settings,
 )
 
-
 CPU_2 = {"provider": "cpu", "precision": "int8", "n_threads": 2}
 CPU_4 = {"provider": "cpu", "precision": "fp32", "n_threads": 4}
 OPENVINO = {"provider": "openvino", "precision": "bf16", "n_threads": None}
