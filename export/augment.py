@@ -13,7 +13,7 @@ from edgeperc.perception import Box
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASS_OF
 
-from .scans import LabelledScan, mirrored, turned, turned_box
+from .scans import LabeledScan, mirrored, turned, turned_box
 
 __all__ = ["ObjectBank", "augmented", "facing", "pasted", "swapped", "weathered"]
 
@@ -35,7 +35,7 @@ class ObjectBank:
     objects: dict[str, list[tuple[Box, NDArray[np.float32]]]]
 
     @classmethod
-    def of(cls, scans: Iterable[LabelledScan], fewest: int = 8) -> ObjectBank:
+    def of(cls, scans: Iterable[LabeledScan], fewest: int = 8) -> ObjectBank:
         """The objects within 60 m with at least ``fewest`` returns."""
         objects: dict[str, list[tuple[Box, NDArray[np.float32]]]] = {}
         for scan in scans:
@@ -50,8 +50,8 @@ class ObjectBank:
 
 
 def pasted(
-    scan: LabelledScan, bank: ObjectBank, rng: np.random.Generator, n: int, odds: Mapping[str, float]
-) -> LabelledScan:
+    scan: LabeledScan, bank: ObjectBank, rng: np.random.Generator, n: int, odds: Mapping[str, float]
+) -> LabeledScan:
     """The scan with up to ``n`` objects of the bank added, of kinds drawn by ``odds``.
 
     An object keeps its distance, and so its density of returns, and moves to a random azimuth ahead. It is placed on
@@ -133,7 +133,7 @@ def _rays(points: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.fl
     return (row + 500) * 10_000 + column + 5_000, np.hypot(flat, points[:, 2])
 
 
-def swapped(scan: LabelledScan, other: LabelledScan, rng: np.random.Generator) -> LabelledScan:
+def swapped(scan: LabeledScan, other: LabeledScan, rng: np.random.Generator) -> LabeledScan:
     """The scan with one sector replaced by another scan's (PolarMix; Xiao et al., 2022): points and their labels only.
 
     Boxes and surface are not changed, so this is only for networks that label points.
@@ -149,7 +149,7 @@ def swapped(scan: LabelledScan, other: LabelledScan, rng: np.random.Generator) -
     return replace(scan, points=points, labels=labels)
 
 
-def weathered(scan: LabelledScan, rng: np.random.Generator) -> LabelledScan:
+def weathered(scan: LabeledScan, rng: np.random.Generator) -> LabeledScan:
     """The scan in rain, snow or fog: far returns are lost more often, and a few come from drops in the air."""
     points, labels = scan.points, scan.labels
     distance = np.linalg.norm(points[:, :3], axis=1)
@@ -163,7 +163,7 @@ def weathered(scan: LabelledScan, rng: np.random.Generator) -> LabelledScan:
     return replace(scan, points=points, labels=labels)
 
 
-def facing(scan: LabelledScan, rng: np.random.Generator) -> float:
+def facing(scan: LabeledScan, rng: np.random.Generator) -> float:
     """The angle [rad] that turns a pedestrian or cyclist to the front; 0 if there is none within 40 m."""
     rare = [b for b, n in zip(scan.boxes, scan.counts, strict=True) if b.label in RARE and n >= FEWEST_PASTED]
     rare = [b for b in rare if np.hypot(*b.center[:2]) < 40.0]
@@ -174,7 +174,7 @@ def facing(scan: LabelledScan, rng: np.random.Generator) -> float:
 
 
 def augmented(
-    scan: LabelledScan,
+    scan: LabeledScan,
     rng: np.random.Generator,
     *,
     bank: ObjectBank | None = None,
@@ -183,7 +183,7 @@ def augmented(
     turn_to_rare: float = 0.0,
     turn_anywhere: float = 0.0,
     weather: float = 0.0,
-) -> LabelledScan:
+) -> LabeledScan:
     """The scan turned, mirrored, thinned, shifted in height and scaled in remission, all at random.
 
     A scan that is labeled on all sides (simulation) is turned forwards or backwards along the street, all others by a
@@ -191,7 +191,7 @@ def augmented(
 
     Parameters
     ----------
-    scan : LabelledScan
+    scan : LabeledScan
     rng : np.random.Generator
     bank : ObjectBank, optional
     n_pasted : float

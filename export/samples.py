@@ -18,7 +18,7 @@ from edgeperc.projection import Projection, make_projector
 from .augment import ObjectBank, augmented, swapped
 from .recipe import Recipe
 from .roads import drawn_roads, sure_surface, with_road
-from .scans import LabelledScan
+from .scans import LabeledScan
 from .task import Targets, task_of
 
 __all__ = ["RealScans", "Samples", "real_scans"]
@@ -33,11 +33,11 @@ class Samples:
     Parameters
     ----------
     recipe : Recipe
-    real : sequence of LabelledScan
+    real : sequence of LabeledScan
     real_weights : sequence of float
         How often each real scan is drawn, relative to the others.
     simulated : sequence of Path
-        Files written by `LabelledScan.save`.
+        Files written by `LabeledScan.save`.
 
     Raises
     ------
@@ -46,7 +46,7 @@ class Samples:
     """
 
     def __init__(
-        self, recipe: Recipe, real: Sequence[LabelledScan], real_weights: Sequence[float], simulated: Sequence[Path]
+        self, recipe: Recipe, real: Sequence[LabeledScan], real_weights: Sequence[float], simulated: Sequence[Path]
     ) -> None:
         if not real and not simulated:
             raise ValueError("no scans to train on; give --kitti, --simulated or both")
@@ -60,7 +60,7 @@ class Samples:
         self.bank: ObjectBank | None = None
         if recipe.n_pasted > 0.0:
             every = max(1, len(simulated) // BANK_SCANS)
-            self.bank = ObjectBank.of([*real, *(LabelledScan.load(path) for path in simulated[::every])])
+            self.bank = ObjectBank.of([*real, *(LabeledScan.load(path) for path in simulated[::every])])
 
     def batch(self, step: int) -> Targets:
         """Inputs (B, C, H, W) and targets of one step. The same step always gives the same batch."""
@@ -68,16 +68,16 @@ class Samples:
         drawn = [self.sample(self._drawn(rng)) for _ in range(self.recipe.batch)]
         return tuple(np.stack(parts) for parts in zip(*drawn, strict=True))
 
-    def project(self, scan: LabelledScan) -> Projection:
+    def project(self, scan: LabeledScan) -> Projection:
         """A scan as the network sees it."""
         return self.projector.project(np.ascontiguousarray(scan.points, np.float32))
 
-    def sample(self, scan: LabelledScan) -> Targets:
+    def sample(self, scan: LabeledScan) -> Targets:
         """One input (C, H, W) and its targets."""
         seen = self.project(scan)
         return seen.image, *self.task.target(scan, seen)
 
-    def _drawn(self, rng: np.random.Generator) -> LabelledScan:
+    def _drawn(self, rng: np.random.Generator) -> LabeledScan:
         recipe, odds = self.recipe, dict(self.task.paste_odds)
         scan = self._scan(rng)
         if not recipe.augment:
@@ -100,9 +100,9 @@ class Samples:
             scan = swapped(scan, change(self._scan(rng)), rng)
         return scan
 
-    def _scan(self, rng: np.random.Generator) -> LabelledScan:
+    def _scan(self, rng: np.random.Generator) -> LabeledScan:
         if rng.random() < self.simulated_share:
-            return LabelledScan.load(self.simulated[int(rng.integers(len(self.simulated)))])
+            return LabeledScan.load(self.simulated[int(rng.integers(len(self.simulated)))])
         return self.real[int(rng.choice(len(self.real), p=self.real_odds))]
 
 
@@ -111,31 +111,31 @@ class RealScans(NamedTuple):
 
     Attributes
     ----------
-    scans : list of LabelledScan
+    scans : list of LabeledScan
         Scans to train on.
     hashes : dict of str to str
         Name of each scan -> its `edgeperc.evaluation.datasets.scan_hash`, for the card.
-    watched : list of LabelledScan
+    watched : list of LabeledScan
         Scans to validate on.
     """
 
-    scans: list[LabelledScan]
+    scans: list[LabeledScan]
     hashes: dict[str, str]
-    watched: list[LabelledScan]
+    watched: list[LabeledScan]
 
 
 def real_scans(
     kitti: KittiObjects, names: Sequence[str], *, drawn: bool = False
-) -> tuple[list[LabelledScan], list[float], dict[str, str]]:
+) -> tuple[list[LabeledScan], list[float], dict[str, str]]:
     """Labeled scans, how often to draw each, and the hash of each; ``drawn``: with the hand-drawn roads."""
-    scans: list[LabelledScan] = []
+    scans: list[LabeledScan] = []
     weights: list[float] = []
     hashes: dict[str, str] = {}
     roads: dict[str, NDArray[np.uint8]] = drawn_roads() if drawn else {}
     frames = [kitti.frame(name) for name in tqdm(names, desc="reading real scans", leave=False)]
     drives = [frame.drive for frame in frames]
     for frame in frames:
-        scan = LabelledScan.from_frame(frame, sure_surface)
+        scan = LabeledScan.from_frame(frame, sure_surface)
         hashes[frame.name] = digest = scan_hash(frame.points)
         if digest in roads:
             scan = replace(scan, surface=with_road(scan.surface, roads[digest]))

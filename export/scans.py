@@ -17,7 +17,7 @@ from edgeperc.perception import Box
 from edgeperc.simulation.samples import IGNORE, labels_by_boxes
 from edgeperc.simulation.scene import TOP_VIEW_CLASSES, SimulatedScan
 
-__all__ = ["SURFACE", "LabelledScan", "mirrored", "turned", "turned_box"]
+__all__ = ["SURFACE", "LabeledScan", "mirrored", "turned", "turned_box"]
 
 # Wider and coarser than the network's view, so that a turned scan has ground truth everywhere in the view.
 SURFACE = TopViewGeometry(x_range_m=(-50.0, 50.0), y_range_m=(-50.0, 50.0), cell_m=0.2)
@@ -25,7 +25,7 @@ CAMERA_AZIMUTHS = (-0.70, 0.69)  # KITTI's left color camera sees 41.2 degrees t
 
 
 @dataclass(frozen=True)
-class LabelledScan:
+class LabeledScan:
     """A scan and its ground truth.
 
     Attributes
@@ -58,7 +58,7 @@ class LabelledScan:
     @classmethod
     def from_frame(
         cls, frame: Frame, road: Callable[[NDArray[np.float32]], NDArray[np.uint8]] | None = None
-    ) -> LabelledScan:
+    ) -> LabeledScan:
         """A KITTI frame; ``road`` computes its surface from the points. Without it the surface is unknown."""
         points = frame.points[np.isfinite(frame.points).all(axis=1)]
         frame = replace(frame, points=points)
@@ -67,7 +67,7 @@ class LabelledScan:
         return cls(points, frame.point_labels(), frame.boxes, counts, surface, CAMERA_AZIMUTHS)
 
     @classmethod
-    def from_simulation(cls, scan: SimulatedScan) -> LabelledScan:
+    def from_simulation(cls, scan: SimulatedScan) -> LabeledScan:
         """A simulated scan; everything is labeled."""
         surface = scan.top_view_labels(SURFACE)
         surface = np.where(surface == 1, 1, np.where(surface >= 2, IGNORE, 0)).astype(np.uint8)
@@ -90,7 +90,7 @@ class LabelledScan:
             )
 
     @classmethod
-    def load(cls, path: Path) -> LabelledScan:
+    def load(cls, path: Path) -> LabeledScan:
         """Read a file written by `save`."""
         with np.load(path, allow_pickle=False) as data:
             numbers = zip(data["names"], data["boxes"].tolist(), strict=True)
@@ -103,7 +103,7 @@ class LabelledScan:
                 data["points"], data["labels"], boxes, tuple(map(int, data["counts"])), data["surface"], (low, high)
             )
 
-    def labelled(self, geometry: TopViewGeometry) -> NDArray[np.bool_]:
+    def labeled(self, geometry: TopViewGeometry) -> NDArray[np.bool_]:
         """Cells of the labeled sector, (rows, cols) bool."""
         x, y = geometry.cell_centres()
         azimuth = np.arctan2(y, x)
@@ -118,11 +118,11 @@ class LabelledScan:
         row, col, covered = SURFACE.cells(cos * x + sin * y, cos * y - sin * x)
         truth = np.where(covered, self.surface[row % SURFACE.height, col % SURFACE.width], IGNORE).astype(np.uint8)
         draw_footprints(truth, self.boxes, geometry, TOP_VIEW_CLASSES)
-        truth[~self.labelled(geometry)] = IGNORE
+        truth[~self.labeled(geometry)] = IGNORE
         return truth
 
 
-def turned(scan: LabelledScan, angle: float) -> LabelledScan:
+def turned(scan: LabeledScan, angle: float) -> LabeledScan:
     """The scan turned by ``angle`` [rad] about +z."""
     cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
     points = scan.points.copy()
@@ -135,7 +135,7 @@ def turned(scan: LabelledScan, angle: float) -> LabelledScan:
     return replace(scan, points=points, boxes=boxes, azimuths=azimuths, turn=scan.turn + angle)
 
 
-def mirrored(scan: LabelledScan) -> LabelledScan:
+def mirrored(scan: LabeledScan) -> LabeledScan:
     """The scan with left and right swapped."""
     points = scan.points * np.array([1, -1, 1, 1], np.float32)
     boxes = tuple(replace(b, center=(b.center[0], -b.center[1], b.center[2]), yaw=-b.yaw) for b in scan.boxes)

@@ -14,7 +14,7 @@ from edgeperc.fitness import FitnessProfile
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import simulated_scan
 
-from .scans import LabelledScan
+from .scans import LabeledScan
 
 __all__ = ["fitness_of", "parity_scans", "simulate"]
 
@@ -31,7 +31,7 @@ def simulate(out: Path, n: int, *, first: int = 0, layouts_root: Path | None = N
         if not path.exists():
             # 4,973 is prime: neighboring seeds take layouts of different drives.
             boxes = real[seed * 4973 % len(real)] if real and seed % 2 else None
-            LabelledScan.from_simulation(simulated_scan(seed, sensor, boxes)).save(path)
+            LabeledScan.from_simulation(simulated_scan(seed, sensor, boxes)).save(path)
 
 
 def parity_scans(paths: Sequence[Path]) -> list[NDArray[np.float32]]:

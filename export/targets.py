@@ -56,7 +56,7 @@ def dense_targets(
     boxes: ArrayLike,
     view: TopViewGeometry,
     *,
-    labelled: NDArray[np.bool_] | None = None,
+    labeled: NDArray[np.bool_] | None = None,
     unsure: ArrayLike | None = None,
 ) -> NDArray[np.float32]:
     """Heat map and geometry for head "dense".
@@ -67,7 +67,7 @@ def dense_targets(
         As for `slot_targets`.
     view : TopViewGeometry
         Height and width divisible by 4.
-    labelled : (height, width) bool, optional
+    labeled : (height, width) bool, optional
         False in cells where boxes are not labeled, such as outside the camera's view.
     unsure : (k, 7) array_like, optional
         Boxes that need not be found but may, such as those without returns.
@@ -96,8 +96,8 @@ def dense_targets(
         np.maximum(heat, bump, out=heat)
 
     unlearned = np.zeros((height, width), bool)
-    if labelled is not None:
-        unlearned |= ~labelled.reshape(height, STRIDE, width, STRIDE).all((1, 3))
+    if labeled is not None:
+        unlearned |= ~labeled.reshape(height, STRIDE, width, STRIDE).all((1, 3))
     if unsure is not None:
         boxes, rows, cols = _boxes_in_view(unsure, view)
         for box, row, col in zip(boxes, rows / STRIDE, cols / STRIDE, strict=True):

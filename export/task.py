@@ -27,7 +27,7 @@ from edgeperc.simulation.samples import IGNORE
 from .cards import card_of
 from .losses import box_distillation_loss, distillation_loss, pointseg_loss, road_loss, ssadnet_loss
 from .recipe import Recipe
-from .scans import LabelledScan
+from .scans import LabeledScan
 from .targets import dense_targets, slot_targets
 
 __all__ = ["Outputs", "Points", "Road", "Tally", "Targets", "Task", "Vehicles", "task_of"]
@@ -109,7 +109,7 @@ class Task(ABC):
         return self.card.classes
 
     @abstractmethod
-    def target(self, scan: LabelledScan, seen: Projection) -> Targets:
+    def target(self, scan: LabeledScan, seen: Projection) -> Targets:
         """What the network should answer to a scan: labels (H, W) uint8, `IGNORE` where unknown, and any box targets.
 
         ``seen`` is the scan's projection into `view`.
@@ -127,7 +127,7 @@ class Task(ABC):
         """Counts of nothing yet, for `judge` to add to."""
         return Tally(Confusion(self.classes))
 
-    def judge(self, outputs: Outputs, seen: Projection, targets: Targets, scan: LabelledScan, tally: Tally) -> None:
+    def judge(self, outputs: Outputs, seen: Projection, targets: Targets, scan: LabeledScan, tally: Tally) -> None:
         """Add the outputs for one scan, a batch of one, to a tally."""
         tally.pixels.update(_logits(outputs)[0].argmax(0).cpu().numpy(), targets[0])
 
@@ -138,7 +138,7 @@ class Points(Task):
     paste_odds: ClassVar[Mapping[str, float]] = {"pedestrian": 0.4, "cyclist": 0.35, "van": 0.15, "truck": 0.1}
     swaps_sectors = True
 
-    def target(self, scan: LabelledScan, seen: Projection) -> Targets:
+    def target(self, scan: LabeledScan, seen: Projection) -> Targets:
         """The label of the point in each pixel."""
         return (np.append(scan.labels, np.uint8(IGNORE))[seen.index],)  # the index of an empty pixel is -1
 
@@ -164,7 +164,7 @@ class Vehicles(Task):
 
     paste_odds: ClassVar[Mapping[str, float]] = {"car": 0.3, "van": 0.4, "truck": 0.3}
 
-    def target(self, scan: LabelledScan, seen: Projection) -> Targets:
+    def target(self, scan: LabeledScan, seen: Projection) -> Targets:
         """Class of each cell; slots or dense maps of the vehicles."""
         view, kinds = _top_view(self.card), self.card.box_classes
         vehicles = [(box, n) for box, n in zip(scan.boxes, scan.counts, strict=True) if box.label in kinds]
@@ -175,7 +175,7 @@ class Vehicles(Task):
         if self.recipe.head == "slots":
             boxes = slot_targets(to_find, view, N_SLOTS)
         else:
-            boxes = dense_targets(to_find, view, labelled=scan.labelled(view), unsure=unclear)
+            boxes = dense_targets(to_find, view, labeled=scan.labeled(view), unsure=unclear)
         return scan.top_view_truth(view), boxes
 
     def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
@@ -200,19 +200,19 @@ class Vehicles(Task):
         """Counts of nothing yet, for labels and boxes."""
         return Tally(Confusion(self.classes), BoxEvaluator())
 
-    def judge(self, outputs: Outputs, seen: Projection, targets: Targets, scan: LabelledScan, tally: Tally) -> None:
+    def judge(self, outputs: Outputs, seen: Projection, targets: Targets, scan: LabeledScan, tally: Tally) -> None:
         """Labels and boxes as the runtime decodes them; boxes count where the scan is labeled."""
         view = _top_view(self.card)
         kinds = [output.kind for output in self.card.outputs]
         answers = {kind: output[0].cpu().numpy() for kind, output in zip(kinds, outputs, strict=True)}
         labels, found = decode_top_view(self.card, seen.index >= 0, answers, self.card.score_threshold)
         tally.pixels.update(labels, targets[0])
-        labelled = scan.labelled(view)
+        labeled = scan.labeled(view)
 
         def known(box: Box) -> bool:
             x, y = box.center[:2]
             row, col = int((view.x_range_m[1] - x) / view.cell_m), int((view.y_range_m[1] - y) / view.cell_m)
-            return view.holds(x, y) and bool(labelled[min(row, view.height - 1), min(col, view.width - 1)])
+            return view.holds(x, y) and bool(labeled[min(row, view.height - 1), min(col, view.width - 1)])
 
         truth = zip(scan.boxes, scan.counts, strict=True)
         to_find, ignored = boxes_to_find(truth, view, self.card.box_classes, known=known)
@@ -225,7 +225,7 @@ class Road(Task):
 
     paste_odds = Vehicles.paste_odds
 
-    def target(self, scan: LabelledScan, seen: Projection) -> Targets:
+    def target(self, scan: LabeledScan, seen: Projection) -> Targets:
         """1 for drivable cells, 0 for others."""
         truth = scan.top_view_truth(_top_view(self.card))
         return (np.where(truth == IGNORE, IGNORE, truth == 1).astype(np.uint8),)

@@ -21,10 +21,10 @@ from edgeperc.projection import make_projector
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import IGNORE
 
-from .scans import SURFACE, LabelledScan, turned
+from .scans import SURFACE, LabeledScan, turned
 from .task import Task
 
-__all__ = ["pseudo_labelled", "teach", "unlabelled_scans"]
+__all__ = ["pseudo_labeled", "teach", "unlabeled_scans"]
 
 SURE = 0.9
 
@@ -32,20 +32,20 @@ SURE = 0.9
 LOOKS = np.radians([0.0, 80.0, 160.0, 200.0, 280.0])
 
 
-def unlabelled_scans(objects: KittiObjects, fold: int | None) -> list[LabelledScan]:
+def unlabeled_scans(objects: KittiObjects, fold: int | None) -> list[LabeledScan]:
     """The unlabeled scans of the training drives."""
     scans = []
     for name in objects.unlabelled("train", fold=fold):
         points = read_points(objects.root / "training/velodyne" / f"{name}.bin")
         points = points[np.isfinite(points).all(axis=1)]
         unknown = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
-        scans.append(LabelledScan(points, np.full(len(points), IGNORE, np.uint8), (), (), unknown))
+        scans.append(LabeledScan(points, np.full(len(points), IGNORE, np.uint8), (), (), unknown))
     return scans
 
 
-def pseudo_labelled(
-    network: nn.Module, task: Task, scans: Iterable[LabelledScan], sure: float = SURE
-) -> list[LabelledScan]:
+def pseudo_labeled(
+    network: nn.Module, task: Task, scans: Iterable[LabeledScan], sure: float = SURE
+) -> list[LabeledScan]:
     """The scans with labels on all sides.
 
     Parameters
@@ -54,7 +54,7 @@ def pseudo_labelled(
         Labels points.
     task : Task
         The network's own.
-    scans : iterable of LabelledScan
+    scans : iterable of LabeledScan
         Their own labels are kept.
     sure : float
         Other points take the network's label if its probability is at least this.

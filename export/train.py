@@ -27,9 +27,9 @@ from .networks import build
 from .recipe import Recipe
 from .roads import sure_surface
 from .samples import RealScans, Samples, real_scans
-from .scans import LabelledScan
+from .scans import LabeledScan
 from .task import Targets, Task, task_of
-from .teacher import pseudo_labelled, teach, unlabelled_scans
+from .teacher import pseudo_labeled, teach, unlabeled_scans
 from .watch import Watch
 
 __all__ = ["train"]
@@ -106,7 +106,7 @@ def train(
         names = objects.names("train") if only_simulated else []
         if fold is not None and not only_simulated:
             names = objects.names("validation", fold=fold)
-        watched = [LabelledScan.from_frame(objects.frame(n), sure_surface) for n in names[::VALIDATION_STRIDE]]
+        watched = [LabeledScan.from_frame(objects.frame(n), sure_surface) for n in names[::VALIDATION_STRIDE]]
         names = [] if only_simulated else objects.names("train", fold=fold)
         real, weights, hashes = real_scans(objects, names, drawn=recipe.drawn_roads)
     if recipe.distil > 0.0 and teacher is None:
@@ -116,8 +116,8 @@ def train(
         raise ValueError("the teacher is not used; give --distil, or train a network that labels points on --kitti")
     tutor = None if teacher is None else _teacher(teacher, task).to(device)
     if tutor is not None and objects is not None and recipe.distil == 0.0:
-        extra = unlabelled_scans(objects, fold)
-        real = pseudo_labelled(tutor.cpu(), task, [*real, *extra])
+        extra = unlabeled_scans(objects, fold)
+        real = pseudo_labeled(tutor.cpu(), task, [*real, *extra])
         weights += [len(extra) ** -0.5] * len(extra)
     samples = Samples(recipe, real, weights, sorted(simulated.glob("*.npz")) if simulated else [])
     watch = Watch(samples, watched) if watched else None

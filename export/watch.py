@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from .samples import Samples
-from .scans import LabelledScan
+from .scans import LabeledScan
 
 __all__ = ["Watch"]
 
@@ -21,11 +21,11 @@ class Watch:
     ----------
     samples : Samples
         Makes the inputs and targets.
-    scans : sequence of LabelledScan
+    scans : sequence of LabeledScan
         Scans to validate on.
     """
 
-    def __init__(self, samples: Samples, scans: Sequence[LabelledScan]) -> None:
+    def __init__(self, samples: Samples, scans: Sequence[LabeledScan]) -> None:
         self.task, self.scans = samples.task, scans
         self.seen = [samples.project(scan) for scan in scans]
         self.targets = [self.task.target(scan, seen) for scan, seen in zip(scans, self.seen, strict=True)]

@@ -17,17 +17,17 @@ from edgeperc.perception import Box
 from edgeperc.simulation.samples import IGNORE, simulated_scan
 from edgeperc.simulation.scene import POINT_CLASS_OF
 from edgeperc_export.augment import ObjectBank, augmented, facing, pasted, swapped, weathered
-from edgeperc_export.scans import SURFACE, LabelledScan, turned
+from edgeperc_export.scans import SURFACE, LabeledScan, turned
 
 GROUND_M = -1.73
 
 
-def flat_street(boxes: tuple[Box, ...] = ()) -> LabelledScan:
+def flat_street(boxes: tuple[Box, ...] = ()) -> LabeledScan:
     """Ground points every 10 cm ahead, and nothing else."""
     x, y = np.meshgrid(np.arange(3.0, 40.0, 0.1), np.arange(-12.0, 12.0, 0.1))
     points = np.stack([x.ravel(), y.ravel(), np.full(x.size, GROUND_M), np.full(x.size, 0.3)], 1).astype(np.float32)
     unknown = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
-    return LabelledScan(points, np.zeros(len(points), np.uint8), boxes, (0,) * len(boxes), unknown)
+    return LabeledScan(points, np.zeros(len(points), np.uint8), boxes, (0,) * len(boxes), unknown)
 
 
 def post(x: float, y: float, label: str = "pedestrian") -> tuple[Box, np.ndarray]:
@@ -39,11 +39,11 @@ def post(x: float, y: float, label: str = "pedestrian") -> tuple[Box, np.ndarray
 
 
 @pytest.fixture(scope="module")
-def scan() -> LabelledScan:
-    return LabelledScan.from_simulation(simulated_scan(17))
+def scan() -> LabeledScan:
+    return LabeledScan.from_simulation(simulated_scan(17))
 
 
-def test_what_lies_in_a_simulated_box_is_the_object(scan: LabelledScan) -> None:
+def test_what_lies_in_a_simulated_box_is_the_object(scan: LabeledScan) -> None:
     for box, count in zip(scan.boxes, scan.counts, strict=True):
         core = replace(box, size=(box.size[0], box.size[1], box.size[2] - 0.2))  # clear of the ground
         if count and not any(b is not box and np.hypot(*np.subtract(b.center, box.center)[:2]) < 6 for b in scan.boxes):
@@ -109,7 +109,7 @@ def test_objects_are_not_pasted_into_one_another() -> None:
     assert {b.label for b in out.boxes} == {"pedestrian", "cyclist"}
 
 
-def test_nothing_to_paste_is_no_change(scan: LabelledScan) -> None:
+def test_nothing_to_paste_is_no_change(scan: LabeledScan) -> None:
     rng = np.random.default_rng(0)
     assert pasted(scan, ObjectBank({}), rng, 5, {"pedestrian": 1.0}) is scan
     assert pasted(scan, ObjectBank({"pedestrian": [post(10, 0)]}), rng, 0, {"pedestrian": 1.0}) is scan
@@ -119,7 +119,7 @@ def test_nothing_to_paste_is_no_change(scan: LabelledScan) -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_pasted_labels_are_those_of_the_boxes(scan: LabelledScan, seed: int) -> None:
+def test_pasted_labels_are_those_of_the_boxes(scan: LabeledScan, seed: int) -> None:
     rng = np.random.default_rng(seed)
     bank = ObjectBank.of([scan])
     out = pasted(scan, bank, rng, 6, dict.fromkeys(bank.objects, 1.0))
@@ -130,7 +130,7 @@ def test_pasted_labels_are_those_of_the_boxes(scan: LabelledScan, seed: int) -> 
         assert np.count_nonzero(own) >= 0.9 * count > 0
 
 
-def test_a_swapped_sector_brings_its_labels_along(scan: LabelledScan) -> None:
+def test_a_swapped_sector_brings_its_labels_along(scan: LabeledScan) -> None:
     other = replace(scan, points=scan.points + np.float32([0, 0, 0.5, 0]), labels=np.full_like(scan.labels, 3))
     scan = replace(scan, labels=np.zeros_like(scan.labels))
     out = swapped(scan, other, np.random.default_rng(1))
@@ -142,7 +142,7 @@ def test_a_swapped_sector_brings_its_labels_along(scan: LabelledScan) -> None:
     assert (out.labels[~within & (azimuth != low) & (azimuth != high)] == 0).all()
 
 
-def test_weather_loses_returns_and_labels_drops_background(scan: LabelledScan) -> None:
+def test_weather_loses_returns_and_labels_drops_background(scan: LabeledScan) -> None:
     out = weathered(replace(scan, labels=np.ones_like(scan.labels)), np.random.default_rng(4))
     far = [np.mean(np.linalg.norm(s.points[:, :3], axis=1) > 30) for s in (scan, out)]
     assert far[1] < far[0]
@@ -153,7 +153,7 @@ def test_weather_loses_returns_and_labels_drops_background(scan: LabelledScan) -
     assert (unknown.labels == IGNORE).all()
 
 
-def test_facing_turns_somebody_to_the_front(scan: LabelledScan) -> None:
+def test_facing_turns_somebody_to_the_front(scan: LabeledScan) -> None:
     rare = [b for b, n in zip(scan.boxes, scan.counts, strict=True) if b.label in ("pedestrian", "cyclist") and n >= 5]
     assert rare, "the scene has nobody in it"
     for seed in range(5):
@@ -163,7 +163,7 @@ def test_facing_turns_somebody_to_the_front(scan: LabelledScan) -> None:
     assert facing(flat_street(), np.random.default_rng(0)) == 0.0
 
 
-def test_a_scan_known_all_around_turns_anywhere(scan: LabelledScan) -> None:
+def test_a_scan_known_all_around_turns_anywhere(scan: LabeledScan) -> None:
     middle = np.array([scan.boxes[0].center[:2]])
 
     def turns(**how: float) -> np.ndarray:
@@ -178,7 +178,7 @@ def test_a_scan_known_all_around_turns_anywhere(scan: LabelledScan) -> None:
     assert np.histogram(anywhere, bins=6, range=(0.0, 180.0))[0].min() >= 2
 
 
-def test_the_same_draw_gives_the_same_scan(scan: LabelledScan) -> None:
+def test_the_same_draw_gives_the_same_scan(scan: LabeledScan) -> None:
     bank = ObjectBank.of([scan])
     how = {"bank": bank, "n_pasted": 5.0, "turn_to_rare": 0.5, "weather": 0.5}
     one, other = (augmented(scan, np.random.default_rng(9), **how) for _ in range(2))  # type: ignore[arg-type]
@@ -187,8 +187,8 @@ def test_the_same_draw_gives_the_same_scan(scan: LabelledScan) -> None:
     assert one.boxes == other.boxes
 
 
-def test_saved_scans_read_back(tmp_path: Path, scan: LabelledScan) -> None:
+def test_saved_scans_read_back(tmp_path: Path, scan: LabeledScan) -> None:
     scan.save(tmp_path / "scan.npz")
-    back = LabelledScan.load(tmp_path / "scan.npz")
+    back = LabeledScan.load(tmp_path / "scan.npz")
     np.testing.assert_array_equal(back.labels, scan.labels)
     assert back.counts == scan.counts

@@ -30,7 +30,7 @@ from edgeperc.simulation.samples import IGNORE, simulated_scan
 from edgeperc.simulation.scene import TOP_VIEW_CLASSES
 from edgeperc_export.augment import augmented
 from edgeperc_export.roads import ground_plane, sure_surface
-from edgeperc_export.scans import SURFACE, LabelledScan, mirrored, turned
+from edgeperc_export.scans import SURFACE, LabeledScan, mirrored, turned
 
 VIEW = TopViewGeometry()
 # The camera looks along the sensor's x axis: camera x is -y, camera y is -z, camera z is x; 0.27 m ahead of it.
@@ -176,11 +176,11 @@ def test_semantickitti_files(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def scan() -> LabelledScan:
-    return LabelledScan.from_simulation(simulated_scan(3))
+def scan() -> LabeledScan:
+    return LabeledScan.from_simulation(simulated_scan(3))
 
 
-def agreement(scan: LabelledScan) -> float:
+def agreement(scan: LabeledScan) -> float:
     """Share of vehicle points that lie in the box they are of."""
     vehicles = [b for b in scan.boxes if b.label in ("car", "van", "truck")]
     inboxes = np.zeros(len(scan.points), bool)
@@ -189,14 +189,14 @@ def agreement(scan: LabelledScan) -> float:
     return float(inboxes[scan.labels == 1].mean())
 
 
-def test_changes_keep_labels_true(scan: LabelledScan) -> None:
+def test_changes_keep_labels_true(scan: LabeledScan) -> None:
     assert agreement(scan) > 0.98
     for seed in range(4):
         assert agreement(augmented(scan, np.random.default_rng(seed))) > 0.97
 
 
 @pytest.mark.parametrize("change", [lambda s: s, mirrored, lambda s: turned(s, 0.4), lambda s: mirrored(turned(s, -2))])
-def test_the_surface_follows_the_points(scan: LabelledScan, change) -> None:  # type: ignore[no-untyped-def]
+def test_the_surface_follows_the_points(scan: LabeledScan, change) -> None:  # type: ignore[no-untyped-def]
     marked = np.zeros_like(scan.surface)
     marked[150:200, 220:300] = 1  # x 10..20 m, y -10..6 m
     scan = replace(scan, surface=marked, boxes=(), counts=())
@@ -211,16 +211,16 @@ def test_the_surface_follows_the_points(scan: LabelledScan, change) -> None:  # 
     assert np.count_nonzero(truth == 1) == pytest.approx(16_000, rel=0.03)
 
 
-def test_a_mirrored_turned_scan_turned_and_mirrored_back(scan: LabelledScan) -> None:
+def test_a_mirrored_turned_scan_turned_and_mirrored_back(scan: LabeledScan) -> None:
     back = turned(mirrored(mirrored(turned(scan, 0.7))), -0.7)
     np.testing.assert_allclose(back.points, scan.points, atol=1e-4)
     assert not back.mirrored
     assert back.turn == pytest.approx(0.0)
 
 
-def test_scans_are_stored_and_read_back(scan: LabelledScan, tmp_path: Path) -> None:
+def test_scans_are_stored_and_read_back(scan: LabeledScan, tmp_path: Path) -> None:
     scan.save(tmp_path / "scan.npz")
-    again = LabelledScan.load(tmp_path / "scan.npz")
+    again = LabeledScan.load(tmp_path / "scan.npz")
     np.testing.assert_array_equal(again.points, scan.points)
     np.testing.assert_array_equal(again.labels, scan.labels)
     np.testing.assert_array_equal(again.surface, scan.surface)
@@ -229,7 +229,7 @@ def test_scans_are_stored_and_read_back(scan: LabelledScan, tmp_path: Path) -> N
     assert list(tmp_path.iterdir()) == [tmp_path / "scan.npz"]
 
 
-def test_same_seed_same_change(scan: LabelledScan) -> None:
+def test_same_seed_same_change(scan: LabeledScan) -> None:
     one, other = (augmented(scan, np.random.default_rng((1, 2))) for _ in range(2))
     np.testing.assert_array_equal(one.points, other.points)
 
@@ -237,7 +237,7 @@ def test_same_seed_same_change(scan: LabelledScan) -> None:
 def test_the_sure_road_is_road() -> None:
     claimed = right = 0
     for seed in range(5):
-        scan = LabelledScan.from_simulation(simulated_scan(seed))
+        scan = LabeledScan.from_simulation(simulated_scan(seed))
         sure = sure_surface(scan.points)
         assert sure.shape == (SURFACE.height, SURFACE.width)
         claimed += np.count_nonzero(sure == 1)

@@ -37,16 +37,16 @@ from edgeperc_export import cards, to_onnx
 from edgeperc_export import make as make_module
 from edgeperc_export.ablation import PAPERS, SHIPPED, VARIANTS, ablate, plot
 from edgeperc_export.cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT
-from edgeperc_export.cli import _parser, _recipe, main
+from edgeperc_export.cli import _recipe, build_parser, main
 from edgeperc_export.models_page import models_page
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe, Stage
 from edgeperc_export.roads import DRAWN, drawn_roads
 from edgeperc_export.samples import Samples, real_scans
-from edgeperc_export.scans import LabelledScan
+from edgeperc_export.scans import LabeledScan
 from edgeperc_export.simulate import parity_scans, simulate
 from edgeperc_export.task import Task, task_of
-from edgeperc_export.teacher import pseudo_labelled, teach, unlabelled_scans
+from edgeperc_export.teacher import pseudo_labeled, teach, unlabeled_scans
 from edgeperc_export.to_onnx import ParityError, export, load, to_graph, verify, write_card
 from edgeperc_export.train import _optimizer, _schedule, _start, train
 from edgeperc_export.watch import Watch
@@ -222,7 +222,7 @@ def test_the_papers_recipes_are_theirs() -> None:
 
 @pytest.fixture(scope="module")
 def kitti(tmp_path_factory: pytest.TempPathFactory, scans: list[np.ndarray]) -> Path:
-    """A KITTI object set, simulated: a labelled frame of fold 0, of fold 1 and of a test drive, and one unlabelled."""
+    """A KITTI object set, simulated: a labeled frame of fold 0, of fold 1 and of a test drive, and one unlabelled."""
     root = tmp_path_factory.mktemp("kitti")
     for part in ("velodyne", "label_2", "calib"):
         (root / "training" / part).mkdir(parents=True)
@@ -299,7 +299,7 @@ def test_a_drawn_road_is_the_truth_of_its_scan(kitti: Path, monkeypatch: pytest.
 def test_lodnn_learns_road_alone(simulated: Path) -> None:
     recipe = small("lodnn", edge=True)
     samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
-    scan = LabelledScan.load(samples.simulated[0])
+    scan = LabeledScan.load(samples.simulated[0])
     image, truth = samples.sample(scan)
     assert image.shape == (3, 400, 200)
     whole = scan.top_view_truth(TOP_VIEW)
@@ -343,11 +343,11 @@ class Sure(nn.Module):
 
 def test_a_teacher_labels_what_nobody_did(kitti: Path) -> None:
     objects = KittiObjects(kitti)
-    (nobodys,) = unlabelled_scans(objects, fold=0)
-    assert not unlabelled_scans(objects, fold=1)  # a fold that is left out is left out
-    frame = LabelledScan.from_frame(objects.frame("000000"))
+    (nobodys,) = unlabeled_scans(objects, fold=0)
+    assert not unlabeled_scans(objects, fold=1)  # a fold that is left out is left out
+    frame = LabeledScan.from_frame(objects.frame("000000"))
     task = task_of(Recipe("pointseg"))
-    ahead, all_around = pseudo_labelled(Sure(), task, [frame, nobodys])
+    ahead, all_around = pseudo_labeled(Sure(), task, [frame, nobodys])
     own = frame.labels != IGNORE
     np.testing.assert_array_equal(ahead.labels[own], frame.labels[own])
     assert (ahead.labels[~own] == 1).mean() > 0.5
@@ -355,7 +355,7 @@ def test_a_teacher_labels_what_nobody_did(kitti: Path) -> None:
     for left in range(-180, 180, 15):
         sector = all_around.labels[(azimuth >= left) & (azimuth < left + 15)]
         assert (sector == 1).mean() > 0.5 if len(sector) > 50 else True
-    unsure = pseudo_labelled(Sure(), task, [nobodys], sure=1.1)[0]
+    unsure = pseudo_labeled(Sure(), task, [nobodys], sure=1.1)[0]
     assert (unsure.labels == IGNORE).all()
 
 
@@ -527,7 +527,7 @@ def test_a_step_always_draws_the_same_samples(simulated: Path) -> None:
 
 def test_an_empty_scan_is_a_sample_without_truth(simulated: Path) -> None:
     files = sorted(simulated.glob("*.npz"))
-    scan = LabelledScan.load(files[0])
+    scan = LabeledScan.load(files[0])
     nothing = replace(scan, points=scan.points[:0], labels=scan.labels[:0])
     image, truth = Samples(small("pointseg"), [], [], files).sample(nothing)
     assert not image.any()
@@ -541,7 +541,7 @@ def test_simulated_scans_resume_too(tmp_path: Path) -> None:
     stamp = (tmp_path / "000000.npz").stat().st_mtime_ns
     simulate(tmp_path, 2)
     assert (tmp_path / "000000.npz").stat().st_mtime_ns == stamp
-    assert len(LabelledScan.load(tmp_path / "000001.npz").points) > 50_000
+    assert len(LabeledScan.load(tmp_path / "000001.npz").points) > 50_000
 
 
 Exported = Callable[[str, str], tuple[Path, Path, ModelCard]]
@@ -825,7 +825,7 @@ def test_a_network_has_one_task(network: str, simulated: Path) -> None:
     task = task_of(recipe)
     assert [network in networks for networks in TASKS.values()].count(True) == 1
     samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
-    image, labels, *boxes = samples.sample(LabelledScan.load(samples.simulated[0]))
+    image, labels, *boxes = samples.sample(LabeledScan.load(samples.simulated[0]))
     assert image.shape == (len(task.input.channels), task.view.height, task.view.width)
     assert labels.shape == image.shape[1:]
     assert {*np.unique(labels)} <= {*range(len(task.classes)), IGNORE}

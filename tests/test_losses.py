@@ -146,12 +146,12 @@ def test_neighbours_keep_their_own_geometry():
 
 
 def test_unlabelled_cells_learn_nothing():
-    labelled = np.ones((400, 200), bool)
-    labelled[:101] = False  # the 26th output row is only partly labelled
-    heat = dense_targets([CAR, (44.0, 0.0, *CAR[2:])], VIEW, labelled=labelled)[0]
+    labeled = np.ones((400, 200), bool)
+    labeled[:101] = False  # the 26th output row is only partly labeled
+    heat = dense_targets([CAR, (44.0, 0.0, *CAR[2:])], VIEW, labeled=labeled)[0]
     assert (heat[26:] >= 0.0).all()
     assert set(np.unique(heat[:26])) - {-1.0} == set(np.unique(heat[:26][heat[:26] >= REGRESSED_FROM]))
-    assert (heat == 1.0).sum() == 2  # a labelled box counts wherever it is
+    assert (heat == 1.0).sum() == 2  # a labeled box counts wherever it is
 
 
 def test_unsure_boxes_are_neither_found_nor_missed():

@@ -221,6 +221,8 @@ def _finish(builder: SceneBuilder, jobs: list[Job], skipped: dict[str, str]) -> 
         for path in (out / folder).iterdir():
             if path.suffix == ".part" or path.stem not in kept:
                 path.unlink()
+    for path in [*out.glob(".*.part"), *out.glob("road/.*.part")]:
+        path.unlink()
     scores = {split: _scores(confusion) for split, confusion in confusions.items() if confusion.counts.any()}
     manifest = {
         "format": FORMAT,

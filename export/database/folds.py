@@ -14,6 +14,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import onnx
+
+from edgeperc.card import ModelCard
 from edgeperc.errors import EdgepercError
 from edgeperc.evaluation.datasets import KittiObjects, scan_hash
 from edgeperc.fitness import FitnessProfile
@@ -21,8 +24,8 @@ from edgeperc.fitness import FitnessProfile
 from ..recipe import Recipe
 from ..roads import DatabaseError, mask_of, with_road
 from ..samples import RealScans
-from ..scans import LabelledScan
-from ..to_onnx import export
+from ..scans import LabeledScan
+from ..to_onnx import export, write_card
 from ..train import train
 from .files import N_FOLDS
 
@@ -66,6 +69,7 @@ def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: 
     DatabaseError
         All drawn scenes are in one fold.
     """
+    made: dict[str, Path] = {}
     for fold in range(N_FOLDS):
         shown = {name: scene for name, scene in sorted(drawn.items()) if scene.fold != fold}
         held_out = {name: scene for name, scene in sorted(drawn.items()) if scene.fold == fold}
@@ -78,26 +82,33 @@ def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: 
         key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
         model, made_of = out / f"fold-{fold}.onnx", work / f"fold-{fold}.sha256"
         if model.exists() and made_of.exists() and made_of.read_text() == key:
+            made[key] = model
             continue
         made_of.unlink(missing_ok=True)
+        name = f"{recipe.network}-fold-{fold}"
+        if key in made:  # folds without a drawn scene have the same model
+            write_card(onnx.load(made[key]), replace(ModelCard.read(made[key]), name=name), model)
+            made_of.write_text(key)
+            continue
+        made[key] = model
         scans, watched = _labelled(objects, shown), _labelled(objects, held_out)
         hashes = {name: scan_hash(scan.points) for name, scan in scans.items()}
         given = RealScans([*scans.values()], hashes, [*watched.values()])
         checkpoint = train(recipe, work / key, kitti=None, simulated=None, given=given)
         fitness = FitnessProfile.from_scans(scan.points for scan in scans.values())
         proof = [scan.points for scan in scans.values()][:4]
-        export(checkpoint, model, scans=proof, fitness=fitness, name=f"{recipe.network}-fold-{fold}")
+        export(checkpoint, model, scans=proof, fitness=fitness, name=name)
         made_of.write_text(key)
     for left in work.iterdir():
         if left.is_dir():
             shutil.rmtree(left)
 
 
-def _labelled(objects: KittiObjects, drawn: Mapping[str, DrawnScene]) -> dict[str, LabelledScan]:
+def _labelled(objects: KittiObjects, drawn: Mapping[str, DrawnScene]) -> dict[str, LabeledScan]:
     found = {}
     for name, scene in drawn.items():
         try:
-            scan = LabelledScan.from_frame(objects.frame(name))
+            scan = LabeledScan.from_frame(objects.frame(name))
         except (EdgepercError, ValueError, OSError):
             continue  # reported when the scene itself is made
         found[name] = replace(scan, surface=with_road(scan.surface, mask_of(scene.road, name)))
