@@ -38,7 +38,9 @@ def add_parser(commands: Commands) -> None:
         "alone: 24)",
     )
     reading.add_argument(
-        "--split", choices=("test", "train", "all"), help="which drives (default: test, or those of --fold)"
+        "--split",
+        choices=("test", "validation", "train", "all"),
+        help="which drives (default: test, or those of --fold); nothing is trained on test and validation drives",
     )
     reading.add_argument(
         "--fold",
