@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 import inspect
 import os
@@ -10,7 +11,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numba
@@ -39,11 +39,17 @@ def pytest_configure(config: pytest.Config) -> None:
             raise pytest.UsageError("--every-kernel sees interpreted kernels alone; set NUMBA_DISABLE_JIT=1")
         called = config.stash.setdefault(CALLED, set())
 
-        def note(frame: FrameType, event: str, argument: Any) -> None:
-            if event == "call":
-                called.add(f"{frame.f_code.co_filename}:{frame.f_code.co_name}")
+        def noted(kernel: Callable[..., Any]) -> Callable[..., Any]:
+            name = f"{kernel.__code__.co_filename}:{kernel.__name__}"
 
-        sys.setprofile(note)
+            @functools.wraps(kernel)
+            def call(*arguments: Any, **named: Any) -> Any:
+                called.add(name)
+                return kernel(*arguments, **named)
+
+            return call
+
+        numba.njit = lambda **options: noted  # no module with kernels is imported yet
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
