@@ -12,10 +12,10 @@ import platform
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from edgeperc import MissingExtraError, __version__
+from edgeperc import __version__
+from edgeperc.extras import require
 from edgeperc.tuning import cpu_model
 
 __all__ = [
@@ -45,12 +45,8 @@ STOLEN_SHARE = 0.01
 HOT_MARGIN_C = 10.0
 
 
-def _psutil() -> ModuleType:
-    try:
-        import psutil
-    except ImportError as exc:
-        raise MissingExtraError("psutil", "bench", "Measuring") from exc
-    return psutil
+def _psutil() -> Any:
+    return require("psutil", "bench", "Measuring")
 
 
 def _read(path: Path) -> str | None:

@@ -11,24 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeperc import MissingExtraError
+from edgeperc.extras import require
 
 from .scenarios import KeepGoing, Limits, Perceive, Timings, back_to_back
 
-__all__ = ["read_summary", "require", "single_stream"]
+__all__ = ["load", "read_summary", "single_stream"]
 
 SUMMARY = "mlperf_log_summary.txt"
 # MLPerf's early stopping needs this many queries for a 99.9th percentile.
 QUERIES_FOR_P999 = 6636
 
 
-def require() -> Any:
-    """The module of the package ``mlcommons-loadgen``; `MissingExtraError` if it is not installed."""
-    try:
-        import mlperf_loadgen
-    except ImportError as exc:
-        raise MissingExtraError("mlcommons-loadgen", "loadgen", "--loadgen") from exc
-    return mlperf_loadgen
+def load() -> Any:
+    """Import the module of the package ``mlcommons-loadgen``; `MissingExtraError` if it is not installed."""
+    return require("mlperf_loadgen", "loadgen", "--loadgen", package="mlcommons-loadgen")
 
 
 def single_stream(
@@ -54,7 +50,7 @@ def single_stream(
     Timings
         Of the calls as measured here, for the stages; LoadGen's own figures are in its logs (`read_summary`).
     """
-    loadgen = require()
+    loadgen = load()
     timings = back_to_back(perceive, scans, Limits(0, 0.0, limits.warm_up_scans), keep_going=keep_going)
     on_start()
     first = timings.first_s = time.perf_counter()

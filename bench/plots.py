@@ -9,22 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from edgeperc import MissingExtraError
-
 from .document import pooled, scenario_names, stage_medians
 from .samples import percentile
 
-__all__ = ["BLUE", "as_svg", "pictures", "require_matplotlib"]
+__all__ = ["BLUE", "as_svg", "pictures"]
 
 BLUE = "#3b6ea8"
-
-
-def require_matplotlib() -> None:
-    """Raise `MissingExtraError` before anything is measured that cannot be drawn."""
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as exc:
-        raise MissingExtraError("matplotlib", "view", "A page with plots") from exc
 
 
 def pictures(document: Mapping[str, Any]) -> list[str]:

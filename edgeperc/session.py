@@ -24,12 +24,12 @@ from .errors import (
     CardError,
     CardMismatchError,
     InferenceError,
-    MissingExtraError,
     ModelFileError,
     OptionError,
     ProviderError,
     SettingsError,
 )
+from .extras import require
 from .tuning import compiled_folder, cpu_features, fingerprint, read_setting, settings_path
 from .zoo import Variant, choose, digest, resolve
 
@@ -47,7 +47,7 @@ PROVIDERS: Mapping[str, str] = {
     "cpu": "CPUExecutionProvider",
 }
 AUTO = ("cuda", "openvino", "cpu")
-# Providers that come as plugins beside stock onnxruntime: provider, then the package that carries its library.
+# Providers that come as plugins beside stock onnxruntime: provider, then the package with its library.
 PLUGINS = {"openvino": "onnxruntime_ep_openvino", "tensorrt-rtx": "onnxruntime_ep_nv_tensorrt_rtx"}
 PRECISIONS = ("fp32", "bf16", "int8")
 # In standard deviations of an output. The same graph in fp32 was seen to differ by 1e-5 between engines; weights of one
@@ -61,10 +61,7 @@ EXTERNAL_DATA = b"\n\x08location\x12"
 
 
 def _onnxruntime() -> Any:
-    try:
-        return importlib.import_module("onnxruntime")
-    except ImportError as exc:
-        raise MissingExtraError("onnxruntime", "cpu", "Running a model") from exc
+    return require("onnxruntime", "cpu", "Running a model")
 
 
 def _version(package: str) -> str:

@@ -23,7 +23,7 @@ PACKAGES = {
 FLOORS = {
     "edgeperc": """
         errors atomic
-        onnx_metadata
+        extras onnx_metadata
         card points sensor tuning
         perception zoo.__init__
         geometry
@@ -122,8 +122,8 @@ def imported(name: str, tree: ast.AST) -> Iterator[str]:
             assert above or not node.level, f"line {node.lineno}: a relative import that leaves the package"
             origin = ".".join(filter(None, [*above, node.module]))
             yield from (f"{origin}.{alias.name}" for alias in node.names)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
-            yield from (str(name.value) for name in node.args if isinstance(name, ast.Constant))
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__", "require")):
+            yield from (str(name.value) for name in node.args[:1] if isinstance(name, ast.Constant))
 
 
 def packages_imported(name: str, tree: ast.AST) -> set[str]:

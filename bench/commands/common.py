@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgeperc.atomic import write_whole
+from edgeperc.extras import require
 from edgeperc.tuning import fingerprint
 from edgeperc.zoo import DEFAULT
 
@@ -30,7 +31,7 @@ def new_document(kind: str, arguments: argparse.Namespace) -> Iterator[tuple[dic
     """An empty report; what it holds at the end is printed and written, even when measuring is interrupted."""
     html = getattr(arguments, "html", None)  # not every command has a page
     if html:
-        plots.require_matplotlib()
+        require("matplotlib", "view", "A page with plots")
     for file in filter(None, (arguments.json, arguments.markdown, html)):
         file.parent.mkdir(parents=True, exist_ok=True)
     hardware = context.machine()

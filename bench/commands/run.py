@@ -65,7 +65,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     from ..measure import accuracy_of, cold_starts, new_setting, reference, repeat
 
     if arguments.loadgen:
-        loadgen.require()
+        loadgen.load()
         arguments.loadgen.mkdir(parents=True, exist_ok=True)
     names = list(dict.fromkeys(arguments.scenario or DEFAULT_SCENARIOS))
     limits = limits_of(arguments)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from edgeperc.atomic import write_whole
+from edgeperc.extras import require
 
 from .. import plots
 from ..document import latency, stage_medians
@@ -68,7 +69,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     from ..measure import new_setting, repeat
 
     if arguments.plot:
-        plots.require_matplotlib()
+        require("matplotlib", "view", "Drawing the curves")
         arguments.plot.parent.mkdir(parents=True, exist_ok=True)
     limits = limits_of(arguments)
     limits = replace(limits, warm_up_scans=min(limits.warm_up_scans, 5))

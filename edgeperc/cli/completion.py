@@ -6,8 +6,9 @@ import argparse
 from collections.abc import Iterator
 from typing import Any
 
+from ..extras import require
 from .arguments import PROVIDERS, Commands, add_command
-from .output import require, say
+from .output import say
 
 __all__ = ["add_parser", "completion_command"]
 

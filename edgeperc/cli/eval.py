@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..extras import require
 from .arguments import DEFAULT, Commands, add_boxes_from, add_command, add_figures_file, add_model, add_provider
-from .output import many, progress, require, table_lines, write_figures
+from .output import many, progress, table_lines, write_figures
 
 __all__ = ["add_parser", "eval_command"]
 

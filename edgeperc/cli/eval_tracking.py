@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import PointsError
+from ..extras import require
 from .arguments import (
     Commands,
     add_adapt,
@@ -19,7 +20,7 @@ from .arguments import (
     add_sensor,
     positive_number,
 )
-from .output import many, progress, require, table_lines, without_nan, write_figures
+from .output import many, progress, table_lines, without_nan, write_figures
 from .run import make_perceiver
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ def add_parser(commands: Commands) -> None:
 def eval_tracking_command(arguments: argparse.Namespace) -> int:
     """Print tracking figures on KITTI's sequences."""
     if arguments.gif is not None:
-        require("pillow", "view", "Drawing an animation", module="PIL")
+        require("PIL", "view", "Drawing an animation", package="pillow")
     if arguments.boxes is not None and len(arguments.sequences or ()) != 1:
         arguments.usage_error("--boxes holds the boxes of one sequence; name it with --sequences SEQ")
     for file in filter(None, (arguments.json, arguments.gif)):

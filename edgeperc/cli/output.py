@@ -12,8 +12,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
-from ..errors import MissingExtraError
-
 __all__ = [
     "complain",
     "many",
@@ -21,7 +19,6 @@ __all__ = [
     "print_columns",
     "print_rows",
     "progress",
-    "require",
     "say",
     "show_warning",
     "table_lines",
@@ -50,20 +47,6 @@ def complain(text: object) -> None:
 def show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
     """Print a warning as one line, in place of `warnings.showwarning`."""
     complain(f"warning: {message}")
-
-
-def require(package: str, extra: str, purpose: str, *, module: str | None = None) -> Any:
-    """Import a package of an extra before any work is done.
-
-    Raises
-    ------
-    MissingExtraError
-        It is not installed; the message says which line installs it.
-    """
-    try:
-        return import_module(module or package)
-    except ImportError as exc:
-        raise MissingExtraError(package, extra, purpose) from exc
 
 
 @contextlib.contextmanager

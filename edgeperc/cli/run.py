@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import EdgepercError, MissingExtraError, ModelError, PointsError
+from ..extras import require
 from .arguments import DEFAULT, Commands, add_adapt, add_command, add_model, add_network, add_sensor, positive_number
-from .output import complain, many, one_line, progress, require, say
+from .output import complain, many, one_line, progress, say
 from .scans import Scans, find_scans, output_names, scan_folders, scan_namer
 
 if TYPE_CHECKING:
@@ -196,7 +197,7 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
     if arguments.png:
         require("matplotlib", "view", "Drawing a picture")
     if arguments.gif:
-        require("pillow", "view", "Drawing an animation", module="PIL")
+        require("PIL", "view", "Drawing an animation", package="pillow")
 
 
 def _live_source(arguments: argparse.Namespace) -> Path:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MissingExtraError, PointsError
+from ..extras import require
 from ..points import as_points
 from .files import read_points
 
@@ -220,25 +221,20 @@ def _choose(what: str, names: Sequence[str], wanted: str | None, others: str = "
     return 0
 
 
-def _require(module: str, package: str, purpose: str) -> Any:
-    try:
-        return import_module(module)
-    except ImportError as exc:
-        raise MissingExtraError(package, "io", purpose) from exc
-
-
 # --- packets ---------------------------------------------------------------------------------------------------------
 
 
 def _packet_scans(path: Path, kind: str, topic: str | None, remission_field: str | None) -> Iterator[Scan]:
     if kind == ".osf":
-        osf = _require("ouster.sdk.osf", "ouster-sdk", "Reading an Ouster capture")
+        osf = require("ouster.sdk.osf", "io", "Reading an Ouster capture", package="ouster-sdk")
         _check_osf(path)
         scans = _ouster_scans(osf.OsfFrameSetSource(str(path)), topic, remission_field)
     elif any(_is_velodyne(packet) for packet in islice(_packets(path, whole=False), _SNIFFED_PACKETS)):
         scans = _velodyne_scans(path)
     else:
-        pcap = _require("ouster.sdk.pcap", "ouster-sdk", "Reading a capture that is none of a Velodyne")
+        pcap = require(
+            "ouster.sdk.pcap", "io", "Reading a capture of another sensor than Velodyne's", package="ouster-sdk"
+        )
         try:
             frames = pcap.PcapFrameSetSource(str(path))
         except Exception as exc:  # the SDK's errors share no base
@@ -305,7 +301,7 @@ def _is_velodyne(packet: memoryview) -> bool:
 
 
 def _velodyne_scans(path: Path) -> Iterator[Scan]:
-    velodyne = _require("velodyne_decoder", "velodyne-decoder", "Reading a Velodyne capture")
+    velodyne = require("velodyne_decoder", "io", "Reading a Velodyne capture", package="velodyne-decoder")
     config = velodyne.Config()
     for stamp, points in velodyne.read_pcap(str(path), config):
         scan = as_points(points[:, :4])
@@ -316,7 +312,7 @@ def _velodyne_scans(path: Path) -> Iterator[Scan]:
 
 
 def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -> Iterator[Scan]:
-    core = _require("ouster.sdk.core", "ouster-sdk", "Reading an Ouster capture")
+    core = require("ouster.sdk.core", "io", "Reading an Ouster capture", package="ouster-sdk")
     serials = [str(info.sn) for info in frames.sensor_info]
     chosen = _choose("sensor", serials, topic)
     to_xyz = core.XYZLut(frames.sensor_info[chosen], False)  # in the sensor's frame, not the vehicle's
@@ -338,9 +334,9 @@ def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -
 
 
 def _bag_scans(path: Path, kind: str, topic: str | None, remission_field: str | None) -> Iterator[Scan]:
-    highlevel = _require("rosbags.highlevel", "rosbags", "Reading a bag")
-    typesys = _require("rosbags.typesys", "rosbags", "Reading a bag")
-    storage = _require("rosbags.rosbag2.storage_mcap", "rosbags", "Reading a bag")
+    highlevel = require("rosbags.highlevel", "io", "Reading a bag")
+    typesys = require("rosbags.typesys", "io", "Reading a bag")
+    storage = require("rosbags.rosbag2.storage_mcap", "io", "Reading a bag")
     humble = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     # A single .mcap is opened by AnyReader from rosbags 0.10 on only, and ouster-sdk 1.0 asks for 0.9.
     alone = kind == ".mcap" and hasattr(storage, "MCAPFile")

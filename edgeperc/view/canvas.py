@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import write_whole
-from ..errors import MissingExtraError
+from ..extras import require
 from .colors import FAINT, FRAME, GROUND, INK, PANEL
 
 __all__ = [
@@ -45,13 +45,11 @@ def new_figure(width: int, height: int) -> Any:
     MissingExtraError
         matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as exc:
-        raise MissingExtraError("matplotlib", "view", "Drawing a picture") from exc
+    agg = require("matplotlib.backends.backend_agg", "view", "Drawing a picture")
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor=GROUND)
-    FigureCanvasAgg(figure)
+    agg.FigureCanvasAgg(figure)
     return figure
 
 

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import write_whole
-from ..errors import MissingExtraError, TrackingError
+from ..errors import TrackingError
+from ..extras import require
 from ..perception import Perception
 from .canvas import free_place
 from .colors import CLASS_COLORS, FAINT, FRAME, GROUND, HIGH, INK, LOW, PANEL, color_of, rgb
@@ -114,10 +115,9 @@ def draw_tracks(
     OSError
         The file cannot be written.
     """
-    try:
-        from PIL import Image, ImageDraw, ImageFont
-    except ImportError as exc:
-        raise MissingExtraError("pillow", "view", "Drawing an animation") from exc
+    require("PIL", "view", "Drawing an animation", package="pillow")
+    from PIL import Image, ImageDraw, ImageFont
+
     if len(scans) < 2:
         raise TrackingError(
             f"got {len(scans)} scan{'s' * (len(scans) != 1)} for an animation; expected two or more of a drive. "
