@@ -13,7 +13,7 @@ from .recipe import task_name
 __all__ = ["RANGE_IMAGE", "RANGE_IMAGE_INPUT", "ROAD_CLASSES", "TOP_VIEW", "TOP_VIEW_INPUT", "card_of"]
 
 ROAD_CLASSES = TOP_VIEW_CLASSES[:2]
-"""What LoDNN tells apart; a vehicle's footprint is background, for nobody drives there."""
+"""LoDNN's classes; the footprint of a vehicle is background."""
 
 TOP_VIEW = TopViewGeometry()
 RANGE_IMAGE = RangeImageGeometry(get_sensor("hdl-64e").elevations_deg)
@@ -29,7 +29,7 @@ RANGE_IMAGE_INPUT = InputSpec(
 
 
 def card_of(network: str, head: str = "dense", **facts: Any) -> ModelCard:
-    """The card of a network; ``facts`` are whatever else `ModelCard` takes, at least its version."""
+    """The card of a network; ``facts`` are further arguments of `ModelCard`, at least ``version``."""
     facts = {"name": network, **facts}
     task = task_name(network)
     if task == "points":

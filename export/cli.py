@@ -36,10 +36,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         0 for success, 1 if a model was refused or a scene left out, 2 for wrong usage or unusable files.
     """
-    parser, words = build_parser(), list(sys.argv[1:] if argv is None else argv)
-    if words[:1] == ["database"]:
-        parser.error(f'"{" ".join(words[:2])}" is now written {"-".join(words[:2])}; see edgeperc-export --help')
-    args = parser.parse_args(words)
+    parser, given = build_parser(), list(sys.argv[1:] if argv is None else argv)
+    if given[:1] == ["database"]:
+        parser.error(f'"{" ".join(given[:2])}" is now written {"-".join(given[:2])}; see edgeperc-export --help')
+    args = parser.parse_args(given)
     try:
         return int(args.run(args))
     except ModuleNotFoundError as exc:

@@ -109,16 +109,16 @@ def distillation_loss(logits: Tensor, probabilities: Tensor) -> Tensor:
     return -(probabilities * F.log_softmax(logits.float(), dim=1)).sum(1).mean()
 
 
-def box_distillation_loss(predicted: Tensor, taught: Tensor) -> Tensor:
+def box_distillation_loss(predicted: Tensor, teacher: Tensor) -> Tensor:
     """Difference of dense boxes (B, 9, H, W) from a teacher's: cross-entropy of the heat maps plus L1 of the geometry.
 
     Both are divided by the sum of the teacher's heat, which also weights the L1.
     """
-    predicted, taught = predicted.float(), taught.float()
-    heat = taught[:, 0].sigmoid()
+    predicted, teacher = predicted.float(), teacher.float()
+    heat = teacher[:, 0].sigmoid()
     heat_loss = F.binary_cross_entropy_with_logits(predicted[:, 0], heat, reduction="sum")
     share = heat * (heat >= REGRESSED_FROM)
-    error = (predicted[:, 1:] - taught[:, 1:]).abs() * predicted.new_tensor(GEOMETRY_WEIGHTS).view(1, -1, 1, 1)
+    error = (predicted[:, 1:] - teacher[:, 1:]).abs() * predicted.new_tensor(GEOMETRY_WEIGHTS).view(1, -1, 1, 1)
     total = share.sum().clamp(min=1.0)
     return (heat_loss + (error.sum(1) * share).sum()) / total
 

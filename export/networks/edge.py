@@ -1,10 +1,10 @@
-"""SSADNet and PointSeg made for small computers: the same inputs and outputs at a seventh of the arithmetic.
+"""SSADNet and PointSeg for small computers: the same inputs and outputs with a seventh of the arithmetic.
 
-They keep the papers' views, classes and boxes and leave what small computers are slow at: many channels at full
-resolution, unpooling by position, dilations wider than the map. Instead: two halvings into a context of residual
-blocks, and back by moving channels to pixels. Channels come in sixteens, the width of a vector register: 24 channels
-took as long as 32. Batch norm disappears into its convolution on export, ReLU into the engine's. Both are distilled
-from the full networks (`edgeperc_export.recipe.Recipe.distil`).
+They keep the papers' views, classes and boxes, and avoid what is slow on small computers: many channels at full
+resolution, unpooling by position, dilations wider than the map. Instead the resolution is halved twice, residual blocks
+form the context, and channels are moved to pixels on the way back. Numbers of channels are multiples of 16, the width
+of a vector register: 24 channels took as long as 32. Batch norm is folded into its convolution on export, and ReLU by
+the engine. Both networks are distilled from the full ones (`edgeperc_export.recipe.Recipe.distil`).
 """
 
 from __future__ import annotations
@@ -14,31 +14,31 @@ import math
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .pointseg import conv_bn_relu, initialise
+from .pointseg import conv_bn_relu, initialize
 from .ssadnet import HEAT_PRIOR
 
 __all__ = ["PointSegEdge", "SSADNetEdge", "spread"]
 
 CONTEXT_DILATIONS = ((1, 2), (2, 4))
-"""Of the residual blocks (rows, columns): range images are wide."""
+"""Dilations (rows, columns) of the residual blocks; range images are wide."""
 
 
 class Residual(nn.Module):
-    """Two 3x3 convolutions, the second dilated, beside a shortcut."""
+    """Two 3x3 convolutions, the second dilated, added to a shortcut."""
 
     def __init__(self, channels: int, dilation: tuple[int, int]) -> None:
         super().__init__()
         self.first = conv_bn_relu(channels, channels, 3)
         self.second = nn.Conv2d(channels, channels, 3, padding=dilation, dilation=dilation, bias=False)
         self.norm = nn.BatchNorm2d(channels)
-        nn.init.zeros_(self.norm.weight)  # at first nothing but a shortcut
+        nn.init.zeros_(self.norm.weight)  # an untrained block is the identity
 
     def forward(self, x: Tensor) -> Tensor:
         return F.relu(x + self.norm(self.second(self.first(x))))
 
 
 class Trunk(nn.Module):
-    """Encoder, context and decoder, down to an eighth or a quarter of the input and back to the stem's resolution.
+    """Encoder, context and decoder: down to an eighth of the input's columns, and back to its resolution.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class Trunk(nn.Module):
     stride : (int, int)
         Of the stem, (rows, columns).
     fine, middle, coarse : int
-        Channels at the stem's resolution, at a half and at a quarter of it.
+        Channels at the stem's resolution, at half and at a quarter of it.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ def spread(x: Tensor, block: tuple[int, int]) -> Tensor:
 
 
 class PointSegEdge(nn.Module):
-    """Label every pixel of a range image, as `PointSeg` does, for 0.9 of its 7.2 GMAC.
+    """Labels every pixel of a range image, like `PointSeg`, with 0.9 instead of 7.2 GMAC.
 
     In: (B, 5, 64, 512); any height divisible by 4 and width divisible by 8. Out: logits (B, 4, 64, 512).
     """
@@ -94,7 +94,7 @@ class PointSegEdge(nn.Module):
     def __init__(self, *, n_channels: int = 5, n_classes: int = 4) -> None:
         super().__init__()
         self.trunk = Trunk(n_channels, n_classes, (1, 2), fine=16, middle=64, coarse=112)
-        initialise(self, self.trunk.classifier)
+        initialize(self, self.trunk.classifier)
 
     def forward(self, x: Tensor) -> Tensor:
         logits: Tensor = self.trunk(x)[0]
@@ -102,10 +102,10 @@ class PointSegEdge(nn.Module):
 
 
 class SSADNetEdge(nn.Module):
-    """Label every cell of a top view and box the vehicles, as `SSADNet` with head "dense" does, for 1.5 of 8.9 GMAC.
+    """Labels every cell of a top view and boxes the vehicles, like `SSADNet` with head "dense"; 1.5 of 8.9 GMAC.
 
     In: (B, 3, 400, 200); any height and width divisible by 8. Out: segmentation logits (B, 5, 400, 200) and boxes
-    (B, 9, 100, 50), as `DenseHead` has them.
+    (B, 9, 100, 50) as of `DenseHead`.
     """
 
     def __init__(self, *, n_channels: int = 3, n_classes: int = 5) -> None:
@@ -113,7 +113,7 @@ class SSADNetEdge(nn.Module):
         self.trunk = Trunk(n_channels, n_classes, (2, 2), fine=16, middle=64, coarse=112)
         self.detection = nn.Sequential(conv_bn_relu(64, 64, 3), conv_bn_relu(64, 64, 3))
         self.predict = nn.Conv2d(64, 9, 1)
-        initialise(self, self.trunk.classifier, self.predict)
+        initialize(self, self.trunk.classifier, self.predict)
         assert self.predict.bias is not None
         self.predict.bias.data[0] = -math.log(1.0 / HEAT_PRIOR - 1.0)
 

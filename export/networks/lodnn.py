@@ -1,17 +1,17 @@
-"""LoDNN: the road in a top view (Caltagirone et al., 2017); LoDNN-I, the same made anew (Electronics 12, 3165, 2023).
+"""LoDNN: the road in a top view (Caltagirone et al., 2017), and its new version LoDNN-I (Electronics 12, 3165, 2023).
 
-Both are one network: an encoder, a context module of dilated convolutions, a decoder that unpools. LoDNN sees six
-statistics of every cell (number of returns, mean remission; mean, deviation, least and greatest height). LoDNN-I keeps
-every layer and sees three channels (distance, height, remission); what it improves is what it is taught: roads drawn by
-hand, varied and split five ways, a learning rate, a number of epochs and a batch searched for.
+Both are the same network: an encoder, a context module of dilated convolutions, and a decoder with unpooling. LoDNN's
+input are six statistics of each cell (number of returns, mean remission; mean, deviation, minimum and maximum of the
+height). LoDNN-I's are three channels (distance, height, remission). It keeps all layers and improves the training:
+hand-drawn roads, varied and in five folds, and a search for the learning rate, the number of epochs and the batch size.
 
-What the papers leave open, and what is done here:
+What the papers leave open, and the choices made here:
 
-* The decoder's second convolution gives the classes and has no ELU: softmax follows, and an ELU before it would keep
-  logits from falling below -1.
-* ``batch_norm`` puts one behind every other convolution, as in SSADNet, whose segmentation branch is an extended LoDNN.
+* The decoder's second convolution gives the classes and has no ELU: softmax follows, and after an ELU no logit could be
+  below -1.
+* ``batch_norm`` adds batch norm after all other convolutions, as in SSADNet, whose segmentation branch extends LoDNN.
 
-`LoDNNEdge` is for small computers: the context module at a quarter of the image's resolution in place of a half.
+`LoDNNEdge` is for small computers: its context module works at a quarter of the image's resolution instead of half.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import math
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .pointseg import conv_bn_relu, initialise
+from .pointseg import conv_bn_relu, initialize
 from .ssadnet import CONTEXT_DILATIONS, ELU_GAIN, ContextModule, conv_bn_elu, conv_elu, max_pool_with_mask, max_unpool
 
 __all__ = ["EDGE_DILATIONS", "LoDNN", "LoDNNEdge"]
@@ -31,12 +31,12 @@ EDGE_DILATIONS = CONTEXT_DILATIONS[:-1]
 
 
 class LoDNN(nn.Module):
-    """Tell road from everything else, for every cell of a top view.
+    """Labels every cell of a top view as road or not.
 
     Parameters
     ----------
     n_channels : int
-        3 of LoDNN-I, 6 of LoDNN.
+        3 for LoDNN-I, 6 for LoDNN.
     n_classes : int
     context_width : int
         Channels inside the context module; 128 in the papers, 18.5 of 20.1 GMAC.
@@ -64,7 +64,7 @@ class LoDNN(nn.Module):
         self.context = ContextModule(32, context_width, dropout, batch_norm)
         self.decoder = conv(32, 32)
         self.classifier = nn.Conv2d(32, n_classes, 3, padding=1)
-        self._initialise(dropout)
+        self._initialize(dropout)
 
     def forward(self, x: Tensor) -> Tensor:
         x = self.encoder(x)  # (B, 32, 400, 200)
@@ -74,8 +74,8 @@ class LoDNN(nn.Module):
         logits: Tensor = self.classifier(self.decoder(x))  # (B, 2, 400, 200)
         return logits
 
-    def _initialise(self, dropout: float) -> None:
-        """As SSADNet's: the signal's size through ELU and spatial dropout is kept."""
+    def _initialize(self, dropout: float) -> None:
+        """As in SSADNet: preserve the variance of the signal through ELU and spatial dropout."""
         dilated = set(self.context.dilated)
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
@@ -88,9 +88,9 @@ class LoDNN(nn.Module):
 
 
 class LoDNNEdge(nn.Module):
-    """LoDNN at a quarter of the resolution: two halvings by stride, the context module, back by channels to pixels.
+    """LoDNN at a quarter of the resolution: two strided convolutions, the context module, and channels moved to pixels.
 
-    0.73 GMAC in place of 20.1. In and out as `LoDNN`; any height and width divisible by 4.
+    0.73 instead of 20.1 GMAC. Input and output as for `LoDNN`; any height and width divisible by 4.
     """
 
     def __init__(self, *, n_channels: int = 3, n_classes: int = 2, fine: int = 16, context_width: int = 48) -> None:
@@ -101,7 +101,7 @@ class LoDNNEdge(nn.Module):
         self.up = nn.Conv2d(context_width, 4 * fine, 1)
         self.merge = conv_bn_relu(fine, fine, 3)
         self.classifier = nn.Conv2d(fine, 4 * n_classes, 1)
-        initialise(self, self.classifier)
+        initialize(self, self.classifier)
 
     def forward(self, x: Tensor) -> Tensor:
         fine = self.stem(x)  # (B, 16, 200, 100)
@@ -111,7 +111,7 @@ class LoDNNEdge(nn.Module):
 
 
 class Dilated(nn.Module):
-    """A dilated 3x3 convolution beside a shortcut; at first nothing but the shortcut."""
+    """A dilated 3x3 convolution added to a shortcut; untrained, it is the identity."""
 
     def __init__(self, channels: int, dilation: tuple[int, int]) -> None:
         super().__init__()

@@ -1,17 +1,17 @@
 """PointSeg: segmentation of a range image (Wang et al., 2018, section 4).
 
-What the paper leaves open, and what is done here:
+What the paper leaves open, and the choices made here:
 
 * Channels are not stated. They follow SqueezeSeg, which PointSeg extends: 64 after the first convolution, 128, 256, 384
   and 512 in the fire layers; each fire layer squeezes to a quarter of its input (section 4.1).
-* Fire1 stands for SqueezeNet's first convolution, as there; it halves the width, and three poolings halve it again, so
-  that the enlargement layer sees 64 x 32 (section 4.2). Each reweighting closes a resolution: SR-1 before the second
-  pooling, SR-2 before the third, SR-3 before the enlargement layer that stands in for a fourth.
-* Equation 4 with "X = sigmoid(chi)" cannot be meant as printed, as then the two fully connected layers would see no
-  input and the feature map would be lost. As in squeeze-and-excitation (and the paper's Figure 6):
+* Fire1 is SqueezeNet's first convolution, as in SqueezeSeg. It halves the width, and three poolings halve it again, so
+  that the enlargement layer's input is 64 x 32 (section 4.2). The last layer of each resolution is a reweighting: SR-1
+  before the second pooling, SR-2 before the third, SR-3 before the enlargement layer, which replaces a fourth.
+* Equation 4 with "X = sigmoid(chi)" cannot be meant as printed: the two fully connected layers would have no input and
+  the feature map would be lost. As in squeeze-and-excitation (and the paper's Figure 6):
   Scale = sigmoid(FC(relu(FC(chi)))), Y = X * Scale. The first FC squeezes to a quarter.
 * Each branch of the enlargement layer is 80 wide; "compress to 1/4" is read as a quarter of the layer's input.
-* Convolutions are followed by batch norm, which disappears into them on export.
+* Convolutions are followed by batch norm, which is folded into them on export.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ __all__ = [
     "PointSeg",
     "SqueezeReweight",
     "conv_bn_relu",
-    "initialise",
+    "initialize",
     "pool",
 ]
 
@@ -51,7 +51,7 @@ def pool(x: Tensor) -> Tensor:
 
 
 class Fire(nn.Module):
-    """Squeeze, to a quarter if not told, and expand by 1x1 and 3x3 (section 4.1; Figure 4, left)."""
+    """Squeeze, by default to a quarter, and expand by 1x1 and 3x3 (section 4.1; Figure 4, left)."""
 
     def __init__(self, c_in: int, c_out: int, c_mid: int | None = None) -> None:
         super().__init__()
@@ -86,7 +86,7 @@ class FireDeconv(nn.Module):
 
 
 class SqueezeReweight(nn.Module):
-    """Scale each channel by what all channels hold on average (section 4.3, equations 3 and 4)."""
+    """Scale each channel by a function of all channels' means (section 4.3, equations 3 and 4)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -100,7 +100,7 @@ class SqueezeReweight(nn.Module):
 
 
 class Enlargement(nn.Module):
-    """See far without pooling: 1x1, three dilated 3x3 and the image's average, compressed to 1/4 (section 4.2)."""
+    """A large receptive field without pooling: 1x1, three dilated 3x3 and the image's mean, compressed to 1/4 (4.2)."""
 
     def __init__(self, c_in: int, width: int) -> None:
         super().__init__()
@@ -117,7 +117,7 @@ class Enlargement(nn.Module):
 
 
 class PointSeg(nn.Module):
-    """Label every pixel of a range image.
+    """Labels every pixel of a range image.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ class PointSeg(nn.Module):
         self.dropout = nn.Dropout2d(dropout)
         self.classifier = nn.Conv2d(64, n_classes, 3, padding=1)
         self.early = nn.Conv2d(128, n_classes, 1) if deep_supervision else None
-        initialise(self, self.classifier)
+        initialize(self, self.classifier)
 
     def forward(self, x: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         skip1 = self.skip1(x)  # (B, 64, 64, 512)
@@ -181,8 +181,8 @@ class PointSeg(nn.Module):
         return logits if early is None else (logits, early)
 
 
-def initialise(network: nn.Module, *last: nn.Conv2d) -> None:
-    """He's weights, and small ones where the answers come out."""
+def initialize(network: nn.Module, *last: nn.Conv2d) -> None:
+    """He initialization, and small weights in the output layers."""
     for module in network.modules():
         if isinstance(module, nn.Conv2d):
             nn.init.kaiming_normal_(module.weight, nonlinearity="relu")

@@ -1,17 +1,17 @@
 """SqueezeSegV2: segmentation of a range image (Wu et al., 2018), the network that KUL-Seg extends.
 
-SqueezeSeg's fire layers, and three of its four additions: context aggregation, the mask of returns, batch norm. The
-fourth is the focal loss (`edgeperc_export.losses.cross_entropy`).
+It has SqueezeSeg's fire layers and three of the paper's four additions: context aggregation, the mask of returns, and
+batch norm. The fourth is the focal loss (`edgeperc_export.losses.cross_entropy`).
 
-What is done otherwise, and why:
+What differs from the paper, and why:
 
-* The mask is made in the network, of the pixels that are not 0 in every channel, so that the input stays x, y, z,
-  remission and range.
-* Batch norm stands before the ReLU and not behind it, where it disappears into its convolution on export.
-* The recurrent CRF behind SqueezeSeg's logits is left out. KUL-Seg's section 4 does not speak of one; with it cars win
-  3.7 points of IoU, pedestrians and cyclists lose 1.0 and 1.3 (PointSeg's Table 1); and the runtime corrects labels
-  itself, by a vote of neighbours and RANSAC (`edgeperc.refine`).
-* Squeezing and expanding widths are those of the authors' released network.
+* The network computes the mask itself, from the pixels that are not 0 in every channel, so that the input stays x, y,
+  z, remission and range.
+* Batch norm comes before the ReLU instead of after it, so that it can be folded into the convolution on export.
+* SqueezeSeg's recurrent CRF is left out. KUL-Seg's section 4 does not mention one. With it, cars gain 3.7 points of
+  IoU, and pedestrians and cyclists lose 1.0 and 1.3 (PointSeg's Table 1). The runtime corrects labels itself, by a vote
+  of neighbors and RANSAC (`edgeperc.refine`).
+* The widths of the fire layers are those of the authors' released network.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .pointseg import Fire, FireDeconv, conv_bn_relu, initialise, pool
+from .pointseg import Fire, FireDeconv, conv_bn_relu, initialize, pool
 
 __all__ = ["ContextAggregation", "SqueezeSegV2"]
 
 REACH = 7
-"""Pixels across, and down, of which context aggregation takes the maximum."""
+"""Rows and columns of the window whose maximum context aggregation takes."""
 
 
 class ContextAggregation(nn.Module):
-    """Scale each channel of each pixel by what lies around it, so that missing returns weigh less.
+    """Scale each channel of each pixel by its surroundings, so that missing returns matter less.
 
-    The maximum of 7x7 pixels, squeezed to a sixteenth, expanded again, through a sigmoid.
+    The scale is a sigmoid of the maximum of 7x7 pixels, squeezed to a sixteenth of the channels and expanded again.
     """
 
     def __init__(self, channels: int) -> None:
@@ -40,14 +40,14 @@ class ContextAggregation(nn.Module):
         self.expand = nn.Conv2d(channels // 16, channels, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        # Across, then down: the same maxima of 14 values in place of 49.
+        # Rows, then columns: the same maxima from 14 instead of 49 values.
         around = F.max_pool2d(x, (1, REACH), stride=1, padding=(0, REACH // 2))
         around = F.max_pool2d(around, (REACH, 1), stride=1, padding=(REACH // 2, 0))
         return x * torch.sigmoid(self.expand(F.relu(self.squeeze(around))))
 
 
 class SqueezeSegV2(nn.Module):
-    """Label every pixel of a range image.
+    """Labels every pixel of a range image.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class SqueezeSegV2(nn.Module):
         self.deconv12, self.deconv13 = FireDeconv(128, 64, 16), FireDeconv(64, 64, 16)
         self.dropout = nn.Dropout2d(dropout)
         self.classifier = nn.Conv2d(64, n_classes, 3, padding=1)
-        initialise(self, self.classifier)
+        initialize(self, self.classifier)
 
     def forward(self, x: Tensor) -> Tensor:
         returned = (x.abs().amax(1, keepdim=True) > 0.0).to(x.dtype)  # (B, 1, 64, 512)

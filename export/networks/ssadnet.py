@@ -1,20 +1,20 @@
 """SSADNet: segmentation and detection in one pass over a top view (Lee and Park, 2020, section 2.2).
 
-What the paper leaves open, and what is done here:
+What the paper leaves open, and the choices made here:
 
 * Channels are not stated. They follow LoDNN, which the segmentation branch extends: 32 in the encoder and the decoder,
-  128 in the context module, spatial dropout 0.25. The feature extractor's 16, 32, 64, 128, 128 are ours: full
-  resolution is dear, and the bridge already hands over 32 rich channels.
+  128 in the context module, spatial dropout 0.25. The feature extractor's 16, 32, 64, 128, 128 are chosen here: full
+  resolution is expensive, and the bridge already provides 32 channels of features.
 * "Additional 3x3 convolution after each F.E. block except the first and last": it follows the block's pooling and has
   the block's batch norm and ELU.
 * "Each B.B.R. block repeats the dropout and ELU on the 1x1 convolution": 1x1, ReLU, then twice (1x1, dropout, ELU),
-  then a 1x1 to one value a slot, averaged over the image. Without that last linear layer no slot could leave ELU's
-  range; averaging comes last, as in network-in-network.
-* How many boxes one pass may return is not stated: ``n_slots``.
-* ``batch_norm`` puts one behind every convolution of the segmentation branch (and is not the paper's): without, 240
-  steps told no class from another; with it they do. It disappears into the convolutions on export.
-* Head "dense" replaces the regressor (and is not the paper's): one prediction every four cells, so that a box is
-  found where it is, and any number of boxes can be found.
+  then a 1x1 to one value for each slot, averaged over the image. Without this last linear layer the slots would be
+  limited to ELU's range. Averaging comes last, as in network-in-network.
+* The number of boxes for each pass is not stated: ``n_slots``.
+* ``batch_norm`` adds batch norm after every convolution of the segmentation branch (not in the paper): without it, the
+  network did not separate the classes after 240 steps; with it, it does. It is folded into the convolutions on export.
+* Head "dense" replaces the regressor (not in the paper): one prediction every four cells, so that boxes are predicted
+  where they are, in any number.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ __all__ = [
 ]
 
 CONTEXT_DILATIONS = ((1, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 64))
-"""Table 1, as printed: (width, height). torch's ``dilation`` wants (height, width)."""
+"""Table 1, as printed: (width, height). torch's ``dilation`` is (height, width)."""
 
 HEAT_PRIOR = 0.1
-"""What the untrained heat map says everywhere (CenterNet's start; a logit of -2.19)."""
+"""Value of the untrained heat map everywhere (as in CenterNet; a logit of -2.19)."""
 
-# Var(x) / E[elu(x)^2] for a standard normal x: He's argument, carried over from ReLU (where it is 2).
+# Var(x) / E[elu(x)^2] for a standard normal x: He's gain, which is 2 for ReLU.
 ELU_GAIN = 1.55
 
 
@@ -62,12 +62,12 @@ def receptive_fields(dilations: tuple[tuple[int, int], ...] = CONTEXT_DILATIONS)
 
 
 def max_pool_with_mask(x: Tensor) -> tuple[Tensor, Tensor]:
-    """2x2 max-pooling with stride 2 that remembers where each maximum stood.
+    """2x2 max-pooling with stride 2, and the positions of the maxima.
 
-    Returns the pooled map (B, C, H/2, W/2) and a bool map (B, C, H, W) true at exactly one pixel of every window: its
-    maximum, the first in reading order where several are equal, which is the one `torch.nn.MaxPool2d` would point to.
-    Empty cells make such ties the rule. (`torch.nn.MaxUnpool2d` exports as a scatter few runtimes do well; pooling,
-    comparing and multiplying run anywhere.)
+    Returns the pooled map (B, C, H/2, W/2) and a bool map (B, C, H, W) that is true at exactly one pixel of each
+    window: its maximum, and the first in reading order of equal ones, like the indices of `torch.nn.MaxPool2d`. Empty
+    cells make ties common. (`torch.nn.MaxUnpool2d` exports as a scatter, which few runtimes do well; pooling, comparing
+    and multiplying run anywhere.)
     """
     pooled = F.max_pool2d(x, 2)
     with torch.no_grad():
@@ -78,7 +78,7 @@ def max_pool_with_mask(x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def max_unpool(x: Tensor, mask: Tensor) -> Tensor:
-    """Put every value (B, C, H/2, W/2) back where `max_pool_with_mask` took it from; zero elsewhere (B, C, H, W)."""
+    """Put each value (B, C, H/2, W/2) back where `max_pool_with_mask` took it from; zero elsewhere (B, C, H, W)."""
     return _double(x) * mask
 
 
@@ -99,7 +99,7 @@ def norm(channels: int, batch_norm: bool) -> list[nn.Module]:
 
 
 class ContextModule(nn.Module):
-    """Seven dilated 3x3 convolutions that see 129 x 255 cells of the pooled map, and a 1x1 (Table 1)."""
+    """Seven dilated 3x3 convolutions with a receptive field of 129 x 255 pooled cells, and a 1x1 (Table 1)."""
 
     def __init__(self, channels: int = 32, width: int = 128, dropout: float = 0.25, batch_norm: bool = False) -> None:
         super().__init__()
@@ -154,7 +154,7 @@ class FeatureBlock(nn.Module):
 
 
 class BoxRegressor(nn.Module):
-    """B.B.R. block: one number a slot, from the whole image (Figure 6b)."""
+    """B.B.R. block: one number for each slot, from the whole image (Figure 6b)."""
 
     def __init__(self, channels: int, n_slots: int, dropout: float) -> None:
         super().__init__()
@@ -178,7 +178,7 @@ class SlotsHead(nn.Module):
     """The paper's detection branch: five F.E. blocks, four B.B.R. blocks (Figure 7).
 
     Out: (B, n_slots, 4), each row the center column, center row, width and height of an upright box in the top view,
-    as shares of its width and height; zeros where no box is left.
+    as shares of its width and height; zeros in empty slots.
     """
 
     def __init__(self, c_in: int, n_slots: int, dropout: float) -> None:
@@ -212,7 +212,7 @@ class DenseHead(nn.Module):
         )
         self.coarse = nn.Sequential(
             FeatureBlock(32, 64, extra=True),  # -> (B, 64, 50, 25)
-            # Not pooled again: trucks need a wider view, but 25 columns do not halve.
+            # Not pooled again, though trucks need a larger receptive field: 25 columns are odd.
             conv_bn_elu(64, 64),
             conv_bn_elu(64, 64),
         )
@@ -226,7 +226,7 @@ class DenseHead(nn.Module):
 
 
 class SSADNet(nn.Module):
-    """Label every cell of a top view and box the vehicles in it.
+    """Labels every cell of a top view and boxes the vehicles in it.
 
     Parameters
     ----------
@@ -235,9 +235,9 @@ class SSADNet(nn.Module):
     head : {"slots", "dense"}
         The paper's regressor, or one prediction every four cells.
     n_slots : int
-        Boxes that head "slots" can return.
+        Number of boxes of head "slots".
     context_width : int
-        Channels inside the context module. They cost most of the time: 18.5 of 22.6 GMAC at 128.
+        Channels inside the context module, which takes most of the time: 18.5 of 22.6 GMAC at 128.
     dropout : float
         Probability of the spatial dropout in the context module and of the dropout in the B.B.R. blocks.
     batch_norm : bool
@@ -270,16 +270,16 @@ class SSADNet(nn.Module):
             self.detection = DenseHead(bridge)
         else:
             raise ValueError(f'head is {head!r}; expected "slots" or "dense"')
-        self._initialise(dropout)
+        self._initialize(dropout)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         logits, features = self.segmentation(x)
-        # The bridge. Under autocast the input must follow, or concatenation would turn all 35 channels to float32.
+        # The bridge. Under autocast, the input must have the type of the features, or all 35 channels become float32.
         boxes = self.detection(torch.cat([x.to(features.dtype), features], dim=1))
         return logits, boxes
 
-    def _initialise(self, dropout: float) -> None:
-        """Keep the signal's size through ELU and dropout, so that nine layers without batch norm train from scratch."""
+    def _initialize(self, dropout: float) -> None:
+        """Preserve the variance through ELU and dropout, so that nine layers without batch norm can be trained."""
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 fan_in = module.in_channels * module.kernel_size[0] * module.kernel_size[1]
@@ -288,7 +288,7 @@ class SSADNet(nn.Module):
                     nn.init.zeros_(module.bias)
         for module in self.segmentation.context.dilated:
             if isinstance(module, nn.Conv2d):
-                # Spatial dropout scales what it keeps, and so the variance, by 1 / (1 - p).
+                # Spatial dropout scales the kept channels, and so raises the variance, by 1 / (1 - p).
                 module.weight.data.mul_(math.sqrt(1.0 - dropout))
         nn.init.normal_(self.segmentation.classifier.weight, std=0.01)
         if isinstance(self.detection, DenseHead):
