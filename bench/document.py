@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from edgeperc import EdgepercError
-from edgeperc.atomic import write_whole
+from edgeperc.atomic import write_atomic
 
 from .samples import noise_floor, percentile, summary
 
@@ -43,7 +43,7 @@ class ReportError(EdgepercError):
 
 def write_report(document: Mapping[str, Any], path: Path) -> None:
     """Write a document as JSON."""
-    write_whole(path, json.dumps(document, allow_nan=False).encode() + b"\n")
+    write_atomic(path, json.dumps(document, allow_nan=False).encode() + b"\n")
 
 
 def read_report(path: Path) -> dict[str, Any]:

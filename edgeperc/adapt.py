@@ -2,7 +2,7 @@
 
 `condition` prepares every scan, once. Where the sensor's profile has a remission function, `render` replaces the
 remission by what the sensor that the models were trained on would report. `Interpolator` fills the pixels between
-neighbouring beams and columns of a coarser sensor; interpolated points are seen by the network and are in no result.
+neighboring beams and columns of a coarser sensor; interpolated points are seen by the network and are in no result.
 """
 
 from __future__ import annotations
@@ -164,18 +164,18 @@ def rendered_at(x: float, kind: int, coefficients: NDArray[np.float64]) -> float
 MIN_ANGLE_DEG = 5.0
 MAX_STEP_M = 0.5
 
-# Neighbouring rings on the road are metres apart. They are joined if both are near the ground and the line between them
+# Neighboring rings on the road are meters apart. They are joined if both are near the ground and the line between them
 # is level.
 GROUND_M = 0.3
 GROUND_PER_M = 0.02  # of range; the sensor is not quite level, nor is the road
 GROUND_SLOPE = 0.1
 
-# Up to this many pixels between neighbouring beams or columns there is no gap to fill.
+# Up to this many pixels between neighboring beams or columns there is no gap to fill.
 NO_GAP = 1.1
 
 
 class Interpolator:
-    """Fills the pixels of a range image between neighbouring beams and columns of a coarser sensor (KUL-Seg 5).
+    """Fills the pixels of a range image between neighboring beams and columns of a coarser sensor (KUL-Seg 5).
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ class Interpolator:
         Returns
         -------
         points : (n + m, 4) float32
-            The given points, then the interpolated ones: each on the line between two neighbours, in the middle of its
+            The given points, then the interpolated ones: each on the line between two neighbors, in the middle of its
             pixel.
         index : (H, W) int32
             Rows of these points; from n on, a pixel is interpolated.
@@ -251,7 +251,7 @@ class Interpolator:
 
 @njit(cache=True, nogil=True)
 def on_one_surface(points: NDArray[np.float32], i: int, j: int, ground_z: float) -> bool:
-    """Whether two neighbouring returns lie on one surface, or both on the ground."""
+    """Whether two neighboring returns lie on one surface, or both on the ground."""
     xi, yi, zi = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
     xj, yj, zj = np.float64(points[j, 0]), np.float64(points[j, 1]), np.float64(points[j, 2])
     range_i = math.sqrt(xi * xi + yi * yi + zi * zi)
@@ -292,9 +292,9 @@ def fill_between(
     directions : (2, W) float64
         Cosine and sine of each column's azimuth.
     row_reach : (H,) int64
-        Farthest row below, counted from this one, that may hold the neighbouring beam's return.
+        Farthest row below, counted from this one, that may hold the neighboring beam's return.
     col_reach : int
-        Farthest column to the right that may hold the neighbouring column's return.
+        Farthest column to the right that may hold the neighboring column's return.
     ground_z : float
         Height of the ground [m].
     """

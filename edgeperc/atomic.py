@@ -8,11 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-__all__ = ["open_whole", "write_whole"]
+__all__ = ["open_atomic", "write_atomic"]
 
 
 @contextmanager
-def open_whole(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
+def open_atomic(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """Open a temporary file in the target's folder; it replaces the target when the block ends without an error.
 
     Readers see the old file or the new one, never a part of it.
@@ -38,7 +38,7 @@ def open_whole(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
         aside.unlink(missing_ok=True)
 
 
-def write_whole(path: str | Path, content: bytes) -> None:
-    """Write a file at once, as `open_whole` does."""
-    with open_whole(path) as file:
+def write_atomic(path: str | Path, content: bytes) -> None:
+    """Write a file at once, as `open_atomic` does."""
+    with open_atomic(path) as file:
         file.write(content)

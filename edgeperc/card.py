@@ -1,4 +1,4 @@
-"""ModelCard: geometry, normalisation, classes and origin of a model. The only reader and writer of the card's JSON.
+"""ModelCard: geometry, normalization, classes and origin of a model. The only reader and writer of the card's JSON.
 
 A card is stored in the model file, under one ``metadata_props`` key, so that it cannot be separated from the weights.
 """
@@ -54,7 +54,7 @@ class TopViewGeometry:
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise CardError(f"view.{name} is {(low, high)}; expected two finite numbers, the lower first")
         if not (math.isfinite(self.cell_m) and self.cell_m > 0.0):
-            raise CardError(f"view.cell_m is {self.cell_m}; expected a positive number of metres")
+            raise CardError(f"view.cell_m is {self.cell_m}; expected a positive number of meters")
 
     @property
     def kind(self) -> str:
@@ -95,7 +95,7 @@ class TopViewGeometry:
         with np.errstate(invalid="ignore"):  # NaN and what int64 cannot hold are out of view
             return row.astype(np.int64), col.astype(np.int64), in_view
 
-    def cell_centres(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def cell_centers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """x (rows, 1) and y (1, cols) of the middles of the cells [m]."""
         # numpy's own float64: older stubs take a product with Python's float for any float
         cell_m = np.float64(self.cell_m)

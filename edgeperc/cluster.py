@@ -22,7 +22,7 @@ from .points import read_only
 
 __all__ = ["MIN_SCORE", "OBJECT_SIZE_M", "cluster_labels", "find_clusters", "join_boxes", "objects_from_points"]
 
-# Mean length, width and height [m] of KITTI's labelled objects.
+# Mean length, width and height [m] of KITTI's labeled objects.
 OBJECT_SIZE_M: Mapping[str, tuple[float, float, float]] = MappingProxyType(
     {
         "car": (3.89, 1.63, 1.53),
@@ -43,7 +43,7 @@ MIN_OF_WHOLE = 0.25
 COLUMN_EDGE = 0.50005
 RUN_GAP = 0.7
 MAX_COLUMNS = 2**26
-N_LAYERS = 1024  # each half a gap high, so that points of neighbouring layers of a column are linked; 179 m for 0.5 m
+N_LAYERS = 1024  # each half a gap high, so that points of neighboring layers of a column are linked; 179 m for 0.5 m
 
 N_ANGLES = 90
 MAX_FITTED = 256  # points that vote for a rectangle's heading
@@ -73,8 +73,8 @@ def find_clusters(
         The points to cluster, such as those above the ground; all by default.
     min_distance_m, distance_per_m : float
         Two points are linked if their distance is at most ``max(min_distance_m, distance_per_m * range)``, with the
-        range of the nearer one. ``distance_per_m`` is twice the angle [rad] between neighbouring beams, so that points
-        of neighbouring beams are linked at any range: 0.015 for an HDL-64E, 0.07 for a VLP-16. 0: one distance.
+        range of the nearer one. ``distance_per_m`` is twice the angle [rad] between neighboring beams, so that points
+        of neighboring beams are linked at any range: 0.015 for an HDL-64E, 0.07 for a VLP-16. 0: one distance.
     max_range_m : float
         Points with a larger x or y are in no cluster.
     min_points : int
@@ -96,7 +96,7 @@ def find_clusters(
     -----
     With ``distance_per_m=0`` and ``min_points=1`` these are exactly DBSCAN's clusters of ``min_samples=1``. Points are
     sorted into columns of half the distance; points of a column that follow each other closely in height are linked
-    without a test and form a run. Runs of neighbouring columns whose bounds are near enough are joined by the first
+    without a test and form a run. Runs of neighboring columns whose bounds are near enough are joined by the first
     pair of points that is. For 60,000 points in 8,000 runs, 60,000 pairs are tested.
     """
     if points.ndim != 2 or points.shape[1] < 3:
@@ -111,7 +111,7 @@ def find_clusters(
     ):
         raise PointsError(
             f"got min_distance_m={min_distance_m}, distance_per_m={distance_per_m} and max_range_m={max_range_m}; "
-            "expected a distance above 0 and no less than 1/2000 of the range, and 0 to 1 m more a metre"
+            "expected a distance above 0 and no less than 1/2000 of the range, and 0 to 1 m more a meter"
         )
     rows = read_only(points)
     chosen = read_only(np.ones(len(rows)) if among is None else among, np.bool_)

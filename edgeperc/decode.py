@@ -69,12 +69,12 @@ def decode_slots(
     *,
     model: str = "the model",
 ) -> list[Box]:
-    """Boxes as in the paper: axis-aligned, with the class that the segmentation has at their centre.
+    """Boxes as in the paper: axis-aligned, with the class that the segmentation has at their center.
 
     Parameters
     ----------
     slots : (1, K, 4) or (K, 4) float32
-        Centre column, centre row, extent across columns, extent along rows; shares of the image's width and height,
+        Center column, center row, extent across columns, extent along rows; shares of the image's width and height,
         from its far left corner.
     labels, scores : (H, W) uint8, (H, W) float32
         From `decode_classes`.
@@ -93,8 +93,8 @@ def decode_slots(
     Returns
     -------
     list of Box
-        Best score first, the earlier slot on ties; the score is the class's at the centre pixel. A slot is empty
-        when an extent is below 0.5 m, when its centre is out of view, or when no box class is there. The yaw is
+        Best score first, the earlier slot on ties; the score is the class's at the center pixel. A slot is empty
+        when an extent is below 0.5 m, when its center is out of view, or when no box class is there. The yaw is
         0 where the longer side points ahead, else pi/2.
 
     Raises
@@ -153,13 +153,13 @@ def decode_dense(
     max_boxes: int = 100,
     model: str = "the model",
 ) -> list[Box]:
-    """Oriented boxes from a heat map of centres with a box regressed at every cell.
+    """Oriented boxes from a heat map of centers with a box regressed at every cell.
 
     Parameters
     ----------
     dense : (1, 9, H / 4, W / 4) or (9, H / 4, W / 4) float32
-        Heat-map logit; centre's offset from the cell's centre in rows and columns [cells of this map]; logarithms of
-        length and width [m]; sine and cosine of twice the yaw; centre's z [m]; logarithm of the height [m].
+        Heat-map logit; center's offset from the cell's center in rows and columns [cells of this map]; logarithms of
+        length and width [m]; sine and cosine of twice the yaw; center's z [m]; logarithm of the height [m].
     class_output : (1, C, H, W) or (C, H, W) float32
     class_kind : {"class_logits", "class_probabilities"}
     geometry : TopViewGeometry
@@ -194,7 +194,7 @@ def decode_dense(
 
     Notes
     -----
-    The paper reads a box's class at its centre pixel of the segmentation map. Here the probabilities of the box
+    The paper reads a box's class at its center pixel of the segmentation map. Here the probabilities of the box
     classes are summed over all pixels of the footprint and the largest sum wins (the earlier box class on ties), so
     that one pixel, such as a hole in the roof or an edge between two classes, does not decide. With spreads, each sum
     is multiplied by the likelihood of the measured size (log-normal): from above, vans and cars differ only in size.
@@ -364,7 +364,7 @@ def fill_classes(
 
 @njit(cache=True, nogil=True)
 def mark_peaks(heat: NDArray[np.float32], threshold: float, peak: NDArray[np.bool_]) -> None:
-    """Mark the cells that no neighbour exceeds.
+    """Mark the cells that no neighbor exceeds.
 
     Parameters
     ----------
@@ -372,7 +372,7 @@ def mark_peaks(heat: NDArray[np.float32], threshold: float, peak: NDArray[np.boo
     threshold : float
         Cells below it are not peaks.
     peak : (H, W) bool, overwritten
-        Of equal neighbours the earlier, row by row, is the peak.
+        Of equal neighbors the earlier, row by row, is the peak.
     """
     height, width = heat.shape
     for row in range(height):
@@ -398,7 +398,7 @@ def fill_footprint_sums(
     cell: float,
     sums: NDArray[np.float64],
 ) -> None:
-    """Sum each class's probability over the pixels whose centres lie in a rectangle.
+    """Sum each class's probability over the pixels whose centers lie in a rectangle.
 
     Parameters
     ----------
@@ -412,7 +412,7 @@ def fill_footprint_sums(
     cell : float
         Edge of a pixel [m].
     sums : (n, C) float64, overwritten
-        For a rectangle without a pixel's centre, the nearest pixel in view is taken.
+        For a rectangle without a pixel's center, the nearest pixel in view is taken.
     """
     n_classes, height, width = values.shape
     pixel = np.empty(n_classes)

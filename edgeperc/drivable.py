@@ -1,6 +1,6 @@
 """The road in a top view for a planner: its outline as a polygon, the free distance, the lane width.
 
-Everything is in the sensor frame, metres: x forward, y left. Cells without returns have the class that the network gave
+Everything is in the sensor frame, meters: x forward, y left. Cells without returns have the class that the network gave
 them; nothing is known outside the view.
 """
 
@@ -104,7 +104,7 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
     (31.4, 3.1)
     """
     if not tolerance_m >= 0.0:
-        raise PointsError(f"tolerance_m is {tolerance_m}; expected 0 or more metres")
+        raise PointsError(f"tolerance_m is {tolerance_m}; expected 0 or more meters")
     drivable = np.ascontiguousarray(top_view.drivable)
     standing = list(boxes)
     if standing:

@@ -17,7 +17,7 @@ from .sensor import SensorProfile
 
 __all__ = ["FitnessProfile", "check_fitness", "fill_scan_sums"]
 
-# About 6,000 points are enough. Steps are prime, so that they do not align with the rows of an organised scan.
+# About 6,000 points are enough. Steps are prime, so that they do not align with the rows of an organized scan.
 _STEPS = np.array([1, 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 53, 61, 71, 83, 97, 127, 167, 223, 307, 401])
 _SAMPLE, _BEAM_SAMPLE = 6000, 130_000
 
@@ -405,7 +405,7 @@ def _too_few(scan: _Measures, profile: FitnessProfile) -> str:
     )
 
 
-_UNITS = (("millimetres", 1e3), ("centimetres", 1e2), ("kilometres", 1e-3))
+_UNITS = (("millimeters", 1e3), ("centimeters", 1e2), ("kilometers", 1e-3))
 
 
 def _geometry_findings(scan: _Measures, profile: FitnessProfile, sensor: SensorProfile) -> list[str]:
@@ -415,7 +415,7 @@ def _geometry_findings(scan: _Measures, profile: FitnessProfile, sensor: SensorP
         unit = next((name for name, size in _UNITS if 0.2 * size < factor < 5.0 * size), "another unit")
         return [
             f"The median distance is {scan.range_median_m:.3g}, in training it was {near:.0f} to {far:.0f} m: "
-            f"the coordinates seem to be in {unit}; convert them to metres."
+            f"the coordinates seem to be in {unit}; convert them to meters."
         ]
     if scan.flat_axis is not None:
         towards = ("+" if scan.flat_m > 0.0 else "-") + "xyz"[scan.flat_axis]

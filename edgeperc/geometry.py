@@ -1,6 +1,6 @@
 """Rectangles on the ground: overlap, suppression, drawing, points inside.
 
-A rectangle is a row ``x, y, length, width, yaw``: centre [m], extent along and across the heading [m], heading about
+A rectangle is a row ``x, y, length, width, yaw``: center [m], extent along and across the heading [m], heading about
 +z from +x [rad].
 """
 
@@ -35,7 +35,7 @@ def draw_footprints(
 ) -> None:
     """Draw the footprints of boxes over top-view labels, in place (SSADNet 3.1.2).
 
-    A cell belongs to a box when its centre lies in the footprint; the nearer of two boxes wins. Boxes of other classes
+    A cell belongs to a box when its center lies in the footprint; the nearer of two boxes wins. Boxes of other classes
     are left out.
 
     Parameters
@@ -46,7 +46,7 @@ def draw_footprints(
     classes : sequence of str
         Names of the labels; a footprint gets the number of its box's class.
     """
-    all_x, all_y = view.cell_centres()
+    all_x, all_y = view.cell_centers()
     for box in sorted(boxes, key=lambda box: -math.hypot(box.center[0], box.center[1])):
         if box.label not in classes:
             continue
@@ -155,7 +155,7 @@ def bounding_rectangles(rectangles: ArrayLike) -> NDArray[np.float64]:
     Returns
     -------
     (n, 5) float64
-        Same centres; extent along x, extent along y; yaw 0.
+        Same centers; extent along x, extent along y; yaw 0.
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 One plane fits a car park; a street climbs, leans and has kerbs. `find_ground` divides the scan into cells and keeps the
 lowest return of each. RANSAC fits a plane to these in each region, from the vehicle outwards; each region starts from
-the planes of its neighbours. Where the lowest returns of a few cells agree on a step off the plane, such as a
+the planes of its neighbors. Where the lowest returns of a few cells agree on a step off the plane, such as a
 pavement, the ground follows them.
 """
 
@@ -20,7 +20,7 @@ from .points import read_only
 
 __all__ = ["Ground", "find_ground"]
 
-# 256 x 256 cells of half a metre, in 16 x 16 regions of 16 x 16 cells. Farther out, few rays meet the ground.
+# 256 x 256 cells of half a meter, in 16 x 16 regions of 16 x 16 cells. Farther out, few rays meet the ground.
 CELL_M = 0.5
 N_CELLS = 256
 CELLS_A_REGION = 16
@@ -35,7 +35,7 @@ MAX_MOUNT_ERROR_M = 0.5
 MIN_FIRST_SUPPORT = 30  # cells
 N_FIRST_HYPOTHESES = 100
 
-# The planes of the regions, relative to the plane expected from their neighbours.
+# The planes of the regions, relative to the plane expected from their neighbors.
 MAX_BEND = 0.12  # change of slope
 MAX_SHIFT_M = 0.5
 BAND_M = 0.8  # cells farther from the expected plane are ignored
@@ -111,7 +111,7 @@ def find_ground(
     it; a cell whose lowest return is below votes against it. Nothing is seen under the ground, so a plane through
     hedges or a row of car roofs wins only where they hide more than two thirds of the cells. The first plane is
     searched within 20 m of the sensor, near the mounting height. Each region of 8 x 8 m then starts from the mean of
-    its solved neighbours, may differ in slope by 0.12, and is refined by least squares with the neighbours' slope as a
+    its solved neighbors, may differ in slope by 0.12, and is refined by least squares with the neighbors' slope as a
     weak prior, because a far region may hold a single ring of returns. Heights are interpolated between the middles of
     regions. Last, the ground moves to the mean of the lowest returns within 0.3 m in 5 x 5 cells, so that it follows
     kerbs and banks.
@@ -124,7 +124,7 @@ def find_ground(
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
     if not (0.0 < mount_height_m < math.inf and 0.0 < max_height_m < math.inf):
         raise PointsError(
-            f"got mount_height_m={mount_height_m} and max_height_m={max_height_m}; expected metres above 0"
+            f"got mount_height_m={mount_height_m} and max_height_m={max_height_m}; expected meters above 0"
         )
     rows = read_only(points)
     cell = np.empty(len(rows), dtype=np.int32)
@@ -270,7 +270,7 @@ def fill_residuals(
 ) -> int:
     """Write x, y about the middle and z above the expected plane for the lowest returns of size x size cells.
 
-    Those farther from the plane than ``band``, and ``cone`` for every metre from the middle, are left out. Returns how
+    Those farther from the plane than ``band``, and ``cone`` for every meter from the middle, are left out. Returns how
     many were written.
     """
     n = 0

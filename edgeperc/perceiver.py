@@ -136,7 +136,7 @@ class Perceiver:
         what the training sensor would report, where its profile has a function. ``"interpolation"``: fill the range
         image between its beams and columns, where it has fewer. Scans of the training sensor are not changed.
     boxes_from : {"both", "network", "clusters"}
-        ``"network"``: boxes of a top-view model, vehicles ahead. ``"clusters"``: boxes around clusters of labelled
+        ``"network"``: boxes of a top-view model, vehicles ahead. ``"clusters"``: boxes around clusters of labeled
         points above the ground, of every class and everywhere in the range image
         (`edgeperc.cluster.objects_from_points`). ``"both"``: use both. A cluster's box is dropped where it overlaps a
         network's box, or where the network detects its class.
@@ -218,7 +218,7 @@ class Perceiver:
         self.boxes_from = boxes_from
         self.full_turn = full_turn
         gaps_deg = [upper - lower for upper, lower in pairwise(self.sensor.elevations_deg)]
-        # So that neighbouring beams and columns on one object are linked, also with one missing between them.
+        # So that neighboring beams and columns on one object are linked, also with one missing between them.
         self._distance_per_m = 2.0 * math.radians(max(np.median(gaps_deg or [0.0]), 360.0 / self.sensor.columns))
         self._networks = [
             self._load(Session(model, provider, precision=precision, n_threads=n_threads)) for model in wanted
@@ -267,7 +267,7 @@ class Perceiver:
         ----------
         points : (n, 4) or (n, 3) array_like, or a structured array
             x, y, z [m] in the sensor frame, remission in the sensor's raw unit. Left unchanged. Rows that are not
-            finite are counted, labelled 0 and otherwise ignored; an empty scan gives an empty perception.
+            finite are counted, labeled 0 and otherwise ignored; an empty scan gives an empty perception.
         stamp_s : float or None
             Time of the scan [s], for the tracker; returned in the perception.
 
@@ -373,9 +373,9 @@ class Perceiver:
         watch.lap("decode")
         edges_meet = card.view.azimuth_left_deg - card.view.azimuth_right_deg == 360.0
         cleaned = remove_outliers(scan, network.index, labels, card.classes, full_turn=edges_meet)
-        labelled = label_points(scan, pixel, network.index, cleaned, full_turn=edges_meet)
+        labeled = label_points(scan, pixel, network.index, cleaned, full_turn=edges_meet)
         watch.lap("refine")
-        return PointLabels(labelled, pixel >= 0, card.classes)
+        return PointLabels(labeled, pixel >= 0, card.classes)
 
     def _label_full_turn(
         self, network: _Network, scan: NDArray[np.float32], watch: _Stopwatch, infer: bool

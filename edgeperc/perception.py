@@ -1,4 +1,4 @@
-"""Frozen results, in the sensor frame (x forward, y left, z up, metres, radians)."""
+"""Frozen results, in the sensor frame (x forward, y left, z up, meters, radians)."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class TopView:
 
     @property
     def drivable(self) -> NDArray[np.bool_]:
-        """Cells labelled drivable, (rows, columns) bool; all False if the model has no such class."""
+        """Cells labeled drivable, (rows, columns) bool; all False if the model has no such class."""
         if "drivable" not in self.classes:
             return np.zeros(self.labels.shape, dtype=np.bool_)
         return self.labels == self.classes.index("drivable")
@@ -118,8 +118,8 @@ class TopView:
         """Area of the drivable cells [m2]."""
         return float(np.count_nonzero(self.drivable)) * self.cell_m**2
 
-    def to_metres(self, row: float, col: float) -> tuple[float, float]:
-        """Centre of a cell as x, y [m] in the sensor frame."""
+    def to_meters(self, row: float, col: float) -> tuple[float, float]:
+        """Center of a cell as x, y [m] in the sensor frame."""
         return self.x_range_m[1] - (row + 0.5) * self.cell_m, self.y_range_m[1] - (col + 0.5) * self.cell_m
 
 
@@ -155,7 +155,7 @@ class Perception:
     n_points : int
         Points in the input.
     n_dropped : int
-        Input points that are not finite; they are labelled 0 and otherwise ignored.
+        Input points that are not finite; they are labeled 0 and otherwise ignored.
     points : PointLabels or None
         From a range-image model; None without one.
     top_view : TopView or None

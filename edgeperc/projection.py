@@ -1,7 +1,7 @@
 """Points -> the network's input, and the way back from its pixels to the points.
 
 Two views: the ground ahead seen from above (`TopViewProjector`) and the scan seen from the sensor
-(`RangeImageProjector`). Both write normalised pixels straight into the network's input buffer.
+(`RangeImageProjector`). Both write normalized pixels straight into the network's input buffer.
 
 Every decision about a pixel is taken in float32, one rounding an operation, so that compiled and interpreted
 runs, and any other implementation that follows the same steps, agree to the last pixel.
@@ -384,7 +384,7 @@ class TopViewProjector:
 class RangeImageProjector:
     """Points -> the scan as the sensor sees it (PointSeg 3.1). Row 0 is the top beam, column 0 leftmost.
 
-    A point's row is the beam whose elevation is nearest; the outermost beams reach half a neighbour spacing
+    A point's row is the beam whose elevation is nearest; the outermost beams reach half a neighbor spacing
     beyond themselves. Its column comes from its azimuth, atan2(y, x). Pixels are half-open: each holds its upper
     and its left edge. The nearest point wins a pixel (by its squared range in float32), the earlier point wins a
     tie. Points on the sensor's vertical axis have no azimuth and are out of view.
@@ -395,7 +395,7 @@ class RangeImageProjector:
     ----------
     view : RangeImageGeometry
     input : InputSpec
-        Channels, any of ``"x"``, ``"y"``, ``"z"``, ``"remission"``, ``"range"`` in any order, metres.
+        Channels, any of ``"x"``, ``"y"``, ``"z"``, ``"remission"``, ``"range"`` in any order, meters.
 
     Raises
     ------

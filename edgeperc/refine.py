@@ -1,7 +1,7 @@
 """Pixel labels -> point labels: outliers removed by consensus (PointSeg 5.2), then labels carried to all points.
 
-A network labels pixels, and labels of objects bleed over their edges onto what is behind, because neighbouring pixels
-may be metres apart. `remove_outliers` removes this bleeding; `label_points` then carries the labels to all points,
+A network labels pixels, and labels of objects bleed over their edges onto what is behind, because neighboring pixels
+may be meters apart. `remove_outliers` removes this bleeding; `label_points` then carries the labels to all points,
 also to those that share a pixel with a nearer point.
 """
 
@@ -21,7 +21,7 @@ from .points import read_only
 __all__ = ["OBJECT_RADIUS_M", "label_points", "remove_outliers"]
 
 # Half of an object's diagonal seen from above, and a margin because the mean of the visible side is not its middle. On
-# 90 labelled KITTI frames, car IoU was 0.888, 0.884, 0.878 and 0.872 for 2.5, 3, 3.5 and 4.5 m where masks were dilated
+# 90 labeled KITTI frames, car IoU was 0.888, 0.884, 0.878 and 0.872 for 2.5, 3, 3.5 and 4.5 m where masks were dilated
 # by a pixel, and 0.990, 0.991, 0.993 and 0.993 where they were right: below 3.5 m vans and trucks lose points.
 OBJECT_RADIUS_M: Mapping[str, float] = MappingProxyType({"car": 3.5, "pedestrian": 0.7, "cyclist": 1.2})
 
@@ -47,7 +47,7 @@ def remove_outliers(
     radius_m: Mapping[str, float] = OBJECT_RADIUS_M,
     full_turn: bool = False,
 ) -> NDArray[np.uint8]:
-    """Set to background the pixels whose points lie away from the object they were labelled with.
+    """Set to background the pixels whose points lie away from the object they were labeled with.
 
     Parameters
     ----------
@@ -77,14 +77,14 @@ def remove_outliers(
     Notes
     -----
     PointSeg 5.2 refines its back projection by RANSAC but does not name a model; this one is our own. Connected
-    pixels of one label (8 neighbours), at any range, are a component, so that bleeding pixels stay with their object.
+    pixels of one label (8 neighbors), at any range, are a component, so that bleeding pixels stay with their object.
     A hypothesis is a sampled point; its consensus are the component's points within the class's radius, seen from
     above, of the mean of the points within that radius of the sample. The largest consensus is an object. The rest
     is searched in the same way: it is another object (the next car of a row) if its consensus has 5 points and a
     tenth of them are more than 2 pixels from the objects found before. Otherwise all of the rest becomes background.
     At least one object of every component stays.
 
-    On 90 labelled KITTI frames, followed by `label_points`, point IoU of car, pedestrian and cyclist rises from
+    On 90 labeled KITTI frames, followed by `label_points`, point IoU of car, pedestrian and cyclist rises from
     0.81, 0.63, 0.66 to 0.88, 0.86, 0.87 for masks dilated by one pixel, from 0.71, 0.47, 0.54 to 0.80, 0.74, 0.81
     for two, and falls by at most 0.002 for masks that were right. Removing points near a ground plane as well took
     more from the objects' feet than from the ground.
@@ -136,7 +136,7 @@ def label_points(
 
     Notes
     -----
-    The vote is RangeNet++'s, restricted to hidden points. On 90 labelled KITTI frames with masks that were right,
+    The vote is RangeNet++'s, restricted to hidden points. On 90 labeled KITTI frames with masks that were right,
     it raises point IoU of car, pedestrian and cyclist from 0.946, 0.894, 0.881 to 0.994, 0.988, 0.997; windows of
     3 x 3 to 5 x 5, 1 to 5 votes, 0.5 to 1 m, Gaussian weights and distances in space were within 0.003 of that.
     """

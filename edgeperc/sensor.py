@@ -291,7 +291,7 @@ def _ouster(model: str, half_fov_deg: float, min_range_m: float, max_range_m: fl
 
 _BYTE = (0.0, 255.0)
 
-# `edgeperc fit-sensor`, from unlabelled scans. The logarithm was the best of three each time.
+# `edgeperc fit-sensor`, from unlabeled scans. The logarithm was the best of three each time.
 _OF_NUSCENES = RemissionFunction(
     "logarithm", (-0.2949, 0.1832), 255.0, "hdl-64e", 0.0209, "13 nuScenes scans, quantiles by range and incidence"
 )

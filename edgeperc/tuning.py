@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from .atomic import write_whole
+from .atomic import write_atomic
 from .errors import SettingsError
 
 __all__ = [
@@ -127,7 +127,7 @@ def write_settings(path: Path, machine: str, entries: Mapping[str, Mapping[str, 
     document: dict[str, Any] = _read(path) if path.exists() else {"schema": SCHEMA, "machines": {}}
     document["machines"].setdefault(machine, {}).update({sha: dict(entry) for sha, entry in entries.items()})
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, (json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n").encode())
+    write_atomic(path, (json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n").encode())
 
 
 def read_setting(path: Path, machine: str, digest: str) -> dict[str, Any] | None:

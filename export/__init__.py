@@ -1,1 +1,1 @@
-"""Train, export, quantise and verify the networks behind edgeperc's models (extra ``export``; needs torch)."""
+"""Train, export, quantize and verify the networks behind edgeperc's models (extra ``export``; needs torch)."""

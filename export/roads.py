@@ -135,7 +135,7 @@ def drawn_roads(path: Path = DRAWN) -> dict[str, NDArray[np.uint8]]:
 
 def with_road(surface: NDArray[np.uint8], road: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Ground truth over `SURFACE`, replaced by a drawn road's (400, 200) in the drawing's view."""
-    x, y = SURFACE.cell_centres()
+    x, y = SURFACE.cell_centers()
     row, col, drawn = VIEW.cells(x, y)
     return np.where(drawn, road[row % VIEW.height, col % VIEW.width], surface).astype(np.uint8)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeperc.atomic import open_whole
+from edgeperc.atomic import open_atomic
 from edgeperc.card import TopViewGeometry
 from edgeperc.evaluation.datasets import Frame
 from edgeperc.geometry import draw_footprints, inside
@@ -77,7 +77,7 @@ class LabeledScan:
         """Write an .npz file, without pickles."""
         boxes = np.array([[*b.center, *b.size, b.yaw] for b in self.boxes], np.float32).reshape(-1, 7)
         names = np.array([b.label for b in self.boxes], dtype="U16")
-        with open_whole(path) as file:
+        with open_atomic(path) as file:
             np.savez(
                 file,
                 points=self.points,
@@ -105,13 +105,13 @@ class LabeledScan:
 
     def labeled(self, geometry: TopViewGeometry) -> NDArray[np.bool_]:
         """Cells of the labeled sector, (rows, cols) bool."""
-        x, y = geometry.cell_centres()
+        x, y = geometry.cell_centers()
         azimuth = np.arctan2(y, x)
         return (azimuth >= self.azimuths[0]) & (azimuth <= self.azimuths[1])
 
     def top_view_truth(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
         """SSADNet's segmentation truth (3.1.2): the surface, and over it vehicles; `IGNORE` where unknown."""
-        x, y = geometry.cell_centres()
+        x, y = geometry.cell_centers()
         if self.mirrored:
             y = -y
         cos, sin = np.cos(self.turn), np.sin(self.turn)

@@ -35,7 +35,7 @@ LOOKS = np.radians([0.0, 80.0, 160.0, 200.0, 280.0])
 def unlabeled_scans(objects: KittiObjects, fold: int | None) -> list[LabeledScan]:
     """The unlabeled scans of the training drives."""
     scans = []
-    for name in objects.unlabelled("train", fold=fold):
+    for name in objects.unlabeled("train", fold=fold):
         points = read_points(objects.root / "training/velodyne" / f"{name}.bin")
         points = points[np.isfinite(points).all(axis=1)]
         unknown = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from edgeperc.atomic import open_whole
+from edgeperc.atomic import open_atomic
 from edgeperc.card import CARD_KEY, Golden, ModelCard
 from edgeperc.decode import decode_classes, decode_top_view
 from edgeperc.errors import EdgepercError
@@ -139,7 +139,7 @@ def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
     del model.metadata_props[:]
     model.metadata_props.extend(kept)
     model.metadata_props.add(key=CARD_KEY, value=card.to_json())
-    with open_whole(path) as file:
+    with open_atomic(path) as file:
         file.write(model.SerializeToString(deterministic=True))
         file.flush()
         session = Session(Path(file.name), "cpu")

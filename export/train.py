@@ -20,7 +20,7 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from edgeperc.atomic import open_whole
+from edgeperc.atomic import open_atomic
 from edgeperc.evaluation.datasets import KittiObjects
 
 from .networks import build
@@ -145,7 +145,7 @@ def train(
         best_figure, lowest_loss, since_best, halvings = state["watched"]
 
     def save() -> None:
-        with open_whole(checkpoint) as file:
+        with open_atomic(checkpoint) as file:
             torch.save(
                 {
                     "recipe": json.dumps(asdict(recipe)),

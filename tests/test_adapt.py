@@ -238,7 +238,7 @@ def test_where_the_built_in_functions_come_from() -> None:
         (lambda d: d.update(schema=2), "schema 2, this edgeperc reads 1"),
         (lambda d: d.pop("schema"), "schema None"),
         (lambda d: d.pop("columns"), "holds exactly columns, elevations_deg"),
-        (lambda d: d.update(colour="red"), "got colour, columns"),
+        (lambda d: d.update(color="red"), "got color, columns"),
         (lambda d: d.update(columns="1800"), "where a number belongs"),
         (lambda d: d.update(columns=True), "where a number belongs"),
         (lambda d: d.update(elevations_deg=["1", 0]), "where a number belongs"),
@@ -393,7 +393,7 @@ def test_rings_on_the_ground_are_joined_and_roofs_are_not() -> None:
     rings = new_points(floor)
     assert len(rings) > 0
     np.testing.assert_allclose(rings[:, 2], -1.73, atol=1e-4)
-    # As far apart and as level, but a metre above the road: the bonnet of one car and the next one's.
+    # As far apart and as level, but a meter above the road: the bonnet of one car and the next one's.
     assert len(new_points(column(0, 0, *(0.73 / -e[2:4])))) == 0
     assert len(new_points(column(0, 0, *(0.73 / -e[2:4])), replace(COARSE, mount_height_m=0.73))) > 0
 

@@ -102,9 +102,9 @@ def test_an_object_behind_a_wall_is_not_pasted() -> None:
 def test_objects_are_not_pasted_into_one_another() -> None:
     bank = ObjectBank({"pedestrian": [post(10.0, 0.0)], "cyclist": [post(10.0, 0.0, "cyclist")]})
     out = pasted(flat_street(), bank, np.random.default_rng(3), 60, {"pedestrian": 1.0, "cyclist": 1.0})
-    centres = np.array([b.center[:2] for b in out.boxes])
-    apart = np.hypot(*(centres[:, None] - centres[None]).transpose(2, 0, 1)) + 9 * np.eye(len(centres))
-    assert len(centres) > 5
+    centers = np.array([b.center[:2] for b in out.boxes])
+    apart = np.hypot(*(centers[:, None] - centers[None]).transpose(2, 0, 1)) + 9 * np.eye(len(centers))
+    assert len(centers) > 5
     assert apart.min() > 0.7
     assert {b.label for b in out.boxes} == {"pedestrian", "cyclist"}
 

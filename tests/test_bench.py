@@ -111,7 +111,7 @@ def test_a_trend_is_least_squares() -> None:
     assert np.isnan(trend([1.0, 2.0], [1.0, 2.0]).slope)
 
 
-def test_a_trends_error_grows_where_neighbours_are_alike() -> None:
+def test_a_trends_error_grows_where_neighbors_are_alike() -> None:
     rng = np.random.default_rng(0)
     x, steps = np.arange(400.0), rng.normal(0.0, 1.0, 400)
     assert trend(x, np.repeat(steps[:20], 20)).error > 2.0 * trend(x, steps).error

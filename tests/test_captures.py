@@ -105,7 +105,7 @@ def test_clouds_of_whole_numbers() -> None:
 
 
 @pytest.mark.parametrize("row_padding", [0, 3, 16])
-def test_organised_clouds_are_read_row_by_row(row_padding: int) -> None:
+def test_organized_clouds_are_read_row_by_row(row_padding: int) -> None:
     message = cloud(POINTS, FLOATS, padding=4, height=2, row_padding=row_padding)
     np.testing.assert_array_equal(cloud_points(message), POINTS)
     message.data = message.data[: len(message.data) - row_padding]  # the last row's padding may be left out
@@ -369,10 +369,10 @@ def write_pcap(path: Path, payloads: Sequence[bytes], endian: str = "<") -> Path
     return path
 
 
-def vlp16_packets(n_turns: float, metres: float = 10.0, intensity: int = 77) -> list[bytes]:
+def vlp16_packets(n_turns: float, meters: float = 10.0, intensity: int = 77) -> list[bytes]:
     """A VLP-16 in a sphere: 12 blocks of two firings of 16 lasers a packet, 0.4 degrees from block to block."""
     hundredths = np.arange(int(n_turns * 900)) * 40
-    returns = struct.pack("<HB", round(metres / 0.002), intensity) * 32
+    returns = struct.pack("<HB", round(meters / 0.002), intensity) * 32
     packets = []
     for k in range(0, len(hundredths) - 11, 12):
         blocks = b"".join(b"\xff\xee" + struct.pack("<H", h % 36000) + returns for h in hundredths[k : k + 12])

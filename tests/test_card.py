@@ -96,7 +96,7 @@ def test_no_key_is_defaulted(key: str) -> None:
         ({"golden": {"seed": float("inf"), "input_sha256": "", "outputs": {}}}, "malformed"),
         ({"view": {"kind": "sphere"}}, "'sphere'.*top_view"),
         ({"view": 3}, "malformed"),
-        ({"input": {"name": "x", "channels": ["colour"], "mean": [0], "std": [1]}}, "colour"),
+        ({"input": {"name": "x", "channels": ["color"], "mean": [0], "std": [1]}}, "color"),
         ({"input": {"name": "x", "channels": ["height"], "mean": [0, 1], "std": [1]}}, "2 means"),
         ({"input": {"name": "x", "channels": ["height"], "mean": [0], "std": [0]}}, "positive deviations"),
     ],
@@ -167,7 +167,7 @@ def test_any_value_anywhere_is_read_or_refused(key: str, value: object) -> None:
 
 def test_places_and_cells_agree() -> None:
     view = TopViewGeometry()
-    x, y = view.cell_centres()
+    x, y = view.cell_centers()
     rows, cols, in_view = view.cells(x, y)
     assert in_view.all()
     np.testing.assert_array_equal(rows, np.broadcast_to(np.arange(400)[:, None], (400, 200))[:, :1])

@@ -37,7 +37,7 @@ import onnx
 from shapely import Polygon
 
 import twins.database
-from edgeperc.atomic import write_whole
+from edgeperc.atomic import write_atomic
 from edgeperc.card import CARD_KEY, InputSpec, ModelCard, OutputSpec, TopViewGeometry
 from edgeperc.errors import CardMismatchError, MissingExtraError
 from edgeperc.evaluation.datasets import KittiObjects
@@ -170,7 +170,7 @@ def test_a_picture_of_anything_is_its_twin(points: np.ndarray) -> None:
     np.testing.assert_array_equal(picture(points), twins.database.picture(points))
 
 
-def test_metres_are_rounded_and_clamped() -> None:
+def test_meters_are_rounded_and_clamped() -> None:
     """Section 3.1: nearest whole pixel, then 0..399 and 0..199."""
     for (x, y), (row, col) in {
         (6.04, 0.0): (399, 99), (6.06, 0.0): (398, 99), (45.94, 0.0): (0, 99), (46.0, 0.0): (0, 99),
@@ -512,10 +512,10 @@ def test_stopped_at_every_write_and_resumed_it_is_the_same(
                 aside.write_bytes(content[: len(content) // (1 + stops % 2)])
             raise Power
         left -= 1
-        write_whole(path, content)
+        write_atomic(path, content)
 
     for module in (build_module, scenes_module):
-        monkeypatch.setattr(module, "write_whole", failing)
+        monkeypatch.setattr(module, "write_atomic", failing)
     while True:
         left = 3 + 7 * stops % 13  # a scene writes four files, a drawn one up to twelve
         try:
@@ -536,14 +536,14 @@ def test_stopped_at_every_write_and_resumed_it_is_the_same(
 KILLED = """
 import sys
 from pathlib import Path
-from edgeperc.atomic import write_whole
+from edgeperc.atomic import write_atomic
 from edgeperc_export.database import build as build_module, scenes
 
 def announced(path, content):
     print(path.name, flush=True)
-    write_whole(path, content)
+    write_atomic(path, content)
 
-build_module.write_whole = scenes.write_whole = announced
+build_module.write_atomic = scenes.write_atomic = announced
 kitti, out, model, polygons = sys.argv[1:]
 print("ready", flush=True)
 plan = scenes.Plan(Path(kitti), Path(out), model, provider="cpu", variations=3)

@@ -55,7 +55,7 @@ def objects(tmp_path: Path, calibration: Calibration, *lines: str) -> tuple[tupl
 
 def test_a_box_comes_into_the_sensor_frame(tmp_path: Path, calibration: Calibration) -> None:
     # 1.5 m high, 1.6 m wide, 4 m long, facing right; 20 m ahead of the sensor, 3 m to the right.
-    boxes, unlabelled = objects(
+    boxes, unlabeled = objects(
         tmp_path,
         calibration,
         "Car 0 0 0 600 150 700 250 1.5 1.6 4.0 3.0 1.65 19.73 0.0",
@@ -65,7 +65,7 @@ def test_a_box_comes_into_the_sensor_frame(tmp_path: Path, calibration: Calibrat
     assert (box.label, box.size) == ("car", (4.0, 1.6, 1.5))
     assert box.center == pytest.approx((20.0, -3.0, -1.73 + 0.75), abs=1e-6)
     assert box.yaw == pytest.approx(-math.pi / 2)  # ry = 0 is the camera's x axis: to the right
-    np.testing.assert_array_equal(unlabelled, [[10, 20, 30, 40]])
+    np.testing.assert_array_equal(unlabeled, [[10, 20, 30, 40]])
 
 
 @pytest.mark.parametrize("turn", [-2.0, -math.pi / 2, 0.3, 3.0])
@@ -82,8 +82,8 @@ def test_a_calibration_that_is_none(tmp_path: Path) -> None:
         Calibration.read(path)
 
 
-def frame(calibration: Calibration, points: np.ndarray, *boxes: Box, unlabelled: tuple = ()) -> Frame:
-    rectangles = np.array(unlabelled, np.float64).reshape(-1, 4)
+def frame(calibration: Calibration, points: np.ndarray, *boxes: Box, unlabeled: tuple = ()) -> Frame:
+    rectangles = np.array(unlabeled, np.float64).reshape(-1, 4)
     return Frame("0", "drive", "A", np.asarray(points, np.float32), boxes, rectangles, calibration)
 
 
@@ -105,14 +105,14 @@ def test_points_get_the_class_of_their_box(calibration: Calibration) -> None:
     np.testing.assert_array_equal(labels, [1, 1, 0, 3, IGNORE, IGNORE, IGNORE, 0])
 
 
-def test_nothing_is_known_where_nobody_labelled(calibration: Calibration) -> None:
+def test_nothing_is_known_where_nobody_labeled(calibration: Calibration) -> None:
     point = np.array([[20.0, 0.0, -1.0, 0.0]])
     (pixel,), _ = calibration.to_image(point)
     around = (pixel[0] - 5, pixel[1] - 5, pixel[0] + 5, pixel[1] + 5)
     assert frame(calibration, point).point_labels()[0] == 0
-    assert frame(calibration, point, unlabelled=around).point_labels()[0] == IGNORE
+    assert frame(calibration, point, unlabeled=around).point_labels()[0] == IGNORE
     car = Box("car", 1.0, (20.0, 0.0, -1.0), (4.0, 2.0, 1.5), 0.0)
-    assert frame(calibration, point, car, unlabelled=around).point_labels()[0] == 1
+    assert frame(calibration, point, car, unlabeled=around).point_labels()[0] == 1
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, math.pi / 2, -2.2])
@@ -121,15 +121,15 @@ def test_drawn_footprints_agree_with_points_in_boxes(yaw: float) -> None:
     surface = np.ones((VIEW.height, VIEW.width), np.uint8)
     draw_footprints(surface, [box, replace(box, label="pedestrian", center=(40.0, 0.0, 0.0))], VIEW, TOP_VIEW_CLASSES)
     rows, cols = np.indices(surface.shape)
-    centres = np.stack([46 - (rows + 0.5) * 0.1, 10 - (cols + 0.5) * 0.1, 0 * rows], axis=-1).reshape(-1, 3)
-    np.testing.assert_array_equal(surface.ravel() == 4, inside(box, centres))
+    centers = np.stack([46 - (rows + 0.5) * 0.1, 10 - (cols + 0.5) * 0.1, 0 * rows], axis=-1).reshape(-1, 3)
+    np.testing.assert_array_equal(surface.ravel() == 4, inside(box, centers))
     assert set(np.unique(surface)) == {1, 4}
 
 
 def test_footprints_at_the_edge_are_cut() -> None:
     surface = np.zeros((VIEW.height, VIEW.width), np.uint8)
-    for centre in ((46.0, 0.0), (6.0, 10.0), (100.0, 0.0), (20.0, -10.0)):
-        draw_footprints(surface, [Box("car", 1.0, (*centre, 0.0), (4.0, 2.0, 1.5), 0.0)], VIEW, TOP_VIEW_CLASSES)
+    for center in ((46.0, 0.0), (6.0, 10.0), (100.0, 0.0), (20.0, -10.0)):
+        draw_footprints(surface, [Box("car", 1.0, (*center, 0.0), (4.0, 2.0, 1.5), 0.0)], VIEW, TOP_VIEW_CLASSES)
     assert surface[0, 95:105].all()
     assert surface[-1, 0] == 2
     assert surface[255:262, -1].all()

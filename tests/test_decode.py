@@ -83,7 +83,7 @@ def slots_for(slots, labels=None, scores=None):
     )
 
 
-def test_slots_become_boxes_in_metres():
+def test_slots_become_boxes_in_meters():
     labels, scores = np.zeros(SHAPE, dtype=np.uint8), np.zeros(SHAPE, dtype=np.float32)
     # A car 26 m ahead, 5 m to the left, 4 m along x; a truck 16 m ahead, 5 m right, lying across.
     labels[200, 50], scores[200, 50] = 2, 0.75
@@ -196,7 +196,7 @@ def test_dense_gives_back_what_was_put_in():
     assert decode_dense(dense_of(b, a), probabilities, "class_probabilities", VIEW, CLASSES, VEHICLES) == boxes
 
 
-def test_one_odd_pixel_at_the_centre_does_not_name_the_box():
+def test_one_odd_pixel_at_the_center_does_not_name_the_box():
     x, y = 26.05, 0.05
     row, col = pixel_of(x, y)
     logits = class_logits(
@@ -328,8 +328,6 @@ def test_the_papers_boxes_leave_the_map_alone():
     logits = class_logits((slice(100, 140), slice(50, 66), CLASSES.index("van"), 9.0))[0]
     slots = np.zeros((2, 4), np.float32)
     slots[0] = 58 / 200, 120 / 400, 20 / 200, 44 / 400
-    labels, (box,) = decode_top_view(
-        card, np.zeros(SHAPE, np.bool_), {"class_logits": logits, "box_slots": slots}, 0.3
-    )
+    labels, (box,) = decode_top_view(card, np.zeros(SHAPE, np.bool_), {"class_logits": logits, "box_slots": slots}, 0.3)
     assert box.label == "van"
     assert np.count_nonzero(labels == 3) == 40 * 16

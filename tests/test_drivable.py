@@ -123,14 +123,14 @@ def test_the_polygon_is_the_part_nearest_to_the_sensor(cells: NDArray[np.bool_])
         assert road.holes == ()
         return
     polygon = Polygon(road.outline, road.holes)
-    centres = {(row, col): top_view.to_metres(row, col) for row, col in np.argwhere(cells).tolist()}
-    nearest = min(centres, key=lambda cell: math.hypot(*centres[cell]))
+    centers = {(row, col): top_view.to_meters(row, col) for row, col in np.argwhere(cells).tolist()}
+    nearest = min(centers, key=lambda cell: math.hypot(*centers[cell]))
     part = twins.drivable.connected(cells, *nearest)
     for row in range(cells.shape[0]):
         for col in range(cells.shape[1]):
-            inside = polygon.buffer(1e-6).contains(Point(top_view.to_metres(row, col)))
-            assert inside == part[row, col] or math.hypot(*centres.get((row, col), (0, 0))) == pytest.approx(
-                math.hypot(*centres[nearest])
+            inside = polygon.buffer(1e-6).contains(Point(top_view.to_meters(row, col)))
+            assert inside == part[row, col] or math.hypot(*centers.get((row, col), (0, 0))) == pytest.approx(
+                math.hypot(*centers[nearest])
             )
     if polygon.is_valid:  # one that touches itself at a corner is not, to shapely
         assert polygon.exterior.is_ccw

@@ -105,9 +105,9 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
     return made
 
 
-def frame(*boxes: Box, points: list[list[float]] | None = None, drive: str = "a", unlabelled: Any = ()) -> Frame:
+def frame(*boxes: Box, points: list[list[float]] | None = None, drive: str = "a", unlabeled: Any = ()) -> Frame:
     scan = np.array(points or [[0.0, 0.0, 0.0, 0.0]], np.float32)
-    return Frame("000000", drive, "A", scan, boxes, np.array(unlabelled, np.float64).reshape(-1, 4), CAMERA)
+    return Frame("000000", drive, "A", scan, boxes, np.array(unlabeled, np.float64).reshape(-1, 4), CAMERA)
 
 
 def hits(at: Box, n: int, label: int = 1) -> list[list[float]]:
@@ -247,10 +247,10 @@ def test_cells_under_boxes(world: World) -> None:
     assert sum(bands[b]["n_cells"] for b in list(BANDS)[1:]) < row["n_cells"]  # some corners lie beyond 46 m
 
 
-def test_nothing_is_known_of_cells_nobody_labelled(world: World) -> None:
+def test_nothing_is_known_of_cells_nobody_labeled(world: World) -> None:
     judge = Judge(["ssadnet"])
     whole = judge.kitti(frame()).cells["vehicles from 3-D boxes"][1]
-    half = judge.kitti(frame(unlabelled=[[0, 0, 621, 375]])).cells["vehicles from 3-D boxes"][1]
+    half = judge.kitti(frame(unlabeled=[[0, 0, 621, 375]])).cells["vehicles from 3-D boxes"][1]
     assert (half[:, :99] == IGNORE).all()
     np.testing.assert_array_equal(half[:, 101:], whole[:, 101:])
 
@@ -273,7 +273,7 @@ def test_road_drawn_by_another_model(world: World) -> None:
 
 
 def test_road_by_hand(world: World) -> None:
-    # A row of cells 20 m ahead: four of road, a car, three of something else, and one that nobody labelled.
+    # A row of cells 20 m ahead: four of road, a car, three of something else, and one that nobody labeled.
     y = 5.05 - np.arange(9)
     points = np.stack([np.full(9, 20.05), y, np.full(9, -1.7), np.zeros(9)], axis=1).astype(np.float32)
     scan = RoadFrame("00/000000", "b", points, np.array([1, 1, 1, 1, 2, 0, 0, 0, IGNORE], np.uint8))

@@ -222,7 +222,7 @@ def test_the_papers_recipes_are_theirs() -> None:
 
 @pytest.fixture(scope="module")
 def kitti(tmp_path_factory: pytest.TempPathFactory, scans: list[np.ndarray]) -> Path:
-    """A KITTI object set, simulated: a labeled frame of fold 0, of fold 1 and of a test drive, and one unlabelled."""
+    """A KITTI object set, simulated: a labeled frame of fold 0, of fold 1 and of a test drive, and one unlabeled."""
     root = tmp_path_factory.mktemp("kitti")
     for part in ("velodyne", "label_2", "calib"):
         (root / "training" / part).mkdir(parents=True)

@@ -161,5 +161,5 @@ def test_a_wrong_shape_is_refused(points):
 
 @pytest.mark.parametrize("option", [{"mount_height_m": 0.0}, {"mount_height_m": np.nan}, {"max_height_m": -1.0}])
 def test_an_impossible_height_is_refused(option):
-    with pytest.raises(PointsError, match="metres above 0"):
+    with pytest.raises(PointsError, match="meters above 0"):
         find_ground(np.zeros((3, 4), np.float32), **option)

@@ -84,9 +84,9 @@ def test_empty_slots_are_zero():
     assert slot_targets(np.empty((0, 7)), VIEW, 2).dtype == np.float32
 
 
-@pytest.mark.parametrize("centre", [(5.9, 0.0), (46.1, 0.0), (20.0, 10.1), (20.0, -10.1), (6.0, 0.0), (np.nan, 0.0)])
-def test_boxes_centred_outside_the_view_are_left_out(centre):
-    box = [(*centre, *CAR[2:])]
+@pytest.mark.parametrize("center", [(5.9, 0.0), (46.1, 0.0), (20.0, 10.1), (20.0, -10.1), (6.0, 0.0), (np.nan, 0.0)])
+def test_boxes_centered_outside_the_view_are_left_out(center):
+    box = [(*center, *CAR[2:])]
     assert not slot_targets(box, VIEW, 2).any()
     assert not dense_targets(box, VIEW).any()
 
@@ -111,7 +111,7 @@ def test_dense_target_of_one_box():
     np.testing.assert_allclose(target[1:, row, col], expected, atol=1e-5)
 
 
-def test_every_learning_cell_points_at_the_same_centre():
+def test_every_learning_cell_points_at_the_same_center():
     target = dense_targets([(26.13, 2.27, -0.8, 9.0, 3.0, 1.5, 0.3)], VIEW)
     rows, cols = np.nonzero(target[0] >= REGRESSED_FROM)
     assert len(rows) > 5
@@ -126,26 +126,26 @@ def test_heat_lies_along_the_box():
     ((row, col),) = np.argwhere(heat == 1.0)
     assert heat[row - 2, col - 2] == pytest.approx(heat[row + 2, col + 2])
     assert heat[row - 2, col - 2] > 0.5 > 0.1 > heat[row - 2, col + 2]
-    # The edge of the footprint, 4 m from the centre, is three standard deviations away.
+    # The edge of the footprint, 4 m from the center, is three standard deviations away.
     ahead = dense_targets([(26.0, 0.0, 0.0, 8.0, 2.0, 1.5, 0.0)], VIEW)[0]
     ((row, col),) = np.argwhere(ahead == 1.0)
     assert ahead[row - 10, col] == pytest.approx(np.exp(-4.5), rel=1e-5)
 
 
-def test_neighbours_keep_their_own_geometry():
+def test_neighbors_keep_their_own_geometry():
     near, far = (20.0, 0.1, -1.0, 4.0, 1.6, 1.5, 0.0), (21.7, 0.1, -0.5, 8.0, 2.4, 3.0, 0.0)
     for boxes in ([near, far], [far, near]):
         target = dense_targets(boxes, VIEW)
-        centres = np.argwhere(target[0] == 1.0)
-        assert len(centres) == 2
-        (far_row, far_col), (near_row, near_col) = centres  # farther ahead is higher up
+        centers = np.argwhere(target[0] == 1.0)
+        assert len(centers) == 2
+        (far_row, far_col), (near_row, near_col) = centers  # farther ahead is higher up
         assert target[7, far_row, far_col] == pytest.approx(-0.5)
         assert target[7, near_row, near_col] == pytest.approx(-1.0)
         alone = np.maximum(dense_targets([near], VIEW)[0], dense_targets([far], VIEW)[0])
         np.testing.assert_array_equal(target[0], alone)
 
 
-def test_unlabelled_cells_learn_nothing():
+def test_unlabeled_cells_learn_nothing():
     labeled = np.ones((400, 200), bool)
     labeled[:101] = False  # the 26th output row is only partly labeled
     heat = dense_targets([CAR, (44.0, 0.0, *CAR[2:])], VIEW, labeled=labeled)[0]
@@ -255,7 +255,7 @@ def test_the_focal_loss_of_a_pixel_is_its_formula(p, gamma, expected):
 
 
 @pytest.mark.parametrize("loss", [cross_entropy, lovasz_softmax, lambda x, y: pointseg_loss(x, y, lovasz_weight=1.0)])
-def test_nothing_labelled_costs_nothing(loss):
+def test_nothing_labeled_costs_nothing(loss):
     logits = torch.randn(2, 4, 3, 3, requires_grad=True)
     value = loss(logits, torch.full((2, 3, 3), IGNORE, dtype=torch.uint8))
     value.backward()

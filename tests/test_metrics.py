@@ -297,7 +297,7 @@ def test_ignored_boxes_and_regions_make_neither_right_nor_wrong():
             box(20.0, 0.0, score=0.8),  # an ignored object
             box(20.0, 0.3, "van", score=0.7),  # on the same, of another class
             box(30.0, 0.0, score=0.6),  # within a region
-            box(33.0, 0.0, score=0.5),  # half a metre of it within the region
+            box(33.0, 0.0, score=0.5),  # half a meter of it within the region
         ],
         [box(10.0, 0.0)],
         ignored=[box(20.0, 0.0)],

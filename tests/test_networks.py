@@ -606,7 +606,7 @@ def test_lodnn_edge_sees_as_far_for_a_twenty_seventh():
     network = on_meta(LoDNNEdge)
     cells = receptive_fields(EDGE_DILATIONS)[-1]
     whole = receptive_fields()[-1]
-    assert [0.4 * n for n in cells] == pytest.approx([0.2 * n for n in whole], abs=0.3)  # metres
+    assert [0.4 * n for n in cells] == pytest.approx([0.2 * n for n in whole], abs=0.3)  # meters
     shape = (1, 3, 400, 200)
     assert network(torch.empty(shape, device="meta")).shape == (1, 2, 400, 200)
     small, full = giga_macs(network, *shape), giga_macs(on_meta(LoDNN), *shape)

@@ -104,7 +104,7 @@ def test_the_rest_of_the_perception(perception: Perception, perceive: Perceiver)
     assert perception.top_view is not None
     assert perception.top_view.labels.shape == (400, 200)
     assert perception.top_view.classes == ("background", "drivable", "car", "van", "truck")
-    assert perception.top_view.to_metres(399, 0) == pytest.approx((6.05, 9.95))
+    assert perception.top_view.to_meters(399, 0) == pytest.approx((6.05, 9.95))
     assert set(perception.stage_ms) == {"check", "project", "infer", "decode", "refine", "cluster"}
     assert all(v >= 0.0 for v in perception.stage_ms.values())
     assert [*perception.providers] == ["ssadnet", "pointseg"]
@@ -278,13 +278,13 @@ def spoilt(points: NDArray[np.float32], how: str) -> NDArray[np.float32]:
             "no remission": np.c_[x, y, z, remission * 0],
             "upside down": np.c_[x, -y, -z, remission],
             "camera axes": np.c_[-y, -z, x, remission],
-            "millimetres": np.c_[x * 1000, y * 1000, z * 1000, remission],
+            "millimeters": np.c_[x * 1000, y * 1000, z * 1000, remission],
         }[how],
         dtype=np.float32,
     )
 
 
-FAULTS = ("remission 0..255", "no remission", "upside down", "camera axes", "millimetres")
+FAULTS = ("remission 0..255", "no remission", "upside down", "camera axes", "millimeters")
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -304,7 +304,7 @@ def test_a_wrong_set_up_can_be_an_error(scan: SimulatedScan, fault: str) -> None
 def test_a_wrong_set_up_can_be_ignored(scan: SimulatedScan) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        answer = Perceiver("pointseg", provider="cpu", on_mismatch="ignore")(spoilt(scan.points, "millimetres"))
+        answer = Perceiver("pointseg", provider="cpu", on_mismatch="ignore")(spoilt(scan.points, "millimeters"))
     assert answer.fitness == ()
 
 
@@ -459,7 +459,7 @@ def test_a_networks_boxes_are_vehicles_ahead(perceive: Perceiver, scan: Simulate
     assert Perceiver("pointseg", provider="cpu", boxes_from="network")(scan.points).boxes == ()
 
 
-def test_boxes_of_labelled_points_are_around_them(scan: SimulatedScan) -> None:
+def test_boxes_of_labeled_points_are_around_them(scan: SimulatedScan) -> None:
     perceive = Perceiver("pointseg", provider="cpu")
     answer = perceive(scan.points)
     assert answer.points is not None

@@ -136,5 +136,5 @@ def test_a_top_view_knows_where_its_cells_lie() -> None:
     view = TopView(np.zeros((400, 200), np.uint8), ("background", "drivable"), *VIEW)
     assert (view.geometry.height, view.geometry.width) == view.labels.shape
     for cell in ((0, 0), (399, 199), (17, 101)):
-        row, col, in_view = view.geometry.cells(*view.to_metres(*cell))
+        row, col, in_view = view.geometry.cells(*view.to_meters(*cell))
         assert ((int(row), int(col)), bool(in_view)) == (cell, True)

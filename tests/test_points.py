@@ -357,7 +357,7 @@ def test_values_beyond_float32_become_infinite():
     assert np.isinf(as_points([[1e300, 0.0, 0.0]])[0, 0])
 
 
-def test_structured_arrays_with_padding_and_rows_of_an_organised_cloud():
+def test_structured_arrays_with_padding_and_rows_of_an_organized_cloud():
     layout = np.dtype(
         {
             "names": ["x", "y", "z", "intensity", "ring", "rgb"],

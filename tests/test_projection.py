@@ -138,7 +138,7 @@ def test_a_point_lands_where_the_equations_say():
 
 
 @pytest.mark.parametrize("channels", [("height",), ("remission", "distance"), ("height", "distance", "remission")])
-def test_channels_are_normalised_in_the_order_asked_for(channels):
+def test_channels_are_normalized_in_the_order_asked_for(channels):
     mean, std = (10.0, 0.5, -1.0)[: len(channels)], (2.0, 0.25, 4.0)[: len(channels)]
     points = np.float32([[3.0, 4.0, 1.0, 0.5], [1.0, 1.0, 0.5, 1.5]])
     seen = check(points, VIEWS["coarse top view"], InputSpec("input", channels, mean, std))

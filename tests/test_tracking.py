@@ -1026,7 +1026,7 @@ Tr_velo_to_cam: 0.0 -1.0 0.0 0.0 0.0 0.0 -1.0 0.0 1.0 0.0 0.0 0.0
 
 @pytest.fixture
 def kitti(tmp_path: Path) -> Path:
-    """A sequence of a car that drives ahead, a van beside it, and a pedestrian whom nobody labelled."""
+    """A sequence of a car that drives ahead, a van beside it, and a pedestrian whom nobody labeled."""
     for folder in ("calib", "label_02", *(f"detections/pointrcnn_{of}" for of in ("Car", "Pedestrian", "Cyclist"))):
         (tmp_path / folder).mkdir(parents=True)
     (tmp_path / "calib/0000.txt").write_text(CALIBRATION)
@@ -1069,7 +1069,7 @@ def test_kitti_is_evaluated_by_its_rules(kitti: Path) -> None:
     assert (car["best"]["n_truth"], car["best"]["n_false"], car["best"]["n_switches"]) == (20, 0, 0)
     assert car["best"]["mota"] == 1.0
     assert car["hota"]["assa"] > 0.9
-    assert pedestrian["best"]["n_false"] == 0  # it stands where nothing was labelled
+    assert pedestrian["best"]["n_false"] == 0  # it stands where nothing was labeled
     assert (seen, figures["sequences"]) == ([(1, 1)], ["0000"])
 
 
@@ -1151,7 +1151,7 @@ def drive_root(kitti: Path, tmp_path: Path) -> Path:
         (root / f"training/track_id/{name}.txt").write_text("".join(words[1] + "\n" for words in labels))
         (root / f"training/calib/{name}.txt").write_text(CALIBRATION)
         (root / f"training/velodyne/{name}.bin").write_bytes(np.full((3, 4), 0.5 + k, np.float32).tobytes())
-    (root / "frames.csv").write_text("\n".join([*rows, "000000,unlabelled_drive"]) + "\n")
+    (root / "frames.csv").write_text("\n".join([*rows, "000000,unlabeled_drive"]) + "\n")
     return root
 
 

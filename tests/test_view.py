@@ -284,8 +284,8 @@ def some_mistakes(points: np.ndarray, **given) -> Mistakes:
     return Mistakes("000123", "drive_0011", points, np.zeros(len(points), np.uint8), **given)
 
 
-def amount(picture: np.ndarray, colour: str) -> int:
-    wanted = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+def amount(picture: np.ndarray, color: str) -> int:
+    wanted = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
     return int((np.abs(picture - wanted) <= 12).all(axis=2).sum())
 
 

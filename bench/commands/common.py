@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgeperc.atomic import write_whole
+from edgeperc.atomic import write_atomic
 from edgeperc.extras import require
 from edgeperc.tuning import fingerprint
 from edgeperc.zoo import DEFAULT
@@ -69,9 +69,9 @@ def _write(document: Mapping[str, Any], json: Path | None, md: Path | None, html
     if json:
         write_report(document, json)
     if md:
-        write_whole(md, markdown(parts, title).encode())
+        write_atomic(md, markdown(parts, title).encode())
     if html:
-        write_whole(html, html_page(parts, title, plots.pictures(document)).encode())
+        write_atomic(html, html_page(parts, title, plots.pictures(document)).encode())
 
 
 def prepare_input(arguments: argparse.Namespace, folder: Path, document: dict[str, Any], live: LiveTable) -> Input:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from edgeperc.atomic import write_whole
+from edgeperc.atomic import write_atomic
 from edgeperc.extras import require
 
 from .. import plots
@@ -174,6 +174,6 @@ def _plot(curves: Mapping[str, Curve], path: Path) -> None:
         axes.plot(*np.array(curve, np.float64).reshape(-1, 2).T, marker="o", color=plots.BLUE)
         axes.set(xlabel=kind, ylabel="scans a second" if kind == "processes" else "median ms", ylim=(0.0, None))
     if path.suffix == ".svg":
-        write_whole(path, plots.as_svg(figure).encode())
+        write_atomic(path, plots.as_svg(figure).encode())
     else:
         figure.savefig(path, dpi=150)

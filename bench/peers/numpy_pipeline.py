@@ -124,7 +124,7 @@ def dense_boxes(card: ModelCard, logits: NDArray[np.float32], dense: NDArray[np.
     x, y = view.x_range_m[1] - (rows + 0.5 + d_row) * cell_m, view.y_range_m[1] - (cols + 0.5 + d_col) * cell_m
     sizes, yaw = np.exp([log_l, log_w, log_h]).T, 0.5 * np.arctan2(sin, cos)
     boxes: list[Box] = []
-    all_x, all_y = (centers.reshape(-1) for centers in view.cell_centres())
+    all_x, all_y = (centers.reshape(-1) for centers in view.cell_centers())
     for k in range(len(rows)):
         place, size = (float(x[k]), float(y[k]), float(z[k])), tuple(sizes[k].tolist())
         box = Box("", float(1.0 / (1.0 + math.exp(-score[k]))), place, size, float(yaw[k]))

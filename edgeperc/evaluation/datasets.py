@@ -125,7 +125,7 @@ class Frame:
     points : (n, 4) float32
     boxes : tuple of Box
         In the sensor frame, labels in lower case (car, van, truck, pedestrian, person_sitting, cyclist, tram, misc).
-    unlabelled : (k, 4) float64
+    unlabeled : (k, 4) float64
         Image rectangles (left, top, right, bottom) whose objects are not labeled (DontCare).
     calibration : Calibration
     """
@@ -135,7 +135,7 @@ class Frame:
     grade: str
     points: NDArray[np.float32]
     boxes: tuple[Box, ...]
-    unlabelled: NDArray[np.float64]
+    unlabeled: NDArray[np.float64]
     calibration: Calibration
 
     @cached_property
@@ -147,7 +147,7 @@ class Frame:
         """Whether the truth is known at places (n, 3+) in the sensor frame, (n,) bool."""
         known = self.calibration.in_image(points)
         pixel, _ = self.calibration.to_image(points)
-        for left, top, right, bottom in self.unlabelled:
+        for left, top, right, bottom in self.unlabeled:
             known &= ~((pixel[:, 0] >= left) & (pixel[:, 0] <= right) & (pixel[:, 1] >= top) & (pixel[:, 1] <= bottom))
         return known
 
@@ -161,14 +161,14 @@ class Frame:
 
 def read_objects(label_path: Path, calibration: Calibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
     """Boxes of a KITTI label file in the sensor frame, and its DontCare rectangles (SSADNet 3.1.1)."""
-    kinds, rows, unlabelled = [], [], []
+    kinds, rows, unlabeled = [], [], []
     for line in label_path.read_text().splitlines():
         values = line.split()
         if not values:
             continue
         kind, numbers = values[0], [float(v) for v in values[1:15]]
         if kind == "DontCare":
-            unlabelled.append(numbers[3:7])
+            unlabeled.append(numbers[3:7])
             continue
         kinds.append(kind.lower())
         rows.append(numbers[7:14])
@@ -177,7 +177,7 @@ def read_objects(label_path: Path, calibration: Calibration) -> tuple[tuple[Box,
         Box(kind, 1.0, (x, y, z), (length, width, height), yaw)
         for kind, (x, y, z, length, width, height, yaw) in zip(kinds, placed.tolist(), strict=True)
     )
-    return boxes, np.array(unlabelled, np.float64).reshape(-1, 4)
+    return boxes, np.array(unlabeled, np.float64).reshape(-1, 4)
 
 
 def scan_hash(points: NDArray[np.float32]) -> str:
@@ -224,7 +224,7 @@ class KittiObjects:
         """Names of the labeled scans of a split (`splits.in_split`) whose labels have one of the ``grades``."""
         return [r["name"] for r in self.rows if in_split(r["drive"], split, fold) and r.get("grade", "A") in grades]
 
-    def unlabelled(self, split: str, *, fold: int | None = None) -> list[str]:
+    def unlabeled(self, split: str, *, fold: int | None = None) -> list[str]:
         """Names of the scans of a split that have no label file."""
         labeled, scans = {row["name"] for row in self.rows}, self.root / "training/velodyne"
         names = [name for name, drive in self.drives.items() if name not in labeled and in_split(drive, split, fold)]
@@ -234,9 +234,9 @@ class KittiObjects:
         """Read a labeled scan with its labels and calibration."""
         row = next(row for row in self.rows if row["name"] == name)
         calibration = Calibration.read(self.root / "training/calib" / f"{name}.txt")
-        boxes, unlabelled = read_objects(self.root / "training/label_2" / f"{name}.txt", calibration)
+        boxes, unlabeled = read_objects(self.root / "training/label_2" / f"{name}.txt", calibration)
         points = read_points(self.root / "training/velodyne" / f"{name}.bin")
-        return Frame(name, row["drive"], row.get("grade", "A"), points, boxes, unlabelled, calibration)
+        return Frame(name, row["drive"], row.get("grade", "A"), points, boxes, unlabeled, calibration)
 
 
 def _frame_rows(root: Path) -> list[dict[str, str]]:

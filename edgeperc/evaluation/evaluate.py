@@ -1,4 +1,4 @@
-"""The papers' tables on labelled scans: points (PointSeg 5.1), boxes and top view (SSADNet 3.3, appendix A), road.
+"""The papers' tables on labeled scans: points (PointSeg 5.1), boxes and top view (SSADNet 3.3, appendix A), road.
 
 Scans go through `edgeperc.Perceiver`, so the figures are of what a user gets. Each scan leaves a small `Record` of
 counts. Every figure is computed from sums of records, and its interval from the same sums over resampled drives.
@@ -39,7 +39,7 @@ def evaluate(
     n_resamples: int = 1000,
     on_scan: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[dict[str, Any], list[Mistakes]]:
-    """Figures of models on labelled scans.
+    """Figures of models on labeled scans.
 
     Parameters
     ----------

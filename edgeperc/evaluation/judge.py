@@ -79,7 +79,7 @@ class Judge:
         if self.from_above is not None:
             assert isinstance(self.from_above.card.view, TopViewGeometry)
             self.view = self.from_above.card.view
-            self.cell_range_m = np.hypot(*np.broadcast_arrays(*self.view.cell_centres()))
+            self.cell_range_m = np.hypot(*np.broadcast_arrays(*self.view.cell_centers()))
         self.draw_road = None if road_by is None else _perceiver([road_by], provider, precision)
         cards = [*self.perceive.cards]
         if self.draw_road is not None:

@@ -41,8 +41,8 @@ CLASSES = ("car", "pedestrian", "cyclist")
 KINDS = {**{of: (of,) for of in CLASSES}, "vehicle": ("car", "van", "truck")}
 
 # From KITTI's evaluation: labels that may be confused with each class, and limits of objects to find.
-NEIGHBOURS = {"car": ("van",), "pedestrian": ("person", "person_sitting"), "cyclist": (), "vehicle": ("tram", "misc")}
-MAX_OCCLUSION, MAX_TRUNCATION, MIN_HEIGHT_PX, MIN_UNLABELLED = 2, 0, 25.0, 0.5
+NEIGHBORS = {"car": ("van",), "pedestrian": ("person", "person_sitting"), "cyclist": (), "vehicle": ("tram", "misc")}
+MAX_OCCLUSION, MAX_TRUNCATION, MIN_HEIGHT_PX, MIN_UNLABELED = 2, 0, 25.0, 0.5
 FRAME_S = 0.1
 
 
@@ -57,7 +57,7 @@ class TrackingSequence:
         By frame, of all classes, in the sensor frame. Scores are in 0..1.
     truth : mapping of str to tuple of FrameTruth
         By class and frame.
-    unlabelled : tuple of (k, 4) float64
+    unlabeled : tuple of (k, 4) float64
         By frame: image rectangles (left, top, right, bottom) without labels (DontCare).
     calibration : Calibration
     """
@@ -65,7 +65,7 @@ class TrackingSequence:
     name: str
     detections: tuple[tuple[Box, ...], ...]
     truth: Mapping[str, tuple[FrameTruth, ...]]
-    unlabelled: tuple[NDArray[np.float64], ...]
+    unlabeled: tuple[NDArray[np.float64], ...]
     calibration: Calibration
 
 
@@ -191,18 +191,18 @@ def read_sequence(
     ignored = (values[:, 2] > MAX_TRUNCATION) | (values[:, 3] > MAX_OCCLUSION)
     truth: dict[str, tuple[FrameTruth, ...]] = {}
     for of in classes:
-        mine = np.isin(kinds, [*KINDS[of], *NEIGHBOURS[of]])
+        mine = np.isin(kinds, [*KINDS[of], *NEIGHBORS[of]])
         excused = ignored | ~np.isin(kinds, KINDS[of])
         in_frame = [np.flatnonzero(mine & (values[:, 0] == k)) for k in range(n_frames)]
         truth[of] = tuple(
             FrameTruth(values[rows, 1].astype(np.int64), placed[rows], excused[rows]) for rows in in_frame
         )
-    unlabelled = kinds == "dontcare"
+    unlabeled = kinds == "dontcare"
     return TrackingSequence(
         name=name,
         detections=tuple(tuple(of_frame) for of_frame in detections),
         truth=truth,
-        unlabelled=tuple(values[unlabelled & (values[:, 0] == k), 5:9] for k in range(n_frames)),
+        unlabeled=tuple(values[unlabeled & (values[:, 0] == k), 5:9] for k in range(n_frames)),
         calibration=calibration,
     )
 
@@ -261,19 +261,17 @@ def track_sequence(
 def _frame_tracks(sequence: TrackingSequence, tracks: Sequence[Tracks], of: str) -> list[FrameTracks]:
     """The tracks of one class by frame, for the metrics."""
     frames = []
-    for in_frame, unlabelled in zip(tracks, sequence.unlabelled, strict=True):
+    for in_frame, unlabeled in zip(tracks, sequence.unlabeled, strict=True):
         mine = np.flatnonzero([label in KINDS[of] for label in in_frame.labels])
         boxes = in_frame.boxes[mine]
-        excused = _excused(boxes, unlabelled, sequence.calibration)
+        excused = _excused(boxes, unlabeled, sequence.calibration)
         with np.errstate(divide="ignore"):  # log odds, like the detections' scores: probabilities near 1 are too close
             scores = np.log(in_frame.scores[mine]) - np.log1p(-in_frame.scores[mine])
         frames.append(FrameTracks(in_frame.ids[mine], boxes, np.clip(scores, -36.0, 36.0), excused))
     return frames
 
 
-def _excused(
-    boxes: NDArray[np.float64], unlabelled: NDArray[np.float64], calibration: Calibration
-) -> NDArray[np.bool_]:
+def _excused(boxes: NDArray[np.float64], unlabeled: NDArray[np.float64], calibration: Calibration) -> NDArray[np.bool_]:
     """Boxes at most 25 pixels high in the image, or with more than half of their image area in DontCare."""
     signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
     local = signs[None] * boxes[:, None, 3:6]
@@ -288,10 +286,10 @@ def _excused(
     high = np.where(ahead[..., None], pixel, -np.inf).max(axis=1).clip(0.0, IMAGE_SIZE)
     size = np.maximum(high - low, 0.0)
     hidden = (size[:, 1] <= MIN_HEIGHT_PX) | (size[:, 0] <= 0.0)
-    for left, top, right, bottom in unlabelled:
+    for left, top, right, bottom in unlabeled:
         shared = np.minimum(high, [right, bottom]) - np.maximum(low, [left, top])
         overlap = np.where((shared > 0.0).all(axis=1), shared.prod(axis=1), 0.0)
-        hidden |= overlap > MIN_UNLABELLED * np.maximum(size.prod(axis=1), 1e-9)
+        hidden |= overlap > MIN_UNLABELED * np.maximum(size.prod(axis=1), 1e-9)
     return hidden
 
 

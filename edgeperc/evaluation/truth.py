@@ -103,7 +103,7 @@ def simulated_truth(seed: int, view: TopViewGeometry | None) -> Truth:
 
 def _cell_places(view: TopViewGeometry) -> NDArray[np.float64]:
     """Centers of the cells (rows * columns, 3), near the ground."""
-    x, y = np.broadcast_arrays(*view.cell_centres())
+    x, y = np.broadcast_arrays(*view.cell_centers())
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, GROUND_Z_M)], axis=1)
 
 

@@ -1,6 +1,6 @@
 """Sensor files and captures to points: one module for each family of formats.
 
-`files` recognises a file by its content and suffix and calls the parser; `captures` reads packet captures and bags.
+`files` recognizes a file by its content and suffix and calls the parser; `captures` reads packet captures and bags.
 """
 
 from __future__ import annotations

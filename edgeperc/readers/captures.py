@@ -121,7 +121,7 @@ def cloud_points(message: Any, *, remission_field: str | None = None) -> NDArray
     Parameters
     ----------
     message : object
-        With the message's attributes: height, width, fields, is_bigendian, point_step, row_step, data. Organised or
+        With the message's attributes: height, width, fields, is_bigendian, point_step, row_step, data. Organized or
         not; fields in any order, of any type, padded or not.
     remission_field : str, optional
         As in `edgeperc.read_points`.

@@ -71,10 +71,10 @@ def _parse_pcd_header(head: bytes) -> _PcdHeader:
         )
     if any(not 1 <= count <= MAX_HEADER_BYTES for count in counts):
         raise PointsError(f"the PCD header's COUNT must be at least 1, got {' '.join(map(str, counts))}")
-    organised = None if width is None else width * (1 if height is None else height)
-    if n_points is None and organised is not None and organised < 1 << 63:
-        n_points = organised
-    if n_points is None or n_points < 0 or organised not in (None, n_points):
+    organized = None if width is None else width * (1 if height is None else height)
+    if n_points is None and organized is not None and organized < 1 << 63:
+        n_points = organized
+    if n_points is None or n_points < 0 or organized not in (None, n_points):
         raise PointsError(f"the PCD header declares {width} x {height} points and POINTS {n_points}; they must agree")
     encoding = entries["DATA"][0].lower() if entries["DATA"] else ""
     return _PcdHeader(tuple(names), tuple(types), tuple(counts), n_points, encoding, at)

@@ -1,4 +1,4 @@
-"""Scenes around the boxes of a real, labelled scan."""
+"""Scenes around the boxes of a real, labeled scan."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
             x, y, yaw = street.on_strip(-s + float(rng.normal(0, 3.0)), u)
             yaw += math.pi * (ahead < 0.0)
             street.add_object(any_vehicle(rng, 0.03), x, y, yaw)
-    _add_unlabelled_people(street, boxes)
+    _add_unlabeled_people(street, boxes)
     add_roadside(street, place)
     return street.scene()
 
@@ -148,7 +148,7 @@ def _parking_rows(
     return -edges[-1.0], edges[1.0], bays
 
 
-def _add_unlabelled_people(street: Street, boxes: Sequence[Box]) -> None:
+def _add_unlabeled_people(street: Street, boxes: Sequence[Box]) -> None:
     rng = street.rng
     for box in boxes:
         if box.label in ("pedestrian", "cyclist") and rng.random() < 0.7:

@@ -163,7 +163,7 @@ class SimulatedScan:
             surface.
         """
         view = TopViewGeometry() if geometry is None else geometry
-        x, y = view.cell_centres()
+        x, y = view.cell_centers()
         labels = np.zeros((view.height, view.width), dtype=np.uint8)
         strips, terrain, tile = self.scene.strips, self.scene.terrain, self.scene.tile
         fill_drivable(strips, terrain, tile, self.T_world_sensor, x.ravel(), y.ravel(), labels)

@@ -42,7 +42,7 @@ class ClassParameters:
     detection : float
         Probability that a visible object is detected in a scan.
     clutter : float
-        False detections and new objects per square metre and radian.
+        False detections and new objects per square meter and radian.
     gate : float
         Largest Mahalanobis distance between a track and a detection of it.
     birth_score : float

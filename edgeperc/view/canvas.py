@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import write_whole
+from ..atomic import write_atomic
 from ..extras import require
 from .colors import FAINT, FRAME, GROUND, INK, PANEL
 
@@ -63,7 +63,7 @@ def as_png(figure: Any, path: str | Path | None) -> bytes:
     stream = io.BytesIO()
     Image.fromarray(picture).save(stream, "PNG")
     if path is not None:
-        write_whole(path, stream.getvalue())
+        write_atomic(path, stream.getvalue())
     return stream.getvalue()
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import write_whole
+from ..atomic import write_atomic
 from ..errors import PointsError
 from ..perception import Perception
 from .colors import color_of, rgb
@@ -65,7 +65,7 @@ def write_ply(perception: Perception, points: NDArray[np.float32], path: str | P
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"comment label {k} {' '.join(name.split())}" for k, name in enumerate(perception.points.classes)]
     header += [f"element vertex {len(points)}", *(f"property {kinds[t]} {name}" for name, t in fields), "end_header\n"]
-    write_whole(path, "\n".join(header).encode("ascii", "replace") + rows.tobytes())
+    write_atomic(path, "\n".join(header).encode("ascii", "replace") + rows.tobytes())
 
 
 def write_labels(perception: Perception, path: str | Path) -> None:
@@ -90,7 +90,7 @@ def write_labels(perception: Perception, path: str | Path) -> None:
     if perception.points is None:
         raise _no_labels(".label file")
     ids = np.array([SEMANTICKITTI_IDS.get(name, _OTHER_ID) for name in perception.points.classes], dtype="<u4")
-    write_whole(path, ids[perception.points.labels].tobytes())
+    write_atomic(path, ids[perception.points.labels].tobytes())
 
 
 def _no_labels(what: str) -> PointsError:

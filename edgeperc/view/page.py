@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import write_whole
+from ..atomic import write_atomic
 from ..perception import Perception, TopView
 from .colors import HIGH, LOW, color_of
 from .content import (
@@ -91,7 +91,7 @@ def write_html(perception: Perception, points: NDArray[np.float32], path: str | 
     template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
     # In one pass, so that a title that looks like a place to fill stays a title.
     page = re.sub("|".join(filled), lambda match: filled[match.group()], template)
-    write_whole(path, page.encode(errors="replace"))
+    write_atomic(path, page.encode(errors="replace"))
 
 
 def _road(top_view: TopView) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import write_whole
+from ..atomic import write_atomic
 from ..errors import TrackingError
 from ..extras import require
 from ..perception import Perception
@@ -168,7 +168,7 @@ def draw_tracks(
         optimize=False,
     )
     if path is not None:
-        write_whole(path, stream.getvalue())
+        write_atomic(path, stream.getvalue())
     return stream.getvalue()
 
 

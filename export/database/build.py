@@ -28,7 +28,7 @@ from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from edgeperc import __version__
-from edgeperc.atomic import write_whole
+from edgeperc.atomic import write_atomic
 from edgeperc.errors import MissingExtraError
 from edgeperc.evaluation.datasets import KittiObjects
 from edgeperc.evaluation.metrics import Confusion
@@ -239,7 +239,7 @@ def _finish(builder: SceneBuilder, jobs: list[Job], skipped: dict[str, str]) -> 
         "skipped": skipped,
         "sha256": sums,
     }
-    write_whole(out / "manifest.json", (json.dumps(manifest, indent=1, sort_keys=True) + "\n").encode())
+    write_atomic(out / "manifest.json", (json.dumps(manifest, indent=1, sort_keys=True) + "\n").encode())
     return scores
 
 
@@ -258,5 +258,5 @@ def _write_table(path: Path, columns: Sequence[str], rows: Sequence[dict[str, An
     table.writerow(columns)
     table.writerows([row[name] for name in columns] for row in rows)
     content = text.getvalue().encode()
-    write_whole(path, content)
+    write_atomic(path, content)
     return hashlib.sha256(content).hexdigest()

@@ -131,12 +131,12 @@ def _label(args: argparse.Namespace) -> int:
 
 
 def _coco(args: argparse.Namespace) -> int:
-    from edgeperc.atomic import open_whole
+    from edgeperc.atomic import open_atomic
 
     from .coco import write_database_coco
     from .files import TopViewDatabase
 
-    with open_whole(args.file, "w") as file:
+    with open_atomic(args.file, "w") as file:
         n = write_database_coco(TopViewDatabase(args.out), file)
     print(f"{args.file}: {n} annotations")
     return 0

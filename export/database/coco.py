@@ -78,7 +78,7 @@ def varied(
         return image, mask, 0.0, False
     rng = np.random.default_rng(int.from_bytes(hashlib.sha256(f"{name}/{k}".encode()).digest()[:8], "little"))
     turn_deg, mirrored = round(float(rng.uniform(-TURN_DEG, TURN_DEG)), 3), bool(rng.random() < 0.5)
-    x, y = VIEW.cell_centres()
+    x, y = VIEW.cell_centers()
     cos, sin = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     from_x, from_y = cos * x + sin * y, cos * y - sin * x
     if mirrored:

@@ -91,7 +91,7 @@ def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: 
             made_of.write_text(key)
             continue
         made[key] = model
-        scans, watched = _labelled(objects, shown), _labelled(objects, held_out)
+        scans, watched = _labeled(objects, shown), _labeled(objects, held_out)
         hashes = {name: scan_hash(scan.points) for name, scan in scans.items()}
         given = RealScans([*scans.values()], hashes, [*watched.values()])
         checkpoint = train(recipe, work / key, kitti=None, simulated=None, given=given)
@@ -104,7 +104,7 @@ def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: 
             shutil.rmtree(left)
 
 
-def _labelled(objects: KittiObjects, drawn: Mapping[str, DrawnScene]) -> dict[str, LabeledScan]:
+def _labeled(objects: KittiObjects, drawn: Mapping[str, DrawnScene]) -> dict[str, LabeledScan]:
     found = {}
     for name, scene in drawn.items():
         try:

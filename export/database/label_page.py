@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from edgeperc.atomic import write_whole
+from edgeperc.atomic import write_atomic
 
 from ..roads import HEIGHT, WIDTH, DatabaseError, read_coco, write_coco
 from .coco import draft
@@ -74,7 +74,7 @@ class LabelServer(ThreadingHTTPServer):
             self.roads.pop(name, None)
             if polygons:
                 self.roads[name] = polygons
-            write_whole(self.polygons, write_coco(self.roads, self.scans).encode())
+            write_atomic(self.polygons, write_coco(self.roads, self.scans).encode())
 
 
 def _polygons(path: Path) -> tuple[dict[str, list[Any]], dict[str, str]]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from edgeperc import Perceiver
 from edgeperc.adapt import condition
-from edgeperc.atomic import write_whole
+from edgeperc.atomic import write_atomic
 from edgeperc.card import TopViewGeometry
 from edgeperc.errors import CardMismatchError, EdgepercError
 from edgeperc.evaluation.datasets import KittiObjects, scan_hash
@@ -255,7 +255,7 @@ class SceneBuilder:
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
     def _write(self, path: Path, content: bytes) -> str:
-        write_whole(path, content)
+        write_atomic(path, content)
         return hashlib.sha256(content).hexdigest()
 
 

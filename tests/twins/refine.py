@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def neighbours(row, col, reach, shape, full_turn):
+def neighbors(row, col, reach, shape, full_turn):
     """Pixels at most ``reach`` rows and columns away, row by row."""
     for r in range(max(row - reach, 0), min(row + reach + 1, shape[0])):
         for c in range(col - reach, col + reach + 1):
@@ -24,7 +24,7 @@ def without_outliers(points, index, labels, radii, full_turn):
         found = [first]
         seen[first] = True
         for pixel in found:
-            for other in neighbours(*pixel, 1, labels.shape, full_turn):
+            for other in neighbors(*pixel, 1, labels.shape, full_turn):
                 if not seen[other] and labels[other] == labels[first]:
                     seen[other] = True
                     found.append(other)
@@ -58,7 +58,7 @@ def without_outliers(points, index, labels, radii, full_turn):
                     cleaned[pixel] = 0
                 break
             for pixel in members:
-                rim.update(neighbours(*pixel, 2, labels.shape, full_turn))
+                rim.update(neighbors(*pixel, 2, labels.shape, full_turn))
             left = [pixel for pixel, near in zip(left, inside, strict=True) if not near]
     return cleaned
 
@@ -74,7 +74,7 @@ def point_labels(points, pixel, index, labels, full_turn):
         if index[at] == i:
             out[i] = labels[at]
             continue
-        around = [p for p in neighbours(*at, 2, labels.shape, full_turn) if index[p] >= 0]
+        around = [p for p in neighbors(*at, 2, labels.shape, full_turn) if index[p] >= 0]
         gaps = [(abs(ranges[index[p]] - ranges[i]), k) for k, p in enumerate(around)]
         votes = [labels[around[k]] for gap, k in sorted(g for g in gaps if g[0] <= 1.0)[:5]]
         out[i] = max(votes, key=votes.count) if votes else 0
