@@ -60,7 +60,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         function, module = getattr(item, "function", None), getattr(item, "module", None)
         if function is not None and module is not None:
-            names = {*inspect.unwrap(function).__code__.co_names}
+            if hasattr(function, "hypothesis"):
+                function = function.hypothesis.inner_test
+            names = {*function.__code__.co_names}
             helpers = [value for name, value in vars(module).items() if name in names and inspect.isfunction(value)]
             if any("twins" in {*inspect.unwrap(each).__code__.co_names} for each in (function, *helpers)):
                 item.add_marker("kernel")

@@ -139,7 +139,7 @@ def filterpy_filter(mode: int, state: np.ndarray, covariance: np.ndarray, dt: fl
 
 @pytest.mark.parametrize("mode", [0, 1, 2])
 def test_each_motion_filters_as_filterpys(mode: int) -> None:
-    """Straight lines, turns and random steps, to 1e-6 over fifty scans (ten interpreted): linear where the heading is certain."""
+    """Straight lines, turns and random steps, to 1e-6 over many scans: linear where the heading is certain."""
     rng, dt = rng_of(mode), 0.1
     state, covariance = np.array([3.0, -1.0, 8.0, 0.4, 0.3]), np.diag([0.5, 0.5, 4.0, 0.1, 0.05])
     theirs = filterpy_filter(mode, state, covariance, dt)
