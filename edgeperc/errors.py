@@ -108,4 +108,5 @@ class MissingExtraError(EdgepercError, ImportError):
     """An optional dependency is absent; the message holds the line that installs it."""
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
+        self.package, self.extra, self.purpose = package, extra, purpose
         super().__init__(f"{purpose} needs {package}, which is not installed. Run: pip install 'edgeperc[{extra}]'")

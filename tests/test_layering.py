@@ -29,8 +29,12 @@ FLOORS = {
         geometry
         adapt cluster decode drivable fitness ground projection refine sensor_fit session
         readers.__init__ readers.tables
+        readers.inflate readers.packets
         readers.pcd readers.ply
-        readers.files
+        readers.files readers.mcap readers.ouster
+        readers.decoders
+        readers.worker
+        readers.apart
         readers.captures
         tracking.egomotion tracking.imm tracking.jpda tracking.lives tracking.ukf
         tracking.tracks

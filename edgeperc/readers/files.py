@@ -6,6 +6,7 @@ import io
 import math
 import os
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
 from ..points import as_points
+from .inflate import inflate
 from .pcd import begins_like_pcd, parse_pcd
 from .ply import parse_ply
-from .tables import MAX_HEADER_BYTES
+from .tables import MAX_BYTES, MAX_HEADER_BYTES
 
 __all__ = ["read_points"]
 
@@ -58,14 +60,19 @@ def read_points(
     Raises
     ------
     PointsError
-        The file cannot be read, is empty, cut short or not a scan. A scan of no points is valid if a header says so;
+        The file cannot be read, is empty, larger than 2 GiB, cut short or not a scan. A scan of no points is valid if a header says so;
         a file of 0 bytes is an error.
     """
     if not isinstance(source, str | os.PathLike):
         return as_points(source, remission_field=remission_field)
     path = Path(source)
     try:
+        size = path.stat().st_size if path.is_file() else 0
+        if size > MAX_BYTES:
+            raise PointsError(f"{path}: {size:,} bytes are too much for one scan; expected at most {MAX_BYTES:,}")
         data = np.fromfile(path, dtype=np.uint8) if path.is_file() else None
+    except PointsError:
+        raise
     except (OSError, ValueError) as exc:  # ValueError: a NUL in the name
         raise PointsError(f"{path}: the file cannot be read ({exc})") from exc
     if data is None:
@@ -182,7 +189,7 @@ def _parse_npz(data: NDArray[np.uint8]) -> NDArray[Any]:
                     f"{data.size} bytes claim to unpack to {member.file_size}; no scan packs so well, so it is not "
                     "unpacked. Save it as .npy"
                 )
-            content = archive.read(member)
+            content = _unpack_member(data, member)
     except PointsError:
         raise
     except Exception as exc:
@@ -190,3 +197,20 @@ def _parse_npz(data: NDArray[np.uint8]) -> NDArray[Any]:
     if not content.startswith(b"\x93NUMPY"):
         raise PointsError(f"{member.filename!r} in the archive is no .npy array")
     return _parse_npy(np.frombuffer(content, dtype=np.uint8))
+
+
+def _unpack_member(data: NDArray[np.uint8], member: zipfile.ZipInfo) -> bytes:
+    """A member of a zip archive, without unpacking more than it claims: `zipfile` has no such limit for bzip2."""
+    methods = {zipfile.ZIP_STORED: "", zipfile.ZIP_DEFLATED: "deflate", zipfile.ZIP_BZIP2: "bz2"}
+    if member.compress_type not in methods or member.flag_bits & 1:
+        raise PointsError(f"{member.filename!r} is encrypted, or compressed by another method than deflate or bzip2")
+    at = member.header_offset
+    # The header in front of a member has a name and an extra field of its own.
+    if data[at : at + 4].tobytes() != b"PK\x03\x04" or at + 30 > data.size:
+        raise PointsError(f"{member.filename!r} does not begin at the byte {at:,} that the archive names")
+    at += 30 + int(data[at + 26 : at + 30].view("<u2").sum())
+    packed = data[at : at + member.compress_size].tobytes()
+    content = inflate(packed, methods[member.compress_type], min(member.file_size, MAX_BYTES))
+    if len(content) != member.file_size or zlib.crc32(content) != member.CRC:
+        raise PointsError(f"{member.filename!r} in the archive is damaged: its length or CRC-32 is wrong")
+    return content

@@ -12,9 +12,13 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..points import assemble, remission_name
 
-__all__ = ["MAX_HEADER_BYTES", "column", "cut_short", "parse_table", "whole_number"]
+__all__ = ["MAX_BYTES", "MAX_HEADER_BYTES", "column", "cut_short", "parse_table", "whole_number"]
 
 MAX_HEADER_BYTES = 65536
+
+# Limit for a scan file, for what a compressed file or chunk unpacks to, and for the memory that decoding a capture
+# takes: 2 GiB, over 100 million points.
+MAX_BYTES = 1 << 31
 
 
 def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int) -> NDArray[Any]:

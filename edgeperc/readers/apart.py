@@ -1,0 +1,125 @@
+"""Captures decoded in a process of their own, which a damaged capture may end without harm."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import MissingExtraError, PointsError
+from .decoders import Scan
+from .tables import MAX_BYTES
+from .worker import ALIVE, END, ERROR, HEADER, MISSING, READY, SCAN, WARNING
+
+__all__ = ["SCAN_LIMIT_S", "decode_apart"]
+
+# Longest time to decode one scan [s]; the slowest library takes well under one.
+SCAN_LIMIT_S = 60.0
+
+# The module path is that of this process; the current folder, which may hold foreign files, is not added to it.
+_START = "import sys; sys.path[:] = sys.argv[1:]; from edgeperc.readers.worker import main; main()"
+
+
+def decode_apart(path: Path, kind: str, topic: str | None, remission_field: str | None) -> Iterator[Scan]:
+    """Like `decoders.decode`, in a process of its own.
+
+    The process runs ahead by one scan and waits then, so the memory stays flat. It ends with the iterator.
+
+    Raises
+    ------
+    PointsError
+        As `decoders.decode`, or the process ended, or it exceeded the limits of memory or time.
+    """
+    request = {"path": str(path), "kind": kind, "topic": topic, "remission_field": remission_field}
+    request_line = json.dumps({**request, "limit_s": SCAN_LIMIT_S}).encode() + b"\n"
+    with tempfile.TemporaryDirectory(prefix="edgeperc-", ignore_cleanup_errors=True) as folder:
+        with _start(folder) as process:
+            assert process.stdin is not None
+            assert process.stdout is not None
+            try:
+                with suppress(OSError), process.stdin as stdin:  # its end is found when it does not reply
+                    stdin.write(request_line)
+                yield from _replies(process, process.stdout, path)
+            finally:
+                process.kill()
+
+
+def _start(folder: str) -> subprocess.Popen[bytes]:
+    # Threads of these libraries would each take part of the memory limit.
+    one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    # Here lies what libraries unpack, and it is deleted even if the process is killed.
+    temporary = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), folder)
+    flags = getattr(subprocess, "CREATE_NO_WINDOW", 0) | getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
+    return subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", _START, *sys.path],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env={**os.environ, **one_thread, **temporary},
+        creationflags=flags,
+        start_new_session=os.name == "posix",  # Ctrl-C is for this process, which then ends the other
+    )
+
+
+def _replies(process: subprocess.Popen[bytes], replies: IO[bytes], path: Path) -> Iterator[Scan]:
+    n_scans, ready = 0, False
+    while len(header := replies.read(HEADER.size)) == HEADER.size:
+        kind, stamp, n_bytes = HEADER.unpack(header)
+        if kind not in (ALIVE, END, ERROR, MISSING, READY, SCAN, WARNING) or not 0 <= n_bytes <= MAX_BYTES:
+            break
+        if kind == SCAN and n_bytes % 16 == 0:
+            points: NDArray[np.float32] = np.empty((n_bytes // 16, 4), "<f4")
+            if n_bytes and _fill(replies, points) < n_bytes:
+                break
+            n_scans += 1
+            yield None if np.isnan(stamp) else stamp, points
+            continue
+        text = replies.read(n_bytes)
+        if len(text) < n_bytes:
+            break
+        if kind == END:
+            return
+        if kind == ERROR:
+            raise PointsError(text.decode("utf-8", "replace"))
+        if kind == MISSING:
+            raise MissingExtraError(*json.loads(text))
+        if kind == WARNING:
+            warnings.warn(text.decode("utf-8", "replace"), UserWarning, stacklevel=2)
+        ready = ready or kind == READY
+    # Broken off. A process that still runs has replied nonsense, so its memory is damaged.
+    try:
+        code = process.wait(1.0)
+    except subprocess.TimeoutExpired:
+        code = 0
+    after = f"after {n_scans} scans " if n_scans else ""
+    if not ready:
+        raise PointsError(f"{path}: the process that decodes captures did not start ({_ending(code)})")
+    if code == 1:
+        raise PointsError(f"{path}: {after}decoding a scan took longer than {SCAN_LIMIT_S:g} s; the capture is damaged")
+    raise PointsError(
+        f"{path}: {after}the library that decodes the capture failed ({_ending(code)}); the capture is damaged, or "
+        f"decoding it takes more than {MAX_BYTES:,} bytes of memory"
+    )
+
+
+def _fill(replies: Any, points: NDArray[np.float32]) -> int:
+    """Read into the points; fewer bytes than they have if the process ends."""
+    n_bytes: int = replies.readinto(points.data.cast("B"))
+    return n_bytes
+
+
+def _ending(code: int) -> str:
+    try:
+        return signal.Signals(-code).name
+    except ValueError:
+        return f"exit code {code & 0xFFFFFFFF:#x}" if code < -64 or code > 255 else f"exit code {code}"

@@ -1,0 +1,81 @@
+"""Decompression that stops at a limit, so that a small damaged or hostile file cannot fill the memory."""
+
+from __future__ import annotations
+
+import bz2
+import io
+import zlib
+from collections.abc import Callable
+from typing import Any
+
+from ..errors import PointsError
+from ..extras import require
+from .tables import MAX_BYTES
+
+__all__ = ["inflate"]
+
+
+def inflate(packed: bytes, method: str, limit: int = MAX_BYTES) -> bytes:
+    """Decompress bytes, but no more than a limit.
+
+    Parameters
+    ----------
+    packed : bytes
+    method : {"", "deflate", "bz2", "lz4", "zstd"}
+        ``""``: not compressed. ``"lz4"`` is LZ4's frame format.
+    limit : int
+        Most bytes of the result.
+
+    Raises
+    ------
+    PointsError
+        The data holds more than ``limit`` bytes, is damaged or cut short, or the method is unknown.
+    """
+    if method == "":
+        content = packed
+    elif method in ("deflate", "bz2", "lz4", "zstd"):
+        try:
+            content = _decompressor(method)(packed, limit + 1)
+        except (PointsError, ImportError):
+            raise
+        except Exception as exc:  # each library has its own errors
+            raise PointsError(f"the {method} data is damaged: {exc}") from exc
+    else:
+        raise PointsError(f"unknown compression {method!r}; expected lz4, zstd or bz2")
+    if len(content) > limit:
+        raise PointsError(f"{len(packed):,} compressed bytes unpack to more than {limit:,}, so they are not unpacked")
+    return content
+
+
+def _decompressor(method: str) -> Any:
+    """A function from the compressed bytes and a number to at most so many bytes."""
+    if method == "deflate":
+        return zlib.decompressobj(-15).decompress
+    if method == "bz2":
+        return _each_bz2
+    if method == "lz4":
+        lz4 = require("lz4.frame", "io", "Reading lz4 data")
+        return lambda packed, most: _in_pieces(lz4.LZ4FrameFile(io.BytesIO(packed)).read, most)
+    zstd = require("zstandard", "io", "Reading zstd data")
+    return lambda packed, most: _in_pieces(zstd.ZstdDecompressor().stream_reader(packed).read, most)
+
+
+def _in_pieces(read: Callable[[int], bytes], most: int) -> bytes:
+    """Read to the end or the limit; these libraries allocate what a single call asks for."""
+    pieces, n = [], 0
+    while n < most and (piece := read(min(1 << 20, most - n))):
+        pieces.append(piece)
+        n += len(piece)
+    return b"".join(pieces)
+
+
+def _each_bz2(packed: bytes, most: int) -> bytes:
+    """Several streams may follow one another, as parallel compressors write them."""
+    content = b""
+    while packed and len(content) < most:
+        stream = bz2.BZ2Decompressor()
+        content += stream.decompress(packed, most - len(content))
+        if not stream.eof and len(content) < most:
+            raise PointsError("the bz2 data is cut short")
+        packed = stream.unused_data
+    return content

@@ -1,0 +1,156 @@
+"""MCAP files: records in the file's order, chunks checked and unpacked within limits."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from ..errors import PointsError
+from .inflate import inflate
+from .tables import MAX_BYTES
+
+__all__ = ["Channel", "McapFile", "Message"]
+
+_MAGIC = b"\x89MCAP0\r\n"
+_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 1, 2, 3, 4, 5, 6, 15
+
+
+class Channel(NamedTuple):
+    """A topic and the type of its messages."""
+
+    topic: str
+    msgtype: str
+    encoding: str
+
+
+class Message(NamedTuple):
+    """A message as recorded: channel's number, time of recording [ns], bytes."""
+
+    channel: int
+    stamp_ns: int
+    data: memoryview
+
+
+class McapFile:
+    """One .mcap file, read from front to back; an index is not needed.
+
+    Parameters
+    ----------
+    path : Path
+
+    Attributes
+    ----------
+    channels : dict of int to Channel
+        Those of the summary, or those met so far.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._schemas: dict[int, str] = {}
+        self.channels: dict[int, Channel] = {}
+        with path.open("rb") as file:
+            size = path.stat().st_size
+            if size < 45 or file.read(8) != _MAGIC:
+                raise PointsError("the file is damaged or cut short: it does not begin as an MCAP file")
+            kind, content = next(_records(file, 8, size))
+            if kind != _HEADER or (profile := _text(content, 0)[0]) != "ros2":
+                raise PointsError(f"the MCAP file cannot be read: its profile is {profile!r}; expected 'ros2'")
+            file.seek(-37, 2)
+            footer = file.read()
+            if footer[:9] != struct.pack("<BQ", _FOOTER, 20) or footer[29:] != _MAGIC:
+                raise PointsError("the file is damaged or cut short: it does not end as an MCAP file")
+            (summary,) = struct.unpack_from("<Q", footer, 9)
+            self._end = size - 37
+            if summary > self._end:
+                raise PointsError(f"the file is damaged: its summary is said to begin at byte {summary:,} of {size:,}")
+            if summary:
+                for kind, content in _records(file, summary, self._end):
+                    self._learn(kind, content)
+        if not self.channels:  # no summary: the channels stand among the messages
+            with suppress(PointsError):  # raised when the messages are read
+                for _ in self.messages():
+                    pass
+
+    def messages(self) -> Iterator[Message]:
+        """Every message: chunk by chunk, within a chunk in the order of time."""
+        with self._path.open("rb") as file:
+            for kind, content in _records(file, 8, self._end):
+                if kind == _CHUNK:
+                    found = list(self._of_records(_split(_unpacked(content))))
+                    yield from sorted(found, key=lambda message: message.stamp_ns)
+                elif kind == _DATA_END:
+                    return
+                else:
+                    yield from self._of_records(iter([(kind, content)]))
+
+    def _of_records(self, records: Iterator[tuple[int, memoryview]]) -> Iterator[Message]:
+        for kind, content in records:
+            if kind == _MESSAGE:
+                channel, _, stamp_ns, _ = struct.unpack_from("<HIQQ", content)
+                yield Message(channel, stamp_ns, content[22:])
+            else:
+                self._learn(kind, content)
+
+    def _learn(self, kind: int, content: memoryview) -> None:
+        if kind == _SCHEMA:
+            self._schemas[struct.unpack_from("<H", content)[0]] = _text(content, 2)[0]
+        elif kind == _CHANNEL:
+            number, schema = struct.unpack_from("<HH", content)
+            topic, at = _text(content, 4)
+            self.channels[number] = Channel(topic, self._schemas.get(schema, ""), _text(content, at)[0])
+
+
+def _records(file: BinaryIO, at: int, end: int) -> Iterator[tuple[int, memoryview]]:
+    """The kind and content of each record; those that are not needed are skipped."""
+    while at < end:
+        file.seek(at)
+        head = file.read(9)
+        kind, length = struct.unpack("<BQ", head) if len(head) == 9 else (0, end)
+        if at + 9 + length > end:
+            raise PointsError(f"the file is damaged or cut short: the record at byte {at:,} is not whole")
+        if kind in (_HEADER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END):
+            if length > MAX_BYTES:
+                raise PointsError(f"the record at byte {at:,} has {length:,} bytes; expected at most {MAX_BYTES:,}")
+            yield kind, memoryview(file.read(length))
+        at += 9 + length
+
+
+def _split(content: bytes) -> Iterator[tuple[int, memoryview]]:
+    """The records of a chunk."""
+    view, at = memoryview(content), 0
+    while at < len(view):
+        kind, length = struct.unpack_from("<BQ", view, at) if at + 9 <= len(view) else (0, len(view))
+        if at + 9 + length > len(view):
+            raise PointsError("a chunk is damaged: it ends inside a record")
+        yield kind, view[at + 9 : at + 9 + length]
+        at += 9 + length
+
+
+def _unpacked(chunk: memoryview) -> bytes:
+    """The records of a chunk as bytes, once length and CRC-32 are right."""
+    size, crc = struct.unpack_from("<16xQI", chunk)
+    method, at = _text(chunk, 28)
+    (packed_size,) = struct.unpack_from("<Q", chunk, at)
+    if size > MAX_BYTES:
+        raise PointsError(f"a chunk claims to unpack to {size:,} bytes; expected at most {MAX_BYTES:,}")
+    if packed_size != len(chunk) - at - 8:
+        raise PointsError(f"a chunk is damaged: it declares {packed_size:,} bytes and holds {len(chunk) - at - 8:,}")
+    content = inflate(bytes(chunk[at + 8 :]), method, size)
+    if len(content) != size:
+        raise PointsError(f"a chunk is damaged: it unpacks to {len(content):,} bytes and declares {size:,}")
+    if crc and zlib.crc32(content) != crc:
+        raise PointsError("a chunk is damaged: its CRC-32 is wrong")
+    return content
+
+
+def _text(content: memoryview, at: int) -> tuple[str, int]:
+    """A string with its length in front, and the place behind it."""
+    (length,) = struct.unpack_from("<I", content, at)
+    end = at + 4 + length
+    if end > len(content):
+        raise PointsError("a record is damaged: a text ends past it")
+    return bytes(content[at + 4 : end]).decode(), end

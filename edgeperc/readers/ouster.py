@@ -1,0 +1,158 @@
+"""Ouster captures: the sensor's metadata and packets, checked before ouster-sdk reads them."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import tempfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import PointsError
+from ..extras import require
+from .packets import check_datagrams, copy_without
+
+__all__ = ["check_metadata", "check_osf", "open_capture"]
+
+# Sensors have up to 128 beams, 4,096 columns in a turn and 32 columns in a packet.
+_MOST_BEAMS, _MOST_COLUMNS = 1024, 65536
+_MOST_JSON_BYTES = 1 << 24
+
+
+def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], None]) -> Any:
+    """The turns of an Ouster packet capture as ouster-sdk reads them, without packets that could end the process.
+
+    Returns
+    -------
+    ouster.sdk.pcap.PcapFrameSetSource or None
+        None if no packet has the size that the metadata says.
+    """
+    pcap = require("ouster.sdk.pcap", "io", "Reading a capture of another sensor than Velodyne's", package="ouster-sdk")
+    core = require("ouster.sdk.core", "io", "Reading an Ouster capture", package="ouster-sdk")
+    metadata = _metadata_beside(path)
+    if not metadata:
+        raise PointsError(
+            "no Velodyne's packets (1206 bytes each), and as an Ouster's capture it cannot be read: there is no metadata "
+            "beside it. Expected a .json whose name begins alike"
+        )
+    sizes = set()
+    for file in metadata:
+        text = _read_metadata(file)
+        layout = core.PacketFormat(core.SensorInfo(text))
+        sizes |= {int(getattr(layout, f"{kind}_packet_size", 0)) for kind in ("lidar", "imu", "zone")}
+    found = check_datagrams(path, sizes - {0}, alive)
+    if not found.n_good:
+        return None
+    if found.n_bad:
+        warn(
+            f"{path}: dropped {found.n_bad} damaged packets of the capture: empty, incomplete, or of another length "
+            "than the metadata says"
+        )
+    if found.bad:
+        source = Path(tempfile.mkdtemp()) / "whole.pcap"
+        copy_without(path, found.bad, source, alive)
+    else:
+        source = path
+    return pcap.PcapFrameSetSource(str(source), meta=[str(file) for file in metadata])
+
+
+def _metadata_beside(path: Path) -> list[Path]:
+    """The .json files whose names have the longest beginning in common with the capture's, as ouster-sdk chooses."""
+    files = sorted(file for file in path.absolute().parent.iterdir() if file.suffix.lower() == ".json")
+    alike = {
+        file: len(os.path.commonprefix([file.name, path.name]))  # noqa: RUF071 - of the characters
+        for file in files
+        if file.is_file()
+    }
+    longest = max(alike.values(), default=0)
+    return [file for file, n in alike.items() if n == longest > 0]
+
+
+def _read_metadata(path: Path) -> str:
+    """The text of a sensor's metadata, once it is checked."""
+    if path.stat().st_size > _MOST_JSON_BYTES:
+        raise PointsError(f"the metadata {path.name} is larger than {_MOST_JSON_BYTES:,} bytes")
+    text = path.read_bytes().decode("utf-8", "replace")
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as exc:
+        raise PointsError(f"the metadata {path.name} cannot be read: it is no JSON ({exc})") from exc
+    try:
+        check_metadata(content)
+    except PointsError as exc:
+        raise PointsError(f"the metadata {path.name} cannot be read: {exc}") from exc
+    return text
+
+
+def check_metadata(content: Any) -> None:
+    """Raise `PointsError` unless the numbers that ouster-sdk divides and allocates by are possible and agree.
+
+    Parameters
+    ----------
+    content : object
+        The sensor's metadata as `json.loads` returns it, of any firmware. Fields that are absent are not checked.
+    """
+    if not isinstance(content, dict):
+        raise PointsError(f"expected an object, got {type(content).__name__}")
+    layout = content.get("lidar_data_format", content.get("data_format", {}))
+    if not isinstance(layout, dict):
+        raise PointsError("data_format: expected an object")
+    most = {"columns_per_packet": 1024, "pixels_per_column": _MOST_BEAMS, "columns_per_frame": _MOST_COLUMNS}
+    for name, limit in most.items():
+        if name in layout and not (_is_whole(layout[name]) and 1 <= layout[name] <= limit):
+            raise PointsError(f"{name}: expected a whole number from 1 to {limit}, got {layout[name]!r}")
+    columns, beams = layout.get("columns_per_frame", _MOST_COLUMNS), layout.get("pixels_per_column")
+    if layout.get("columns_per_packet", 1) > columns:
+        raise PointsError(f"columns_per_packet: {layout['columns_per_packet']} is above columns_per_frame, {columns}")
+    window = layout.get("column_window", [0, 0])
+    if not (isinstance(window, list) and len(window) == 2 and all(_is_whole(v) and 0 <= v < columns for v in window)):
+        raise PointsError(f"column_window: expected two columns from 0 to {columns - 1}, got {window!r:.80}")
+    angles = content.get("beam_intrinsics", {})
+    for holder in (content, angles if isinstance(angles, dict) else {}):
+        for name in ("beam_altitude_angles", "beam_azimuth_angles"):
+            if name in holder:
+                beams = _checked_beams(name, holder[name], beams)
+    shifts = layout.get("pixel_shift_by_row")
+    if shifts is not None:
+        _checked_beams("pixel_shift_by_row", shifts, beams)
+        if any(not _is_whole(shift) or abs(shift) > columns for shift in shifts):
+            raise PointsError(f"pixel_shift_by_row: expected whole numbers up to {columns}")
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _checked_beams(name: str, values: Any, n: int | None) -> int:
+    """The length of a list with a number for each beam."""
+    if not isinstance(values, list) or not 1 <= len(values) <= _MOST_BEAMS or n not in (None, len(values)):
+        got = f"{len(values)}" if isinstance(values, list) else type(values).__name__
+        raise PointsError(
+            f"{name}: expected a list of {n or f'1 to {_MOST_BEAMS}'} numbers, one for each beam, got {got}"
+        )
+    for value in values:  # early firmware has a list of numbers for each beam
+        numbers = value if isinstance(value, list) else [value]
+        if not all(isinstance(v, int | float) and not isinstance(v, bool) and np.isfinite(v) for v in numbers):
+            raise PointsError(f"{name}: expected finite numbers, got {value!r:.80}")
+    return len(values)
+
+
+def check_osf(path: Path) -> None:
+    """Raise `PointsError` unless every checksum is right."""
+    data = np.memmap(path, np.uint8, "r").data
+    kind, at, size = b"", 0, len(data)
+    while at < size:
+        # The length of the block, the block, CRC-32 of both.
+        end = at + 4 + struct.unpack_from("<I", data, at)[0] if at + 8 <= size else size
+        if end + 4 > size or zlib.crc32(data[at:end]) != struct.unpack_from("<I", data, end)[0]:
+            raise PointsError(
+                f"the .osf file is damaged or cut short: the block at byte {at:,} of {size:,} is not whole"
+            )
+        kind, at = bytes(data[at + 8 : at + 12]), end + 4
+    if kind != b"OSF#":
+        raise PointsError("the .osf file is cut short: its last block is not that of the metadata")

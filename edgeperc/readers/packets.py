@@ -1,0 +1,203 @@
+"""Packet captures (pcap): their packets, and those that are whole."""
+
+from __future__ import annotations
+
+import struct
+from array import array
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import PointsError
+
+__all__ = ["PCAP_MAGIC", "Checked", "check_datagrams", "copy_without", "pcap_packets"]
+
+# First bytes of a pcap file, and the byte order that they stand for.
+PCAP_MAGIC = {
+    b"\xd4\xc3\xb2\xa1": "<",
+    b"\xa1\xb2\xc3\xd4": ">",
+    b"\x4d\x3c\xb2\xa1": "<",
+    b"\xa1\xb2\x3c\x4d": ">",
+}
+
+# Bytes in front of the IP header and the place of the EtherType, by the link type: Ethernet, Linux cooked 1 and 2.
+_LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
+
+# Datagrams of which fragments are awaited; more than a few at once are damage.
+_PENDING = 256
+
+
+def pcap_packets(path: Path, whole: bool = True) -> Iterator[tuple[int, memoryview]]:
+    """The place in the file of each captured packet's record, and the packet with its network headers.
+
+    Parameters
+    ----------
+    path : Path
+    whole : bool
+        Raise `PointsError` if the file ends inside a packet; otherwise stop in front of that packet.
+    """
+    size = path.stat().st_size
+    if size < 24:
+        raise PointsError(f"cut short: {size} bytes; expected a pcap file of 24 bytes and more")
+    data = np.memmap(path, np.uint8, "r").data
+    if bytes(data[:4]) not in PCAP_MAGIC:
+        raise PointsError("not a pcap file by its first bytes")
+    header = struct.Struct(f"{PCAP_MAGIC[bytes(data[:4])]}8xI4x")
+    at, n_packets = 24, 0
+    while at < size:
+        end = at + 16 + (header.unpack_from(data, at)[0] if at + 16 <= size else size)
+        if end > size and not whole:
+            return
+        if end > size:
+            raise PointsError(
+                f"cut short or damaged: the file ends inside packet {n_packets + 1}, at byte {size:,}; all before it "
+                "is read"
+            )
+        yield at, data[at + 16 : end]
+        at, n_packets = end, n_packets + 1
+
+
+class Checked(NamedTuple):
+    """What `check_datagrams` finds.
+
+    Attributes
+    ----------
+    n_good : int
+        Datagrams of an expected size.
+    n_bad : int
+        Datagrams that are empty, incomplete, contradict themselves, or have another size on a port of good ones.
+    bad : array of int
+        Places in the file of the bad records, and of the unfinished one at its end.
+    """
+
+    n_good: int
+    n_bad: int
+    bad: array[int]
+
+
+class _Fragment(NamedTuple):
+    source: bytes  # addresses and identification: the same for all fragments of a datagram
+    start: int
+    more: bool
+    payload: memoryview
+
+
+def check_datagrams(path: Path, sizes: Collection[int], alive: Callable[[], None]) -> Checked:
+    """Compare the lengths in the headers of every UDP datagram over IPv4 with its record and with expected sizes.
+
+    Packets of other protocols, and whole datagrams on other ports, are neither good nor bad.
+
+    Parameters
+    ----------
+    path : Path
+        A pcap file; one that is cut short is checked up to the cut.
+    sizes : collection of int
+        Bytes of payload that the sensor's packets have.
+    alive : callable
+        Called now and then, for large files.
+    """
+    size = path.stat().st_size
+    bad, n_good, n_bad, end = array("q"), 0, 0, 24
+    good_ports: set[int] = set()
+    other_sizes: dict[int, array[int]] = {}  # port: places of the records of whole datagrams of another size
+    n_others: Counter[int] = Counter()
+    pending: dict[bytes, tuple[list[int], int, int]] = {}  # source: places, bytes so far, port and length of UDP
+    with path.open("rb") as file:
+        head = file.read(24)
+    order = PCAP_MAGIC.get(head[:4], "<")
+    link = struct.unpack(f"{order}I", head[20:24])[0] & 0xFFFF if len(head) == 24 else 1
+    for k, (at, packet) in enumerate(pcap_packets(path, whole=False)):
+        if k % 10_000 == 0:
+            alive()
+        end = at + 16 + len(packet)
+        try:
+            part = _fragment(packet, link)
+        except ValueError:
+            bad.append(at)
+            n_bad += 1
+            continue
+        if part is None:
+            continue
+        places, n_bytes, udp = pending.pop(part.source, ([], 0, -1))
+        if part.start == 0:
+            if places or len(part.payload) < 8:  # a second beginning: the first datagram lacks its end
+                bad.extend(places)
+                n_bad += 1
+                places, n_bytes = [], 0
+                if len(part.payload) < 8:
+                    bad.append(at)
+                    continue
+            udp = struct.unpack_from(">2xI", part.payload)[0]
+        elif part.start != n_bytes:
+            bad.extend([*places, at])
+            n_bad += 1
+            continue
+        places.append(at)
+        n_bytes += len(part.payload)
+        if part.more:
+            pending[part.source] = places, n_bytes, udp
+            if len(pending) > _PENDING:
+                bad.extend(pending.pop(next(iter(pending)))[0])
+                n_bad += 1
+            continue
+        port, length = udp >> 16, udp & 0xFFFF
+        if length != n_bytes or length == 8:
+            bad.extend(places)
+            n_bad += 1
+        elif length - 8 in sizes:
+            good_ports.add(port)
+            n_good += 1
+        else:
+            other_sizes.setdefault(port, array("q")).extend(places)
+            n_others[port] += 1
+    for places, _, _ in pending.values():
+        bad.extend(places)
+        n_bad += end == size  # a cut file says so itself
+    for port in good_ports & other_sizes.keys():
+        bad.extend(other_sizes[port])
+        n_bad += n_others[port]
+    if end < size:
+        bad.append(end)
+    return Checked(n_good, n_bad, bad)
+
+
+def _fragment(packet: memoryview, link: int) -> _Fragment | None:
+    """The part of a UDP datagram over IPv4 in a packet, None if it holds none; ValueError if lengths contradict."""
+    if link in _LINKS:
+        at, kind = _LINKS[link]
+        if len(packet) < at:
+            raise ValueError("cut inside the link's header")
+        while bytes(packet[kind : kind + 2]) in (b"\x81\x00", b"\x88\xa8") and len(packet) >= at + 4:  # a VLAN
+            at, kind = at + 4, kind + 4
+        if bytes(packet[kind : kind + 2]) != b"\x08\x00":
+            return None
+    elif link in (0, 12, 14, 101, 108, 228):  # loopback has 4 bytes in front, raw IP none
+        at = 4 if link in (0, 108) else 0
+    else:
+        return None
+    if len(packet) < at + 20:
+        raise ValueError("cut inside the IP header")
+    if packet[at] >> 4 != 4 or packet[at + 9] != 17:
+        return None
+    header = 4 * (packet[at] & 15)
+    total, identification, place = struct.unpack_from(">HHH", packet, at + 2)
+    if not 20 <= header < total <= len(packet) - at:
+        raise ValueError("the length in the IP header contradicts the record")
+    source = bytes(packet[at + 12 : at + 20]) + identification.to_bytes(2, "big")
+    return _Fragment(source, 8 * (place & 0x1FFF), bool(place & 0x2000), packet[at + header : at + total])
+
+
+def copy_without(path: Path, bad: Collection[int], target: Path, alive: Callable[[], None]) -> None:
+    """Copy a pcap file without some of its records."""
+    left_out = frozenset(bad)
+    with path.open("rb") as source, target.open("wb") as out:
+        out.write(source.read(24))
+        for k, (at, packet) in enumerate(pcap_packets(path, whole=False)):
+            if k % 10_000 == 0:
+                alive()
+            if at not in left_out:
+                source.seek(at)
+                out.write(source.read(16 + len(packet)))

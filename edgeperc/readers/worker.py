@@ -1,0 +1,76 @@
+"""The process that decodes one capture: reads a request from standard input, writes scans to standard output.
+
+Every reply is a header (`HEADER`: kind, stamp, number of bytes) and its bytes; `apart` reads them.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import importlib
+import json
+import os
+import struct
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import MissingExtraError, PointsError
+from .decoders import decode
+from .tables import MAX_BYTES
+
+__all__ = ["ALIVE", "END", "ERROR", "HEADER", "MISSING", "READY", "SCAN", "WARNING", "main"]
+
+HEADER = struct.Struct("<cdq")
+ALIVE, END, ERROR, MISSING, READY, SCAN, WARNING = b"A", b"Z", b"E", b"M", b"R", b"S", b"W"
+
+
+def main() -> None:
+    """Decode the capture of the request: a JSON object with path, kind, topic, remission_field, limit_s."""
+    # What the libraries print must not come between the replies.
+    replies = os.fdopen(os.dup(1), "wb", 0)
+    os.dup2(2, 1)
+    request = json.loads(sys.stdin.buffer.readline())
+    _limit_memory()
+    with Path(os.devnull).open("w") as nowhere, suppress(BrokenPipeError):  # the reader has gone
+
+        def reply(kind: bytes, content: memoryview | bytes = b"", stamp: float = np.nan) -> None:
+            # The limit is for decoding, not for a reader that takes its time.
+            faulthandler.cancel_dump_traceback_later()
+            for part in (HEADER.pack(kind, stamp, len(content)), content):
+                view = memoryview(part)
+                while len(view):
+                    view = view[replies.write(view) :]
+            # Ends the process, even while a library blocks all Python threads.
+            faulthandler.dump_traceback_later(request["limit_s"], exit=True, file=nowhere)
+
+        reply(READY)
+        try:
+            for stamp_s, points in decode(
+                Path(request["path"]),
+                request["kind"],
+                request["topic"],
+                request["remission_field"],
+                lambda text: reply(WARNING, text.encode("utf-8", "replace")),
+                lambda: reply(ALIVE),
+            ):
+                content = np.ascontiguousarray(points, "<f4").data.cast("B") if points.size else b""
+                reply(SCAN, content, np.nan if stamp_s is None else stamp_s)
+        except MissingExtraError as exc:
+            reply(MISSING, json.dumps([exc.package, exc.extra, exc.purpose]).encode())
+        except PointsError as exc:
+            reply(ERROR, str(exc).encode("utf-8", "replace"))
+        else:
+            reply(END)
+    os._exit(0)  # without destructors of libraries that may be damaged
+
+
+def _limit_memory() -> None:
+    """Where the system can: Linux counts the data, macOS accepts the limit without effect, Windows has none."""
+    with suppress(ImportError, ValueError, OSError):
+        resource = importlib.import_module("resource")
+        _, most = resource.getrlimit(resource.RLIMIT_DATA)
+        limit = MAX_BYTES if most == resource.RLIM_INFINITY else min(MAX_BYTES, most)
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, most))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
