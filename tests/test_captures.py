@@ -528,7 +528,7 @@ def test_a_damaged_osf_is_refused_before_it_can_do_harm(ouster: Path, tmp_path: 
     while at < len(content):  # cut between blocks
         for end in (at, at + 6):
             path.write_bytes(content[:end])
-            with pytest.raises(PointsError, match="cut short|cannot be read"):
+            with pytest.raises(PointsError, match=r"cut short|cannot be read"):
                 next(decode_here(path))
         at += 8 + struct.unpack_from("<I", content, at)[0]
 

@@ -43,16 +43,18 @@ def decode_apart(path: Path, kind: str, topic: str | None, remission_field: str 
     """
     request = {"path": str(path), "kind": kind, "topic": topic, "remission_field": remission_field}
     request_line = json.dumps({**request, "limit_s": SCAN_LIMIT_S}).encode() + b"\n"
-    with tempfile.TemporaryDirectory(prefix="edgeperc-", ignore_cleanup_errors=True) as folder:
-        with _start(folder) as process:
-            assert process.stdin is not None
-            assert process.stdout is not None
-            try:
-                with suppress(OSError), process.stdin as stdin:  # its end is found when it does not reply
-                    stdin.write(request_line)
-                yield from _replies(process, process.stdout, path)
-            finally:
-                process.kill()
+    with (
+        tempfile.TemporaryDirectory(prefix="edgeperc-", ignore_cleanup_errors=True) as folder,
+        _start(folder) as process,
+    ):
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            with suppress(OSError), process.stdin as stdin:  # its end is found when it does not reply
+                stdin.write(request_line)
+            yield from _replies(process, process.stdout, path)
+        finally:
+            process.kill()
 
 
 def _start(folder: str) -> subprocess.Popen[bytes]:

@@ -60,8 +60,8 @@ def read_points(
     Raises
     ------
     PointsError
-        The file cannot be read, is empty, larger than 2 GiB, cut short or not a scan. A scan of no points is valid if a header says so;
-        a file of 0 bytes is an error.
+        The file cannot be read, is empty, larger than 2 GiB, cut short or not a scan. A scan of no points is valid if a
+        header says so; a file of 0 bytes is an error.
     """
     if not isinstance(source, str | os.PathLike):
         return as_points(source, remission_field=remission_field)

@@ -37,8 +37,8 @@ def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], No
     metadata = _metadata_beside(path)
     if not metadata:
         raise PointsError(
-            "no Velodyne's packets (1206 bytes each), and as an Ouster's capture it cannot be read: there is no metadata "
-            "beside it. Expected a .json whose name begins alike"
+            "no Velodyne's packets (1206 bytes each), and as an Ouster's capture it cannot be read: there is no "
+            "metadata beside it. Expected a .json whose name begins alike"
         )
     sizes = set()
     for file in metadata:

@@ -1,0 +1,547 @@
+"""Captures that could end the process or fill the memory: they give scans and then `PointsError`, and nothing else."""
+
+from __future__ import annotations
+
+import bz2
+import json
+import os
+import random
+import signal
+import sqlite3
+import struct
+import subprocess
+import sys
+import threading
+import zipfile
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from test_captures import (
+    LIDAR,
+    POINTS,
+    messages,
+    read_until_error,
+    record,
+    sized,
+    vlp16_packets,
+    write_bag2,
+    write_pcap,
+)
+from test_captures import ouster as ouster
+
+from edgeperc.errors import PointsError
+from edgeperc.readers import apart, decoders, files
+from edgeperc.readers.captures import read_scans
+from edgeperc.readers.files import read_points
+from edgeperc.readers.inflate import inflate
+from edgeperc.readers.ouster import check_metadata
+
+READY = "import os, signal, sys, time; from edgeperc.readers.worker import *\nout = sys.stdout.buffer\n"
+READY = "import sys; sys.path[:] = sys.argv[1:]\n" + READY + "out.write(HEADER.pack(READY, 0, 0)); out.flush()\n"
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
+    """The processes that decode captures, as they are started."""
+    processes: list[subprocess.Popen[bytes]] = []
+    real = apart._start
+
+    def start(folder: str) -> subprocess.Popen[bytes]:
+        processes.append(real(folder))
+        return processes[-1]
+
+    monkeypatch.setattr(apart, "_start", start)
+    return processes
+
+
+# --- the process -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal")
+def test_a_process_that_is_killed(ouster: Path, started: list[subprocess.Popen[bytes]]) -> None:
+    scans = read_scans(ouster / "sphere.pcap")
+    _, first = next(scans)
+    assert len(first) == 64 * 256
+    os.kill(started[0].pid, signal.SIGKILL)  # it waits: a scan is larger than the pipe
+    with pytest.raises(PointsError, match=r"sphere\.pcap: after 1 scans .* failed \(SIGKILL\)"):
+        next(scans)
+    assert started[0].returncode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize(
+    ("end", "error"),
+    [
+        ("os.kill(os.getpid(), signal.SIGSEGV)", "failed" if os.name == "nt" else r"failed \(SIGSEGV\)"),
+        ("out.write(b'x' * 100)", "failed"),
+        ("out.write(HEADER.pack(SCAN, 0, 1 << 40))", "failed"),
+        ("out.write(HEADER.pack(SCAN, 0, 64) + bytes(10))", "failed"),
+        ("os._exit(3)", r"failed \(exit code 3\)"),
+        ("out.write(b'x' * 100); out.flush(); time.sleep(60)", "failed"),
+    ],
+)
+def test_a_process_that_ends_or_replies_nonsense(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, started: list[subprocess.Popen[bytes]], end: str, error: str
+) -> None:
+    monkeypatch.setattr(apart, "_START", READY + end)
+    with pytest.raises(PointsError, match=error):
+        next(read_scans(write_pcap(tmp_path / "any.pcap", [])))
+    assert started[0].returncode is not None
+
+
+def test_a_process_that_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(apart, "_START", "import sys; sys.exit(7)")
+    with pytest.raises(PointsError, match=r"did not start \(exit code 7\)"):
+        next(read_scans(write_pcap(tmp_path / "any.pcap", [])))
+
+
+def test_a_scan_that_takes_too_long(ouster: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(apart, "SCAN_LIMIT_S", 0.01)  # less than importing the library takes
+    with pytest.raises(PointsError, match=r"took longer than 0\.01 s"):
+        next(read_scans(ouster / "sphere.pcap"))
+
+
+def test_the_process_ends_with_the_iterator(ouster: Path, started: list[subprocess.Popen[bytes]]) -> None:
+    scans = read_scans(ouster / "sphere.pcap")
+    next(scans)
+    assert started[0].poll() is None
+    scans.close()  # type: ignore[attr-defined]
+    assert started[0].returncode is not None
+    list(read_scans(ouster / "sphere.pcap"))
+    assert started[1].returncode is not None
+
+
+def test_from_threads(ouster: Path) -> None:
+    counts: list[int] = []
+    threads = [
+        threading.Thread(target=lambda: counts.append(len(list(read_scans(ouster / "sphere.pcap"))))) for _ in range(3)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert counts == [3, 3, 3]
+
+
+def test_a_program_without_a_guard(ouster: Path, tmp_path: Path) -> None:
+    """The program is not run again in the other process, and files of the folder it runs in are not imported there."""
+    (tmp_path / "program.py").write_text(
+        "import sys, edgeperc\nprint(len([points for _, points in edgeperc.read_scans(sys.argv[1])]))\n"
+    )
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "numpy.py").write_text("raise RuntimeError")
+    done = subprocess.run(
+        [sys.executable, tmp_path / "program.py", ouster / "sphere.pcap"], cwd=elsewhere, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout) == (0, "3\n"), done.stderr
+
+
+# --- packets and metadata --------------------------------------------------------------------------------------------
+
+
+def records_of(content: bytes) -> list[bytes]:
+    """The records of a pcap file, each with its header."""
+    at, found = 24, []
+    while at < len(content):
+        end = at + 16 + struct.unpack_from("<I", content, at + 8)[0]
+        found.append(content[at:end])
+        at = end
+    return found
+
+
+def datagram(payload: bytes, *, port: int = 7502, length: int | None = None, total: int | None = None) -> bytes:
+    """A record of a UDP packet; lengths in its headers may be false."""
+    udp = struct.pack(">HHHH", port, port, 8 + len(payload) if length is None else length, 0) + payload
+    total = 20 + len(udp) if total is None else total
+    ip = struct.pack(">BBHHHBBHII", 0x45, 0, total, 7, 0, 64, 17, 0, 0x7F000001, 0x7F000001) + udp
+    frame = bytes(12) + b"\x08\x00" + ip
+    return struct.pack("<IIII", 1000, 0, len(frame), len(frame)) + frame
+
+
+BAD_PACKETS = {
+    "empty": datagram(b""),
+    "empty by its IP length": datagram(bytes(3000), total=28),
+    "IP length past the record": datagram(bytes(100), total=9000),
+    "UDP length": datagram(bytes(100), length=3000),
+    "cut inside UDP": datagram(b"", length=0, total=21),
+    "another size on the sensor's port": datagram(bytes(100)),
+    "cut inside IP": struct.pack("<IIII", 1000, 0, 20, 20) + bytes(12) + b"\x08\x00" + bytes(6),
+}
+
+
+@pytest.mark.parametrize("name", [*BAD_PACKETS])
+def test_damaged_packets_of_an_ouster_are_dropped(ouster: Path, tmp_path: Path, name: str) -> None:
+    """They may come anywhere, between the fragments of a good packet too; every scan is the same."""
+    content = (ouster / "sphere.pcap").read_bytes()
+    path = tmp_path / "damaged.pcap"
+    path.with_suffix(".json").write_bytes((ouster / "sphere.json").read_bytes())
+    records = records_of(content)
+    for place in (len(records) // 2, 1, 0):
+        records.insert(place, BAD_PACKETS[name])
+    path.write_bytes(content[:24] + b"".join(records))
+    with pytest.warns(UserWarning, match="dropped 3 damaged packets") as caught:
+        scans = list(read_scans(path))
+    assert len(caught) == 1
+    for (stamp, points), (true_stamp, true_points) in zip(scans, read_scans(ouster / "sphere.pcap"), strict=True):
+        assert stamp == true_stamp
+        np.testing.assert_array_equal(points, true_points)
+
+
+def test_packets_of_others_are_no_damage(ouster: Path, tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    content = (ouster / "sphere.pcap").read_bytes()
+    path = tmp_path / "shared.pcap"
+    path.with_suffix(".json").write_bytes((ouster / "sphere.json").read_bytes())
+    arp = struct.pack("<IIII", 1000, 0, 42, 42) + bytes(12) + b"\x08\x06" + bytes(28)
+    path.write_bytes(content[:24] + arp + datagram(b"name server", port=53) + content[24:])
+    assert len(list(read_scans(path))) == 3
+    assert not recwarn.list
+
+
+def in_fragments(packet: bytes, identification: int) -> list[bytes]:
+    """The records of a datagram that was sent in three fragments."""
+    frame = packet[16:]
+    payload = frame[34:]
+    found = []
+    for at in range(0, len(payload), step := 8 * -(-len(payload) // 24)):
+        part = payload[at : at + step]
+        place = at // 8 | (0x2000 if at + step < len(payload) else 0)
+        ip = frame[14:16] + struct.pack(">HHH", 20 + len(part), identification, place) + frame[22:34]
+        found.append(packet[:8] + struct.pack("<II", 34 + len(part), 34 + len(part)) + frame[:14] + ip + part)
+    return found
+
+
+def test_packets_in_fragments(ouster: Path, tmp_path: Path) -> None:
+    content = (ouster / "sphere.pcap").read_bytes()
+    records = [part for k, each in enumerate(records_of(content)) for part in in_fragments(each, k)]
+    path = tmp_path / "fragments.pcap"
+    path.with_suffix(".json").write_bytes((ouster / "sphere.json").read_bytes())
+    path.write_bytes(content[:24] + b"".join(records))
+    whole = [len(points) for _, points in read_scans(path)]
+    assert whole == [64 * 256] * 3
+    for missing in (3, 4, 5):  # the second packet's first fragment, its middle, its last
+        path.write_bytes(content[:24] + b"".join(records[:missing] + records[missing + 1 :]))
+        with pytest.warns(UserWarning, match=r"dropped \d damaged packets"):
+            sizes = [len(points) for _, points in read_scans(path)]
+        assert sizes[1:] == whole[1:]
+        assert 0 < sizes[0] < whole[0]
+
+
+METADATA = {
+    "lidar_data_format": {
+        "columns_per_frame": 1024,
+        "columns_per_packet": 16,
+        "pixels_per_column": 4,
+        "column_window": [0, 1023],
+        "pixel_shift_by_row": [0, 1, 2, -3],
+    },
+    "beam_intrinsics": {"beam_altitude_angles": [1.0, 2, 3, 4], "beam_azimuth_angles": [0.0] * 4},
+}
+
+
+@pytest.mark.parametrize(
+    ("holder", "name", "value"),
+    [
+        ("lidar_data_format", "columns_per_packet", 0),
+        ("lidar_data_format", "columns_per_packet", -16),
+        ("lidar_data_format", "columns_per_packet", 1 << 40),
+        ("lidar_data_format", "columns_per_packet", True),
+        ("lidar_data_format", "columns_per_frame", 0),
+        ("lidar_data_format", "columns_per_frame", 1e300),
+        ("lidar_data_format", "columns_per_frame", "many"),
+        ("lidar_data_format", "pixels_per_column", 0),
+        ("lidar_data_format", "pixels_per_column", 1 << 30),
+        ("lidar_data_format", "column_window", [0, 1024]),
+        ("lidar_data_format", "column_window", [0]),
+        ("lidar_data_format", "pixel_shift_by_row", [0, 1, 2]),
+        ("lidar_data_format", "pixel_shift_by_row", [0, 1, 2, 1 << 20]),
+        ("beam_intrinsics", "beam_altitude_angles", []),
+        ("beam_intrinsics", "beam_altitude_angles", [1.0] * 5),
+        ("beam_intrinsics", "beam_azimuth_angles", [0.0, 0.0, 0.0, float("nan")]),
+        ("beam_intrinsics", "beam_azimuth_angles", "none"),
+    ],
+)
+def test_impossible_metadata_names_the_field(holder: str, name: str, value: Any) -> None:
+    check_metadata(METADATA)
+    check_metadata({})
+    with pytest.raises(PointsError, match=name):
+        check_metadata({**METADATA, holder: {**METADATA[holder], name: value}})
+
+
+def test_metadata_that_would_end_the_process(ouster: Path, tmp_path: Path) -> None:
+    path = tmp_path / "zero.pcap"
+    path.write_bytes((ouster / "sphere.pcap").read_bytes())
+    metadata = json.loads((ouster / "sphere.json").read_text())
+    metadata["lidar_data_format"]["columns_per_packet"] = 0
+    path.with_suffix(".json").write_text(json.dumps(metadata))
+    scans, error = read_until_error(path)
+    assert not scans
+    assert "zero.json" in error
+    assert "columns_per_packet" in error
+
+
+# --- random damage ---------------------------------------------------------------------------------------------------
+
+
+def read_whole(path: Path) -> None:
+    """Every scan and perhaps a `PointsError`; another error fails the test."""
+    with suppress(PointsError):
+        for _, points in read_scans(path):
+            assert points.shape[1] == 4
+
+
+def damage(content: bytes, chance: random.Random, near: int) -> bytes:
+    """Change some bytes; most of them among the first ``near`` of a record, where headers are."""
+    damaged = bytearray(content)
+    places, at = [], 24
+    while at < len(content):
+        places.append(at)
+        at += 16 + struct.unpack_from("<I", content, at + 8)[0]
+    for _ in range(chance.choice((1, 4, 30))):
+        start = chance.choice(places) + chance.choice((8, 16, 16, 16))
+        place = min(start + chance.randrange(near), len(damaged) - 1)
+        damaged[place] = chance.choice((0, 255, chance.randrange(256)))
+    return bytes(damaged)
+
+
+@pytest.mark.filterwarnings("ignore:.*damaged packets:UserWarning")
+def test_damaged_packet_captures(ouster: Path, tmp_path: Path) -> None:
+    pytest.importorskip("velodyne_decoder")
+    chance = random.Random(5)
+    velodyne = write_pcap(tmp_path / "vlp16.pcap", vlp16_packets(1.2)).read_bytes()
+    (tmp_path / "sphere.json").write_bytes((ouster / "sphere.json").read_bytes())
+    for content, name in (((ouster / "sphere.pcap").read_bytes(), "sphere.pcap"), (velodyne, "vlp16.pcap")):
+        for _ in range(6):
+            (tmp_path / name).write_bytes(damage(content, chance, 120))
+            read_whole(tmp_path / name)
+
+
+@pytest.mark.filterwarnings("ignore:.*damaged packets:UserWarning")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "ouster/OS-0-128-U1_v2.3.0_1024x10",
+        "velodyne/sample_velodyne_vlp16_gps",
+    ],
+)
+def test_real_captures_that_are_damaged(data_root: Callable[[str], Path], tmp_path: Path, name: str) -> None:
+    pytest.importorskip("velodyne_decoder" if name.startswith("velodyne") else "ouster.sdk.pcap")
+    source = data_root("other_sensors") / name
+    if source.with_name(f"{source.name}.json").is_file():
+        (tmp_path / "copy.json").write_bytes(source.with_name(f"{source.name}.json").read_bytes())
+    chance, content = random.Random(6), source.with_name(f"{source.name}.pcap").read_bytes()
+    for _ in range(6):
+        (tmp_path / "copy.pcap").write_bytes(damage(content, chance, 120))
+        read_whole(tmp_path / "copy.pcap")
+
+
+def test_osf_files_with_damage_and_right_checksums(ouster: Path, tmp_path: Path) -> None:
+    content = (ouster / "sphere.osf").read_bytes()
+    blocks, at = [], 0
+    while at < len(content):
+        end = at + 4 + struct.unpack_from("<I", content, at)[0]
+        blocks.append((at, end))
+        at = end + 4
+    chance = random.Random(7)
+    for _ in range(6):
+        damaged = bytearray(content)
+        at, end = chance.choice(blocks)
+        damaged[chance.randrange(at + 4, min(end, at + 400))] ^= chance.randrange(1, 256)
+        damaged[end : end + 4] = struct.pack("<I", zlib.crc32(damaged[at:end]))
+        (tmp_path / "damaged.osf").write_bytes(damaged)
+        read_whole(tmp_path / "damaged.osf")
+
+
+# --- compressed files ------------------------------------------------------------------------------------------------
+
+
+def pack(content: bytes, method: str) -> bytes:
+    if method == "lz4":
+        return bytes(pytest.importorskip("lz4.frame").compress(content))
+    if method == "zstd":
+        return bytes(pytest.importorskip("zstandard").ZstdCompressor().compress(content))
+    if method == "deflate":
+        packer = zlib.compressobj(wbits=-15)
+        return packer.compress(content) + packer.flush()
+    return bz2.compress(content) if method == "bz2" else content
+
+
+@pytest.mark.parametrize("method", ["", "deflate", "bz2", "lz4", "zstd"])
+def test_inflating_stops_at_the_limit(method: str) -> None:
+    content = random.Random(1).randbytes(5000) + bytes(3_000_000)
+    packed = pack(content, method)
+    assert inflate(packed, method, len(content)) == content
+    with pytest.raises(PointsError, match=f"more than {len(content) - 1:,}"):
+        inflate(packed, method, len(content) - 1)
+    if method:
+        with pytest.raises(PointsError, match=r"damaged|cut short"):
+            inflate(b"\xff" * 50, method, 100)
+    with pytest.raises(PointsError, match="unknown compression 'rar'"):
+        inflate(packed, "rar", 100)
+
+
+def test_several_bz2_streams() -> None:
+    assert inflate(bz2.compress(b"one") + bz2.compress(b"two"), "bz2", 6) == b"onetwo"
+    with pytest.raises(PointsError, match="cut short"):
+        inflate(bz2.compress(b"one")[:-5], "bz2")
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2])
+def test_an_npz_that_claims_less_than_it_holds(tmp_path: Path, method: int) -> None:
+    path = tmp_path / "bomb.npz"
+    with zipfile.ZipFile(path, "w", method) as archive:
+        archive.writestr("points.npy", bytes(40_000_000))
+    content = path.read_bytes()
+    assert content.count(struct.pack("<I", 40_000_000)) == 2
+    path.write_bytes(content.replace(struct.pack("<I", 40_000_000), struct.pack("<I", 160)))
+    with pytest.raises(PointsError, match="unpack to more than 160"):
+        read_points(path)
+
+
+def test_an_npz_of_bzip2_and_one_with_a_wrong_checksum(tmp_path: Path) -> None:
+    plain = tmp_path / "points.npy"
+    np.save(plain, POINTS)
+    for method in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2):
+        path = tmp_path / "points.npz"
+        with zipfile.ZipFile(path, "w", method) as archive:
+            archive.write(plain, "points.npy")
+        np.testing.assert_array_equal(read_points(path), POINTS)
+    crc = struct.pack("<I", zlib.crc32(plain.read_bytes()))
+    path.write_bytes(path.read_bytes().replace(crc, bytes(4)))
+    with pytest.raises(PointsError, match="CRC-32 is wrong"):
+        read_points(path)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
+        archive.write(plain, "points.npy")
+    with pytest.raises(PointsError, match="another method than deflate or bzip2"):
+        read_points(path)
+
+
+@pytest.mark.parametrize("name", ["huge.bin", "huge.txt", "huge.pcd"])
+def test_huge_files_are_refused_before_they_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    with (tmp_path / name).open("wb") as file:
+        file.truncate(100 << 30)  # sparse
+    monkeypatch.setattr(files.np, "fromfile", None)
+    with pytest.raises(PointsError, match="107,374,182,400 bytes are too much for one scan"):
+        read_points(tmp_path / name)
+
+
+def chunked_mcap(
+    path: Path, method: str, *, crc: bool = True, damaged: int | None = None, summary: bool = True
+) -> Path:
+    """MCAP with a chunk for each of three clouds; one may have a changed byte behind its checksum."""
+    typesys = pytest.importorskip("rosbags.typesys")
+    store, sent = messages(typesys, 2)
+    kind = "sensor_msgs/msg/PointCloud2"
+    magic = b"\x89MCAP0\r\n"
+    definition = store.generate_msgdef(kind, ros_version=2)[0].encode()
+    meta = record(3, struct.pack("<H", 1) + sized(kind.encode()) + sized(b"ros2msg") + sized(definition))
+    meta += record(4, struct.pack("<HH", 1, 1) + sized(LIDAR.encode()) + sized(b"cdr") + sized(b""))
+    content = magic + record(1, sized(b"ros2") + sized(b"test"))
+    clouds = [(stamp_ns, message) for topic, _, stamp_ns, message in sent if topic == LIDAR]
+    for k, (stamp_ns, message) in enumerate(clouds):
+        data = struct.pack("<HIQQ", 1, k, stamp_ns, stamp_ns) + bytes(store.serialize_cdr(message, kind))
+        records = (meta if k == 0 else b"") + record(5, data)
+        checksum = zlib.crc32(records) if crc else 0
+        if k == damaged:
+            records = records[:-9] + bytes([records[-9] ^ 1]) + records[-8:]
+        packed = pack(records, method)
+        head = struct.pack("<QQQI", stamp_ns, stamp_ns, len(records), checksum)
+        content += record(6, head + sized(method.encode()) + struct.pack("<Q", len(packed)) + packed)
+    content += record(15, bytes(4))
+    place = len(content) if summary else 0
+    content += (meta if summary else b"") + record(2, struct.pack("<QQI", place, 0, 0)) + magic
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize("summary", [True, False])
+@pytest.mark.parametrize("method", ["", "lz4", "zstd"])
+def test_mcap_chunks(tmp_path: Path, method: str, summary: bool) -> None:
+    for crc in (True, False):
+        scans = list(read_scans(chunked_mcap(tmp_path / "whole.mcap", method, crc=crc, summary=summary)))
+        assert [stamp for stamp, _ in scans] == pytest.approx([100.5, 101.5, 202.0])
+        for k, (_, points) in enumerate(scans):
+            np.testing.assert_array_equal(points, POINTS + np.float32(k))
+    scans, error = read_until_error(chunked_mcap(tmp_path / "bad.mcap", method, damaged=2, summary=summary))
+    assert len(scans) == 2
+    assert "bad.mcap: a chunk is damaged: its CRC-32 is wrong" in error
+
+
+@pytest.mark.parametrize("method", ["lz4", "zstd"])
+@pytest.mark.parametrize("claim", [100, 1 << 33])
+def test_an_mcap_chunk_that_holds_more_than_it_says(tmp_path: Path, method: str, claim: int) -> None:
+    path = chunked_mcap(tmp_path / "bomb.mcap", method)
+    content = path.read_bytes()
+    packed = pack(bytes(10_000_000), method)
+    chunk = struct.pack("<QQQI", 1, 1, claim, 0) + sized(method.encode()) + struct.pack("<Q", len(packed)) + packed
+    end = content.index(record(15, bytes(4)))
+    content = content[:end] + record(6, chunk) + content[end:]
+    (place,) = struct.unpack_from("<Q", content, len(content) - 28)
+    path.write_bytes(content[:-28] + struct.pack("<Q", place + len(record(6, chunk))) + content[-20:])
+    scans, error = read_until_error(path)
+    assert len(scans) == 3
+    assert "unpack to" in error
+
+
+@pytest.mark.parametrize("compression", ["BZ2", "LZ4"])
+def test_a_bag_with_compressed_chunks(tmp_path: Path, compression: str) -> None:
+    rosbag1, typesys = pytest.importorskip("rosbags.rosbag1"), pytest.importorskip("rosbags.typesys")
+    store, sent = messages(typesys, 1)
+    bag = rosbag1.Writer(tmp_path / "packed.bag")
+    bag.set_compression(rosbag1.Writer.CompressionFormat[compression])
+    with bag:
+        connection = bag.add_connection(LIDAR, sent[0][1], typestore=store)
+        for topic, kind, stamp_ns, message in sent:
+            if topic == LIDAR:
+                bag.write(connection, stamp_ns, store.serialize_ros1(message, kind))
+    scans = list(read_scans(tmp_path / "packed.bag"))
+    assert len(scans) == 3
+    np.testing.assert_array_equal(scans[0][1], POINTS)
+
+
+def test_chunks_of_a_bag_stop_at_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Chunk(NamedTuple):
+        decompressor: Callable[[bytes], bytes]
+
+    monkeypatch.setattr(decoders, "inflate", lambda packed, method: inflate(packed, method, 1000))
+    reader = SimpleNamespace(chunks={9: Chunk(lambda packed: packed + b" as it is")})
+    decoders._limit_chunks(reader)
+    unpack = reader.chunks[9].decompressor
+    assert unpack(b"plain") == b"plain as it is"
+    for method in ("bz2", "lz4"):
+        assert unpack(pack(bytes(1000), method)) == bytes(1000)
+        with pytest.raises(PointsError, match="more than 1,000"):
+            unpack(pack(bytes(1001), method))
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux limits the memory of a process")
+def test_a_message_that_takes_more_memory_than_the_limit(tmp_path: Path) -> None:
+    zstandard = pytest.importorskip("zstandard")
+    folder = write_bag2(tmp_path / "bag")
+    metadata = folder / "metadata.yaml"
+    text = metadata.read_text()
+    for name, value in (("compression_format", "zstd"), ("compression_mode", "message")):
+        text = "".join(
+            f"  {name}: {value}\n" if line.strip().startswith(f"{name}:") else line for line in text.splitlines(True)
+        )
+    metadata.write_text(text)
+    (database,) = folder.glob("*.db3")
+    # A frame of one block, whose header says 8 GiB.
+    bomb = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", 8 << 30) + b"\x03\0\0\0"
+    connection = sqlite3.connect(database)
+    rows = connection.execute("SELECT id, data FROM messages ORDER BY timestamp").fetchall()
+    for k, (number, data) in enumerate(rows):
+        packed = bomb if k >= 2 else zstandard.ZstdCompressor().compress(data)
+        connection.execute("UPDATE messages SET data = ? WHERE id = ?", (packed, number))
+    connection.commit()
+    connection.close()
+    scans, error = read_until_error(folder)
+    assert len(scans) == 1
+    assert "after 1 scans decoding the capture takes more than 2,147,483,648 bytes of memory" in error
