@@ -8,6 +8,8 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 import warnings
 from collections.abc import Iterator
 from contextlib import suppress
@@ -42,17 +44,18 @@ def decode_apart(path: Path, kind: str, topic: str | None, remission_field: str 
         As `decoders.decode`, or the process ended, or it exceeded the limits of memory or time.
     """
     request = {"path": str(path), "kind": kind, "topic": topic, "remission_field": remission_field}
-    request_line = json.dumps({**request, "limit_s": SCAN_LIMIT_S}).encode() + b"\n"
+    request_line = json.dumps(request).encode() + b"\n"
     with (
         tempfile.TemporaryDirectory(prefix="edgeperc-", ignore_cleanup_errors=True) as folder,
         _start(folder) as process,
+        _Watch(process) as watch,
     ):
         assert process.stdin is not None
         assert process.stdout is not None
         try:
             with suppress(OSError), process.stdin as stdin:  # its end is found when it does not reply
                 stdin.write(request_line)
-            yield from _replies(process, process.stdout, path)
+            yield from _replies(process, process.stdout, path, watch)
         finally:
             process.kill()
 
@@ -73,9 +76,46 @@ def _start(folder: str) -> subprocess.Popen[bytes]:
     )
 
 
-def _replies(process: subprocess.Popen[bytes], replies: IO[bytes], path: Path) -> Iterator[Scan]:
+class _Watch:
+    """A thread that ends the process when a reply takes too long; not every system can wait for a pipe with a limit.
+
+    Attributes
+    ----------
+    since_s : float or None
+        Since when a reply is awaited, on the monotonic clock; None while the reader of the scans takes its time.
+    expired : bool
+    """
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        self.since_s: float | None = None
+        self.expired = False
+        self._process, self._over = process, threading.Event()
+        self._thread = threading.Thread(target=self._run, name="edgeperc-capture", daemon=True)
+
+    def _run(self) -> None:
+        while not self._over.wait(min(1.0, SCAN_LIMIT_S)):
+            since_s = self.since_s
+            if since_s is not None and time.monotonic() - since_s > SCAN_LIMIT_S:
+                self.expired = True
+                self._process.kill()
+                return
+
+    def __enter__(self) -> _Watch:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+
+def _replies(process: subprocess.Popen[bytes], replies: IO[bytes], path: Path, watch: _Watch) -> Iterator[Scan]:
     n_scans, ready = 0, False
-    while len(header := replies.read(HEADER.size)) == HEADER.size:
+    while True:
+        watch.since_s = time.monotonic()
+        header = replies.read(HEADER.size)
+        if len(header) < HEADER.size:
+            break
         kind, stamp, n_bytes = HEADER.unpack(header)
         if kind not in (ALIVE, END, ERROR, MISSING, READY, SCAN, WARNING) or not 0 <= n_bytes <= MAX_BYTES:
             break
@@ -84,6 +124,7 @@ def _replies(process: subprocess.Popen[bytes], replies: IO[bytes], path: Path) -
             if n_bytes and _fill(replies, points) < n_bytes:
                 break
             n_scans += 1
+            watch.since_s = None
             yield None if np.isnan(stamp) else stamp, points
             continue
         text = replies.read(n_bytes)
@@ -104,10 +145,10 @@ def _replies(process: subprocess.Popen[bytes], replies: IO[bytes], path: Path) -
     except subprocess.TimeoutExpired:
         code = 0
     after = f"after {n_scans} scans " if n_scans else ""
+    if watch.expired:
+        raise PointsError(f"{path}: {after}decoding a scan took longer than {SCAN_LIMIT_S:g} s; the capture is damaged")
     if not ready:
         raise PointsError(f"{path}: the process that decodes captures did not start ({_ending(code)})")
-    if code == 1:
-        raise PointsError(f"{path}: {after}decoding a scan took longer than {SCAN_LIMIT_S:g} s; the capture is damaged")
     raise PointsError(
         f"{path}: {after}the library that decodes the capture failed ({_ending(code)}); the capture is damaged, or "
         f"decoding it takes more than {MAX_BYTES:,} bytes of memory"

@@ -5,7 +5,6 @@ Every reply is a header (`HEADER`: kind, stamp, number of bytes) and its bytes; 
 
 from __future__ import annotations
 
-import faulthandler
 import importlib
 import json
 import os
@@ -27,23 +26,19 @@ ALIVE, END, ERROR, MISSING, READY, SCAN, WARNING = b"A", b"Z", b"E", b"M", b"R",
 
 
 def main() -> None:
-    """Decode the capture of the request: a JSON object with path, kind, topic, remission_field, limit_s."""
+    """Decode the capture of the request: a JSON object with path, kind, topic, remission_field."""
     # What the libraries print must not come between the replies.
     replies = os.fdopen(os.dup(1), "wb", 0)
     os.dup2(2, 1)
     request = json.loads(sys.stdin.buffer.readline())
     _limit_memory()
-    with Path(os.devnull).open("w") as nowhere, suppress(BrokenPipeError):  # the reader has gone
+    with suppress(BrokenPipeError):  # the reader has gone
 
         def reply(kind: bytes, content: memoryview | bytes = b"", stamp: float = np.nan) -> None:
-            # The limit is for decoding, not for a reader that takes its time.
-            faulthandler.cancel_dump_traceback_later()
             for part in (HEADER.pack(kind, stamp, len(content)), content):
                 view = memoryview(part)
                 while len(view):
                     view = view[replies.write(view) :]
-            # Ends the process, even while a library blocks all Python threads.
-            faulthandler.dump_traceback_later(request["limit_s"], exit=True, file=nowhere)
 
         reply(READY)
         try:
@@ -63,7 +58,6 @@ def main() -> None:
             reply(ERROR, str(exc).encode("utf-8", "replace"))
         else:
             reply(END)
-    os._exit(0)  # without destructors of libraries that may be damaged
 
 
 def _limit_memory() -> None:
