@@ -309,7 +309,7 @@ def test_pointseg_halves_widths_only(width):
         assert seen["enlarge"][0].shape[2:] == (64, 32)
 
 
-@pytest.mark.parametrize(("height", "width"), [(64, 2048), (5, 16)])
+@pytest.mark.parametrize(("height", "width"), [(32, 256), (5, 16)])
 def test_pointseg_takes_other_sizes(height, width):
     with torch.inference_mode():
         logits = PointSeg().eval()(torch.randn(1, 5, height, width))
@@ -410,7 +410,7 @@ def test_squeezesegv2_halves_widths_only(make, width):
     assert logits.shape == (2, 4, 64, width)
 
 
-@pytest.mark.parametrize(("height", "width"), [(32, 1024), (5, 16)])
+@pytest.mark.parametrize(("height", "width"), [(32, 128), (5, 16)])
 def test_kulseg_takes_other_sizes(height, width):
     with torch.inference_mode():
         logits = KULSeg(n_classes=3).eval()(torch.randn(2, 5, height, width))
@@ -529,7 +529,7 @@ def test_squeezesegv2_aggregates_context_three_times_and_adds_its_skips():
 
 @pytest.mark.parametrize(
     ("network", "channels", "sizes"),
-    [(PointSegEdge, 5, [(64, 512), (32, 2048), (4, 8)]), (SSADNetEdge, 3, [(400, 200), (8, 16)])],
+    [(PointSegEdge, 5, [(64, 512), (32, 256), (4, 8)]), (SSADNetEdge, 3, [(400, 200), (8, 16)])],
 )
 def test_edge_networks_answer_as_the_full_ones_do(network, channels, sizes):
     edge = network().eval()

@@ -13,7 +13,7 @@ from edgeperc.card import InputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.errors import CardError, PointsError
 from edgeperc.projection import column_edges, make_projector, row_edges, tabulate
 from edgeperc.sensor import get_sensor
-from edgeperc_bench.peers.projection import contenders
+from edgeperc_bench.peers.projection import contenders, fill_copy
 
 KERNELS = ("mark_top_view", "mark_range_image", "fill_image")
 UNEVEN = (2.0, 1.7, 1.3, 0.2, -0.1, -4.0, -4.4, -11.0, -24.8)
@@ -297,3 +297,12 @@ def test_wrong_cards_are_told():
     ):
         with pytest.raises(CardError, match="closer than"):
             make_projector(view, spec)
+
+
+@pytest.mark.kernel
+@pytest.mark.parametrize("n", [0, 1, 500])
+def test_the_loop_for_scale_copies(n):
+    points = random_points(np.random.default_rng(n), n)
+    copy = np.empty_like(points)
+    fill_copy(points, copy)
+    np.testing.assert_array_equal(copy, points)
