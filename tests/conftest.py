@@ -31,6 +31,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "kernel: holds a kernel against its slow twin")
+    if "PYTEST_XDIST_WORKER" in os.environ:  # the processes share the cores; torch's threads would wait for one another
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
     if numba.config.DISABLE_JIT:
         # An interpreted kernel computes with numpy's scalars, which warn where compiled code yields NaN or infinity.
         config.addinivalue_line("filterwarnings", "ignore:(invalid value|overflow|divide by zero):RuntimeWarning")
