@@ -298,7 +298,7 @@ FAULTS = {
     "no remission": "Remission is 0 for 100",
     "upside down": "mounted upside down",
     "camera axes": "ground seems to lie towards",
-    "millimetres": "convert them to meters",
+    "millimeters": "convert them to meters",
 }
 
 
