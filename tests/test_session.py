@@ -233,7 +233,7 @@ def test_the_openvino_plugin_agrees_with_the_cpu_provider() -> None:
     if "openvino" not in available_providers():
         pytest.skip("the OpenVINO plugin is absent, or finds no device of Intel's")
     for variant in listed():
-        assert Session(str(variant), "openvino").golden_deviation < 0.05
+        assert Session(str(variant), "openvino", precision=variant.precision).golden_deviation < 0.05
 
 
 def test_a_failing_run_is_an_inference_error() -> None:
