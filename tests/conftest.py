@@ -134,6 +134,12 @@ def matplotlib() -> None:
 
 
 @pytest.fixture(scope="session")
+def psutil() -> None:
+    """For tests that measure: skips them where only the runtime is installed."""
+    pytest.importorskip("psutil")
+
+
+@pytest.fixture(scope="session")
 def data_root() -> Callable[[str], Path]:
     """A function from the name of a group of real data to the folder that holds it unpacked.
 
