@@ -1,4 +1,4 @@
-"""How reduced precisions agree with fp32: measured through post-processing, and written into the cards."""
+"""Agreement of reduced precisions with fp32: measured after post-processing, and written into the cards."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def measured(labels: list[int], mean_iou: float, ap: float | None) -> module._Me
     ("mean_iou", "ap", "loss"),
     [(0.8, 0.6, 0.0), (0.79, 0.6, 1.0), (0.9, 0.58, 2.0), (0.79, 0.58, 2.0), (0.9, 0.7, 0.0)],
 )
-def test_the_loss_is_the_larger_of_both_in_points(mean_iou: float, ap: float, loss: float) -> None:
+def test_the_loss_is_the_larger_one_of_iou_and_ap_in_points(mean_iou: float, ap: float, loss: float) -> None:
     record = module._record(measured([0, 1, 2, 3], mean_iou, ap), measured([0, 1, 2, 2], 0.8, 0.6), "a command")
     assert record["loss"] == pytest.approx(loss)
     assert (record["label_agreement"], record["n_scans"]) == (0.75, 1)
@@ -44,12 +44,12 @@ def test_a_network_without_boxes_has_no_ap() -> None:
 
 
 @pytest.mark.parametrize("models", [["pointseg:fp32", "ssadnet:int8"], ["pointseg:int8"]])
-def test_files_are_of_one_network_and_one_is_in_fp32(models: list[str]) -> None:
+def test_files_must_be_of_one_network_and_one_in_fp32(models: list[str]) -> None:
     with pytest.raises(ModelError, match="expected files of one network, one of them in fp32"):
         agree(models, kitti=None)
 
 
-def test_labels_are_needed(tmp_path: Path) -> None:
+def test_labeled_scans_are_required(tmp_path: Path) -> None:
     path = tmp_path / "pointseg.onnx"
     shutil.copy(model_path("pointseg"), path)
     with pytest.raises(PointsError, match="name a KITTI object set"):
@@ -57,8 +57,8 @@ def test_labels_are_needed(tmp_path: Path) -> None:
     assert path.read_bytes() == model_path("pointseg").read_bytes()
 
 
-def test_every_precision_is_measured_and_kept(kitti_root: Path, tmp_path: Path) -> None:
-    paths = [tmp_path / "a.onnx", tmp_path / "b.onnx"]  # a file's name decides nothing
+def test_every_precision_is_measured_and_recorded(kitti_root: Path, tmp_path: Path) -> None:
+    paths = [tmp_path / "a.onnx", tmp_path / "b.onnx"]  # the names of the files have no effect
     for variant, path in zip(resolve("pointseg"), paths, strict=True):
         shutil.copy(variant.path, path)
     has_bf16 = importlib.util.find_spec("openvino") is not None and not BF16_FEATURES.isdisjoint(cpu_features())
