@@ -127,7 +127,7 @@ def test_the_remission_is_the_field_asked_for() -> None:
     assert cloud_points(message, remission_field="reflectivity")[:, 3].tolist() == [7.0] * 4
     np.testing.assert_array_equal(cloud_points(message)[:, 3], POINTS[:, 3])
     assert cloud_points(cloud(POINTS, FLOATS[:3]))[:, 3].tolist() == [0.0] * 4
-    with pytest.raises(PointsError, match="no number field 'echo'"):
+    with pytest.raises(PointsError, match="no numeric field 'echo'"):
         cloud_points(message, remission_field="echo")
 
 
@@ -149,9 +149,9 @@ def test_a_cloud_of_no_points_is_a_scan(shape: tuple[int, int]) -> None:
         ({"width": 2**60}, "holds 64 bytes"),
         ({"point_step": 8}, "layout is impossible"),
         ({"point_step": 0}, "layout is impossible"),
-        ({"fields": []}, "no number field x, y, z"),
-        ({"fields": [field("x", 0, "f4"), field("y", 4, "f4")]}, "no number field z among x, y"),
-        ({"fields": [field("x", 0, "f4", 2), field("y", 4, "f4"), field("z", 8, "f4")]}, "no number field x"),
+        ({"fields": []}, "no numeric field x, y, z"),
+        ({"fields": [field("x", 0, "f4"), field("y", 4, "f4")]}, "no numeric field z among x, y"),
+        ({"fields": [field("x", 0, "f4", 2), field("y", 4, "f4"), field("z", 8, "f4")]}, "no numeric field x"),
         ({"fields": [field("x", 2**40, "f4")]}, "layout is impossible"),
         ({"fields": [field("x", -4, "f4")]}, "layout is impossible"),
         ({"fields": None}, "layout is impossible"),
@@ -490,7 +490,7 @@ def test_an_ouster_capture_without_its_metadata(ouster: Path, tmp_path: Path) ->
     path.write_bytes((ouster / "sphere.pcap").read_bytes())
     error = error_of(path)
     assert "metadata" in error
-    assert ".json whose name begins alike" in error
+    assert ".json file whose name has the same beginning" in error
     (tmp_path / "alone.json").write_text("{}")
     assert "cannot be read" in error_of(path)
 
@@ -528,9 +528,9 @@ def test_a_damaged_osf_is_refused_before_it_can_do_harm(ouster: Path, tmp_path: 
 
 def test_packets_of_no_lidar(tmp_path: Path, ouster: Path) -> None:
     path = write_pcap(tmp_path / "other.pcap", [b"name server" * 9] * 7)
-    assert "no Velodyne's packets" in error_of(path)
+    assert "not a Velodyne capture" in error_of(path)
     path.with_suffix(".json").write_text((ouster / "sphere.json").read_text())
-    assert "of its 7 packets none is a LiDAR's" in error_of(path)
+    assert "has 7 packets, none from a supported LiDAR" in error_of(path)
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ json_values = st.recursive(
 
 
 def test_a_bottomless_card_is_a_card_error() -> None:
-    with pytest.raises(CardError, match="no JSON"):
+    with pytest.raises(CardError, match="not JSON"):
         ModelCard.from_json("[" * 200_000)
 
 
@@ -246,12 +246,12 @@ def test_a_file_without_a_card_says_so(tmp_path: Path, content: bytes) -> None:
     ],
 )
 def test_a_damaged_file_is_a_card_error(tmp_path: Path, content: bytes) -> None:
-    with pytest.raises(CardError, match=r"model\.onnx is no complete \.onnx file"):
+    with pytest.raises(CardError, match=r"model\.onnx is not a complete \.onnx file"):
         ModelCard.read(write(tmp_path, content))
 
 
 def test_a_damaged_card_names_its_file(tmp_path: Path) -> None:
-    with pytest.raises(CardError, match=r"model\.onnx: the card is no JSON"):
+    with pytest.raises(CardError, match=r"model\.onnx: the card is not JSON"):
         ModelCard.read(write(tmp_path, entry(CARD_KEY, b"{")))
 
 

@@ -241,7 +241,7 @@ BAD_FILES = {
     "two.npz": (npz(a=POINTS, b=POINTS), "none called points"),
     "zip.npz": (b"PK\3\4" + b"\0" * 60, "cannot be read"),
     "names.pcd": (pcd("a b c", "F F F", "4 4 4", "1 1 1", 1, "ascii", b"1 2 3\n"), "x, y, z"),
-    "vector.pcd": (pcd("x y z", "F F F", "4 4 4", "2 1 1", 1, "ascii", b"1 2 3 4\n"), "no number field x"),
+    "vector.pcd": (pcd("x y z", "F F F", "4 4 4", "2 1 1", 1, "ascii", b"1 2 3 4\n"), "no numeric field x"),
     "half.pcd": (pcd("x y z", "F F F", "2 4 4", "1 1 1", 1, "ascii", b"1 2 3\n"), "TYPE and SIZE"),
     "counts.pcd": (pcd("x y z", "F F F", "4 4", "1 1 1", 1, "ascii", b"1 2 3\n"), "equal length"),
     "zero.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 0", 1, "ascii", b"1 2 3\n"), "COUNT"),
@@ -373,7 +373,7 @@ def test_structured_arrays_with_padding_and_rows_of_an_organized_cloud():
     np.testing.assert_array_equal(as_points(cloud[["x", "y", "z"]])[:, :3], POINTS[:, :3])
     with pytest.raises(PointsError, match=r"field z among x, y"):
         as_points(cloud[["x", "y"]])
-    with pytest.raises(PointsError, match="no number field"):
+    with pytest.raises(PointsError, match="no numeric field"):
         as_points(np.zeros(3, [("x", "O"), ("y", "f4"), ("z", "f4")]))
 
 

@@ -94,7 +94,7 @@ def test_swapped_outputs(tmp_path: Path) -> None:
     names = [o.name for o in card.outputs]
     swapped = f"{first},{second}".replace(names[0], "@").replace(names[1], names[0]).replace("@", names[1])
     path = edited(tmp_path, "ssadnet", (f"{first},{second}".encode(), swapped.encode()))
-    with pytest.raises(CardMismatchError, match=r"its card says tensor\(float\) of shape \(1, 5, 400, 200\)"):
+    with pytest.raises(CardMismatchError, match=r"its card declares tensor\(float\) of shape \(1, 5, 400, 200\)"):
         Session(path, "cpu")
 
 
@@ -224,7 +224,7 @@ def test_auto_passes_over_a_provider_that_cannot_run_the_model(
     monkeypatch.setattr(session_module, "AUTO", ("mirage", "cpu"))
     monkeypatch.setattr(session_module, "available_providers", lambda: ("mirage", "cpu"))
     assert Session(model_path("pointseg"), "auto").provider == "CPUExecutionProvider"
-    assert "auto passes over pointseg on mirage in fp32" in caplog.text
+    assert "auto skips pointseg on mirage in fp32" in caplog.text
     with pytest.raises(ProviderError):
         Session(model_path("pointseg"), "mirage")
 
@@ -281,7 +281,7 @@ def test_auto_passes_over_a_provider_that_gives_other_answers(
     monkeypatch.setattr(Session, "_warm_up", wrong)
     monkeypatch.setattr(session_module, "cpu_features", lambda: frozenset({"avx512_vnni"}))
     assert Session("pointseg", "cpu").description == "pointseg fp32, CPUExecutionProvider"
-    assert "auto passes over pointseg on cpu in int8: off by far" in caplog.text
+    assert "auto skips pointseg on cpu in int8: off by far" in caplog.text
     with pytest.raises(CardMismatchError, match="off by far"):
         Session("pointseg", "cpu", precision="int8")
 
@@ -299,14 +299,14 @@ def test_auto_takes_the_setting_that_was_measured_here(
     assert Session(path, "cpu").options["threads"] == "the provider's choice"
     keep({sha: {"provider": "tensorrt", "precision": "fp32", "n_threads": 1}})
     assert Session(path, "auto").options["threads"] == "the provider's choice"
-    assert "pointseg on tensorrt, measured as the fastest: it is not available any more" in caplog.text
+    assert "pointseg on tensorrt, which was measured as the fastest: it is no longer available" in caplog.text
     monkeypatch.setattr(session_module, "cpu_features", frozenset)
     keep({digest(resolve("pointseg")): {"provider": "cpu", "precision": "int8", "n_threads": 1}})
     assert Session("pointseg").precision == "int8"  # though nothing is known of the processor
     assert Session("pointseg", precision="fp32").options["threads"] == "the provider's choice"
     settings_path().write_text("{")
     assert Session(path, "auto").options["threads"] == "the provider's choice"
-    assert "auto knows of no setting measured here" in caplog.text
+    assert "auto cannot read the settings measured on this computer" in caplog.text
 
 
 def test_threads_must_be_positive() -> None:
