@@ -177,7 +177,7 @@ def ssadnet_loss(
     box_targets : Tensor
         Shaped like ``boxes``: (B, n_slots, 4) from `slot_targets`, or (B, 9, H/4, W/4) from `dense_targets`.
     lw_seg, lw_det : float
-        Table 2.
+        Weights of the two losses (Table 2).
     class_weights : (C,) float, optional
         Not in the paper.
     lovasz_weight : float

@@ -18,7 +18,7 @@ from .recipe import Recipe
 
 __all__ = ["models_page"]
 
-SEES = {"range_image": "a class for every point", "top_view": "drivable area and vehicles ahead"}
+TASKS = {"range_image": "a class for every point", "top_view": "drivable area and vehicles ahead"}
 SOURCES = {"real": "real", "semantickitti": "SemanticKITTI", "simulated": "simulated"}
 ALL_RANGES = ("all",)
 
@@ -87,13 +87,13 @@ def _shipped(variants: Sequence[Variant]) -> Iterable[str]:
         "A name stands for one network and its variants. `Perceiver()` and `edgeperc run PATH` take "
         f"{' and '.join(f'`{name}`' for name in DEFAULT)}. `NAME:fp32` and `NAME:int8` ask for one variant."
     )
-    yield from _head("name", ["answers", "classes", "view", "files", "terms of the weights"])
+    yield from _head("name", ["task", "classes", "view", "files", "terms of the weights"])
     for name in dict.fromkeys(variant.name for variant in variants):
         own = [variant for variant in variants if variant.name == name]
         card = own[0].card
-        sees = "drivable area ahead" if not card.box_classes and card.view.kind == "top_view" else SEES[card.view.kind]
+        task = "drivable area ahead" if not card.box_classes and card.view.kind == "top_view" else TASKS[card.view.kind]
         files = ", ".join(f"{variant.precision} {_size(variant)}" for variant in own)
-        yield _row(f"`{name}`", sees, ", ".join(card.classes), _view(card), files, card.training.get("licence", "-"))
+        yield _row(f"`{name}`", task, ", ".join(card.classes), _view(card), files, card.training.get("licence", "-"))
 
 
 def _view(card: ModelCard) -> str:

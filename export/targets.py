@@ -76,9 +76,10 @@ def dense_targets(
     Returns
     -------
     (9, height/4, width/4) float32
-        Channel 0: 1 in the output cell that holds a box's center, falling off as a Gaussian shaped like the box (its
-        edges are three standard deviations away); -1 in cells that are not learned. Channels 1 to 8: the geometry of
-        the box with the highest heat, in the format of box_dense, where that heat is at least `REGRESSED_FROM`; else 0.
+        Channel 0, the heat: 1 in the output cell that holds a box's center; around it a Gaussian shaped like the box,
+        whose edges are three standard deviations away; -1 in cells that are not learned. Channels 1 to 8: the geometry
+        of the box with the highest heat, in the format of box_dense, where that heat is at least `REGRESSED_FROM`; else
+        0.
 
     Raises
     ------

@@ -49,7 +49,7 @@ N_SLOTS = 16
 
 @dataclass
 class Tally:
-    """A network's labels and boxes, counted against the truth.
+    """Counts of a network's labels and boxes compared with the ground truth.
 
     Attributes
     ----------
@@ -126,10 +126,10 @@ class Task(ABC):
         return distillation_loss(_logits(outputs), probabilities)
 
     def tally(self) -> Tally:
-        """An empty tally, for `judge` to add to."""
+        """An empty tally, for `count` to add to."""
         return Tally(Confusion(self.classes))
 
-    def judge(self, outputs: Outputs, projected: Projection, targets: Targets, scan: LabeledScan, tally: Tally) -> None:
+    def count(self, outputs: Outputs, projected: Projection, targets: Targets, scan: LabeledScan, tally: Tally) -> None:
         """Add the outputs for one scan (a batch of one) to a tally."""
         tally.pixels.update(_logits(outputs)[0].argmax(0).cpu().numpy(), targets[0])
 
@@ -202,7 +202,7 @@ class Vehicles(Task):
         """An empty tally of labels and boxes."""
         return Tally(Confusion(self.classes), BoxEvaluator())
 
-    def judge(self, outputs: Outputs, projected: Projection, targets: Targets, scan: LabeledScan, tally: Tally) -> None:
+    def count(self, outputs: Outputs, projected: Projection, targets: Targets, scan: LabeledScan, tally: Tally) -> None:
         """Labels and boxes as the runtime decodes them; boxes count where the scan is labeled."""
         view = _top_view(self.card)
         kinds = [output.kind for output in self.card.outputs]

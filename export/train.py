@@ -200,7 +200,7 @@ def train(
                 line: dict[str, Any] = {"step": step, "loss": round(float(np.mean(losses)), 5)}
                 losses.clear()
                 if watch is not None:
-                    figure, watched_loss, figures = watch.judge(averaged)
+                    figure, watched_loss, figures = watch.validate(averaged)
                     line |= {"validation_loss": round(watched_loss, 5), "validation": figures}
                     if figure > best_figure:
                         best_figure, best = figure, copy.deepcopy(averaged.state_dict())

@@ -32,7 +32,7 @@ class Watch:
             self.task.target(scan, projected) for scan, projected in zip(scans, self.projected, strict=True)
         ]
 
-    def judge(self, network: nn.Module) -> tuple[float, float, dict[str, float | None]]:
+    def validate(self, network: nn.Module) -> tuple[float, float, dict[str, float | None]]:
         """Validate a network: the decisive figure (`Tally.decisive`), the mean loss, and all figures by name."""
         losses, tally = [], self.task.tally()
         device = next(network.parameters()).device
@@ -41,5 +41,5 @@ class Watch:
                 outputs = network(torch.from_numpy(projected.image[None]).to(device))
             batch = [torch.from_numpy(target[None]).to(device) for target in targets]
             losses.append(float(self.task.loss(outputs, batch)))
-            self.task.judge(outputs, projected, targets, scan, tally)
+            self.task.count(outputs, projected, targets, scan, tally)
         return tally.decisive(), float(np.mean(losses)), tally.figures()

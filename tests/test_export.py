@@ -471,13 +471,15 @@ def test_make_also_makes_the_models_that_it_starts_from(
     }
     evaluated = []
 
-    def judge(datasets: list[object], *args: object, **kwargs: object) -> tuple[dict[str, object], list[object]]:
+    def recorded_evaluate(
+        datasets: list[object], *args: object, **kwargs: object
+    ) -> tuple[dict[str, object], list[object]]:
         evaluated.append([*map(str, datasets)])
         return evaluate(["simulation:1" if d == "simulation" else d for d in datasets], *args, **kwargs)
 
     monkeypatch.setattr(make_module, "MODELS", stages)
     monkeypatch.setattr(make_module, "N_SIMULATED", 2)
-    monkeypatch.setattr(make_module, "evaluate", judge)
+    monkeypatch.setattr(make_module, "evaluate", recorded_evaluate)
     monkeypatch.setattr(to_onnx, "MIN_AGREEMENT", 0.99)  # after so few steps, the logits of many pixels are close
     out = tmp_path / "out"
     arguments = {"kitti": kitti, "layouts": layouts, "n_threads": 1}

@@ -22,7 +22,7 @@ from edgeperc_export.recipe import MODELS, NETWORKS, Recipe
 
 
 def parsers(parser: argparse.ArgumentParser | None = None, name: str = "") -> Iterator[tuple[str, object]]:
-    """Every command's name and parser, the main one's included."""
+    """Name and parser of every command, and of the program itself."""
     parser = parser or build_parser()
     yield name, parser
     for action in parser._actions:
@@ -31,13 +31,13 @@ def parsers(parser: argparse.ArgumentParser | None = None, name: str = "") -> It
                 yield from parsers(inner, f"{name} {command}".strip())
 
 
-def test_every_model_has_its_command() -> None:
+def test_every_model_can_be_made() -> None:
     for name in MODELS:
         if not name.endswith("-start"):
             assert build_parser().parse_args(["make", name, "out"]).name == name
 
 
-def test_every_option_says_what_it_does() -> None:
+def test_every_option_has_a_help_text() -> None:
     commands = dict(parsers())
     assert all(name.count(" ") == 0 for name in commands)  # one level
     for name, parser in commands.items():
@@ -45,11 +45,11 @@ def test_every_option_says_what_it_does() -> None:
             if not isinstance(action, argparse._SubParsersAction):
                 assert action.help, f"{name} {action.option_strings or action.dest} has no help"
                 assert len(action.help.split()) > 1, f"{name} {action.option_strings}: {action.help}"
-        parser.format_help()  # no stray % in a text
+        parser.format_help()  # raises ValueError for a stray % in a help text
 
 
 @pytest.mark.parametrize("command", ["build", "label", "coco", "check"])
-def test_the_old_two_words_name_the_new_one(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_old_database_commands_name_the_new_ones(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         main(["database", command, "out"])
     assert caught.value.code == 2
@@ -63,9 +63,9 @@ from edgeperc_export import recipe
 assert recipe.MODELS and recipe.PAPER
 assert not {"torch", "numpy", "onnx"} & {*sys.modules}, "recipe"
 from edgeperc_export.cli import main
-for words in (["--help"], ["train", "--help"], ["database-build", "--help"]):
+for arguments in (["--help"], ["train", "--help"], ["database-build", "--help"]):
     try:
-        main(words)
+        main(arguments)
     except SystemExit as end:
         assert end.code == 0
 assert not {"torch", "numba", "onnx"} & {*sys.modules}, "--help"
@@ -81,21 +81,21 @@ def test_every_field_of_a_recipe_is_an_option() -> None:
         if field.name != "network":
             assert field.metadata["help"] in str(options[field.name].help)
             assert {*field.metadata["networks"]} <= {*NETWORKS}
-    # Given with its default, each option gives the default recipe of each network that it is for.
+    # All options of a network, given with their defaults, result in the default recipe.
     for network in NETWORKS:
-        words = ["train", network, "out"]
+        arguments = ["train", network, "out"]
         for field in dataclasses.fields(Recipe):
             if field.metadata and network in field.metadata["networks"]:
                 option = f"--{field.name.replace('_', '-')}"
                 if isinstance(field.default, bool):
-                    words += [option if field.default else option.replace("--", "--no-", 1)]
+                    arguments += [option if field.default else option.replace("--", "--no-", 1)]
                 else:
-                    words += [option, str(field.default)]
-        assert _recipe(build_parser().parse_args(words)) == Recipe(network)
+                    arguments += [option, str(field.default)]
+        assert _recipe(build_parser().parse_args(arguments)) == Recipe(network)
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("arguments", "message"),
     [
         (["pointseg", "--head", "slots"], "--head has no effect on pointseg, only on ssadnet"),
         (["lodnn", "--no-class-weights"], "--class-weights has no effect on lodnn"),
@@ -110,13 +110,13 @@ def test_every_field_of_a_recipe_is_an_option() -> None:
     ],
 )
 def test_an_option_without_effect_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
-    assert main(["train", words[0], str(tmp_path), *words[1:]]) == 2
+    assert main(["train", arguments[0], str(tmp_path), *arguments[1:]]) == 2
     assert message in capsys.readouterr().err
 
 
-def test_wrong_usage_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_usage_is_reported_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(
         ValueError, match="kulseg has no network for small computers; expected lodnn or pointseg or ssadnet"
     ):
