@@ -121,7 +121,7 @@ def test_a_read_only_installation_caches_in_the_users_folder(site: Path, tmp_pat
 
 
 @needs_compiler
-def test_a_read_only_system_caches_where_it_is_told(site: Path, tmp_path: Path) -> None:
+def test_read_only_system_caches_in_the_given_folder(site: Path, tmp_path: Path) -> None:
     """No folder of the package or of the user can be written; ``NUMBA_CACHE_DIR`` names one that can."""
     forbid_writing(site)
     nowhere = tmp_path / "nowhere"
@@ -132,7 +132,7 @@ def test_a_read_only_system_caches_where_it_is_told(site: Path, tmp_path: Path) 
     assert second["hits"] == first["misses"] == first["kernels"]
 
 
-def test_without_onnxruntime_a_perceiver_says_which_line_to_run(site: Path) -> None:
+def test_without_onnxruntime_a_perceiver_names_the_install_command(site: Path) -> None:
     done = run(site, USE_WITHOUT_ONNXRUNTIME, "any.onnx")
     assert done.returncode == 0, done.stderr
     assert "pip install 'edgeperc[cpu]'" in done.stdout
