@@ -323,7 +323,7 @@ def test_a_simulated_share_of_1_uses_no_real_frame(tmp_path: Path, kitti: Path, 
 def test_the_learning_rate_is_halved_after_epochs_without_improvement(
     tmp_path: Path, kitti: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Watch, "judge", lambda self, network: (0.5, 1.0, {"car": 0.5}))
+    monkeypatch.setattr(Watch, "validate", lambda self, network: (0.5, 1.0, {"car": 0.5}))
     recipe = small("pointseg", steps=4, halve_after=2, n_pasted=0.0)
     checkpoint = train(recipe, tmp_path, kitti=kitti, simulated=simulated, fold=1, n_threads=1, checkpoint_every=1)
     state = torch.load(checkpoint, weights_only=True)
