@@ -71,23 +71,23 @@ class TopViewGeometry:
         return round((self.y_range_m[1] - self.y_range_m[0]) / self.cell_m)
 
     def holds(self, x: float, y: float) -> bool:
-        """Whether a place x, y [m] is in view."""
+        """Whether a position x, y [m] in the sensor frame is in view."""
         (near, far), (right, left) = self.x_range_m, self.y_range_m
         return near <= x < far and right <= y < left
 
     def cells(self, x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-        """Cells that hold some places.
+        """Find the cells that contain some positions.
 
         Parameters
         ----------
         x, y : array_like
-            Places [m], in arrays of shapes that broadcast together.
+            Positions in the sensor frame [m]; their shapes must broadcast.
 
         Returns
         -------
         rows, cols : ndarray of int64
         in_view : ndarray of bool
-            False where a place is out of view or not finite; its row and column are then no index.
+            False if a position is out of view or not finite; its row and column are then not valid.
         """
         row = np.floor((self.x_range_m[1] - np.asarray(x)) / self.cell_m)
         col = np.floor((self.y_range_m[1] - np.asarray(y)) / self.cell_m)
@@ -96,8 +96,8 @@ class TopViewGeometry:
             return row.astype(np.int64), col.astype(np.int64), in_view
 
     def cell_centers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """x (rows, 1) and y (1, cols) of the middles of the cells [m]."""
-        # numpy's own float64: older stubs take a product with Python's float for any float
+        """Centers of the cells in the sensor frame [m]: x (rows, 1) and y (1, columns)."""
+        # np.float64, because older type stubs of numpy widen the type of a product with a Python float
         cell_m = np.float64(self.cell_m)
         x = np.float64(self.x_range_m[1]) - (np.arange(self.height, dtype=np.float64)[:, None] + 0.5) * cell_m
         y = np.float64(self.y_range_m[1]) - (np.arange(self.width, dtype=np.float64)[None, :] + 0.5) * cell_m
@@ -145,13 +145,22 @@ class RangeImageGeometry:
 
     @property
     def height(self) -> int:
-        """Rows, one a beam."""
+        """Rows, one per beam."""
         return len(self.row_elevations_deg)
 
 
 @dataclass(frozen=True, slots=True)
 class InputSpec:
-    """The network's input: ``(raw - mean) / std`` per channel, 0 in every channel where nothing returned."""
+    """The network's input: ``(raw - mean) / std`` per channel; 0 in every channel of a pixel without a return.
+
+    Attributes
+    ----------
+    name : str
+        Name of the input in the graph.
+    channels : tuple of str
+    mean, std : tuple of float
+        One value per channel, in the channel's unit.
+    """
 
     name: str
     channels: tuple[str, ...]
@@ -182,16 +191,16 @@ class OutputSpec:
 
 @dataclass(frozen=True, slots=True)
 class Golden:
-    """A known input, and the exporting computer's answers to it.
+    """A known input, and the outputs that the exporting computer got for it.
 
-    The input is uniform noise in -1..1 from ``numpy.random.PCG64(seed)``. At samples of every output
-    (flat positions) the answers are kept, so that any runtime can be held against the exporter's.
+    The input is uniform noise in -1..1 from ``numpy.random.PCG64(seed)``. Each output is stored at sampled flat
+    positions, so that any runtime can be compared with the exporter's.
 
     Attributes
     ----------
     seed : int
     input_sha256 : str
-        Of the input's bytes, float32, C order.
+        SHA-256 of the input as float32 bytes in C order.
     outputs : mapping
         Output name to ``{"sha256": str, "std": float, "positions": [int], "values": [float]}``.
     """
@@ -209,7 +218,7 @@ class ModelCard:
     ----------
     name, version : str
     precision : {"fp32", "int8"}
-        Of the stored weights: ``"int8"`` where they and the activations between them are eight-bit integers.
+        Precision of the stored weights. ``"int8"``: weights and activations are 8-bit integers.
     view : TopViewGeometry or RangeImageGeometry
     input : InputSpec
     outputs : tuple of OutputSpec
@@ -220,25 +229,25 @@ class ModelCard:
     box_size_priors : mapping
         Class to usual (length, width, height) [m].
     box_size_spreads : mapping
-        Class to the standard deviations of their logarithms; empty where sizes do not separate classes.
+        Class to the standard deviations of the logarithms of these sizes; empty if size does not decide the class.
     score_threshold, nms_iou : float
         Defaults for boxes.
     mount_height_m : float
         Height of the training sensor above the road [m].
     fitness : mapping or None
-        Measures of the training scans (`edgeperc.fitness.FitnessProfile`); None if they were not measured.
+        Statistics of the training scans (`edgeperc.fitness.FitnessProfile`); None if they were not measured.
     training : mapping
         Free-form training metadata: data, licence, recipe, seed, hashes of the frames.
     metrics : mapping
-        Measured figures.
+        Measured accuracy.
     parity : mapping
-        How far the exported graph was from the network it was made of.
+        Measured differences between the exported graph and the network that it was made from.
     golden : Golden or None
     precisions : mapping
-        Precision in which this file can run to how its answers agree with those of fp32 on real scans, after
+        For each precision in which this file can run, the measured agreement with fp32 on real scans after
         post-processing: ``n_scans``, ``label_agreement`` (share of pixels or cells), ``mean_iou`` and ``ap`` with
-        ``fp32_mean_iou`` and ``fp32_ap`` (0..1; AP is None without boxes), ``loss`` (the larger loss of the two, in
-        points, 0 where neither is lower), ``by`` (engine and processor) and ``command``.
+        ``fp32_mean_iou`` and ``fp32_ap`` (0..1; AP is None without boxes), ``loss`` (the larger loss of mean IoU and
+        AP in percentage points, 0 if neither is lower), ``by`` (engine and processor) and ``command``.
     """
 
     name: str
@@ -282,14 +291,16 @@ class ModelCard:
                 raise CardError(f"output kinds {kinds} in a {self.view.kind}; boxes need a top_view")
             if not self.box_classes:
                 raise CardError("a box output without box_classes; expected the classes that boxes may have")
-        strange = [c for c in (*self.box_classes, *self.box_size_priors) if c not in self.classes]
-        if strange:
-            raise CardError(f"box classes {strange} are not among the classes {self.classes}")
+        unlisted = [c for c in (*self.box_classes, *self.box_size_priors) if c not in self.classes]
+        if unlisted:
+            raise CardError(f"box classes {unlisted} are not among the classes {self.classes}")
         if (
             self.box_size_spreads
             and not set(self.box_classes) <= self.box_size_spreads.keys() & self.box_size_priors.keys()
         ):
-            raise CardError(f"box_size_spreads of {[*self.box_size_spreads]}; expected them, and priors, for all boxes")
+            raise CardError(
+                f"box_size_spreads of {[*self.box_size_spreads]}; expected a spread and a prior for each box class"
+            )
         if any(spread <= 0.0 for spreads in self.box_size_spreads.values() for spread in spreads):
             raise CardError(f"box_size_spreads are {self.box_size_spreads}; expected numbers above 0")
         for name in ("score_threshold", "nms_iou"):
@@ -319,7 +330,7 @@ class ModelCard:
         ModelFileError
             The file cannot be read.
         CardError
-            The file is no complete .onnx, has no card, or one that `from_json` refuses.
+            The file is not a complete .onnx file, has no card, or has a card that `from_json` refuses.
         """
         text = read_metadata(path, CARD_KEY)
         if text is None:
@@ -338,12 +349,12 @@ class ModelCard:
         Raises
         ------
         CardError
-            No JSON, no schema, a newer schema, or a key missing or malformed. Unknown keys are ignored.
+            Not JSON, no schema number, a newer schema, or a missing or malformed key. Unknown keys are ignored.
         """
         try:
             document = json.loads(text)
         except (RecursionError, ValueError) as exc:
-            raise CardError(f"the card is no JSON ({exc}); export the model again") from exc
+            raise CardError(f"the card is not JSON ({exc}); export the model again") from exc
         if not isinstance(document, dict) or not isinstance(document.get("schema"), int):
             raise CardError("the card has no schema number; export the model again")
         if document["schema"] not in (2, SCHEMA):
@@ -378,7 +389,7 @@ def _card(document: dict[str, Any]) -> ModelCard:
     else:
         raise CardError(f"view.kind is {kind!r}; expected top_view or range_image")
     fitness, golden = document["fitness"], document["golden"]
-    if document["schema"] == 2:  # kept the precision among the free-form metadata, and no agreement
+    if document["schema"] == 2:  # schema 2 has the precision in the free-form metadata, and no measured agreement
         precision, precisions = document["training"].get("precision", "fp32"), {}
     else:
         precision, precisions = document["precision"], document["precisions"]

@@ -1,7 +1,7 @@
-"""One entry of an .onnx file's metadata, read without onnx or onnxruntime.
+"""Read one metadata entry of an .onnx file, without onnx or onnxruntime.
 
-An .onnx file is a protobuf message: fields one after the other, each with its number and length in front. Only the
-``metadata_props`` are read; the graph with its weights is one field, and skipped.
+An .onnx file is a protobuf message, a sequence of fields. Each field begins with its number and, for most types, its
+length. Only ``metadata_props`` is read. The graph with the weights is one field, which is skipped.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from .errors import CardError, ModelFileError
 
 __all__ = ["read_metadata"]
 
-METADATA_PROPS = 14  # of ModelProto: entries of a key (field 1) and a value (field 2)
-MAX_FIELDS = 10_000  # a model has some twenty; a file of empty fields would take minutes
+METADATA_PROPS = 14  # field number in ModelProto; an entry has a key (field 1) and a value (field 2)
+MAX_FIELDS = 10_000  # a model has about twenty; a file of empty fields would take minutes to read
 
 
 def read_metadata(path: str | os.PathLike[str], key: str) -> str | None:
-    """The text of a metadata entry.
+    """Read the text of a metadata entry.
 
     Parameters
     ----------
@@ -31,14 +31,14 @@ def read_metadata(path: str | os.PathLike[str], key: str) -> str | None:
     Returns
     -------
     str or None
-        Of several entries with this key the last, as onnxruntime has it. None where there is none.
+        The last value if the key occurs several times, as in onnxruntime. None if the key is absent.
 
     Raises
     ------
     ModelFileError
         The file cannot be read.
     CardError
-        The file is cut short or no .onnx file, or the entry is no text.
+        The file is truncated or not an .onnx file, or the entry is not UTF-8 text.
     """
     wanted, text = key.encode(), None
     try:
@@ -50,12 +50,14 @@ def read_metadata(path: str | os.PathLike[str], key: str) -> str | None:
     except OSError as exc:
         raise ModelFileError(f"{os.fspath(path)} cannot be read: {exc.strerror or exc}") from exc
     except ValueError as exc:
-        raise CardError(f"{os.fspath(path)} is no complete .onnx file ({exc}); copy or export the model again") from exc
+        raise CardError(
+            f"{os.fspath(path)} is not a complete .onnx file ({exc}); copy or export the model again"
+        ) from exc
     return text
 
 
 def _entry(file: BinaryIO, end: int, wanted: bytes) -> bytes | None:
-    """The value of the entry that ends at ``end``; None where its key is another."""
+    """The value of the entry that ends at ``end``; None if the entry has another key."""
     found, value = b"", (0, 0)
     for number, start, stop in _fields(file, end):
         if number == 1:
@@ -69,7 +71,7 @@ def _entry(file: BinaryIO, end: int, wanted: bytes) -> bytes | None:
 
 
 def _fields(file: BinaryIO, end: int) -> Iterator[tuple[int, int, int]]:
-    """Number, start and end of each field of the message from here to ``end``."""
+    """Yield number, start and end of each field with a length, from the current position to ``end``."""
     n_fields = 0
     while file.tell() < end:
         tag, n_fields = _varint(file), n_fields + 1

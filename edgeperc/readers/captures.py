@@ -1,4 +1,4 @@
-"""Recordings to scans: folders of scan files, Velodyne and Ouster packet captures, ROS 1 and 2 bags and MCAP."""
+"""Read the scans of recordings: folders of scan files, Velodyne and Ouster captures, ROS 1 and 2 bags, MCAP."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _MAGIC = {
 def read_scans(
     source: str | os.PathLike[str], *, topic: str | None = None, remission_field: str | None = None
 ) -> Iterator[Scan]:
-    """The scans of a recording, one after another, as they are read.
+    """Read the scans of a recording, one after another.
 
     Captures are decoded in a process of their own, because a damaged one can make the libraries that decode them end
     their process. It ends with the iterator: at the last scan, or when the iterator is closed or deleted. It may use
@@ -39,21 +39,21 @@ def read_scans(
     Parameters
     ----------
     source : str or path
-        A scan file (`edgeperc.read_points`); a folder of scan files and captures, taken in the order of their names; a
-        Velodyne ``.pcap``; an Ouster ``.pcap``, with its metadata beside it in a ``.json`` whose name has the same
-        beginning, or ``.osf``; a ROS 1 ``.bag``, a ROS 2 bag's folder or one ``.mcap`` file, of which the messages of
-        type ``sensor_msgs/PointCloud2`` are read. The first bytes of a file decide, not its name.
+        A scan file (`edgeperc.read_points`); a folder of scan files and captures, read in the order of their names; a
+        Velodyne ``.pcap``; an Ouster ``.osf``, or ``.pcap`` with its metadata beside it in a ``.json`` file whose name
+        has the same beginning; a ROS 1 ``.bag``, a ROS 2 bag's folder or one ``.mcap`` file. Bags are read for
+        messages of type ``sensor_msgs/PointCloud2``. The first bytes of a file decide its format, not its name.
     topic : str, optional
-        Which topic of a bag that has several with point clouds; which sensor, by serial number, of an Ouster capture
-        that has several.
+        The topic to read if a bag has several with point clouds; the serial number of the sensor if an Ouster capture
+        has several.
     remission_field : str, optional
-        Which field is the remission: as in `edgeperc.read_points`; of an Ouster capture by default ``reflectivity``.
+        Name of the remission field, as in `edgeperc.read_points`; ``reflectivity`` by default for an Ouster capture.
 
     Yields
     ------
     stamp_s : float or None
-        Time of the scan by the sensor's own clock [s]: the end of the scan for a Velodyne and an Ouster, the header's
-        stamp for a message. None for scan files.
+        Time of the scan on the sensor's clock [s]: the end of the scan for a Velodyne and an Ouster, the header's stamp
+        for a message. None for scan files.
     points : (n, 4) float32, C-contiguous
         x, y, z [m] in the sensor's frame, and the raw remission, which the `Perceiver` scales by its sensor's
         ``remission_range``: 0..255 for a Velodyne and an Ouster's reflectivity, but 0..1 for an HDL-64E, as in KITTI's

@@ -84,7 +84,7 @@ def decode(
 
 
 def cloud_points(message: Any, *, remission_field: str | None = None) -> NDArray[np.float32]:
-    """Points of a ROS ``sensor_msgs/PointCloud2`` message, as an object of any library.
+    """Convert a ROS ``sensor_msgs/PointCloud2`` message, from any library, to points.
 
     Parameters
     ----------
@@ -102,13 +102,13 @@ def cloud_points(message: Any, *, remission_field: str | None = None) -> NDArray
     Raises
     ------
     PointsError
-        When the message holds fewer bytes than it declares, or no x, y and z.
+        The message holds fewer bytes than it declares, or has no x, y and z.
     """
     try:
         height, width, step = int(message.height), int(message.width), int(message.point_step)
         row_step = int(message.row_step) if height > 1 else width * step
         data = np.frombuffer(message.data, np.uint8)
-        # A field of several values a point, such as a descriptor, is no coordinate.
+        # A field with several values per point, such as a descriptor, is not a coordinate.
         fields = {f.name: f for f in message.fields if f.count in (0, 1) and 1 <= f.datatype <= len(_CLOUD_TYPES)}
         order = ">" if message.is_bigendian else "<"
         dtype = np.dtype(
@@ -133,7 +133,7 @@ def cloud_points(message: Any, *, remission_field: str | None = None) -> NDArray
 
 
 def _choose(what: str, names: Sequence[str], wanted: str | None, others: str = "") -> int:
-    """Index of the wanted name, or of the only one; the `PointsError` lists the names."""
+    """Index of the wanted name, or of the only name; otherwise a `PointsError` lists the names."""
     if wanted in names:
         return names.index(str(wanted))
     there = f"there are {', '.join(names)}" if names else "there is none"
@@ -170,11 +170,11 @@ def _packet_scans(
     for scan in scans:
         n_scans += 1
         yield scan
-    # Both libraries silently stop at a file that ends inside a packet or holds no packets of theirs.
+    # Both libraries stop without an error if the file ends inside a packet, or has no packets of their sensors.
     n_packets = 0 if kind == ".osf" else sum(1 for _ in pcap_packets(path))
     if not n_scans:
-        held = "holds no scan" if kind == ".osf" else f"of its {n_packets} packets none is a LiDAR's that can be read"
-        raise PointsError(f"the capture {held}; expected those of a Velodyne, or of an Ouster and its metadata")
+        held = "holds no scan" if kind == ".osf" else f"has {n_packets} packets, none from a supported LiDAR"
+        raise PointsError(f"the capture {held}; expected a Velodyne capture, or an Ouster capture with its metadata")
 
 
 def _is_velodyne(packet: memoryview) -> bool:
@@ -187,7 +187,7 @@ def _velodyne_scans(path: Path) -> Iterator[Scan]:
     config = velodyne.Config()
     for stamp, points in velodyne.read_pcap(str(path), config):
         scan = as_points(points[:, :4])
-        # By now the decoder has found the model of the sensor.
+        # After the first scan the decoder knows the model of the sensor.
         if config.model is not None and config.model.name.startswith("HDL64E"):
             scan[:, 3] /= 255.0
         yield stamp.device, scan

@@ -37,8 +37,8 @@ def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], No
     metadata = _metadata_beside(path)
     if not metadata:
         raise PointsError(
-            "no Velodyne's packets (1206 bytes each), and as an Ouster's capture it cannot be read: there is no "
-            "metadata beside it. Expected a .json whose name begins alike"
+            "not a Velodyne capture (packets of 1206 bytes), and cannot be read as Ouster's: there is no "
+            "metadata beside it. Expected a .json file whose name has the same beginning"
         )
     sizes = set()
     for file in metadata:
@@ -155,4 +155,4 @@ def check_osf(path: Path) -> None:
             )
         kind, at = bytes(data[at + 8 : at + 12]), end + 4
     if kind != b"OSF#":
-        raise PointsError("the .osf file is cut short: its last block is not that of the metadata")
+        raise PointsError("the .osf file is cut short: its last block is not the metadata")

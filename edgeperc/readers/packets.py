@@ -53,8 +53,8 @@ def pcap_packets(path: Path, whole: bool = True) -> Iterator[tuple[int, memoryvi
             return
         if end > size:
             raise PointsError(
-                f"cut short or damaged: the file ends inside packet {n_packets + 1}, at byte {size:,}; all before it "
-                "is read"
+                f"cut short or damaged: the file ends inside packet {n_packets + 1}, at byte {size:,}; all packets "
+                "before it were read"
             )
         yield at, data[at + 16 : end]
         at, n_packets = end, n_packets + 1
