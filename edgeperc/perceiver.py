@@ -143,6 +143,9 @@ class Perceiver:
     full_turn : bool
         Run a range-image model that sees a sector once for every sector, four times for the shipped ones: every point
         then has a class, and there are boxes beside and behind the vehicle.
+    trusted : bool
+        Open model files whose graphs are refused otherwise: with unusual operators, functions, subgraphs or sizes
+        (`edgeperc.session.Session`). Only for files that you know the origin of.
 
     Attributes
     ----------
@@ -196,6 +199,7 @@ class Perceiver:
         adapt: Adaptation = "both",
         boxes_from: BoxesFrom = "both",
         full_turn: bool = False,
+        trusted: bool = False,
     ) -> None:
         _check_choice("adapt", adapt, ADAPTATIONS, {"neither": "none"})
         _check_choice("on_mismatch", on_mismatch, ("warn", "raise", "ignore"))
@@ -221,7 +225,8 @@ class Perceiver:
         # So that neighboring beams and columns on one object are linked, also with one missing between them.
         self._distance_per_m = 2.0 * math.radians(max(np.median(gaps_deg or [0.0]), 360.0 / self.sensor.columns))
         self._networks = [
-            self._load(Session(model, provider, precision=precision, n_threads=n_threads)) for model in wanted
+            self._load(Session(model, provider, precision=precision, n_threads=n_threads, trusted=trusted))
+            for model in wanted
         ]
         views = [n.session.card.view.kind for n in self._networks]
         if not views or len(views) != len(set(views)):

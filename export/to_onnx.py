@@ -156,7 +156,8 @@ def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
     answers = session.run([o.name for o in card.outputs], {card.input.name: x})
     outputs = {}
     for spec, answer in zip(card.outputs, answers, strict=True):
-        at = np.random.default_rng(0).integers(answer.size, size=min(N_GOLDEN_VALUES, answer.size))
+        few = answer.size <= N_GOLDEN_VALUES
+        at = np.arange(answer.size) if few else np.random.default_rng(0).integers(answer.size, size=N_GOLDEN_VALUES)
         outputs[spec.name] = {
             "sha256": hashlib.sha256(answer.tobytes()).hexdigest(),
             "std": float(answer.std()),
