@@ -36,12 +36,12 @@ check: .venv-test/installed
 	$(TEST)/mypy
 
 test-full: .venv-test/installed
-	$(TEST)/pytest -n $(JOBS)
+	$(TEST)/pytest -n $(JOBS) --dist worksteal
 
 # Interpreted, a kernel answers as it does compiled; compiled, it stays inside its arrays.
 test-kernels: .venv-test/installed
-	NUMBA_DISABLE_JIT=1 $(TEST)/pytest -q -n $(JOBS) -m kernel --every-kernel
-	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/.venv-test/bounds-checked $(TEST)/pytest -q -n $(JOBS) -m kernel
+	NUMBA_DISABLE_JIT=1 $(TEST)/pytest -q -n $(JOBS) --dist worksteal -m kernel --every-kernel
+	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/.venv-test/bounds-checked $(TEST)/pytest -q -n $(JOBS) --dist worksteal -m kernel
 
 docs: .venv-test/installed
 	$(TEST)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
@@ -52,7 +52,7 @@ test-wheel: .venv-test/installed
 
 test-minimal: .venv-minimal/installed
 	$(MINIMAL)/python -c "import importlib.util as u; assert not any(map(u.find_spec, ['torch', 'onnx', 'matplotlib']))"
-	$(MINIMAL)/pytest -n $(JOBS)
+	$(MINIMAL)/pytest -n $(JOBS) --dist worksteal
 
 # The stamp inside each environment is as new as what it was installed from, so a second `make` installs nothing.
 .venv/installed: pyproject.toml

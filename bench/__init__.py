@@ -1,1 +1,1 @@
-"""Measure edgeperc's latency on the hardware at hand."""
+"""Measure edgeperc's latency on this computer (extra ``bench``)."""

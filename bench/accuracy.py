@@ -1,4 +1,4 @@
-"""How accurate the measured results are: compared with a reference (fp32 on the CPU provider) and the ground truth."""
+"""Compare the measured results with a reference (fp32 on the CPU provider) and with the ground truth."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from .worker import Prediction
 
 __all__ = ["agreement", "agrees", "correctness"]
 
-# Results agree if nearly all labels and boxes are the reference's, and no figure of `correctness` falls by a point.
+# Results agree if nearly all labels and boxes equal the reference's, and no value of `correctness` falls by 0.01.
 LEAST_EQUAL = 0.99
 LEAST_BOX_F1 = 0.9
 MOST_LOST = 0.01
 
 
 def agreement(reference: Sequence[Prediction], found: Sequence[Prediction]) -> dict[str, Any]:
-    """How far predictions equal those of the reference on the same scans.
+    """Compare predictions with those of the reference on the same scans.
 
     Returns
     -------
     dict
         ``"n_scans"``; for ``"points"`` in view and ``"cells"``: the share of ``equal`` labels, and ``mean_iou`` with
         the reference as ground truth; for ``"boxes"``: ``n_reference``, ``n_found``, ``n_both`` (IoU at least 0.5) and
-        ``f1``. None for what the models do not predict.
+        ``f1``. An entry is None if the models do not predict it.
     """
     result: dict[str, Any] = {"n_scans": len(reference), "points": None, "cells": None, "boxes": None}
     points, cells = [], []
@@ -64,10 +64,10 @@ def agreement(reference: Sequence[Prediction], found: Sequence[Prediction]) -> d
 
 
 def correctness(predictions: Sequence[Prediction], truth: Sequence[SimulatedScan]) -> dict[str, float | None]:
-    """Figures against the ground truth of simulated scans: ``points_mean_iou``, ``cells_mean_iou``, ``vehicle_ap50``.
+    """Evaluate on the ground truth of simulated scans: ``points_mean_iou``, ``cells_mean_iou``, ``vehicle_ap50``.
 
-    None for what the models do not predict, or predict in other classes than the simulator's. A few scans only check
-    an engine; `edgeperc eval` evaluates a model.
+    An entry is None if the models do not predict it, or predict other classes than the simulator's. A few scans only
+    check an engine; `edgeperc eval` evaluates a model.
     """
     points, cells, boxes = Confusion(POINT_CLASSES), Confusion(TOP_VIEW_CLASSES), BoxEvaluator()
     for predicted, scan in zip(predictions, truth, strict=True):
@@ -94,7 +94,7 @@ def agrees(accuracy: Mapping[str, Any]) -> bool:
     Parameters
     ----------
     accuracy : mapping
-        ``"agreement"`` of `agreement`, ``"truth"`` and ``"reference_truth"`` of `correctness`, or None.
+        ``"agreement"`` from `agreement`; ``"truth"`` and ``"reference_truth"`` from `correctness`, or None.
     """
     same = accuracy["agreement"]
     if any(same[kind] is not None and same[kind]["equal"] < LEAST_EQUAL for kind in ("points", "cells")):

@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     code : int
-        The exit code. Wrong usage ends by argparse's ``SystemExit(2)``.
+        The exit code. Wrong usage raises argparse's ``SystemExit(2)``.
     """
     typed = with_command(sys.argv[1:] if argv is None else argv)
     command_line = shlex.join(["edgeperc-bench", *typed])
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def with_command(typed: Sequence[str]) -> list[str]:
-    """The arguments with the command that they stand for, if none was typed."""
+    """The arguments, with the default command in front if none was typed."""
     if typed and typed[0] in (*COMMANDS, "-h", "--help", "--version"):
         return list(typed)
     several = any(option.startswith(("--providers", "--precisions")) for option in typed)
@@ -59,17 +59,17 @@ def with_command(typed: Sequence[str]) -> list[str]:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of the whole command line."""
-    whole = argparse.ArgumentParser(
+    """Build the parser of the command line."""
+    parser = argparse.ArgumentParser(
         prog="edgeperc-bench",
         description="Measure how long edgeperc takes on this computer, from a scan to the result.",
         allow_abbrev=False,
     )
-    whole.add_argument("--version", action="version", version=f"edgeperc {__version__}")
-    subparsers = whole.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    parser.add_argument("--version", action="version", version=f"edgeperc {__version__}")
+    subparsers = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in COMMANDS.values():
         command.add_parser(subparsers)
-    return whole
+    return parser
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""What a latency depends on besides the code: the machine, its software, its state, and other busy processes.
+"""Record what a latency depends on besides the code: the machine, its software, its state and other processes.
 
-Everything here is read, nothing is set. A figure that the machine does not expose is None.
+Everything here is read, nothing is set. A value that the machine does not expose is None.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ VARIABLES = (
     *("NUMBA_DISABLE_JIT", "ORT_LOG_LEVEL", "MALLOC_ARENA_MAX"),
 )
 CPU = Path("/sys/devices/system/cpu")
-BUSY_CORES = 0.1  # of other processes: a tenth of a core shows in the p99 of a scan
+BUSY_CORES = 0.1  # used by other processes: a tenth of a core is visible in the p99 of a scan
 STOLEN_SHARE = 0.01
 HOT_MARGIN_C = 10.0
 
@@ -164,14 +164,14 @@ def _ask(question: Callable[[], Any], otherwise: Any) -> Any:
 def disturbances(
     hardware: Mapping[str, Any], before: Mapping[str, Any], after: Mapping[str, Any], own_cpu_s: float
 ) -> list[str]:
-    """What disturbed the samples taken between two `conditions`, one sentence each.
+    """List what disturbed the samples between two `conditions`, one sentence each.
 
     Parameters
     ----------
     hardware : mapping
-        Of `machine`.
+        From `machine`.
     before, after : mapping
-        Of `conditions`.
+        From `conditions`.
     own_cpu_s : float
         CPU time of the measured process itself [s].
     """
@@ -200,7 +200,7 @@ def disturbances(
 
 
 def lasting_disturbances(hardware: Mapping[str, Any], busy: list[dict[str, Any]]) -> list[str]:
-    """What disturbs every sample of a report, one sentence each."""
+    """List what disturbs every sample of a report, one sentence each."""
     found = []
     governor = hardware["governor"]
     if governor not in (None, "performance"):
@@ -223,7 +223,7 @@ def rss_mb() -> float:
 
 def peak_rss_mb() -> float | None:
     """Largest resident memory of this process so far [MB]."""
-    # getrusage counts on from the parent's figure across fork and exec.
+    # After fork and exec, getrusage starts from the parent's value.
     for line in (_read(Path("/proc/self/status")) or "").splitlines():
         if line.startswith("VmHWM:"):
             return int(line.split()[1]) * 1.024e-3
@@ -240,8 +240,8 @@ def peak_rss_mb() -> float | None:
 class EnergyMeter:
     """Energy by the machine's own counters: RAPL domains, and INA power rails as on Jetson boards.
 
-    It is the energy of whole packages or boards, with idle power and everything else that runs. Call `tick` often:
-    counters wrap, and rails show power only, which is integrated here.
+    The energy is that of whole packages or boards, including idle power and all other processes. Call `tick` often,
+    because counters wrap, and because rails show only power, which is integrated here.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""The document of a measurement: what ``edgeperc-bench --json`` writes and ``compare`` reads.
+"""The document of a measurement, which ``edgeperc-bench --json`` writes and ``compare`` reads.
 
 The JSON has ``schema``, ``kind`` (run, matrix, scaling, soak, peers), ``command``, ``complete``, ``machine``,
 ``software``, ``input``, ``disturbances`` and, by kind, ``settings`` (a list: models, provider, precision and threads as
 asked for, ``repeats`` with the engines that really ran and all samples, ``accuracy``, ``offline``, ``cold_start``,
 ``loadgen``), ``skipped``, ``recommended``, ``tables``, ``soak`` or ``peers`` (by table, the samples of each contender
-in each round). Everything that is shown is computed from it.
+in each round). All reports are computed from this document.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ def read_report(path: Path) -> dict[str, Any]:
     Raises
     ------
     ReportError
+        The file is not a report, or has another schema.
     """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
@@ -66,12 +67,12 @@ def read_report(path: Path) -> dict[str, Any]:
 
 
 def scenario_names(setting: Mapping[str, Any]) -> list[str]:
-    """The scenarios of one setting, in the order of measuring."""
+    """The scenarios of one setting, in the order in which they were measured."""
     return list(dict.fromkeys(name for repeat in setting["repeats"] for name in repeat["scenarios"]))
 
 
 def setting_label(setting: Mapping[str, Any]) -> str:
-    """What ran: each model with its precision and provider, and the threads."""
+    """Label of a setting: each model with its active precision and provider, and the threads."""
     engines = [each for repeat in setting["repeats"][:1] for each in repeat["engines"]]
     ran = "; ".join(f"{each['name']} {each['precision']}, {each['provider']}" for each in engines)
     return f"{ran or setting['provider']}, {setting['n_threads'] or 'default'} threads"
@@ -92,7 +93,7 @@ def pooled(setting: Mapping[str, Any], scenario: str, key: str = "ms") -> list[f
 
 
 def latency(setting: Mapping[str, Any], scenario: str) -> dict[str, Any]:
-    """The figures of one scenario, one number each; None for what is unknown or what the samples do not support."""
+    """Statistics of one scenario; a value is None if it is unknown or if there are too few samples."""
     parts = _parts(setting, scenario)
     ms = pooled(setting, scenario)
     n, wall_s = sum(part["n"] for part in parts), sum(part["wall_s"] for part in parts)

@@ -1,4 +1,4 @@
-"""The scans to measure with: simulated ones with ground truth, or the user's own."""
+"""Scans to measure with: simulated ones with ground truth, or the user's own."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def simulated_input(folder: Path, n: int, sensor: str) -> Input:
 
 
 def raw(points: NDArray[np.float32], sensor: str) -> NDArray[np.float32]:
-    """Simulated points, whose remission is 0..1, with remission in the unit of the sensor's own files."""
+    """Convert the remission of simulated points from 0..1 to the sensor's raw unit."""
     profile = get_sensor(sensor)
     points = points.copy()
     points[:, 3] = points[:, 3] / np.float32(profile.remission_scale) - np.float32(profile.remission_offset)
@@ -97,7 +97,7 @@ def _stored(
 
 
 def sized(n_points: int, sensor: str) -> NDArray[np.float32]:
-    """A scan of this many points, drawn from one simulated scan, or from several laid over each other."""
+    """Make a scan of ``n_points`` points, sampled from one simulated scan or from several merged ones."""
     scans: list[NDArray[np.float32]] = []
     while sum(map(len, scans)) < n_points:
         scans.append(simulated_scan(FIRST_SEED + len(scans), sensor).points)
@@ -108,7 +108,7 @@ def sized(n_points: int, sensor: str) -> NDArray[np.float32]:
 
 
 def crowd(n_cars: int, sensor: str) -> NDArray[np.float32]:
-    """A scan of a street with up to 28 cars in the top view, in rows of four, the nearest first."""
+    """Make a scan of a street with up to 28 cars in the top view, in rows of four, the nearest first."""
     size = (4.2, 1.8, 1.6)
     places = [(9.0 + 5.5 * row, y) for row in range(7) for y in (2.5, -2.5, 7.5, -7.5)][:n_cars]
     boxes = [Box("car", 1.0, (x, y, -1.73 + size[2] / 2.0), size, 0.0) for x, y in places]

@@ -1,4 +1,4 @@
-"""MLPerf LoadGen in place of our own loop: it draws the scans, measures the time and writes its own logs."""
+"""Measure with MLPerf LoadGen in place of `scenarios`: it draws the scans, measures and writes its own logs."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def single_stream(
     Returns
     -------
     Timings
-        Of the calls as measured here, for the stages; LoadGen's own figures are in its logs (`read_summary`).
+        The calls as measured here, for the stages; LoadGen's own results are in its logs (`read_summary`).
     """
     loadgen = load()
     timings = back_to_back(perceive, scans, Limits(0, 0.0, limits.warm_up_scans), keep_going=keep_going)
@@ -93,7 +93,7 @@ def single_stream(
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
-    """Percentiles [ms], LoadGen's result and its whole summary."""
+    """Read the percentiles [ms], LoadGen's result and its summary."""
     text = (folder / SUMMARY).read_text(encoding="utf-8", errors="replace")
     found: dict[str, Any] = {
         f"p{float(p):g}": int(ns) / 1e6

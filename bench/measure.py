@@ -1,4 +1,4 @@
-"""Repeats, accuracy, offline throughput and cold starts of one setting, recorded in a report's document at once."""
+"""Measure one setting (repeats, accuracy, offline throughput, cold starts) and record it in a document at once."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def repeat(
     Raises
     ------
     KeyboardInterrupt
-        After what was measured by then is in ``setting``.
+        Interrupted; the results so far are in ``setting``.
     """
     predictions: list[Prediction] = []
     for k in range(n_repeats):
@@ -99,7 +99,7 @@ def accuracy_of(right: Reference, found: Sequence[Prediction], truth: Sequence[S
 
 
 def offline(job: Job, files: Sequence[Path], n_processes: int, limits: Limits, on_tick: OnTick) -> dict[str, Any]:
-    """Throughput of several processes, each back to back, with one thread each unless the job sets another number."""
+    """Measure the throughput of several processes, each back to back, by default with one thread each."""
     name = f"offline x {n_processes}"
     own = replace(job, n_threads=job.n_threads or 1, scenarios=(Scenario(name, tuple(files), limits),))
     before = conditions()
@@ -124,7 +124,7 @@ def offline(job: Job, files: Sequence[Path], n_processes: int, limits: Limits, o
 
 
 def cold_starts(job: Job, scan: Path, n: int) -> list[dict[str, Any]]:
-    """Start processes that perceive one scan: the first finds empty caches, the others what it left there.
+    """Start processes that perceive one scan: the first finds empty caches, the others find what it cached.
 
     The caches are numba's and those in the user's cache folder. The operating system keeps the files in memory.
     """

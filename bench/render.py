@@ -15,7 +15,7 @@ from .samples import summary
 
 __all__ = ["QUANTILES", "LiveTable", "Section", "html_page", "markdown", "number", "share", "text"]
 
-TEXT_WIDTH = 24  # a longer cell makes its column one of text, not of numbers
+TEXT_WIDTH = 24  # a column with a longer cell is a text column, aligned left
 QUANTILES = ("p50", "p90", "p99", "p99.9", "max")
 
 
@@ -29,7 +29,7 @@ class Section:
 
 
 def text(parts: Iterable[Section]) -> str:
-    """Sections for a terminal."""
+    """Format sections for a terminal."""
     lines: list[str] = []
     for part in parts:
         lines += ["", part.title, *(f"  {sentence}" for sentence in part.sentences)]
@@ -53,7 +53,7 @@ def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def markdown(parts: Iterable[Section], title: str) -> str:
-    """Sections as Markdown."""
+    """Format sections as Markdown."""
 
     def plain(cell: str) -> str:
         return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", cell)
@@ -77,7 +77,7 @@ svg{max-width:100%;height:auto}"""
 
 
 def html_page(parts: Iterable[Section], title: str, pictures: Sequence[str] = ()) -> str:
-    """Sections as a page that loads nothing.
+    """Format sections as an HTML page without external files.
 
     Parameters
     ----------
@@ -109,12 +109,12 @@ def _cell(tag: str, text: str) -> str:
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """A number of a table; a dash if it is unknown or the samples do not support it."""
+    """Format a number of a table; a dash if it is unknown or if there are too few samples."""
     return "-" if value is None or math.isnan(value) else f"{value:,.{digits}f}"
 
 
 def share(value: float | None) -> str:
-    """A share in per cent, or a dash."""
+    """Format a share in per cent; a dash if it is unknown."""
     return "-" if value is None or math.isnan(value) else f"{100.0 * value:.1f} %"
 
 

@@ -14,7 +14,7 @@ __all__ = ["sections"]
 
 
 def sections(document: Mapping[str, Any]) -> list[Section]:
-    """Every section of a document, in the order of showing."""
+    """Every section of a document, in the order in which they are shown."""
     parts = [_reliability(document)]
     if document["kind"] == "matrix":
         parts.append(_matrix(document))
@@ -55,7 +55,7 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
             if t["energy_j_per_scan"]:
                 rails = ", ".join(f"{rail} {joules:.3f} J" for rail, joules in t["energy_j_per_scan"].items())
                 sentences.append(
-                    f"energy of a scan, {name}, of the whole package or board with all that ran on it: {rails}"
+                    f"energy of a scan, {name}, of the whole package or board with everything that ran on it: {rails}"
                 )
         if all(not t["energy_j_per_scan"] for t in figures.values()):
             sentences.append("energy: this machine has no counter that can be read")
@@ -123,9 +123,7 @@ def _stages(setting: Mapping[str, Any], names: Sequence[str]) -> Section:
 
 
 def _starts(setting: Mapping[str, Any]) -> Section:
-    rows = [
-        ["repeat", "construct s", "first call ms", "warm-up scans", "warm-up p50 ms", "peak RSS MB", "thereof scans MB"]
-    ]
+    rows = [["repeat", "construct s", "first call ms", "warm-up scans", "warm-up p50 ms", "peak RSS MB", "scans MB"]]
     for k, repeat in enumerate(setting["repeats"], start=1):
         warm = [ms for each in repeat["scenarios"].values() for ms in each["warm_up_ms"]]
         rows.append(
@@ -138,7 +136,7 @@ def _starts(setting: Mapping[str, Any]) -> Section:
 
 
 def accuracy_sentences(accuracy: Mapping[str, Any]) -> list[str]:
-    """How far the results of one setting are those of the reference, and of the ground truth."""
+    """Sentences on how far the results of a setting agree with the reference and the ground truth."""
     found = accuracy["agreement"]
     parts = []
     for kind in ("points", "cells"):
@@ -217,8 +215,8 @@ def _context(document: Mapping[str, Any]) -> list[Section]:
     for group in ("machine", "software"):
         rows += [[key.replace("_", " "), _shown(value)] for key, value in document[group].items()]
     rows.append(["command", document["command"]])
-    heard = [text for setting in document.get("settings", ()) for r in setting["repeats"] for text in r["warnings"]]
-    return [Section("Context", list(dict.fromkeys(heard)), rows)]
+    warned = [text for setting in document.get("settings", ()) for r in setting["repeats"] for text in r["warnings"]]
+    return [Section("Context", list(dict.fromkeys(warned)), rows)]
 
 
 def _shown(value: Any) -> str:

@@ -1,10 +1,10 @@
-"""Statistics of samples: percentiles they support, run-to-run noise, a verdict on two runs, a trend with its error.
+"""Statistics of samples: percentiles, run-to-run noise, comparison of two runs, a trend with its error.
 
-A percentile is the smallest sample that at least so many per cent do not exceed (nearest rank), so it is a time that
-was measured. It is shown only if at least ten samples are expected above it, n >= 10 / (1 - p): 20 for the median, 100
-for p90, 1,000 for p99, 10,000 for p99.9. The number of samples above a percentile is binomial: ten of them fix the
-share of the tail to within a third (1 / sqrt(10)); with one or two, a single outlier decides. MLPerf's early stopping
-asks for 64, 662 and 6,636 queries for p90, p99 and p99.9.
+A percentile p is the smallest sample such that at least p per cent of the samples do not exceed it (nearest rank), so
+it is a measured time. It is shown only if at least ten samples are expected above it, n >= 10 / (1 - p): 20 for the
+median, 100 for p90, 1,000 for p99, 10,000 for p99.9. The number of samples above a percentile is binomial: ten of them
+fix the share of the tail to within a third (1 / sqrt(10)); with one or two, a single outlier decides. MLPerf's early
+stopping asks for 64, 662 and 6,636 queries for p90, p99 and p99.9.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ N_RESAMPLES = 2000
 
 
 def percentile(values: ArrayLike, p: float) -> float:
-    """The smallest value that at least ``p`` per cent do not exceed; NaN without values."""
+    """The smallest value that at least ``p`` per cent of the values do not exceed; NaN without values."""
     ordered = np.sort(np.asarray(values, np.float64))
     # Rounded, because 99.9 / 100 * 10,000 comes out slightly above 9,990.
     return float(ordered[max(math.ceil(round(p * len(ordered) / 100.0, 9)), 1) - 1]) if len(ordered) else math.nan
@@ -37,7 +37,7 @@ def supported(p: float, n: int) -> bool:
 
 
 def summary(values: ArrayLike) -> dict[str, float | int | None]:
-    """``n``, ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max``; None for what the samples do not support."""
+    """``n``, ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max``; None if there are too few samples."""
     array = np.asarray(values, np.float64)
     found: dict[str, float | int | None] = {"n": len(array)}
     found |= {f"p{p:g}": percentile(array, p) if supported(p, len(array)) else None for p in PERCENTILES}
@@ -76,8 +76,8 @@ def compare(a: Sequence[ArrayLike], b: Sequence[ArrayLike], seed: int = 0) -> Ve
 
     The runs differ if the interval of the ratio excludes 1 *and* their medians are farther apart than those of either
     run's own repeats. The bootstrap draws repeats, and from each repeat medians of blocks of consecutive samples,
-    because neighbors in time are correlated. With three repeats the bootstrap alone is overconfident; hence the second
-    condition.
+    because neighbors in time are correlated. The second condition is needed because the bootstrap alone is
+    overconfident with three repeats.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class Trend:
 
 
 def trend(x: ArrayLike, y: ArrayLike) -> Trend:
-    """Least squares, with an interval that accounts for correlated residuals.
+    """Fit a straight line by least squares, with an interval that accounts for correlated residuals.
 
     Consecutive samples of memory are not independent: with a lag-1 correlation r of the residuals, n samples count as
     n (1 - r) / (1 + r). All NaN for fewer than three samples.
@@ -153,8 +153,8 @@ def trend(x: ArrayLike, y: ArrayLike) -> Trend:
     slope = float(centered @ values) / spread
     left = values - values.mean() - slope * centered
     squares = float(left @ left)
-    alike = min(max(float(left[1:] @ left[:-1]) / squares, 0.0), 0.99) if squares > 0.0 else 0.0
-    free = max(len(t) * (1.0 - alike) / (1.0 + alike) - 2.0, 1.0)
-    error = 1.96 * math.sqrt(squares / free / spread)
+    correlation = min(max(float(left[1:] @ left[:-1]) / squares, 0.0), 0.99) if squares > 0.0 else 0.0
+    n_free = max(len(t) * (1.0 - correlation) / (1.0 + correlation) - 2.0, 1.0)
+    error = 1.96 * math.sqrt(squares / n_free / spread)
     explained = 1.0 - squares / variance if variance > 0.0 else math.nan
     return Trend(slope, error, float(values.mean() - slope * t.mean()), explained)

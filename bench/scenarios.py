@@ -1,6 +1,7 @@
-"""How scans arrive: back to back, or paced at a sensor's rate. A scenario knows no models, processes or reports.
+"""How scans arrive: back to back, or paced at a sensor's rate. This module knows no models, processes or reports.
 
-It takes a callable, scans and a clock, and ends when it has both the least number of scans and the least time.
+A scenario takes a callable, scans and a clock. It ends when both the minimum number of scans and the minimum time are
+reached.
 """
 
 from __future__ import annotations
@@ -34,16 +35,17 @@ class Clock:
 
 @dataclass(frozen=True)
 class Limits:
-    """How long a scenario lasts: until all are reached.
+    """How long a scenario lasts: until all limits are reached.
 
     Attributes
     ----------
     min_scans : int
     min_seconds : float
     warm_up_scans : int
-        Scans before those that count; kept apart.
+        Scans before the first one that counts.
     stride : int
-        One of so many scans leaves a sample; in a long run the samples would be the memory that grows.
+        Only every ``stride``-th scan leaves a sample, because the samples of a long run would themselves be memory
+        growth.
     """
 
     min_scans: int = 100
@@ -61,7 +63,7 @@ class Timings:
     n : int
         Scans perceived, without the warm-up.
     stride : int
-        One of so many scans has a sample.
+        Every ``stride``-th scan has a sample.
     first_s : float
         When the first scan that counts arrived, on the clock.
     start_s : list of float
@@ -69,7 +71,7 @@ class Timings:
     ms : list of float
         Wall time of each call, from scan to result.
     age_ms : list of float
-        From the arrival of each scan to its result; as ``ms`` if scans do not arrive by the clock.
+        Time from the arrival of each scan to its result; equal to ``ms`` if scans do not arrive at a rate.
     stage_ms : dict of str to list of float
         As `edgeperc.Perception.stage_ms`.
     warm_up_ms : list of float
@@ -104,7 +106,7 @@ class Timings:
 
 
 class KeepGoing(Protocol):
-    """Called after every scan, with warm-up; False ends the scenario, whose measurements stay."""
+    """Called after every scan, including the warm-up; False ends the scenario and keeps its measurements."""
 
     def __call__(self, timings: Timings) -> bool: ...
 
@@ -201,7 +203,7 @@ def paced(
 
 
 def throughput(calls: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[float, float]:
-    """Scans per second of several processes together, while all of them were at work.
+    """Scans per second of several processes together, while all of them were running.
 
     Parameters
     ----------

@@ -1,7 +1,8 @@
-"""Fresh processes that measure, and the parent's side of them.
+"""Measure in fresh processes.
 
-Every repeat is a process of its own (spawned, never forked), so that the noise includes what differs between processes:
-the place of memory, the cores of the threads. A process holds a Perceiver and the scans, and nothing of its parent.
+Every repeat is a process of its own (spawned, never forked), so that the noise includes the differences between
+processes: memory layout and the cores of the threads. A process holds a Perceiver and the scans, and nothing of its
+parent.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ __all__ = [
 ]
 
 TICK_S = 0.25
-MEMORY_SAMPLES = 500  # at most, in a scenario: a longer list would itself be growth
+MEMORY_SAMPLES = 500  # at most, in a scenario: a longer list would itself be memory growth
 # Time for a process to end its scan and send its results after it was asked to stop.
 STOP_S = 30.0
 
@@ -51,7 +52,7 @@ class WorkerError(EdgepercError):
 
 @dataclass(frozen=True)
 class Scenario:
-    """One way of scans to arrive: back to back, or at a rate.
+    """How scans arrive: back to back, or at a rate.
 
     Attributes
     ----------
@@ -109,7 +110,7 @@ OnTick = Callable[[str, Sequence[float]], None]
 
 
 def perceiver_arguments(job: Job) -> dict[str, Any]:
-    """The arguments of the Perceiver that a job asks for, which are JSON."""
+    """The arguments of a job's Perceiver, as JSON types."""
     return {
         "models": list(job.models),
         "sensor": job.sensor,
@@ -120,7 +121,7 @@ def perceiver_arguments(job: Job) -> dict[str, Any]:
 
 
 def make_perceiver(job: Job) -> Perceiver:
-    """The Perceiver that a job asks for."""
+    """Make a job's Perceiver."""
     return Perceiver(**perceiver_arguments(job))
 
 
@@ -181,7 +182,7 @@ def _predict(perceive: Perceive, scan: NDArray[np.float32]) -> Prediction:
 
 
 def _engines(perceive: Perceiver) -> list[dict[str, Any]]:
-    """What really runs, one record per network."""
+    """The active engines, one record per network."""
     return [
         {
             "name": session.card.name,
@@ -200,7 +201,7 @@ def _engines(perceive: Perceiver) -> list[dict[str, Any]]:
 
 
 class _Watch:
-    """Between calls, a few times a second: reports to the parent, and asks whether to stop."""
+    """Reports to the parent between calls, a few times a second, and asks whether to stop."""
 
     def __init__(self, connection: Any, scenario: Scenario) -> None:
         self.connection, self.scenario, self.stopped = connection, scenario, False
@@ -278,7 +279,7 @@ def _interrupts() -> Iterator[_Interrupts]:
 
 
 def measure(jobs: Sequence[Job], on_tick: OnTick = lambda name, ms: None) -> list[dict[str, Any]]:
-    """Do several jobs at once, each in a fresh process; all start when all are ready.
+    """Run several jobs at once, each in a fresh process; all start when all are ready.
 
     Ctrl-C asks the processes for their results so far, which are returned with ``"interrupted"`` set; a second one ends
     them. Call this from the main thread.

@@ -10,12 +10,12 @@
     perception.to_dict()
     edgeperc.draw(perception, points, "000123.png")
 
-`models`, `sensors` and `providers` list what there is to choose from.
+`models`, `sensors` and `providers` list the available models, sensor profiles and execution providers.
 
 Importing this package compiles nothing, starts no thread and reads no file. A name is looked up in its module on first
 use, because numba probes the cache folder of every kernel when it reads the kernel's decorator. onnxruntime is an
-extra, because its builds exclude one another. Without it everything but a model works, and `Perceiver` raises
-`MissingExtraError`, which names the line that installs it.
+optional extra, because only one of its builds can be installed at a time. Without it, everything works except running a
+model: `Perceiver` raises `MissingExtraError`, whose message gives the install command.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The scan as the networks need it: finite, read-only, remission in 0..1, gaps of a coarser sensor filled (KUL-Seg 5).
+"""Prepare scans for the networks: remission in 0..1, gaps of a coarser sensor filled (KUL-Seg 5).
 
-`condition` prepares every scan, once. Where the sensor's profile has a remission function, `render` replaces the
-remission by what the sensor that the models were trained on would report. `Interpolator` fills the pixels between
-neighboring beams and columns of a coarser sensor; interpolated points are seen by the network and are in no result.
+`condition` prepares every scan. If the sensor's profile has a remission function, `render` converts the remission to
+that of the sensor that the models were trained on. `Interpolator` fills the pixels between neighboring beams and
+columns of a coarser sensor. Only the network sees the interpolated points; the results do not contain them.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True
     Parameters
     ----------
     points : array_like
-        As `edgeperc.points.as_points` takes it; remission in the sensor's raw unit. Left unchanged.
+        A scan, as for `edgeperc.points.as_points`; remission in the sensor's raw unit. Not modified.
     sensor : SensorProfile
         Its ``remission_range`` scales remission to 0..1.
     rendered : bool
-        Replace the remission by what ``sensor.remission`` gives (`render`), where the profile has a function.
+        Convert the remission with ``sensor.remission`` (`render`), if the profile has a function.
 
     Returns
     -------
     scan : (n, 4) float32, C-contiguous, read-only
-        x, y, z [m], remission in 0..1, in input order. Rows that are not finite are NaN in all four columns. A view of
-        ``points`` where nothing had to be changed.
+        x, y, z [m], remission in 0..1, in input order. Rows with a non-finite value are NaN in all four columns. A
+        view of ``points`` if nothing had to be changed.
     n_dropped : int
-        Rows that are not finite.
+        Number of rows with a non-finite value.
 
     Raises
     ------
     PointsError
-        ``points`` is no scan.
+        ``points`` is not a scan.
     """
     given = scan = as_points(points)
     if rendered and sensor.remission is not None:
@@ -60,7 +60,7 @@ def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True
                 scan[:, 3] = (scan[:, 3] + offset) * scale
     finite = np.isfinite(scan)
     n_dropped = 0
-    # Reducing rows of four costs ten times the count, and nearly every scan is finite throughout.
+    # First the whole array: all(axis=1) takes ten times as long, and nearly every scan is entirely finite.
     if not finite.all():
         dropped = ~finite.all(axis=1)
         n_dropped = int(np.count_nonzero(dropped))
@@ -70,25 +70,26 @@ def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True
 
 
 def render(points: NDArray[np.float32], sensor: SensorProfile) -> NDArray[np.float32]:
-    """Replace the remission by what the sensor that the models were trained on would report, 0..1.
+    """Convert the remission to that of the sensor that the models were trained on, 0..1 (KUL-Seg 5).
 
     Parameters
     ----------
     points : (n, 4) float32
-        x, y, z [m], remission as ``sensor`` gives it. Left unchanged; what is not finite stays so.
+        x, y, z [m], remission in the sensor's raw unit. Not modified. Non-finite values stay non-finite.
     sensor : SensorProfile
-        With a function in ``remission``.
+        A profile with a remission function.
 
     Returns
     -------
     (n, 4) float32
+        x, y, z [m], remission in 0..1.
 
     Raises
     ------
     PointsError
         ``points`` has another shape or dtype.
     SensorError
-        The sensor has no function.
+        The profile has no remission function.
     """
     if points.ndim != 2 or points.shape[1] != 4 or points.dtype != np.float32:
         raise PointsError(f"got points of shape {points.shape} and {points.dtype}; expected (n, 4) float32")
@@ -124,14 +125,14 @@ def fill_rendered(
     ----------
     points : (n, 4) float32, C-contiguous
     kind : int
-        Of ``KIND_CODES``.
+        A value of ``KIND_CODES``.
     coefficients : (3,) float64
     offset, scale : float
-        x of `RemissionFunction` is ``(raw + offset) * scale``, and no less than 0 under the logarithm.
+        The argument x of `RemissionFunction` is ``(raw + offset) * scale``; the logarithm clips it to 0 from below.
     rendered : (n, 4) float32, overwritten
         A remission that is not finite becomes NaN.
     """
-    # Most sensors report whole numbers up to 255. Computing each of them once per scan is seven times as fast.
+    # Most sensors report whole numbers up to 255. A table of their 256 results is seven times as fast.
     whole = np.empty(256)
     for k in range(len(whole)):
         whole[k] = rendered_at(float(k), kind, coefficients)
@@ -158,19 +159,19 @@ def rendered_at(x: float, kind: int, coefficients: NDArray[np.float64]) -> float
 
 # --- interpolation ---------------------------------------------------------------------------------------------------
 
-# Two returns lie on one surface when the line between them is MIN_ANGLE_DEG and more off the ray, and spans MAX_STEP_M
-# of range at most. Of the points that this puts on objects of 48 simulated scans of three sensors, 5 to 7 % lie more
-# than 0.3 m from what a ray there meets; with steps up to 2 m, 8 to 13 %.
+# Two returns lie on one surface if the line between them is at least MIN_ANGLE_DEG off the ray and their ranges differ
+# by at most MAX_STEP_M. On objects in 48 simulated scans of three sensors, 5 to 7 % of the interpolated points are more
+# than 0.3 m from the true surface. With steps up to 2 m it would be 8 to 13 %.
 MIN_ANGLE_DEG = 5.0
 MAX_STEP_M = 0.5
 
 # Neighboring rings on the road are meters apart. They are joined if both are near the ground and the line between them
 # is level.
 GROUND_M = 0.3
-GROUND_PER_M = 0.02  # of range; the sensor is not quite level, nor is the road
+GROUND_PER_M = 0.02  # of range; neither the sensor nor the road is exactly level
 GROUND_SLOPE = 0.1
 
-# Up to this many pixels between neighboring beams or columns there is no gap to fill.
+# Neighboring beams or columns that are at most this many pixels apart leave no gap to fill.
 NO_GAP = 1.1
 
 
@@ -186,6 +187,8 @@ class Interpolator:
 
     Attributes
     ----------
+    shape : tuple of 2 int
+        Height and width of the range image.
     needed : bool
         Whether the sensor is coarser than some part of the view.
     """
@@ -197,7 +200,7 @@ class Interpolator:
         self._row_slopes = np.tan(np.radians(rows))
         self._directions = np.stack([np.cos(azimuths), np.sin(azimuths)])
         self._ground_z = -sensor.mount_height_m
-        # The beams' places in rows, then the number of rows between each row's beam and the next beam.
+        # Row coordinates of the beams; then, for each row, how many rows below it the next beam's return may be.
         places = np.interp(-np.array(sensor.elevations_deg), -rows, np.arange(len(rows)), left=-1.0, right=len(rows))
         self._row_reach = np.zeros(len(rows), np.int64)
         for upper, lower in pairwise(places.tolist()):
@@ -212,13 +215,13 @@ class Interpolator:
     def fill(
         self, points: NDArray[np.float32], index: NDArray[np.int32]
     ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Points between the points of a range image.
+        """Interpolate points in the gaps of a range image.
 
         Parameters
         ----------
         points : (n, 4) float32
         index : (H, W) int32
-            Row of ``points`` behind each pixel; -1 where nothing returned.
+            Row of ``points`` at each pixel; -1 without a return.
 
         Returns
         -------
@@ -226,18 +229,19 @@ class Interpolator:
             The given points, then the interpolated ones: each on the line between two neighbors, in the middle of its
             pixel.
         index : (H, W) int32
-            Rows of these points; from n on, a pixel is interpolated.
+            Row of the returned points at each pixel, -1 if empty. Rows from n on are interpolated points.
 
         Raises
         ------
         PointsError
-            Arrays of another shape, or ``index`` points outside ``points``.
+            An array has another shape, or ``index`` refers to rows that ``points`` does not have.
         """
         if points.ndim != 2 or points.shape[1] != 4 or points.dtype != np.float32:
             raise PointsError(f"got points of shape {points.shape} and {points.dtype}; expected (n, 4) float32")
         if index.shape != self.shape or (index.size and int(index.max()) >= len(points)):
             raise PointsError(
-                f"got index of shape {index.shape} for {len(points)} points; expected {self.shape}, of these points"
+                f"got index of shape {index.shape} for {len(points)} points; expected {self.shape}, "
+                "rows of these points"
             )
         dense = np.empty((len(points) + index.size, 4), np.float32)
         dense[: len(points)] = points
@@ -279,24 +283,30 @@ def fill_between(
     col_reach: int,
     ground_z: float,
 ) -> int:
-    """Fill empty pixels between two on one surface, first along the rows, then along the columns; count the points.
+    """Fill the empty pixels between two returns of one surface, first along rows, then along columns.
 
     Parameters
     ----------
     points : (n + H * W, 4) float32
-        The first ``n`` are read, rows from there on overwritten.
+        The first ``n`` rows are the input; the rows after them are overwritten.
+    n : int
     index : (H, W) int32
-        Row of points, -1 where empty; empty ones overwritten.
+        Row of points, -1 if empty; empty pixels are overwritten.
     row_slopes : (H,) float64
         Tangent of each row's elevation.
     directions : (2, W) float64
         Cosine and sine of each column's azimuth.
     row_reach : (H,) int64
-        Farthest row below, counted from this one, that may hold the neighboring beam's return.
+        How many rows below each row the next beam's return may be.
     col_reach : int
-        Farthest column to the right that may hold the neighboring column's return.
+        How many columns to the right the next return may be.
     ground_z : float
-        Height of the ground [m].
+        Height of the ground in the sensor frame [m].
+
+    Returns
+    -------
+    int
+        Number of points, with the interpolated ones.
     """
     height, width = index.shape
     for row in range(height if col_reach > 1 else 0):
@@ -312,7 +322,7 @@ def fill_between(
                 i, j = index[row, last], index[row, col]
                 for k in range(last + 1, col):
                     cos, sin = directions[0, k], directions[1, k]
-                    # How far the ends lie to the sides of the middle of the column.
+                    # Signed distances of the two returns from the vertical plane through the middle of the column.
                     side_i = np.float64(points[i, 0]) * sin - np.float64(points[i, 1]) * cos
                     side_j = np.float64(points[j, 0]) * sin - np.float64(points[j, 1]) * cos
                     if side_i * side_j < 0.0:

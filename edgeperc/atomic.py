@@ -1,4 +1,4 @@
-"""Write a file whole, or not at all."""
+"""Write files atomically: a reader sees the old file or the new one, never a part of it."""
 
 from __future__ import annotations
 
@@ -15,30 +15,34 @@ __all__ = ["open_atomic", "write_atomic"]
 def open_atomic(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """Open a temporary file in the target's folder; it replaces the target when the block ends without an error.
 
-    Readers see the old file or the new one, never a part of it.
-
     Parameters
     ----------
     path : str or Path
+        The target.
     mode : {"wb", "w"}
         ``"w"`` writes text as UTF-8.
+
+    Yields
+    ------
+    file
+        The temporary file, open for writing.
 
     Raises
     ------
     OSError
-        The file cannot be written; the target is then as it was.
+        The file cannot be written; the target is unchanged.
     """
     path = Path(path)
-    aside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with aside.open(mode, encoding=None if "b" in mode else "utf-8") as file:
+        with temporary.open(mode, encoding=None if "b" in mode else "utf-8") as file:
             yield file
-        aside.replace(path)
+        temporary.replace(path)
     finally:
-        aside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def write_atomic(path: str | Path, content: bytes) -> None:
-    """Write a file at once, as `open_atomic` does."""
+    """Write ``content`` to a file; see `open_atomic`."""
     with open_atomic(path) as file:
         file.write(content)

@@ -104,23 +104,23 @@ class TopViewGeometry:
         return round((self.y_range_m[1] - self.y_range_m[0]) / self.cell_m)
 
     def holds(self, x: float, y: float) -> bool:
-        """Whether a place x, y [m] is in view."""
+        """Whether a position x, y [m] in the sensor frame is in view."""
         (near, far), (right, left) = self.x_range_m, self.y_range_m
         return near <= x < far and right <= y < left
 
     def cells(self, x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-        """Cells that hold some places.
+        """Find the cells that contain some positions.
 
         Parameters
         ----------
         x, y : array_like
-            Places [m], in arrays of shapes that broadcast together.
+            Positions in the sensor frame [m]; their shapes must broadcast.
 
         Returns
         -------
         rows, cols : ndarray of int64
         in_view : ndarray of bool
-            False where a place is out of view or not finite; its row and column are then no index.
+            False if a position is out of view or not finite; its row and column are then not valid.
         """
         row = np.floor((self.x_range_m[1] - np.asarray(x)) / self.cell_m)
         col = np.floor((self.y_range_m[1] - np.asarray(y)) / self.cell_m)
@@ -129,8 +129,8 @@ class TopViewGeometry:
             return row.astype(np.int64), col.astype(np.int64), in_view
 
     def cell_centers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """x (rows, 1) and y (1, cols) of the middles of the cells [m]."""
-        # numpy's own float64: older stubs take a product with Python's float for any float
+        """Centers of the cells in the sensor frame [m]: x (rows, 1) and y (1, columns)."""
+        # np.float64, because older type stubs of numpy widen the type of a product with a Python float
         cell_m = np.float64(self.cell_m)
         x = np.float64(self.x_range_m[1]) - (np.arange(self.height, dtype=np.float64)[:, None] + 0.5) * cell_m
         y = np.float64(self.y_range_m[1]) - (np.arange(self.width, dtype=np.float64)[None, :] + 0.5) * cell_m
@@ -177,13 +177,22 @@ class RangeImageGeometry:
 
     @property
     def height(self) -> int:
-        """Rows, one a beam."""
+        """Rows, one per beam."""
         return len(self.row_elevations_deg)
 
 
 @dataclass(frozen=True, slots=True)
 class InputSpec:
-    """The network's input: ``(raw - mean) / std`` per channel, 0 in every channel where nothing returned."""
+    """The network's input: ``(raw - mean) / std`` per channel; 0 in every channel of a pixel without a return.
+
+    Attributes
+    ----------
+    name : str
+        Name of the input in the graph.
+    channels : tuple of str
+    mean, std : tuple of float
+        One value per channel, in the channel's unit.
+    """
 
     name: str
     channels: tuple[str, ...]
@@ -220,17 +229,17 @@ class OutputSpec:
 
 @dataclass(frozen=True, slots=True)
 class Golden:
-    """A known input, and the exporting computer's answers to it.
+    """A known input, and the outputs that the exporting computer got for it.
 
-    The input is uniform noise in -1..1 from ``numpy.random.PCG64(seed)``. At samples of every output
-    (flat positions) the answers are kept, so that any runtime can be held against the exporter's: at 16 different
-    positions or more, or everywhere where an output is smaller.
+    The input is uniform noise in -1..1 from ``numpy.random.PCG64(seed)``. Each output is stored at sampled flat
+    positions, so that any runtime can be compared with the exporter's: at 16 or more different positions, or at all
+    positions of a smaller output.
 
     Attributes
     ----------
     seed : int
     input_sha256 : str
-        Of the input's bytes, float32, C order.
+        SHA-256 of the input as float32 bytes in C order.
     outputs : mapping
         Output name to ``{"sha256": str, "std": float, "positions": [int], "values": [float]}``.
     """
@@ -251,7 +260,7 @@ class Golden:
                 raise CardError(f"{field} lacks {', '.join(sorted(missing))}; export the model again")
             positions, values = record["positions"], record["values"]
             if not isinstance(positions, list) or not isinstance(values, list) or len(positions) != len(values):
-                raise CardError(f"{field} holds positions and values that are no lists of one length")
+                raise CardError(f"{field} holds positions and values that are not lists of one length")
             _check(f"the number of {field}.values", len(values), 1, MAX_GOLDEN_VALUES)
             _check(f"{field}.std", _float(f"{field}.std", record["std"]), 0.0, 1e30)
             for index, (position, value) in enumerate(zip(positions, values, strict=True)):
@@ -259,12 +268,12 @@ class Golden:
                 _check(f"{field}.values[{index}]", _float(f"{field}.values", value), -1e30, 1e30)
 
     def check_output(self, name: str, size: int) -> None:
-        """Hold the record of an output against the number of its values.
+        """Check the record of an output against the number of its values.
 
         Raises
         ------
         CardError
-            A position is out of the output, or too few different ones are there.
+            A position is outside the output, or there are too few different positions.
         """
         positions = self.outputs[name]["positions"]
         field, fewest = f"golden.outputs[{reprlib.repr(name)}]", min(MIN_GOLDEN_VALUES, size)
@@ -282,7 +291,7 @@ class ModelCard:
     ----------
     name, version : str
     precision : {"fp32", "int8"}
-        Of the stored weights: ``"int8"`` where they and the activations between them are eight-bit integers.
+        Precision of the stored weights. ``"int8"``: weights and activations are 8-bit integers.
     view : TopViewGeometry or RangeImageGeometry
     input : InputSpec
     outputs : tuple of OutputSpec
@@ -293,25 +302,25 @@ class ModelCard:
     box_size_priors : mapping
         Class to usual (length, width, height) [m].
     box_size_spreads : mapping
-        Class to the standard deviations of their logarithms; empty where sizes do not separate classes.
+        Class to the standard deviations of the logarithms of these sizes; empty if size does not decide the class.
     score_threshold, nms_iou : float
         Defaults for boxes.
     mount_height_m : float
         Height of the training sensor above the road [m].
     fitness : mapping or None
-        Measures of the training scans (`edgeperc.fitness.FitnessProfile`); None if they were not measured.
+        Statistics of the training scans (`edgeperc.fitness.FitnessProfile`); None if they were not measured.
     training : mapping
         Free-form training metadata: data, licence, recipe, seed, hashes of the frames.
     metrics : mapping
-        Measured figures.
+        Measured accuracy.
     parity : mapping
-        How far the exported graph was from the network it was made of.
+        Measured differences between the exported graph and the network that it was made from.
     golden : Golden or None
     precisions : mapping
-        Precision in which this file can run to how its answers agree with those of fp32 on real scans, after
+        For each precision in which this file can run, the measured agreement with fp32 on real scans after
         post-processing: ``n_scans``, ``label_agreement`` (share of pixels or cells), ``mean_iou`` and ``ap`` with
-        ``fp32_mean_iou`` and ``fp32_ap`` (0..1; AP is None without boxes), ``loss`` (the larger loss of the two, in
-        points, 0 where neither is lower), ``by`` (engine and processor) and ``command``.
+        ``fp32_mean_iou`` and ``fp32_ap`` (0..1; AP is None without boxes), ``loss`` (the larger loss of mean IoU and
+        AP in percentage points, 0 if neither is lower), ``by`` (engine and processor) and ``command``.
     """
 
     name: str
@@ -359,14 +368,16 @@ class ModelCard:
                 raise CardError(f"output kinds {kinds} in a {self.view.kind}; boxes need a top_view")
             if not self.box_classes:
                 raise CardError("a box output without box_classes; expected the classes that boxes may have")
-        strange = [c for c in (*self.box_classes, *self.box_size_priors) if c not in self.classes]
-        if strange:
-            raise CardError(f"box classes {reprlib.repr(strange)} are not among the classes {self.classes}")
+        unlisted = [c for c in (*self.box_classes, *self.box_size_priors) if c not in self.classes]
+        if unlisted:
+            raise CardError(f"box classes {reprlib.repr(unlisted)} are not among the classes {self.classes}")
         if (
             self.box_size_spreads
             and not set(self.box_classes) <= self.box_size_spreads.keys() & self.box_size_priors.keys()
         ):
-            raise CardError(f"box_size_spreads of {[*self.box_size_spreads]}; expected them, and priors, for all boxes")
+            raise CardError(
+                f"box_size_spreads of {[*self.box_size_spreads]}; expected a spread and a prior for each box class"
+            )
         for name, sizes in self.box_size_priors.items():
             _check_each(f"box_size_priors.{name}", sizes, 0.01, 100.0)
         for name, spreads in self.box_size_spreads.items():
@@ -385,7 +396,7 @@ class ModelCard:
                     self.golden.check_output(output.name, math.prod(n for n in shape if n is not None))
 
     def output_shape(self, kind: str) -> tuple[int | None, ...]:
-        """Shape of the output of a kind, with the batch; None where any length will do."""
+        """Shape of the output of a kind, with the batch; None where any length is allowed."""
         if kind == "box_slots":
             return (1, None, 4)
         if kind == "box_dense":
@@ -413,9 +424,9 @@ class ModelCard:
         Raises
         ------
         ModelFileError
-            The file cannot be read, or is no complete .onnx.
+            The file cannot be read, or is not a complete .onnx file.
         CardError
-            The file has no card, or one that `from_json` refuses.
+            The file has no card, or has a card that `from_json` refuses.
         """
         text = read_metadata(path, CARD_KEY)
         if text is None:
@@ -434,15 +445,15 @@ class ModelCard:
         Raises
         ------
         CardError
-            No JSON, no schema, a newer schema, or a key missing, malformed or out of its bounds. Unknown keys are
-            ignored.
+            Not JSON, no schema number, a newer schema, or a key that is missing, malformed or out of its bounds.
+            Unknown keys are ignored.
         """
         if len(text) > MAX_CHARACTERS:
             raise CardError(f"the card has {len(text)} characters; expected at most {MAX_CHARACTERS}")
         try:
             document = json.loads(text)
         except (RecursionError, ValueError) as exc:
-            raise CardError(f"the card is no JSON ({exc}); export the model again") from exc
+            raise CardError(f"the card is not JSON ({exc}); export the model again") from exc
         _check_tree(document)
         if not isinstance(document, dict) or not isinstance(document.get("schema"), int):
             raise CardError("the card has no schema number; export the model again")
@@ -480,7 +491,7 @@ def _card(document: dict[str, Any]) -> ModelCard:
     else:
         raise CardError(f"view.kind is {reprlib.repr(kind)}; expected top_view or range_image")
     fitness, golden = document["fitness"], document["golden"]
-    if document["schema"] == 2:  # kept the precision among the free-form metadata, and no agreement
+    if document["schema"] == 2:  # schema 2 has the precision in the free-form metadata, and no measured agreement
         precision, precisions = document["training"].get("precision", "fp32"), {}
     else:
         precision, precisions = document["precision"], document["precisions"]
@@ -522,7 +533,7 @@ def _card(document: dict[str, Any]) -> ModelCard:
 
 
 def _check_tree(document: Any) -> None:
-    """Refuse what JSON can hold and no card may, wherever it stands."""
+    """Refuse values anywhere in the document that JSON allows and a card does not."""
     level = [document]
     for _ in range(MAX_DEPTH):
         inner: list[Any] = []
@@ -536,7 +547,7 @@ def _check_tree(document: Any) -> None:
                 if len(value) > MAX_TEXT:
                     raise CardError(f"the card has a text of {len(value)} characters; expected at most {MAX_TEXT}")
                 if any("\ud800" <= character <= "\udfff" for character in value):
-                    raise CardError(f"the card has a text that is no Unicode: {reprlib.repr(value)}")
+                    raise CardError(f"the card has a text that is not valid Unicode: {reprlib.repr(value)}")
             elif isinstance(value, int | float) and not -1e300 <= value <= 1e300:
                 raise CardError(f"the card has the number {reprlib.repr(value)}; expected finite ones below 1e300")
         level = inner

@@ -1,8 +1,8 @@
-"""Euclidean clusters of points, the share of each class in them, and boxes around them.
+"""Cluster points by distance, label the clusters, and fit boxes to them (KUL-Seg 5.2).
 
 KUL-Seg (section 5.2) clusters the points above the ground and keeps a cluster for tracking if more than 70 % of its
 points have one class, which removes labels smeared over walls and trees. `objects_from_points` does the same and fits a
-box to every kept cluster: boxes of every class of points, all around the vehicle.
+box to every kept cluster. It gives boxes of every class of points, all around the vehicle.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ MAX_COLUMNS = 2**26
 N_LAYERS = 1024  # each half a gap high, so that points of neighboring layers of a column are linked; 179 m for 0.5 m
 
 N_ANGLES = 90
-MAX_FITTED = 256  # points that vote for a rectangle's heading
+MAX_FITTED = 256  # a rectangle's heading is fitted to at most this many points
 MIN_SIDE_M = 0.1
-MAX_OVERLAP = 0.1  # between two objects; completed boxes of two pieces of one object overlap by more
+MAX_OVERLAP = 0.1  # IoU of two objects; the completed boxes of two pieces of one object overlap by more
 MAX_INSIDE = 0.5  # of the smaller of two footprints
-EVIDENCE = 10.0  # points with which half a score is reached
+EVIDENCE = 10.0  # number of points for which this factor of the score is 0.5
 MIN_SCORE = 0.3  # precision of cars on KITTI's drive 0005 rose from 0.24 to 0.57, recall stayed at 0.70
 
 
@@ -74,7 +74,8 @@ def find_clusters(
     min_distance_m, distance_per_m : float
         Two points are linked if their distance is at most ``max(min_distance_m, distance_per_m * range)``, with the
         range of the nearer one. ``distance_per_m`` is twice the angle [rad] between neighboring beams, so that points
-        of neighboring beams are linked at any range: 0.015 for an HDL-64E, 0.07 for a VLP-16. 0: one distance.
+        of neighboring beams are linked at any range: 0.015 for an HDL-64E, 0.07 for a VLP-16. 0: one distance
+        for all ranges.
     max_range_m : float
         Points with a larger x or y are in no cluster.
     min_points : int
@@ -84,20 +85,20 @@ def find_clusters(
     -------
     (n,) int32
         Cluster of every point, -1 for none. Clusters are numbered by their first points, in input order. Points that
-        are not finite are in none.
+        are not finite have -1.
 
     Raises
     ------
     PointsError
-        Arrays disagree in shape, a number is out of its range, or the distance is too small for the range: beyond
-        2^26 columns of half of it.
+        Arrays disagree in shape, a number is out of its range, or ``min_distance_m`` is so small that ``max_range_m``
+        needs more than 2^26 columns.
 
     Notes
     -----
-    With ``distance_per_m=0`` and ``min_points=1`` these are exactly DBSCAN's clusters of ``min_samples=1``. Points are
-    sorted into columns of half the distance; points of a column that follow each other closely in height are linked
-    without a test and form a run. Runs of neighboring columns whose bounds are near enough are joined by the first
-    pair of points that is. For 60,000 points in 8,000 runs, 60,000 pairs are tested.
+    With ``distance_per_m=0`` and ``min_points=1``, the result is exactly that of DBSCAN with ``min_samples=1``. Points
+    are sorted into columns that are half the distance wide. Consecutive points of a column that are close in height are
+    linked without a test and form a run. Two runs of neighboring columns whose bounds are near enough are joined at the
+    first pair of points that is near enough. For 60,000 points in 8,000 runs, 60,000 pairs are tested.
     """
     if points.ndim != 2 or points.shape[1] < 3:
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
@@ -111,7 +112,7 @@ def find_clusters(
     ):
         raise PointsError(
             f"got min_distance_m={min_distance_m}, distance_per_m={distance_per_m} and max_range_m={max_range_m}; "
-            "expected a distance above 0 and no less than 1/2000 of the range, and 0 to 1 m more a meter"
+            "expected a distance above 0 and at least 1/2000 of the range, and distance_per_m in 0..1"
         )
     rows = read_only(points)
     chosen = read_only(np.ones(len(rows)) if among is None else among, np.bool_)
@@ -127,7 +128,7 @@ def cluster_labels(
     min_share: float = 0.7,
     part_of: Mapping[int, int] = MappingProxyType({}),
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """The class that more than ``min_share`` of a cluster's points carry (KUL-Seg 5.2).
+    """The class that more than ``min_share`` of a cluster's points have (KUL-Seg 5.2).
 
     Parameters
     ----------
@@ -138,15 +139,15 @@ def cluster_labels(
     min_share : float
         In 0..1.
     part_of : mapping of int to int
-        Class to the class that it may be a part of: if at least a quarter of the points of both have the second class,
-        all of them count as the second class.
+        Class to the class that it may be a part of. If at least a quarter of the points of these two classes have the
+        second class, all of them count as the second class.
 
     Returns
     -------
     classes : (k,) uint8
-        Class of every cluster, the smaller of two equally frequent ones; 0 where no class has the share.
+        Class of every cluster, the lower one on ties; 0 if no class has the share.
     shares : (k,) float64
-        Share of the cluster's points that carry its most frequent class of objects.
+        Share of the cluster's points that have its most frequent class of objects.
 
     Raises
     ------
@@ -186,7 +187,7 @@ def objects_from_points(
     min_score: float = MIN_SCORE,
     size_m: Mapping[str, tuple[float, float, float]] = OBJECT_SIZE_M,
 ) -> tuple[Box, ...]:
-    """Boxes around the clusters in which one class prevails.
+    """Fit boxes to the clusters that have one dominant class (KUL-Seg 5.2).
 
     Parameters
     ----------
@@ -198,7 +199,8 @@ def objects_from_points(
     among : (n,) bool, optional
         Points to cluster, all by default. Leave out the ground (`Ground.mask`), which would join everything on it.
     height_m : (n,) float32, optional
-        Height above the ground (`Ground.height_m`), down to which a box reaches; without, to its lowest point.
+        Height of every point above the ground (`Ground.height_m`). A box then reaches down to the ground, otherwise
+        to its lowest point.
     min_share : float
         A cluster is kept if more than this share of its points has one class (KUL-Seg 5.2). Pedestrian points count as
         cyclist if at least a quarter of the pedestrian and cyclist points are cyclist.
@@ -212,24 +214,24 @@ def objects_from_points(
     Returns
     -------
     tuple of Box
-        Best score first. The score is the product of the class's share; n / (n + 10) for n points; the square of the
-        height over the usual height, at most 1 (for persons the inverse if they are too tall); and the longer side seen
-        from above over the usual width, at most 1. The heading is known up to a half turn: yaw is in -pi/2..pi/2.
+        Best score first. The score is a product of four factors: the share of the class; n / (n + 10) for n points;
+        the square of height / usual height, at most 1 (inverted for persons that are too tall); and longer side / usual
+        width, at most 1. The heading is known up to a half turn: yaw is in -pi/2..pi/2.
 
     Raises
     ------
     PointsError
-        Arrays disagree in shape, or a label is no class.
+        Arrays disagree in shape, or a label is not in ``classes``.
 
     Notes
     -----
-    The heading of cars, vans and trucks is that of the L-shape along whose sides most points lie (Zhang et al. 2017,
-    closeness), of others that of the smallest rectangle. The longer side is the length, unless both sides may be a
-    front or a rear (at most 1.25 usual widths): then the length is the side that differs more from the usual width. A
-    side shorter than usual was only seen in part: it is extended to the usual length away from the sensor, or to both
-    ends if the sensor is beside it. The height is extended upwards likewise. Longer sides are kept. Of two boxes that
-    overlap by more than 0.1, or of which one has more than half its footprint in the other, the better one is kept:
-    they are pieces of one object.
+    The heading of cars, vans and trucks comes from an L-shape fit: most points lie near the sides of the rectangle
+    (Zhang et al. 2017, closeness). Other classes get the heading of the smallest rectangle. The longer side is the
+    length. If both sides may be a front or a rear (at most 1.25 usual widths), the length is the side that differs more
+    from the usual width. A side that is shorter than usual was seen only in part: it is extended to the usual length,
+    away from the sensor, or at both ends if the sensor is beside it. The height is extended upwards in the same way.
+    Longer sides are kept. Two boxes are pieces of one object if they overlap by more than 0.1, or if more than half of
+    one footprint lies in the other; the box with the higher score is kept.
 
     Parameters were chosen on KITTI's training drives (`edgeperc.evaluation.splits.FOLDS`), with labels of networks that
     were not trained on them. ``bench/RESULTS.md`` has the results on the test drives.
@@ -274,27 +276,36 @@ def objects_from_points(
         if score >= min_score:
             boxes.append(_completed(name, score, rectangle, bottom, top, size_m.get(name, (0.0, 0.0, 0.0))))
     boxes.sort(key=lambda box: -box.score)
-    doubles = _doubles(boxes, boxes)
+    same = _same_object(boxes, boxes)
     best: list[int] = []
     for row in range(len(boxes)):
-        if not doubles[row, best].any():
+        if not same[row, best].any():
             best.append(row)
     return tuple(boxes[row] for row in best)
 
 
 def join_boxes(first: Sequence[Box], second: Sequence[Box]) -> tuple[Box, ...]:
-    """All boxes of ``first``, and those of ``second`` that are not the same object as one of ``first``.
+    """Join two lists of boxes; a box of ``second`` is dropped if ``first`` has the same object.
 
-    Best score first. Two boxes are one object if they overlap by more than 0.1, or if more than half of one's footprint
-    lies in the other.
+    Two boxes are one object if they overlap by more than 0.1 (IoU), or if more than half of one footprint lies in the
+    other.
+
+    Parameters
+    ----------
+    first, second : sequence of Box
+
+    Returns
+    -------
+    tuple of Box
+        Best score first.
     """
-    doubles = _doubles(second, first)
-    others = [box for row, box in enumerate(second) if not doubles[row].any()]
+    same = _same_object(second, first)
+    others = [box for row, box in enumerate(second) if not same[row].any()]
     return tuple(sorted((*first, *others), key=lambda box: -box.score))
 
 
-def _doubles(first: Sequence[Box], second: Sequence[Box]) -> NDArray[np.bool_]:
-    """Which boxes of two lists are the same object, (n, m) bool."""
+def _same_object(first: Sequence[Box], second: Sequence[Box]) -> NDArray[np.bool_]:
+    """Whether boxes of two lists are the same object, (n, m) bool."""
     a, b = rectangles(first), rectangles(second)
     overlap = oriented_iou(a, b)
     smaller = np.minimum.outer(a[:, 2] * a[:, 3], b[:, 2] * b[:, 3])
@@ -344,7 +355,7 @@ def fill_clusters(
     min_points: int,
     clusters: NDArray[np.int32],
 ) -> None:
-    """Write every point's cluster; see `find_clusters`.
+    """Compute every point's cluster; see `find_clusters`.
 
     Parameters
     ----------
@@ -476,7 +487,7 @@ def fill_clusters(
 
 @njit(cache=True, nogil=True)
 def root_of(parent: NDArray[np.int32], run: int) -> int:
-    """The root of the runs that are joined with this one."""
+    """The root of the set of joined runs that this run belongs to (union-find with path halving)."""
     while parent[run] != run:
         parent[run] = parent[parent[run]]
         run = parent[run]
@@ -485,7 +496,7 @@ def root_of(parent: NDArray[np.int32], run: int) -> int:
 
 @njit(cache=True, nogil=True)
 def squared_gap(bounds: NDArray[np.float64], a: int, b: int) -> float:
-    """Square of the distance between two boxes, of rows lowest x, y, z, highest x, y, z; 0 where they meet."""
+    """Squared distance between two axis-aligned bounds (lowest x, y, z, highest x, y, z); 0 if they overlap."""
     gap_x = max(bounds[a, 0] - bounds[b, 3], bounds[b, 0] - bounds[a, 3], 0.0)
     gap_y = max(bounds[a, 1] - bounds[b, 4], bounds[b, 1] - bounds[a, 4], 0.0)
     gap_z = max(bounds[a, 2] - bounds[b, 5], bounds[b, 2] - bounds[a, 5], 0.0)
@@ -525,7 +536,7 @@ def fill_rectangle(members: NDArray[np.float64], l_shaped: bool, rectangle: NDAr
     members : (n, 2) float64
         x, y [m], at least one.
     l_shaped : bool
-        The heading is that of which most points lie near a side; otherwise that of the smallest rectangle.
+        True: the heading for which most points lie near a side. False: the heading of the smallest rectangle.
     rectangle : (5,) float64, overwritten
         x, y of the middle, extent along and across the heading [m], heading [rad] in 0..pi/2.
     """

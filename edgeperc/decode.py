@@ -1,4 +1,4 @@
-"""Raw network outputs -> class maps and boxes (SSADNet 2.2.1 B)."""
+"""Decode raw network outputs to class maps and boxes (SSADNet 2.2.1 B)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def decode_classes(
     Returns
     -------
     labels : (H, W) uint8
-        The lower of equally probable classes.
+        The lower class on ties.
     scores : (H, W) float32
         Softmax probability of that class, or the probability as given.
 
@@ -69,7 +69,7 @@ def decode_slots(
     *,
     model: str = "the model",
 ) -> list[Box]:
-    """Boxes as in the paper: axis-aligned, with the class that the segmentation has at their center.
+    """Decode axis-aligned boxes; each gets the class of the segmentation at its center (SSADNet 2.2.1 B).
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def decode_slots(
     box_classes : sequence of str
         Classes that boxes may have.
     box_size_priors : mapping
-        Class to (length, width, height) [m]; the height is taken, as the top view has none.
+        Class to (length, width, height) [m]; only the height is used, because the top view has none.
     mount_height_m : float
         Height of the sensor above the road [m]; boxes stand on the road.
     model : str
@@ -93,9 +93,9 @@ def decode_slots(
     Returns
     -------
     list of Box
-        Best score first, the earlier slot on ties; the score is the class's at the center pixel. A slot is empty
-        when an extent is below 0.5 m, when its center is out of view, or when no box class is there. The yaw is
-        0 where the longer side points ahead, else pi/2.
+        Best score first, the earlier slot on ties. The score is the probability of the class at the center pixel. A
+        slot is empty if an extent is below 0.5 m, if its center is out of view, or if the class there is not a box
+        class. The yaw is 0 if the longer side points ahead, else pi/2.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def decode_dense(
     max_boxes: int = 100,
     model: str = "the model",
 ) -> list[Box]:
-    """Oriented boxes from a heat map of centers with a box regressed at every cell.
+    """Decode oriented boxes from a heat map of centers and a box regressed at every cell.
 
     Parameters
     ----------
@@ -168,22 +168,22 @@ def decode_dense(
     box_classes : sequence of str
         Classes that boxes may have.
     box_size_priors, box_size_spreads : mapping, optional
-        Usual length, width and height [m] of each box class, and the deviations of their logarithms. Without spreads
-        only the segmentation decides the class.
+        Usual length, width and height [m] of each box class, and the standard deviations of their logarithms. Without
+        spreads only the segmentation decides the class.
     score_threshold : float
-        Least score, in 0..1.
+        Lowest score of a box, in 0..1.
     iou_threshold : float
-        Of two boxes that overlap more, the one with the lower score is dropped, also if their classes differ.
+        If two boxes overlap by more, the one with the lower score is dropped, even if their classes differ.
     max_boxes : int
-        Only this many peaks of the heat map are decoded, the highest ones.
+        Only this many of the highest peaks of the heat map are decoded.
     model : str
         Name for messages.
 
     Returns
     -------
     list of Box
-        Best score first; of equal scores the one farther ahead, then the one farther left. The score is the heat
-        map's; the yaw lies in -pi/2..pi/2: the network, like the paper's, does not tell front from rear.
+        Best score first; on ties the box farther ahead, then the box farther left. The score is the probability in the
+        heat map. The yaw is in -pi/2..pi/2: the network, like the paper's, does not distinguish front and rear.
 
     Raises
     ------
@@ -313,13 +313,13 @@ def fill_classes(
         Logits or probabilities.
     are_logits : bool
     labels : (H, W) uint8, overwritten
-        Of equal values the lower class.
+        The lower class on ties.
     scores : (H, W) float32, overwritten
 
     Returns
     -------
     n_bad : int
-        Values that are not finite; if there are any, the outputs are undefined.
+        Number of values that are not finite; if there are any, the outputs are undefined.
     """
     n_classes, height, width = values.shape
     n_bad = 0
@@ -345,8 +345,8 @@ def fill_classes(
         total[:] = 0.0
         for c in range(n_classes):
             for col in range(width):
-                # exp(x) is exp(x / 64) ** 64, its Taylor series off by less than 2e-6 here. Compiled to vector
-                # instructions it takes 0.3 ms for 5 x 400 x 200 logits, where math.exp takes 1.1 ms.
+                # exp(x) = exp(x / 64) ** 64, from a Taylor series with an error below 2e-6 here. In vector
+                # instructions this takes 0.3 ms for 5 x 400 x 200 logits; math.exp takes 1.1 ms.
                 x = max(values[c, row, col] - best[col], np.float32(-24.0)) * np.float32(1.0 / 64.0)
                 e = np.float32(1.0 / 120.0) * x + np.float32(1.0 / 24.0)
                 e = (e * x + np.float32(1.0 / 6.0)) * x + np.float32(0.5)
@@ -372,7 +372,7 @@ def mark_peaks(heat: NDArray[np.float32], threshold: float, peak: NDArray[np.boo
     threshold : float
         Cells below it are not peaks.
     peak : (H, W) bool, overwritten
-        Of equal neighbors the earlier, row by row, is the peak.
+        Of equal neighbors, the first one in row order is the peak.
     """
     height, width = heat.shape
     for row in range(height):
@@ -412,7 +412,7 @@ def fill_footprint_sums(
     cell : float
         Edge of a pixel [m].
     sums : (n, C) float64, overwritten
-        For a rectangle without a pixel's center, the nearest pixel in view is taken.
+        A rectangle that holds no pixel center gets the nearest pixel in view.
     """
     n_classes, height, width = values.shape
     pixel = np.empty(n_classes)
@@ -466,7 +466,7 @@ def add_probabilities(
 def decode_top_view(
     card: ModelCard, returned: NDArray[np.bool_], outputs: Mapping[str, NDArray[np.float32]], score_threshold: float
 ) -> tuple[NDArray[np.uint8], list[Box]]:
-    """Labels and boxes of a top-view network.
+    """Decode the labels and boxes of a top-view network (SSADNet 2.2.1 B, 3.1.2).
 
     Parameters
     ----------
@@ -475,17 +475,17 @@ def decode_top_view(
     returned : (rows, cols) bool
         Cells with a return: ``Projection.index >= 0``.
     outputs : mapping of str to ndarray
-        Raw outputs, by kind.
+        Raw outputs by kind, e.g. ``"class_logits"``.
     score_threshold : float
-        Least score of a box, in 0..1.
+        Lowest score of a box, in 0..1.
 
     Returns
     -------
     labels : (rows, cols) uint8
-        Index into ``card.classes``. The boxes of a dense head are drawn into the labels, as boxes are in the truth
+        Index into ``card.classes``. The boxes of a dense head are drawn into the labels, as in the ground truth
         (SSADNet 3.1.2). Outside boxes, a cell of a box class without a return becomes background. On simulated scans
-        this raised the IoU of cars from 0.41 to 0.54 and of vans from 0.14 to 0.35: few cells of a vehicle hold a
-        return.
+        this raised the IoU of cars from 0.41 to 0.54 and of vans from 0.14 to 0.35, because few cells of a vehicle hold
+        a return.
     boxes : list of Box
         Best score first.
 
@@ -515,7 +515,7 @@ def decode_top_view(
             model=card.name,
         )
         is_box = np.array([name in card.box_classes for name in card.classes])
-        boxed = np.flatnonzero(is_box[labels])  # few cells of many
+        boxed = np.flatnonzero(is_box[labels])  # indices, because these cells are few
         labels.reshape(-1)[boxed[~returned.reshape(-1)[boxed]]] = 0
         draw_footprints(labels, found, card.view, card.classes)
     elif "box_slots" in outputs:

@@ -1,7 +1,7 @@
 """The road in a top view for a planner: its outline as a polygon, the free distance, the lane width.
 
-Everything is in the sensor frame, meters: x forward, y left. Cells without returns have the class that the network gave
-them; nothing is known outside the view.
+Everything is in the sensor frame [m]: x forward, y left. Cells without a return have the class that the network
+predicted; outside the view nothing is known.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ class RoadAhead:
     ----------
     outline : (k, 2) float64
         Corners x, y of the connected road nearest to the sensor, counter-clockwise seen from above, the first not
-        repeated. Cells that share only a corner are not connected. (0, 2) if no cell is drivable.
+        repeated. Cells that share only a corner are not connected. Shape (0, 2) if no cell is drivable.
     holes : tuple of (k, 2) float64
         Areas inside the outline that are not road, such as vehicles; clockwise.
     y_m : (columns,) float64
         Middles of the top view's columns, leftmost first.
     free_m : (columns,) float64
-        x up to which each column is drivable without a gap, from the near edge of the view on. The near edge itself if
-        the nearest cell is not drivable, the far edge if all cells are.
+        x up to which each column is drivable without a gap, from the near edge of the view. It is the near edge if the
+        nearest cell is not drivable, and the far edge if all cells are drivable.
     x_m : (rows,) float64
         Middles of the top view's rows, nearest first.
     left_m, right_m : (rows,) float64
-        y of the edges of the corridor ahead: in every row the run of drivable cells that continues that of the row
-        before. NaN before the corridor begins and after it ends, and everywhere if none begins within 2 m of the
-        sensor's axis.
+        y of the edges of the corridor ahead. In each row, the corridor is the run of drivable cells that continues the
+        run of the row before. NaN before the corridor begins and after it ends, and everywhere if none begins within
+        2 m of the sensor's axis.
     lane_width_m : float
-        Estimate: the corridor's width across its direction, median of the nearest 20 m of view, divided by the number
-        of lanes (at least one) that brings it nearest to 3.25 m; the map has no lane markings. NaN if the two edges
-        are nowhere in view together.
+        Estimated from the corridor's width across its direction (median of the nearest 20 m of view), because the map
+        has no lane markings. The width is divided by the number of lanes, at least one, that gives about 3.25 m. NaN if
+        no row has both edges in view.
     """
 
     outline: NDArray[np.float64]
@@ -70,7 +70,7 @@ class RoadAhead:
         return self.left_m - self.right_m
 
     def free_ahead_m(self, half_width_m: float = 1.0) -> float:
-        """x up to which a strip as wide as a vehicle is free: the least `free_m` within ``half_width_m`` of the axis.
+        """x [m] up to which a strip as wide as a vehicle is free: lowest `free_m` within ``half_width_m`` of the axis.
 
         NaN if the view has no column there.
         """
@@ -79,7 +79,7 @@ class RoadAhead:
 
 
 def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: float = 0.1) -> RoadAhead:
-    """Road polygon, free distance and lane width of a top view.
+    """Measure the road in a top view: polygon, free distance and lane width.
 
     Parameters
     ----------
@@ -87,9 +87,13 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
     boxes : iterable of Box
         Obstacles that are not road, such as `Perception.boxes`: the top view has no class for pedestrians.
     tolerance_m : float
-        Largest distance of the polygon from the edges of the cells (Douglas and Peucker, 1973); 0 keeps every corner.
-        The default is a cell of the shipped models, which removes the steps of a slanting edge. With more than a
-        cell, edges of a ring may cross.
+        Largest distance of the polygon from the edges of the cells [m] (Douglas and Peucker, 1973); 0 keeps every
+        corner. The default is one cell of the shipped models, which removes the steps of a slanting edge. With more
+        than one cell, edges of a ring may cross.
+
+    Returns
+    -------
+    RoadAhead
 
     Raises
     ------
@@ -133,7 +137,7 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
         _simplified(np.column_stack([x_far - ring[:, 0] * cell_m, y_left - ring[:, 1] * cell_m]), tolerance_m)
         for ring in _rings(_nearest_part(drivable, y_m, x_m[::-1]))
     ]
-    # With the road to the left, only the ring around everything else has a positive area.
+    # Rings run with the road on their left, so only the outer ring has a positive area.
     areas = [_area(ring) for ring in rings]
     outer = int(np.argmax(areas)) if rings else -1
     return RoadAhead(
@@ -170,7 +174,7 @@ def _nearest_part(drivable: NDArray[np.bool_], y: NDArray[np.float64], x: NDArra
 
 
 def _rings(part: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-    """Rings of corners (row, column) around some cells, those to the left."""
+    """Rings of corners (row, column) around the cells of ``part``, with these cells on the left."""
     padded = np.pad(part, 1)
     n_sides = sum(int(np.count_nonzero(padded & ~np.roll(padded, shift, axis))) for axis in (0, 1) for shift in (1, -1))
     corners, ends = np.empty((n_sides, 2), np.int64), np.empty(n_sides // 4 + 1, np.int64)
@@ -217,12 +221,12 @@ def fill_corridor(drivable: NDArray[np.bool_], first: float, last: float, bounds
     first, last : float
         Columns between which the corridor has to begin.
     bounds : (rows, 2) int64, overwritten
-        First column of the corridor in each row, and one past its last; -1, -1 in rows without.
+        First column of the corridor in each row, and one past its last; -1, -1 in rows without a corridor.
 
     Notes
     -----
-    It begins in the last row with a run of drivable cells between ``first`` and ``last``, and continues with the run
-    that shares most columns with the row before, the left one of equals. It ends where no run shares a column.
+    The corridor begins in the last row that has a run of drivable cells between ``first`` and ``last``. It continues
+    with the run that shares most columns with the row before, the left one on ties, and ends where no run shares one.
     """
     height, width = drivable.shape
     bounds[:] = -1
@@ -252,7 +256,7 @@ def fill_corridor(drivable: NDArray[np.bool_], first: float, last: float, bounds
 
 @njit(cache=True, nogil=True)
 def mark_connected(cells: NDArray[np.bool_], row: int, col: int, part: NDArray[np.bool_]) -> None:
-    """Mark the cells connected to one over shared sides.
+    """Mark the cells that are connected to a start cell over shared sides.
 
     Parameters
     ----------
@@ -281,15 +285,15 @@ def mark_connected(cells: NDArray[np.bool_], row: int, col: int, part: NDArray[n
 
 @njit(cache=True, nogil=True)
 def fill_rings(cells: NDArray[np.bool_], corners: NDArray[np.int64], ends: NDArray[np.int64]) -> int:
-    """Walk along the edges of marked cells, with the cells to the left.
+    """Trace the edges of marked cells, with the cells on the left.
 
     Parameters
     ----------
     cells : (rows, columns) bool
         None marked along the border.
     corners : (n, 2) int64, overwritten
-        Row and column of the corners where the walk turns, ring after ring; a cell's upper left corner has its row and
-        column. ``n`` is at least the number of the cells' sides that face no other.
+        Row and column of the corners where the trace turns, ring after ring; a cell's upper left corner has its row and
+        column. ``n`` is at least the number of sides between a marked and an unmarked cell.
     ends : (m,) int64, overwritten
         Where each ring ends in ``corners``; ``m`` at least a quarter of ``n``.
 
@@ -345,7 +349,7 @@ def mark_kept(ring: NDArray[np.float64], tolerance: float, kept: NDArray[np.bool
     """
     n = ring.shape[0]
     kept[:] = False
-    # The ring is two lines: from its first corner to the farthest from it, and back.
+    # Split the ring into two lines: from its first corner to the corner farthest from it, and back.
     farthest, most = 0, 0.0
     for k in range(n):
         apart = math.hypot(ring[k, 0] - ring[0, 0], ring[k, 1] - ring[0, 1])

@@ -1,4 +1,4 @@
-"""Every error edgeperc raises on purpose.
+"""The exceptions of edgeperc.
 
 ::
 
@@ -6,18 +6,18 @@
     ├── OptionError (ValueError)      an unknown option, or a value out of its range
     ├── PointsError (ValueError)      an array or a sensor file that is not a scan
     ├── SensorError (ValueError)      an unknown or impossible sensor profile
-    ├── SettingsError (ValueError)    the file with this computer's settings cannot be read
+    ├── SettingsError (ValueError)    this computer's settings file cannot be read
     ├── SplitError (ValueError)       a model would be evaluated on a scan that it was trained on
     ├── TrackingError (ValueError)    boxes or a pose that cannot be tracked
-    │   └── StampError                a scan that is no later than the one before it
-    ├── FitnessError                  a scan unlike those a model was trained on, and on_mismatch="raise"
+    │   └── StampError                a scan that is not later than the one before it
+    ├── FitnessError                  a scan differs from the training scans, and on_mismatch="raise"
     ├── ModelError
     │   ├── ModelFileError            missing, or onnxruntime cannot open it
-    │   ├── CardError                 card absent, unreadable or of a newer schema
+    │   ├── CardError                 the card is missing, unreadable or of a newer schema
     │   └── CardMismatchError         the card and the graph disagree
-    ├── ProviderError                 the execution provider asked for is not there or not active
+    ├── ProviderError                 the requested execution provider is not installed or not active
     ├── InferenceError                the session failed on a valid tensor
-    └── MissingExtraError (ImportError)   an optional dependency is absent; says which line installs it
+    └── MissingExtraError (ImportError)   an optional package is not installed
 
 Each message says what was given, what was expected and what to do.
 """
@@ -45,7 +45,7 @@ __all__ = [
 
 
 class EdgepercError(Exception):
-    """Root of every error that edgeperc raises on purpose."""
+    """Base class of all errors of edgeperc."""
 
 
 class OptionError(EdgepercError, ValueError):
@@ -61,7 +61,7 @@ class SensorError(EdgepercError, ValueError):
 
 
 class SettingsError(EdgepercError, ValueError):
-    """The file with this computer's settings cannot be read, or has another schema."""
+    """This computer's settings file cannot be read, or has another schema."""
 
 
 class SplitError(EdgepercError, ValueError):
@@ -73,11 +73,11 @@ class TrackingError(EdgepercError, ValueError):
 
 
 class StampError(TrackingError):
-    """A scan's time is not finite, or no later than that of the scan before it."""
+    """A scan's time is not finite, or not later than that of the scan before it."""
 
 
 class FitnessError(EdgepercError):
-    """A scan is unlike those the model was trained on, and the caller asked for an error."""
+    """A scan differs from the model's training scans, and ``on_mismatch`` is ``"raise"``."""
 
 
 class ModelError(EdgepercError):
@@ -89,7 +89,7 @@ class ModelFileError(ModelError):
 
 
 class CardError(ModelError):
-    """The model carries no card, an unreadable one, or one of a newer schema."""
+    """The model's card is missing, unreadable or of a newer schema."""
 
 
 class CardMismatchError(ModelError):
@@ -97,7 +97,7 @@ class CardMismatchError(ModelError):
 
 
 class ProviderError(EdgepercError):
-    """The execution provider asked for is not installed or did not become active."""
+    """The requested execution provider is not installed, or onnxruntime did not activate it."""
 
 
 class InferenceError(EdgepercError):
@@ -105,7 +105,7 @@ class InferenceError(EdgepercError):
 
 
 class MissingExtraError(EdgepercError, ImportError):
-    """An optional dependency is absent; the message holds the line that installs it."""
+    """An optional package is not installed; the message gives the install command."""
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
         super().__init__(f"{purpose} needs {package}, which is not installed. Run: pip install 'edgeperc[{extra}]'")

@@ -1,4 +1,4 @@
-"""Is a scan like the scans that a model was trained on?"""
+"""Check whether a scan is like the scans that a model was trained on."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ __all__ = ["FitnessProfile", "check_fitness", "fill_scan_sums"]
 _STEPS = np.array([1, 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 53, 61, 71, 83, 97, 127, 167, 223, 307, 401])
 _SAMPLE, _BEAM_SAMPLE = 6000, 130_000
 
-# Least share of the near points at one height that counts as ground; KITTI scans have 0.18 (5th percentile) and more.
+# The most frequent height of the near points counts as ground if it has at least this share of them. The 5th percentile
+# of KITTI scans is 0.18.
 _GROUND_SHARE = 0.15
 
 
@@ -48,7 +49,7 @@ def fill_scan_sums(
     points : (n, 4) float32
         x, y, z [m], remission.
     step, beam_step : int
-        The elevations along eight directions come from every ``beam_step``-th point.
+        Every ``step``-th point is used; for the elevations in eight directions, every ``beam_step``-th.
     view_right, view_left : float
         Edges of the model's view as pseudo-azimuth, y / (|x| + |y|) unfolded to -2..2.
     remissions : (258,) int64, overwritten
@@ -63,9 +64,9 @@ def fill_scan_sums(
         Elevation [deg] of the points in the eight directions ahead, left, behind, right and halfway between.
     n_rows : (8,) int64, overwritten
     sums : (8,) float64, overwritten
-        0 points that are finite; 1 of these, in the view; 2 sixty-fourths of the turn that hold points; 3 of those
-        in the view, the share that holds points; 4 logarithm of the obstacles at the sides over those ahead and behind;
-        5 lowest and 6 highest remission; 7 points 3 to 25 m away.
+        0: finite points; 1: finite points in the view; 2: sectors of 1/64 turn with points; 3: share of the sectors in
+        the view that have points; 4: logarithm of the ratio of obstacles at the sides to those ahead and behind;
+        5, 6: lowest and highest remission; 7: points 3 to 25 m away.
     """
     n = points.shape[0]
     remissions[:] = 0
@@ -167,7 +168,7 @@ def fill_scan_sums(
 
 @dataclass(frozen=True)
 class _Measures:
-    """Measures of one scan; None where the scan does not determine one."""
+    """Statistics of one scan; None where the scan does not determine a value."""
 
     points_in_view: float
     view_covered: float
@@ -181,7 +182,7 @@ class _Measures:
     range_median_m: float
     ground_m: float | None
     road_ahead: float | None
-    # The rest is checked by itself, not against the training scans.
+    # The values below are checked on their own, not against the training scans.
     n_sampled: float
     remission_low: float
     remission_high: float
@@ -204,7 +205,7 @@ def _quantile(histogram: NDArray[np.int64], share: float) -> float:
 
 
 def _measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> _Measures | None:
-    """None where no point is finite."""
+    """Statistics of one scan; None if no point is finite."""
     if points.ndim != 2 or points.shape[1] != 4:
         raise PointsError(f"got an array of shape {points.shape}; expected (n, 4): x, y, z, remission")
     points = read_only(points)
@@ -243,14 +244,14 @@ def _measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> _
         beams_per_deg=n_beams / (high - low + 1.0),
         range_median_m=10.0 ** (_quantile(ranges, 0.5) / 20.0 - 3.0),
         ground_m=round(int(heights[2].argmax()) * 0.2 - 9.9, 1) if has_ground else None,
-        # 58 of 64 sectors: a full turn, of which a pillar or two may hide a part.
+        # 58 of 64 sectors: a full turn, parts of which may be hidden by the vehicle.
         road_ahead=float(sums[4]) if has_ground and sums[2] >= 58 else None,
         n_sampled=float(n_finite),
         remission_low=float(sums[5]),
         remission_high=float(sums[6]),
         remission_beyond=float(remissions[257] / n_finite),
         remission_alike=float(remissions.max() / n_finite),
-        # Facades are flat along y too, but only the ground along a camera's axis spreads the elevations so far.
+        # Facades are flat along y too, but only ground along a camera's axis gives such a wide range of elevations.
         flat_axis=flattest if peaks[flattest] >= max(_GROUND_SHARE, 1.5 * peaks[2]) and high - low > 60.0 else None,
         flat_m=round(int(heights[flattest].argmax()) * 0.2 - 9.9, 1),
     )
@@ -261,7 +262,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class FitnessProfile:
-    """Lowest and highest value of each measure over the training scans.
+    """Lowest and highest value of each statistic over the training scans.
 
     The model's card holds it; `check_fitness` compares scans with it.
 
@@ -269,23 +270,23 @@ class FitnessProfile:
     ----------
     n_scans : int
     azimuth_deg : tuple of 2 float
-        Left and right edge of the model's view.
+        Left and right edge of the model's view [deg].
     points_in_view : tuple of 2 float
         Points in that view.
     view_covered : tuple of 2 float
         Share of the view with returns, in steps of 1/64 turn.
     remission_median, remission_p99, remission_zeros : tuple of 2 float
-        Of remission scaled to 0..1: median, 99th percentile, share of points with none.
+        Median, 99th percentile and share of zeros of the remission, scaled to 0..1.
     elevation_p01_deg, elevation_p99_deg : tuple of 2 float
-        1st and 99th percentile of the points' elevation.
+        1st and 99th percentile of the points' elevation [deg].
     beams, beams_per_deg : tuple of 2 float
         Rows of points above one another, and their number per degree of elevation.
     range_median_m : tuple of 2 float
-        Median horizontal distance.
+        Median horizontal distance [m].
     ground_m : tuple of 2 float, or None
-        Height of the ground in the sensor's frame; None where no scan shows it.
+        Height of the ground in the sensor frame [m]; None if no scan shows the ground.
     road_ahead : tuple of 2 float, or None
-        Logarithm of the ratio of obstacles at the sides to those ahead and behind; None where no scan is a full turn.
+        Logarithm of the ratio of obstacles at the sides to those ahead and behind; None if no scan is a full turn.
     """
 
     n_scans: int
@@ -314,7 +315,7 @@ class FitnessProfile:
         scans : iterable of (n, 4) float32
             x, y, z [m], remission scaled to 0..1.
         azimuth_deg : tuple of 2 float
-            Left and right edge of the model's view, within 180 and -180.
+            Left and right edge of the model's view [deg], between 180 and -180.
 
         Raises
         ------
@@ -331,7 +332,7 @@ class FitnessProfile:
         return cls(n_scans=len(measures), azimuth_deg=(float(azimuth_deg[0]), float(azimuth_deg[1])), **seen)  # type: ignore[arg-type]
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON; `from_dict` reads it."""
+        """Convert to a dict for JSON; `from_dict` reads it."""
         return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
 
     @classmethod
@@ -341,7 +342,7 @@ class FitnessProfile:
         Raises
         ------
         CardError
-            When an entry is missing, unknown, no pair of numbers or out of its bounds.
+            An entry is missing, unknown, not a pair of numbers or out of its bounds.
         """
         names = {field.name for field in fields(cls)}
         if not isinstance(document, Mapping) or set(document) != names:
@@ -399,19 +400,19 @@ _MEASURED = tuple(field.name for field in fields(FitnessProfile) if field.name n
 
 
 def check_fitness(points: NDArray[np.float32], profile: FitnessProfile, sensor: SensorProfile) -> tuple[str, ...]:
-    """List how a scan differs from the scans that a model was trained on, and what to do about it.
+    """Describe how a scan differs from the scans that a model was trained on, and what to do about it.
 
     Margins are wide: the check finds gross mistakes (axes, units, remission scale, another sensor) and accepts ordinary
-    scans of the right sensor, also scans cropped to the model's view. It does not find scans turned by 180 degrees or
-    mirrored left to right, and misses one of nine scans turned by 90 degrees (measured on KITTI).
+    scans of the right sensor, including scans cropped to the model's view. It does not find scans turned by 180 degrees
+    or mirrored left to right, and misses one of nine scans turned by 90 degrees (measured on KITTI).
 
     Parameters
     ----------
     points : (n, 4) float32
-        x, y, z [m], remission scaled to 0..1 by ``sensor``. Points not finite are skipped.
+        x, y, z [m], remission scaled to 0..1 by ``sensor``. Points that are not finite are skipped.
     profile : FitnessProfile
     sensor : SensorProfile
-        The sensor that the scan is said to come from.
+        The sensor that the caller says recorded the scan.
 
     Returns
     -------
@@ -421,7 +422,7 @@ def check_fitness(points: NDArray[np.float32], profile: FitnessProfile, sensor: 
     Raises
     ------
     PointsError
-        When ``points`` is of another shape.
+        ``points`` has another shape.
     """
     scan = _measure(points, profile.azimuth_deg)
     if scan is None:
@@ -496,11 +497,12 @@ def _geometry_findings(scan: _Measures, profile: FitnessProfile, sensor: SensorP
     ):
         findings.append(
             "There are more obstacles ahead and behind than to the sides, as if the road ran along y: if x does not "
-            "point forward, turn the points (from x right, y forward: pass y, -x, z). Across a road this may be right."
+            "point forward, turn the points (from x right, y forward: pass y, -x, z). "
+            "If the vehicle stands across the road, ignore this."
         )
 
     few_rows = scan.beams < 0.75 * profile.beams[0] and scan.beams_per_deg < 0.65 * profile.beams_per_deg[0]
-    if few_rows and has_ground:  # seen from a wrong origin, rows cannot be separated
+    if few_rows and has_ground:  # rows cannot be separated if the origin is wrong
         findings.append(
             f"The scan has about {scan.beams:.0f} rows of points (sensor {sensor.name}: {sensor.n_beams}), in training "
             f"it had at least {profile.beams[0]:.0f}: expect to lose far and small objects, or use a model trained for "
@@ -522,7 +524,7 @@ def _remission_findings(scan: _Measures, profile: FitnessProfile, sensor: Sensor
     raw_low, raw_high, raw_p99 = (
         value * (high - low) + low for value in (scan.remission_low, scan.remission_high, scan.remission_p99)
     )
-    stated = f"the profile {sensor.name} says {low:g} to {high:g}"
+    stated = f"the profile {sensor.name} has {low:g} to {high:g}"
     useless = max(0.9, profile.remission_zeros[1] + 0.05)
     if scan.remission_beyond > 0.01 or scan.remission_low < -0.05:
         likely = next((f"(0, {top})" for top in (1, 255, 65535) if raw_low >= 0.0 and raw_high <= top), "that")
@@ -549,6 +551,6 @@ def _remission_findings(scan: _Measures, profile: FitnessProfile, sensor: Sensor
     if not darkest / 4.0 <= scan.remission_median <= brightest * 2.5:
         return [
             f"The median remission is {scan.remission_median:.2f} of full scale, in training it was {darkest:.2f} to "
-            f"{brightest:.2f}: sensors differ in this; fit a profile to it with edgeperc fit-sensor."
+            f"{brightest:.2f}: sensors differ in remission; fit a profile with edgeperc fit-sensor."
         ]
     return []

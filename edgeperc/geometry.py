@@ -35,12 +35,12 @@ def draw_footprints(
 ) -> None:
     """Draw the footprints of boxes over top-view labels, in place (SSADNet 3.1.2).
 
-    A cell belongs to a box when its center lies in the footprint; the nearer of two boxes wins. Boxes of other classes
-    are left out.
+    A cell belongs to a box if its center lies in the footprint; the nearer of two boxes wins. Boxes of other classes
+    are not drawn.
 
     Parameters
     ----------
-    labels : (rows, columns) uint8
+    labels : (rows, columns) uint8, modified
     boxes : iterable of Box
     view : TopViewGeometry
     classes : sequence of str
@@ -69,19 +69,19 @@ def rectangles(boxes: Iterable[Box]) -> NDArray[np.float64]:
 
 
 def oriented_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
-    """Intersection over union of every rectangle of ``a`` with every one of ``b`` (SSADNet equation A1).
+    """Intersection over union of every rectangle of ``a`` with every rectangle of ``b`` (SSADNet equation A1).
 
     Parameters
     ----------
     a : (n, 5) array_like
         x, y, length, width [m], yaw [rad].
     b : (m, 5) array_like
-        Likewise.
+        As ``a``.
 
     Returns
     -------
     (n, m) float64
-        In 0..1. A rectangle that is not finite, or without area, overlaps nothing, not even itself.
+        In 0..1. A rectangle that is not finite or has no area overlaps nothing, not even itself.
 
     Raises
     ------
@@ -121,13 +121,13 @@ def suppress_overlaps(rectangles: ArrayLike, scores: ArrayLike, iou_threshold: f
         x, y, length, width [m], yaw [rad].
     scores : (n,) array_like
     iou_threshold : float
-        A rectangle is dropped when it overlaps a kept one with a better score by more than this.
+        A rectangle is dropped if it overlaps a kept one with a better score by more than this.
 
     Returns
     -------
     (k,) int64
-        Rows kept, best score first. Of equal scores the earlier row comes first. Rows that are not finite
-        overlap nothing, so they are kept.
+        Rows kept, best score first, the earlier row on ties. Rows that are not finite overlap nothing, so they are
+        kept.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def _as_rectangles(given: ArrayLike) -> NDArray[np.float64]:
 
 @njit(cache=True, nogil=True)
 def fill_oriented_iou(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArray[np.float64]) -> None:
-    """Write the overlap of every pair into ``iou``.
+    """Compute the overlap (IoU) of every pair.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def fill_oriented_iou(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArr
 
 @njit(cache=True, nogil=True)
 def mark_nms(rectangles: NDArray[np.float64], iou_threshold: float, keep: NDArray[np.bool_]) -> None:
-    """Mark the rectangles that no better kept one overlaps by more than ``iou_threshold``.
+    """Mark the rectangles that overlap no better kept rectangle by more than ``iou_threshold``.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def mark_nms(rectangles: NDArray[np.float64], iou_threshold: float, keep: NDArra
 
 @njit(cache=True, nogil=True)
 def pair_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Overlap of two rectangles (5,): the second is clipped by the first in the first's own frame."""
+    """IoU of two rectangles (5,); the second is clipped by the first in the frame of the first."""
     area_a = a[2] * a[3]
     area_b = b[2] * b[3]
     if not (a[2] > 0.0 and a[3] > 0.0 and b[2] > 0.0 and b[3] > 0.0 and area_a + area_b < math.inf):
@@ -267,13 +267,27 @@ def pair_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     for k in range(n):
         last = n - 1 if k == 0 else k - 1
         twice += corners[last, source] * corners[k, source + 1] - corners[k, source] * corners[last, source + 1]
-    # With rounding, the area of a sliver may be below zero, and that of equal rectangles above their own.
+    # Rounding may give a sliver a negative area, and two equal rectangles a shared area above their own.
     shared = min(max(0.5 * twice, 0.0), area_a, area_b)
     return float(shared / (area_a + area_b - shared))
 
 
 def inside(box: Box, points: NDArray[Any], margin_m: float = 0.0) -> NDArray[np.bool_]:
-    """Points (n, 3+) within a box grown by a margin, (n,) bool."""
+    """Find the points inside a box.
+
+    Parameters
+    ----------
+    box : Box
+    points : (n, 3 or more) array
+        x, y, z [m] in the frame of the box.
+    margin_m : float
+        The box is grown by this on every side [m].
+
+    Returns
+    -------
+    (n,) bool
+        False for points that are not finite.
+    """
     offset = points[:, :3] - np.asarray(box.center, np.float32)
     cos, sin = np.cos(box.yaw), np.sin(box.yaw)
     along = offset[:, 0] * cos + offset[:, 1] * sin

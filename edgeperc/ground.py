@@ -1,9 +1,9 @@
-"""Ground points, and the height of the others above the ground: RANSAC in every region of the street.
+"""Find the ground and the height of every point above it, by RANSAC in regions (KUL-Seg 5.2).
 
-One plane fits a car park; a street climbs, leans and has kerbs. `find_ground` divides the scan into cells and keeps the
-lowest return of each. RANSAC fits a plane to these in each region, from the vehicle outwards; each region starts from
-the planes of its neighbors. Where the lowest returns of a few cells agree on a step off the plane, such as a
-pavement, the ground follows them.
+One plane fits a car park, but a street has slopes, camber and kerbs. `find_ground` divides the scan into cells and
+keeps the lowest return of each. RANSAC fits a plane to these in each region, from the vehicle outwards; each region
+starts from the planes of its neighbors. Where the lowest returns of a few cells agree on a step off the plane, such as
+a pavement, the ground follows them.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ TOLERANCE_M = 0.1
 MIN_AREA_M2 = 1.0  # twice the triangle of a hypothesis, seen from above
 MAX_TESTED = 1024  # cells a hypothesis is tested on
 
-# Steps: 5 x 5 cells; recall and precision rose by 0.007 and 0.001 on simulated scans, 0.027 and 0.002 on HDL-32E ones.
+# Steps in 5 x 5 cells. They raised recall and precision by 0.007 and 0.001 on simulated scans, by 0.027 and 0.002 on
+# HDL-32E scans.
 WINDOW = 2
 MAX_STEP_M = 0.3
 MAX_DEPTH_M = 0.5  # deeper points are reflections
@@ -64,8 +65,8 @@ class Ground:
     height_m : (n,) float32
         Height of every point above the ground below it [m]; NaN for points that are not finite.
     plane : tuple of 3 float, or None
-        a, b, c of z = a x + b y + c [m] around the vehicle. None where no ground was found: then no point is ground,
-        and heights are those above a level plane at the mounting height.
+        a, b, c of z = a x + b y + c [m] around the vehicle. None if no ground was found: then no point is ground, and
+        heights are above a level plane at the mounting height.
     """
 
     mask: NDArray[np.bool_]
@@ -80,24 +81,23 @@ def find_ground(
     max_height_m: float = 0.125,
     regions: bool = True,
 ) -> Ground:
-    """Separate the ground from what stands on it.
+    """Separate the ground from what stands on it (KUL-Seg 5.2).
 
     Parameters
     ----------
     points : (n, 3 or more) float32
         x, y, z [m] in the sensor frame.
     mount_height_m : float
-        Height of the sensor above the ground, with an error of at most 0.5 m (`SensorProfile.mount_height_m`).
+        Height of the sensor above the ground [m] (`SensorProfile.mount_height_m`); may be wrong by 0.5 m.
     max_height_m : float
-        Points up to this above the ground are ground, and those down to 0.5 m below it.
+        A point is ground if it is at most this far above the ground [m] and at most 0.5 m below it.
     regions : bool
         False fits only the plane around the vehicle.
 
     Returns
     -------
     Ground
-        The same scan gives the same answer. For an empty scan, or one without ground such as that of a wall,
-        ``plane`` is None.
+        Deterministic. ``plane`` is None for an empty scan, or a scan without ground, such as that of a wall.
 
     Raises
     ------
@@ -108,8 +108,8 @@ def find_ground(
     -----
     KUL-Seg (section 5.2) removes the ground by RANSAC without details; this method is our own. A hypothesis is the
     plane through the lowest returns of three cells. A cell whose lowest return is within 0.1 m of the plane votes for
-    it; a cell whose lowest return is below votes against it. Nothing is seen under the ground, so a plane through
-    hedges or a row of car roofs wins only where they hide more than two thirds of the cells. The first plane is
+    it; a cell whose lowest return is lower votes against it. There are no returns from below the ground, so a plane
+    through hedges or a row of car roofs wins only if they hide more than two thirds of the cells. The first plane is
     searched within 20 m of the sensor, near the mounting height. Each region of 8 x 8 m then starts from the mean of
     its solved neighbors, may differ in slope by 0.12, and is refined by least squares with the neighbors' slope as a
     weak prior, because a far region may hold a single ring of returns. Heights are interpolated between the middles of
@@ -163,7 +163,8 @@ def fill_lowest(points: NDArray[np.float32], cell: NDArray[np.int32], lowest: ND
     flat = lowest.reshape(-1)
     reach = np.float32(REACH_M)
     cells_per_m = np.float32(1.0 / CELL_M)  # a power of two: no rounding
-    # Backwards: the lowest beam of most sensors comes last, so the minimum changes less often. Saves a fifth.
+    # Backwards, which saves a fifth of the time: the lowest beam of most sensors comes last, so minima change less
+    # often.
     for i in range(points.shape[0] - 1, -1, -1):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         if not (abs(x) < reach and abs(y) < reach and abs(z) < math.inf):
@@ -210,7 +211,7 @@ def fill_planes(
     first : (3,) float64
         a, b, c around the vehicle.
     planes : (N_REGIONS, N_REGIONS, 3) float64, overwritten
-        Slopes along x and y, and height in the region's middle [m]; as expected where too few cells agree.
+        Slopes along x and y, and height in the region's middle [m]; the expected plane if too few cells agree.
     """
     solved = np.zeros((N_REGIONS, N_REGIONS))  # 1 and the cells that agree
     residuals = np.empty((CELLS_A_REGION * CELLS_A_REGION, 3))
@@ -268,10 +269,10 @@ def fill_residuals(
     cone: float,
     residuals: NDArray[np.float64],
 ) -> int:
-    """Write x, y about the middle and z above the expected plane for the lowest returns of size x size cells.
+    """Write x, y from the middle and z above the expected plane of the lowest returns of size x size cells.
 
-    Those farther from the plane than ``band``, and ``cone`` for every meter from the middle, are left out. Returns how
-    many were written.
+    A return is skipped if it is farther from the plane than ``band`` plus ``cone`` times its distance from the middle.
+    Returns the number of rows written.
     """
     n = 0
     for row in range(first_row, first_row + size):
@@ -298,7 +299,7 @@ def find_plane(
     draw: int,
     plane: NDArray[np.float64],
 ) -> None:
-    """Write the best hypothesis' a, b, c into ``plane`` (3,); the expected plane, 0, 0, 0, is the first of them."""
+    """Write a, b, c of the best hypothesis into ``plane`` (3,); the first one is the expected plane, 0, 0, 0."""
     plane[:] = 0.0
     if n == 0:
         return
@@ -329,7 +330,7 @@ def find_plane(
 
 @njit(cache=True, nogil=True)
 def count_support(residuals: NDArray[np.float64], n: int, step: int, a: float, b: float, c: float) -> int:
-    """Cells on the plane less the cells below it."""
+    """Number of cells on the plane minus the number of cells below it."""
     support = 0
     for k in range(0, n, step):
         gap = residuals[k, 2] - a * residuals[k, 0] - b * residuals[k, 1] - c
@@ -344,7 +345,7 @@ def count_support(residuals: NDArray[np.float64], n: int, step: int, a: float, b
 def refine_plane(
     residuals: NDArray[np.float64], n: int, prior: float, max_slope: float, max_shift: float, plane: NDArray[np.float64]
 ) -> int:
-    """Replace ``plane`` by the least squares of the cells on it, and return how many there are; 0 without a plane.
+    """Replace ``plane`` by the least-squares plane of the cells on it; return their number, or 0 if there is no plane.
 
     ``prior`` [m2] is the weight of a slope of zero.
     """
@@ -393,9 +394,9 @@ def fill_levels(
     lowest : (N_CELLS, N_CELLS) int32
     planes : (N_REGIONS, N_REGIONS, 3) float64
     level : (N_CELLS, N_CELLS) float32, overwritten
-        z [m]; NaN where no point is.
+        z [m]; NaN without a point.
     """
-    # Padded with zeros, so that the sums below need no checks: half the time.
+    # Padded with zeros, so that the sums below need no bounds checks: this halves the time.
     step = np.zeros((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), dtype=np.float32)
     counts = np.zeros((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), dtype=np.float32)
     for row in range(N_CELLS):
@@ -453,7 +454,7 @@ def fill_heights(
     height: NDArray[np.float32],
     mask: NDArray[np.bool_],
 ) -> None:
-    """Write every point's height above the ground, and whether it is on it.
+    """Write every point's height above the ground, and whether it is on the ground.
 
     Parameters
     ----------
@@ -462,7 +463,7 @@ def fill_heights(
     level : (N_CELLS, N_CELLS) float32
     planes : (N_REGIONS, N_REGIONS, 3) float64
     height : (n,) float32, overwritten
-        Out of the grid above the nearest region's plane; NaN for points that are not finite.
+        [m]; outside the grid, above the plane of the nearest region. NaN for points that are not finite.
     mask : (n,) bool, overwritten
     """
     for i in range(points.shape[0]):
@@ -495,7 +496,7 @@ def fill_heights_above_plane(
     height: NDArray[np.float32],
     mask: NDArray[np.bool_],
 ) -> None:
-    """Write every point's height above z = a x + b y + c, NaN where it is not finite, and whether it is on it."""
+    """Write every point's height above z = a x + b y + c (NaN if not finite), and whether it is on the ground."""
     for i in range(points.shape[0]):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         above = z - plane[0] * x - plane[1] * y - plane[2]

@@ -1,8 +1,8 @@
-"""An .onnx file read without onnx or onnxruntime: an entry of its metadata, and whether its graph may be opened.
+"""Read one metadata entry of an .onnx file, and check its graph, without onnx or onnxruntime.
 
-An .onnx file is a protobuf message: fields one after the other, each with its number and type in front; a field may be
-a message itself. Two readers that disagree about a file are a risk, so everything unusual is refused: groups, numbers
-that do not fit, fields that leave their message.
+An .onnx file is a protobuf message, a sequence of fields. Each field begins with its number and type, and may be a
+message itself. Two readers that disagree about a file are a risk, so everything unusual is refused: groups, numbers
+that do not fit, and fields that extend beyond their message.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ __all__ = ["OPERATORS", "check_graph", "open_model", "read_metadata", "read_mode
 
 MAX_BYTES = 2 * 10**9  # protobuf itself stops at 2 GiB
 MAX_ENTRY_BYTES = 16 * 10**6
-MAX_TOP_FIELDS = 10_000  # of the file itself, which has some twenty; a file of empty fields would take minutes
-MAX_FIELDS = 1_000_000  # of a whole file; the shipped ones have at most some thousands
+MAX_TOP_FIELDS = 10_000  # of the file itself, which has about twenty; a file of empty fields would take minutes to read
+MAX_FIELDS = 1_000_000  # of a whole file; the shipped ones have a few thousand at most
 MAX_DEPTH = 32  # messages within messages; a graph without subgraphs needs 5
 MAX_NODES = 20_000
 MAX_WEIGHT_BYTES = 10**9
@@ -73,7 +73,7 @@ def open_model(path: str | os.PathLike[str]) -> BinaryIO:
     file.close()
     if stat.S_ISREG(status.st_mode):
         raise ModelFileError(f"{os.fspath(path)} has {status.st_size} bytes; expected at most {MAX_BYTES}")
-    raise ModelFileError(f"{os.fspath(path)} cannot be read: it is no regular file; give the path of an .onnx file")
+    raise ModelFileError(f"{os.fspath(path)} cannot be read: it is not a regular file; give the path of an .onnx file")
 
 
 def read_model(path: str | os.PathLike[str]) -> bytes:
@@ -92,7 +92,7 @@ def read_model(path: str | os.PathLike[str]) -> bytes:
 
 
 def read_metadata(path: str | os.PathLike[str], key: str) -> str | None:
-    """The text of a metadata entry.
+    """Read the text of a metadata entry.
 
     Parameters
     ----------
@@ -103,14 +103,14 @@ def read_metadata(path: str | os.PathLike[str], key: str) -> str | None:
     Returns
     -------
     str or None
-        Of several entries with this key the last, as onnxruntime has it. None where there is none.
+        The last value if the key occurs several times, as in onnxruntime. None if the key is absent.
 
     Raises
     ------
     ModelFileError
-        The file cannot be read, is cut short or is no .onnx file.
+        The file cannot be read, is truncated or is not an .onnx file.
     CardError
-        The entry is no UTF-8, or longer than 16 MB.
+        The entry is not UTF-8 text, or is longer than 16 MB.
     """
     wanted, value = key.encode(), None
     with open_model(path) as file:
@@ -134,15 +134,15 @@ def read_metadata(path: str | os.PathLike[str], key: str) -> str | None:
         try:
             return reader.content(*value).decode("utf-8")
         except ValueError as exc:
-            raise CardError(f"{os.fspath(path)}: the entry {key} is no UTF-8 ({exc}); export the model again") from exc
+            raise CardError(f"{os.fspath(path)}: the entry {key} is not UTF-8 ({exc}); export the model again") from exc
 
 
 def _damaged(path: str | os.PathLike[str], exc: ValueError) -> ModelFileError:
-    return ModelFileError(f"{os.fspath(path)} is no complete .onnx file ({exc}); copy or export the model again")
+    return ModelFileError(f"{os.fspath(path)} is not a complete .onnx file ({exc}); copy or export the model again")
 
 
 def _entry(reader: _Reader, start: int, end: int, wanted: bytes) -> tuple[int, int] | None:
-    """Where the value of a metadata entry lies; None where its key is another."""
+    """Start and end of the value of a metadata entry; None if the entry has another key."""
     found, value = b"", (0, 0)
     for number, _, first, last in reader.fields(start, end):
         if number == 1:
@@ -164,7 +164,7 @@ class _Reader:
         return self._file.read(end - start)
 
     def fields(self, start: int, end: int) -> Iterator[tuple[int, int | None, int, int]]:
-        """Fields of the message from ``start`` to ``end``: number, value, start and end of the content.
+        """Yield the fields of the message from ``start`` to ``end``: number, value, start and end of the content.
 
         The value is that of an integer, and None for bytes. Fields of four and eight bytes are left out.
         """
@@ -193,7 +193,7 @@ class _Reader:
             file.seek(start)
 
     def integers(self, value: int | None, start: int, end: int) -> Iterator[int]:
-        """Of a repeated field of integers, which come one by one or packed."""
+        """Yield the values of a repeated field of integers, stored one by one or packed."""
         if value is not None:
             yield value
             return
@@ -228,8 +228,8 @@ def check_graph(blob: bytes, path: str | os.PathLike[str], *, trusted: bool = Fa
     Raises
     ------
     ModelFileError
-        The file is damaged or no .onnx file; keeps tensors in other files; or, if it is not trusted, has an operator
-        that is not in `OPERATORS`, a subgraph, a function, or a size beyond the limits of this module.
+        The file is damaged or not an .onnx file; keeps tensors in other files; or, if it is not trusted, has an
+        operator that is not in `OPERATORS`, a subgraph, a function, or a size beyond the limits of this module.
     """
     if blob[4:8] == b"ORTM":  # onnxruntime would read it in its own format, which is not checked here
         raise ModelFileError(f"{os.fspath(path)} is in onnxruntime's own format; expected an .onnx file")
@@ -286,7 +286,9 @@ class _GraphCheck:
 
     def _refuse_unless_trusted(self, what: str) -> None:
         if not self._trusted:
-            raise ModelFileError(f"{self._path} {what}; pass trusted=True, or --trusted, if you know where it comes from")
+            raise ModelFileError(
+                f"{self._path} {what}; pass trusted=True, or --trusted, if you know where it comes from"
+            )
 
     def _graph(self, start: int, end: int, depth: int) -> None:
         self._initializers(start, end, depth)

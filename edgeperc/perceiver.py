@@ -1,4 +1,4 @@
-"""Joins the stages: a scan in, a perception out."""
+"""The pipeline from a scan to a perception."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ BoxesFrom = Literal["both", "network", "clusters"]
 OnMismatch = Literal["warn", "raise", "ignore"]
 ADAPTATIONS: tuple[Adaptation, ...] = ("none", "remission", "interpolation", "both")
 
-# A wrong set-up shows in any scan. Several are checked because one may be taken in a tunnel or a depot.
+# A wrong set-up shows in any scan. Several are checked, because one may have been taken in a tunnel or a depot.
 CHECKED_SCANS = 5
 
 _P = ParamSpec("_P")
 
 
 class _Stopwatch:
-    """Adds up the wall time of each stage."""
+    """Sum of the wall time of each stage [ms]."""
 
     def __init__(self) -> None:
         self.ms = dict.fromkeys(STAGES, 0.0)
@@ -70,7 +70,7 @@ class _Network:
 
 
 def _renamed(**names: str) -> Callable[[Callable[_P, None]], Callable[_P, None]]:
-    """Refuse the old name of a keyword, and give the new one."""
+    """Refuse the old name of a keyword; the message gives the new name."""
 
     def decorate(function: Callable[_P, None]) -> Callable[_P, None]:
         @functools.wraps(function)
@@ -95,7 +95,7 @@ def _check_choice(
 
 
 def _listed(models: object) -> list[str | os.PathLike[str]]:
-    """The models as a list; a name or a path alone is a list of one."""
+    """The models as a list; one name or path becomes a list of one."""
     if models is None:
         return list(DEFAULT)
     given = models if isinstance(models, Sequence) and not isinstance(models, str) else [models]
@@ -108,44 +108,46 @@ def _listed(models: object) -> list[str | os.PathLike[str]]:
 class Perceiver:
     """Turn a LiDAR scan into drivable area, boxes and a class for every point.
 
-    Construction loads the models, checks them against their cards and compiles every kernel. Results are the caller's;
-    internal buffers are reused between calls. One instance answers one call at a time, and other threads wait; for
-    parallel calls use one instance per thread. Options cannot be changed after construction.
+    Construction loads the models, checks them against their cards and compiles every kernel. Results own their
+    arrays; internal buffers are reused between calls. One instance processes one call at a time, and other threads
+    wait; for parallel calls use one instance per thread. Options cannot be changed after construction.
 
     Parameters
     ----------
     models : str, Path, sequence of these, or None
         Names of shipped models (``"ssadnet"``, ``"pointseg:int8"``) or paths of .onnx files with a card; at most one
-        model a view. None takes the best pair, `edgeperc.zoo.DEFAULT`.
+        model per view. None takes the best pair, `edgeperc.zoo.DEFAULT`.
     sensor : str, Path or SensorProfile
-        The sensor that takes the scans: a built-in name (`edgeperc.sensors`), a file that ``edgeperc fit-sensor``
-        wrote, or a profile.
+        The sensor that takes the scans: a built-in name (`edgeperc.sensors`), a file written by ``edgeperc
+        fit-sensor``, or a profile.
     provider : str
-        ``"auto"``, ``"cpu"``, ``"openvino"``, ... A provider asked for is required (`edgeperc.session.PROVIDERS`).
+        ``"auto"``, ``"cpu"``, ``"openvino"``, ... Any other value than ``"auto"`` is required, without fallback
+        (`edgeperc.session.PROVIDERS`).
     precision : {"auto", "fp32", "bf16", "int8"}
-        What the networks compute in. ``"auto"`` takes a reduced precision where it is native to the processor and the
-        card shows that it loses at most 0.3 points (`edgeperc.zoo.choose`); ``"fp32"`` forbids that.
+        Precision of the networks. ``"auto"`` takes a reduced precision if the processor computes it natively and the
+        card shows a loss of at most 0.3 points (`edgeperc.zoo.choose`). Any other value is required.
     n_threads : int or None
-        Threads inside one call; None leaves it to the provider. The answer does not depend on it.
+        Threads inside one call; None leaves it to the provider. The results do not depend on it.
     on_mismatch : {"warn", "raise", "ignore"}
         What to do when one of the first five scans is unlike the training scans. ``"ignore"`` skips the check.
     score_threshold : float or None
-        Least score of a box, in 0..1. None takes the card's for boxes of a network, and 0.3 for boxes of clusters.
+        Lowest score of a box, in 0..1. None takes the card's threshold for boxes of a network, and 0.3 for boxes of
+        clusters.
     adapt : {"both", "remission", "interpolation", "none"}
-        How to adapt scans of a sensor that the models were not trained on. ``"remission"``: replace its remission by
-        what the training sensor would report, where its profile has a function. ``"interpolation"``: fill the range
-        image between its beams and columns, where it has fewer. Scans of the training sensor are not changed.
+        How to adapt scans of a sensor that the models were not trained on. ``"remission"``: convert its remission to
+        that of the training sensor, if its profile has a function for it. ``"interpolation"``: fill the range image
+        between its beams and columns, if they are fewer. Scans of the training sensor are not changed.
     boxes_from : {"both", "network", "clusters"}
         ``"network"``: boxes of a top-view model, vehicles ahead. ``"clusters"``: boxes around clusters of labeled
         points above the ground, of every class and everywhere in the range image
-        (`edgeperc.cluster.objects_from_points`). ``"both"``: use both. A cluster's box is dropped where it overlaps a
-        network's box, or where the network detects its class.
+        (`edgeperc.cluster.objects_from_points`). ``"both"``: use both. A cluster's box is dropped if it overlaps a
+        network's box, or if the network detects its class there.
     full_turn : bool
-        Run a range-image model that sees a sector once for every sector, four times for the shipped ones: every point
-        then has a class, and there are boxes beside and behind the vehicle.
+        Run a range-image model once for each sector, four times for the shipped models. Every point then has a class,
+        and there are boxes beside and behind the vehicle.
     trusted : bool
-        Open model files whose graphs are refused otherwise: with unusual operators, functions, subgraphs or sizes
-        (`edgeperc.session.Session`). Only for files that you know the origin of.
+        Open model files whose graphs are otherwise refused: with unusual operators, functions, subgraphs or sizes
+        (`edgeperc.session.Session`). Only for files whose origin you know.
 
     Attributes
     ----------
@@ -161,11 +163,11 @@ class Perceiver:
     Raises
     ------
     OptionError
-        An option is unknown or out of range, or the models do not go together.
+        An option is unknown or out of range, or the models cannot be combined.
     ModelError, ProviderError, SensorError, MissingExtraError
-        A model, a provider or a sensor is not there or does not fit. Like OptionError from construction only.
+        A model, a provider or a sensor is missing or does not fit. Only construction raises these and OptionError.
     PointsError, InferenceError, FitnessError
-        From a call only.
+        Only a call raises these.
 
     Examples
     --------
@@ -222,7 +224,7 @@ class Perceiver:
         self.boxes_from = boxes_from
         self.full_turn = full_turn
         gaps_deg = [upper - lower for upper, lower in pairwise(self.sensor.elevations_deg)]
-        # So that neighboring beams and columns on one object are linked, also with one missing between them.
+        # Twice the spacing of beams or columns: points of one object are linked even if a return between is missing.
         self._distance_per_m = 2.0 * math.radians(max(np.median(gaps_deg or [0.0]), 360.0 / self.sensor.columns))
         self._networks = [
             self._load(Session(model, provider, precision=precision, n_threads=n_threads, trusted=trusted))
@@ -240,12 +242,12 @@ class Perceiver:
         self.providers = MappingProxyType({n.session.card.name: n.session.description for n in self._networks})
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
         self._lock = threading.Lock()
-        # Compile every kernel here and not in the first call, with a scan of two points. The networks have run already,
-        # on their golden inputs: those outputs are decoded.
+        # Compile every kernel here, not in the first call, with a scan of two points. The networks have already run on
+        # their golden inputs, and those outputs are decoded.
         warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
         self._perceive(warm_up, None, check=self._to_check > 0, infer=False)
         if boxes_from != "network" and "range_image" in views:
-            self._find_objects(*self._post_on_floor())
+            self._find_objects(*self._warm_up_objects())
 
     def __setattr__(self, name: str, value: object) -> None:
         if not name.startswith("_") and "_lock" in vars(self):  # the last attribute of construction
@@ -271,19 +273,19 @@ class Perceiver:
         Parameters
         ----------
         points : (n, 4) or (n, 3) array_like, or a structured array
-            x, y, z [m] in the sensor frame, remission in the sensor's raw unit. Left unchanged. Rows that are not
-            finite are counted, labeled 0 and otherwise ignored; an empty scan gives an empty perception.
+            x, y, z [m] in the sensor frame, remission in the sensor's raw unit. Not modified. Rows that are not finite
+            are counted, labeled 0 and otherwise ignored; an empty scan gives an empty perception.
         stamp_s : float or None
             Time of the scan [s], for the tracker; returned in the perception.
 
         Raises
         ------
         PointsError
-            ``points`` is no scan.
+            ``points`` is not a scan.
         InferenceError
-            A network failed, or answered with values that are not finite.
+            A network failed, or its output has values that are not finite.
         FitnessError
-            The scan is unlike the training scans, and ``on_mismatch`` is ``"raise"``.
+            The scan differs from the training scans, and ``on_mismatch`` is ``"raise"``.
         """
         scan = as_points(points)
         with self._lock:
@@ -360,7 +362,7 @@ class Perceiver:
     def _label_sector(
         self, network: _Network, scan: NDArray[np.float32], watch: _Stopwatch, infer: bool
     ) -> PointLabels:
-        """Class of every point in the range image: decoded for pixels, cleaned, carried to points (PointSeg)."""
+        """Class of every point in the range image: decode pixels, remove outliers, label points (PointSeg 5.2)."""
         card = network.session.card
         assert isinstance(card.view, RangeImageGeometry)
         pixel = self._project(network, scan)
@@ -385,7 +387,7 @@ class Perceiver:
     def _label_full_turn(
         self, network: _Network, scan: NDArray[np.float32], watch: _Stopwatch, infer: bool
     ) -> PointLabels:
-        """Run the network once for each sector, with the scan turned; a point of two sectors keeps its first label."""
+        """Run the network once for each sector, on a turned scan; a point in two sectors keeps its first label."""
         view = network.session.card.view
         assert isinstance(view, RangeImageGeometry)
         width_deg = view.azimuth_left_deg - view.azimuth_right_deg
@@ -401,7 +403,7 @@ class Perceiver:
             in_view = in_view | aside.in_view
         return PointLabels(labels, in_view, ahead.classes)
 
-    def _post_on_floor(self) -> tuple[NDArray[np.float32], PointLabels]:
+    def _warm_up_objects(self) -> tuple[NDArray[np.float32], PointLabels]:
         """Nine points of a car on a floor: enough to compile every kernel of `_find_objects`."""
         x, y = np.meshgrid(np.arange(-8.0, 8.0), np.arange(-8.0, 8.0))
         scan = np.zeros((x.size + 9, 4), np.float32)
@@ -411,10 +413,10 @@ class Perceiver:
         return scan, PointLabels(labels, np.ones(len(scan), np.bool_), ("background", "car"))
 
     def _find_objects(self, scan: NDArray[np.float32], points: PointLabels) -> tuple[Box, ...]:
-        """Boxes around clusters of points above the ground in which one class prevails (KUL-Seg 5.2).
+        """Boxes around clusters of points above the ground that have one dominant class (KUL-Seg 5.2).
 
-        Points out of the network's view count as background. An object cut by the view's edge therefore gets a box for
-        the whole object, or none.
+        Points out of the network's view count as background. An object cut by the view's edge therefore gets either a
+        box of the whole object or none.
         """
         ground = find_ground(scan, mount_height_m=self.sensor.mount_height_m)
         return objects_from_points(
@@ -428,8 +430,8 @@ class Perceiver:
         )
 
     def _new_to_networks(self, boxes: tuple[Box, ...]) -> list[Box]:
-        """Boxes that no network detects: of another class, or out of its view."""
-        looking = [(c.view, c.box_classes) for c in self.cards if isinstance(c.view, TopViewGeometry)]
+        """Boxes that no network can detect, because of their class or because they are out of its view."""
+        detectors = [(c.view, c.box_classes) for c in self.cards if isinstance(c.view, TopViewGeometry)]
         return [
-            b for b in boxes if not any(b.label in classes and view.holds(*b.center[:2]) for view, classes in looking)
+            b for b in boxes if not any(b.label in classes and view.holds(*b.center[:2]) for view, classes in detectors)
         ]

@@ -1,4 +1,4 @@
-"""Frozen results, in the sensor frame (x forward, y left, z up, meters, radians)."""
+"""Immutable results, in the sensor frame (x forward, y left, z up, meters, radians)."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Box:
         return local @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(self.center[:2])
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON, rounded to 0.1 mm, 0.00001 rad and 0.0001 of the score; `from_dict` reads it."""
+        """Convert to a dict for JSON, rounded to 0.1 mm, 0.00001 rad and 0.0001 of the score; `from_dict` reads it."""
         return {
             "label": self.label,
             "score": round(float(self.score), 4),
@@ -132,7 +132,7 @@ class PointLabels:
     labels : (n,) uint8
         Index into ``classes``; 0 for points out of the network's view and for points that are not finite.
     in_view : (n,) bool
-        False where the point is out of the network's view; its label 0 then means nothing.
+        False if the point is out of the network's view; its label 0 is then not a prediction.
     classes : tuple of str
     """
 
@@ -141,7 +141,7 @@ class PointLabels:
     classes: tuple[str, ...]
 
     def counts(self) -> dict[str, int]:
-        """Number of points in view of each class."""
+        """Number of points in view, by class."""
         counted = np.bincount(self.labels[self.in_view], minlength=len(self.classes))
         return {name: int(counted[k]) for k, name in enumerate(self.classes)}
 
@@ -163,12 +163,12 @@ class Perception:
     boxes : tuple of Box
         Best score first.
     stage_ms : mapping
-        Wall time of ``check``, ``project``, ``infer``, ``decode``, ``refine`` and ``cluster`` [ms], and of ``adapt``
-        for sensors that are adapted.
+        Wall time [ms] of ``check``, ``project``, ``infer``, ``decode``, ``refine`` and ``cluster``, and of ``adapt``
+        for sensors whose scans are adapted.
     providers : mapping
         What ran, by model name, e.g. ``"pointseg int8, CPUExecutionProvider"``.
     fitness : tuple of str
-        How the scan differs from the training scans, a sentence each; empty if it does not.
+        How the scan differs from the training scans, one sentence for each difference; empty if there is none.
     stamp_s : float or None
         The time given with the scan [s].
     """
@@ -184,14 +184,14 @@ class Perception:
     stamp_s: float | None
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON: everything but the labels of the single points and cells, which are counted.
+        """Convert to a dict for JSON, with the number of points of each class in place of their labels.
 
         Returns
         -------
         dict
             ``stamp_s``, ``n_points``, ``n_dropped``, ``stage_ms``, ``providers``, ``boxes`` (`Box.to_dict`),
-            ``drivable_area_m2``, ``point_counts`` and ``fitness``. Every key is always there; its value is None where
-            no model of that kind took part.
+            ``drivable_area_m2``, ``point_counts`` and ``fitness``. Every key is always present; its value is None if no
+            model of that kind ran.
         """
         return {
             "stamp_s": self.stamp_s,

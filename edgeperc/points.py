@@ -1,4 +1,4 @@
-"""A sensor file or an array becomes points: (n, 4) float32, x, y, z [m] and remission as the sensor gave it."""
+"""Convert arrays to points: (n, 4) float32, x, y, z [m] and remission in the sensor's raw unit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _REMISSION_NAMES = ("remission", "intensity", "i", "reflectivity", "reflectance"
 
 
 def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArray[np.float32]:
-    """An array as points.
+    """Convert an array to points.
 
     Parameters
     ----------
@@ -31,12 +31,12 @@ def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArra
     Returns
     -------
     (n, 4) float32, C-contiguous
-        The given array itself if it is this already. Values beyond float32 become infinite.
+        The given array itself if it already has this form. Values beyond the range of float32 become infinite.
 
     Raises
     ------
     PointsError
-        When the shape, the dtype or the fields are not those of points.
+        The shape, the dtype or the fields are not those of points.
     """
     if isinstance(array, np.ma.MaskedArray):
         raise PointsError("got a masked array; fill it first, e.g. with array.filled(np.nan)")
@@ -44,7 +44,7 @@ def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArra
         # Ragged sequences raise ValueError; the __array__ of an object may raise anything.
         values = np.asarray(array)
     except Exception as exc:
-        raise PointsError(f"got no array: {exc}; expected (n, 4) x, y, z, remission") from exc
+        raise PointsError(f"got an object that is not an array: {exc}; expected (n, 4) x, y, z, remission") from exc
     if values.dtype.names is not None:
         flat = values.reshape(-1)
         fields: dict[str, NDArray[Any]] = {}
@@ -69,10 +69,10 @@ def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArra
 
 
 def read_only(array: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray[Any]:
-    """A read-only, C-contiguous and aligned view of an array, copied only where its layout or dtype is another.
+    """A read-only, C-contiguous and aligned view of an array; a copy only if its layout or dtype differs.
 
-    numba compiles a kernel once for arrays that can be written to and once for those that cannot. Kernels get their
-    input through this function, so that a memory map or ``np.frombuffer`` needs no second compilation.
+    numba compiles a kernel separately for writable and read-only arrays. Kernels get their input through this function,
+    so that a memory map or ``np.frombuffer`` needs no second compilation.
     """
     view = np.require(array, dtype=dtype, requirements=["C", "A"]).view()
     view.flags.writeable = False
@@ -80,29 +80,56 @@ def read_only(array: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray[Any]:
 
 
 def plain_name(name: str) -> str:
-    """A field's name as it is compared: lower case, without CloudCompare's prefix."""
-    # CloudCompare calls an intensity "scalar_Intensity".
+    """A field's name for comparison: lower case, without CloudCompare's prefix (``"scalar_Intensity"``)."""
     return name.lower().removeprefix("scalar_")
 
 
 def remission_name(names: Iterable[str], wanted: str | None) -> str | None:
-    """Name of the remission field: the wanted one, or the first known name that is present; None if there is none."""
+    """Name of the remission field: the wanted one, or the first known name that is present; None if there is none.
+
+    Raises
+    ------
+    PointsError
+        The wanted field is not among ``names``.
+    """
     present = list(names)
     if wanted is None:
         return next((name for name in _REMISSION_NAMES if name in present), None)
     if plain_name(wanted) not in present:
-        raise PointsError(f"there is no number field {wanted!r} for the remission, only {', '.join(present)}")
+        raise PointsError(f"there is no numeric field {wanted!r} for the remission, only {', '.join(present)}")
     return plain_name(wanted)
 
 
 def assemble(
     n: int, fields: Mapping[str, NDArray[Any]], names: Sequence[str], remission_field: str | None
 ) -> NDArray[np.float32]:
-    """Points from named columns; ``names`` are the fields of the source, for the message."""
+    """Build points from named columns.
+
+    Parameters
+    ----------
+    n : int
+        Number of points.
+    fields : mapping of str to (n,) array
+        Columns by `plain_name`.
+    names : sequence of str
+        All fields of the source, for the error message.
+    remission_field : str or None
+        As in `as_points`.
+
+    Returns
+    -------
+    (n, 4) float32
+        x, y, z [m], remission; 0 without a remission field.
+
+    Raises
+    ------
+    PointsError
+        A coordinate or the wanted remission field is missing.
+    """
     missing = [axis for axis in "xyz" if axis not in fields]
     if missing:
         raise PointsError(
-            f"no number field {', '.join(missing)} among {', '.join(map(str, names)) or 'no fields'}; "
+            f"no numeric field {', '.join(missing)} among {', '.join(map(str, names)) or 'no fields'}; "
             "expected x, y, z and a remission or intensity"
         )
     remission = remission_name(fields, remission_field)

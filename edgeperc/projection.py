@@ -1,10 +1,10 @@
-"""Points -> the network's input, and the way back from its pixels to the points.
+"""Project points to the networks' inputs, and keep which pixel belongs to which point.
 
 Two views: the ground ahead seen from above (`TopViewProjector`) and the scan seen from the sensor
 (`RangeImageProjector`). Both write normalized pixels straight into the network's input buffer.
 
-Every decision about a pixel is taken in float32, one rounding an operation, so that compiled and interpreted
-runs, and any other implementation that follows the same steps, agree to the last pixel.
+Pixels are computed in float32 with one rounding per operation. Compiled code, interpreted code and any other
+implementation of the same steps therefore agree on every pixel.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ __all__ = [
     "tabulate",
 ]
 
-# What a channel holds, as the kernels know it. "height" is z and "distance" the range within the x-y plane.
+# Number of each channel in the kernels. "height" is z; "distance" is the range in the x-y plane.
 CHANNEL_CODES = {"x": 0, "y": 1, "z": 2, "height": 2, "remission": 3, "distance": 4, "range": 5}
 
 # The nearest point of a pixel is the smallest of `rank << 32 | row of points`: the better rank wins, then the earlier
@@ -43,24 +43,24 @@ ZERO = np.float32(0.0)
 TWO = np.float32(2.0)
 INFINITY = np.float32(math.inf)
 
-# Points, and pixels, worked on at a time: their intermediate values stay in the first-level cache.
+# Points and pixels per block: the intermediate values of a block fit into the first-level cache.
 BLOCK = 256
 PIXEL_BLOCK = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
-    """One scan as one view.
+    """A scan projected to one view.
 
     Attributes
     ----------
     image : (C, H, W) float32
-        The network's input: ``(raw - mean) / std`` per channel, 0 in every channel where nothing returned.
+        The network's input: ``(raw - mean) / std`` per channel; 0 in every channel of a pixel without a return.
     index : (H, W) int32
-        Row of the points whose values the pixel carries; -1 where nothing returned.
+        Row of the point whose values the pixel has; -1 without a return.
     pixel : (n,) int32
-        Flat pixel, ``row * W + column``, into which every point fell, also where another point won it; -1 for
-        points out of view, not finite or at the origin.
+        Flat pixel ``row * W + column`` of every point, even if another point won that pixel; -1 for points that are
+        out of view, not finite or at the origin.
     """
 
     image: NDArray[np.float32]
@@ -68,12 +68,13 @@ class Projection:
     pixel: NDArray[np.int32]
 
 
-# The kernels take a block of points through short loops without branches, which compile to vector instructions, and
-# leave only the table look-ups and the choice of a pixel's point to scalar code. Three habits matter for that, each
-# worth a factor of two to three in its loop: points are indexed flat (4 * i + 1, as the compiler does not know the
-# stride of points[i, 1]), all four values of a point are used (a gap in the loads stops it), and positions are kept
-# unsigned (a signed one costs a test for counting from the end). The choice of the
-# points in view is repeated in both kernels: as a separate function it made them 2 to 5 % slower.
+# The kernels process points in blocks, in short loops without branches that compile to vector instructions. Only the
+# table look-ups and the choice of a pixel's point are scalar code. Each of these rules makes its loop two to three
+# times as fast:
+# - Points are indexed flat (4 * i + 1), because the compiler does not know the stride of points[i, 1].
+# - All four values of a point are used, because a gap in the loads prevents vector instructions.
+# - Positions are unsigned, because a signed index needs a test for counting from the end.
+# Both kernels repeat the selection of the points in view: as a separate function it made them 2 to 5 % slower.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -99,7 +100,7 @@ def mark_top_view(
     cells_per_m : float32
     height, width : int32
     index : (height * width,) int32, overwritten
-        Row of points; -1 where nothing returned.
+        Row of points; -1 without a return.
     pixel : (n,) int32, overwritten
         Flat pixel of each point; -1 out of view.
     """
@@ -179,12 +180,12 @@ def mark_range_image(
     row_scale, col_scale : (3,) float32
     row_base, col_base : (cells + 2,) int32
     row_split, col_split : (cells + 2,) float32
-        Of `tabulate`.
+        From `tabulate`.
     width : int32
     winner : (height * width,) int64, overwritten
         Scratch: ``rank << 32 | row of points``, or ``EMPTY``.
     index : (height * width,) int32, overwritten
-        Row of points; -1 where nothing returned.
+        Row of points; -1 without a return.
     pixel : (n,) int32, overwritten
         Flat pixel of each point; -1 out of view.
     """
@@ -275,9 +276,9 @@ def fill_image(
     ----------
     points : (n, 4) float32, C-contiguous
     index : (pixels,) int32
-        Row of points; -1 where nothing returned.
+        Row of points; -1 without a return.
     channels : (C,) int32
-        Of ``CHANNEL_CODES``.
+        Values of ``CHANNEL_CODES``.
     mean, std : (C,) float32
     image : (C, pixels) float32, overwritten
     """
@@ -318,11 +319,11 @@ def fill_image(
 
 
 class TopViewProjector:
-    """Points -> the ground ahead as an image (SSADNet 2.1.2). Row 0 is farthest ahead, column 0 leftmost.
+    """Project points to an image of the ground ahead (SSADNet 2.1.2). Row 0 is farthest ahead, column 0 leftmost.
 
-    Cells are half-open: each holds its near edge and its right edge, not its far and left ones, so the view is
-    ``x_min <= x < x_max``, ``y_min <= y < y_max``; in height it is closed, ``z_min <= z <= z_max``. The highest
-    point wins a cell, the earlier point wins a tie.
+    Cells are half-open: a cell includes its near and right edges, not its far and left edges. The view is
+    ``x_min <= x < x_max``, ``y_min <= y < y_max`` and ``z_min <= z <= z_max``. The highest point wins a cell, the
+    earlier one on ties.
 
     Parameters
     ----------
@@ -382,12 +383,13 @@ class TopViewProjector:
 
 
 class RangeImageProjector:
-    """Points -> the scan as the sensor sees it (PointSeg 3.1). Row 0 is the top beam, column 0 leftmost.
+    """Project points to a range image, the scan as the sensor sees it (PointSeg 3.1). Row 0 is the top beam, column 0
+    leftmost.
 
-    A point's row is the beam whose elevation is nearest; the outermost beams reach half a neighbor spacing
-    beyond themselves. Its column comes from its azimuth, atan2(y, x). Pixels are half-open: each holds its upper
-    and its left edge. The nearest point wins a pixel (by its squared range in float32), the earlier point wins a
-    tie. Points on the sensor's vertical axis have no azimuth and are out of view.
+    A point's row is the beam with the nearest elevation; the top and the bottom row reach half a beam spacing farther
+    out. Its column follows from its azimuth, atan2(y, x). Pixels are half-open: a pixel includes its upper and left
+    edges. The point nearest to the sensor wins a pixel (by squared range in float32), the earlier one on ties. Points
+    on the sensor's vertical axis have no azimuth and are out of view.
 
     Tables and scratch are made once and reused between calls, so use one instance per thread.
 
@@ -404,14 +406,14 @@ class RangeImageProjector:
 
     Notes
     -----
-    PointSeg's equation 2 takes arcsin(y / sqrt(x^2 + y^2 + z^2)) for the azimuth. That is arcsin(sin(azimuth) *
-    cos(elevation)), smaller than the azimuth by ever more as the beam points farther down: at azimuth 45 degrees a
-    beam at -24.8 degrees gets 39.9, which is 29 of 512 columns off, so upright edges would bend. This module uses
-    the true azimuth.
+    PointSeg's equation 2 uses arcsin(y / sqrt(x^2 + y^2 + z^2)) as azimuth. That is arcsin(sin(azimuth) *
+    cos(elevation)), which is smaller than the azimuth, and the error grows as the beam points farther down. At azimuth
+    45 degrees, a beam at -24.8 degrees gets 39.9 degrees: an error of 29 of 512 columns, which would bend vertical
+    edges. This module uses the true azimuth.
 
-    No angle is computed for a point. Azimuth and elevation are replaced by y / (|x| + |y|), unfolded over the
-    half-planes, and z / (sqrt(x^2 + y^2) + |z|), which grow with them, and compared with the pixels' edges in the
-    same terms.
+    No angle is computed for a point. Two functions that increase with azimuth and elevation replace them:
+    y / (|x| + |y|), unfolded over the half-planes, and z / (sqrt(x^2 + y^2) + |z|). The edges of the pixels are
+    converted to the same quantities.
     """
 
     def __init__(self, view: RangeImageGeometry, input: InputSpec) -> None:
@@ -444,7 +446,7 @@ class RangeImageProjector:
         index: NDArray[np.int32],
         image: NDArray[np.float32],
     ) -> None:
-        """Write the image of an ``index`` that is known already; arguments and errors as in `TopViewProjector.fill`."""
+        """Write the image for a given ``index``; arguments and errors as in `TopViewProjector.fill`."""
         points = _checked(self.shape, points, image, index)
         fill_image(points, index.reshape(-1), self._channels, self._mean, self._std, image.reshape(self.shape[0], -1))
 
@@ -456,7 +458,7 @@ class RangeImageProjector:
 def make_projector(
     view: TopViewGeometry | RangeImageGeometry, input: InputSpec
 ) -> TopViewProjector | RangeImageProjector:
-    """The projector that a model's card asks for.
+    """Make the projector for a model's view and input.
 
     Raises
     ------
@@ -498,30 +500,30 @@ def wedge(view: RangeImageGeometry) -> NDArray[np.float32]:
 def tabulate(
     edges: NDArray[np.float32], what: str
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]:
-    """Tables that find the interval of a value with one comparison.
+    """Build tables that find the interval of a value with one comparison.
 
     Interval j holds ``edges[j] >= value > edges[j + 1]``. With ``k = int32((first - value) * cells_per_unit)`` in
-    float32, it is ``base[k] + (value <= split[k])``, exactly: the edges are sorted into table cells by the same
-    rounded arithmetic, no two into one.
+    float32, j is exactly ``base[k] + (value <= split[k])``: the edges are sorted into table cells by the same rounded
+    arithmetic, and no two edges share a cell.
 
     Parameters
     ----------
     edges : (m + 1,) float32
         Strictly decreasing.
     what : str
-        Named in the error.
+        Noun for the error message, e.g. ``"rows"``.
 
     Returns
     -------
     scale : (3,) float32
-        First edge, last edge (below any value where that is straight behind), cells_per_unit.
+        First edge, last edge (lower than any value if it is straight behind the sensor), cells_per_unit.
     base : (cells + 2,) int32
     split : (cells + 2,) float32
 
     Raises
     ------
     CardError
-        Edges so close that 65,536 table cells do not separate them.
+        Edges are so close that 65,536 table cells do not separate them.
     """
     first, last = edges[0], edges[-1]
     inner = edges[1:-1]

@@ -18,7 +18,7 @@ from .errors import SensorError
 __all__ = ["REMISSION_KINDS", "SENSORS", "RemissionFunction", "SensorProfile", "get_sensor"]
 
 SCHEMA = 1  # of a sensor profile's file
-REMISSION_KINDS = {"linear": 2, "polynomial": 3, "logarithm": 2}  # and how many coefficients each has
+REMISSION_KINDS = {"linear": 2, "polynomial": 3, "logarithm": 2}  # number of coefficients
 
 
 @dataclass(frozen=True)
@@ -34,15 +34,15 @@ class RemissionFunction:
     kind : str
         ``"linear"``, ``"polynomial"`` or ``"logarithm"``.
     coefficients : tuple of float
-        a, b and, of a polynomial, c.
+        a, b and, for a polynomial, c.
     full_scale : float
-        Width of the sensor's remission range when the function was fitted, 255 for a byte.
+        Width of the sensor's raw remission range when the function was fitted, e.g. 255.
     to : str
         The sensor whose remission is the result.
     rmse : float
         Root mean square error on held-back samples, as a share of the other sensor's full scale.
     source : str
-        What it was fitted to.
+        The data that it was fitted to.
 
     Raises
     ------
@@ -63,7 +63,7 @@ class RemissionFunction:
             object.__setattr__(self, "full_scale", float(self.full_scale))
             object.__setattr__(self, "rmse", float(self.rmse))
         except (TypeError, ValueError, OverflowError) as exc:
-            raise SensorError(f"remission function: a value is no number ({exc})") from exc
+            raise SensorError(f"remission function: a value is not a number ({exc})") from exc
         if self.kind not in REMISSION_KINDS:
             raise SensorError(f"remission function of kind {self.kind!r}; expected one of {', '.join(REMISSION_KINDS)}")
         if len(self.coefficients) != REMISSION_KINDS[self.kind] or not all(map(math.isfinite, self.coefficients)):
@@ -83,7 +83,7 @@ class RemissionFunction:
 class SensorProfile:
     """A spinning LiDAR.
 
-    A built-in profile (`SENSORS`) describes a usual set-up of the sensor. Change what differs with
+    A built-in profile (`SENSORS`) describes a usual set-up of the sensor. Change single values with
     ``dataclasses.replace``, e.g.
     ``replace(get_sensor("os1-64"), remission_range=(0, 65535), mount_height_m=2.1)`` for an Ouster whose 16-bit
     signal is used instead of its 8-bit reflectivity. Describe another sensor with ``SensorProfile(...)``, or with
@@ -93,15 +93,15 @@ class SensorProfile:
     ----------
     name : str
     elevations_deg : tuple of float
-        Elevation of each beam, strictly decreasing from the top beam to the bottom one, up positive.
+        Elevation of each beam [deg], strictly decreasing from the top beam to the bottom one, up positive.
     columns : int
         Azimuth steps in one turn.
     remission_range : tuple of 2 float
         Raw remissions that are scaled to 0 and 1.
     mount_height_m : float
-        Height of the sensor above the road.
+        Height of the sensor above the road [m].
     min_range_m, max_range_m : float
-        Nearest and farthest return to expect.
+        Nearest and farthest return to expect [m].
     remission : RemissionFunction or None
         Maps this sensor's remission to that of the sensor that the models were trained on. None: remission is only
         scaled by ``remission_range``.
@@ -132,7 +132,7 @@ class SensorProfile:
             columns_are_whole = int(self.columns) == self.columns
             object.__setattr__(self, "columns", int(self.columns))
         except (TypeError, ValueError, OverflowError) as exc:
-            raise SensorError(f"sensor {self.name!r}: a value is no number ({exc})") from exc
+            raise SensorError(f"sensor {self.name!r}: a value is not a number ({exc})") from exc
         if not self.elevations_deg or not all(-90.0 < e < 90.0 for e in self.elevations_deg):
             raise SensorError(f"sensor {self.name!r}: elevations_deg needs one angle a beam, between -90 and 90")
         if any(upper <= lower for upper, lower in pairwise(self.elevations_deg)):
@@ -155,7 +155,7 @@ class SensorProfile:
             raise SensorError(f"sensor {self.name!r}: remission is a RemissionFunction or None, got {self.remission!r}")
 
     def to_json(self) -> str:
-        """JSON for a file that `get_sensor` reads."""
+        """Convert to JSON, which `get_sensor` reads from a file."""
         return json.dumps({"schema": SCHEMA, **asdict(self)}, indent=1, ensure_ascii=False, allow_nan=False)
 
     @classmethod
@@ -171,7 +171,7 @@ class SensorProfile:
             document = json.loads(text)
         except (RecursionError, ValueError) as exc:
             raise SensorError(
-                f"the sensor profile is no JSON ({exc}); write it again with edgeperc fit-sensor"
+                f"the sensor profile is not JSON ({exc}); write it again with edgeperc fit-sensor"
             ) from exc
         if not isinstance(document, dict) or document.get("schema") != SCHEMA:
             found = document.get("schema") if isinstance(document, dict) else None
@@ -198,7 +198,22 @@ class SensorProfile:
         max_range_m: float = 120.0,
         remission: RemissionFunction | None = None,
     ) -> SensorProfile:
-        """A sensor with evenly spaced beams, the top one at ``fov_up_deg``, the bottom one at ``fov_down_deg``."""
+        """Describe a sensor with evenly spaced beams.
+
+        Parameters
+        ----------
+        name : str
+        n_beams : int
+        fov_up_deg, fov_down_deg : float
+            Elevation of the top and of the bottom beam [deg].
+        columns, remission_range, mount_height_m, min_range_m, max_range_m, remission
+            As the attributes.
+
+        Raises
+        ------
+        SensorError
+            The values do not describe a possible sensor.
+        """
         if isinstance(n_beams, bool) or not isinstance(n_beams, int | np.integer) or not 1 <= n_beams <= 4096:
             raise SensorError(f"sensor {name!r}: n_beams is a whole number in 1..4096, got {n_beams!r}")
         if not math.isfinite(fov_up_deg) or not math.isfinite(fov_down_deg):
@@ -217,20 +232,22 @@ class SensorProfile:
 
     @property
     def n_beams(self) -> int:
+        """Number of beams."""
         return len(self.elevations_deg)
 
     @property
     def fov_up_deg(self) -> float:
-        """Elevation of the top beam."""
+        """Elevation of the top beam [deg]."""
         return self.elevations_deg[0]
 
     @property
     def fov_down_deg(self) -> float:
-        """Elevation of the bottom beam."""
+        """Elevation of the bottom beam [deg]."""
         return self.elevations_deg[-1]
 
     @property
     def azimuth_resolution_deg(self) -> float:
+        """Azimuth step between columns [deg]."""
         return 360.0 / self.columns
 
     @property
@@ -244,10 +261,10 @@ class SensorProfile:
         return 1.0 / (self.remission_range[1] - self.remission_range[0])
 
 
-# Median elevation of each laser's returns seen from the origin, over 77 KITTI scans of 15 drives; every scan's order
-# gives its lasers away. The unit's own angles are 0.6 deg (upper block) to 1.4 deg (bottom laser) lower, as the lasers
-# sit 0.21 and 0.12 m above the origin; S3 calibrations published for other units differ by up to 0.9 deg, and the
-# data sheet (2 .. -8.33 every 1/3, -8.83 .. -24.33 every 1/2) by up to 0.7 deg.
+# Median elevation of each laser's returns seen from the origin, over 77 KITTI scans of 15 drives; the order of the
+# points in a scan identifies the lasers. The unit's own angles are 0.6 deg (upper block) to 1.4 deg (bottom laser)
+# lower, as the lasers sit 0.21 and 0.12 m above the origin; S3 calibrations published for other units differ by up to
+# 0.9 deg, and the data sheet (2 .. -8.33 every 1/3, -8.83 .. -24.33 every 1/2) by up to 0.7 deg.
 _HDL_64E = (
     *(2.54, 2.17, 1.92, 1.46, 1.21, 0.79, 0.53, 0.15, -0.19, -0.59, -0.88, -1.22, -1.59, -1.93, -2.26, -2.61),
     *(-2.90, -3.27, -3.53, -3.91, -4.20, -4.55, -4.86, -5.18, -5.57, -5.88, -6.18, -6.45, -6.82, -7.17, -7.39, -7.76),
@@ -262,7 +279,7 @@ _VLP_32C = (
     *(-2.33, -2.67, -3.0, -3.33, -3.67, -4.0, -4.67, -5.33, -6.15, -7.25, -8.84, -11.31, -15.64, -25.0),
 )
 
-# Design angles of the Pandar64, as its drivers carry them for units without a calibration file.
+# Design angles of the Pandar64, which its drivers use for units without a calibration file.
 _PANDAR_64 = (
     *(14.88, 11.03, 8.06, 5.06, 3.04, 2.03, 1.86, 1.69, 1.52, 1.35, 1.18, 1.01, 0.85, 0.68, 0.51, 0.34, 0.17, 0.0),
     *(-0.17, -0.34, -0.51, -0.68, -0.85, -1.01, -1.18, -1.35, -1.52, -1.69, -1.86, -2.03, -2.20, -2.37, -2.54, -2.70),
@@ -272,8 +289,8 @@ _PANDAR_64 = (
 
 
 def _ouster(model: str, half_fov_deg: float, min_range_m: float, max_range_m: float) -> tuple[SensorProfile, ...]:
-    # Even spacing over the data sheet's field of view; single units were calibrated up to 1.3 deg off that. The first
-    # OS1 generation spanned 33.2 deg instead. 8-bit reflectivity.
+    # Evenly spaced over the field of view in the data sheet; calibrations of single units differ by up to 1.3 deg. The
+    # first OS1 generation had 33.2 deg instead. Remission is the 8-bit reflectivity.
     return tuple(
         SensorProfile.uniform(
             f"{model}-{beams}",
@@ -342,7 +359,7 @@ def _check_entries(document: object, names: set[str], what: str) -> None:
 
 
 def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
-    """The built-in profile of that name, the one in a file, or the profile itself.
+    """Get a sensor profile by name, from a file, or as given.
 
     Parameters
     ----------
@@ -353,7 +370,7 @@ def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
     Raises
     ------
     SensorError
-        No built-in profile has this name, or the file holds no profile.
+        No built-in profile has this name, or the file is not a sensor profile.
     """
     if isinstance(sensor, SensorProfile):
         return sensor

@@ -1,4 +1,4 @@
-"""Fit a sensor's remission function, offline, from scans of any street."""
+"""Fit a sensor's remission function, offline, from scans of any street (KUL-Seg 5)."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ __all__ = [
 
 # --- remission -------------------------------------------------------------------------------------------------------
 
-# Strata in which remissions of similar streets are compared: by range [m], then by the cosine of the incidence; the
-# last is no surface (leaves, single beams). Quantiles are taken at the middles of equal shares of a stratum.
+# Strata in which remissions of similar streets are compared: by range [m], then by the cosine of the incidence. The
+# last one is for points that are not on a surface (leaves, single beams). Quantiles are at the middles of equal shares.
 RANGE_EDGES_M = (3.0, 10.0, 25.0, 60.0)
 COSINE_EDGES = (0.0, 0.35, 1.0)
 N_STRATA = (len(RANGE_EDGES_M) - 1) * len(COSINE_EDGES)
 N_SHARES = 20
-FEWEST = 200  # points in a stratum
+MIN_POINTS = 200  # points in a stratum
 FOLDS = 10
 
 # fmt: off
 REFERENCES: Mapping[str, tuple[tuple[float, tuple[float, ...]], ...]] = MappingProxyType(
     {
-        # 28 scans of 13 KITTI drives that are trained on.
+        # From 28 scans of 13 KITTI drives of the training set.
         "hdl-64e": (
             (0.272, (0.00, 0.00, 0.05, 0.10, 0.16, 0.18, 0.19, 0.21, 0.23, 0.25,
                      0.27, 0.28, 0.29, 0.30, 0.31, 0.32, 0.34, 0.36, 0.38, 0.45)),
@@ -61,7 +61,7 @@ REFERENCES: Mapping[str, tuple[tuple[float, tuple[float, ...]], ...]] = MappingP
         )
     }
 )
-"""For each training sensor, share of the points and quantiles of remission (0..1) in every stratum."""
+"""For each training sensor: share of the points, and quantiles of remission (0..1), in every stratum."""
 
 
 def _terms(kind: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -91,24 +91,24 @@ def fit_functions(
     Parameters
     ----------
     raw : (n,) array_like
-        Remission of the sensor at hand, from 0 (the lower end of its ``remission_range``).
+        Remission of the sensor to adapt, from 0 (the lower end of its ``remission_range``).
     wanted : (n,) array_like
         Remission of the other sensor at the same places, 0..1.
     full_scale : float
-        Upper end of the raw values, e.g. 255.
+        Width of the raw range, e.g. 255.
     to, source : str
-        Entries of the functions.
+        Entries of `RemissionFunction`.
 
     Returns
     -------
     tuple of RemissionFunction
-        By ``rmse`` in ten-fold cross-validation. On the pairs it is fitted to, a parabola is never worse than a line;
-        on held-back pairs it is the worst, as in the paper (KUL-Seg, Table 5).
+        Lowest ``rmse`` in ten-fold cross-validation first. A parabola is never worse than a line on the pairs it is
+        fitted to, but it is the worst on held-back pairs, as in the paper (KUL-Seg, Table 5).
 
     Raises
     ------
     SensorError
-        Fewer than four finite pairs, or raw values that are all alike.
+        There are fewer than four finite pairs, or all raw values are equal.
     """
     x, y = np.asarray(raw, np.float64).ravel(), np.asarray(wanted, np.float64).ravel()
     if len(x) != len(y):
@@ -133,9 +133,19 @@ def fit_functions(
 
 
 def incidences(points: NDArray[np.float32], cell_m: float = 0.8) -> NDArray[np.float64]:
-    """Cosine between each ray and the normal of the surface around its point, (n,) float64.
+    """Compute the cosine of the incidence, between each ray and the normal of the surface around its point.
 
-    NaN where fewer than six returns lie in the cell of ``cell_m``, or these are no surface (leaves).
+    Parameters
+    ----------
+    points : (n, 3 or more) float32
+        x, y, z [m] in the sensor frame.
+    cell_m : float
+        Edge of the cubic cells in which surfaces are fitted [m].
+
+    Returns
+    -------
+    (n,) float64
+        0..1. NaN if the point's cell has fewer than six returns, or if these are not on a surface (leaves).
     """
     xyz = np.asarray(points[:, :3], np.float64)
     cosines = np.full(len(xyz), np.nan)
@@ -154,7 +164,7 @@ def incidences(points: NDArray[np.float32], cell_m: float = 0.8) -> NDArray[np.f
         for j in range(3):
             spread[:, i, j] = np.bincount(cell, off[:, i] * off[:, j]) / count
     values, vectors = np.linalg.eigh(spread)
-    # The middle extent separates surfaces from the line of one beam, the least one separates them from leaves.
+    # The middle eigenvalue separates surfaces from the line of one beam, the smallest one separates them from leaves.
     flat = (count >= 6) & (values[:, 1] > 0.0025) & (values[:, 0] < 0.1 * values[:, 1])
     range_m = np.linalg.norm(p, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -164,14 +174,24 @@ def incidences(points: NDArray[np.float32], cell_m: float = 0.8) -> NDArray[np.f
 
 
 def remission_strata(scans: Iterable[NDArray[np.float32]]) -> list[tuple[float, tuple[float, ...]]]:
-    """Share of the points and `N_SHARES` quantiles of their remission, stratum by stratum, as in `REFERENCES`.
+    """Compute the share of the points and `N_SHARES` quantiles of their remission in each stratum, as in `REFERENCES`.
 
     A stratum of fewer than 200 points has a share of 0 and no quantiles.
+
+    Parameters
+    ----------
+    scans : iterable of (n, 4) float32
+        x, y, z [m] in the sensor frame, remission.
+
+    Returns
+    -------
+    list of (share, quantiles)
+        One entry per stratum.
 
     Raises
     ------
     PointsError
-        An array is no scan.
+        An array is not a scan.
     """
     strata, remissions = [np.empty(0, np.int64)], [np.empty(0)]
     for scan in scans:
@@ -189,7 +209,7 @@ def remission_strata(scans: Iterable[NDArray[np.float32]]) -> list[tuple[float, 
     found: list[tuple[float, tuple[float, ...]]] = []
     for k in range(N_STRATA):
         own = remission[stratum == k]
-        enough = len(own) >= FEWEST
+        enough = len(own) >= MIN_POINTS
         quantiles = tuple(float(v) for v in np.quantile(own, shares)) if enough else ()
         found.append((len(own) / len(remission) if enough else 0.0, quantiles))
     return found
@@ -207,12 +227,12 @@ def match_quantiles(
     Parameters
     ----------
     strata, reference : sequence of (share, quantiles)
-        From `remission_strata`: of scans, and of another sensor in similar streets.
+        From `remission_strata`: one of the sensor's scans, one of another sensor in similar streets.
 
     Returns
     -------
     raw, wanted : (k,) float64
-        Rising; empty where no stratum is known for both.
+        Increasing; empty if no stratum is known for both.
     """
     both = [
         (min(share, other_share), own, other)
@@ -222,11 +242,11 @@ def match_quantiles(
     if not both:
         return np.empty(0), np.empty(0)
     weights = np.repeat([weight for weight, _, _ in both], N_SHARES)
-    raw, wanted = (_mixed(np.concatenate([row[side] for row in both]), weights) for side in (1, 2))
+    raw, wanted = (_weighted_quantiles(np.concatenate([row[side] for row in both]), weights) for side in (1, 2))
     return raw, wanted
 
 
-def _mixed(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+def _weighted_quantiles(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Quantiles of weighted values at the middles of equal shares."""
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weights[order])
@@ -253,7 +273,7 @@ def fit_sensor(
     Returns
     -------
     profile : SensorProfile
-        ``sensor`` with the best function; a parabola that turns down before full scale is not taken.
+        ``sensor`` with the best function; a parabola that decreases before full scale is not used.
     functions : tuple of RemissionFunction
         All kinds, best first.
 
@@ -262,7 +282,7 @@ def fit_sensor(
     SensorError
         No reference of that name, or the scans hold too few points.
     PointsError
-        An array is no scan.
+        An array is not a scan.
     """
     if to not in REFERENCES:
         raise SensorError(f"no reference remissions of {to!r}; known are {', '.join(REFERENCES)}")
@@ -270,11 +290,11 @@ def fit_sensor(
     raw, wanted = match_quantiles(remission_strata(scans), REFERENCES[to])
     described = source or f"quantiles by range and incidence of {len(scans)} scans"
     functions = fit_functions(raw - low, wanted, full_scale=high - low, to=to, source=described)
-    best = next(f for f in functions if f.kind != "polynomial" or _rises(f))  # quantiles rise, so a line does
+    best = next(f for f in functions if f.kind != "polynomial" or _increases(f))  # a line increases
     return replace(sensor, remission=best), functions
 
 
-def _rises(parabola: RemissionFunction) -> bool:
-    """Whether the parabola rises up to full scale; beyond the samples it may turn down."""
+def _increases(parabola: RemissionFunction) -> bool:
+    """Whether the parabola increases up to full scale; it may turn down beyond the samples."""
     _, b, c = parabola.coefficients
     return b >= 0.0 and b + 2.0 * c * parabola.full_scale >= 0.0

@@ -1,9 +1,9 @@
-"""Network input to raw outputs; the only importer of onnxruntime.
+"""Run networks, from their input to their raw outputs. This is the only module that imports onnxruntime.
 
-A provider asked for is required: if it is absent, or would hand part of the graph to another, construction raises
-`ProviderError`. ``"auto"`` takes the setting that was measured to be the fastest on this computer
-(``edgeperc-bench matrix --recommend``), else the first of `AUTO` that runs the whole model and gives the card's golden
-answers. Which variant of a network runs, and in which precision, `edgeperc.zoo.choose` decides.
+There is no silent fallback: if a requested provider is absent, or would leave part of the graph to another provider,
+construction raises `ProviderError`. ``"auto"`` takes the setting that was measured to be the fastest on this computer
+(``edgeperc-bench matrix --recommend``), else the first of `AUTO` that runs the whole model and reproduces the card's
+golden outputs. `edgeperc.zoo.choose` selects the variant of a network and its precision.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ AUTO = ("cuda", "openvino", "cpu")
 # Providers that come as plugins beside stock onnxruntime: provider, then the package with its library.
 PLUGINS = {"openvino": "onnxruntime_ep_openvino", "tensorrt-rtx": "onnxruntime_ep_nv_tensorrt_rtx"}
 PRECISIONS = ("fp32", "bf16", "int8")
-# In standard deviations of an output. The same graph in fp32 was seen to differ by 1e-5 between engines; weights of one
-# layer tripled, by 0.5.
+# Largest accepted deviation, in standard deviations of an output. The same graph in fp32 differs by 1e-5 between
+# engines; tripled weights of one layer give 0.5.
 MAX_GOLDEN_DEVIATION = {"fp32": 0.02, "bf16": 0.5, "int8": 0.5}
-# Part of the golden values that has to be as near: where max-pooling meets two maxima within a rounding of each other,
-# engines unpool either, and a few pixels differ from then on.
+# Share of the golden values that must be within that deviation. If two maxima in max-pooling differ only by rounding,
+# engines may unpool to either one, and a few pixels differ from there on.
 GOLDEN_SHARE = 0.9
 # The largest network of this project takes 0.2 s on one core of a server.
 MAX_FIRST_RUN_S = 30.0
@@ -65,7 +65,7 @@ MAX_FIRST_RUN_S = 30.0
 
 def _onnxruntime() -> Any:
     ort = require("onnxruntime", "cpu", "Running a model")
-    ort.set_default_logger_severity(4)  # what it has to say is in its exceptions, and so in ours
+    ort.set_default_logger_severity(4)  # its exceptions contain the messages, and ours repeat them
     return ort
 
 
@@ -74,7 +74,7 @@ def _version(package: str) -> str:
 
 
 def _plugin_devices(ort: Any, short: str) -> list[Any]:
-    """Devices a plugin provider offers here; an empty list where its package is absent or finds none."""
+    """Devices of a plugin provider on this computer; empty if its package is not installed or finds none."""
     if not hasattr(ort, "get_ep_devices"):
         return []
     name = PROVIDERS[short]
@@ -95,17 +95,25 @@ def _plugin_devices(ort: Any, short: str) -> list[Any]:
 
 
 def available_providers() -> tuple[str, ...]:
-    """Names that ``Perceiver(provider=...)`` can have on this computer."""
+    """The providers that ``Perceiver(provider=...)`` accepts on this computer, as keys of `PROVIDERS`.
+
+    Raises
+    ------
+    MissingExtraError
+        onnxruntime is not installed.
+    ProviderError
+        The plugin of a provider is installed but does not load.
+    """
     ort = _onnxruntime()
     stock = ort.get_available_providers()
     return tuple(s for s, name in PROVIDERS.items() if name in stock or (s in PLUGINS and _plugin_devices(ort, s)))
 
 
 _Attempt = tuple[str, Variant, str, int | None]
-"""Provider, file, precision and threads."""
+"""Provider, variant, precision and number of threads."""
 
 
-def _check_words(provider: str, precision: str) -> None:
+def _check_names(provider: str, precision: str) -> None:
     if precision not in ("auto", *PRECISIONS):
         raise ProviderError(f"precision {precision!r} is unknown; expected auto, {', '.join(PRECISIONS)}")
     if provider == "auto" or provider in PROVIDERS:
@@ -129,14 +137,14 @@ class Session:
     provider : str
         ``"auto"``, or a key of `PROVIDERS`.
     precision : {"auto", "fp32", "bf16", "int8"}
-        ``"auto"`` takes a reduced precision where it is native to the processor and the card shows its loss to be small
-        (`edgeperc.zoo.choose`). The others are required.
+        ``"auto"`` takes a reduced precision if the processor computes it natively and the card shows a small loss
+        (`edgeperc.zoo.choose`). Any other value is required.
     n_threads : int or None
         Threads inside one run; None leaves it to the provider.
     trusted : bool
-        Open graphs that are refused otherwise, because they could run without end or take all memory: with operators
-        that are not in `edgeperc.onnx_file.OPERATORS`, functions, subgraphs or sizes beyond the limits. Nor is the
-        first run stopped after 30 s. Weights in other files are always refused.
+        Open graphs that are otherwise refused, because they could run without end or take all memory: with operators
+        that are not in `edgeperc.onnx_file.OPERATORS`, functions, subgraphs or sizes beyond the limits. The first run
+        is then not stopped after 30 s. Weights in other files are always refused.
 
     Attributes
     ----------
@@ -146,26 +154,33 @@ class Session:
     sha256 : str
         Of the file.
     digest : str
-        What settings of this network are kept under (`edgeperc.zoo.digest`).
+        Key of this network's measured settings (`edgeperc.zoo.digest`).
     short, provider : str
-        What runs it, as a key of `PROVIDERS` and as onnxruntime calls it: ``"cpu"``, ``"CPUExecutionProvider"``.
+        The active provider as a key of `PROVIDERS` and as onnxruntime calls it: ``"cpu"``, ``"CPUExecutionProvider"``.
     precision : str
-        What it runs in: ``"fp32"``, ``"bf16"`` or ``"int8"``.
+        The active precision: ``"fp32"``, ``"bf16"`` or ``"int8"``.
     options : dict of str to str
         Settings of onnxruntime's session and of the provider, for reports.
     input : (C, H, W) float32
         Write the network's input here, then `run`.
     outputs : mapping of str to ndarray
-        By output *kind*, without the batch axis; overwritten by every `run`.
+        Raw outputs by output *kind*, without the batch axis; overwritten by every `run`.
     golden_deviation : float
-        Distance of this computer's answers to the card's golden input from the exporter's, in standard deviations of
-        the output: 90 % of the values are nearer. NaN if the card has no golden record, which is logged as a warning.
+        Deviation of the outputs for the card's golden input from the exporter's, in standard deviations of the output
+        (90th percentile). NaN if the card has no golden record, which is logged as a warning.
 
     Raises
     ------
     OptionError
-        A number of threads below 1.
-    ModelFileError, CardError, CardMismatchError, ProviderError, MissingExtraError
+        ``n_threads`` is below 1.
+    ModelFileError, CardError, CardMismatchError
+        The model cannot be read, or its graph or outputs do not agree with its card.
+    ProviderError
+        The provider or the precision is unknown or not available, or the provider cannot run the model.
+    InferenceError
+        The first run failed.
+    MissingExtraError
+        onnxruntime is not installed.
     """
 
     def __init__(
@@ -179,7 +194,7 @@ class Session:
     ) -> None:
         if n_threads is not None and n_threads < 1:
             raise OptionError(f"n_threads is {n_threads}; expected at least 1, or None")
-        _check_words(provider, precision)
+        _check_names(provider, precision)
         self._trusted = trusted
         ort = _onnxruntime()
         variants = resolve(model)
@@ -193,25 +208,25 @@ class Session:
                 if attempt == attempts[-1]:
                     raise
                 short, _, runs_in, _ = attempt
-                logger.warning("auto passes over %s on %s in %s: %s", variants[0].name, short, runs_in, exc)
+                logger.warning("provider auto skips %s on %s in %s: %s", variants[0].name, short, runs_in, exc)
 
     def _attempts(
         self, variants: Sequence[Variant], provider: str, precision: str, n_threads: int | None
     ) -> list[_Attempt]:
-        """What to try, in this order: one setting, or several where something is left to "auto"."""
+        """The settings to try, in this order: one, or several if provider or precision is "auto"."""
         present, features = available_providers(), cpu_features()
-        wishes = [(provider, precision, n_threads)]
+        candidates = [(provider, precision, n_threads)]
         if provider == "auto":
-            wishes = [(short, precision, n_threads) for short in AUTO if short in present]
-            wishes = [*self._measured_best(variants[0].name, precision, n_threads, present), *wishes]
+            candidates = [(short, precision, n_threads) for short in AUTO if short in present]
+            candidates = [*self._measured_best(variants[0].name, precision, n_threads, present), *candidates]
         elif provider not in present:
             raise ProviderError(
                 f"provider {provider!r} is not available on this computer (present: {', '.join(present)}); "
-                "install its onnxruntime build or plugin, or ask for one that is present"
+                "install its onnxruntime build or plugin, or choose one that is present"
             )
         attempts: list[_Attempt] = []
         refusal = None
-        for short, wanted, threads in wishes:
+        for short, wanted, threads in candidates:
             try:
                 variant, runs_in = choose(variants, short, wanted, features)
             except ProviderError as exc:
@@ -227,17 +242,17 @@ class Session:
     def _measured_best(
         self, name: str, precision: str, n_threads: int | None, present: Sequence[str]
     ) -> list[tuple[str, str, int | None]]:
-        """The provider, precision and threads that were measured to be the fastest here, if any were."""
+        """The fastest provider, precision and threads measured on this computer; empty if none was measured."""
         try:
             setting = read_setting(settings_path(), fingerprint(), self.digest)
         except SettingsError as exc:
-            logger.warning("auto knows of no setting measured here: %s", exc)
+            logger.warning("provider auto cannot read the settings measured on this computer: %s", exc)
             return []
         if setting is None or precision not in ("auto", setting["precision"]):
             return []
         if setting["provider"] not in present:
             logger.warning(
-                "auto passes over %s on %s, measured as the fastest: it is not available any more",
+                "provider auto skips %s on %s, which was measured as the fastest: it is no longer available",
                 *(name, setting["provider"]),
             )
             return []
@@ -257,7 +272,7 @@ class Session:
 
     @property
     def description(self) -> str:
-        """What really runs: ``"pointseg int8, CPUExecutionProvider"``."""
+        """The active network, precision and provider: ``"pointseg int8, CPUExecutionProvider"``."""
         return f"{self.card.name} {self.precision}, {self.provider}"
 
     def _open(self, ort: Any, blob: bytes, short: str, precision: str, n_threads: int | None) -> Any:
@@ -267,14 +282,15 @@ class Session:
         options.use_deterministic_compute = True
         if n_threads is not None:
             options.intra_op_num_threads = n_threads
-        # A plan of memory is made beside the blocks of the first run, which stay: 38 and 54 MB more, and no faster.
+        # The memory pattern would be allocated in addition to the blocks of the first run: 38 and 54 MB more, not
+        # faster.
         options.enable_mem_pattern = False
         entries = {}
-        # Threads that spin for work between two runs take the cores of the Perceiver's other network: both networks
-        # one after the other took 357 ms with and 290 ms without. Within a run they may spin.
+        # Threads that spin between two runs occupy the cores that the Perceiver's other network needs: both networks in
+        # turn took 357 ms with spinning and 290 ms without. Within a run, threads may spin.
         entries["session.force_spinning_stop"] = "1"
         if short != "cpu":
-            # Part of a graph on another provider is a fall-back too.
+            # Running part of the graph on the CPU provider would be a silent fallback.
             entries["session.disable_cpu_ep_fallback"] = "1"
         for key, value in entries.items():
             options.add_session_config_entry(key, value)
@@ -283,7 +299,7 @@ class Session:
         try:
             if plugin:
                 if short == "openvino":
-                    hint = "bf16" if precision == "bf16" else "f32"  # what is not in int8 runs in fp32
+                    hint = "bf16" if precision == "bf16" else "f32"  # layers that are not int8 run in fp32
                     cpu = {"INFERENCE_PRECISION_HINT": hint, "PERFORMANCE_HINT": "LATENCY"}
                     if n_threads is not None:
                         cpu["INFERENCE_NUM_THREADS"] = str(n_threads)
@@ -325,14 +341,14 @@ class Session:
 
     def _match(self, name: str, node: Any, expected: tuple[int | None, ...]) -> None:
         shape = tuple(node.shape)
-        # A graph may leave a dimension open (a name, or None); what it then answers is checked by the first run.
+        # A graph may leave a dimension open (a name or None); the first run then checks the shape.
         fits = len(shape) == len(expected) and all(
             e is None or not isinstance(s, int) or s == e for s, e in zip(shape, expected, strict=True)
         )
         if not fits or node.type != "tensor(float)":
             raise CardMismatchError(
-                f"{self.path}: {name!r} is {node.type} of shape {shape} in the graph; its card says tensor(float) of "
-                f"shape {expected} (None: any)"
+                f"{self.path}: {name!r} is {node.type} of shape {shape} in the graph; its card declares tensor(float) "
+                f"of shape {expected} (None: any)"
             )
 
     def _bind(self, run_options: Any) -> None:
@@ -349,7 +365,7 @@ class Session:
         self._bound_input = (card.input.name, "cpu", 0, np.float32, batch.shape, batch.ctypes.data)
 
     def _shapes(self, batch: NDArray[np.float32], run_options: Any) -> list[tuple[int, ...]]:
-        """Of the outputs: as the graph says, or, where it leaves some open, as a run gives them."""
+        """Shapes of the outputs, from the graph, or from a run if the graph leaves dimensions open."""
         declared = {o.name: tuple(o.shape) for o in self._session.get_outputs()}
         shapes = [declared[o.name] for o in self.card.outputs]
         if all(isinstance(n, int) for shape in shapes for n in shape):
@@ -364,7 +380,7 @@ class Session:
                 e is not None and s != e for s, e in zip(answer.shape, expected, strict=True)
             ):
                 raise CardMismatchError(
-                    f"{self.path}: {output.name!r} came out with shape {answer.shape}, its card says {expected}"
+                    f"{self.path}: {output.name!r} has shape {answer.shape} after a run; its card declares {expected}"
                 )
         return [answer.shape for answer in answers]
 
@@ -372,7 +388,7 @@ class Session:
         golden = self.card.golden
         if golden is None:
             logger.warning(
-                "the card of %s has no golden record: whether %s computes what its exporter did is not checked",
+                "the card of %s has no golden record: the outputs on %s are not compared with the exporter's",
                 *(self.path, self.provider),
             )
             self._run(run_options)
@@ -380,7 +396,7 @@ class Session:
         self.input[:] = golden_input(golden.seed, self._batch.shape)[0]
         if hashlib.sha256(self._batch.tobytes()).hexdigest() != golden.input_sha256:
             raise CardMismatchError(
-                f"{self.path}: the golden input made here is not the card's; export the model again"
+                f"{self.path}: the golden input does not have the card's SHA-256; export the model again"
             )
         self._run(run_options)
         self.input[:] = 0.0
@@ -405,18 +421,24 @@ class Session:
         return deviation
 
     def run(self) -> Mapping[str, NDArray[np.float32]]:
-        """Run the network on `input`; the answer lies in `outputs`, which the next run overwrites.
+        """Run the network on `input`.
+
+        Returns
+        -------
+        mapping of str to ndarray
+            `outputs`, which the next run overwrites.
 
         Raises
         ------
         InferenceError
+            onnxruntime failed.
         """
         self._run()
         return self.outputs
 
     def _run(self, *run_options: Any) -> None:
         try:
-            # Every time: a provider with memory of its own copies the input when it is bound, and never again.
+            # Bind before every run: a provider with its own memory copies the input only when it is bound.
             self._binding.bind_input(*self._bound_input)
             self._session.run_with_iobinding(self._binding, *run_options)
         except Exception as exc:  # onnxruntime's errors share no base but Exception
@@ -425,7 +447,7 @@ class Session:
 
 @contextmanager
 def _terminated(ort: Any, after_s: float | None) -> Iterator[Any]:
-    """Options of runs that onnxruntime gives up between two operators once ``after_s`` have passed; None: never."""
+    """Run options with which onnxruntime stops between two operators after ``after_s`` seconds; None: never."""
     options = ort.RunOptions()
     options.log_severity_level = 4
 
@@ -445,8 +467,8 @@ def _terminated(ort: Any, after_s: float | None) -> Iterator[Any]:
 
 
 def golden_input(seed: int, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """The noise that a card's golden record is about."""
-    # Uniform, and from raw bits: the same bytes on every platform and numpy, which normal() does not promise.
+    """The input of a card's golden record: uniform noise in -1..1, float32 of ``shape`` (`edgeperc.card.Golden`)."""
+    # From raw bits: these bytes are the same on every platform and numpy version, which normal() does not promise.
     bits = np.random.PCG64(seed).random_raw(int(np.prod(shape)))
     uniform = (bits >> np.uint64(40)).astype(np.float32) / np.float32(2**23) - np.float32(1.0)
     return uniform.reshape(shape)

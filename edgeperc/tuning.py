@@ -1,6 +1,6 @@
-"""What a computer keeps between starts: the fastest setting that was measured for a model, and compiled models.
+"""Data cached on this computer: the fastest measured setting of each model, and compiled models.
 
-Everything lies in one folder, `cache_folder`; deleting it costs time, never an answer.
+Everything is in one folder, `cache_folder`. It can be deleted: the next start takes longer, the results stay the same.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SCHEMA = 2
 
 
 def cache_folder() -> Path:
-    """``$EDGEPERC_CACHE_DIR``, or ``edgeperc`` in the system's place for caches. Not made by asking."""
+    """``$EDGEPERC_CACHE_DIR``, or ``edgeperc`` in the system's cache folder; not created by this call."""
     given = os.environ.get("EDGEPERC_CACHE_DIR")
     if given:
         return Path(given)
@@ -44,23 +44,26 @@ def cache_folder() -> Path:
 
 
 def compiled_folder(engine: str, sha256: str, precision: str) -> Path | None:
-    """A folder for what an engine makes of a model, which only that engine and that file will find again.
-
-    None where nothing can be written there: the engine then compiles at every start.
+    """Create the folder for the compiled form of a model, separate for each engine, file and precision.
 
     Parameters
     ----------
     engine : str
-        With its versions; whatever it compiled for another one is stale.
+        Name and versions; another version does not find the folder.
     sha256 : str
         Of the model file.
     precision : str
+
+    Returns
+    -------
+    Path or None
+        None if the folder is not writable; the engine then compiles at every start.
     """
     name = hashlib.sha256(f"{engine} {fingerprint()} {precision}".encode()).hexdigest()[:16]
     try:
         folder = cache_folder() / "compiled" / f"{sha256[:16]}-{name}"
         folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):  # RuntimeError: there is no home
+    except (OSError, RuntimeError):  # RuntimeError: there is no home folder
         return None
     return folder if os.access(folder, os.W_OK) else None
 
@@ -71,14 +74,14 @@ def cpu_model() -> str:
 
 
 def cpu_features() -> frozenset[str]:
-    """Flags of the processor as Linux names them, such as ``avx512_vnni``; empty where the system does not say."""
+    """Flags of the processor as Linux names them, such as ``avx512_vnni``; empty if the system does not list them."""
     if sys.platform == "darwin" and platform.machine() == "arm64":
         return frozenset({"asimddp"})  # every Apple processor multiplies bytes in dot products
     return frozenset(_cpuinfo("flags", "Features").split())
 
 
 def _cpuinfo(*keys: str) -> str:
-    """The first value of any of the keys; empty where there is none."""
+    """The first value of any of the keys; empty if there is none."""
     for line in (_text(Path("/proc/cpuinfo")) or "").splitlines():
         key, _, value = line.partition(":")
         if key.strip() in keys:
@@ -87,11 +90,11 @@ def _cpuinfo(*keys: str) -> str:
 
 
 def fingerprint() -> str:
-    """A name for computers that are alike: 16 hexadecimal digits of CPU, board, architecture, cores and their quota."""
+    """Identify this kind of computer: 16 hexadecimal digits from CPU, board, architecture, cores and CPU quota."""
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     board, quota = (_text(Path(p)) for p in ("/sys/firmware/devicetree/base/model", "/sys/fs/cgroup/cpu.max"))
-    told = [cpu_model(), board, platform.machine(), os.cpu_count(), usable, quota]
-    return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
+    properties = [cpu_model(), board, platform.machine(), os.cpu_count(), usable, quota]
+    return hashlib.sha256(json.dumps(properties).encode()).hexdigest()[:16]
 
 
 def _text(path: Path) -> str | None:
@@ -102,19 +105,19 @@ def _text(path: Path) -> str | None:
 
 
 def settings_path() -> Path:
-    """Where ``edgeperc-bench matrix --recommend`` writes and ``Perceiver(provider="auto")`` reads."""
+    """The file that ``edgeperc-bench matrix --recommend`` writes and ``Perceiver(provider="auto")`` reads."""
     return cache_folder() / "settings.json"
 
 
 def write_settings(path: Path, machine: str, entries: Mapping[str, Mapping[str, Any]]) -> None:
-    """Put settings into a file, beside those of other computers and models, in place of older ones.
+    """Add settings to a file. They replace older ones of the same computer and model; others stay.
 
     Parameters
     ----------
     path : Path
         JSON: ``{"schema": 2, "machines": {fingerprint: {digest: entry}}}``; created if it does not exist.
     machine : str
-        `fingerprint` of the computer they were measured on.
+        `fingerprint` of the computer that they were measured on.
     entries : mapping
         A network's digest (`edgeperc.zoo.digest`) to ``provider``, ``precision`` and ``n_threads``, as
         `edgeperc.Perceiver` takes them, and any further keys.
@@ -122,7 +125,7 @@ def write_settings(path: Path, machine: str, entries: Mapping[str, Mapping[str, 
     Raises
     ------
     SettingsError
-        The file is there and is something else.
+        The file exists and is not a settings file.
     """
     document: dict[str, Any] = _read(path) if path.exists() else {"schema": SCHEMA, "machines": {}}
     document["machines"].setdefault(machine, {}).update({sha: dict(entry) for sha, entry in entries.items()})
@@ -131,11 +134,17 @@ def write_settings(path: Path, machine: str, entries: Mapping[str, Mapping[str, 
 
 
 def read_setting(path: Path, machine: str, digest: str) -> dict[str, Any] | None:
-    """The setting for a computer and a network; None if none was measured.
+    """Read the setting for a computer (`fingerprint`) and a network (`edgeperc.zoo.digest`).
+
+    Returns
+    -------
+    dict or None
+        ``provider``, ``precision``, ``n_threads`` and further keys; None if nothing was measured.
 
     Raises
     ------
     SettingsError
+        The file is not a settings file, or the entry is malformed.
     """
     if not path.exists():
         return None
@@ -144,15 +153,15 @@ def read_setting(path: Path, machine: str, digest: str) -> dict[str, Any] | None
         return None
     if not isinstance(entry, dict) or not _is_setting(entry):
         raise SettingsError(
-            f"{path} keeps {entry!r} of a model; expected a provider, a precision and n_threads; delete it"
+            f"{path} has the entry {entry!r} for a model; expected a provider, a precision and n_threads; delete it"
         )
     return entry
 
 
 def _is_setting(entry: Mapping[str, Any]) -> bool:
     n_threads = entry.get("n_threads")
-    words = all(isinstance(entry.get(key), str) for key in ("provider", "precision"))
-    return words and (n_threads is None or (isinstance(n_threads, int) and n_threads >= 1))
+    are_names = all(isinstance(entry.get(key), str) for key in ("provider", "precision"))
+    return are_names and (n_threads is None or (isinstance(n_threads, int) and n_threads >= 1))
 
 
 def _read(path: Path) -> dict[str, Any]:

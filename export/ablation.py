@@ -1,8 +1,8 @@
-"""The effect of each part of the data and of the training, measured on drives that the run has not seen.
+"""The effect of each part of the data and of the training, measured on drives outside the training set.
 
-All variants are short runs from the same weights, trained on simulation alone (LoDNN's are random), and differ in one
-setting. Each is evaluated on a fold of the training drives. Test drives take no part, nor do teachers, which may have
-been trained on the fold.
+All variants are short runs from the same weights, which were trained on simulation alone (LoDNN's are random). Each
+variant changes one setting and is evaluated on a fold of the training drives. Test drives are not used. The teachers of
+the shipped models are not used either, because they may have been trained on the fold.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "weights not averaged": {"ema": 0.0},
         "the paper's slots": {"head": "slots"},
     },
-    # What LoDNN-I was searched by (Electronics 12, 3165, Figure 16).
+    # The settings that the paper of LoDNN-I varies (Electronics 12, 3165, Figure 16).
     "lodnn": {
         "as shipped": {},
         **{f"learning rate {rate:g}": {"learning_rate": rate} for rate in (1e-4, 3e-4, 1e-3, 1e-2, 3e-2)},
@@ -63,7 +63,7 @@ VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
 }  # fmt: skip
 PAPERS = "the paper's recipe, from nothing, as many scans"
 SHIPPED = {"pointseg": "pointseg-full", "ssadnet": "ssadnet-full", "lodnn": "lodnn"}
-"""Network -> the model whose recipe is varied: one that can be trained without a teacher."""
+"""Network -> the model whose recipe is varied; it can be trained without a teacher."""
 
 
 def ablate(
@@ -85,10 +85,13 @@ def ablate(
     network : str
         ``"pointseg"``, ``"ssadnet"`` or ``"lodnn"``.
     out : Path
+        Folder for the runs and ``ablation.json``.
     kitti, simulated : Path
+        As for `edgeperc_export.train.train`.
     start_from : Path or None
         Checkpoint of the network's ``-sim`` model; None for ``"lodnn"``, which has none.
     fold, steps : int
+        Fold to evaluate on; training steps of each run, for the shipped model's batch size.
     variants : sequence of str
         Names in `VARIANTS`, or `PAPERS`; by default all of them.
     n_threads : int or None
@@ -101,7 +104,7 @@ def ablate(
     Raises
     ------
     ValueError
-        There is no such variant.
+        The variant is unknown.
     """
     out.mkdir(parents=True, exist_ok=True)
     path = out / "ablation.json"
@@ -121,7 +124,7 @@ def ablate(
         start: Path | None = start_from
         if variant == PAPERS:
             recipe, start = replace(PAPER[network], context_width=shipped.context_width), None
-        recipe = replace(recipe, steps=max(1, int(n_scans) // recipe.batch))  # as many scans
+        recipe = replace(recipe, steps=max(1, int(n_scans) // recipe.batch))  # the same number of scans
         folder = out / f"{network}-{fold}-{steps}-{'-'.join(variant.split())}"
         train(
             recipe, folder, kitti=kitti, simulated=simulated, fold=fold, start_from=start, teacher=teacher,
@@ -143,7 +146,13 @@ def ablate(
 
 
 def plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the search for LoDNN's learning rate, number of scans and batch size, like the paper's Figure 16."""
+    """Draw the search for LoDNN's learning rate, number of scans and batch size, like the paper's Figure 16.
+
+    Raises
+    ------
+    ValueError
+        ``rows``, from `ablate`, has no run of LoDNN.
+    """
     from matplotlib.figure import Figure
 
     rows = [row for row in rows if row["network"] == "lodnn"]

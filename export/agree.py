@@ -1,6 +1,6 @@
-"""How a network's answers in bf16 and int8 agree with those in fp32, on labeled real scans: a record in its cards.
+"""Measures how a network's outputs in bf16 and int8 agree with fp32 on labeled real scans; writes it into its cards.
 
-`edgeperc.zoo.choose` reads this record: ``precision="auto"`` takes a reduced precision only where its loss is small.
+`edgeperc.zoo.choose` reads this record: ``precision="auto"`` takes a reduced precision only if its loss is small.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ __all__ = ["agree", "summary"]
 
 
 @dataclass(frozen=True)
-class _Answers:
-    """What one precision answers on all scans."""
+class _Measured:
+    """Labels and accuracy of one precision over all scans; ``by`` is the engine, provider and processor."""
 
     labels: list[NDArray[np.uint8]]
     mean_iou: float
@@ -53,34 +53,35 @@ def agree(
 ) -> dict[str, dict[str, Any]]:
     """Measure every precision that the files of one network can run in, and write the record into their cards.
 
-    fp32 and int8 run on stock onnxruntime's CPU provider. bf16 runs the fp32 file in OpenVINO's own Python API, and is
-    measured where that is installed and the processor has bf16 instructions.
+    fp32 and int8 run on stock onnxruntime's CPU provider. bf16 runs the fp32 file in OpenVINO's own Python API. It is
+    measured if OpenVINO is installed and the processor has bf16 instructions.
 
     Parameters
     ----------
     models : sequence of str or Path
-        Files of one network, or its name, which stands for all its variants. One of them is in fp32.
+        Files of one network, or its name for all its variants. One of them is in fp32.
     kitti, semantickitti : Path or None
-        Roots of a KITTI object set and of SemanticKITTI, whose labels are the truth: of points or of vehicles, and of
-        road. All scans of SemanticKITTI are taken, which belong to a test drive: they have the only road of real scans.
+        Roots of a KITTI object set and of SemanticKITTI. Their labels are the ground truth: of points or vehicles
+        (KITTI) and of road (SemanticKITTI). All scans of SemanticKITTI are used, although they are of a test drive,
+        because no other real scans have road labels.
     split : str
         Drives of the KITTI object set (`edgeperc.evaluation.splits.in_split`).
     n_scans : int or None
-        At most so many scans of each set, evenly spread; None takes all.
+        At most this many scans of each set, evenly spread; None takes all.
     on_scan : callable
-        Called after each scan with the precision.
+        Called with the precision after each scan.
 
     Returns
     -------
     precisions : dict
-        Precision to its record (`edgeperc.card.ModelCard`, ``precisions``).
+        Precision -> its record (`edgeperc.card.ModelCard`, ``precisions``).
 
     Raises
     ------
     ModelError
         The files are not of one network, or none is in fp32.
     PointsError
-        No scans.
+        There are no labeled scans.
     SplitError
         The network was trained on one of the scans.
     """
@@ -95,14 +96,14 @@ def agree(
     if importlib.util.find_spec("openvino") is not None and not BF16_FEATURES.isdisjoint(cpu_features()):
         runs["bf16"] = variants["fp32"]
     runs |= variants
-    answers = {
-        precision: _answers(variant, precision, kitti, semantickitti, split, n_scans, on_scan)
+    measured = {
+        precision: _measure(variant, precision, kitti, semantickitti, split, n_scans, on_scan)
         for precision, variant in runs.items()
     }
     options = [f"--kitti KITTI --split {split}"] * (kitti is not None)
     options += ["--semantickitti SEMANTICKITTI"] * (semantickitti is not None) + [f"--scans {n_scans}"] * bool(n_scans)
     command = " ".join(["edgeperc-export agree", variants["fp32"].name, *options])
-    records = {precision: _record(each, answers["fp32"], command) for precision, each in answers.items()}
+    records = {precision: _record(each, measured["fp32"], command) for precision, each in measured.items()}
     for variant in variants.values():
         own = {precision: records[precision] for precision, each in runs.items() if each is variant}
         write_card(onnx.load(variant.path), replace(variant.card, precisions=own), variant.path)
@@ -110,7 +111,7 @@ def agree(
 
 
 def summary(precisions: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """A line for each precision."""
+    """One line of text for each record of `agree`."""
     return [
         f"{precision}: labels agree on {record['label_agreement']:.3%}, mean IoU {100 * record['mean_iou']:.2f} "
         f"(fp32 {100 * record['fp32_mean_iou']:.2f})"
@@ -120,25 +121,25 @@ def summary(precisions: Mapping[str, Mapping[str, Any]]) -> list[str]:
     ]
 
 
-def _record(here: _Answers, fp32: _Answers, command: str) -> dict[str, Any]:
-    same = sum(int(np.count_nonzero(a == b)) for a, b in zip(here.labels, fp32.labels, strict=True))
-    losses = [fp32.mean_iou - here.mean_iou, 0.0]
-    if here.ap is not None and fp32.ap is not None:
-        losses.append(fp32.ap - here.ap)
+def _record(own: _Measured, fp32: _Measured, command: str) -> dict[str, Any]:
+    same = sum(int(np.count_nonzero(a == b)) for a, b in zip(own.labels, fp32.labels, strict=True))
+    losses = [fp32.mean_iou - own.mean_iou, 0.0]
+    if own.ap is not None and fp32.ap is not None:
+        losses.append(fp32.ap - own.ap)
     return {
-        "n_scans": len(here.labels),
-        "label_agreement": round(same / max(sum(labels.size for labels in here.labels), 1), 6),
-        "mean_iou": round(here.mean_iou, 5),
+        "n_scans": len(own.labels),
+        "label_agreement": round(same / max(sum(labels.size for labels in own.labels), 1), 6),
+        "mean_iou": round(own.mean_iou, 5),
         "fp32_mean_iou": round(fp32.mean_iou, 5),
-        "ap": None if here.ap is None else round(here.ap, 5),
+        "ap": None if own.ap is None else round(own.ap, 5),
         "fp32_ap": None if fp32.ap is None else round(fp32.ap, 5),
         "loss": round(100.0 * max(losses), 3),
-        "by": here.by,
+        "by": own.by,
         "command": command,
     }
 
 
-def _answers(
+def _measure(
     variant: Variant,
     precision: str,
     kitti: Path | None,
@@ -146,7 +147,7 @@ def _answers(
     split: str,
     n_scans: int | None,
     on_scan: Callable[[str], None],
-) -> _Answers:
+) -> _Measured:
     judge = Judge([variant.path])
     (session,) = judge.perceive.sessions
     by = f"onnxruntime {onnxruntime.__version__}, {session.provider}"
@@ -170,10 +171,10 @@ def _answers(
         records.setdefault(block, []).append(judge.record(truth)[0])
         labels.append(_labels(judge.perceive(truth.points)))
         on_scan(precision)
-    measured = [figures(of_block, 0) for of_block in records.values()]
-    ious = [iou for of_block in measured for iou in _ious(of_block)]
-    ap = [of_block["boxes"]["oriented"]["all"]["vehicle"]["ap"] for of_block in measured if "boxes" in of_block]
-    return _Answers(labels, float(np.nanmean(ious)), ap[0] if ap else None, f"{by}, {cpu_model()}")
+    blocks = [figures(of_block, 0) for of_block in records.values()]
+    ious = [iou for block in blocks for iou in _ious(block)]
+    ap = [block["boxes"]["oriented"]["all"]["vehicle"]["ap"] for block in blocks if "boxes" in block]
+    return _Measured(labels, float(np.nanmean(ious)), ap[0] if ap else None, f"{by}, {cpu_model()}")
 
 
 def _kitti(judge: Judge, objects: KittiObjects, name: str) -> Truth:
@@ -185,11 +186,12 @@ def _semantickitti(judge: Judge, roads: SemanticKitti, name: str) -> Truth:
 
 
 def _spread(names: Sequence[str], most: int | None) -> Sequence[str]:
+    """At most ``most`` of the names, evenly spread."""
     return names if most is None else names[:: max(1, -(-len(names) // most))]
 
 
 def _labels(found: Perception) -> NDArray[np.uint8]:
-    """Of points or of cells, after post-processing."""
+    """Labels of points or of cells after post-processing, flat."""
     if found.points is not None:
         return found.points.labels
     assert found.top_view is not None
@@ -197,7 +199,7 @@ def _labels(found: Perception) -> NDArray[np.uint8]:
 
 
 def _ious(block: Mapping[str, Any]) -> list[float]:
-    """IoU of every class of points but the background, of vehicles as one class, and of road."""
+    """IoU of every class of points without background, of vehicles as one class, and of road."""
     found = [row["iou"] for name, row in block.get("points", {}).get("all", {}).items() if name != "background"]
     for bands in block.get("segmentation", {}).values():
         found += [iou for name, iou in bands["all"]["iou"].items() if name in ("vehicle", "road")]
@@ -205,7 +207,7 @@ def _ious(block: Mapping[str, Any]) -> list[float]:
 
 
 def _run_in_openvino(session: Session) -> str:
-    """Let OpenVINO's own API compute a session's outputs in bf16; returns what computes."""
+    """Make a session compute its outputs in bf16 through OpenVINO's own API; returns the engine and its version."""
     import openvino
 
     core = openvino.Core()

@@ -29,14 +29,14 @@ class ObjectBank:
     Attributes
     ----------
     objects : dict of str to list of (Box, (n, 4) float32)
-        By label.
+        Label -> boxes and the points in them.
     """
 
     objects: dict[str, list[tuple[Box, NDArray[np.float32]]]]
 
     @classmethod
     def of(cls, scans: Iterable[LabeledScan], fewest: int = 8) -> ObjectBank:
-        """The objects within 60 m with at least ``fewest`` returns."""
+        """The objects of the scans within 60 m that have at least ``fewest`` returns."""
         objects: dict[str, list[tuple[Box, NDArray[np.float32]]]] = {}
         for scan in scans:
             for box, count in zip(scan.boxes, scan.counts, strict=True):
@@ -55,8 +55,7 @@ def pasted(
     """The scan with up to ``n`` objects of the bank added, of kinds drawn by ``odds``.
 
     An object keeps its distance, and so its density of returns, and moves to a random azimuth ahead. It is placed on
-    the ground there if the place is free. Returns behind the object are removed, and so are returns of the object
-    behind something nearer, ray by ray.
+    the ground there if the place is free. Ray by ray, only the nearer return remains: the scan's or the object's.
     """
     names = [name for name in odds if bank.objects.get(name)]
     if not names or n == 0:
@@ -92,7 +91,6 @@ def pasted(
         here[:, 0], here[:, 1] = cos * cut[:, 0] - sin * cut[:, 1], sin * cut[:, 0] + cos * cut[:, 1]
         here[:, 2] += np.float32(ground - foot)
 
-        # The beams of an HDL-64E are 0.4 degrees apart, its columns 0.17.
         own, own_range = _rays(here)
         other, other_range = _rays(points[window])
         rays = np.unique(own)
@@ -102,14 +100,14 @@ def pasted(
         met = rays[at] == other
         blocking = np.full(len(rays), np.inf)
         np.minimum.at(blocking, at[met], other_range[met])
-        seen = own_range < blocking[np.searchsorted(rays, own)] + 0.3
-        if np.count_nonzero(seen) < FEWEST_PASTED:
+        visible = own_range < blocking[np.searchsorted(rays, own)] + 0.3
+        if np.count_nonzero(visible) < FEWEST_PASTED:
             continue
         kept[window[met & (other_range > nearest[at])]] = False
-        new_points.append(here[seen])
-        new_labels.append(np.full(np.count_nonzero(seen), POINT_CLASS_OF[box.label], np.uint8))
+        new_points.append(here[visible])
+        new_labels.append(np.full(np.count_nonzero(visible), POINT_CLASS_OF[box.label], np.uint8))
         boxes.append(box)
-        counts.append(int(np.count_nonzero(seen)))
+        counts.append(int(np.count_nonzero(visible)))
     if not new_points:
         return scan
     return replace(
@@ -122,11 +120,14 @@ def pasted(
 
 
 def _close(box: Box, other: Box) -> bool:
+    """Whether two boxes are so close that they may overlap."""
     apart = np.hypot(box.center[0] - other.center[0], box.center[1] - other.center[1])
     return bool(apart < 0.45 * (np.hypot(*box.size[:2]) + np.hypot(*other.size[:2])))
 
 
 def _rays(points: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """The ray number of each point, and its range [m]."""
+    # The beams of an HDL-64E are 0.4 degrees apart, its columns 0.17.
     flat = np.hypot(points[:, 0], points[:, 1])
     row = np.floor(np.degrees(np.arctan2(points[:, 2], flat)) / 0.42).astype(np.int64)
     column = np.floor(np.degrees(np.arctan2(points[:, 1], points[:, 0])) / 0.18).astype(np.int64)
@@ -136,7 +137,7 @@ def _rays(points: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.fl
 def swapped(scan: LabeledScan, other: LabeledScan, rng: np.random.Generator) -> LabeledScan:
     """The scan with one sector replaced by another scan's (PolarMix; Xiao et al., 2022): points and their labels only.
 
-    Boxes and surface are not changed, so this is only for networks that label points.
+    Boxes and surface do not change, so this suits only networks that label points.
     """
     low = rng.uniform(-np.pi / 4.0, np.pi / 8.0)
     high = low + rng.uniform(np.pi / 8.0, np.pi / 4.0)
@@ -150,7 +151,7 @@ def swapped(scan: LabeledScan, other: LabeledScan, rng: np.random.Generator) -> 
 
 
 def weathered(scan: LabeledScan, rng: np.random.Generator) -> LabeledScan:
-    """The scan in rain, snow or fog: far returns are lost more often, and a few come from drops in the air."""
+    """The scan in rain, snow or fog: far returns are lost more often, and a few returns come from drops in the air."""
     points, labels = scan.points, scan.labels
     distance = np.linalg.norm(points[:, :3], axis=1)
     kept = rng.random(len(points)) < np.exp(-rng.uniform(0.0, 0.02) * distance)
@@ -186,8 +187,8 @@ def augmented(
 ) -> LabeledScan:
     """The scan turned, mirrored, thinned, shifted in height and scaled in remission, all at random.
 
-    A scan that is labeled on all sides (simulation) is turned forwards or backwards along the street, all others by a
-    few degrees only.
+    A scan that is labeled on all sides (simulation) faces forwards or backwards along the street. Other scans are
+    turned by a few degrees only.
 
     Parameters
     ----------
@@ -216,7 +217,7 @@ def augmented(
     scan = turned(scan, float(angle))
     if rng.random() < 0.5:
         scan = mirrored(scan)
-    # Both views look ahead; points behind would only cost time.
+    # Points behind the sensor are in neither view and would only cost time.
     ahead = scan.points[:, 0] > 0.0
     scan = replace(scan, points=scan.points[ahead], labels=scan.labels[ahead])
     if bank is not None and n_pasted > 0.0:

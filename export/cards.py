@@ -1,4 +1,4 @@
-"""What this project's networks see, and the cards their files will carry."""
+"""Views and inputs of this project's networks, and their model cards."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from .recipe import task_name
 __all__ = ["RANGE_IMAGE", "RANGE_IMAGE_INPUT", "ROAD_CLASSES", "TOP_VIEW", "TOP_VIEW_INPUT", "card_of"]
 
 ROAD_CLASSES = TOP_VIEW_CLASSES[:2]
-"""LoDNN's classes; the footprint of a vehicle is background."""
+"""LoDNN's classes; the ground under a vehicle is background."""
 
 TOP_VIEW = TopViewGeometry()
 RANGE_IMAGE = RangeImageGeometry(get_sensor("hdl-64e").elevations_deg)
 # SSADNet 2.1.2 scales every channel to its range; the farthest corner of the view is 47.07 m away.
 TOP_VIEW_INPUT = InputSpec("top_view", ("distance", "remission", "height"), (0.0, 0.0, -2.5), (47.07, 1.0, 5.0))
-# Means and deviations of the returns in the front 90 degrees of 27 training scans.
+# Means and standard deviations of the returns in the front 90 degrees of 27 training scans.
 RANGE_IMAGE_INPUT = InputSpec(
     "range_image",
     ("x", "y", "z", "remission", "range"),
@@ -49,7 +49,8 @@ def card_of(network: str, head: str = "dense", **facts: Any) -> ModelCard:
         outputs=(OutputSpec("segmentation", "class_logits"), OutputSpec("boxes", f"box_{head}")),
         classes=TOP_VIEW_CLASSES,
         box_classes=("car", "van", "truck"),
-        # Length, width, height of 28,963 labels of KITTI, test drives apart: geometric means, deviations of logarithms.
+        # Length, width, height: geometric means, and standard deviations of the logarithms, of 28,963 labels of KITTI
+        # without test drives.
         box_size_priors={"car": (3.86, 1.63, 1.52), "van": (5.0, 1.9, 2.18), "truck": (10.02, 2.58, 3.2)},
         box_size_spreads={"car": (0.11, 0.06, 0.084), "van": (0.164, 0.087, 0.143), "truck": (0.291, 0.09, 0.144)},
         **facts,

@@ -1,4 +1,4 @@
-"""``edgeperc-export``: train networks, export them as proven models, and build top-view databases."""
+"""``edgeperc-export``: train networks, export them as verified models, and build top-view databases."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["build_parser", "main"]
 
 KITTI = "KITTI object set: a folder of training/velodyne, label_2, calib and of frames.csv"
 LAYOUTS = "folder of KITTI's label_2, calib and frames.csv: half of the simulated scenes get their boxes"
-SEMANTICKITTI = "root folder of SemanticKITTI, to evaluate the drivable area on"
+SEMANTICKITTI = "root folder of SemanticKITTI, to evaluate the drivable area"
 FOLD = "fold of the training drives (0, 1 or 2) to validate on instead of training on it"
 THREADS = "number of CPU threads (default: one for each core)"
 COMPILE = "run the network through torch.compile, which needs a C++ compiler and a minute to start"
@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 for success, 1 if a model was refused or a scene left out, 2 for wrong usage or unusable files.
+        0: success; 1: a model was refused or a scene was left out; 2: wrong usage or unusable files.
     """
     parser, given = build_parser(), list(sys.argv[1:] if argv is None else argv)
     if given[:1] == ["database"]:
@@ -52,13 +52,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def build_parser() -> argparse.ArgumentParser:
+    """The parser of all commands; ``run`` of the parsed arguments is the command's function."""
     parser = argparse.ArgumentParser(prog="edgeperc-export", description=__doc__)
     parser.add_argument("--version", action="version", version=f"edgeperc {__version__}")
     parser.set_defaults(extra="export")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     simulate = commands.add_parser("simulate", help="write simulated, labeled scans to train on")
-    simulate.add_argument("out", type=Path, help="folder for the scans; scans that are there already are kept")
+    simulate.add_argument("out", type=Path, help="folder for the scans; existing scans in it are kept")
     simulate.add_argument("-n", type=int, default=1000, help="number of scans (default 1000)")
     simulate.add_argument("--first", type=int, default=0, help="number of the first scan, and its seed (default 0)")
     simulate.add_argument("--layouts", type=Path, help=LAYOUTS)
@@ -93,7 +94,7 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_argument("out", type=Path, help=".onnx file to write; not written if torch and onnxruntime disagree")
     export.add_argument("--scans", type=Path, nargs="*", default=[], help=PROOF)
     export.add_argument("--kitti", type=Path, help=f"{KITTI}; the card describes its scans, for the check of inputs")
-    export.add_argument("--metrics", type=Path, help="JSON file of edgeperc eval --json, to keep in the card")
+    export.add_argument("--metrics", type=Path, help="JSON file of edgeperc eval --json, to write into the card")
     export.add_argument("--name", help="name of the model (default: the network's)")
     export.add_argument("--model-version", default="1.0.0", help=VERSION)
     export.add_argument(
@@ -117,7 +118,9 @@ def build_parser() -> argparse.ArgumentParser:
     card.add_argument("out", type=Path, help=".onnx file to write")
     card.set_defaults(run=_card)
 
-    quantize = commands.add_parser("quantize", help="make an int8 model, if it is faster on this computer and as good")
+    quantize = commands.add_parser(
+        "quantize", help="make an int8 model, if it is faster on this computer and as accurate"
+    )
     quantize.add_argument("model", type=Path, help=".onnx file of the fp32 model")
     quantize.add_argument("out", type=Path, help=".onnx file to write")
     quantize.add_argument(
@@ -134,7 +137,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--seven-bits",
         action="store_true",
         default=None,
-        help="use 7-bit weights, so that the model also runs on x86 without VNNI (default: if this computer needs it)",
+        help="use 7-bit weights, which x86 without VNNI needs (default: if this computer needs them)",
     )
     quantize.add_argument(
         "--evaluate-on",
@@ -149,7 +152,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     quantize.set_defaults(run=_quantize)
 
-    agree = commands.add_parser("agree", help="measure bf16 and int8 against fp32, and write it into the cards")
+    agree = commands.add_parser("agree", help="compare bf16 and int8 with fp32, and write the agreement into the cards")
     agree.add_argument("models", nargs="+", metavar="MODEL", help="a network's name, or its files, one of them in fp32")
     agree.add_argument("--kitti", type=Path, help="root of a KITTI object set")
     agree.add_argument("--semantickitti", type=Path, help="root of SemanticKITTI, for the road")
@@ -159,7 +162,11 @@ def build_parser() -> argparse.ArgumentParser:
 
     make = commands.add_parser("make", help="make a shipped model from scratch: simulate, train, export, evaluate")
     shipped = sorted(name for name in MODELS if not name.endswith("-start"))
-    make.add_argument("name", choices=shipped, help="model to make; the models that it learns from are made first")
+    make.add_argument(
+        "name",
+        choices=shipped,
+        help="model to make; the models that it starts from or is distilled from are made first",
+    )
     make.add_argument("out", type=Path, help="folder for scans, checkpoints and models; finished ones in it are kept")
     make.add_argument("--kitti", type=Path, help=KITTI)
     make.add_argument("--layouts", type=Path, help=LAYOUTS)
@@ -202,21 +209,21 @@ TYPES = {"bool": bool, "float": float, "int": int, "str": str}
 
 
 def _recipe_fields() -> dict[str, Field[Any]]:
-    """Option -> field, of every field of a recipe but the network."""
+    """Option -> field, for every field of a recipe except the network."""
     return {f"--{field.name.replace('_', '-')}": field for field in fields(Recipe) if field.metadata}
 
 
 def _add_recipe_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a recipe, in a group for every set of networks that they have an effect on."""
+    """Add the options of a recipe. Options that have an effect on the same networks are in one group."""
     groups: dict[tuple[str, ...], argparse._ArgumentGroup] = {}
     for option, field in _recipe_fields().items():
         networks = field.metadata["networks"]
         if networks not in groups:
             groups[networks] = parser.add_argument_group(f"recipe: {_title(networks)}")
-        how: dict[str, Any] = {"type": TYPES[str(field.type)], "choices": field.metadata["choices"] or None}
+        settings: dict[str, Any] = {"type": TYPES[str(field.type)], "choices": field.metadata["choices"] or None}
         if field.type == "bool":
-            how = {"action": argparse.BooleanOptionalAction}
-        groups[networks].add_argument(option, help=f"{field.metadata['help']} (default: {field.default})", **how)
+            settings = {"action": argparse.BooleanOptionalAction}
+        groups[networks].add_argument(option, help=f"{field.metadata['help']} (default: {field.default})", **settings)
 
 
 def _title(networks: tuple[str, ...]) -> str:
@@ -244,7 +251,9 @@ def _recipe(args: argparse.Namespace) -> Recipe:
         if args.network not in networks:
             raise ValueError(f"{option} has no effect on {args.network}, only on {', '.join(networks)}; leave it out")
         if args.edge and not field.metadata["edge"]:
-            raise ValueError(f"{option} has no effect on a network for small computers; leave out it or --edge")
+            raise ValueError(
+                f"{option} has no effect on a network for small computers; leave out the option, or --edge"
+            )
         given[field.name] = value
     return replace(PAPER[args.network] if args.recipe == "paper" else Recipe(args.network), **given)
 
@@ -339,7 +348,7 @@ def _quantize(args: argparse.Namespace) -> int:
         f"{args.out}: {card.name} {card.version}, kept in fp32: {', '.join(card.training['quantized']['left_alone'])}"
     )
     print(json.dumps(dict(card.parity)))
-    print(f"precision auto takes it once its answers are measured: edgeperc-export agree {args.model} {args.out}")
+    print(f"precision auto takes the model only if it agrees with fp32: edgeperc-export agree {args.model} {args.out}")
     return 0
 
 
@@ -351,7 +360,7 @@ def _agree(args: argparse.Namespace) -> int:
     )
     print(*summary(measured), sep="\n")
     if "bf16" not in measured:
-        print("bf16 is not measured: that takes a processor with bf16, and openvino: pip install 'edgeperc[peers]'")
+        print("bf16 was not measured; it needs a processor with bf16 and openvino: pip install 'edgeperc[peers]'")
     return 0
 
 

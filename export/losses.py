@@ -23,8 +23,8 @@ __all__ = [
     "ssadnet_loss",
 ]
 
-# Offsets, log sizes and the doubled angle have errors of similar size in an untrained head. Height above ground, which
-# no metric here uses, counts half.
+# Offsets, log sizes and the doubled angle have errors of similar size in an untrained head. z and height count half,
+# because no metric uses them.
 GEOMETRY_WEIGHTS = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.5, 0.5)
 
 
@@ -88,7 +88,7 @@ def pointseg_loss(
     focal_gamma: float = 0.0,
     lovasz_weight: float = 0.0,
 ) -> Tensor:
-    """Class-weighted cross-entropy, `focal_gamma` included, plus ``lovasz_weight`` times `lovasz_softmax`."""
+    """`cross_entropy` plus ``lovasz_weight`` times `lovasz_softmax`. Parameters are those of `cross_entropy`."""
     loss = cross_entropy(logits, labels, class_weights, focal_gamma=focal_gamma)
     return loss + lovasz_weight * lovasz_softmax(logits, labels) if lovasz_weight > 0.0 else loss
 
@@ -96,7 +96,7 @@ def pointseg_loss(
 def road_loss(logits: Tensor, labels: Tensor, lovasz_weight: float = 0.0) -> Tensor:
     """Cross-entropy of a road map plus ``lovasz_weight`` times `lovasz_softmax` of every fourth cell.
 
-    Sorting all cells would take a tenth of a training step.
+    Every fourth, because sorting all cells would take a tenth of a training step. Shapes as for `cross_entropy`.
     """
     loss = cross_entropy(logits, labels)
     if lovasz_weight > 0.0:
@@ -138,8 +138,8 @@ def dense_loss(predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """Loss of the heat map (penalty-reduced focal loss; Zhou et al., 2019) and of the geometry (L1).
 
     Both arguments are (B, 9, H, W), the target from `dense_targets`. The heat map's loss is a sum divided by the number
-    of boxes. The geometry's is a mean over the cells that learn it, weighted by their heat, of the errors summed over
-    the channels by `GEOMETRY_WEIGHTS`.
+    of boxes. An error of the geometry is the sum of a cell's absolute errors, weighted by `GEOMETRY_WEIGHTS`. The
+    geometry's loss is the mean error of the cells with a heat of at least `REGRESSED_FROM`, weighted by the heat.
     """
     predicted = predicted.float()
     logit, heat = predicted[:, 0], target[:, 0]
@@ -173,20 +173,21 @@ def ssadnet_loss(
     logits, boxes : Tensor
         Outputs of the network.
     labels : (B, H, W) integer
+        As for `cross_entropy`.
     box_targets : Tensor
         Shaped like ``boxes``: (B, n_slots, 4) from `slot_targets`, or (B, 9, H/4, W/4) from `dense_targets`.
     lw_seg, lw_det : float
-        Table 2.
+        Weights of the two losses (Table 2).
     class_weights : (C,) float, optional
         Not in the paper.
     lovasz_weight : float
-        Weight of `lovasz_softmax`, which is added to the segmentation's loss. Not in the paper.
+        Weight of `lovasz_softmax` in the segmentation's loss. Not in the paper.
 
     Returns
     -------
     total : Tensor
     parts : dict
-        Detached: "seg", and "det" or "heat" and "geometry".
+        Detached losses: "seg", and "det" (slots) or "heat" and "geometry" (dense).
     """
     seg = cross_entropy(logits, labels, class_weights)
     if lovasz_weight > 0.0:

@@ -1,4 +1,4 @@
-"""A shipped model from scratch, by one command: ``edgeperc-export make NAME OUT``."""
+"""Make a shipped model from scratch: ``edgeperc-export make NAME OUT``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["finish", "make"]
 
 N_SIMULATED = 2400
 ROAD_TRUTH = "ssadnet-sim"
-"""Draws the road that counts as the truth of KITTI's scans."""
+"""Model whose road is the ground truth of KITTI's scans, which have no road labels."""
 
 
 def make(
@@ -35,17 +35,17 @@ def make(
     compiled: bool = False,
     version: str = "1.0.0",
 ) -> Path:
-    """Simulate, train, export, evaluate: everything that a shipped model takes. Finished parts are not made again.
+    """Simulate, train, export and evaluate a model. Finished parts are not made again.
 
     Parameters
     ----------
     name : str
-        A key of `MODELS`. The models that it starts or distils from are made first.
+        A key of `MODELS`. The models that it starts from or is distilled from are made first.
     out : Path
         Folder for scans, checkpoints and models.
     kitti, layouts, semantickitti : Path or None
-        Folders of a KITTI object set, of its labels and calibrations alone, and of SemanticKITTI. The models called
-        ``-sim`` are made without the first two, and evaluated on KITTI if it is given.
+        Folders of a KITTI object set, of its labels and calibrations alone, and of SemanticKITTI. Models whose name
+        ends in ``-sim`` need none of them; ``kitti`` then serves for evaluation only.
     fold : int, optional
         Validate on this fold of the training drives, and do not train on it.
     steps : int, optional
@@ -54,6 +54,7 @@ def make(
     compiled : bool
         As for `edgeperc_export.train.train`; the shipped PointSegs were compiled, the SSADNets not.
     version : str
+        Version to write into the card.
 
     Returns
     -------
@@ -74,7 +75,7 @@ def make(
     simulate(scans, N_SIMULATED, layouts_root=None if simulated_only else layouts)
 
     def checkpoint_of(other: str) -> Path:
-        # The models that this one starts or distils from must not have seen the fold either.
+        # The models that this one starts from or is distilled from must not be trained on the fold either.
         own_fold = None if MODELS[other].recipe.simulated_share == 1.0 else fold
         base = out / f"{other}{_suffix(own_fold)}"
         if not base.with_suffix(".onnx").exists():
@@ -120,7 +121,7 @@ def finish(
     fold: int | None = None,
     version: str = "1.0.0",
 ) -> None:
-    """Export a checkpoint as a shipped model, evaluate the file, and write the figures into its card and beside it.
+    """Export a checkpoint, evaluate the file, and write the figures into its card and a JSON file beside it.
 
     Parameters
     ----------
@@ -128,7 +129,7 @@ def finish(
         A key of `MODELS`, and the name of the model.
     checkpoint : Path
     path : Path
-        The .onnx to write; the figures go into a .json beside it, too.
+        The .onnx file to write. The JSON file has the same name, but ends in .json.
     kitti, semantickitti, fold, version
         As for `make`.
     """
@@ -140,7 +141,7 @@ def finish(
         datasets = {"SEMANTICKITTI": semantickitti, **datasets}
     if kitti is not None:
         datasets = {"KITTI": kitti, **datasets}
-    # SSADNet 3.1.2 takes another network's road as truth where no road is labeled.
+    # SSADNet 3.1.2 takes another network's road as ground truth where no road is labeled.
     learned_road = "drivable" in card.classes and (stage.after or stage.teacher) is not None
     road_by = path.with_name(f"{ROAD_TRUTH}.onnx") if learned_road and kitti is not None else None
     figures, _ = evaluate([*datasets.values()], [path], fold=fold, road_by=road_by)

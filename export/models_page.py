@@ -1,4 +1,4 @@
-"""models/MODELS.md, written from the cards and from validation.json, ablation.json and folds.json beside them."""
+"""Writes models/MODELS.md from the cards, and from validation.json, ablation.json and folds.json beside them."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from .recipe import Recipe
 
 __all__ = ["models_page"]
 
-SEES = {"range_image": "a class for every point", "top_view": "drivable area and vehicles ahead"}
+TASKS = {"range_image": "a class for every point", "top_view": "drivable area and vehicles ahead"}
 SOURCES = {"real": "real", "semantickitti": "SemanticKITTI", "simulated": "simulated"}
 ALL_RANGES = ("all",)
 
 
 def models_page(folder: Path) -> str:
-    """The page for the models of a folder: those in it are shipped, those in its ``research`` are not."""
+    """The page (Markdown) for the models of a folder, which are shipped, and of its ``research``, which are not."""
     shipped, research = (
         sorted((variant for path in sorted(of.glob("*.onnx")) for variant in resolve(path)), key=str)
         for of in (folder, folder / "research")
@@ -33,9 +33,8 @@ def models_page(folder: Path) -> str:
         "# Models",
         "",
         *_prose(
-            "Written by `edgeperc-export models models` from the cards in the files. `edgeperc info NAME` prints "
-            "a card; "
-            "`edgeperc-export make NAME OUT --kitti KITTI --layouts KITTI_LABELS` trains a model again."
+            "Written by `edgeperc-export models models` from the cards in the files. `edgeperc info NAME` prints a "
+            "card; `edgeperc-export make NAME OUT --kitti KITTI --layouts KITTI_LABELS` trains a model again."
         ),
         "",
         *_shipped(shipped),
@@ -47,9 +46,8 @@ def models_page(folder: Path) -> str:
         "",
         *_prose(
             f"On the test drives ({', '.join(sorted(TEST_DRIVES))}), on which nothing was trained or chosen, and on "
-            "simulated scans. All figures are percentages. In brackets: 95 % bootstrap intervals over drives "
-            "(over scenes "
-            "for simulation), if two or more have the class. Do not average tables of real and simulated scans."
+            "simulated scans. All figures are percentages. In brackets: 95 % bootstrap intervals over drives (over "
+            "scenes for simulation), if two or more have the class. Do not average tables of real and simulated scans."
         ),
     ]
     for variant in shipped:
@@ -60,9 +58,8 @@ def models_page(folder: Path) -> str:
         "## Research models",
         "",
         *_prose(
-            "Teachers of the shipped models, the papers' own networks, and models trained on simulation alone. "
-            "They are "
-            "in the repository and the source distribution, not in the wheel; use one by its path, `--model "
+            "Teachers of the shipped models, the papers' own networks, and models trained on simulation alone. They "
+            "are in the repository and the source distribution, not in the wheel; use one by its path, `--model "
             "models/research/NAME.onnx`."
         ),
     ]
@@ -90,13 +87,13 @@ def _shipped(variants: Sequence[Variant]) -> Iterable[str]:
         "A name stands for one network and its variants. `Perceiver()` and `edgeperc run PATH` take "
         f"{' and '.join(f'`{name}`' for name in DEFAULT)}. `NAME:fp32` and `NAME:int8` ask for one variant."
     )
-    yield from _head("name", ["answers", "classes", "view", "files", "terms of the weights"])
+    yield from _head("name", ["task", "classes", "view", "files", "terms of the weights"])
     for name in dict.fromkeys(variant.name for variant in variants):
         own = [variant for variant in variants if variant.name == name]
         card = own[0].card
-        sees = "drivable area ahead" if not card.box_classes and card.view.kind == "top_view" else SEES[card.view.kind]
+        task = "drivable area ahead" if not card.box_classes and card.view.kind == "top_view" else TASKS[card.view.kind]
         files = ", ".join(f"{variant.precision} {_size(variant)}" for variant in own)
-        yield _row(f"`{name}`", sees, ", ".join(card.classes), _view(card), files, card.training.get("licence", "-"))
+        yield _row(f"`{name}`", task, ", ".join(card.classes), _view(card), files, card.training.get("licence", "-"))
 
 
 def _view(card: ModelCard) -> str:
@@ -113,12 +110,11 @@ def _view(card: ModelCard) -> str:
 def _precisions(variants: Sequence[Variant]) -> Iterable[str]:
     yield from ("", "## Precision", "")
     yield from _prose(
-        "How answers in each precision agree with fp32, after post-processing, on labeled real scans. `precision=auto` "
-        f"takes a reduced precision only if its loss (of mean IoU or of AP, whichever is larger) is at most {MAX_LOSS} "
-        "points and the processor has instructions for it: int8 on the CPU provider and OpenVINO (VNNI, AMX, or Arm's "
-        "dot product), bf16 on OpenVINO (AMX or AVX-512). `precision=fp32` forbids it. `perception.providers` "
-        "says what "
-        "ran."
+        "Agreement of each precision with fp32, after post-processing, on labeled real scans. "
+        "`precision=auto` takes a reduced precision only if its loss (of mean IoU or of AP, whichever is larger) is "
+        f"at most {MAX_LOSS} points and the processor has instructions for it: int8 on the CPU provider and OpenVINO "
+        "(VNNI, AMX, or Arm's dot product), bf16 on OpenVINO (AMX or AVX-512). `precision=fp32` forbids it. "
+        "`perception.providers` shows what ran."
     )
     yield from _head("model", ["equal labels", "mean IoU", "fp32", "AP50", "fp32", "loss", "scans", "measured with"])
     for variant in variants:
@@ -133,9 +129,8 @@ def _precisions(variants: Sequence[Variant]) -> Iterable[str]:
     yield ""
     yield from _prose(
         "Mean IoU is of points without background, or of vehicles and road. Made by "
-        f"{', '.join(f'`{command}`' for command in commands)}. Scans of SemanticKITTI are of a test drive; they "
-        "serve here "
-        "only to compare precisions of one network."
+        f"{', '.join(f'`{command}`' for command in commands)}. Scans of SemanticKITTI are of a test drive; they serve "
+        "here only to compare precisions of one network."
     )
 
 
@@ -146,15 +141,14 @@ def _free(research: Sequence[Variant]) -> Iterable[str]:
     options = " ".join(f"--model models/research/{variant.path.name}" for variant in reversed(free))
     yield from ("", "## Weights free of KITTI's terms", "")
     yield from _prose(
-        "The shipped models were trained on KITTI's scans, whose terms exclude commercial use. For commercial use take "
-        "the models that were trained on simulation alone, from the repository or the source distribution:"
+        "The shipped models were trained on KITTI's scans, whose terms exclude commercial use. For commercial use "
+        "take the models that were trained on simulation alone, from the repository or the source distribution:"
     )
     yield from ("", f"    edgeperc run PATH {options}", "")
     size = sum(variant.path.stat().st_size for variant in free) / 1e6
     yield from _prose(
         f"They are less accurate ({', '.join(variant.name for variant in free)} below). At {size:.1f} MB they are "
-        "larger "
-        "than all shipped models together, so the wheel leaves them out."
+        "larger than all shipped models together, so the wheel leaves them out."
     )
 
 
@@ -163,16 +157,15 @@ def _validation(path: Path) -> Iterable[str]:
     if not table:
         return
     rows = table["rows"]
-    yield from ("", "## How the names were given", "")
+    yield from ("", "## How the shipped models were chosen", "")
     yield from _prose(
-        f"A name went to the network that is most accurate on {rows[0]['n_scans']} scans of {len(VALIDATION_DRIVES)} "
-        "validation drives, which neither the training scans nor the test drives contain "
-        "(`edgeperc/evaluation/splits.py`); speed decides between equals. 107 of the scans are of one drive, "
-        "2011_09_26_drive_0001, with 12 cars, 2 cyclists and 1 tram, so the intervals over drives are wide. The "
-        "drives' "
-        "boxes, not their scans, are among the layouts of the simulated training scenes. Relative time: of the network "
-        "alone in stock onnxruntime, two threads, divided by that of the name's fp32 file, measured in turn on a busy "
-        "computer (`bench/RESULTS.md` has times)."
+        f"Each name belongs to the network that is most accurate on {rows[0]['n_scans']} scans of "
+        f"{len(VALIDATION_DRIVES)} validation drives. These drives are neither training nor test drives "
+        "(`edgeperc/evaluation/splits.py`). If two networks are equally accurate, the faster one is chosen. 107 of "
+        "the scans are of one drive, 2011_09_26_drive_0001, with 12 cars, 2 cyclists and 1 tram, so the intervals over "
+        "drives are wide. The drives' boxes, but not their scans, are among the layouts of the simulated training "
+        "scenes. Relative time: time of the network alone in stock onnxruntime with two threads, divided by the time "
+        "of the shipped fp32 file. Both were measured in turn on a busy computer (`bench/RESULTS.md` has times)."
     )
     for title, key, columns in (
         ("points", "points", ("car", "pedestrian", "cyclist")),
@@ -218,7 +211,7 @@ def _model(variant: Variant) -> Iterable[str]:
 
 
 def _recipe(recipe: Mapping[str, Any]) -> str:
-    """What differs from the defaults of `Recipe`."""
+    """The options that differ from the defaults of `Recipe`."""
     usual = {field.name: field.default for field in fields(Recipe)}
     return _flat({name: value for name, value in recipe.items() if name not in usual or value != usual[name]})
 
@@ -264,21 +257,19 @@ def _figures(figures: Mapping[str, Any], scans: str, bands: Sequence[str]) -> It
 
 
 def _by_band(rows: Mapping[str, Any], bands: Sequence[str]) -> Iterable[tuple[str, Any]]:
-    """In the order of the bands, which a card's sorted keys lose."""
+    """Rows in the order of the bands; a card sorts its keys."""
     return ((band, rows[band]) for band in BANDS if band in rows and band in bands)
 
 
 def _folds(rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
-    """Figures of models that were trained without one fold, on that fold."""
+    """Figures on one fold of models that were trained without it."""
     if not rows:
         return
-    yield from ("", "## Over folds", "")
+    yield from ("", "## Cross-validation", "")
     yield from _prose(
-        f"Each model was trained without one of the {len(FOLDS)} folds of the training drives, by "
-        "`edgeperc-export make "
-        "NAME OUT --fold K --steps N`, and evaluated on that fold, frames of grade A, with fewer steps and fewer "
-        "drives "
-        "than the model of the same name."
+        f"Each model was trained without one of the {len(FOLDS)} folds of the training drives, by `edgeperc-export "
+        "make NAME OUT --fold K --steps N`, and evaluated on frames of grade A of that fold. It had fewer steps and "
+        "fewer drives than the model of the same name."
     )
     for row in rows:
         made = f"{row['name']} without fold {row['fold']}, {row['steps']} steps of {row['batch']}"
@@ -291,9 +282,8 @@ def _ablations(rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
     yield from ("", "## Ablations", "")
     yield from _prose(
         "Short runs from the weights trained on simulation alone (LoDNN: from scratch), each with one change, "
-        "evaluated "
-        "on a fold that the run has not seen (`edgeperc-export ablate`): IoU of pixel labels, and AP50 of all vehicles "
-        "as one class."
+        "evaluated on a fold outside its training set (`edgeperc-export ablate`): IoU of pixel labels, and AP50 of "
+        "all vehicles as one class."
     )
     for network, fold, steps in sorted({(r["network"], r["fold"], r["steps"]) for r in rows}):
         here = [r for r in rows if (r["network"], r["fold"], r["steps"]) == (network, fold, steps)]

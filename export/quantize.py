@@ -1,9 +1,9 @@
 """The int8 variant of a model: written only if it is faster on this computer and as accurate.
 
-Weights become int8 per channel, activations uint8: of the pairs that onnxruntime's CPU provider supports, u8s8 has the
+Weights become int8 per channel, activations uint8. Of the pairs that onnxruntime's CPU provider supports, u8s8 has the
 fast kernels (u8u8 took twice as long). Scales come from the calibration scans and clip one value in ten thousand of
-each tensor: disagreement with fp32 with all convolutions of pointseg in int8 was 0.04, and 0.10 without clipping. The
-first and last convolutions stay in fp32, and so do those whose rounding changes labels and boxes most.
+each tensor. With all convolutions of pointseg in int8, the disagreement with fp32 was 0.04, and 0.10 without clipping.
+The first and last convolutions stay in fp32, and also those whose rounding changes labels and boxes most.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ from .to_onnx import with_golden, write_card
 
 __all__ = ["RefusedError", "calibration_scans", "quantize"]
 
-# What onnxruntime's CPU provider computes in eight bits. It has no such kernel for ConvTranspose, Elu or Equal.
+# Operators that onnxruntime's CPU provider computes in int8. It has no int8 kernel for ConvTranspose, Elu or Equal.
 ROUNDED_OPS = (
     *("Add", "Concat", "Conv", "DepthToSpace", "MaxPool", "Mul", "Relu", "Reshape", "Resize", "Sigmoid", "Transpose"),
 )
 FIRST_SEED = 3 * 10**9  # seeds of training start at 0, of parity scans at 10**9, of evaluation at 2 * 10**9
 N_PROBES = 8
 KEPT_PERCENT = 99.99
-# Of labels and boxes with the fp32 network's (`_disagreement`). With all convolutions in int8: pointseg 0.024, ssadnet
-# 0.079, both as accurate as in fp32; ssadnet-full 0.17, of which 0.16 is due to one convolution before its unpooling.
+# Limit of `_disagreement`. With all convolutions in int8: pointseg 0.024, ssadnet 0.079, both as accurate as in fp32;
+# ssadnet-full 0.17, of which 0.16 is due to one convolution before its unpooling.
 MAX_DISAGREEMENT = 0.1
 MAX_LOSS = 0.01
 N_RUNS = 40
@@ -79,6 +79,14 @@ def calibration_scans(
     kitti : Path or None
         Root of a KITTI object set; 64 scans of its training drives are taken, evenly spread.
     n_simulated : int
+        Number of simulated scans.
+
+    Returns
+    -------
+    scans : list of (n, 4) float32
+        The real scans first.
+    hashes : list of str
+        `edgeperc.evaluation.datasets.scan_hash` of each real scan.
 
     Raises
     ------
@@ -105,7 +113,7 @@ def calibration_scans(
 
 
 def _drive(file: Path) -> str | None:
-    """The KITTI drive of a scan; None if its folders do not say."""
+    """The KITTI drive of a scan; None if its folders do not show it."""
     file = file.resolve()
     if named := DRIVE.search(str(file)):
         return named[0]
@@ -116,12 +124,12 @@ def _drive(file: Path) -> str | None:
 
 
 def _saturates() -> bool:
-    """Whether this computer adds pairs of eight-bit products in sixteen bits: x86 without VNNI, or unknown x86."""
+    """Whether this computer adds pairs of 8-bit products in 16 bits, which may saturate: x86 without VNNI."""
     return platform.machine() in ("x86_64", "AMD64") and INT8_FEATURES.isdisjoint(cpu_features())
 
 
 def _folded(path: Path) -> onnx.ModelProto:
-    """The graph with its constants computed (weights kept in half precision are floats again) and a name a node."""
+    """The graph with folded constants (half-precision weights become fp32), and a name for every node."""
     with tempfile.TemporaryDirectory() as folder:
         options = onnxruntime.SessionOptions()
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
@@ -140,20 +148,21 @@ def _folded(path: Path) -> onnx.ModelProto:
 
 @dataclass(frozen=True)
 class _Calibrated:
-    """A network in fp32, the range of each of its tensors, and the fp32 answers to some images."""
+    """A network in fp32, the range of each of its tensors, and its outputs for some images."""
 
     card: ModelCard
     model: onnx.ModelProto
     ranges: Any
     images: Sequence[NDArray[np.float32]]
     returned: Sequence[NDArray[np.bool_]]  # cells of each image with a return
-    answers: Sequence[Mapping[str, NDArray[np.float32]]]
+    outputs: Sequence[Mapping[str, NDArray[np.float32]]]
     seven_bits: bool
 
     @classmethod
     def on(
         cls, path: Path, card: ModelCard, scans: Sequence[NDArray[np.float32]], seven_bits: bool = False
     ) -> _Calibrated:
+        """Calibrate the model of a file on scans."""
         model, projector = _folded(path), make_projector(card.view, card.input)
         views = [projector.project(np.ascontiguousarray(points)) for points in scans]
         images = [view.image[None] for view in views]
@@ -165,16 +174,16 @@ class _Calibrated:
                 extra_options={"percentile": KEPT_PERCENT},
             )
             with contextlib.redirect_stdout(io.StringIO()):  # the calibrator prints its progress
-                # One at a time: it keeps every tensor of a batch of scans in memory.
+                # One at a time, because the calibrator keeps every tensor of a batch in memory.
                 for image in tqdm(images, desc="calibrating", unit="scan"):
                     calibrator.collect_data(_Reader(iter([{card.input.name: image}])))
                 ranges = calibrator.compute_data()
         probed = views[:: max(1, len(views) // N_PROBES)][:N_PROBES]
         probes, returned = [view.image[None] for view in probed], [view.index >= 0 for view in probed]
-        return cls(card, model, ranges, probes, returned, _answers(model, card, probes), seven_bits)
+        return cls(card, model, ranges, probes, returned, _outputs(model, card, probes), seven_bits)
 
     def rounded(self, convolutions: Collection[str]) -> onnx.ModelProto:
-        """The network with these convolutions, and what lies between them, in eight bits."""
+        """The network with these convolutions, and the operators between them, in int8."""
         names = _between(self.model.graph, convolutions)
         model = onnx.ModelProto()
         model.CopyFrom(self.model)
@@ -198,7 +207,8 @@ class _Calibrated:
         return rounded
 
     def loss(self, convolutions: Collection[str]) -> float:
-        return _disagreement(self, _answers(self.rounded(convolutions), self.card, self.images))
+        """Disagreement with fp32 if these convolutions are in int8."""
+        return _disagreement(self, _outputs(self.rounded(convolutions), self.card, self.images))
 
 
 class _Reader:
@@ -224,7 +234,7 @@ def _between(graph: onnx.GraphProto, convolutions: Collection[str]) -> set[str]:
 def _unround(graph: onnx.GraphProto, rounded: Collection[str]) -> None:
     """Connect operators in fp32 directly to outputs in fp32, without rounding in between.
 
-    SSADNet's unpooling compares a tensor with its maxima: with one side rounded, few are equal.
+    SSADNet's unpooling compares a tensor with its maxima. With one side rounded, few values would be equal.
     """
     maker = {output: node for node in graph.node for output in node.output}
     origin = {}
@@ -238,7 +248,7 @@ def _unround(graph: onnx.GraphProto, rounded: Collection[str]) -> None:
             node.input[:] = [origin.get(name, name) for name in node.input]
 
 
-def _answers(
+def _outputs(
     model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]]
 ) -> list[dict[str, NDArray[np.float32]]]:
     """Raw outputs by kind, without the batch axis."""
@@ -247,21 +257,23 @@ def _answers(
     session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
     names, kinds = [o.name for o in card.outputs], [o.kind for o in card.outputs]
     runs = (session.run(names, {card.input.name: image}) for image in images)
-    return [{kind: answer[0] for kind, answer in zip(kinds, run, strict=True)} for run in runs]
+    return [{kind: output[0] for kind, output in zip(kinds, run, strict=True)} for run in runs]
 
 
-def _disagreement(fp32: _Calibrated, answers: Sequence[Mapping[str, NDArray[np.float32]]]) -> float:
+def _disagreement(fp32: _Calibrated, outputs: Sequence[Mapping[str, NDArray[np.float32]]]) -> float:
     """Distance of labels and boxes from the fp32 network's: 1 - min(mean IoU, AP)."""
     card, labels, boxes = fp32.card, Confusion(fp32.card.classes), BoxEvaluator(oriented=True)
-    for returned, here, there in zip(fp32.returned, answers, fp32.answers, strict=True):
+    for returned, actual, expected in zip(fp32.returned, outputs, fp32.outputs, strict=True):
         if card.view.kind == "top_view":
-            (mine, found), (theirs, wanted) = (
-                decode_top_view(card, returned, outputs, card.score_threshold) for outputs in (here, there)
+            (own_labels, own_boxes), (fp32_labels, fp32_boxes) = (
+                decode_top_view(card, returned, raw, card.score_threshold) for raw in (actual, expected)
             )
-            boxes.update(found, wanted)
+            boxes.update(own_boxes, fp32_boxes)
         else:
-            mine, theirs = (decode_classes(next(iter(o.values())), next(iter(o)))[0] for o in (here, there))
-        labels.update(mine, theirs)
+            own_labels, fp32_labels = (
+                decode_classes(next(iter(raw.values())), next(iter(raw)))[0] for raw in (actual, expected)
+            )
+        labels.update(own_labels, fp32_labels)
     return 1.0 - float(np.nanmin([labels.mean_iou(), boxes.overall().ap]))
 
 
@@ -283,7 +295,7 @@ def _candidates(graph: onnx.GraphProto, exclude: Collection[str]) -> list[str]:
 
 
 def _choose(fp32: _Calibrated, candidates: Sequence[str], limit: float) -> tuple[list[str], float]:
-    """The convolutions to round, and their loss: all, or as many as stay below the limit, the least harmful first.
+    """The convolutions to round, and their loss: all of them, or as many as the limit allows, the least harmful first.
 
     Takes at most n + log2(n) trials for n convolutions.
     """
@@ -306,7 +318,7 @@ def _choose(fp32: _Calibrated, candidates: Sequence[str], limit: float) -> tuple
 def race(
     one: Path, other: Path, n_threads: int | None, n_runs: int = N_RUNS
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times of two networks' runs [ms], taken in turn; the first run of each turn is a warm-up."""
+    """Times of the runs of two networks [ms], measured in turn; the first run of each turn is a warm-up."""
     sessions = [Session(path, "cpu", n_threads=n_threads) for path in (one, other)]
     times = np.empty((2, n_runs))
     for run in range(n_runs):
@@ -328,7 +340,7 @@ def _ratio(one: NDArray[np.float64], other: NDArray[np.float64]) -> tuple[float,
 
 
 def _scores(figures: Mapping[str, Any]) -> dict[str, float]:
-    """The IoU of each class of points and cells, and the AP of boxes, over all ranges."""
+    """IoU of each class of points and cells, and AP of boxes, over all ranges, by name."""
     scores = {}
     for block in ("real", "simulated"):
         of = figures.get(block, {})
@@ -358,7 +370,7 @@ def quantize(
     max_disagreement: float = MAX_DISAGREEMENT,
     race: Race = race,
 ) -> ModelCard:
-    """Write the int8 variant of a model, with its card and figures of its own.
+    """Write the int8 variant of a model, with its own card and figures.
 
     ``precision="auto"`` takes the variant only after `edgeperc_export.agree` has measured it.
 
@@ -369,7 +381,7 @@ def quantize(
     scans : sequence of (n, 4) float32
         To calibrate on, from `calibration_scans`.
     hashes : sequence of str
-        Of the real scans among them; the card lists them, so that the model is never evaluated on them.
+        Hashes of the real scans. The card lists them, so that the model is never evaluated on these scans.
     kitti : Path or None
         Root of a KITTI object set; both models are evaluated on its test drives.
     semantickitti : Path or None
@@ -377,8 +389,8 @@ def quantize(
     exclude : sequence of str
         Nodes to keep in fp32.
     seven_bits : bool or None
-        Use 7-bit weights. x86 without VNNI needs them, because its sums of 8-bit products saturate; None: only if this
-        computer does.
+        Use 7-bit weights. x86 without VNNI needs them, because its sums of 8-bit products saturate; None: if this
+        computer needs them.
     n_evaluated : int
         Number of simulated scans, other than those of the calibration, on which both models are evaluated.
     n_threads : int or None
@@ -395,8 +407,8 @@ def quantize(
     Raises
     ------
     RefusedError
-        The int8 model is not faster beyond the noise of the race, or an IoU or AP is more than a point lower. ``out``
-        is unchanged.
+        The int8 model is not faster (95 % interval of the ratio of times), or an IoU or AP is lower by more than one
+        point. ``out`` is unchanged.
     ModelError
         The model is not in fp32.
     PointsError, OptionError
@@ -414,7 +426,7 @@ def quantize(
     chosen, disagreement = _choose(fp32, candidates, max_disagreement)
     model = fp32.rounded(chosen)
     model.producer_name, model.producer_version = "edgeperc", ""
-    alone = [n.name for n in fp32.model.graph.node if n.op_type == "Conv" and n.name not in chosen]
+    kept = [n.name for n in fp32.model.graph.node if n.op_type == "Conv" and n.name not in chosen]
     training = dict(card.training)
     frames = training.get("frames")
     training |= {
@@ -423,7 +435,7 @@ def quantize(
             "from": f"{card.name} {card.version}",
             "graph_sha256": hashlib.sha256(onnx.load(path).graph.SerializeToString(deterministic=True)).hexdigest(),
             "calibration": f"{len(hashes)} real and {len(scans) - len(hashes)} simulated scans",
-            "left_alone": alone,
+            "left_alone": kept,
             "disagreement": disagreement,
             "weight_bits": 7 if seven_bits else 8,
         },
@@ -433,7 +445,7 @@ def quantize(
     trial = out.with_name(f".{out.name}.trial.onnx")
     try:
         write_card(model, card, trial)
-        share = f"{len(chosen)} of {len(chosen) + len(alone)} convolutions in int8"
+        share = f"{len(chosen)} of {len(chosen) + len(kept)} convolutions in int8"
         one, other = race(path, trial, n_threads)
         ratio, least, most = _ratio(one, other)
         speed = (
@@ -441,14 +453,18 @@ def quantize(
             f"{ratio:.2f} times as long ({least:.2f} to {most:.2f})"
         )
         if most >= 1.0:
-            raise RefusedError(f"{path}: not faster here with {share}: {speed}; the time must be shorter beyond noise")
+            raise RefusedError(f"{path}: not faster here with {share}: {speed}; expected an interval below 1")
         simulated = f"simulation:{n_evaluated}"
         given = {"KITTI": kitti, "SEMANTICKITTI": semantickitti, simulated: simulated}
         datasets = {name: root for name, root in given.items() if root is not None}
         figures, before = (evaluate([*datasets.values()], [each])[0] for each in (trial, path))
-        mine, theirs = _scores(figures), _scores(before)
-        lost = {name: theirs[name] - mine.get(name, 0.0) for name in theirs}
-        worse = [f"{name} {theirs[name]:.3f} to {mine.get(name, 0.0):.3f}" for name in lost if lost[name] > MAX_LOSS]
+        int8_scores, fp32_scores = _scores(figures), _scores(before)
+        lost = {name: score - int8_scores.get(name, 0.0) for name, score in fp32_scores.items()}
+        worse = [
+            f"{name} {fp32_scores[name]:.3f} to {int8_scores.get(name, 0.0):.3f}"
+            for name in lost
+            if lost[name] > MAX_LOSS
+        ]
         if worse:
             raise RefusedError(f"{path}: more than {MAX_LOSS} lost with {share}: {'; '.join(worse)} ({speed})")
         figures["command"] = " ".join(["edgeperc eval", *datasets, f"--model {out.name}"])
@@ -461,7 +477,7 @@ def quantize(
 
 
 def _parity(path: Path, rounded: Path) -> dict[str, float]:
-    """Least agreement of pixel labels with the fp32 model's, on simulated scans that neither was made with."""
+    """Smallest share of pixels with the same label as in fp32, on simulated scans outside training and calibration."""
     sessions, scans, agreement = [Session(each, "cpu") for each in (path, rounded)], parity_scans([]), 1.0
     card = sessions[0].card
     projector = make_projector(card.view, card.input)

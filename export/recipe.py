@@ -13,8 +13,8 @@ TASKS: Mapping[str, tuple[str, ...]] = {
     "vehicles": ("ssadnet",),
     "road": ("lodnn",),
 }
-"""Networks by what they learn: a class for every point (range image), or from the top view vehicles and drivable
-ground, or drivable ground alone."""
+"""Task -> its networks. Points: a class for every point of a range image. Vehicles: vehicles and drivable area in a
+top view. Road: drivable area alone."""
 
 NETWORKS = tuple(sorted(network for networks in TASKS.values() for network in networks))
 EDGE_NETWORKS = ("lodnn", "pointseg", "ssadnet")
@@ -27,7 +27,7 @@ def task_name(network: str) -> str:
     Raises
     ------
     ValueError
-        There is no such network.
+        The network is unknown.
     """
     for task, networks in TASKS.items():
         if network in networks:
@@ -38,7 +38,7 @@ def task_name(network: str) -> str:
 def _option(
     default: Any, text: str, networks: tuple[str, ...] = NETWORKS, *, edge: bool = True, choices: tuple[str, ...] = ()
 ) -> Any:
-    """A field that `edgeperc-export train` offers for these networks; ``edge``: for their small versions too."""
+    """A field that is an option of ``train`` for these networks; ``edge``: for their small versions too."""
     return field(default=default, metadata={"help": text, "networks": networks, "edge": edge, "choices": choices})
 
 
@@ -147,7 +147,7 @@ PLAIN: Mapping[str, Any] = {
     "ema": 0.0,
     "batch_norm": False,
 }
-"""Nothing that the papers do not mention."""
+"""Settings that switch off everything that the papers do not mention."""
 
 PAPER = {
     # SSADNet 3.2: Adam, 1e-5, halved after 100 epochs without improvement; batch 8; cross-entropy and 0.1 x MSE.
@@ -157,9 +157,10 @@ PAPER = {
     # PointSeg 5: Adagrad, 1e-3, batch 32, 50,000 steps.
     "pointseg": Recipe("pointseg", optimizer="adagrad", learning_rate=1e-3, batch=32, steps=50_000, **PLAIN),
     # LoDNN-I (Electronics 12, 3165) 3.3 to 3.6: cross-entropy on drawn roads, augmented; 22 epochs; the learning rate
-    # is lowered when the validation figure stops improving. The paper prints its rate as "1 x 10^-x" and its batch as
-    # the largest tried: this takes Adam's usual rate, and 16. 22 epochs of 300 scenes, each in eight variations, are
-    # 3,300 steps of 16. The authors drew 300 scenes; here there are nine, and the certain cells of the other scans.
+    # is lowered when the validation figure stops improving. The paper prints the rate as "1 x 10^-x" and the batch size
+    # as the largest tried; here they are Adam's default rate and 16. 22 epochs of 300 scenes, each in eight variations,
+    # are 3,300 steps of 16. The authors drew 300 scenes. Here nine are drawn; the other scans have the ground truth of
+    # `roads.sure_surface`.
     "lodnn": Recipe(
         "lodnn",
         optimizer="adam",
@@ -171,7 +172,7 @@ PAPER = {
         **{**PLAIN, "augment": True},
     ),
 }
-"""The papers' own recipes; what they do not mention is left out."""
+"""The papers' own recipes, without what the papers do not mention (`PLAIN`)."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +186,7 @@ class Stage:
     after : str or None
         The model whose weights the run starts from.
     teacher : str or None
-        The model that the run distils from.
+        The model that the run is distilled from.
     """
 
     recipe: Recipe
@@ -193,18 +194,18 @@ class Stage:
     teacher: str | None = None
 
 
-# From random weights, distilling from the first step; the focal loss is SqueezeSegV2's.
+# From random weights, distilled from the first step; the focal loss is SqueezeSegV2's.
 KULSEG = Recipe("kulseg", steps=3600, batch=4, focal_gamma=2.0, distil=1.0, seen_twice=False)
 
-# Batches of four: twice the steps for as many scans, and better figures. No dropout: a network that sees so few scans
-# does not need it, and it disturbs batch norm.
+# Batches of four instead of eight: twice the steps for the same number of scans, and better figures. No dropout: with
+# so few training scans the network does not need it, and it disturbs batch norm.
 SSADNET = Recipe("ssadnet", batch=4, learning_rate=1.5e-3, context_width=64, n_pasted=3.0, dropout=0.0)
 
 EDGE = Recipe("ssadnet", edge=True, steps=6000, batch=4, learning_rate=3e-3, cooldown=0.2, n_pasted=3.0)
 
 DISTILLED = replace(EDGE, steps=1000, learning_rate=1e-3, cooldown=0.4, distil=1.0, seen_twice=False)
 
-# LoDNN-I's structure at a quarter of the resolution, distilling from the start from the network that finds roads best.
+# LoDNN-I's structure at a quarter of the resolution, distilled from the start from the network with the best roads.
 LODNN = Recipe(
     "lodnn",
     edge=True,
@@ -229,8 +230,8 @@ MODELS = {
     "ssadnet-full": Stage(replace(SSADNET, steps=2000), after="ssadnet-sim"),
     # With the segmentation branch of ssadnet-full, so that the two heads can be compared.
     "ssadnet-paper": Stage(replace(SSADNET, head="slots", head_only=True, steps=1000), after="ssadnet-full"),
-    # A step of a small network takes a quarter of a full one's time, a step with a teacher as long as the full one's:
-    # so first many steps on labels alone, then some with a teacher too.
+    # A training step of a small network takes a quarter of the time of a full one; with a teacher it takes as long as a
+    # full one. So the first run has many steps on labels alone, and the second has few steps with a teacher.
     "pointseg-start": Stage(replace(EDGE, network="pointseg", n_pasted=6.0)),
     "pointseg": Stage(
         replace(DISTILLED, network="pointseg", n_pasted=6.0, steps=1600), "pointseg-start", "pointseg-full"
@@ -239,4 +240,4 @@ MODELS = {
     "ssadnet-start": Stage(EDGE),
     "ssadnet": Stage(DISTILLED, "ssadnet-start", "ssadnet-full"),
 }
-"""The training run of every model, by name; those called ``-start`` are intermediate."""
+"""The training run of every model, by name; names that end in ``-start`` are intermediate results."""

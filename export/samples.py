@@ -1,4 +1,4 @@
-"""Training samples: scans drawn, augmented and projected."""
+"""Training samples: scans drawn at random, augmented and projected."""
 
 from __future__ import annotations
 
@@ -59,23 +59,23 @@ class Samples:
         self.simulated_share = share if simulated else 0.0
         self.bank: ObjectBank | None = None
         if recipe.n_pasted > 0.0:
-            every = max(1, len(simulated) // BANK_SCANS)
-            self.bank = ObjectBank.of([*real, *(LabeledScan.load(path) for path in simulated[::every])])
+            stride = max(1, len(simulated) // BANK_SCANS)
+            self.bank = ObjectBank.of([*real, *(LabeledScan.load(path) for path in simulated[::stride])])
 
     def batch(self, step: int) -> Targets:
-        """Inputs (B, C, H, W) and targets of one step. The same step always gives the same batch."""
+        """Inputs (B, C, H, W) float32 and targets of one step. The same step always gives the same batch."""
         rng = np.random.default_rng((self.recipe.seed, step))
         drawn = [self.sample(self._drawn(rng)) for _ in range(self.recipe.batch)]
         return tuple(np.stack(parts) for parts in zip(*drawn, strict=True))
 
     def project(self, scan: LabeledScan) -> Projection:
-        """A scan as the network sees it."""
+        """A scan projected into the network's view."""
         return self.projector.project(np.ascontiguousarray(scan.points, np.float32))
 
     def sample(self, scan: LabeledScan) -> Targets:
-        """One input (C, H, W) and its targets."""
-        seen = self.project(scan)
-        return seen.image, *self.task.target(scan, seen)
+        """One input (C, H, W) float32 and its targets."""
+        projected = self.project(scan)
+        return projected.image, *self.task.target(scan, projected)
 
     def _drawn(self, rng: np.random.Generator) -> LabeledScan:
         recipe, odds = self.recipe, dict(self.task.paste_odds)
@@ -107,7 +107,7 @@ class Samples:
 
 
 class RealScans(NamedTuple):
-    """Real scans labeled otherwise than in KITTI's files, for instance with hand-drawn roads.
+    """Real scans with labels that are not in KITTI's files, for instance hand-drawn roads.
 
     Attributes
     ----------
@@ -127,7 +127,23 @@ class RealScans(NamedTuple):
 def real_scans(
     kitti: KittiObjects, names: Sequence[str], *, drawn: bool = False
 ) -> tuple[list[LabeledScan], list[float], dict[str, str]]:
-    """Labeled scans, how often to draw each, and the hash of each; ``drawn``: with the hand-drawn roads."""
+    """Read labeled scans of KITTI.
+
+    Parameters
+    ----------
+    kitti : KittiObjects
+    names : sequence of str
+    drawn : bool
+        Replace the ground truth by the hand-drawn road where a scan has one.
+
+    Returns
+    -------
+    scans : list of LabeledScan
+    weights : list of float
+        How often to draw each scan, relative to the others.
+    hashes : dict of str to str
+        Name of each scan -> its `edgeperc.evaluation.datasets.scan_hash`.
+    """
     scans: list[LabeledScan] = []
     weights: list[float] = []
     hashes: dict[str, str] = {}
@@ -140,7 +156,8 @@ def real_scans(
         if digest in roads:
             scan = replace(scan, surface=with_road(scan.surface, roads[digest]))
         scans.append(scan)
-        # A drive weighs the square root of its number of frames: 154 neighboring frames are not 154 scenes. A scan
-        # with a drawn road weighs as much as a drive with one frame, because its ground is known everywhere.
+        # The weight of a drive is the square root of its number of frames, because neighboring frames look alike (a
+        # drive has up to 154). A scan with a drawn road weighs as much as a drive with one frame, because its ground is
+        # known everywhere.
         weights.append(1.0 if digest in roads else drives.count(frame.drive) ** -0.5)
     return scans, weights, hashes

@@ -31,6 +31,7 @@ class LabeledScan:
     Attributes
     ----------
     points : (n, 4) float32
+        x, y, z [m] in the sensor frame, remission.
     labels : (n,) uint8
         PointSeg's classes, `IGNORE` where unknown.
     boxes : tuple of Box
@@ -39,11 +40,11 @@ class LabeledScan:
     surface : (500, 500) uint8
         0 background, 1 drivable, `IGNORE` unknown, over `SURFACE`, as it was before ``turn`` and ``mirrored``.
     azimuths : tuple of 2 float
-        Least and largest azimuth of the labeled sector [rad], counterclockwise from +x.
+        Smallest and largest azimuth of the labeled sector [rad], counterclockwise from +x.
     turn : float
         Angle by which the points were turned about +z [rad].
     mirrored : bool
-        Whether left and right were then swapped.
+        Whether left and right were swapped after that turn.
     """
 
     points: NDArray[np.float32]
@@ -104,13 +105,16 @@ class LabeledScan:
             )
 
     def labeled(self, geometry: TopViewGeometry) -> NDArray[np.bool_]:
-        """Cells of the labeled sector, (rows, cols) bool."""
+        """Whether each cell is in the labeled sector, (rows, cols) bool."""
         x, y = geometry.cell_centers()
         azimuth = np.arctan2(y, x)
         return (azimuth >= self.azimuths[0]) & (azimuth <= self.azimuths[1])
 
     def top_view_truth(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
-        """SSADNet's segmentation truth (3.1.2): the surface, and over it vehicles; `IGNORE` where unknown."""
+        """SSADNet's segmentation truth (3.1.2), (rows, cols) uint8: the surface with the vehicles drawn over it.
+
+        `IGNORE` where it is unknown.
+        """
         x, y = geometry.cell_centers()
         if self.mirrored:
             y = -y

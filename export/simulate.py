@@ -1,4 +1,4 @@
-"""Simulated scans to train on, and the scans that an export is proven and described by."""
+"""Simulated scans: to train on, to verify an export on, and to describe the expected input in its card."""
 
 from __future__ import annotations
 
@@ -20,9 +20,18 @@ __all__ = ["fitness_of", "parity_scans", "simulate"]
 
 
 def simulate(out: Path, n: int, *, first: int = 0, layouts_root: Path | None = None, sensor: str = "hdl-64e") -> None:
-    """Write ``n`` labeled scans into ``out``; with ``layouts_root``, every other one has the boxes of a real scan.
+    """Write ``n`` labeled scans into ``out``. Existing files are kept, so a stopped run resumes.
 
-    Existing files are kept, so a stopped run resumes.
+    Parameters
+    ----------
+    out : Path
+    n : int
+    first : int
+        Number and seed of the first scan.
+    layouts_root : Path, optional
+        Folder of KITTI's labels; every other scene gets the boxes of one of its scans.
+    sensor : str
+        Name of the sensor to simulate.
     """
     out.mkdir(parents=True, exist_ok=True)
     real = list(layouts(layouts_root)) if layouts_root else []
@@ -35,12 +44,15 @@ def simulate(out: Path, n: int, *, first: int = 0, layouts_root: Path | None = N
 
 
 def parity_scans(paths: Sequence[Path]) -> list[NDArray[np.float32]]:
-    """Scans to prove an export on: the given files, and four simulated scans that are in no training set."""
+    """Scans to verify an export on: the given files, and four simulated scans that are in no training set."""
     return [read_points(p) for p in paths] + [simulated_scan(10**9 + k).points for k in range(4)]
 
 
 def fitness_of(kitti: Path | None) -> FitnessProfile:
-    """The profile of the training scans, for the check of inputs: KITTI's, or simulated ones without ``kitti``."""
+    """The fitness profile of the training scans: KITTI's, or, if ``kitti`` is None, 32 simulated ones.
+
+    At runtime, inputs are compared with it.
+    """
     if kitti is None:
         return FitnessProfile.from_scans(simulated_scan(10**9 + k).points for k in range(32))
     objects = KittiObjects(kitti)

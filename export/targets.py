@@ -13,7 +13,7 @@ STRIDE = 4
 """Top-view cells along the edge of one output cell of head "dense"."""
 REGRESSED_FROM = 0.5
 """Cells with at least this heat learn the box's geometry, weighted by the heat. The detected peak may be a neighbor of
-the true one, whose geometry must then be correct too."""
+the true one, so the neighbors' geometry must be correct too."""
 
 
 def slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> NDArray[np.float32]:
@@ -70,14 +70,21 @@ def dense_targets(
     labeled : (height, width) bool, optional
         False in cells where boxes are not labeled, such as outside the camera's view.
     unsure : (k, 7) array_like, optional
-        Boxes that need not be found but may, such as those without returns.
+        Boxes that count neither as found nor as missed, such as those without returns. Cells near them are not
+        learned.
 
     Returns
     -------
     (9, height/4, width/4) float32
-        Channel 0: 1 in the output cell that holds a box's center, falling off as a Gaussian shaped like the box (its
-        edges are three standard deviations away); -1 in cells that are not learned. Channels 1 to 8: the geometry of
-        the box with the highest heat, in the format of box_dense, where that heat is at least `REGRESSED_FROM`; else 0.
+        Channel 0, the heat: 1 in the output cell that holds a box's center; around it a Gaussian shaped like the box,
+        whose edges are three standard deviations away; -1 in cells that are not learned. Channels 1 to 8: the geometry
+        of the box with the highest heat, in the format of box_dense, where that heat is at least `REGRESSED_FROM`; else
+        0.
+
+    Raises
+    ------
+    ValueError
+        A length, width or height is not positive.
     """
     height, width = view.height // STRIDE, view.width // STRIDE
     target = np.zeros((9, height, width), np.float32)
@@ -127,6 +134,6 @@ def _gaussian(
     left = int(col) - np.arange(shape[1])[None, :]
     cos, sin = np.cos(box[6]), np.sin(box[6])
     along, across = cos * forward + sin * left, cos * left - sin * forward
-    # At least half a cell wide: a bump of a single cell would be hard to hit.
+    # At least half a cell: a peak of a single cell would be hard to learn.
     sigma_along, sigma_across = max(box[3] / cell_m / 6.0, 0.5), max(box[4] / cell_m / 6.0, 0.5)
     return np.exp(-0.5 * ((along / sigma_along) ** 2 + (across / sigma_across) ** 2)).astype(np.float32)

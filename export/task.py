@@ -1,7 +1,7 @@
-"""What a network learns: classes of points, or vehicles and drivable ground seen from above, or drivable ground alone.
+"""Tasks of networks: classes of points, vehicles and drivable area in a top view, or drivable area alone.
 
-A task knows its view, input and classes, makes the training targets of a scan, and computes the loss and the validation
-figures of a network's outputs. Only `networks.build`, which makes the network, depends on more than the task.
+A task has a view, an input and classes. It makes the training targets of a scan, and computes the loss and the
+validation figures of a network's outputs. All code but `networks.build` depends on the task, not on the network's name.
 """
 
 from __future__ import annotations
@@ -35,20 +35,21 @@ __all__ = ["Outputs", "Points", "Road", "Tally", "Targets", "Task", "Vehicles", 
 Outputs: TypeAlias = "Tensor | tuple[Tensor, Tensor]"
 """What a network returns: logits (B, C, H, W), or logits and boxes, or PointSeg's logits and early logits."""
 Targets: TypeAlias = "tuple[NDArray[Any], ...]"
+"""Labels (H, W) uint8, and box targets if the network has boxes; in a batch, stacked along a new first axis."""
 
 # Vehicles are 4 % of the labeled pixels, pedestrians and cyclists 0.2 %.
 POINT_WEIGHTS = (1.0, 2.0, 4.0, 4.0)
 TOP_VIEW_WEIGHTS = (1.0, 1.0, 2.0, 4.0, 4.0)
 
-# The paper's weight of its slots (Table 2). The dense head's loss is a sum for each box and ten times the
-# segmentation's, which is a mean over cells.
+# Slots: the paper's weight (Table 2). Dense: this head's loss, a sum for each box, is about ten times as large as the
+# segmentation's, a mean over cells.
 BOX_WEIGHT = {"slots": 0.1, "dense": 0.2}
 N_SLOTS = 16
 
 
 @dataclass
 class Tally:
-    """A network's labels and boxes, counted against the truth.
+    """Counts of a network's labels and boxes compared with the ground truth.
 
     Attributes
     ----------
@@ -75,7 +76,7 @@ class Tally:
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """A recipe's network, seen from the data: what goes in, what it should answer, and how wrong it is.
+    """The task of a recipe's network: its input, targets, loss and validation.
 
     Attributes
     ----------
@@ -85,7 +86,8 @@ class Task(ABC):
     paste_odds : mapping of str to float
         How often each kind of object is pasted into a training scan.
     swaps_sectors : bool
-        Whether a sector of another scan may replace the scan's own: its boxes and its ground are not replaced with it.
+        Whether a sector of a scan may be replaced by another scan's. This replaces points and their labels, but
+        neither boxes nor the ground.
     """
 
     recipe: Recipe
@@ -109,26 +111,26 @@ class Task(ABC):
         return self.card.classes
 
     @abstractmethod
-    def target(self, scan: LabeledScan, seen: Projection) -> Targets:
-        """What the network should answer to a scan: labels (H, W) uint8, `IGNORE` where unknown, and any box targets.
+    def target(self, scan: LabeledScan, projected: Projection) -> Targets:
+        """The targets of a scan: labels (H, W) uint8, `IGNORE` where unknown, and box targets if the network has boxes.
 
-        ``seen`` is the scan's projection into `view`.
+        ``projected`` is the scan's projection into `view`.
         """
 
     @abstractmethod
     def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
-        """The loss of a batch: a network's outputs against the stacked targets of `target`."""
+        """The loss of a batch: a network's outputs compared with the stacked targets of `target`."""
 
     def distillation(self, outputs: Outputs, probabilities: Tensor, boxes: Tensor | None) -> Tensor:
-        """The loss of a batch towards a teacher's class probabilities (B, C, H, W) and boxes."""
+        """The distillation loss of a batch towards a teacher's class probabilities (B, C, H, W) and boxes."""
         return distillation_loss(_logits(outputs), probabilities)
 
     def tally(self) -> Tally:
-        """Counts of nothing yet, for `judge` to add to."""
+        """An empty tally, for `count` to add to."""
         return Tally(Confusion(self.classes))
 
-    def judge(self, outputs: Outputs, seen: Projection, targets: Targets, scan: LabeledScan, tally: Tally) -> None:
-        """Add the outputs for one scan, a batch of one, to a tally."""
+    def count(self, outputs: Outputs, projected: Projection, targets: Targets, scan: LabeledScan, tally: Tally) -> None:
+        """Add the outputs for one scan (a batch of one) to a tally."""
         tally.pixels.update(_logits(outputs)[0].argmax(0).cpu().numpy(), targets[0])
 
 
@@ -138,12 +140,12 @@ class Points(Task):
     paste_odds: ClassVar[Mapping[str, float]] = {"pedestrian": 0.4, "cyclist": 0.35, "van": 0.15, "truck": 0.1}
     swaps_sectors = True
 
-    def target(self, scan: LabeledScan, seen: Projection) -> Targets:
+    def target(self, scan: LabeledScan, projected: Projection) -> Targets:
         """The label of the point in each pixel."""
-        return (np.append(scan.labels, np.uint8(IGNORE))[seen.index],)  # the index of an empty pixel is -1
+        return (np.append(scan.labels, np.uint8(IGNORE))[projected.index],)  # the index of an empty pixel is -1
 
     def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
-        """`pointseg_loss`; under deep supervision of the early logits too."""
+        """`pointseg_loss`; with deep supervision, plus that of the early logits."""
         recipe, (labels,) = self.recipe, targets
         weights = torch.tensor(POINT_WEIGHTS, device=labels.device) if recipe.class_weights else None
 
@@ -154,7 +156,7 @@ class Points(Task):
         if isinstance(outputs, Tensor):
             return one(outputs, labels)
         logits, early = outputs
-        # One column of every four: labels have no mean.
+        # Every fourth column, because labels cannot be averaged.
         coarse = labels[:, :, 1 :: labels.shape[2] // early.shape[3]]
         return one(logits, labels) + recipe.deep_supervision * one(early, coarse)
 
@@ -164,8 +166,8 @@ class Vehicles(Task):
 
     paste_odds: ClassVar[Mapping[str, float]] = {"car": 0.3, "van": 0.4, "truck": 0.3}
 
-    def target(self, scan: LabeledScan, seen: Projection) -> Targets:
-        """Class of each cell; slots or dense maps of the vehicles."""
+    def target(self, scan: LabeledScan, projected: Projection) -> Targets:
+        """The class of each cell, and slots or dense maps of the vehicles."""
         view, kinds = _top_view(self.card), self.card.box_classes
         vehicles = [(box, n) for box, n in zip(scan.boxes, scan.counts, strict=True) if box.label in kinds]
         to_find, unclear = (
@@ -197,15 +199,15 @@ class Vehicles(Task):
         return loss
 
     def tally(self) -> Tally:
-        """Counts of nothing yet, for labels and boxes."""
+        """An empty tally of labels and boxes."""
         return Tally(Confusion(self.classes), BoxEvaluator())
 
-    def judge(self, outputs: Outputs, seen: Projection, targets: Targets, scan: LabeledScan, tally: Tally) -> None:
+    def count(self, outputs: Outputs, projected: Projection, targets: Targets, scan: LabeledScan, tally: Tally) -> None:
         """Labels and boxes as the runtime decodes them; boxes count where the scan is labeled."""
         view = _top_view(self.card)
         kinds = [output.kind for output in self.card.outputs]
-        answers = {kind: output[0].cpu().numpy() for kind, output in zip(kinds, outputs, strict=True)}
-        labels, found = decode_top_view(self.card, seen.index >= 0, answers, self.card.score_threshold)
+        raw = {kind: output[0].cpu().numpy() for kind, output in zip(kinds, outputs, strict=True)}
+        labels, found = decode_top_view(self.card, projected.index >= 0, raw, self.card.score_threshold)
         tally.pixels.update(labels, targets[0])
         labeled = scan.labeled(view)
 
@@ -221,11 +223,11 @@ class Vehicles(Task):
 
 
 class Road(Task):
-    """Drivable or not, for every cell of a top view; the ground under a vehicle is not."""
+    """Whether each cell of a top view is drivable; ground under a vehicle is not."""
 
     paste_odds = Vehicles.paste_odds
 
-    def target(self, scan: LabeledScan, seen: Projection) -> Targets:
+    def target(self, scan: LabeledScan, projected: Projection) -> Targets:
         """1 for drivable cells, 0 for others."""
         truth = scan.top_view_truth(_top_view(self.card))
         return (np.where(truth == IGNORE, IGNORE, truth == 1).astype(np.uint8),)
@@ -235,7 +237,7 @@ class Road(Task):
         return road_loss(_logits(outputs), targets[0], self.recipe.lovasz_weight)
 
     def distillation(self, outputs: Outputs, probabilities: Tensor, boxes: Tensor | None) -> Tensor:
-        """Towards the teacher's drivable class against all its others, vehicles among them."""
+        """Towards the teacher's drivable class; all its other classes, vehicles included, count as one."""
         drivable = probabilities[:, 1]
         return distillation_loss(_logits(outputs), torch.stack([1.0 - drivable, drivable], dim=1))
 

@@ -1,7 +1,7 @@
-"""What a trained network teaches another: labels for unlabeled points, and class probabilities to distil.
+"""A teacher network's outputs as training targets: labels for unlabeled points, and class probabilities to distil from.
 
-KITTI labels what its camera sees, and some scans not at all, but each scan holds the street on all sides. A teacher
-labels the points that it is sure of (pseudo-labels; Lee, 2013); all others stay unknown.
+KITTI labels only what its camera sees, and some scans not at all, but each scan covers the street on all sides. The
+teacher labels the points whose class it is sure of (pseudo-labels; Lee, 2013); all others stay unknown.
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ from .task import Task
 __all__ = ["pseudo_labeled", "teach", "unlabeled_scans"]
 
 SURE = 0.9
+"""Smallest probability of a pseudo-label."""
 
-# The view covers 90 degrees. These directions overlap, so that no object is seen at the edge of a view alone.
-LOOKS = np.radians([0.0, 80.0, 160.0, 200.0, 280.0])
+# The view covers 90 degrees. The directions overlap, so that no object lies only at the edge of a view.
+DIRECTIONS = np.radians([0.0, 80.0, 160.0, 200.0, 280.0])
 
 
 def unlabeled_scans(objects: KittiObjects, fold: int | None) -> list[LabeledScan]:
-    """The unlabeled scans of the training drives."""
+    """The unlabeled scans of the training drives without those of ``fold``; every label is `IGNORE`."""
     scans = []
     for name in objects.unlabeled("train", fold=fold):
         points = read_points(objects.root / "training/velodyne" / f"{name}.bin")
@@ -46,52 +47,53 @@ def unlabeled_scans(objects: KittiObjects, fold: int | None) -> list[LabeledScan
 def pseudo_labeled(
     network: nn.Module, task: Task, scans: Iterable[LabeledScan], sure: float = SURE
 ) -> list[LabeledScan]:
-    """The scans with labels on all sides.
+    """The scans, labeled by a network on all sides.
 
     Parameters
     ----------
     network : nn.Module
-        Labels points.
+        A network that labels points.
     task : Task
-        The network's own.
+        The network's task.
     scans : iterable of LabeledScan
         Their own labels are kept.
     sure : float
-        Other points take the network's label if its probability is at least this.
+        An unlabeled point gets the network's label if its probability is at least this.
     """
     projector = make_projector(task.view, task.input)
     network.eval()
-    done = []
+    labeled = []
     for scan in tqdm(list(scans), desc="labeling", leave=False):
         labels = scan.labels.copy()
-        for angle in LOOKS:
-            seen = projector.project(np.ascontiguousarray(turned(scan, float(angle)).points))
+        for angle in DIRECTIONS:
+            projected = projector.project(np.ascontiguousarray(turned(scan, float(angle)).points))
             with torch.no_grad():
-                p = network(torch.from_numpy(seen.image[None])).float().softmax(1)[0].numpy()
+                p = network(torch.from_numpy(projected.image[None])).float().softmax(1)[0].numpy()
             best: NDArray[np.uint8] = p.argmax(0).astype(np.uint8)
-            trusted = (p.max(0) >= sure) & (seen.index >= 0)
-            at = seen.index[trusted]
+            trusted = (p.max(0) >= sure) & (projected.index >= 0)
+            at = projected.index[trusted]
             labels[at] = np.where(labels[at] == IGNORE, best[trusted], labels[at])
-        done.append(replace(scan, labels=labels, azimuths=(-np.pi, np.pi)))
-    return done
+        labeled.append(replace(scan, labels=labels, azimuths=(-np.pi, np.pi)))
+    return labeled
 
 
 @torch.no_grad()
 def teach(network: nn.Module, image: Tensor, inputs: InputSpec, *, mirror: bool) -> tuple[Tensor, Tensor | None]:
-    """A network's class probabilities (B, C, H, W) for a batch of inputs, and its boxes if it has any.
+    """A network's class probabilities (B, C, H, W) for a batch of inputs, and its boxes or None.
 
-    ``mirror`` averages the probabilities over each scene and its mirror image, in which a channel y changes its sign.
+    ``mirror`` averages the probabilities over each scene and its mirror image. In the mirror image, the channel y
+    changes its sign.
     """
     with torch.autocast(image.device.type, torch.bfloat16):
-        answer = network(image)
-        logits, boxes = answer if isinstance(answer, tuple) else (answer, None)
+        outputs = network(image)
+        logits, boxes = outputs if isinstance(outputs, tuple) else (outputs, None)
         p = logits.float().softmax(1)
         if mirror:
             mirrored = image.flip(-1)
             if "y" in inputs.channels:
                 mirrored = mirrored.clone()
                 mirrored[:, inputs.channels.index("y")] *= -1.0
-            answer = network(mirrored)
-            other = answer[0] if isinstance(answer, tuple) else answer
+            outputs = network(mirrored)
+            other = outputs[0] if isinstance(outputs, tuple) else outputs
             p = 0.5 * (p + other.float().softmax(1).flip(-1))
     return p, boxes

@@ -1,7 +1,7 @@
-"""torch -> ONNX with a card, and the proof that nothing changed on the way.
+"""Export of a torch network to ONNX with a card, and verification of the file.
 
-A file is written only when onnxruntime, through the whole runtime, gives the network's own answers: raw outputs within
-`MAX_DEVIATION`, the same labels and boxes after post-processing, on every scan tried.
+A file is written only if onnxruntime reproduces the torch network's outputs on every scan tried: raw outputs within
+`MAX_DEVIATION`, and the same labels and boxes after post-processing.
 """
 
 from __future__ import annotations
@@ -35,29 +35,30 @@ from .recipe import Recipe
 __all__ = ["ParityError", "export", "load", "to_graph", "verify", "with_golden", "write_card"]
 
 OPSET = 18
-# fp32 convolutions summed in another order were seen to differ by 1e-4 of the outputs' deviation; a wrong operator
-# differs by 0.1 and more.
+# In standard deviations of the output. Measured: 1e-4 for fp32 convolutions summed in another order, and 0.1 or more
+# for a wrong operator.
 MAX_DEVIATION = 0.03
-# Where the two largest of a pooling window are equal but for rounding, unpooling may put one in the other's place, and
-# the cells around it differ, by 0.011 in a trained network and by 0.5 in one of random weights. Such places are few.
+# Quantile of the differences that is compared. If the two largest values of a pooling window differ by rounding only,
+# unpooling may swap their places. The cells around them then differ by 0.011 in a trained network, and by 0.5 with
+# random weights. Such places are few.
 COMPARED = 0.999
-# Rounding weights moved 0.07 % of an untrained network's labels, which lie close, and 0.006 % of a trained one's.
+# Weights in half precision changed 0.07 % of the labels of an untrained network, whose logits are close to each other,
+# and 0.006 % of a trained one's.
 MIN_AGREEMENT = 0.999
-# Biases and scales are few, and stay as they are.
+# Smaller tensors, such as biases and scales, stay in fp32.
 FEWEST_HALVED = 1024
 N_GOLDEN_VALUES = 64
 
 
 class ParityError(EdgepercError):
-    """The exported graph does not give the network's answers; nothing was written."""
+    """The exported graph does not reproduce the network's outputs; nothing was written."""
 
 
 def load(checkpoint: Path) -> tuple[nn.Module, Recipe, dict[str, Any]]:
-    """The averaged network of a checkpoint, ready to answer; its recipe; and what it was trained on."""
+    """The averaged network of a checkpoint in inference mode, its recipe, and notes on its training."""
     state = torch.load(checkpoint, weights_only=True, map_location="cpu")
     recipe = Recipe(**json.loads(state["recipe"]))
     network = build(recipe)
-    # A training aid (deep supervision) is no part of what is exported.
     network.load_state_dict(state["best"] or state["averaged"])
     notes = {"frames": json.loads(state["frames"]), "n_simulated": state["n_simulated"], "step": state["step"]}
     notes |= {"before": json.loads(state["before"]), "curve": json.loads(state["curve"])}
@@ -65,7 +66,7 @@ def load(checkpoint: Path) -> tuple[nn.Module, Recipe, dict[str, Any]]:
 
 
 def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:
-    """What the card says of how the weights came about."""
+    """The card's record of the training."""
     frames = notes["frames"]
     simulated = f"{notes['n_simulated']} simulated scans"
     return {
@@ -80,9 +81,9 @@ def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
-    """The network as an ONNX graph: weights inside, nothing of this computer in it, no card yet."""
+    """The network as an ONNX graph with its weights, without paths of this computer and without a card."""
     example = torch.from_numpy(golden_input(0, (1, len(card.input.channels), card.view.height, card.view.width)))
-    with warnings.catch_warnings():  # the exporter speaks of its own future, which is not the user's affair
+    with warnings.catch_warnings():  # the exporter warns about its own future changes
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
             network.eval(),
@@ -96,7 +97,7 @@ def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
         )
     assert program is not None
     model = program.model_proto
-    # The exporter keeps stack traces, with this computer's paths, beside every node.
+    # The exporter adds stack traces, with paths of this computer, to every node.
     stripped = [model, model.graph, *model.graph.node, *model.graph.value_info, *model.graph.input]
     for holder in [*stripped, *model.graph.output, *model.graph.initializer, *model.functions]:
         if hasattr(holder, "metadata_props"):
@@ -104,14 +105,15 @@ def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
         if hasattr(holder, "doc_string"):
             holder.doc_string = ""
     model.producer_name, model.producer_version = "edgeperc", ""
-    # Where maxima are put back in their places, a rounded weight can move one: by 0.12 deviations, it was seen.
+    # Top-view networks stay in fp32: in unpooling, a rounded weight can move a maximum to another cell, which changed
+    # outputs by up to 0.12 standard deviations.
     if card.view.kind == "range_image":
         _halve(model.graph)
     return model
 
 
 def _halve(graph: onnx.GraphProto) -> None:
-    """Keep large weights in half precision: half the file, and engines turn them back when they load it."""
+    """Store large weights in half precision, which halves the file; engines convert them to fp32 when they load it."""
     casts = []
     for weight in graph.initializer:
         values = onnx.numpy_helper.to_array(weight)
@@ -126,14 +128,17 @@ def _halve(graph: onnx.GraphProto) -> None:
 
 
 def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
-    """Write a graph with its card, last of all, and read it back through onnxruntime.
+    """Write a graph with its card, and read the card back through onnxruntime.
 
-    Any network with a range-image or top-view input and class or box outputs of a kind the card can name will do.
+    The graph may be of any network with a range image or a top view as input and outputs of the kinds of
+    `edgeperc.card.OutputSpec`. It is changed in place: a card in it is replaced.
 
     Raises
     ------
     CardError, CardMismatchError, ModelFileError
-        Nothing is written, or left, in the place of ``path``.
+        The card does not fit the graph, or onnxruntime cannot load it. ``path`` is unchanged.
+    ParityError
+        The card in the file differs from the one given. ``path`` is unchanged.
     """
     kept = [p for p in model.metadata_props if p.key != CARD_KEY]
     del model.metadata_props[:]
@@ -144,31 +149,31 @@ def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
         file.flush()
         session = Session(Path(file.name), "cpu")
         if session.card.to_json() != card.to_json():
-            raise ParityError(f"{path}: the card read back is not the card written")
+            raise ParityError(f"{path}: the card read back differs from the card written")
 
 
 def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
-    """The card with a known input and this computer's answers to it."""
+    """The card with a golden record: a known input, and this computer's outputs for it."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     x = golden_input(0, (1, len(card.input.channels), card.view.height, card.view.width))
-    answers = session.run([o.name for o in card.outputs], {card.input.name: x})
-    outputs = {}
-    for spec, answer in zip(card.outputs, answers, strict=True):
-        few = answer.size <= N_GOLDEN_VALUES
-        at = np.arange(answer.size) if few else np.random.default_rng(0).integers(answer.size, size=N_GOLDEN_VALUES)
-        outputs[spec.name] = {
-            "sha256": hashlib.sha256(answer.tobytes()).hexdigest(),
-            "std": float(answer.std()),
+    outputs = session.run([o.name for o in card.outputs], {card.input.name: x})
+    records = {}
+    for spec, output in zip(card.outputs, outputs, strict=True):
+        few = output.size <= N_GOLDEN_VALUES
+        at = np.arange(output.size) if few else np.random.default_rng(0).integers(output.size, size=N_GOLDEN_VALUES)
+        records[spec.name] = {
+            "sha256": hashlib.sha256(output.tobytes()).hexdigest(),
+            "std": float(output.std()),
             "positions": [int(i) for i in at],
-            "values": [float(v) for v in answer.reshape(-1)[at]],
+            "values": [float(v) for v in output.reshape(-1)[at]],
         }
-    return replace(card, golden=Golden(0, hashlib.sha256(x.tobytes()).hexdigest(), outputs))
+    return replace(card, golden=Golden(0, hashlib.sha256(x.tobytes()).hexdigest(), records))
 
 
 def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]]) -> dict[str, float]:
-    """Hold an exported model against the network it was made of, through post-processing.
+    """Compare an exported model with its torch network: raw outputs, and labels and boxes after post-processing.
 
     Parameters
     ----------
@@ -176,48 +181,49 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
     path : Path
         The .onnx.
     scans : sequence of (n, 4) float32
-        Real or simulated, remission in 0..1.
+        x, y, z [m] in the sensor frame, remission in 0..1.
 
     Returns
     -------
     dict
-        ``n_scans``; ``max_deviation``, what 99.9 % of the raw outputs stay within, in standard deviations of the
-        output; ``label_agreement``, the least share of pixels with the same label; ``box_deviation``, the largest
-        difference of any number of a box.
+        ``n_scans``; ``max_deviation``: the 99.9 % quantile of the differences of raw outputs, in standard deviations of
+        the output; ``label_agreement``: the smallest share of pixels with the same label; ``box_deviation``: the
+        largest difference of a center's coordinate or a size [m].
 
     Raises
     ------
     ParityError
+        A difference exceeds its limit, or the boxes differ in number or class.
     """
     session = Session(path, "cpu")
     card = session.card
     projector = make_projector(card.view, card.input)
     worst, agreement, box_deviation = 0.0, 1.0, 0.0
     for points in scans:
-        seen = projector.project(np.ascontiguousarray(points))
-        image = seen.image
+        projected = projector.project(np.ascontiguousarray(points))
         with torch.no_grad():
-            answers = network.eval()(torch.from_numpy(image[None]))
-        answers = answers if isinstance(answers, tuple) else (answers,)
-        session.input[:] = image
-        here = session.run()
-        wanted = {o.kind: a[0].numpy() for o, a in zip(card.outputs, answers, strict=True)}
-        for kind, want in wanted.items():
-            apart = np.quantile(np.abs(here[kind] - want), COMPARED)
-            worst = max(worst, float(apart) / max(float(want.std()), 1e-6))
+            outputs = network.eval()(torch.from_numpy(projected.image[None]))
+        outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+        session.input[:] = projected.image
+        actual = session.run()
+        expected = {o.kind: output[0].numpy() for o, output in zip(card.outputs, outputs, strict=True)}
+        for kind, values in expected.items():
+            difference = np.quantile(np.abs(actual[kind] - values), COMPARED)
+            worst = max(worst, float(difference) / max(float(values.std()), 1e-6))
         if card.view.kind == "top_view":
-            (here_labels, mine), (labels, theirs) = (
-                decode_top_view(card, seen.index >= 0, a, card.score_threshold) for a in (here, wanted)
+            (labels, boxes), (expected_labels, expected_boxes) = (
+                decode_top_view(card, projected.index >= 0, raw, card.score_threshold) for raw in (actual, expected)
             )
-            if [b.label for b in mine] != [b.label for b in theirs]:
-                raise ParityError(f"{path}: onnxruntime finds {len(mine)} boxes, torch {len(theirs)}, or others")
-            for box, other in zip(mine, theirs, strict=True):
-                apart = np.abs(np.array([*box.center, *box.size]) - np.array([*other.center, *other.size]))
-                box_deviation = max(box_deviation, float(apart.max()))
+            kinds, expected_kinds = [box.label for box in boxes], [box.label for box in expected_boxes]
+            if kinds != expected_kinds:
+                raise ParityError(f"{path}: onnxruntime finds the boxes {kinds}, torch {expected_kinds}")
+            for box, other in zip(boxes, expected_boxes, strict=True):
+                difference = np.abs(np.array([*box.center, *box.size]) - np.array([*other.center, *other.size]))
+                box_deviation = max(box_deviation, float(difference.max()))
         else:
-            ((kind, logits),) = wanted.items()
-            here_labels, labels = (decode_classes(a, kind)[0] for a in (here[kind], logits))
-        agreement = min(agreement, float((here_labels == labels).mean()))
+            ((kind, logits),) = expected.items()
+            labels, expected_labels = (decode_classes(raw, kind)[0] for raw in (actual[kind], logits))
+        agreement = min(agreement, float((labels == expected_labels).mean()))
     if worst > MAX_DEVIATION or agreement < MIN_AGREEMENT or box_deviation > 0.05:
         raise ParityError(
             f"{path}: raw outputs differ by {worst:.3g} standard deviations (at most {MAX_DEVIATION}), labels "
@@ -243,12 +249,33 @@ def export(
     metrics: Mapping[str, Any] | None = None,
     licence: str = "Apache-2.0",
 ) -> ModelCard:
-    """Export a checkpoint, prove it, and write it with its card.
+    """Export a checkpoint, verify the file, and write it with its card.
+
+    Parameters
+    ----------
+    checkpoint : Path
+    path : Path
+        The .onnx file to write.
+    scans : sequence of (n, 4) float32
+        Scans to verify on, as for `verify`.
+    fitness : FitnessProfile or None
+        Profile of the training scans, for the check of inputs at runtime.
+    name : str, optional
+        Name of the model; by default the network's.
+    version : str
+    metrics : mapping, optional
+        Figures to write into the card.
+    licence : str
+        License of weights trained on simulation alone; KITTI's applies to all others.
+
+    Returns
+    -------
+    ModelCard
 
     Raises
     ------
     ParityError
-        The graph does not give the network's answers; ``path`` is left as it was.
+        The graph does not reproduce the network's outputs; ``path`` is unchanged.
     """
     network, recipe, notes = load(checkpoint)
     card = card_of(

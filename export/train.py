@@ -36,7 +36,7 @@ __all__ = ["train"]
 
 WARM_UP_STEPS = 100
 
-# Neighboring frames look alike: one in so many is enough to validate on.
+# Every sixth frame is enough to validate on, because neighboring frames look alike.
 VALIDATION_STRIDE = 6
 
 
@@ -62,8 +62,8 @@ def train(
     out : Path
         Folder for ``checkpoint.pt`` and ``log.jsonl``. A checkpoint of the same recipe in it is resumed.
     kitti : Path or None
-        Folder of a KITTI object set. Frames of test drives are not used; with a ``simulated_share`` of 1, no frame is
-        trained on, and all training drives are validated on.
+        Folder of a KITTI object set. Frames of test drives are not used. With a ``simulated_share`` of 1, all training
+        drives are for validation only.
     simulated : Path or None
         Folder of scans written by ``edgeperc-export simulate``.
     given : RealScans, optional
@@ -74,9 +74,10 @@ def train(
     start_from : Path or None
         A checkpoint whose weights a new run starts from. Weights that the networks do not share are ignored.
     teacher : Path or None
-        A checkpoint of the network to distil from. If the recipe does not distil, of a network that labels the
-        unlabeled points of the real scans of the training drives.
+        A checkpoint of the network to distil from. If the recipe does not distil: a checkpoint of a network that labels
+        the unlabeled points of real scans.
     n_threads : int or None
+        Number of CPU threads; None leaves it to torch.
     compiled : bool
         Use `torch.compile`, which takes a minute and a C++ compiler; PointSeg then trains a third faster.
     checkpoint_every : int
@@ -90,7 +91,7 @@ def train(
     Raises
     ------
     ValueError
-        There are no scans, the checkpoint is of another recipe, or the teacher is missing or of no use.
+        There are no scans, the checkpoint is of another recipe, or the teacher is missing, unsuitable or unused.
     FloatingPointError
         The loss is not finite.
     """
@@ -114,10 +115,10 @@ def train(
     task = task_of(recipe)
     if teacher is not None and recipe.distil == 0.0 and (objects is None or recipe.task != "points"):
         raise ValueError("the teacher is not used; give --distil, or train a network that labels points on --kitti")
-    tutor = None if teacher is None else _teacher(teacher, task).to(device)
-    if tutor is not None and objects is not None and recipe.distil == 0.0:
+    teacher_network = None if teacher is None else _teacher(teacher, task).to(device)
+    if teacher_network is not None and objects is not None and recipe.distil == 0.0:
         extra = unlabeled_scans(objects, fold)
-        real = pseudo_labeled(tutor.cpu(), task, [*real, *extra])
+        real = pseudo_labeled(teacher_network.cpu(), task, [*real, *extra])
         weights += [len(extra) ** -0.5] * len(extra)
     samples = Samples(recipe, real, weights, sorted(simulated.glob("*.npz")) if simulated else [])
     watch = Watch(samples, watched) if watched else None
@@ -181,9 +182,9 @@ def train(
             with torch.autocast(device.type, torch.bfloat16):
                 outputs = forward(x)
             loss = task.loss(outputs, y)
-            if tutor is not None and recipe.distil > 0.0:
-                taught = teach(tutor, x, task.input, mirror=recipe.seen_twice)
-                loss = loss + recipe.distil * task.distillation(outputs, *taught)
+            if teacher_network is not None and recipe.distil > 0.0:
+                distilled = teach(teacher_network, x, task.input, mirror=recipe.seen_twice)
+                loss = loss + recipe.distil * task.distillation(outputs, *distilled)
             if not torch.isfinite(loss):
                 raise FloatingPointError(f"the loss is {loss.item()} at step {step}; lower --learning-rate")
             optimizer.zero_grad(set_to_none=True)
@@ -199,7 +200,7 @@ def train(
                 line: dict[str, Any] = {"step": step, "loss": round(float(np.mean(losses)), 5)}
                 losses.clear()
                 if watch is not None:
-                    figure, watched_loss, figures = watch.judge(averaged)
+                    figure, watched_loss, figures = watch.validate(averaged)
                     line |= {"validation_loss": round(watched_loss, 5), "validation": figures}
                     if figure > best_figure:
                         best_figure, best = figure, copy.deepcopy(averaged.state_dict())
@@ -216,13 +217,13 @@ def train(
 
 
 def _ahead(samples: Samples, start: int, stop: int) -> Iterator[Targets]:
-    """Batches; the next one is made while the last one is trained on."""
+    """The batches of the steps. Each is made during the training step before it."""
     with ThreadPoolExecutor(1) as pool:
-        coming = pool.submit(samples.batch, start) if start < stop else None
+        pending = pool.submit(samples.batch, start) if start < stop else None
         for step in range(start, stop):
-            assert coming is not None
-            batch = coming.result()
-            coming = pool.submit(samples.batch, step + 1) if step + 1 < stop else None
+            assert pending is not None
+            batch = pending.result()
+            pending = pool.submit(samples.batch, step + 1) if step + 1 < stop else None
             yield batch
 
 
@@ -250,10 +251,10 @@ def _optimizer(recipe: Recipe, network: nn.Module) -> torch.optim.Optimizer:
 
 
 def _start(network: nn.Module, checkpoint: Path) -> list[dict[str, object]]:
-    """Copy the weights that a checkpoint shares with the network; the recipes that the checkpoint was made with."""
+    """Copy the weights that a checkpoint shares with the network; returns the recipes of its training runs in order."""
     state = torch.load(checkpoint, weights_only=True, map_location="cpu")
-    own, theirs = network.state_dict(), state["best"] or state["averaged"]
-    common = {name: value for name, value in theirs.items() if name in own and own[name].shape == value.shape}
+    own, saved = network.state_dict(), state["best"] or state["averaged"]
+    common = {name: value for name, value in saved.items() if name in own and own[name].shape == value.shape}
     if not common:
         raise ValueError(f"{checkpoint} has no weight in common with the network to train")
     network.load_state_dict(common, strict=False)
@@ -261,6 +262,7 @@ def _start(network: nn.Module, checkpoint: Path) -> list[dict[str, object]]:
 
 
 def _teacher(checkpoint: Path, task: Task) -> nn.Module:
+    """The network of a checkpoint with the same view and input as the task."""
     state = torch.load(checkpoint, weights_only=True, map_location="cpu")
     recipe = Recipe(**json.loads(state["recipe"]))
     if (task_of(recipe).view, task_of(recipe).input) != (task.view, task.input):
@@ -272,6 +274,7 @@ def _teacher(checkpoint: Path, task: Task) -> nn.Module:
 
 @torch.no_grad()
 def _average(averaged: nn.Module, network: nn.Module, decay: float) -> None:
+    """One step of the exponential moving average of weights; counters are copied."""
     for slow, fast in zip(averaged.state_dict().values(), network.state_dict().values(), strict=True):
         if slow.dtype.is_floating_point:
             slow.lerp_(fast, 1.0 - decay)

@@ -15,7 +15,7 @@ __all__ = ["Watch"]
 
 
 class Watch:
-    """Validates a network on scans that it is not trained on.
+    """Validates a network on scans that are not in its training set.
 
     Parameters
     ----------
@@ -27,17 +27,19 @@ class Watch:
 
     def __init__(self, samples: Samples, scans: Sequence[LabeledScan]) -> None:
         self.task, self.scans = samples.task, scans
-        self.seen = [samples.project(scan) for scan in scans]
-        self.targets = [self.task.target(scan, seen) for scan, seen in zip(scans, self.seen, strict=True)]
+        self.projected = [samples.project(scan) for scan in scans]
+        self.targets = [
+            self.task.target(scan, projected) for scan, projected in zip(scans, self.projected, strict=True)
+        ]
 
-    def judge(self, network: nn.Module) -> tuple[float, float, dict[str, float | None]]:
-        """The decisive figure (see `Tally.decisive`), the mean loss, and all figures by name."""
+    def validate(self, network: nn.Module) -> tuple[float, float, dict[str, float | None]]:
+        """Validate a network: the decisive figure (`Tally.decisive`), the mean loss, and all figures by name."""
         losses, tally = [], self.task.tally()
         device = next(network.parameters()).device
-        for scan, seen, targets in zip(self.scans, self.seen, self.targets, strict=True):
+        for scan, projected, targets in zip(self.scans, self.projected, self.targets, strict=True):
             with torch.no_grad():
-                outputs = network(torch.from_numpy(seen.image[None]).to(device))
+                outputs = network(torch.from_numpy(projected.image[None]).to(device))
             batch = [torch.from_numpy(target[None]).to(device) for target in targets]
             losses.append(float(self.task.loss(outputs, batch)))
-            self.task.judge(outputs, seen, targets, scan, tally)
+            self.task.count(outputs, projected, targets, scan, tally)
         return tally.decisive(), float(np.mean(losses)), tally.figures()

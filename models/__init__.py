@@ -1,7 +1,7 @@
 """The models that come with edgeperc: .onnx files, each carrying its card; installed as ``edgeperc.zoo``.
 
-A name stands for one network and its variants: the same network with its weights in fp32 and in int8. `choose` alone
-decides which variant runs on which provider, and in which precision.
+A name refers to one network and its variants, which have the same weights in fp32 and in int8. Only `choose` decides
+which variant runs on which provider, and in which precision.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ DEFAULT = ("ssadnet", "pointseg")
 """The best pair: drivable area and vehicles ahead, and a class for every point."""
 
 MAX_LOSS = 0.3
-"""Points of mean IoU, or of AP, that ``precision="auto"`` gives up for speed."""
+"""Largest loss of mean IoU or AP, in percentage points, that ``precision="auto"`` accepts for speed."""
 
 # Processor flags (`edgeperc.tuning.cpu_features`). Without a dot product of bytes, x86 adds pairs of 8-bit products in
-# 16 bits, which saturates, and int8 is no faster than fp32.
+# 16 bits, which saturates. int8 is then not faster than fp32.
 INT8_FEATURES = frozenset({"avx512_vnni", "avx_vnni", "amx_int8", "asimddp"})
 BF16_FEATURES = frozenset({"amx_bf16", "avx512_bf16"})
 BF16_PROVIDERS = ("openvino",)
-# The reduced precisions of a provider, the fastest first. Measured on two cores with avx512_vnni and avx512_bf16, each
-# in its fastest engine, fp32 / bf16 / int8: pointseg 9.8 / 5.5 / 3.3 ms, ssadnet 15.5 / 8.4 / 5.2 ms.
+# The reduced precisions of a provider, the fastest first. Measured on two cores with avx512_vnni and avx512_bf16, fp32
+# / bf16 / int8 in the fastest engine of each: pointseg 9.8 / 5.5 / 3.3 ms, ssadnet 15.5 / 8.4 / 5.2 ms.
 FASTEST = {"cpu": ("int8",), "openvino": ("int8", "bf16")}
 
 RENAMED = {
@@ -69,7 +69,7 @@ class Variant:
 
     @property
     def precision(self) -> str:
-        """Of the stored weights: ``"fp32"`` or ``"int8"``."""
+        """Precision of the stored weights: ``"fp32"`` or ``"int8"``."""
         return self.card.precision
 
     def __str__(self) -> str:
@@ -82,7 +82,7 @@ def listed() -> tuple[Variant, ...]:
     Raises
     ------
     CardError, ModelFileError
-        A file was changed or cut short.
+        A model file is damaged.
     """
     paths = [Path(str(entry)) for entry in resources.files(__name__).iterdir() if entry.name.endswith(".onnx")]
     return tuple(sorted((Variant(path, ModelCard.read(path)) for path in paths), key=str))
@@ -94,7 +94,7 @@ def shipped_models() -> tuple[str, ...]:
 
 
 def resolve(model: str | os.PathLike[str]) -> tuple[Variant, ...]:
-    """The variants that a model's name or path stands for.
+    """Find the variants of a model by its name or path.
 
     Parameters
     ----------
@@ -110,9 +110,9 @@ def resolve(model: str | os.PathLike[str]) -> tuple[Variant, ...]:
     Raises
     ------
     ModelFileError
-        No model has this name, or the file cannot be read; the message lists the names, or gives the new one.
+        No model has this name, or the file cannot be read. The message lists the names, or gives the new name.
     CardError
-        The file carries no card, or one that cannot be read.
+        The file has no card, or its card cannot be read.
     """
     if not isinstance(model, str) or Path(model).suffix == ".onnx":
         path = Path(model)
@@ -144,7 +144,7 @@ def _unknown(name: str) -> str:
 
 
 def model_path(model: str | os.PathLike[str]) -> Path:
-    """The one file of ``"pointseg:int8"``, or of a network's name: there the one in fp32.
+    """The file of one variant, such as ``"pointseg:int8"``; for the name of a network, its fp32 file.
 
     Raises
     ------
@@ -157,10 +157,10 @@ def model_path(model: str | os.PathLike[str]) -> Path:
 def choose(
     variants: Sequence[Variant], provider: str, precision: str = "auto", features: Collection[str] = ()
 ) -> tuple[Variant, str]:
-    """Which variant of a network runs on a provider, and in which precision.
+    """Choose the variant of a network, and the precision, for a provider.
 
-    ``"auto"`` takes the fastest precision of the provider that this processor computes natively and that the card
-    shows to lose at most `MAX_LOSS` points; else fp32. A network that is there in int8 alone runs in int8.
+    ``"auto"`` takes the fastest precision of the provider that this processor computes natively and whose loss,
+    according to the card, is at most `MAX_LOSS`; else fp32. A network that exists only in int8 runs in int8.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def choose(
         A key of `edgeperc.session.PROVIDERS`.
     precision : {"auto", "fp32", "bf16", "int8"}
     features : collection of str
-        Flags of the processor (`edgeperc.tuning.cpu_features`); empty where they are not known. ``"auto"`` then takes
+        Flags of the processor (`edgeperc.tuning.cpu_features`); empty if they are not known. ``"auto"`` then takes
         no reduced precision.
 
     Returns
@@ -182,7 +182,7 @@ def choose(
     Raises
     ------
     ProviderError
-        This network cannot run in the precision asked for; the message says in which it can.
+        The network cannot run in this precision; the message lists those in which it can.
     """
     runs = {variant.precision: (variant, variant.precision) for variant in variants}
     if "fp32" in runs and provider in BF16_PROVIDERS and (not features or BF16_FEATURES & {*features}):
@@ -199,7 +199,7 @@ def choose(
 
 
 def _loss(card: ModelCard, precision: str) -> float:
-    """Points lost to fp32 on real scans; infinite where nobody measured."""
+    """Percentage points lost compared with fp32 on real scans; infinite if not measured."""
     return float(card.precisions.get(precision, {}).get("loss", "inf"))
 
 
@@ -214,7 +214,7 @@ def _not_in(name: str, provider: str, precision: str, can: Sequence[str]) -> str
 
 
 def digest(variants: Sequence[Variant]) -> str:
-    """What settings of a network are kept under: its file's SHA-256, or, of several files, that of their SHA-256s.
+    """Key of a network's measured settings: the SHA-256 of its file, or of the SHA-256s of its files.
 
     Raises
     ------

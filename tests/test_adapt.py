@@ -50,7 +50,7 @@ OUSTER, VELODYNE = np.array([45.91, 714.50, 113.28, 376.01]), np.array([3.78, 12
 # --- remission -------------------------------------------------------------------------------------------------------
 
 
-def test_the_papers_table() -> None:
+def test_ranking_of_functions_matches_the_papers_table() -> None:
     """The ranking of the paper's Table 5: logarithm 58.26, line 72.12, parabola 132.87."""
     best, *others = fit_functions(OUSTER, VELODYNE / 255.0, full_scale=9000.0, to="hdl-64e", source="KUL-Seg")
     assert [f.kind for f in (best, *others)] == ["logarithm", "linear", "polynomial"]
@@ -59,7 +59,7 @@ def test_the_papers_table() -> None:
     np.testing.assert_allclose(np.multiply(others[0].coefficients, 255.0), np.polyfit(OUSTER, VELODYNE, 1)[::-1])
     np.testing.assert_allclose(np.multiply(others[1].coefficients, 255.0), np.polyfit(OUSTER, VELODYNE, 2)[::-1])
     assert (best.full_scale, best.to, best.source) == (9000.0, "hdl-64e", "KUL-Seg")
-    # On the four pairs themselves the parabola is nearest, which is why they are not what it is judged by.
+    # On the four pairs themselves the parabola is nearest, which is why cross-validation ranks the functions.
     terms = np.stack([np.ones(4), OUSTER, OUSTER**2], axis=1)
     errors = terms @ others[1].coefficients - VELODYNE / 255.0
     assert 255.0 * np.sqrt(np.mean(errors**2)) < 11.0
@@ -72,7 +72,7 @@ def test_the_papers_table() -> None:
     st.floats(0.01, 2.0),
     st.integers(0, 2**32 - 1),
 )
-def test_exact_pairs_give_the_function_back(shape: RemissionFunction, offset: float, size: float, seed: int) -> None:
+def test_exact_pairs_recover_the_function(shape: RemissionFunction, offset: float, size: float, seed: int) -> None:
     x = np.random.default_rng(seed).uniform(0.0, 255.0, 60)
     wanted = offset + size * _value(shape, x)
     best = fit_functions(x, wanted, full_scale=255.0, to="hdl-64e", source="")[0]
@@ -95,7 +95,7 @@ def _value(function: RemissionFunction, x: np.ndarray) -> np.ndarray:
         ([1, 2, 3, 4], [1, 2, 3], "4 raw values and 3 wanted ones"),
     ],
 )
-def test_too_little_to_fit(raw: list[float], wanted: list[float], message: str) -> None:
+def test_too_few_pairs_are_refused(raw: list[float], wanted: list[float], message: str) -> None:
     with pytest.raises(SensorError, match=message):
         fit_functions(raw, wanted, full_scale=255.0, to="hdl-64e", source="")
 
@@ -123,7 +123,7 @@ def test_incidence_on_a_plane(normal: np.ndarray, seed: int) -> None:
     np.testing.assert_allclose(found, wanted, atol=0.02)
 
 
-def test_incidence_where_there_is_no_surface() -> None:
+def test_incidence_without_a_surface_is_nan() -> None:
     rng = np.random.default_rng(1)
     leaves = rng.uniform([8.0, 0.0, 0.0], [8.8, 0.8, 0.8], (500, 3))
     beam = np.column_stack([np.full(50, 20.1), np.linspace(0.01, 0.79, 50), np.full(50, 0.1)])
@@ -138,7 +138,7 @@ def street(seed: int) -> np.ndarray:
     return simulate(random_scene(seed, "urban"), "hdl-64e", seed).points
 
 
-def test_a_function_is_found_in_other_streets() -> None:
+def test_function_is_recovered_from_other_streets() -> None:
     """A sensor that says exp of the HDL-64E's remission: seen in streets that the reference knows nothing of."""
     scans = [street(k) for k in (11, 12, 13)]
     for scan in scans:
@@ -159,8 +159,8 @@ def test_a_function_is_found_in_other_streets() -> None:
     np.testing.assert_allclose(_value(again, x), [0.1, 0.2, 0.3, 0.4, 0.5], atol=0.05)
 
 
-def test_brighter_stays_brighter() -> None:
-    """A parabola that fits best, and turns down before full scale, is not what is taken."""
+def test_parabola_that_turns_down_is_not_used() -> None:
+    """The best fit is a parabola that turns down before full scale; the second best is used."""
     bent = [street(k) for k in (11, 12)]
     for scan in bent:
         scan[:, 3] = 300.0 - np.sqrt(90000.0 - 90000.0 * np.minimum(scan[:, 3], 0.99))
@@ -170,7 +170,7 @@ def test_brighter_stays_brighter() -> None:
     assert profile.remission is functions[1]
 
 
-def test_strata_of_little() -> None:
+def test_strata_with_few_points_are_empty() -> None:
     nothing = [(0.0, ())] * N_STRATA
     few = np.tile(np.array([[5.0, 0.0, 0.0, 9.0]], np.float32), (199, 1))
     assert remission_strata([]) == remission_strata([few]) == nothing
@@ -187,7 +187,7 @@ def test_strata_of_little() -> None:
 @pytest.mark.parametrize("function", FUNCTIONS, ids=lambda f: f.kind)
 @settings(max_examples=60, deadline=None)
 @given(points=hnp.arrays(np.float32, st.tuples(st.integers(0, 20), st.just(4)), elements=st.floats(width=32)))
-def test_rendering_against_its_twin(function: RemissionFunction, points: np.ndarray) -> None:
+def test_rendering_agrees_with_the_twin(function: RemissionFunction, points: np.ndarray) -> None:
     sensor = replace(get_sensor("vlp-16"), remission_range=(5.0, 105.0), remission=function)
     before = points.copy()
     with np.errstate(over="ignore", invalid="ignore"):
@@ -201,7 +201,7 @@ def test_rendering_against_its_twin(function: RemissionFunction, points: np.ndar
     assert np.isnan(found[~finite, 3]).all()
 
 
-def test_rendering_follows_the_profiles_range() -> None:
+def test_rendering_uses_the_profiles_range() -> None:
     """The same values as bytes and scaled to 0..1 render alike."""
     byte = replace(get_sensor("pandar64"), remission=LOGARITHM)
     raw = np.column_stack([np.ones((256, 3)), np.arange(256)]).astype(np.float32)
@@ -217,13 +217,13 @@ def test_rendering_follows_the_profiles_range() -> None:
 
 
 @pytest.mark.parametrize("name", SENSORS)
-def test_a_profile_survives_its_file(name: str, tmp_path: Path) -> None:
+def test_profile_is_read_back_from_its_file(name: str, tmp_path: Path) -> None:
     file = tmp_path / "sensor.json"
     file.write_text(SENSORS[name].to_json(), encoding="utf-8")
     assert get_sensor(file) == get_sensor(str(file)) == SENSORS[name]
 
 
-def test_where_the_built_in_functions_come_from() -> None:
+def test_built_in_functions_match_their_source() -> None:
     functions = {name: profile.remission for name, profile in SENSORS.items() if profile.remission}
     assert set(functions) == {"hdl-32e", "vlp-16", "vlp-32c", "pandar64"}
     for function in functions.values():
@@ -243,7 +243,7 @@ def test_where_the_built_in_functions_come_from() -> None:
         (lambda d: d.update(columns=True), "where a number belongs"),
         (lambda d: d.update(elevations_deg=["1", 0]), "where a number belongs"),
         (lambda d: d.update(elevations_deg=[0, 1]), "strictly decrease"),
-        (lambda d: d.update(elevations_deg=None), "no number"),
+        (lambda d: d.update(elevations_deg=None), "not a number"),
         (lambda d: d.update(remission=3), "got 3"),
         (lambda d: d["remission"].pop("kind"), "remission file holds exactly"),
         (lambda d: d["remission"].update(kind="cubic"), "kind 'cubic'; expected one of linear"),
@@ -255,7 +255,7 @@ def test_where_the_built_in_functions_come_from() -> None:
         (lambda d: d["remission"].update(to=7), "expected two str"),
     ],
 )
-def test_a_wrong_profile_says_what_is_wrong(change: object, message: str, tmp_path: Path) -> None:
+def test_wrong_profile_names_the_fault(change: object, message: str, tmp_path: Path) -> None:
     document = json.loads(get_sensor("vlp-16").to_json())
     change(document)  # type: ignore[operator]
     file = tmp_path / "sensor.json"
@@ -266,7 +266,7 @@ def test_a_wrong_profile_says_what_is_wrong(change: object, message: str, tmp_pa
 
 
 @pytest.mark.parametrize("text", ["", "[]", "7", "{", "[" * 100_000, "\xff"])
-def test_a_file_that_is_no_profile(text: str, tmp_path: Path) -> None:
+def test_file_that_is_not_a_profile_is_refused(text: str, tmp_path: Path) -> None:
     file = tmp_path / "sensor.json"
     file.write_text(text, encoding="latin-1")
     with pytest.raises(SensorError, match=r"sensor\.json"):
@@ -280,7 +280,7 @@ def test_a_file_that_is_no_profile(text: str, tmp_path: Path) -> None:
 # --- interpolation ---------------------------------------------------------------------------------------------------
 
 
-def test_only_a_coarser_sensor_is_filled() -> None:
+def test_only_scans_of_a_coarser_sensor_are_interpolated() -> None:
     assert not Interpolator(VIEW, HDL).needed
     for name in ("hdl-32e", "vlp-16", "vlp-32c", "os1-64", "os0-32", "pandar64"):
         assert Interpolator(VIEW, get_sensor(name)).needed
@@ -327,7 +327,7 @@ def sparse_scan(seed: int, n: int) -> np.ndarray:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 120))
-def test_filling_against_its_twin_and_its_promises(seed: int, n: int) -> None:
+def test_interpolation_agrees_with_the_twin_and_its_documentation(seed: int, n: int) -> None:
     points = sparse_scan(seed, n)
     index = project(points, SMALL)
     before, index_before = points.copy(), index.copy()
@@ -351,7 +351,7 @@ def test_filling_against_its_twin_and_its_promises(seed: int, n: int) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 120))
-def test_a_new_point_falls_into_its_pixel(seed: int, n: int) -> None:
+def test_interpolated_point_falls_into_its_pixel(seed: int, n: int) -> None:
     """So that the image the network sees is that of a scan."""
     points = sparse_scan(seed, n)
     dense, filled = Interpolator(SMALL, COARSE).fill(points, project(points, SMALL))
@@ -375,7 +375,7 @@ def new_points(points: np.ndarray, sensor: SensorProfile = COARSE) -> np.ndarray
     return Interpolator(SMALL, sensor).fill(points, project(points, SMALL))[0][len(points) :]
 
 
-def test_never_across_a_depth_edge() -> None:
+def test_no_interpolation_across_a_depth_edge() -> None:
     wall = new_points(column(10.0, 10.1, 10.2))
     assert len(wall) > 2
     assert (np.abs(np.linalg.norm(wall[:, :3], axis=1) - 10.1) < 0.3).all()
@@ -398,7 +398,7 @@ def test_rings_on_the_ground_are_joined_and_roofs_are_not() -> None:
     assert len(new_points(column(0, 0, *(0.73 / -e[2:4])), replace(COARSE, mount_height_m=0.73))) > 0
 
 
-def test_points_that_are_not_finite_are_left_where_they_are() -> None:
+def test_non_finite_points_stay_in_place() -> None:
     points = np.vstack([column(10.0, 10.1, 10.2), np.full((2, 4), np.nan), [[np.inf, 0, 0, 0]]]).astype(np.float32)
     dense, filled = Interpolator(SMALL, COARSE).fill(points, project(points, SMALL))
     np.testing.assert_array_equal(dense[: len(points)], points)
@@ -421,7 +421,7 @@ def test_wrong_arrays() -> None:
 
 
 @pytest.mark.parametrize("name", ["vlp-16", "os1-64"])
-def test_labels_are_of_the_points_that_came(name: str) -> None:
+def test_labels_are_only_of_input_points(name: str) -> None:
     points = simulate(random_scene(4, "urban"), name, seed=4).points
     points[::97] = np.nan
     before = points.copy()
@@ -439,7 +439,7 @@ def test_labels_are_of_the_points_that_came(name: str) -> None:
     assert (one.labels != other.labels).any()
 
 
-def test_the_training_sensor_is_left_alone() -> None:
+def test_scans_of_the_training_sensor_are_not_adapted() -> None:
     points = simulate(random_scene(4, "urban"), "hdl-64e", seed=4).points
     answers = [
         Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore", adapt=adapt)(points)
@@ -451,8 +451,8 @@ def test_the_training_sensor_is_left_alone() -> None:
         Perceiver("pointseg", adapt="all")
 
 
-def test_a_rendered_scan_is_seen_as_the_reference_would_be() -> None:
-    """Remission taken through a function's inverse and rendered back: the same answer as without either."""
+def test_rendered_scan_gives_the_reference_result() -> None:
+    """Remission taken through a function's inverse and rendered back: the same result as without both."""
     points = simulate(random_scene(4, "urban"), "hdl-64e", seed=4).points
     distorted = points.copy()
     distorted[:, 3] = np.expm1((points[:, 3].astype(np.float64) + 0.1) / 0.15)
@@ -565,7 +565,7 @@ def some_scan(n=300):
 @pytest.mark.parametrize("sensor", [get_sensor("hdl-64e"), RAW, get_sensor("vlp-16")], ids=lambda s: s.name)
 @pytest.mark.parametrize("rendered", [True, False])
 @pytest.mark.parametrize("n", [0, 1, 300])
-def test_a_conditioned_scan_is_finite_or_nowhere_and_read_only(sensor, rendered, n):
+def test_conditioned_scan_is_finite_or_nan_and_read_only(sensor, rendered, n):
     points = some_scan(n)
     before = points.copy()
     scan, n_dropped = condition(points, sensor, rendered=rendered)
@@ -603,6 +603,6 @@ def test_a_remission_that_overflows_is_not_finite():
 
 
 @pytest.mark.parametrize("bad", [np.zeros((5, 2)), "scan", None, np.zeros((2, 5, 4))])
-def test_what_is_no_scan_does_not_pass_the_door(bad):
+def test_arrays_that_are_not_scans_are_refused(bad):
     with pytest.raises(PointsError):
         condition(bad, RAW)

@@ -1,4 +1,4 @@
-"""Objects pasted, sectors swapped, bad weather: whatever is done to a scan, its labels stay true."""
+"""Augmentation (pasted objects, swapped sectors, bad weather) keeps the labels correct."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def scan() -> LabeledScan:
     return LabeledScan.from_simulation(simulated_scan(17))
 
 
-def test_what_lies_in_a_simulated_box_is_the_object(scan: LabeledScan) -> None:
+def test_points_in_a_simulated_box_belong_to_the_object(scan: LabeledScan) -> None:
     for box, count in zip(scan.boxes, scan.counts, strict=True):
         core = replace(box, size=(box.size[0], box.size[1], box.size[2] - 0.2))  # clear of the ground
         if count and not any(b is not box and np.hypot(*np.subtract(b.center, box.center)[:2]) < 6 for b in scan.boxes):
@@ -57,7 +57,7 @@ def test_a_bank_holds_each_object_with_its_points() -> None:
         street,
         points=np.concatenate([street.points, points]),
         boxes=(box, replace(box, center=(20.0, 5.0, -0.88)), replace(box, label="tram")),
-        counts=(len(points), 3, 50),  # enough, too few to be worth it, no class of ours
+        counts=(len(points), 3, 50),  # enough returns, too few returns, an unknown class
     )
     bank = ObjectBank.of([held])
     ((kept, cut),) = bank.objects.pop("pedestrian")
@@ -67,7 +67,7 @@ def test_a_bank_holds_each_object_with_its_points() -> None:
     assert inside(box, cut).all()
 
 
-def test_a_pasted_object_hides_what_is_behind_it_and_nothing_else() -> None:
+def test_a_pasted_object_hides_only_what_is_behind_it() -> None:
     box, points = post(10.0, 0.0)
     street = flat_street()
     bank = ObjectBank({"pedestrian": [(box, points)]})
@@ -83,7 +83,7 @@ def test_a_pasted_object_hides_what_is_behind_it_and_nothing_else() -> None:
     left = {tuple(p) for p in out.points[out.labels == 0].tolist()}
     lost = np.array([p for p in street.points.tolist() if tuple(p) not in left])
     assert len(lost) > 50
-    assert (np.hypot(lost[:, 0], lost[:, 1]) > 9.5).all()  # its shadow begins at its feet
+    assert (np.hypot(lost[:, 0], lost[:, 1]) > 9.5).all()  # its shadow begins at its base
     assert (np.abs(np.arctan2(lost[:, 1], lost[:, 0]) - azimuth) < np.radians(1.6)).all()
 
 
@@ -130,7 +130,7 @@ def test_pasted_labels_are_those_of_the_boxes(scan: LabeledScan, seed: int) -> N
         assert np.count_nonzero(own) >= 0.9 * count > 0
 
 
-def test_a_swapped_sector_brings_its_labels_along(scan: LabeledScan) -> None:
+def test_a_swapped_sector_keeps_its_labels(scan: LabeledScan) -> None:
     other = replace(scan, points=scan.points + np.float32([0, 0, 0.5, 0]), labels=np.full_like(scan.labels, 3))
     scan = replace(scan, labels=np.zeros_like(scan.labels))
     out = swapped(scan, other, np.random.default_rng(1))
@@ -153,9 +153,9 @@ def test_weather_loses_returns_and_labels_drops_background(scan: LabeledScan) ->
     assert (unknown.labels == IGNORE).all()
 
 
-def test_facing_turns_somebody_to_the_front(scan: LabeledScan) -> None:
+def test_facing_turns_a_rare_object_to_the_front(scan: LabeledScan) -> None:
     rare = [b for b, n in zip(scan.boxes, scan.counts, strict=True) if b.label in ("pedestrian", "cyclist") and n >= 5]
-    assert rare, "the scene has nobody in it"
+    assert rare, "the scene has no pedestrian or cyclist"
     for seed in range(5):
         angle = facing(scan, np.random.default_rng(seed))
         ahead = [b for b in turned(scan, angle).boxes if b.label in ("pedestrian", "cyclist")]
@@ -163,14 +163,14 @@ def test_facing_turns_somebody_to_the_front(scan: LabeledScan) -> None:
     assert facing(flat_street(), np.random.default_rng(0)) == 0.0
 
 
-def test_a_scan_known_all_around_turns_anywhere(scan: LabeledScan) -> None:
+def test_a_scan_labeled_on_all_sides_turns_anywhere(scan: LabeledScan) -> None:
     middle = np.array([scan.boxes[0].center[:2]])
 
     def turns(**how: float) -> np.ndarray:
         seen = [augmented(scan, np.random.default_rng(seed), **how).boxes[0].center[:2] for seed in range(60)]
         return np.abs(np.degrees(np.angle(np.array(seen) @ [1, 1j] / (middle @ [1, 1j]))))
 
-    # A mirror changes the sign of an angle, so an object ahead or behind tells how far the scan was turned.
+    # A mirror changes only the sign of an angle, so an object ahead or behind shows how far the scan was turned.
     along = np.degrees(np.abs(np.arctan2(middle[0, 1], np.abs(middle[0, 0]))))
     street = turns()
     assert np.minimum(street, 180.0 - street).max() < 2 * along + 25.0

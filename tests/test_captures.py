@@ -122,17 +122,17 @@ def test_other_kinds_of_bytes_and_fields() -> None:
     np.testing.assert_array_equal(cloud_points(message), POINTS)
 
 
-def test_the_remission_is_the_field_asked_for() -> None:
+def test_remission_field_is_used() -> None:
     message = cloud(POINTS, (*FLOATS, ("reflectivity", "u2")))
     assert cloud_points(message, remission_field="reflectivity")[:, 3].tolist() == [7.0] * 4
     np.testing.assert_array_equal(cloud_points(message)[:, 3], POINTS[:, 3])
     assert cloud_points(cloud(POINTS, FLOATS[:3]))[:, 3].tolist() == [0.0] * 4
-    with pytest.raises(PointsError, match="no number field 'echo'"):
+    with pytest.raises(PointsError, match="no numeric field 'echo'"):
         cloud_points(message, remission_field="echo")
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (1, 0), (0, 7)])
-def test_a_cloud_of_no_points_is_a_scan(shape: tuple[int, int]) -> None:
+def test_empty_cloud_is_a_scan(shape: tuple[int, int]) -> None:
     message = cloud(POINTS)
     message.height, message.width = shape
     message.data = b""
@@ -149,9 +149,9 @@ def test_a_cloud_of_no_points_is_a_scan(shape: tuple[int, int]) -> None:
         ({"width": 2**60}, "holds 64 bytes"),
         ({"point_step": 8}, "layout is impossible"),
         ({"point_step": 0}, "layout is impossible"),
-        ({"fields": []}, "no number field x, y, z"),
-        ({"fields": [field("x", 0, "f4"), field("y", 4, "f4")]}, "no number field z among x, y"),
-        ({"fields": [field("x", 0, "f4", 2), field("y", 4, "f4"), field("z", 8, "f4")]}, "no number field x"),
+        ({"fields": []}, "no numeric field x, y, z"),
+        ({"fields": [field("x", 0, "f4"), field("y", 4, "f4")]}, "no numeric field z among x, y"),
+        ({"fields": [field("x", 0, "f4", 2), field("y", 4, "f4"), field("z", 8, "f4")]}, "no numeric field x"),
         ({"fields": [field("x", 2**40, "f4")]}, "layout is impossible"),
         ({"fields": [field("x", -4, "f4")]}, "layout is impossible"),
         ({"fields": None}, "layout is impossible"),
@@ -159,7 +159,7 @@ def test_a_cloud_of_no_points_is_a_scan(shape: tuple[int, int]) -> None:
         ({"height": "many"}, "layout is impossible"),
     ],
 )
-def test_clouds_that_are_none(changes: dict[str, Any], error: str) -> None:
+def test_malformed_clouds_are_refused(changes: dict[str, Any], error: str) -> None:
     message = cloud(POINTS)
     vars(message).update(changes)
     with pytest.raises(PointsError, match=error):
@@ -311,7 +311,7 @@ def test_a_bag_with_several_lidars_asks_which(tmp_path: Path) -> None:
     assert len(list(read_scans(path, topic=LIDAR))) == 2
 
 
-def test_a_bag_without_lidar_says_what_it_holds(tmp_path: Path) -> None:
+def test_bag_without_lidar_lists_its_topics(tmp_path: Path) -> None:
     typesys, rosbag1 = pytest.importorskip("rosbags.typesys"), pytest.importorskip("rosbags.rosbag1")
     store, sent = messages(typesys, 1)
     path = tmp_path / "text.bag"
@@ -490,7 +490,7 @@ def test_an_ouster_capture_without_its_metadata(ouster: Path, tmp_path: Path) ->
     path.write_bytes((ouster / "sphere.pcap").read_bytes())
     error = error_of(path)
     assert "metadata" in error
-    assert ".json whose name begins alike" in error
+    assert ".json file whose name has the same beginning" in error
     (tmp_path / "alone.json").write_text("{}")
     assert "cannot be read" in error_of(path)
 
@@ -506,7 +506,7 @@ def test_an_ouster_capture_that_is_cut_short(ouster: Path, tmp_path: Path) -> No
     assert "cut short or damaged: the file ends inside packet" in error
 
 
-def test_a_damaged_osf_is_refused_before_it_can_do_harm(ouster: Path, tmp_path: Path) -> None:
+def test_damaged_osf_is_refused_before_the_sdk_opens_it(ouster: Path, tmp_path: Path) -> None:
     """The SDK ends the process on some of these."""
     path, content = tmp_path / "damaged.osf", (ouster / "sphere.osf").read_bytes()
     chance = random.Random(0)
@@ -526,11 +526,11 @@ def test_a_damaged_osf_is_refused_before_it_can_do_harm(ouster: Path, tmp_path: 
         at += 8 + struct.unpack_from("<I", content, at)[0]
 
 
-def test_packets_of_no_lidar(tmp_path: Path, ouster: Path) -> None:
+def test_packets_without_a_lidar_are_refused(tmp_path: Path, ouster: Path) -> None:
     path = write_pcap(tmp_path / "other.pcap", [b"name server" * 9] * 7)
-    assert "no Velodyne's packets" in error_of(path)
+    assert "not a Velodyne capture" in error_of(path)
     path.with_suffix(".json").write_text((ouster / "sphere.json").read_text())
-    assert "of its 7 packets none is a LiDAR's" in error_of(path)
+    assert "has 7 packets, none from a supported LiDAR" in error_of(path)
 
 
 @pytest.mark.parametrize(
@@ -550,7 +550,7 @@ def test_packets_of_no_lidar(tmp_path: Path, ouster: Path) -> None:
         ("text.db3", b"no database", "folder it lies in"),
     ],
 )
-def test_files_that_are_no_captures(tmp_path: Path, name: str, content: bytes, error: str) -> None:
+def test_files_that_are_not_captures_are_refused(tmp_path: Path, name: str, content: bytes, error: str) -> None:
     for module in ("rosbags.highlevel", "ouster.sdk.pcap", "velodyne_decoder"):
         pytest.importorskip(module)
     path = tmp_path / name
@@ -569,7 +569,7 @@ def test_files_that_are_no_captures(tmp_path: Path, name: str, content: bytes, e
         ("drive.mcap", ("rosbags", "rosbags.highlevel")),
     ],
 )
-def test_without_the_extra_the_line_that_installs_it(
+def test_missing_extra_names_the_install_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, modules: Sequence[str]
 ) -> None:
     path = tmp_path / name
@@ -615,7 +615,7 @@ def test_a_folder_is_read_by_name(tmp_path: Path) -> None:
         next(read_scans(tmp_path / "folder.bin"))
 
 
-def test_what_a_file_begins_with_decides(tmp_path: Path) -> None:
+def test_first_bytes_decide_the_format(tmp_path: Path) -> None:
     path = write_bag1(tmp_path / "drive.bag").rename(tmp_path / "drive.bag.1")
     assert is_capture(path)
     assert "there is none" not in error_of(path, topic="/nowhere")

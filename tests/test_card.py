@@ -44,7 +44,7 @@ RANGE_CARD = replace(
 
 
 @pytest.mark.parametrize("card", [TOP_VIEW_CARD, RANGE_CARD])
-def test_a_card_survives_json(card: ModelCard) -> None:
+def test_card_is_read_back_from_json(card: ModelCard) -> None:
     assert ModelCard.from_json(card.to_json()) == card
     assert ModelCard.from_json(card.to_json()).to_json() == card.to_json()
 
@@ -54,7 +54,7 @@ def test_geometries_know_their_shape() -> None:
     assert RANGE_CARD.view.height == 3
 
 
-def test_a_top_view_holds_what_lies_in_its_cells() -> None:
+def test_top_view_holds_positions_in_its_cells() -> None:
     view = TopViewGeometry()
     for place in ((6.0, -10.0), (45.99, 9.99), (20.0, 0.0)):
         assert view.holds(*place)
@@ -68,7 +68,7 @@ def test_unknown_keys_are_ignored() -> None:
 
 
 @pytest.mark.parametrize("key", sorted(json.loads(TOP_VIEW_CARD.to_json())))
-def test_no_key_is_defaulted(key: str) -> None:
+def test_missing_keys_are_refused(key: str) -> None:
     document = json.loads(TOP_VIEW_CARD.to_json())
     del document[key]
     with pytest.raises(CardError, match="schema" if key == "schema" else key):
@@ -146,8 +146,8 @@ json_values = st.recursive(
 )
 
 
-def test_a_bottomless_card_is_a_card_error() -> None:
-    with pytest.raises(CardError, match="no JSON"):
+def test_deeply_nested_json_is_a_card_error() -> None:
+    with pytest.raises(CardError, match="not JSON"):
         ModelCard.from_json("[" * 200_000)
 
 
@@ -164,7 +164,7 @@ def test_any_value_anywhere_is_read_or_refused(key: str, value: object) -> None:
         ModelCard.from_json(json.dumps(document))
 
 
-def test_places_and_cells_agree() -> None:
+def test_positions_and_cells_agree() -> None:
     view = TopViewGeometry()
     x, y = view.cell_centers()
     rows, cols, in_view = view.cells(x, y)
@@ -223,7 +223,7 @@ def test_a_card_is_found_in_a_file(tmp_path: Path, content: bytes) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", GRAPH, entry("author", b"nobody"), field(7, CARD)])
-def test_a_file_without_a_card_says_so(tmp_path: Path, content: bytes) -> None:
+def test_file_without_a_card_is_a_card_error(tmp_path: Path, content: bytes) -> None:
     with pytest.raises(CardError, match=r"model\.onnx has no card; write one"):
         ModelCard.read(write(tmp_path, content))
 
@@ -243,13 +243,13 @@ def test_a_file_without_a_card_says_so(tmp_path: Path, content: bytes) -> None:
         (varint(9 << 3) + b"\x00") * 20_000,
     ],
 )
-def test_a_damaged_file_is_a_model_file_error(tmp_path: Path, content: bytes) -> None:
-    with pytest.raises(ModelFileError, match=r"model\.onnx is no complete \.onnx file"):
+def test_damaged_file_is_a_model_file_error(tmp_path: Path, content: bytes) -> None:
+    with pytest.raises(ModelFileError, match=r"model\.onnx is not a complete \.onnx file"):
         ModelCard.read(write(tmp_path, content))
 
 
 def test_a_card_is_utf_8_of_at_most_16_mb(tmp_path: Path) -> None:
-    with pytest.raises(CardError, match=r"model\.onnx: the entry edgeperc\.card is no UTF-8"):
+    with pytest.raises(CardError, match=r"model\.onnx: the entry edgeperc\.card is not UTF-8"):
         ModelCard.read(write(tmp_path, entry(CARD_KEY, b"\xff\xfe")))
     with pytest.raises(CardError, match=r"model\.onnx: the entry edgeperc\.card has 16000001 bytes; expected at most"):
         ModelCard.read(write(tmp_path, entry(CARD_KEY, b" " * 16_000_001)))
@@ -258,7 +258,7 @@ def test_a_card_is_utf_8_of_at_most_16_mb(tmp_path: Path) -> None:
 
 
 def test_a_damaged_card_names_its_file(tmp_path: Path) -> None:
-    with pytest.raises(CardError, match=r"model\.onnx: the card is no JSON"):
+    with pytest.raises(CardError, match=r"model\.onnx: the card is not JSON"):
         ModelCard.read(write(tmp_path, entry(CARD_KEY, b"{")))
 
 

@@ -1,17 +1,16 @@
+"""The command line: running, output files, data sets, help pages and wrong usage."""
+
 from __future__ import annotations
 
 import argparse
-import hashlib
 import io
 import json
 import os
 import shlex
-import shutil
 import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar
@@ -21,47 +20,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edgeperc import __version__, cli, listing, session, tuning, zoo
-from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from cli_helpers import POINTSEG, SSADNET, run, write_scan
+from edgeperc import __version__, session, zoo
 from edgeperc.cli.arguments import DEFAULT, PRECISIONS, PROVIDERS
 from edgeperc.cli.eval import _figure_lines
 from edgeperc.cli.main import build_parser, in_options
-from edgeperc.cli.output import progress, say
+from edgeperc.cli.output import print_line, progress
 from edgeperc.cli.scans import find_scans, output_names
 from edgeperc.errors import InferenceError, ModelFileError, OptionError, PointsError
-from edgeperc.fitness import FitnessProfile
 from edgeperc.perception import Box, Perception, PointLabels, TopView
 from edgeperc.readers import captures
-from edgeperc.sensor import SENSORS
-from edgeperc.zoo import Variant
-
-POINTSEG = ModelCard(
-    name="pointseg",
-    version="1.2.3",
-    view=RangeImageGeometry((2.0, 0.0, -10.0), width=8),
-    input=InputSpec("range_image", ("x", "y", "z"), (0.0,) * 3, (1.0,) * 3),
-    outputs=(OutputSpec("logits", "class_logits"),),
-    classes=("background", "car", "pedestrian", "cyclist"),
-    training={
-        "data": "streets",
-        "licence": "CC0",
-        "frames": list(range(40)),
-        "drives": ["a", "b"],
-        "seen": dict.fromkeys("abcdefghijklmnopqrstuvwxyz", 0),
-    },
-    metrics={"real": {"n_frames": 21, "points": {"all": {"car": {"iou": 0.65123, "n_objects": 3}}}}},
-    parity={"max_abs_diff": 1.5e-5},
-    precisions={"int8": {"label_agreement": 0.99953, "loss": 0.1}},
-)
-SSADNET = ModelCard(
-    name="ssadnet",
-    version="1.0.0",
-    view=TopViewGeometry(),
-    input=InputSpec("top_view", ("height",), (0.0,), (1.0,)),
-    outputs=(OutputSpec("map", "class_probabilities"), OutputSpec("boxes", "box_dense")),
-    classes=("background", "drivable", "car", "van", "truck"),
-    box_classes=("car", "van"),
-)
 
 
 class FakePerceiver:
@@ -116,19 +84,6 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakePerceiver]:
     monkeypatch.setitem(sys.modules, "edgeperc.perceiver", SimpleNamespace(Perceiver=FakePerceiver))
     monkeypatch.setattr(FakePerceiver, "made", [])
     return FakePerceiver
-
-
-def write_scan(path: Path, n: int = 40, first_remission: float = 0.0) -> Path:
-    points = np.random.default_rng(n).uniform(-20.0, 20.0, (n, 4)).astype(np.float32)
-    points[:, 3] = 0.5
-    points[:1, 3] = first_remission
-    path.parent.mkdir(parents=True, exist_ok=True)
-    points.tofile(path)
-    return path
-
-
-def run(*arguments: object) -> int:
-    return cli.main([str(a) for a in arguments])
 
 
 def usage_code(*arguments: object) -> int:
@@ -245,12 +200,11 @@ def test_run_prints_a_line_a_scan(
     assert "boxes: 1 car" in lines[1]
     assert "car 600, pedestrian 0, cyclist 0" in lines[1]
     assert fake.made[0].given == (["ssadnet", "pointseg"], "os1-64", "cpu", 2, "ignore")
-    assert (
-        run("run", scans[0], "--boxes-from", "clusters", "--full-turn", "--precision", "bf16", "--adapt", "none") == 0
-    )
+    options = ("--boxes-from", "clusters", "--full-turn", "--precision", "bf16", "--adapt", "none", "--trusted")
+    assert run("run", scans[0], *options) == 0
     assert [one.more for one in fake.made] == [
-        {"precision": "auto", "adapt": "both", "boxes_from": "both", "full_turn": False},
-        {"precision": "bf16", "adapt": "none", "boxes_from": "clusters", "full_turn": True},
+        {"precision": "auto", "adapt": "both", "boxes_from": "both", "full_turn": False, "trusted": False},
+        {"precision": "bf16", "adapt": "none", "boxes_from": "clusters", "full_turn": True, "trusted": True},
     ]
 
 
@@ -591,7 +545,7 @@ def test_a_progress_bar_is_drawn_on_a_terminal_below_the_lines(
     with progress("file") as show:
         show(0, 4)
         show(2, 4)
-        say("a line")
+        print_line("a line")
     shown = sys.stderr.getvalue()  # type: ignore[attr-defined]
     assert "0/4" in shown
     assert "2/4" in shown
@@ -656,223 +610,6 @@ def test_demo_without_matplotlib(
     assert "pip install 'edgeperc[view]'" in out
     assert "drivable" in out
     assert [file.name for file in (tmp_path / "demo").iterdir()] == ["scene.html"]
-
-
-@pytest.fixture
-def fake_models(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    file = tmp_path / "pointseg.onnx"
-    file.write_bytes(bytes(2_500_000))
-    file.with_stem("pointseg-int8").write_bytes(bytes(700_000))
-    file.with_stem("ssadnet").write_bytes(bytes(10))
-    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "cache"))
-
-    def listed() -> tuple[Variant, ...]:
-        return (
-            Variant(file, POINTSEG),
-            Variant(file.with_stem("pointseg-int8"), replace(POINTSEG, precision="int8")),
-            Variant(file.with_stem("ssadnet"), SSADNET),
-        )
-
-    def resolve(model: str) -> tuple[Variant, ...]:
-        found = tuple(each for each in listed() if each.name in (Path(model).stem, model))
-        if not found:
-            raise ModelFileError(f"no model is called {model!r}")
-        return found
-
-    monkeypatch.setattr(zoo, "listed", listed)
-    monkeypatch.setattr(listing, "listed", listed)
-    monkeypatch.setattr(zoo, "resolve", resolve)
-
-
-def rows_of(text: str) -> dict[str, str]:
-    """First words of lines, and what follows."""
-    return dict((*line.split(None, 1), "")[:2] for line in text.splitlines())
-
-
-@pytest.mark.usefixtures("fake_models")
-@pytest.mark.parametrize("thing", ["pointseg", "pointseg.onnx"])
-def test_info_of_a_model(thing: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("info", thing if thing == "pointseg" else tmp_path / thing) == 0
-    rows = rows_of(capsys.readouterr().out)
-    assert rows["model"] == "pointseg 1.2.3: a class for every point (car, pedestrian, cyclist)"
-    assert rows["variants"] == "fp32 2.5 MB, int8 0.7 MB"
-    assert rows["sha256"] == hashlib.sha256(bytes(2_500_000)).hexdigest()
-    assert rows["view"] == "range_image: 3 beams from 2 to -10 deg, azimuths 45 to -45 deg"
-    assert rows["input"] == "3 x 3 x 8: x, y, z"
-    assert rows["outputs"] == "logits (class_logits)"
-    assert rows["classes"] == "background, car, pedestrian, cyclist"
-    assert rows["data"] == "streets"
-    assert rows["licence"] == "CC0"
-    assert rows["on"] == "KITTI  21 scans, %: IoU car 65.1"
-    assert rows["int8"] == "99.95 % of the labels as in fp32, 0.1 points lost"
-    assert "frames" not in rows
-
-
-@pytest.mark.parametrize("name", zoo.shipped_models())
-def test_info_of_a_shipped_model_fits_a_screen(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("info", name) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert 8 < len(lines) <= 24
-    assert max(map(len, lines)) <= 100
-
-
-def test_info_folds_what_is_long(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
-    card = replace(POINTSEG, training={"data": "street " * 100}, classes=tuple(f"class {k}" for k in range(250)))
-    monkeypatch.setattr(zoo, "resolve", lambda model: (Variant(Path(__file__), card),))
-    assert run("info", "pointseg") == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) <= 24
-    assert max(map(len, lines)) <= 100
-    assert sum(line.endswith(" ...") for line in lines) == 3  # classes are in two rows
-
-
-@pytest.mark.usefixtures("fake_models")
-def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-
-    checked = []
-
-    def check_fitness(points, profile, sensor) -> tuple[str, ...]:
-        checked.append((points, profile, sensor.name))
-        return ("it has 32 beams",)
-
-    monkeypatch.setattr("edgeperc.fitness.check_fitness", check_fitness)
-    monkeypatch.setattr(FitnessProfile, "from_dict", dict)
-    monkeypatch.setattr(sys.modules[__name__], "POINTSEG", replace(POINTSEG, fitness={"n_beams": 64}))
-    points = np.array([[3, 4, 0, 10], [0, 10, 10, 255], [-6, 0, 8, 51], [np.nan, 0, 0, 0]], np.float32)
-    np.save(tmp_path / "scan.npy", points)
-    assert run("info", tmp_path / "scan.npy", "--sensor", "os1-64") == 0
-    rows = rows_of(capsys.readouterr().out)
-    assert rows["points"] == "4, of which 1 are not finite"
-    assert rows["extent"] == "x -6.0 .. 3.0, y 0.0 .. 10.0, z 0.0 .. 10.0 m"
-    assert rows["range"] == "5.0 .. 14.1 m, median 10.0 m"
-    assert rows["remission"].startswith("min 10, 5 % ")
-    assert rows["beams"].endswith("rows of points (os1-64: 64)")
-    assert rows["pointseg"] == "as a scan of os1-64: it has 32 beams"
-    assert rows["ssadnet"].startswith("its card does not describe")
-    ((scaled, profile, sensor),) = checked
-    np.testing.assert_allclose(scaled[:3, 3], np.array([10, 255, 51]) / 255, rtol=1e-6)
-    assert (profile, sensor) == ({"n_beams": 64}, "os1-64")
-    assert run("info", tmp_path / "scan.npy", "--sensor", "os1-64", "--json") == 0
-    document = json.loads(capsys.readouterr().out)
-    assert document["range_m"] == pytest.approx([5.0, 10.0, 14.1421], abs=1e-4)
-    assert (document["n_points"], document["n_not_finite"]) == (4, 1)
-    assert document["models"] == {"pointseg": ["it has 32 beams"], "ssadnet": None}
-
-
-def test_info_prints_a_card_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("info", "ssadnet", "--json") == 0
-    assert ModelCard.from_json(capsys.readouterr().out).to_json() == zoo.resolve("ssadnet")[0].card.to_json()
-
-
-@pytest.mark.usefixtures("fake_models")
-def test_info_goes_on_after_what_it_does_not_know(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    empty = tmp_path / "empty.npy"
-    np.save(empty, np.zeros((0, 4), np.float32))
-    assert run("info", "nonesuch", tmp_path / "absent.bin", empty, "ssadnet") == 1
-    captured = capsys.readouterr()
-    assert [line.split(":")[0] for line in captured.err.splitlines()] == ["edgeperc", "edgeperc"]
-    assert "0, of which 0 are not finite" in captured.out
-    assert "top_view: x 6..46 m, y -10..10 m, cells of 0.1 m" in captured.out
-    assert "car, van, score from 0.3" in captured.out
-    assert run("info", empty, "--sensor", "nonesuch") == 2
-    assert "nonesuch" in capsys.readouterr().err
-
-
-def test_info_and_lists_need_no_onnxruntime(tmp_path: Path) -> None:
-    scan = write_scan(tmp_path / "a.bin", 40)
-    code = (
-        "import sys; from edgeperc.cli import main\n"
-        f"for words in (['info', 'pointseg', {str(scan)!r}], ['models'], ['sensors']): assert main(words) == 0\n"
-        "sys.exit('opened' if 'onnxruntime' in sys.modules else 0)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-
-
-# --- models, sensors, providers, completion --------------------------------------------------------------------------
-
-
-@pytest.mark.usefixtures("fake_models")
-def test_models_are_listed_with_what_was_measured_here(capsys: pytest.CaptureFixture[str]) -> None:
-    entry = {"provider": "cpu", "precision": "int8", "n_threads": 2, "p50_ms": 7.25}
-    digest = zoo.digest(zoo.resolve("pointseg"))
-    tuning.write_settings(tuning.settings_path(), tuning.fingerprint(), {digest: entry})
-    assert run("models") == 0
-    heading, pointseg, ssadnet = capsys.readouterr().out.splitlines()
-    assert heading.split()[:2] == ["name", "default"]
-    assert pointseg.split()[:2] == ["pointseg", "yes"]
-    assert "fp32 2.5, int8 0.7" in pointseg
-    assert "7.2 ms, cpu int8" in pointseg
-    assert pointseg.endswith("CC0")
-    assert "boxes of car, van" in ssadnet
-    assert run("models", "--json") == 0
-    first, second = map(json.loads, capsys.readouterr().out.splitlines())
-    assert (first["name"], first["measured"], first["default"]) == ("pointseg", entry, True)
-    assert first["variants"] == {"fp32": 2.5, "int8": 0.7}
-    assert second["measured"] is None
-
-
-def test_sensors_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("sensors") == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines[1:]] == [*SENSORS]
-    assert [line.split()[0] for line in lines[1:] if line.split()[1] == "yes"] == ["hdl-64e"]
-    assert run("sensors", "--json") == 0
-    records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [record["name"] for record in records] == [*SENSORS]
-    assert records[0]["beams"] == 64
-
-
-def test_providers_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("onnxruntime")
-    assert run("providers", "--json") == 0
-    records = {record["name"]: record for record in map(json.loads, capsys.readouterr().out.splitlines())}
-    assert {*records} == {*session.PROVIDERS}
-    assert records["cpu"]["available"]
-    assert run("providers") == 0
-    assert len(capsys.readouterr().out.splitlines()) == 1 + len(records)
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
-def test_completion_knows_commands_options_and_names(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("shtab")
-    assert run("completion", shell) == 0
-    script = capsys.readouterr().out
-    for word in ("eval-tracking", "full-turn", "os1-64", "ssadnet", "openvino", "bf16"):
-        assert word in script
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
-@pytest.mark.parametrize(
-    ("words", "found"),
-    [
-        (["mod"], {"models"}),
-        (["run", "--full"], {"--full-turn"}),
-        (["run", "--precision", "b"], {"bf16"}),
-        (["run", "--model", "ssad"], {"ssadnet"}),
-        (["run", "--sensor", "pandarx"], {"pandarxt-32"}),
-        (["run", "--model", "ssadnet", "sca"], {"scan.bin"}),
-        (["info", "sca"], {"scan.bin"}),
-        (["eval-tracking", "--gif", "sca"], {"scan.bin"}),
-    ],
-)
-def test_bash_completes(words: list[str], found: set[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("shtab")
-    assert run("completion", "bash") == 0
-    (tmp_path / "scan.bin").touch()
-    (tmp_path / "completion").write_text(capsys.readouterr().out)
-    code = (
-        f"source ./completion; COMP_WORDS=(edgeperc {' '.join(words)}); COMP_CWORD={len(words)}; "
-        '_shtab_edgeperc 2>/dev/null; printf "%s\\n" "${COMPREPLY[@]}"'
-    )
-    done = subprocess.run(["bash", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert {*done.stdout.split()} == found, done.stderr
-
-
-def test_completion_names_its_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "shtab", None)
-    assert run("completion", "bash") == 2
-    assert "pip install 'edgeperc[completion]'" in capsys.readouterr().err
 
 
 # --- data sets -------------------------------------------------------------------------------------------------------

@@ -47,7 +47,7 @@ def car_points(x, y, yaw, *, front=True, flank=True, size=(3.89, 1.63)):
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("per_m", [0.0, 0.02, 0.1])
-def test_clusters_are_those_of_every_pair_looked_at(seed, per_m):
+def test_clusters_match_a_test_of_every_pair(seed, per_m):
     rng = np.random.default_rng(seed)
     centers = rng.uniform(-30, 30, (25, 3)) * [1, 1, 0.1]
     points = as_points(centers[rng.integers(0, 25, 700)] + rng.normal(0, 0.1 * (seed + 1), (700, 3)))
@@ -66,7 +66,7 @@ places = st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0, 0.3, -0.2, 0.35, 5.0, -7.5,
 
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.tuples(places, places, places), max_size=30), st.sampled_from([0.0, 0.05]), st.integers(1, 3))
-def test_whatever_comes_the_twin_agrees(rows, per_m, min_points):
+def test_random_scans_match_the_twin(rows, per_m, min_points):
     points = as_points(np.array(rows).reshape(-1, 3))
     among = np.ones(len(points), bool)
     found = find_clusters(points, min_distance_m=0.5, distance_per_m=per_m, min_points=min_points)
@@ -74,7 +74,7 @@ def test_whatever_comes_the_twin_agrees(rows, per_m, min_points):
 
 
 @pytest.mark.parametrize("spread", [0.02, 0.5, 20.0])
-def test_a_tall_column_in_any_order_is_the_twins(spread):
+def test_tall_column_in_any_order_matches_the_twin(spread):
     rng = np.random.default_rng(0)
     points = as_points(np.column_stack([rng.uniform(0, 0.6, (300, 2)), rng.uniform(0, spread * 10, 300)]))
     np.testing.assert_array_equal(
@@ -115,12 +115,12 @@ def test_clusters_are_numbered_by_their_first_points():
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 4)), np.full((7, 4), np.nan), np.full((3, 4), np.inf)])
-def test_nothing_is_in_no_cluster(points):
+def test_scan_without_finite_points_has_no_clusters(points):
     assert (find_clusters(points.astype(np.float32), min_points=1) == -1).all()
     assert objects_from_points(points.astype(np.float32), np.zeros(len(points), np.uint8), CLASSES) == ()
 
 
-def test_one_point_is_a_cluster_if_that_is_enough():
+def test_one_point_is_a_cluster_if_min_points_is_1():
     point = as_points([[3.0, 1.0, 0.0]])
     assert find_clusters(point, min_points=1).tolist() == [0]
     assert find_clusters(point).tolist() == [-1]
@@ -151,7 +151,7 @@ def test_a_wrong_shape_is_refused():
 # --- the class of a cluster
 
 
-def test_a_cluster_is_kept_when_more_than_the_share_carries_one_class():
+def test_cluster_is_kept_if_more_than_min_share_has_one_class():
     clusters = np.repeat(np.array([0, 1, 2, 3, -1], np.int32), 10)
     labels = np.array([1] * 8 + [0] * 2 + [1] * 7 + [0] * 3 + [2] * 5 + [3] * 5 + [0] * 10 + [1] * 10, np.uint8)
     classes, shares = cluster_labels(clusters, labels)
@@ -176,7 +176,7 @@ def test_labels_of_another_scan_are_refused():
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 700), st.integers(0, 2**31), st.booleans())
-def test_rectangles_are_the_twins(n, seed, l_shaped):
+def test_rectangles_agree_with_the_twin(n, seed, l_shaped):
     rng = np.random.default_rng(seed)
     turn = rng.uniform(0, np.pi)
     members = (
@@ -203,7 +203,7 @@ def test_a_car_gets_its_box_all_around_the_vehicle(where, yaw):
 
 @pytest.mark.parametrize("part", [{"flank": False}, {"front": False}])
 @pytest.mark.parametrize("x", [15.0, -15.0])
-def test_the_side_that_was_not_seen_is_made_as_long_as_usual(part, x):
+def test_hidden_side_is_extended_to_the_usual_length(part, x):
     points = as_points(car_points(x, 6.0, 0.0, **part))
     (box,) = objects_from_points(points, np.ones(len(points), np.uint8), CLASSES)
     np.testing.assert_allclose(box.size[:2], OBJECT_SIZE_M["car"][:2], atol=0.06)
@@ -211,7 +211,7 @@ def test_the_side_that_was_not_seen_is_made_as_long_as_usual(part, x):
     assert abs(box.yaw) < 0.03
 
 
-def test_what_is_longer_than_usual_stays_so():
+def test_sides_longer_than_usual_are_kept():
     points = as_points(car_points(12.0, 6.0, 0.0, size=(11.0, 2.5)))
     (box,) = objects_from_points(points, np.ones(len(points), np.uint8), CLASSES)
     np.testing.assert_allclose(box.size[:2], (11.0, 2.5), atol=0.05)
@@ -225,7 +225,7 @@ def test_boxes_stand_on_the_ground():
     assert box.size[2] == pytest.approx(OBJECT_SIZE_M["car"][2])
 
 
-def test_the_ground_does_not_join_what_stands_on_it():
+def test_ground_points_do_not_join_objects():
     cars = [car_points(12.0, y, 0.0) for y in (5.0, 9.0)]
     x, y = np.meshgrid(np.arange(5.0, 20.0, 0.3), np.arange(0.0, 15.0, 0.3))
     floor = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -1.73)])
@@ -254,14 +254,14 @@ def test_every_class_has_boxes_and_better_ones_come_first():
     assert objects_from_points(points, labels, CLASSES) == boxes
 
 
-def test_what_lies_under_the_ground_is_nothing():
+def test_objects_below_the_ground_are_dropped():
     points = as_points(side((8.0, -6.0), (8.0, -5.5), z=(-3.5, -2.5)))
     height = points[:, 2] + np.float32(1.73)
     for label in (1, 2):
         assert objects_from_points(points, np.full(len(points), label, np.uint8), CLASSES, height_m=height) == ()
 
 
-def test_a_pole_is_less_of_a_person_than_a_person():
+def test_pole_scores_lower_than_a_person():
     def score(top, label):
         points = as_points(side((8.0, -6.0), (8.0, -5.3), z=(-1.7, top)))
         boxes = objects_from_points(points, np.full(len(points), label, np.uint8), CLASSES, min_score=0.0)
@@ -272,7 +272,7 @@ def test_a_pole_is_less_of_a_person_than_a_person():
     assert score(0.0, 1) == score(0.7, 1)  # as tall as a van
 
 
-def test_a_class_without_usual_size_is_as_large_as_it_is_seen():
+def test_class_without_usual_size_has_the_size_of_its_points():
     points = as_points(side((8.0, -6.0), (8.0, -4.0), z=(-1.7, 0.0)))
     (box,) = objects_from_points(points, np.ones(len(points), np.uint8), ("background", "sign"))
     np.testing.assert_allclose(box.size, (2.0, cluster.MIN_SIDE_M, 1.7), atol=1e-5)

@@ -1,4 +1,4 @@
-"""The top-view database: its contents, that every way of building it gives the same, and drawing roads in it."""
+"""The top-view database: its contents, equal results of all ways to build it, and drawing of roads."""
 
 from __future__ import annotations
 
@@ -68,11 +68,11 @@ INPUT = InputSpec("top_view", ("distance", "remission", "height"), (0.0, 0.0, -2
 
 @pytest.fixture(scope="module")
 def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A KITTI object set, simulated: seven scenes of drives to train on and one of a test drive."""
+    """A simulated KITTI object set: seven scenes of training drives and one of a test drive."""
     root = tmp_path_factory.mktemp("kitti")
     for part in ("velodyne", "label_2", "calib", "image_2"):
         (root / "training" / part).mkdir(parents=True)
-    # The camera is tilted a little, as KITTI's is.
+    # The camera is tilted a little, like KITTI's.
     calibration = "P2: 700 0 620 0 0 700 180 0 0 0 1 0\nR0_rect: 1 0 0 0 0.99995 -0.01 0 0.01 0.99995\n"
     calibration += "Tr_velo_to_cam: 0 -1 0 0.1 0 0 -1 -0.08 1 0 0 -0.27\n"
     rows = ["name,drive"]
@@ -124,7 +124,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="module")
 def polygons(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Roads of a scene to train on and of a test scene."""
+    """Roads of a training scene and of a test scene."""
     path = tmp_path_factory.mktemp("drawn") / "road.json"
     path.write_text(write_coco({"000001": [TRAPEZIUM], "000007": [TRAPEZIUM]}))
     return path
@@ -143,7 +143,7 @@ def out(tmp_path_factory: pytest.TempPathFactory, kitti: Path, model: str, polyg
 
 
 def contents(root: Path) -> dict[str, str]:
-    """Every file below a folder, and the hash of what is in it."""
+    """Every file below a folder, and the hash of its content."""
     files = (path for path in sorted(root.rglob("*")) if path.is_file())
     return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
@@ -159,19 +159,19 @@ def with_edges(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("n", [0, 1, 5000])
-def test_a_picture_is_its_twin(n: int) -> None:
+def test_a_picture_equals_its_twin(n: int) -> None:
     points = with_edges(np.random.default_rng(n), n)
     np.testing.assert_array_equal(picture(points), twins.database.picture(points))
 
 
 @settings(max_examples=30, deadline=None)
 @given(hnp.arrays(np.float32, st.tuples(st.integers(0, 6), st.just(4)), elements=st.floats(width=32)))
-def test_a_picture_of_anything_is_its_twin(points: np.ndarray) -> None:
+def test_a_picture_of_any_points_equals_its_twin(points: np.ndarray) -> None:
     np.testing.assert_array_equal(picture(points), twins.database.picture(points))
 
 
 def test_meters_are_rounded_and_clamped() -> None:
-    """Section 3.1: nearest whole pixel, then 0..399 and 0..199."""
+    """Section 3.1: round to the nearest pixel, then clamp to 0..399 and 0..199."""
     for (x, y), (row, col) in {
         (6.04, 0.0): (399, 99), (6.06, 0.0): (398, 99), (45.94, 0.0): (0, 99), (46.0, 0.0): (0, 99),
         (20.0, 10.0): (259, 0), (20.0, 9.94): (259, 0), (20.0, -10.0): (259, 199), (20.0, -9.94): (259, 198),
@@ -189,7 +189,7 @@ def test_the_highest_point_wins_and_the_first_of_equals() -> None:
     assert picture(points)[259, 99, 2] == round(255 * 0.2)
 
 
-def test_a_card_with_the_databases_view_sees_its_cells() -> None:
+def test_a_card_with_the_databases_view_has_its_cells() -> None:
     points = with_edges(np.random.default_rng(1), 20_000)[:10_000]
     points = points[(points[:, 0] >= 6.0) & (points[:, 0] < 45.9) & (np.abs(points[:, 1]) < 9.9)]
     points[:, 2], points[:, 3] = np.clip(points[:, 2], -2.5, 2.5), np.clip(points[:, 3], 0, 1)
@@ -204,7 +204,7 @@ def test_a_card_with_the_databases_view_sees_its_cells() -> None:
 
 
 def footprints(kitti: Path, name: str) -> list[tuple[str, Polygon]]:
-    """Vehicles' footprints in pixels of the map, from KITTI's files by a way of its own: 3-D corners to polygons."""
+    """Vehicles' footprints in pixels of the map, computed differently, from KITTI's files: 3-D corners to polygons."""
     lines = (kitti / "training/calib" / f"{name}.txt").read_text().splitlines()
     numbers = {key: np.array(rest.split(), float) for key, _, rest in (line.partition(":") for line in lines if line)}
     R, T = numbers["R0_rect"].reshape(3, 3), numbers["Tr_velo_to_cam"].reshape(3, 4)
@@ -218,7 +218,7 @@ def footprints(kitti: Path, name: str) -> list[tuple[str, Polygon]]:
         local = np.array([[l, -l, -l, l], [-h, -h, -h, -h], [w, w, -w, -w]]) / 2
         camera = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ local + np.array([[x], [y], [z]])
         velo = T[:, :3].T @ (R.T @ camera - T[:, 3:])
-        # Pixel (row, col) lies around x = 6.0 + 0.1 (399 - row), y = -10.0 + 0.1 (199 - col).
+        # The center of pixel (row, col) is x = 6.0 + 0.1 (399 - row), y = -10.0 + 0.1 (199 - col).
         col, row = 199.5 - (velo[1] + 10.0) / 0.1, 399.5 - (velo[0] - 6.0) / 0.1
         found.append((kind.lower(), Polygon(np.stack([col, row], 1))))
     return found
@@ -236,13 +236,13 @@ def disagreements(kitti: Path, name: str, labels: np.ndarray) -> tuple[int, int]
         inside = shapely.contains_properly(polygon, cells)
         whole[CLASSES.index(kind)][window] |= inside
         touched[window] |= shapely.intersects(polygon, cells) & ~inside
-    # Where two vehicles overlap either may be drawn; a border of one inside another is still a border.
+    # Where two vehicles overlap, either may be drawn; the outline of one inside the other is not compared either.
     right = np.take_along_axis(whole, labels[None].astype(np.int64), 0)[0]
     wrong = np.where(whole.any(0), ~right, labels >= 2) & ~touched
     return int(np.count_nonzero(wrong)), int(np.count_nonzero(whole.any(0) & ~touched))
 
 
-def test_maps_are_the_boxes(kitti: Path, out: Path) -> None:
+def test_maps_show_the_boxes(kitti: Path, out: Path) -> None:
     compared = 0
     for scene in TopViewDatabase(out):
         wrong, cells = disagreements(kitti, scene.name, scene.map)
@@ -251,8 +251,8 @@ def test_maps_are_the_boxes(kitti: Path, out: Path) -> None:
     assert compared > 10_000
 
 
-def test_maps_of_all_real_scans_are_the_boxes(kitti_root: Path) -> None:
-    """Without their roads, which a model finds."""
+def test_maps_of_all_real_scans_show_the_boxes(kitti_root: Path) -> None:
+    """Vehicles only: the roads come from a model."""
     objects, compared = KittiObjects(kitti_root), 0
     names = [row["name"] for row in objects.rows]
     for name in names:
@@ -264,7 +264,7 @@ def test_maps_of_all_real_scans_are_the_boxes(kitti_root: Path) -> None:
     assert compared > 100_000
 
 
-def test_labels_are_in_the_plane_and_in_the_map(out: Path) -> None:
+def test_labels_match_the_map(out: Path) -> None:
     kinds: Counter[str] = Counter()
     for scene in TopViewDatabase(out):
         text = (out / "labels" / f"{scene.name}.txt").read_text()
@@ -283,7 +283,7 @@ def test_an_impossible_vehicle_is_named(size: tuple[float, float, float]) -> Non
         vehicles([Box("van", 1.0, (20.0, 0.0, 0.0), size, 0.0)])
 
 
-def test_pedestrians_and_what_is_out_of_view_are_left_out() -> None:
+def test_pedestrians_and_vehicles_out_of_view_are_left_out() -> None:
     seen = Box("car", 1.0, (20.0, 0.0, -1.0), (4.0, 1.8, 1.5), 0.3)
     boxes = [seen, replace(seen, label="pedestrian"), replace(seen, center=(80.0, 0.0, 0.0))]
     assert [b.label for b in vehicles(boxes)] == ["car"]
@@ -292,7 +292,7 @@ def test_pedestrians_and_what_is_out_of_view_are_left_out() -> None:
 # --- the database ----------------------------------------------------------------------------------------------------
 
 
-def test_three_folders_of_equal_names_and_an_index(out: Path, kitti: Path) -> None:
+def test_three_folders_with_equal_names_and_an_index(out: Path, kitti: Path) -> None:
     names = [f"{k:06d}" for k in range(8)]
     for folder in ("images", "labels", "maps"):
         assert sorted(path.stem for path in (out / folder).iterdir()) == names
@@ -311,7 +311,7 @@ def test_three_folders_of_equal_names_and_an_index(out: Path, kitti: Path) -> No
         assert row["road"] == ("polygons" if scene.name in ("000001", "000007") else "model")
 
 
-def test_drives_stay_whole_and_test_drives_apart(out: Path) -> None:
+def test_drives_are_not_divided_and_test_drives_are_separate(out: Path) -> None:
     whole = TopViewDatabase(out)
     assert [row["scene"] for row in whole.rows if row["split"] == "test"] == ["000007"]
     assert {row["fold"] for row in whole.rows} == {"", "0", "1", "2", "3", "4"}
@@ -328,8 +328,8 @@ def test_drives_stay_whole_and_test_drives_apart(out: Path) -> None:
     assert {*sizes.values()} == {4, 5}
 
 
-def test_the_road_model_sees_the_databases_cells(out: Path, kitti: Path) -> None:
-    """What stands higher than the network's threshold is no road; the same cells as in the image."""
+def test_the_road_model_has_the_databases_cells(out: Path, kitti: Path) -> None:
+    """Points above the network's threshold are no road, in the same cells as in the image."""
     for scene in TopViewDatabase(out):
         if scene.name in ("000001", "000007"):
             continue
@@ -337,13 +337,13 @@ def test_the_road_model_sees_the_databases_cells(out: Path, kitti: Path) -> None
         low = scene.image[..., 1] / 255 * 5 - 2.5
         differs = (scene.map == 1) != ((0.7 - 3 * (low + 2.5) / 5 > 0) | (scene.image[..., 0] == 0))
         near = np.abs(0.7 - 3 * (low + 2.5) / 5) < 0.02  # a byte is no float
-        # Coordinates on a cell's very edge are rounded by the one in float32, by the other in float64.
+        # Coordinates on the edge of a cell are rounded in float32 by the model and in float64 by the database.
         assert np.count_nonzero(differs & ground & ~near) < 20, scene.name
 
 
-def test_drawn_roads_are_kept_and_varied_alike(out: Path) -> None:
+def test_drawn_roads_are_used_and_varied(out: Path) -> None:
     drawn = mask_of([[np.ravel(TRAPEZIUM).tolist()]])
-    for name, n in {"000001": 4, "000007": 1}.items():  # variations of what is trained on alone
+    for name, n in {"000001": 4, "000007": 1}.items():  # only training scenes have variations
         scene = TopViewDatabase(out).scene(name)
         ground = scene.map < 2
         np.testing.assert_array_equal(scene.map[ground], drawn[ground])
@@ -369,7 +369,7 @@ def test_a_variation_moves_image_and_mask_together() -> None:
         known = moved_mask != IGNORE
         np.testing.assert_array_equal(moved[known, 2], moved_mask[known])
         assert not moved[~known].any()
-        # Turned about the sensor, what is in the first channel is still the distance of the cell.
+        # The image is turned about the sensor, so the first channel is still the distance of the cell.
         row, col = np.nonzero(moved[..., 0])
         x, y = 6.0 + 0.1 * (399 - row), -10.0 + 0.1 * (199 - col)
         wrong = np.abs(moved[row, col, 0] / 255 * np.hypot(46, 10) - np.hypot(x, y))
@@ -409,7 +409,7 @@ def test_coco_reads_it(out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         np.testing.assert_array_equal(drawn > 0, scene.map > 0)
 
 
-def test_wrong_questions_are_answered(out: Path, tmp_path: Path) -> None:
+def test_wrong_usage_of_the_reader_is_explained(out: Path, tmp_path: Path) -> None:
     with pytest.raises(DatabaseError, match="run edgeperc-export database-build"):
         TopViewDatabase(tmp_path)
     with pytest.raises(ValueError, match="fold is 5"):
@@ -440,15 +440,15 @@ def test_wrong_questions_are_answered(out: Path, tmp_path: Path) -> None:
             TopViewDatabase(tmp_path / "copy")
 
 
-# --- the same however it is made -------------------------------------------------------------------------------------
+# --- equal results of all builds -------------------------------------------------------------------------------------
 
 
-def test_processes_make_the_same(out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path) -> None:
+def test_processes_make_the_same_files(out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path) -> None:
     build(plan_of(kitti, tmp_path / "out", model), polygons=[polygons], workers=2)
     assert contents(tmp_path / "out") == contents(out)
 
 
-def test_ray_makes_the_same(out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path) -> None:
+def test_ray_makes_the_same_files(out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path) -> None:
     pytest.importorskip("ray")
     command = [sys.executable, "-m", "edgeperc_export.cli", "database-build", str(kitti), str(tmp_path / "out")]
     command += ["--engine", "ray", "--workers", "2", "--road-by", model]
@@ -458,8 +458,8 @@ def test_ray_makes_the_same(out: Path, kitti: Path, model: str, polygons: Path, 
     assert contents(tmp_path / "out") == contents(out)
 
 
-def test_every_fold_has_a_road_model_that_did_not_see_it(kitti: Path, tmp_path: Path) -> None:
-    """Roads of scenes 0, 3 and 7 are drawn. A model's card has the names of the scenes that it was trained on."""
+def test_the_road_model_of_a_fold_is_not_trained_on_it(kitti: Path, tmp_path: Path) -> None:
+    """Roads of scenes 0, 3 and 7 are drawn. A model's card has the names of its training scenes."""
     torch = pytest.importorskip("torch")
     from edgeperc_export.recipe import Recipe
 
@@ -494,14 +494,14 @@ def test_without_ray_the_extra_is_named(
         build(plan_of(kitti, tmp_path / "out", model), engine="ray", workers=2)
 
 
-class Power(BaseException):
-    """The plug is pulled."""
+class PowerFailure(BaseException):
+    """A simulated power failure."""
 
 
-def test_stopped_at_every_write_and_resumed_it_is_the_same(
+def test_a_build_stopped_at_every_write_and_resumed_is_the_same(
     out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The plug is pulled in every file: before it, half way, and before it is renamed, in turn."""
+    """Power fails at every file: before it is written, in the middle, or before it is renamed, in turn."""
     plan, stops = plan_of(kitti, tmp_path / "out", model), 0
 
     def failing(path: Path, content: bytes) -> None:
@@ -510,7 +510,7 @@ def test_stopped_at_every_write_and_resumed_it_is_the_same(
             aside = path.with_name(f".{path.name}.{1000 + stops}.part")
             if stops % 3:
                 aside.write_bytes(content[: len(content) // (1 + stops % 2)])
-            raise Power
+            raise PowerFailure
         left -= 1
         write_atomic(path, content)
 
@@ -521,7 +521,7 @@ def test_stopped_at_every_write_and_resumed_it_is_the_same(
         try:
             build(plan, polygons=[polygons], workers=1)
             break
-        except Power:
+        except PowerFailure:
             stops += 1
             with pytest.raises(DatabaseError, match="unfinished"):
                 TopViewDatabase(plan.out)
@@ -552,10 +552,10 @@ build_module.build(plan, polygons=[Path(polygons)], workers=1)
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal on this platform")
-def test_killed_ten_times_and_resumed_it_is_the_same(
+def test_a_build_killed_ten_times_and_resumed_is_the_same(
     out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path
 ) -> None:
-    """At random moments: while the model is set up, or a random number of writes later and a little more."""
+    """At random moments: while the model is loaded, or after a random number of writes and a short delay."""
     target, rng = tmp_path / "out", random.Random()
     command = [sys.executable, "-c", KILLED, *map(str, (kitti, target, model, polygons))]
     kills, finished = 0, []
@@ -576,8 +576,8 @@ def test_killed_ten_times_and_resumed_it_is_the_same(
     assert contents(target) == contents(out)
 
 
-def test_a_killed_builds_workers_die_with_it(kitti: Path, model: str, tmp_path: Path) -> None:
-    """A worker that went on would write into a database that is being resumed."""
+def test_the_workers_of_a_killed_build_stop(kitti: Path, model: str, tmp_path: Path) -> None:
+    """A surviving worker would write into a database that is being resumed."""
     if not Path("/proc/self/stat").exists():
         pytest.skip("needs /proc to see processes")
     command = [sys.executable, "-m", "edgeperc_export.cli", "database-build", str(kitti), str(tmp_path / "out")]
@@ -630,7 +630,7 @@ def test_a_broken_scene_is_left_out_and_reported(
     assert contents(tmp_path / "out") == contents(out)
 
 
-def test_what_changed_is_made_again_and_what_is_gone_goes(
+def test_changed_scenes_are_made_again_and_removed_ones_deleted(
     out: Path, kitti: Path, model: str, polygons: Path, tmp_path: Path
 ) -> None:
     root = tmp_path / "kitti"
@@ -651,13 +651,13 @@ def test_what_changed_is_made_again_and_what_is_gone_goes(
     assert not [*plan.out.rglob("*000006*")]
     assert not database.damaged()
 
-    assert build(plan, workers=1).made == 2  # no polygons: their scenes take the model's road
+    assert build(plan, workers=1).made == 2  # no polygons: these scenes take the road of the model
     assert not [*(plan.out / "road/masks").iterdir()]
     other = road_network(tmp_path / "other.onnx", VIEW)
     assert build(replace(plan, road_by=str(other)), workers=1).made == 7
 
 
-def test_memory_does_not_grow_with_the_scenes(kitti: Path, model: str, tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_the_number_of_scenes(kitti: Path, model: str, tmp_path: Path) -> None:
     peaks = {}
     for n in (6, 30):
         root = tmp_path / f"kitti-{n}"
@@ -670,7 +670,7 @@ def test_memory_does_not_grow_with_the_scenes(kitti: Path, model: str, tmp_path:
         assert build(plan_of(root, tmp_path / f"out-{n}", model), workers=1).made == n
         peaks[n] = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-    # 24 more images alone, kept, would be 5.8 MB.
+    # If the 24 more images stayed in memory, they would take 5.8 MB.
     assert peaks[30] - peaks[6] < 1e6
 
 
@@ -689,7 +689,7 @@ def test_unusable_input_is_refused(kitti: Path, model: str, out: Path, tmp_path:
     far = road_network(tmp_path / "far.onnx", TopViewGeometry((10.0, 50.0)))
     deaf = road_network(tmp_path / "deaf.onnx", TopViewGeometry(), ("background", "grass"))
     for path, message in {
-        str(far): "give or take a cell",
+        str(far): "to within one cell",
         str(deaf): "class drivable",
         "pointseg": "range_image",
     }.items():
@@ -699,7 +699,7 @@ def test_unusable_input_is_refused(kitti: Path, model: str, out: Path, tmp_path:
     assert main(nothing) == main([nothing[0], str(kitti), nothing[2], "--workers", "0"]) == 2
 
 
-def test_a_users_own_set_gets_notes_on_what_it_lacks(kitti: Path, model: str, polygons: Path, tmp_path: Path) -> None:
+def test_notes_report_what_a_data_set_lacks(kitti: Path, model: str, polygons: Path, tmp_path: Path) -> None:
     root = tmp_path / "kitti"
     shutil.copytree(kitti, root)
     (root / "frames.csv").unlink()
@@ -740,7 +740,7 @@ def test_polygons_and_run_lengths_become_masks(tmp_path: Path) -> None:
         (tmp_path / "b.json").write_text(drawn(annotation={"segmentation": segmentation}))
         np.testing.assert_array_equal(mask_of(read_coco([tmp_path / "b.json"])["000001"]), mask)
     (tmp_path / "c.json").write_text(drawn(annotation={"category_id": 1}))
-    assert read_coco([tmp_path / "c.json"]) == {"000001": []}  # looked at, and no road
+    assert read_coco([tmp_path / "c.json"]) == {"000001": []}  # annotated, but not as road
     with pytest.raises(DatabaseError, match="another file both draw"):
         read_coco([tmp_path / "a.json", tmp_path / "b.json"])
 
@@ -764,15 +764,15 @@ def test_polygons_and_run_lengths_become_masks(tmp_path: Path) -> None:
         (drawn(annotation={"segmentation": {"size": [400, 200], "counts": [81]}}), "run lengths"),
     ],
 )
-def test_what_is_no_drawing_is_named(tmp_path: Path, text: str, message: str) -> None:
+def test_an_invalid_drawing_is_reported(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "bad.json").write_text(text)
     with pytest.raises(DatabaseError, match=message):
         read_coco([tmp_path / "bad.json"])
 
 
-def test_a_draft_is_the_road() -> None:
+def test_a_draft_matches_the_road() -> None:
     labels = mask_of([[np.ravel(TRAPEZIUM).tolist()]])
-    labels[200:230, 90:110] = 2  # a car on the road is no hole in it
+    labels[200:230, 90:110] = 2  # a car on the road leaves no hole
     labels[5:8, 5:8] = 1  # too small to draw
     (outline,) = draft(labels)
     assert len(outline) < 20
@@ -805,7 +805,7 @@ def ask(server: LabelServer, path: str, body: str | None = None, **headers: str)
     return content
 
 
-def test_the_page_keeps_what_is_drawn(server: LabelServer, out: Path) -> None:
+def test_the_page_saves_drawn_polygons(server: LabelServer, out: Path) -> None:
     scenes = json.loads(ask(server, "scenes"))
     assert [scene["name"] for scene in scenes] == TopViewDatabase(out).names
     assert ask(server, "image/000003") == (out / "images/000003.png").read_bytes()
@@ -814,7 +814,7 @@ def test_the_page_keeps_what_is_drawn(server: LabelServer, out: Path) -> None:
     assert json.loads(ask(server, "road/000003")) == []
     ask(server, "road/000003", json.dumps([TRAPEZIUM]))
     ask(server, "road/000004", json.dumps([[[-5, 0], [300, 0], [100, 500]]]))
-    assert json.loads(ask(server, "road/000004")) == [[[0, 0], [200, 0], [100, 400]]]  # kept within the image
+    assert json.loads(ask(server, "road/000004")) == [[[0, 0], [200, 0], [100, 400]]]  # clamped to the image
     roads = read_coco([server.polygons])
     np.testing.assert_array_equal(mask_of(roads["000003"]), mask_of([[np.ravel(TRAPEZIUM).tolist()]]))
     ask(server, "road/000004", "[]")
@@ -845,7 +845,7 @@ def test_the_page_keeps_what_is_drawn(server: LabelServer, out: Path) -> None:
         ("road/000001", "[[[1, 2], [3, 4], [NaN, 1]]]", {}, 400),
     ],
 )
-def test_the_page_refuses(
+def test_the_page_refuses_invalid_requests(
     server: LabelServer, path: str, body: str | None, headers: dict[str, str], status: int
 ) -> None:
     with pytest.raises(urllib.error.HTTPError) as caught:
@@ -855,15 +855,15 @@ def test_the_page_refuses(
     assert not server.polygons.exists()
 
 
-def test_run_lengths_cannot_be_drawn(out: Path, tmp_path: Path) -> None:
+def test_run_lengths_cannot_be_edited(out: Path, tmp_path: Path) -> None:
     runs = {"size": [400, 200], "counts": [80_000]}
     (tmp_path / "road.json").write_text(drawn(annotation={"segmentation": runs}))
     with pytest.raises(DatabaseError, match="run lengths"):
         LabelServer(out, tmp_path / "road.json")
 
 
-def test_a_person_draws_undoes_saves_and_comes_back(server: LabelServer) -> None:
-    """In a real browser, by mouse and keys. ``EDGEPERC_SCREENSHOTS`` names a folder to look at what it showed."""
+def test_drawing_undoing_saving_and_reloading_in_a_browser(server: LabelServer) -> None:
+    """In a real browser, with mouse and keys. ``EDGEPERC_SCREENSHOTS`` names a folder for screenshots."""
     playwright = pytest.importorskip("playwright.sync_api")
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if chromium is None:
@@ -886,7 +886,7 @@ def test_a_person_draws_undoes_saves_and_comes_back(server: LabelServer) -> None
                 page.screenshot(path=Path(os.environ["EDGEPERC_SCREENSHOTS"]) / f"{name}.png")
 
         def place(x: float, y: float) -> tuple[float, float]:
-            """Where a pixel of the top view is on the screen."""
+            """Position of a pixel of the top view on the screen."""
             shown = page.evaluate(
                 "() => { const b = canvas.getBoundingClientRect(); return [b.x, b.y, view.x, view.y, view.scale]; }"
             )
@@ -920,7 +920,7 @@ def test_a_person_draws_undoes_saves_and_comes_back(server: LabelServer) -> None
         page.keyboard.press("Control+y")
         wait_saved(1)
 
-        # Zoomed in, a corner is dragged elsewhere.
+        # A corner is dragged in the zoomed view.
         page.mouse.move(*place(150, 390))
         page.mouse.wheel(0, -400)
         page.wait_for_function("() => view.scale > 3")
@@ -942,7 +942,7 @@ def test_a_person_draws_undoes_saves_and_comes_back(server: LabelServer) -> None
         page.click("#undo")
         wait_saved(1)
 
-        # Selected, an edge is bent by dragging its middle, and the new corner removed again.
+        # Dragging the middle of a selected polygon's edge adds a corner, which is then removed.
         page.mouse.click(*place(100, 300))
         page.wait_for_function("() => selected === 0")
         x, y = page.evaluate("() => middles(polygons[0])[1]")
@@ -960,7 +960,7 @@ def test_a_person_draws_undoes_saves_and_comes_back(server: LabelServer) -> None
         page.wait_for_function("() => polygons[0].length === 4")
         page.keyboard.press("Escape")
 
-        # A second polygon stays open over a reload; the first is in the file.
+        # A second polygon stays open across a reload; the first one is in the file.
         for x, y in [(10, 50), (40, 50)]:
             page.mouse.click(*place(x, y))
         page.reload()

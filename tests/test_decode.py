@@ -118,11 +118,11 @@ def test_empty_slots(slot):
 
 
 @pytest.mark.parametrize("label", [0, 1])
-def test_a_slot_on_no_vehicle_is_empty(label):
+def test_slot_outside_a_vehicle_is_empty(label):
     assert slots_for([[0.5, 0.5, 0.1, 0.1]], np.full(SHAPE, label, dtype=np.uint8)) == []
 
 
-def test_slots_refuse_what_they_cannot_read():
+def test_malformed_slots_are_refused():
     with pytest.raises(InferenceError, match="ssadnet: 1 of 4 values of box_slots"):
         slots_for([[0.5, np.nan, 0.1, 0.1]])
     with pytest.raises(CardMismatchError, match=r"\(1, 5\)"):
@@ -176,7 +176,7 @@ def class_logits(*patches):
     return logits
 
 
-def test_dense_gives_back_what_was_put_in():
+def test_dense_boxes_are_decoded_exactly():
     a = (20.13, 3.37, -0.9, 4.2, 1.7, 1.5, 0.4, 3.0)
     b = (38.8, -6.1, -0.5, 9.5, 2.5, 3.1, -1.2, 1.0)
     rows_a, cols_a = pixel_of(a[0], a[1])
@@ -196,7 +196,7 @@ def test_dense_gives_back_what_was_put_in():
     assert decode_dense(dense_of(b, a), probabilities, "class_probabilities", VIEW, CLASSES, VEHICLES) == boxes
 
 
-def test_one_odd_pixel_at_the_center_does_not_name_the_box():
+def test_one_pixel_at_the_center_does_not_decide_the_class():
     x, y = 26.05, 0.05
     row, col = pixel_of(x, y)
     logits = class_logits(
@@ -218,7 +218,7 @@ def test_background_under_the_box_still_leaves_a_vehicle():
     assert box.label == "van"
 
 
-def test_sizes_tell_classes_apart_where_the_map_does_not():
+def test_sizes_decide_between_equally_likely_classes():
     priors = {"car": (3.9, 1.6, 1.5), "van": (5.0, 1.9, 2.2), "truck": (10.0, 2.6, 3.2)}
     spreads = dict.fromkeys(priors, (0.1, 0.1, 0.1))
     sizes = {"box_size_priors": priors, "box_size_spreads": spreads}
@@ -252,7 +252,7 @@ def test_overlapping_boxes_of_the_dense_head():
     assert sure == boxes[:1]
 
 
-def test_score_thresholds_at_their_ends():
+def test_score_thresholds_0_and_1():
     dense = dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0))
     assert decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, score_threshold=1.0) == []
     # A flat heat map has one peak a plateau, and the plateau of -10 touches the real one.
@@ -262,7 +262,7 @@ def test_score_thresholds_at_their_ends():
     assert decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES, max_boxes=0) == []
 
 
-def test_dense_survives_absurd_sizes_and_refuses_what_is_not_finite():
+def test_dense_clips_extreme_sizes_and_refuses_non_finite_values():
     dense = dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0))
     dense[0, [3, 4, 8], 50, 25] = 200.0, -200.0, 90.0
     (box,) = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
@@ -323,7 +323,7 @@ def test_boxes_are_drawn_into_the_map():
     assert abs(np.count_nonzero(labels == 4) - 100 * 26) < 60
 
 
-def test_the_papers_boxes_leave_the_map_alone():
+def test_slot_boxes_do_not_change_the_map():
     card = card_of("ssadnet", "slots", version="1")
     logits = class_logits((slice(100, 140), slice(50, 66), CLASSES.index("van"), 9.0))[0]
     slots = np.zeros((2, 4), np.float32)

@@ -74,7 +74,7 @@ def test_connected_cells_share_sides(cells: NDArray[np.bool_], data: st.DataObje
 
 @patient
 @given(MASKS)
-def test_rings_walk_every_side_once_with_the_cells_to_the_left(cells: NDArray[np.bool_]) -> None:
+def test_rings_trace_every_side_once_with_the_cells_on_the_left(cells: NDArray[np.bool_]) -> None:
     padded = np.pad(cells, 1)
     sides = twins.drivable.sides(padded)
     corners, ends = np.empty((len(sides), 2), np.int64), np.empty(len(sides) // 4 + 1, np.int64)
@@ -99,7 +99,7 @@ def test_rings_walk_every_side_once_with_the_cells_to_the_left(cells: NDArray[np
 
 @patient
 @given(npst.arrays(np.float64, st.tuples(st.integers(1, 12), st.just(2)), elements=st.integers(-5, 5)), st.floats(0, 4))
-def test_simplifying_keeps_what_its_twin_keeps(ring: NDArray[np.float64], tolerance: float) -> None:
+def test_simplification_agrees_with_the_twin(ring: NDArray[np.float64], tolerance: float) -> None:
     kept = np.ones(len(ring), np.bool_)
     mark_kept(ring, tolerance, kept)
     apart = [math.hypot(x - ring[0, 0], y - ring[0, 1]) for x, y in ring]
@@ -163,7 +163,7 @@ def test_a_ring_of_one_cell_stays_a_ring() -> None:
 # --- what a planner asks ---------------------------------------------------------------------------------------------
 
 
-def test_a_road_by_hand() -> None:
+def test_road_computed_by_hand() -> None:
     labels = blank().astype(np.uint8)
     labels[:, 65:130] = 1  # y from 3.5 to -3.0: 6.5 m
     labels[200:240, 90:110] = 2  # a car from x = 22.0 to 26.0
@@ -195,7 +195,7 @@ def test_lanes_of_a_slanting_road(slope: float, width: float, lanes: int) -> Non
     assert road.lane_width_m * lanes == pytest.approx(width, abs=0.12)
 
 
-def test_nothing_drivable() -> None:
+def test_no_drivable_cell() -> None:
     for road in (
         road_ahead(view(blank())),
         road_ahead(TopView(np.ones((4, 2), np.uint8), CLASSES[::2], 0.1, (6, 7), (0, 1))),
@@ -208,7 +208,7 @@ def test_nothing_drivable() -> None:
     assert road_ahead(view(blank())).free_ahead_m() == 6.0
 
 
-def test_what_is_boxed_stands_in_the_way() -> None:
+def test_boxes_are_obstacles_on_the_road() -> None:
     pedestrian = Box("pedestrian", 0.9, (20.0, 0.0, -0.9), (0.8, 0.6, 1.8), 0.3)
     beside = Box("car", 0.9, (30.0, 15.0, -0.9), (4.0, 1.8, 1.5), 0.0)
     top_view = view(~blank())
@@ -219,7 +219,7 @@ def test_what_is_boxed_stands_in_the_way() -> None:
     assert top_view.drivable.all()  # the map itself is as it was
 
 
-def test_everything_drivable() -> None:
+def test_all_cells_drivable() -> None:
     road = road_ahead(view(~blank()))
     assert (road.free_m == 46.0).all()
     assert len(road.outline) == 4
@@ -227,7 +227,7 @@ def test_everything_drivable() -> None:
     np.testing.assert_allclose(road.width_m, 20.0)
 
 
-def test_a_road_that_begins_farther_on_is_not_free() -> None:
+def test_road_that_begins_farther_ahead_has_no_free_distance() -> None:
     cells = blank()
     cells[:300, 80:120] = True
     road = road_ahead(view(cells))
@@ -239,7 +239,7 @@ def test_a_road_that_begins_farther_on_is_not_free() -> None:
     assert np.isnan(road_ahead(view(aside)).left_m).all()
 
 
-def test_results_are_frozen_and_refusals_say_why() -> None:
+def test_results_are_immutable_and_errors_name_the_reason() -> None:
     road = road_ahead(view(~blank()))
     with pytest.raises(dataclasses.FrozenInstanceError):
         road.lane_width_m = 3.0  # type: ignore[misc]

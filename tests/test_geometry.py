@@ -119,7 +119,7 @@ def test_bounds_hold_the_corners_tightly():
         assert bounds[4] == 0.0
 
 
-def test_kernels_do_uncompiled_what_they_do_compiled():
+def test_interpreted_and_compiled_kernels_agree():
     rng = np.random.default_rng(4)
     a = some_rectangles(rng, 6)
     compiled, interpreted = np.empty((6, 6)), np.empty((6, 6))
@@ -135,7 +135,7 @@ def test_rectangles_are_the_boxes_footprints():
     assert rectangles(iter(boxes)).dtype == np.float64
 
 
-def test_shared_areas_are_those_of_the_overlap():
+def test_shared_area_follows_from_iou():
     a = np.array([[0.0, 0.0, 4.0, 2.0, 0.0]])
     b = np.array([[1.0, 0.0, 4.0, 2.0, 0.0], [0.0, 0.0, 2.0, 1.0, 0.0], [9.0, 9.0, 4.0, 2.0, 0.0]])
     np.testing.assert_allclose(shared_area(oriented_iou(a, b), a, b), [[6.0, 2.0, 0.0]], rtol=1e-12)

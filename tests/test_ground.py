@@ -49,7 +49,7 @@ def test_the_ground_follows_a_hill_that_no_plane_fits():
     assert find_ground(points, regions=False).mask[on].mean() < 0.7
 
 
-def test_nothing_is_seen_under_the_ground():
+def test_street_between_roofs_is_the_ground():
     """Roofs on both sides have three fifths of the cells around the vehicle; the street between lies lower."""
     rng = np.random.default_rng(3)
     points, _ = street(rng, n=12000)
@@ -63,7 +63,7 @@ def test_nothing_is_seen_under_the_ground():
 
 
 @pytest.mark.parametrize("mount", [0.5, 1.73, 3.2])
-def test_any_mounting_height_will_do_if_it_is_said(mount):
+def test_any_mounting_height_works_if_given(mount):
     points, on = street(np.random.default_rng(4), mount=mount)
     np.testing.assert_array_equal(find_ground(points, mount_height_m=mount + 0.3).mask, on)
     assert find_ground(points, mount_height_m=mount + 2.0).plane is None
@@ -81,7 +81,7 @@ def test_any_mounting_height_will_do_if_it_is_said(mount):
     ],
     ids=["empty", "one", "nan", "not finite", "a wall"],
 )
-def test_where_there_is_no_ground_nothing_is(points, regions):
+def test_scan_without_ground_has_no_ground_points(points, regions):
     ground = find_ground(points.astype(np.float32), regions=regions)
     assert ground.plane is None
     assert not ground.mask.any()
@@ -100,7 +100,7 @@ def test_points_that_are_not_finite_change_nothing():
     assert not np.delete(ground.mask, kept).any()
 
 
-def test_what_is_far_below_was_reflected():
+def test_points_far_below_are_not_ground():
     points, _ = street(np.random.default_rng(7))
     points[:3, 2] -= 3.0
     assert not find_ground(points).mask[:3].any()
@@ -108,7 +108,7 @@ def test_what_is_far_below_was_reflected():
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("regions", [True, False])
-def test_heights_are_the_twins(seed, regions):
+def test_heights_agree_with_the_twin(seed, regions):
     rng = np.random.default_rng(seed)
     points, _ = street(rng, n=1500, slope_x=0.05, kerb=0.12 * seed, reach=[20.0, 45.0, 70.0, 90.0][seed])
     points[rng.random(len(points)) < 0.02] *= np.float32(3.0)
@@ -125,7 +125,7 @@ numbers = st.sampled_from([0.0, 1.0, -1.7, -1.73, -2.0, 3.0, 63.99999, 64.0, -64
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.tuples(numbers, numbers, numbers), max_size=40), st.booleans())
-def test_whatever_comes_the_twin_agrees(rows, regions):
+def test_random_scans_match_the_twin(rows, regions):
     # The floor makes sure that there is something to find.
     x, y = np.meshgrid(np.arange(-10.0, 10.0, 2.5), np.arange(-10.0, 10.0, 2.5))
     floor = np.column_stack([x.ravel(), y.ravel(), 0.03 * x.ravel() - 1.7])
@@ -136,14 +136,14 @@ def test_whatever_comes_the_twin_agrees(rows, regions):
     np.testing.assert_allclose(ground.height_m, heights, atol=1e-4, rtol=1e-6)
 
 
-def test_the_same_scan_gives_the_same_answer():
+def test_ground_is_deterministic():
     points, _ = street(np.random.default_rng(8))
     first, second = find_ground(points), find_ground(points.copy())
     np.testing.assert_array_equal(first.height_m, second.height_m)
     assert first.plane == second.plane
 
 
-def test_a_simulated_street_is_told_apart():
+def test_ground_of_a_simulated_street():
     scan = simulate(random_scene(3), "hdl-64e", 0)
     world = scan.points[:, :3] @ scan.T_world_sensor[:3, :3].T + scan.T_world_sensor[:3, 3]
     some = np.arange(0, len(world), 97)

@@ -20,7 +20,7 @@ import edgeperc
 
 PACKAGE = Path(edgeperc.__file__).parent
 
-# Projects a handful of points and tells what numba's cache had to say about it.
+# Projects a handful of points and reports what numba's cache did.
 USE_KERNELS = """
 import json, pathlib
 import numpy as np
@@ -83,10 +83,10 @@ def run(site: Path, code: str, *arguments: str, **environment: str) -> subproces
 def use_kernels(site: Path, **environment: str) -> dict[str, Any]:
     done = run(site, USE_KERNELS, **environment)
     assert done.returncode == 0, done.stderr
-    told: dict[str, Any] = json.loads(done.stdout)
-    assert Path(told["package"]).is_relative_to(site), "another copy of edgeperc was imported"
-    assert told["kernels"] > 0
-    return told
+    report: dict[str, Any] = json.loads(done.stdout)
+    assert Path(report["package"]).is_relative_to(site), "another copy of edgeperc was imported"
+    assert report["kernels"] > 0
+    return report
 
 
 def home(folder: Path) -> dict[str, str]:
@@ -100,17 +100,12 @@ def forbid_writing(site: Path) -> None:
 
 
 @needs_compiler
-def test_the_second_process_compiles_nothing(site: Path) -> None:
+def test_the_second_process_compiles_nothing_and_an_edited_kernel_is_compiled_again(site: Path) -> None:
     first, second = use_kernels(site), use_kernels(site)
     assert (first["hits"], first["misses"]) == (0, first["kernels"])
     assert (second["hits"], second["misses"]) == (second["kernels"], 0)
     assert second["sum"] == first["sum"]
     assert first["folders"] == [str(site / "edgeperc" / "__pycache__")]
-
-
-@needs_compiler
-def test_an_edited_kernel_is_compiled_again(site: Path) -> None:
-    first = use_kernels(site)
     source = site / "edgeperc" / "projection.py"
     source.write_text(source.read_text("utf-8") + "\n# edited\n", "utf-8")
     assert use_kernels(site)["misses"] == first["misses"]
@@ -126,7 +121,7 @@ def test_a_read_only_installation_caches_in_the_users_folder(site: Path, tmp_pat
 
 
 @needs_compiler
-def test_a_read_only_system_caches_where_it_is_told(site: Path, tmp_path: Path) -> None:
+def test_read_only_system_caches_in_the_given_folder(site: Path, tmp_path: Path) -> None:
     """No folder of the package or of the user can be written; ``NUMBA_CACHE_DIR`` names one that can."""
     forbid_writing(site)
     nowhere = tmp_path / "nowhere"
@@ -137,7 +132,7 @@ def test_a_read_only_system_caches_where_it_is_told(site: Path, tmp_path: Path) 
     assert second["hits"] == first["misses"] == first["kernels"]
 
 
-def test_without_onnxruntime_a_perceiver_says_which_line_to_run(site: Path) -> None:
+def test_without_onnxruntime_a_perceiver_names_the_install_command(site: Path) -> None:
     done = run(site, USE_WITHOUT_ONNXRUNTIME, "any.onnx")
     assert done.returncode == 0, done.stderr
     assert "pip install 'edgeperc[cpu]'" in done.stdout

@@ -162,7 +162,7 @@ def at_import(tree: ast.Module) -> Iterator[ast.stmt]:
         pending.extend(child for child in ast.walk(statement) if isinstance(child, ast.stmt) and child is not statement)
 
 
-def test_the_floors_name_what_there_is() -> None:
+def test_floors_list_all_modules() -> None:
     named = {f"{package}.{inside}" for package, floors in FLOORS.items() for inside in floors.split()}
     assert named == {*modules()}
 
@@ -181,13 +181,13 @@ def test_imports_run_one_way(name: str) -> None:
             assert other.partition(".")[0] in may, f"{name} imports {other}"
 
 
-def test_no_module_needs_itself() -> None:
+def test_no_import_cycles() -> None:
     graph = {name: own_imports(name) for name in modules() if name != "edgeperc.__init__"}
     assert list(TopologicalSorter(graph).static_order())  # raises CycleError, which names the cycle
 
 
 @pytest.mark.parametrize("name", sorted(modules()))
-def test_a_file_is_read_in_one_sitting(name: str) -> None:
+def test_files_have_at_most_800_lines(name: str) -> None:
     assert modules()[name].read_text("utf-8").count("\n") <= 800
 
 
@@ -217,7 +217,7 @@ def test_library_code_leaves_the_process_alone(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(name for name in modules() if name.startswith("edgeperc_bench.")))
-def test_the_bench_stands_on_the_runtime_alone(name: str) -> None:
+def test_bench_imports_only_the_runtime(name: str) -> None:
     """It measures what a vehicle installs: nothing of training, and what draws or drives it only where asked for.
 
     Rivals stand on what they stand on, but only when they are asked for too.
@@ -241,7 +241,7 @@ def kernels(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef, ast.expr]]:
 
 
 @pytest.mark.parametrize("name", RUNTIME)
-def test_kernels_keep_to_the_house(name: str) -> None:
+def test_kernels_follow_the_conventions(name: str) -> None:
     """Cached, without the GIL; never parallel (aborts the process when two threads call) or fastmath (drops guards).
 
     A kernel calls no kernel of another file: with ``cache=True`` an edit of the callee leaves a stale result behind.

@@ -1,4 +1,4 @@
-"""Targets and losses against plain numpy."""
+"""Targets and losses compared with plain numpy."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_slot_of_a_box_ahead():
     np.testing.assert_allclose(slot, [80 / 200, 200 / 400, 16 / 200, 40 / 400], rtol=1e-6)
 
 
-def test_slots_of_rotated_boxes_hold_the_footprint(rng):
+def test_slots_of_rotated_boxes_contain_the_footprint(rng):
     for _ in range(20):
         yaw = rng.uniform(-np.pi, np.pi)
         box = np.array([rng.uniform(12, 40), rng.uniform(-5, 5), 0.0, rng.uniform(1, 9), rng.uniform(1, 3), 1.5, yaw])
@@ -111,7 +111,7 @@ def test_dense_target_of_one_box():
     np.testing.assert_allclose(target[1:, row, col], expected, atol=1e-5)
 
 
-def test_every_learning_cell_points_at_the_same_center():
+def test_every_learned_cell_points_to_the_same_center():
     target = dense_targets([(26.13, 2.27, -0.8, 9.0, 3.0, 1.5, 0.3)], VIEW)
     rows, cols = np.nonzero(target[0] >= REGRESSED_FROM)
     assert len(rows) > 5
@@ -151,10 +151,10 @@ def test_unlabeled_cells_learn_nothing():
     heat = dense_targets([CAR, (44.0, 0.0, *CAR[2:])], VIEW, labeled=labeled)[0]
     assert (heat[26:] >= 0.0).all()
     assert set(np.unique(heat[:26])) - {-1.0} == set(np.unique(heat[:26][heat[:26] >= REGRESSED_FROM]))
-    assert (heat == 1.0).sum() == 2  # a labeled box counts wherever it is
+    assert (heat == 1.0).sum() == 2  # a labeled box counts in any cell
 
 
-def test_unsure_boxes_are_neither_found_nor_missed():
+def test_unsure_boxes_are_not_learned():
     unsure = (26.0, -4.0, *CAR[2:])
     target = dense_targets([CAR], VIEW, unsure=[unsure])
     np.testing.assert_array_equal(target[0] == -1.0, dense_targets([unsure], VIEW)[0] > 0.1)
@@ -165,7 +165,7 @@ def test_unsure_boxes_are_neither_found_nor_missed():
     assert (dense_targets([], VIEW, unsure=np.empty((0, 7))) == 0.0).all()
 
 
-# --- The runtime reads back what the networks are trained towards ---------------------------------------------------
+# --- The runtime decodes the training targets -------------------------------------------------------------------------
 
 CLASSES = ("background", "drivable", "car", "van", "truck")
 ROUND_TRIP = {  # nearest first, as slots are
@@ -255,7 +255,7 @@ def test_the_focal_loss_of_a_pixel_is_its_formula(p, gamma, expected):
 
 
 @pytest.mark.parametrize("loss", [cross_entropy, lovasz_softmax, lambda x, y: pointseg_loss(x, y, lovasz_weight=1.0)])
-def test_nothing_labeled_costs_nothing(loss):
+def test_the_loss_without_labels_is_0(loss):
     logits = torch.randn(2, 4, 3, 3, requires_grad=True)
     value = loss(logits, torch.full((2, 3, 3), IGNORE, dtype=torch.uint8))
     value.backward()
@@ -273,16 +273,16 @@ def test_ignored_pixels_get_no_gradient(rng, loss):
     assert gradient[labels != IGNORE].any()
 
 
-def test_distillation_is_least_at_the_teachers_word(rng):
+def test_distillation_is_lowest_at_the_teachers_probabilities(rng):
     logits, _ = random_maps(rng)
     teacher = np.exp(log_softmax(rng.normal(size=logits.shape)))
     expected = -(teacher * log_softmax(logits.astype(np.float64))).sum(1).mean()
-    told = distillation_loss(torch.from_numpy(logits), torch.from_numpy(teacher))
-    assert float(told) == pytest.approx(expected, rel=1e-5)
-    assert distillation_loss(torch.from_numpy(np.log(teacher)), torch.from_numpy(teacher)) < told
+    loss = distillation_loss(torch.from_numpy(logits), torch.from_numpy(teacher))
+    assert float(loss) == pytest.approx(expected, rel=1e-5)
+    assert distillation_loss(torch.from_numpy(np.log(teacher)), torch.from_numpy(teacher)) < loss
 
 
-def test_boxes_are_distilled_by_the_teachers_heat(rng):
+def test_distillation_of_boxes_is_weighted_by_the_teachers_heat(rng):
     taught = rng.normal(size=(2, 9, 3, 4)).astype(np.float32)
     own = rng.normal(size=(2, 9, 3, 4)).astype(np.float32)
     heat = 1.0 / (1.0 + np.exp(-taught[:, 0].astype(np.float64)))
@@ -313,7 +313,7 @@ def test_lovasz_of_hard_predictions_is_one_minus_mean_iou(rng):
 
 
 def test_lovasz_is_the_extension_of_the_jaccard_loss(rng):
-    """Against its definition: the Jaccard loss of each set of largest errors, weighted by the steps between errors."""
+    """Its definition: the Jaccard loss of each set of largest errors, weighted by the steps between the errors."""
     logits, labels = random_maps(rng, n_classes=2, shape=(1, 3, 4), ignored=0.0)
     p = np.exp(log_softmax(logits))[0]
     expected = []
@@ -375,7 +375,7 @@ def test_dense_loss(rng):
     assert geometry_loss.item() == pytest.approx((error * share).sum() / share.sum(), rel=1e-4)
 
 
-def test_dense_loss_ignores_what_is_not_learned(rng):
+def test_dense_loss_ignores_unlearned_cells(rng):
     predicted, target = dense_case(rng)
     tensor = torch.tensor(predicted, requires_grad=True)
     sum(dense_loss(tensor, torch.tensor(target))).backward()
@@ -418,7 +418,7 @@ def test_ssadnet_loss_is_equation_3(rng, head):
 
 
 @pytest.mark.parametrize("shape", [(2, 6, 4), (2, 9, 4, 3)])
-def test_a_batch_without_truth_is_not_learned(shape):
+def test_a_batch_without_ground_truth_is_not_learned(shape):
     logits, boxes = torch.randn(2, 5, 16, 12, requires_grad=True), torch.randn(shape, requires_grad=True)
     labels = torch.full((2, 16, 12), IGNORE, dtype=torch.uint8)
     total, _ = ssadnet_loss(logits, boxes, labels, torch.full(shape, -1.0), class_weights=torch.rand(5))
@@ -437,7 +437,7 @@ def test_losses_take_bfloat16(rng):
 
 
 @pytest.mark.parametrize("gamma", [0.5, 1.0, 2.0])
-def test_a_pixel_that_is_certain_has_a_finite_gradient(gamma):
+def test_a_certain_pixel_has_a_finite_gradient(gamma):
     logits = torch.tensor([[[[30.0]], [[0.0]]]], requires_grad=True)
     cross_entropy(logits, torch.zeros((1, 1, 1), dtype=torch.uint8), focal_gamma=gamma).backward()
     assert torch.isfinite(logits.grad).all()

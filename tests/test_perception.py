@@ -69,7 +69,7 @@ def test_a_box_without_a_key_is_refused(key: str) -> None:
 @given(
     st.dictionaries(st.sampled_from(["label", "score", "center", "size", "yaw"]), st.text() | st.floats() | st.none())
 )
-def test_anything_is_a_box_or_a_points_error(change: dict[str, Any]) -> None:
+def test_any_document_is_a_box_or_a_points_error(change: dict[str, Any]) -> None:
     try:
         box = Box.from_dict(CAR.to_dict() | change)
     except PointsError:
@@ -77,7 +77,7 @@ def test_anything_is_a_box_or_a_points_error(change: dict[str, Any]) -> None:
     assert isinstance(box.label, str)
 
 
-def test_a_perception_as_json_counts_what_it_does_not_list() -> None:
+def test_perception_as_json_counts_points_by_class() -> None:
     document = perception_of(CAR, stamp_s=12.5).to_dict()
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert document["stamp_s"] == 12.5
@@ -125,14 +125,14 @@ def test_boxes_are_read_from_what_was_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("line", ["{}", "[]", "null", '{"boxes": 3}', '{"boxes": [{}]}', "no JSON", '{"error": "x"}'])
-def test_what_is_no_record_is_a_tracking_error(tmp_path: Path, line: str) -> None:
+def test_malformed_record_is_a_tracking_error(tmp_path: Path, line: str) -> None:
     path = tmp_path / "drive.jsonl"
     path.write_text(line, encoding="utf-8")
     with pytest.raises(TrackingError, match=r"drive\.jsonl holds no boxes"):
         read_boxes(path)
 
 
-def test_a_top_view_knows_where_its_cells_lie() -> None:
+def test_cell_centers_of_a_top_view() -> None:
     view = TopView(np.zeros((400, 200), np.uint8), ("background", "drivable"), *VIEW)
     assert (view.geometry.height, view.geometry.width) == view.labels.shape
     for cell in ((0, 0), (399, 199), (17, 101)):

@@ -189,7 +189,7 @@ def test_remission_field_chooses(tmp_path):
         read_points(path, remission_field="signal")
 
 
-def test_a_scan_of_no_points_is_valid_where_it_says_so(tmp_path):
+def test_scan_without_points_is_valid_if_its_header_says_so(tmp_path):
     fields = ("x y z intensity", "F F F F", "4 4 4 4", "1 1 1 1", 0)
     for name, content in {
         "a.npy": npy(POINTS[:0]),
@@ -205,7 +205,7 @@ def test_a_scan_of_no_points_is_valid_where_it_says_so(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_a_file_of_no_bytes_is_an_error(tmp_path, suffix):
+def test_empty_file_is_an_error(tmp_path, suffix):
     with pytest.raises(PointsError, match="empty"):
         read_points(save(tmp_path, f"scan{suffix}", b""))
 
@@ -241,7 +241,7 @@ BAD_FILES = {
     "two.npz": (npz(a=POINTS, b=POINTS), "none called points"),
     "zip.npz": (b"PK\3\4" + b"\0" * 60, "cannot be read"),
     "names.pcd": (pcd("a b c", "F F F", "4 4 4", "1 1 1", 1, "ascii", b"1 2 3\n"), "x, y, z"),
-    "vector.pcd": (pcd("x y z", "F F F", "4 4 4", "2 1 1", 1, "ascii", b"1 2 3 4\n"), "no number field x"),
+    "vector.pcd": (pcd("x y z", "F F F", "4 4 4", "2 1 1", 1, "ascii", b"1 2 3 4\n"), "no numeric field x"),
     "half.pcd": (pcd("x y z", "F F F", "2 4 4", "1 1 1", 1, "ascii", b"1 2 3\n"), "TYPE and SIZE"),
     "counts.pcd": (pcd("x y z", "F F F", "4 4", "1 1 1", 1, "ascii", b"1 2 3\n"), "equal length"),
     "zero.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 0", 1, "ascii", b"1 2 3\n"), "COUNT"),
@@ -294,7 +294,7 @@ BAD_FILES = {
 
 
 @pytest.mark.parametrize("name", BAD_FILES)
-def test_a_bad_file_says_what_is_wrong(tmp_path, name):
+def test_bad_file_names_the_fault(tmp_path, name):
     content, match = BAD_FILES[name]
     if not isinstance(content, bytes):
         content = content.astype("<f4").tobytes()
@@ -373,7 +373,7 @@ def test_structured_arrays_with_padding_and_rows_of_an_organized_cloud():
     np.testing.assert_array_equal(as_points(cloud[["x", "y", "z"]])[:, :3], POINTS[:, :3])
     with pytest.raises(PointsError, match=r"field z among x, y"):
         as_points(cloud[["x", "y"]])
-    with pytest.raises(PointsError, match="no number field"):
+    with pytest.raises(PointsError, match="no numeric field"):
         as_points(np.zeros(3, [("x", "O"), ("y", "f4"), ("z", "f4")]))
 
 
@@ -395,7 +395,7 @@ def test_structured_arrays_with_padding_and_rows_of_an_organized_cloud():
         object(),
     ],
 )
-def test_what_is_no_scan_is_refused(array):
+def test_arrays_that_are_not_scans_are_refused(array):
     with pytest.raises(PointsError):
         as_points(array)
 
@@ -476,7 +476,7 @@ def test_any_array_gives_points_or_points_error(array):
 @given(st.binary(max_size=60), st.integers(0, 200))
 @example(b"\0a\xe0\xff\0", 300)
 @example(b"\0a\x20\0", 4)
-def test_lzf_equals_its_twin(packed, size):
+def test_lzf_agrees_with_the_twin(packed, size):
     unpacked = np.zeros(size, np.uint8)
     written = fill_unpacked_lzf(np.frombuffer(packed, np.uint8), unpacked)
     expected = twins.points.unpack_lzf(packed, size)

@@ -13,7 +13,7 @@ from edgeperc.card import InputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.errors import CardError, PointsError
 from edgeperc.projection import column_edges, make_projector, row_edges, tabulate
 from edgeperc.sensor import get_sensor
-from edgeperc_bench.peers.projection import contenders
+from edgeperc_bench.peers.projection import contenders, fill_copy
 
 KERNELS = ("mark_top_view", "mark_range_image", "fill_image")
 UNEVEN = (2.0, 1.7, 1.3, 0.2, -0.1, -4.0, -4.4, -11.0, -24.8)
@@ -125,7 +125,7 @@ def test_pixels_are_those_of_true_angles(name):
     assert inside.sum() > 200
 
 
-def test_a_point_lands_where_the_equations_say():
+def test_point_lands_in_the_pixel_of_the_equations():
     point = np.float32([[10.0, 0.0, -1.0, 0.25]])
     above = check(point, VIEWS["top view"], InputSpec("input", ("distance", "remission", "height"), (0,) * 3, (1,) * 3))
     assert above.pixel[0] == 359 * 200 + 99  # (46 - 10) / 0.1 cells from the far edge; half-way across, on the edge
@@ -241,13 +241,13 @@ def test_every_pixel_leads_back_to_its_point():
         np.testing.assert_array_equal(np.unique(seen.pixel[seen.pixel >= 0]), flat)
 
 
-def test_what_the_papers_azimuth_would_cost():
+def test_error_of_the_papers_azimuth():
     paper_deg = math.degrees(math.asin(math.sin(math.radians(45.0)) * math.cos(math.radians(-24.8))))
     assert paper_deg == pytest.approx(39.9, abs=0.05)
     assert round((45.0 - paper_deg) / 90.0 * 512) == 29
 
 
-def test_wrong_arrays_are_told():
+def test_wrong_arrays_are_refused():
     view = VIEWS["coarse top view"]
     projector = make_projector(view, spec_of(view))
     good = np.zeros((5, 4), np.float32)
@@ -284,7 +284,7 @@ def test_the_benchmark_compares_equal_answers():
     assert set(calls) >= {"copy loop", "top view", "top view, numpy", "range image", "range image, numpy"}
 
 
-def test_wrong_cards_are_told():
+def test_wrong_cards_are_refused():
     with pytest.raises(CardError, match="range"):
         make_projector(VIEWS["top view"], InputSpec("input", ("range",), (0.0,), (1.0,)))
     with pytest.raises(CardError, match="height"):
@@ -297,3 +297,12 @@ def test_wrong_cards_are_told():
     ):
         with pytest.raises(CardError, match="closer than"):
             make_projector(view, spec)
+
+
+@pytest.mark.kernel
+@pytest.mark.parametrize("n", [0, 1, 500])
+def test_copy_loop_copies(n):
+    points = random_points(np.random.default_rng(n), n)
+    copy = np.empty_like(points)
+    fill_copy(points, copy)
+    np.testing.assert_array_equal(copy, points)

@@ -1,4 +1,4 @@
-"""Eight-bit models: rounded where it is harmless, and refused where they are no faster or answer worse."""
+"""int8 models: layers whose rounding is harmless are rounded; slower or less accurate models are refused."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from edgeperc_export.quantize import RefusedError, calibration_scans, quantize
 from edgeperc_export.to_onnx import to_graph, with_golden, write_card
 
 
-class Spoilt(nn.Module):
-    """Calls everything a car, by a one that lies beside values of tens of thousands where the third layer puts it."""
+class Fragile(nn.Module):
+    """Labels everything as car, by an activation of 1 among values of 10,000 and more, which int8 rounds to 0."""
 
     def __init__(self, spoil: float) -> None:
         super().__init__()
@@ -52,7 +52,7 @@ class Spoilt(nn.Module):
 
 
 class Small(nn.Module):
-    """What networks for small computers are made of: residual blocks, upsampling, channels moved to pixels."""
+    """The parts of networks for small computers: residual blocks, upsampling, channels moved to pixels."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -144,7 +144,7 @@ def test_inner_layers_become_int8_and_the_card_says_so(tmp_path: Path, small: Pa
 
 
 @pytest.mark.parametrize(("seven_bits", "most"), [(True, 64), (False, 127)])
-def test_weights_of_seven_bits_are_for_any_computer(
+def test_weights_have_seven_bits_on_request(
     tmp_path: Path, small: Path, scans: list[np.ndarray], seven_bits: bool, most: int
 ) -> None:
     out = tmp_path / "int8.onnx"
@@ -154,8 +154,8 @@ def test_weights_of_seven_bits_are_for_any_computer(
     assert card.training["quantized"]["weight_bits"] == (7 if seven_bits else 8)
 
 
-def test_layers_that_rounding_spoils_are_left_alone(tmp_path: Path, scans: list[np.ndarray]) -> None:
-    path, out = written(Spoilt(1e4), tmp_path / "spoilt.onnx"), tmp_path / "int8.onnx"
+def test_layers_that_rounding_harms_stay_in_fp32(tmp_path: Path, scans: list[np.ndarray]) -> None:
+    path, out = written(Fragile(1e4), tmp_path / "spoilt.onnx"), tmp_path / "int8.onnx"
     card = quantize(path, out, scans=scans, n_evaluated=1, race=FASTER)
     types = convolutions(out)
     assert types["good"] == onnx.TensorProto.INT8
@@ -163,15 +163,15 @@ def test_layers_that_rounding_spoils_are_left_alone(tmp_path: Path, scans: list[
     assert card.parity["label_agreement"] == 1.0
 
 
-def test_a_model_that_answers_worse_is_refused(tmp_path: Path, scans: list[np.ndarray]) -> None:
-    path = written(Spoilt(1e4), tmp_path / "spoilt.onnx")
+def test_a_less_accurate_model_is_refused(tmp_path: Path, scans: list[np.ndarray]) -> None:
+    path = written(Fragile(1e4), tmp_path / "spoilt.onnx")
     with pytest.raises(RefusedError, match=r"simulated car IoU 0\.\d+ to 0\.000"):
         quantize(path, tmp_path / "int8.onnx", scans=scans, n_evaluated=1, max_disagreement=1.0, race=FASTER)
     assert [p.name for p in tmp_path.iterdir()] == ["spoilt.onnx"]
 
 
 @pytest.mark.parametrize("int8_ms", [20.0, 10.0, 9.99])
-def test_a_model_that_is_no_faster_is_refused(
+def test_a_model_that_is_not_faster_is_refused(
     tmp_path: Path, small: Path, scans: list[np.ndarray], int8_ms: float
 ) -> None:
     out = tmp_path / "int8.onnx"
@@ -182,14 +182,14 @@ def test_a_model_that_is_no_faster_is_refused(
     assert [p.name for p in tmp_path.iterdir()] == ["int8.onnx"]
 
 
-def test_the_race_takes_as_many_runs_of_both(small: Path) -> None:
+def test_the_race_runs_both_models_equally_often(small: Path) -> None:
     one, other = module.race(small, small, 1, n_runs=3)
     assert one.shape == other.shape == (3,)
     assert (one > 0).all()
     assert (other > 0).all()
 
 
-def test_excluded_nodes_are_left_alone(tmp_path: Path, small: Path, scans: list[np.ndarray]) -> None:
+def test_excluded_nodes_stay_in_fp32(tmp_path: Path, small: Path, scans: list[np.ndarray]) -> None:
     out = tmp_path / "int8.onnx"
     name = next(n.name for n in onnx.load(small).graph.node if "down.weight" in n.input)
     quantize(small, out, scans=scans, exclude=[name], n_evaluated=1, max_disagreement=1.0, race=FASTER)
@@ -198,9 +198,7 @@ def test_excluded_nodes_are_left_alone(tmp_path: Path, small: Path, scans: list[
         quantize(small, out, scans=scans, exclude=["nothing"], race=FASTER)
 
 
-def test_what_compares_itself_with_its_maxima_is_not_rounded_on_one_side(
-    tmp_path: Path, scans: list[np.ndarray]
-) -> None:
+def test_unpooling_is_not_rounded_on_one_side(tmp_path: Path, scans: list[np.ndarray]) -> None:
     class Unpooling(nn.Module):
         def __init__(self) -> None:
             super().__init__()
@@ -223,8 +221,8 @@ def test_no_scans_is_an_error(tmp_path: Path, small: Path, capsys: pytest.Captur
     with pytest.raises(PointsError, match="no scan to calibrate on"):
         calibration_scans([])
     (tmp_path / "empty").mkdir()
-    words = ["quantize", "m.onnx", str(tmp_path / "o.onnx"), "--scans", str(tmp_path / "empty"), "--simulated", "0"]
-    assert cli.main(words) == 2
+    arguments = ["quantize", "m.onnx", str(tmp_path / "o.onnx"), "--scans", str(tmp_path / "empty"), "--simulated", "0"]
+    assert cli.main(arguments) == 2
     assert "no scan to calibrate on in 1 paths" in capsys.readouterr().err
     with pytest.raises(PointsError, match="expected at least one"):
         quantize(small, tmp_path / "o.onnx", scans=[])
@@ -253,7 +251,7 @@ def test_calibration_never_sees_test_drives(tmp_path: Path, scans: list[np.ndarr
     assert len(hashes) == 2
 
 
-def test_of_a_kitti_root_training_drives_alone_are_taken(kitti_root: Path) -> None:
+def test_calibration_on_kitti_takes_only_training_drives(kitti_root: Path) -> None:
     objects = KittiObjects(kitti_root)
     names = [name for name, drive in objects.drives.items() if not in_split(drive, "train")]
     test = {module.scan_hash(objects.frame(name).points) for name in objects.names("test") if name in names}
@@ -263,7 +261,7 @@ def test_of_a_kitti_root_training_drives_alone_are_taken(kitti_root: Path) -> No
     assert not test & set(hashes)
 
 
-def test_the_command_refuses_with_1_and_writes_with_0(
+def test_the_command_exits_with_1_if_it_refuses_and_0_if_it_writes(
     tmp_path: Path,
     small: Path,
     scans: list[np.ndarray],
@@ -272,14 +270,14 @@ def test_the_command_refuses_with_1_and_writes_with_0(
 ) -> None:
     out, scan = tmp_path / "int8.onnx", tmp_path / "scan.bin"
     scans[0].tofile(scan)
-    words = ["quantize", str(small), str(out), "--scans", str(scan), "--simulated", "2", "--evaluate-on", "1"]
+    arguments = ["quantize", str(small), str(out), "--scans", str(scan), "--simulated", "2", "--evaluate-on", "1"]
     monkeypatch.setattr(module.quantize, "__kwdefaults__", {**quantize.__kwdefaults__, "race": timed(5.0, 5.0)})
-    assert cli.main(words) == 1
+    assert cli.main(arguments) == 1
     assert "not faster here" in capsys.readouterr().err
     assert not out.exists()
     settings = {**quantize.__kwdefaults__, "race": FASTER, "max_disagreement": 1.0}
     monkeypatch.setattr(module.quantize, "__kwdefaults__", settings)
-    assert cli.main(words) == 0
-    told = capsys.readouterr().out.splitlines()
-    assert "small 1.0.0, kept in fp32: " in told[0]
-    assert json.loads(told[1])["n_scans"] == 4
+    assert cli.main(arguments) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert "small 1.0.0, kept in fp32: " in printed[0]
+    assert json.loads(printed[1])["n_scans"] == 4

@@ -51,7 +51,7 @@ def random_scene(rng, shape, n_classes=4):
 # --- outliers
 
 
-def test_a_wall_loses_what_bled_onto_it_and_the_car_stays():
+def test_bleeding_onto_a_wall_is_removed_and_the_car_stays():
     ranges = np.full((20, 60), 22.0)
     car = (slice(6, 14), slice(20, 40))
     ranges[car] = 12.0
@@ -75,7 +75,7 @@ def test_two_cars_in_one_component_both_stay(farther):
     np.testing.assert_array_equal(remove_outliers(points, index, labels, CLASSES), labels)
 
 
-def test_a_pedestrian_before_a_car_loses_the_car_s_points():
+def test_pedestrian_in_front_of_a_car_loses_the_cars_points():
     ranges = np.full((20, 40), 9.0)
     ranges[3:17, 18:22] = 6.0
     points, index, _ = scene(ranges)
@@ -193,7 +193,7 @@ def test_the_majority_of_the_nearest_five_wins_and_the_nearest_breaks_ties():
     assert label_points(points, pixel, index, labels)[-1] == 3
 
 
-def test_of_equal_differences_the_pixel_above_then_left_has_the_vote():
+def test_equal_ranges_vote_in_order_above_then_left():
     points = np.tile(np.float32([5.0, 0.0, 0.0, 0.1]), (10, 1))
     index = np.arange(9, dtype=np.int32).reshape(3, 3)
     pixel = np.array([*range(9), 4], dtype=np.int32)

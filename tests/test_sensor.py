@@ -189,7 +189,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_faults_are_told(streets, profile, fault):
+def test_faults_are_reported(streets, profile, fault):
     spoil, expected_text = FAULTS[fault]
     for scan in streets[3:]:
         findings = check_fitness(np.ascontiguousarray(spoil(scan)), profile, SENSOR)
@@ -200,7 +200,7 @@ def test_faults_are_told(streets, profile, fault):
 @pytest.mark.parametrize(
     ("name", "expected_text"), [("vlp-16", "about 1[4-7] rows"), ("hdl-32e", "about (2[89]|3[0-3]) rows")]
 )
-def test_fewer_beams_are_told(profile, name, expected_text):
+def test_fewer_beams_are_reported(profile, name, expected_text):
     sensor = get_sensor(name)
     findings = " ".join(check_fitness(street(9, sensor), profile, sensor))
     assert re.search(expected_text, findings), findings
@@ -217,7 +217,7 @@ def test_ordinary_scans_pass(streets, profile):
         assert check_fitness(spoilt, profile, SENSOR) == ()
 
 
-def test_nothing_finite_is_told(profile):
+def test_scan_without_finite_points_is_reported(profile):
     for scan in (np.empty((0, 4), np.float32), np.full((9, 4), np.nan, np.float32)):
         assert "no finite point" in check_fitness(scan, profile, SENSOR)[0]
     assert check_fitness(np.zeros((1, 4), np.float32), profile, SENSOR)
@@ -225,7 +225,7 @@ def test_nothing_finite_is_told(profile):
         check_fitness(np.zeros((5, 3), np.float32), profile, SENSOR)
 
 
-def test_a_profile_survives_json(profile):
+def test_profile_is_read_back_from_json(profile):
     assert FitnessProfile.from_dict(json.loads(json.dumps(profile.to_dict(), allow_nan=False))) == profile
     crops_only = FitnessProfile.from_scans([cropped(street(1))])
     assert crops_only.road_ahead is None
@@ -275,7 +275,7 @@ def check_against_twin(points, step, beam_step, view):
 
 
 @pytest.mark.parametrize(("step", "beam_step"), [(1, 1), (7, 2)])
-def test_sums_equal_their_twin_on_a_street(step, beam_step):
+def test_scan_sums_agree_with_the_twin_on_a_street(step, beam_step):
     check_against_twin(street(5, columns=200), step, beam_step, (-0.5, 0.5))
 
 
@@ -292,7 +292,7 @@ def test_sums_equal_their_twin_on_a_street(step, beam_step):
     ),
     st.integers(1, 3),
 )
-def test_sums_equal_their_twin_on_anything(points, step):
+def test_scan_sums_agree_with_the_twin_on_random_scans(points, step):
     with np.errstate(invalid="ignore", over="ignore"):
         check_against_twin(points, step, 1, (-0.5, 0.5))
 
@@ -328,7 +328,7 @@ def test_every_kitti_scan_passes(kitti_scans, kitti_profile, semantickitti_root)
     assert found == {}
 
 
-def test_kitti_scans_turned_by_90_degrees_are_mostly_told(kitti_scans, kitti_profile):
+def test_kitti_scans_turned_by_90_degrees_are_mostly_reported(kitti_scans, kitti_profile):
     full = [scan for frame, scan in zip(*kitti_scans, strict=True) if frame["crop"] == "0"]
     found = sum(bool(check_fitness(in_nuscenes_axes(scan), kitti_profile, SENSOR)) for scan in full)
     assert found / len(full) > 0.85
@@ -346,7 +346,7 @@ def test_kitti_scans_turned_by_90_degrees_are_mostly_told(kitti_scans, kitti_pro
         "almost empty",
     ],
 )
-def test_spoilt_kitti_scans_are_told(kitti_scans, kitti_profile, fault):
+def test_corrupted_kitti_scans_are_reported(kitti_scans, kitti_profile, fault):
     spoil, expected_text = FAULTS[fault]
     for frame, scan in list(zip(*kitti_scans, strict=True))[:307:9]:
         findings = check_fitness(np.ascontiguousarray(spoil(scan)), kitti_profile, SENSOR)
@@ -354,7 +354,7 @@ def test_spoilt_kitti_scans_are_told(kitti_scans, kitti_profile, fault):
         assert re.search(expected, " ".join(findings)), (frame["name"], findings)
 
 
-def test_the_nuscenes_sweep_is_told_apart(data_root, kitti_profile):
+def test_nuscenes_sweep_is_reported(data_root, kitti_profile):
     (path,) = (data_root("other_sensors") / "nuscenes_sweep").glob("*.bin")
     findings = " ".join(check_fitness(read_points(path), kitti_profile, SENSOR))
     for expected_text in ("pass y, -x, z", "(0, 255)", "rows of points"):

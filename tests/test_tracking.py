@@ -1,16 +1,11 @@
-"""Tracking: filters and association against twins, filterpy and enumeration; the life of tracks; the figures."""
+"""The tracker: the motion of the sensor, the life of tracks, wrong input."""
 
 from __future__ import annotations
 
-import itertools
-import json
 import math
 import tracemalloc
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,25 +13,9 @@ from hypothesis import strategies as st
 
 import edgeperc
 import twins.tracking
-from edgeperc import Box, StampError, Tracker, TrackingError, cli
-from edgeperc.evaluation.datasets import scan_hash
-from edgeperc.evaluation.tracking import evaluate_kitti, read_sequence, sequence_names, sequence_scans, track_sequence
-from edgeperc.evaluation.tracking_metrics import (
-    FrameTracks,
-    FrameTruth,
-    box_iou,
-    count_breaks,
-    evaluate_tracks,
-    fill_assignment,
-    fill_pairs,
-    recall_thresholds,
-)
+from edgeperc import Box, StampError, Tracker, TrackingError
 from edgeperc.perception import Perception
-from edgeperc.sensor import get_sensor
-from edgeperc.tracking import egomotion, ukf
 from edgeperc.tracking.egomotion import fit_motion, nearest_detection, support
-from edgeperc.tracking.imm import fill_combined, fill_interaction, fill_mode_probabilities
-from edgeperc.tracking.jpda import MAX_EVENTS, fill_association, fill_by_propagation, fill_likelihoods
 from edgeperc.tracking.lives import (
     EXPECTED,
     MOST_EXISTENCE,
@@ -50,349 +29,9 @@ from edgeperc.tracking.lives import (
     update_shapes,
 )
 from edgeperc.tracking.tracks import PARAMETERS
-from edgeperc.tracking.ukf import (
-    CONSTANT_VELOCITY,
-    CTRV,
-    fill_cholesky,
-    fill_predictions,
-    fill_updates,
-    half_turn,
-)
-from edgeperc_bench.peers.tracking import crossing, every_second_beam
+from edgeperc_bench.peers.tracking import crossing
 
-NOISE = np.array([2.0, 0.4, 0.3, 0.1, 0.2])
-SIGMAS = np.array([0.2, 0.1, 0.08])
 STANDING = np.eye(4)  # without poses, the motion of a single object cannot be separated from the sensor's
-
-
-def rng_of(seed: int) -> np.random.Generator:
-    return np.random.default_rng(seed)
-
-
-def covariances(rng: np.random.Generator, *shape: int) -> np.ndarray:
-    roots = rng.normal(0.0, 0.3, (*shape, 5, 5))
-    return roots @ np.swapaxes(roots, -1, -2) + 0.01 * np.eye(5)
-
-
-def some_tracks(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
-    states = rng.normal(0.0, 1.0, (n, 3, 5)) * [2.0, 2.0, 5.0, 1.0, 0.5]
-    states[rng.random((n, 3)) < 0.2, 4] = 0.0
-    return states, covariances(rng, n, 3)
-
-
-def predict(states: np.ndarray, covariance: np.ndarray, noise: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    means, predicted = np.empty_like(states), np.empty_like(covariance)
-    fill_predictions(states, covariance, noise, dt, means, predicted)
-    return means, predicted
-
-
-def update(means, predicted, detections, sigmas, beta) -> tuple[np.ndarray, np.ndarray]:
-    states, covariance = np.empty_like(means), np.empty_like(predicted)
-    fill_updates(means, predicted, detections, sigmas, beta, states, covariance)
-    return states, covariance
-
-
-# --- filters ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("n", [0, 1, 6])
-def test_predictions_are_those_of_the_twin(n: int) -> None:
-    rng = rng_of(n)
-    states, covariance = some_tracks(rng, n)
-    noise = np.tile(NOISE, (n, 1))
-    for dt in (0.0, 0.1, 1.3):
-        means, predicted = predict(states, covariance, noise, dt)
-        for i, mode in np.ndindex(n, 3):
-            mean, cov = twins.tracking.unscented_prediction(mode, states[i, mode], covariance[i, mode], NOISE, dt)
-            np.testing.assert_allclose(means[i, mode], mean, atol=1e-9)
-            np.testing.assert_allclose(predicted[i, mode], cov, atol=1e-9)
-
-
-@pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 2), (1, 0), (1, 1), (4, 5)])
-def test_updates_are_those_of_the_twin(n: int, m: int) -> None:
-    rng = rng_of(10 * n + m)
-    means, predicted = some_tracks(rng, n)
-    detections = rng.normal(0.0, 2.0, (m, 3))
-    beta = rng.dirichlet(np.ones(m + 1), (n, 3))
-    sigmas = np.tile(SIGMAS, (n, 1))
-    states, covariance = update(means, predicted, detections, sigmas, beta)
-    for i, mode in np.ndindex(n, 3):
-        mean, cov = twins.tracking.pda_update(means[i, mode], predicted[i, mode], SIGMAS, detections, beta[i, mode])
-        np.testing.assert_allclose(states[i, mode], mean, atol=1e-9)
-        np.testing.assert_allclose(covariance[i, mode], cov, atol=1e-9)
-
-
-def filterpy_filter(mode: int, state: np.ndarray, covariance: np.ndarray, dt: float):
-    """filterpy's unscented filter of one motion; a straight line's is a plain Kalman filter where it is linear."""
-    kalman = pytest.importorskip("filterpy.kalman")
-    filtered = kalman.UnscentedKalmanFilter(
-        dim_x=5,
-        dim_z=3,
-        dt=dt,
-        fx=lambda x, dt: twins.tracking.moved(mode, x, dt),
-        hx=lambda x: x[[0, 1, 3]],
-        points=kalman.JulierSigmaPoints(5, kappa=1.0),
-    )
-    filtered.x, filtered.P = state.copy(), covariance.copy()
-    return filtered
-
-
-@pytest.mark.parametrize("mode", [0, 1, 2])
-def test_each_motion_filters_as_filterpys(mode: int) -> None:
-    """Straight lines, turns and random steps, to 1e-6 over fifty scans (ten interpreted): linear where the heading is certain."""
-    rng, dt = rng_of(mode), 0.1
-    state, covariance = np.array([3.0, -1.0, 8.0, 0.4, 0.3]), np.diag([0.5, 0.5, 4.0, 0.1, 0.05])
-    theirs = filterpy_filter(mode, state, covariance, dt)
-    ours, spread = np.tile(state, (1, 3, 1)), np.tile(covariance, (1, 3, 1, 1))
-    truth = state.copy()
-    for _ in range(10 if numba.config.DISABLE_JIT else 50):
-        truth = twins.tracking.moved(CTRV, truth, dt)
-        detection = truth[[0, 1, 3]] + rng.normal(0.0, 1.0, 3) * [0.1, 0.1, 0.02]
-        theirs.Q = twins.tracking.process_noise(mode, theirs.x[3], NOISE, dt)
-        theirs.predict()
-        means, predicted = predict(ours, spread, NOISE[None], dt)
-        np.testing.assert_allclose(means[0, mode], theirs.x, atol=1e-6)
-        np.testing.assert_allclose(predicted[0, mode], theirs.P, atol=1e-6)
-        _, S = twins.tracking.innovation(means[0, mode], predicted[0, mode], SIGMAS, detection)
-        theirs.update(detection, R=S - predicted[0, mode][np.ix_([0, 1, 3], [0, 1, 3])])
-        if abs(detection[2] - means[0, mode, 3]) > 3.0 * math.sqrt(S[2, 2]):
-            pytest.fail("the reference is to stay within what is never cut")
-        ours, spread = update(means, predicted, detection[None], SIGMAS[None], np.tile([0.0, 1.0], (1, 3, 1)))
-        np.testing.assert_allclose(ours[0, mode], theirs.x, atol=1e-6)
-        np.testing.assert_allclose(spread[0, mode], theirs.P, atol=1e-6)
-
-
-def test_a_straight_line_is_filtered_as_by_filterpys_linear_filter() -> None:
-    kalman = pytest.importorskip("filterpy.kalman")
-    dt = 0.1
-    theirs = kalman.KalmanFilter(dim_x=5, dim_z=3)
-    theirs.F = np.array([[1, 0, dt, 0, 0], [0, 1, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 0.0]])
-    theirs.H = np.eye(5)[[0, 1, 3]]
-    theirs.R = np.diag(SIGMAS**2)
-    noise = NOISE * [1, 0, 1, 0, 1]  # a heading that is known and stays makes the motion linear
-    theirs.x, theirs.P = np.array([0.0, 1.0, 6.0, 0.0, 0.0]), np.diag([1.0, 1.0, 9.0, 0.0, 0.0])
-    theirs.Q = twins.tracking.process_noise(CONSTANT_VELOCITY, 0.0, noise, dt)
-    ours, spread = np.tile(theirs.x, (1, 3, 1)), np.tile(theirs.P, (1, 3, 1, 1))
-    for k in range(60):
-        detection = np.array([0.65 * k + 0.1 * math.sin(k), 1.0 + 0.1 * math.cos(k), 0.0])
-        theirs.predict()
-        theirs.update(detection)
-        means, predicted = predict(ours, spread, noise[None], dt)
-        ours, spread = update(means, predicted, detection[None], SIGMAS[None], np.tile([0.0, 1.0], (1, 3, 1)))
-        np.testing.assert_allclose(ours[0, CONSTANT_VELOCITY], theirs.x, atol=1e-6)
-        np.testing.assert_allclose(spread[0, CONSTANT_VELOCITY], theirs.P, atol=1e-6)
-
-
-def test_all_motions_together_are_filterpys_imm() -> None:
-    """Interaction, prediction, mode probabilities and combination, over a drive that turns and stops."""
-    kalman = pytest.importorskip("filterpy.kalman")
-    rng, dt, stay = rng_of(5), 0.1, 0.95
-    state, covariance = np.array([0.0, 0.0, 5.0, 0.1, 0.0]), np.diag([0.1, 0.1, 4.0, 0.05, 0.05])
-    filters = [filterpy_filter(mode, state, covariance, dt) for mode in range(3)]
-    chain = np.where(np.eye(3, dtype=bool), stay, (1.0 - stay) / 2.0)
-    theirs = kalman.IMMEstimator(filters, np.ones(3) / 3.0, chain)
-    ours, spread = np.tile(state, (1, 3, 1)), np.tile(covariance, (1, 3, 1, 1))
-    modes, prior = np.ones((1, 3)) / 3.0, np.empty((1, 3))
-    truth = state.copy()
-    for k in range(60):
-        truth[4] = 0.4 if 20 <= k < 40 else 0.0
-        truth[2] = 5.0 if k < 40 else 0.0
-        truth = twins.tracking.moved(CTRV, truth, dt)
-        detection = truth[[0, 1, 3]] + rng.normal(0.0, 1.0, 3) * [0.05, 0.05, 0.02]
-
-        mixed, mixed_spread = np.empty_like(ours), np.empty_like(spread)
-        fill_interaction(ours, spread, modes, np.array([stay]), mixed, mixed_spread, prior)
-        means, predicted = predict(mixed, mixed_spread, NOISE[None], dt)
-        gates, likelihoods, weights = np.array([1e3]), np.empty((1, 3, 1)), np.empty((1, 1))
-        group = np.zeros(1, np.int64)
-        fill_likelihoods(
-            means,
-            predicted,
-            SIGMAS[None],
-            prior,
-            np.ones(1),
-            group,
-            detection[None],
-            group,
-            gates,
-            likelihoods,
-            weights,
-        )
-        shares = np.empty((1, 3, 2))
-        fill_mode_probabilities(prior, likelihoods, np.array([[0.0, 1.0]]), shares, modes)
-        ours, spread = update(means, predicted, detection[None], SIGMAS[None], shares)
-        combined, total = np.empty((1, 5)), np.empty((1, 5, 5))
-        fill_combined(ours, spread, modes, combined, total)
-
-        # filterpy mixes before its filters predict, and R lies along the predicted heading.
-        headings = [sum(w * f.x[3] for w, f in zip(column, filters, strict=True)) for column in theirs.omega.T]
-        for mode, one in enumerate(filters):
-            one.Q = twins.tracking.process_noise(mode, headings[mode], NOISE, dt)
-        theirs.predict()
-        for one in filters:
-            _, S = twins.tracking.innovation(one.x, one.P, SIGMAS, detection)
-            one.R = S - one.P[np.ix_([0, 1, 3], [0, 1, 3])]
-        theirs.update(detection)
-        np.testing.assert_allclose(modes[0], theirs.mu, atol=1e-6)
-        np.testing.assert_allclose(combined[0], theirs.x, atol=1e-6)
-        np.testing.assert_allclose(total[0], theirs.P, atol=1e-6)
-
-
-def test_a_track_that_is_not_finite_leaves_the_others_unchanged() -> None:
-    rng = rng_of(9)
-    states, covariance = some_tracks(rng, 3)
-    states[1, :, 3], covariance[1, 2] = np.nan, np.nan
-    means, predicted = predict(states, covariance, np.tile(NOISE, (3, 1)), 0.1)
-    detections, beta = rng.normal(0.0, 2.0, (2, 3)), rng.dirichlet(np.ones(3), (3, 3))
-    detections[1], beta[:, :, 2] = np.nan, 0.0  # a detection that is nobody's
-    updated, spread = update(means, predicted, detections, np.tile(SIGMAS, (3, 1)), beta)
-    for i, mode in itertools.product((0, 2), range(3)):
-        mean, cov = twins.tracking.unscented_prediction(mode, states[i, mode], covariance[i, mode], NOISE, 0.1)
-        np.testing.assert_allclose(means[i, mode], mean, atol=1e-9)
-        np.testing.assert_allclose(predicted[i, mode], cov, atol=1e-9)
-        mean, cov = twins.tracking.pda_update(mean, cov, SIGMAS, detections[:1], beta[i, mode, :2])
-        np.testing.assert_allclose(updated[i, mode], mean, atol=1e-9)
-        np.testing.assert_allclose(spread[i, mode], cov, atol=1e-9)
-    assert np.isnan(updated[1]).any()
-
-
-def test_small_matrices_are_those_of_numpy_the_twins_own() -> None:
-    rng = rng_of(2)
-    for matrix in covariances(rng, 6):
-        root, inverse = np.empty((5, 5)), np.empty((3, 3))
-        fill_cholesky(matrix, root)
-        np.testing.assert_allclose(root, np.linalg.cholesky(matrix), atol=1e-12)
-        for invert in (ukf.fill_inverse, egomotion.fill_inverse):
-            invert(matrix[:3, :3].copy(), inverse)
-            np.testing.assert_allclose(inverse, np.linalg.inv(matrix[:3, :3]), rtol=1e-8, atol=1e-9)
-    fill_cholesky(np.diag([4.0, 0.0, -1e-18, 9.0, 1.0]), root)  # directions without variance
-    np.testing.assert_array_equal(root, np.diag([2.0, 0.0, 0.0, 3.0, 1.0]))
-    for angle in (*rng.uniform(-20.0, 20.0, 20), 0.0, math.pi / 2):
-        assert half_turn(angle) == pytest.approx((angle + math.pi / 2) % math.pi - math.pi / 2, abs=1e-12)
-    assert math.isnan(half_turn(math.nan))
-
-
-@pytest.mark.parametrize("n", [0, 1, 5])
-def test_the_imm_is_its_twin(n: int) -> None:
-    rng = rng_of(n)
-    states, spread = some_tracks(rng, n)
-    probabilities, stay = rng.dirichlet(np.ones(3), n), rng.uniform(0.5, 1.0, n)
-    mixed, mixed_spread, prior = np.empty_like(states), np.empty_like(spread), np.empty((n, 3))
-    fill_interaction(states, spread, probabilities, stay, mixed, mixed_spread, prior)
-    state, covariance = np.empty((n, 5)), np.empty((n, 5, 5))
-    fill_combined(states, spread, probabilities, state, covariance)
-    likelihoods = rng.uniform(0.0, 2.0, (n, 3, 4)) * (rng.random((n, 1, 4)) < 0.6)
-    beta = rng.dirichlet(np.ones(5), n)
-    beta[:, 1:] *= likelihoods.any(axis=1)
-    beta /= beta.sum(axis=1, keepdims=True)
-    shares, modes = np.empty((n, 3, 5)), np.empty((n, 3))
-    fill_mode_probabilities(prior, likelihoods, beta, shares, modes)
-    for i in range(n):
-        twin = twins.tracking.interaction(states[i], spread[i], probabilities[i], stay[i])
-        for got, wanted in zip((mixed[i], mixed_spread[i], prior[i]), twin, strict=True):
-            np.testing.assert_allclose(got, wanted, atol=1e-9)
-        for got, wanted in zip(
-            (state[i], covariance[i]), twins.tracking.combination(states[i], spread[i], probabilities[i]), strict=True
-        ):
-            np.testing.assert_allclose(got, wanted, atol=1e-9)
-        for got, wanted in zip(
-            (shares[i], modes[i]), twins.tracking.mode_probabilities(prior[i], likelihoods[i], beta[i]), strict=True
-        ):
-            np.testing.assert_allclose(got, wanted, atol=1e-9)
-
-
-# --- association -----------------------------------------------------------------------------------------------------
-
-
-def associate(weights: np.ndarray, max_events: int = MAX_EVENTS) -> tuple[np.ndarray, int]:
-    beta = np.empty((weights.shape[0], weights.shape[1] + 1))
-    return beta, fill_association(weights, max_events, beta)
-
-
-@pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 3), (3, 0), (1, 1), (5, 6)])
-def test_likelihoods_are_those_of_the_twin(n: int, m: int) -> None:
-    rng = rng_of(n + 7 * m)
-    means, predicted = some_tracks(rng, n)
-    means[:, 1:] = means[:, :1] + rng.normal(0.0, 0.2, (n, 2, 5))
-    detections = rng.normal(0.0, 2.0, (m, 3))
-    groups, theirs = rng.integers(0, 2, n), rng.integers(0, 2, m)
-    sigmas, prior, odds = np.tile(SIGMAS, (n, 1)), rng.dirichlet(np.ones(3), n), rng.uniform(1.0, 9.0, n)
-    gates, got, weights = np.full(n, 3.0), np.empty((n, 3, m)), np.empty((n, m))
-    fill_likelihoods(means, predicted, sigmas, prior, odds, groups, detections, theirs, gates, got, weights)
-    wanted = twins.tracking.likelihoods(means, predicted, sigmas, groups, detections, theirs, gates)
-    np.testing.assert_allclose(got, wanted, atol=1e-12)
-    np.testing.assert_allclose(weights, odds[:, None] * np.einsum("nk,nkm->nm", prior, wanted), atol=1e-12)
-    detections[:1] = np.nan  # the tracker never lets it in; it must not spread either way
-    fill_likelihoods(means, predicted, sigmas, prior, odds, groups, detections, theirs, gates, got, weights)
-    assert not got[:, :, :1].any()
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.integers(0, 4), st.integers(0, 4), st.integers(0, 10**6))
-def test_association_is_the_sum_over_all_joint_events(n: int, m: int, seed: int) -> None:
-    rng = rng_of(seed)
-    weights = np.exp(rng.normal(0.0, 3.0, (n, m))) * (rng.random((n, m)) < 0.7)
-    beta, n_approximated = associate(weights)
-    assert n_approximated == 0
-    np.testing.assert_allclose(beta, twins.tracking.association(weights), rtol=1e-9, atol=1e-12)
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.integers(1, 4), st.integers(1, 4), st.integers(0, 10**6))
-def test_belief_propagation_is_its_twin_and_near_the_truth(n: int, m: int, seed: int) -> None:
-    rng = rng_of(seed)
-    weights = np.exp(rng.normal(0.0, 2.0, (n, m))) * (rng.random((n, m)) < 0.7)
-    beta, n_approximated = associate(weights, max_events=0)
-    assert n_approximated == n
-    np.testing.assert_allclose(beta.sum(axis=1), 1.0, atol=1e-9)
-    assert (beta[:, 1:].sum(axis=0) < 1.0 + 1e-5).all()
-    twin = twins.tracking.propagation(weights)
-    np.testing.assert_allclose(beta, twin, atol=1e-4)
-    exact = twins.tracking.association(weights)
-    assert np.abs(beta - exact).max() < 0.2
-    if (weights > 0).sum() < n + m - len(clusters(weights)) + 1:  # no loop: nothing is approximated
-        np.testing.assert_allclose(beta, exact, atol=1e-5)
-
-
-def clusters(weights: np.ndarray) -> set[frozenset[int]]:
-    """Connected parts of the bipartite graph of tracks (counted from 0) and detections (from 100)."""
-    parts = [{i} for i in range(weights.shape[0])] + [{100 + j} for j in range(weights.shape[1])]
-    for i, j in zip(*np.nonzero(weights), strict=True):
-        joined = [part for part in parts if i in part or 100 + j in part]
-        parts = [part for part in parts if part not in joined] + [set().union(*joined)]
-    return {frozenset(part) for part in parts}
-
-
-def test_belief_propagation_is_mostly_near() -> None:
-    rng, gaps = rng_of(3), []
-    for _ in range(100):
-        weights = np.exp(rng.normal(1.0, 2.0, (4, 4))) * (rng.random((4, 4)) < 0.6)
-        gaps.append(np.abs(associate(weights, 0)[0] - twins.tracking.association(weights)).mean())
-    assert np.mean(gaps) < 0.01
-
-
-def test_clusters_are_solved_apart_and_large_ones_approximated() -> None:
-    rng = rng_of(0)
-    large = 20 if numba.config.DISABLE_JIT else 200
-    alone, pair = slice(large, large + 30), slice(large + 30, large + 32)
-    weights = np.zeros((large + 32, large + 32))
-    weights[:large, :large] = rng.uniform(0.1, 5.0, (large, large))  # everything could be everything
-    np.fill_diagonal(weights[alone, alone], 3.0)
-    weights[pair, pair] = [[1.0, 2.0], [0.0, 4.0]]
-    beta, n_approximated = associate(weights)
-    assert n_approximated == large
-    np.testing.assert_allclose(beta.sum(axis=1), 1.0)
-    np.testing.assert_allclose(beta[alone, 0], 0.25)
-    where = [0, large + 31, large + 32]
-    np.testing.assert_allclose(beta[pair][:, where], twins.tracking.association(weights[pair, pair]))
-
-
-def test_two_certain_pairs_do_not_mix() -> None:
-    beta, _ = associate(np.array([[1e15, 1.0], [1.0, 1e15]]))
-    np.testing.assert_allclose(beta[:, 1:], np.eye(2), atol=1e-9)
-    scratch = np.zeros((2, 3))
-    fill_by_propagation(np.array([[1e15, 1.0], [1.0, 1e15]]), np.arange(2), np.arange(2), scratch)
-    np.testing.assert_allclose(scratch[:, 1:], np.eye(2), atol=1e-6)
 
 
 # --- the sensor's own motion -----------------------------------------------------------------------------------------
@@ -404,7 +43,7 @@ def some_places(rng: np.random.Generator, n: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 3), (3, 0), (1, 1), (8, 9), (20, 20)])
 def test_the_fit_of_the_motion_is_its_twin(n: int, m: int) -> None:
-    rng = rng_of(n + 10 * m)
+    rng = np.random.default_rng(n + 10 * m)
     prior, spread = np.array([0.5, 0.0, 0.02]), np.array([1.0, 0.1, 0.01])
     for strange in (False, True):
         places = some_places(rng, n), some_places(rng, m)
@@ -434,7 +73,7 @@ def fitted(places: np.ndarray, detections: np.ndarray, spread: np.ndarray) -> tu
 
 
 def test_the_fit_finds_the_motion_among_objects_that_move() -> None:
-    rng = rng_of(4)
+    rng = np.random.default_rng(4)
     true = np.array([1.7, 0.1, 0.04])
     places = rng.uniform(-30.0, 30.0, (12, 2))
     cos, sin = math.cos(true[2]), math.sin(true[2])
@@ -457,7 +96,7 @@ def test_one_far_landmark_that_moves_aside_speaks_for_a_turn() -> None:
 
 def drive(n_scans: int, seed: int = 0):
     """A street of parked cars and an oncoming one, seen from a car that pulls off and turns: boxes and poses."""
-    rng = rng_of(seed)
+    rng = np.random.default_rng(seed)
     parked = np.column_stack([rng.uniform(5.0, 90.0, 24), rng.choice([-6.0, 6.0, 9.0], 24)])
     x = y = heading = 0.0
     for k in range(n_scans):
@@ -621,7 +260,7 @@ def test_a_track_that_leaves_the_field_of_view_is_no_longer_reported() -> None:
 
 
 def test_crossing_pedestrians_keep_their_identities() -> None:
-    tracker, rng, owners = Tracker(), rng_of(2), [set(), set()]
+    tracker, rng, owners = Tracker(), np.random.default_rng(2), [set(), set()]
     for k in range(60):
         s = -3.0 + 0.1 * k
         places = np.array([[10.0 + s, s], [10.0 + s, -s]]) + rng.normal(0.0, 0.03, (2, 2))
@@ -656,7 +295,7 @@ def test_two_hundred_crossing_targets_in_clutter() -> None:
 
 
 def test_memory_stays_flat() -> None:
-    rng, tracker = rng_of(8), Tracker(max_tracks=64)
+    rng, tracker = np.random.default_rng(8), Tracker(max_tracks=64)
     sizes = []
     tracemalloc.start()
     try:
@@ -683,6 +322,8 @@ BAD_BOXES = [
     replace(box("car", 10.0, 0.0), score=math.nan),
     "car",
 ]
+
+
 MIRRORED = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
@@ -752,7 +393,7 @@ def test_a_tracker_takes_perceptions() -> None:
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6))
 def test_any_boxes_at_any_times_make_finite_tracks(seed: int) -> None:
-    rng, tracker, stamp_s = rng_of(seed), Tracker(), 0.0
+    rng, tracker, stamp_s = np.random.default_rng(seed), Tracker(), 0.0
     known: set[int] = set()
     for _ in range(15):
         stamp_s += float(10.0 ** rng.uniform(-6, 1.5))
@@ -781,7 +422,7 @@ def test_any_boxes_at_any_times_make_finite_tracks(seed: int) -> None:
 
 @pytest.mark.parametrize(("n", "m"), [(0, 0), (1, 0), (0, 2), (5, 4), (20, 3)])
 def test_shapes_hiding_and_rivals_are_those_of_the_twins(n: int, m: int) -> None:
-    rng = rng_of(n + m)
+    rng = np.random.default_rng(n + m)
     state, detections = rng.normal(0.0, 1.0, (n, 5)), rng.normal(0.0, 1.0, (m, 3))
     beta, shapes, sigmas = rng.dirichlet(np.ones(m + 1), n), rng.uniform(1, 3, (m, 4)), rng.uniform(0.1, 1, (n, 4))
     shape, variance, front = rng.uniform(1, 3, (n, 4)), rng.uniform(0.1, 1, (n, 4)), rng.uniform(-10, 10, n)
@@ -801,7 +442,7 @@ def test_shapes_hiding_and_rivals_are_those_of_the_twins(n: int, m: int) -> None
 
 @pytest.mark.parametrize(("n", "m"), [(0, 0), (1, 0), (0, 2), (6, 4)])
 def test_births_lives_and_views_are_those_of_the_twins(n: int, m: int) -> None:
-    rng = rng_of(7 * n + m)
+    rng = np.random.default_rng(7 * n + m)
     tracker = Tracker()
     kinds = tracker._kinds(["car", "pedestrian", "cyclist"])[rng.integers(0, 3, n)]
     of = tracker._classes[kinds]
@@ -829,420 +470,3 @@ def test_births_lives_and_views_are_those_of_the_twins(n: int, m: int) -> None:
 def assert_same_tracks(tracks: np.ndarray, wanted: np.ndarray) -> None:
     for name in tracks.dtype.names:
         np.testing.assert_allclose(tracks[name], wanted[name], atol=1e-9, err_msg=name)
-
-
-# --- the figures -----------------------------------------------------------------------------------------------------
-
-
-def row(x: float, y: float = 0.0) -> list[float]:
-    return [x, y, 0.0, 4.0, 2.0, 1.5, 0.0]
-
-
-def truth_of(*objects: tuple[int, float], ignored: tuple[int, ...] = ()) -> FrameTruth:
-    ids = np.array([name for name, _ in objects], np.int64)
-    boxes = np.array([row(x) for _, x in objects]).reshape(-1, 7)
-    return FrameTruth(ids, boxes, np.isin(ids, ignored))
-
-
-def tracks_of(*objects: tuple[int, float], score: float = 0.9, excused: tuple[int, ...] = ()) -> FrameTracks:
-    ids = np.array([name for name, _ in objects], np.int64)
-    boxes = np.array([row(x) for _, x in objects]).reshape(-1, 7)
-    return FrameTracks(ids, boxes, np.full(len(ids), score), np.isin(ids, excused))
-
-
-def test_box_iou() -> None:
-    a = [row(0.0), [0.0, 0.0, 0.75, 4.0, 2.0, 1.5, 0.0], [0.0, 0.0, 0.0, 4.0, 2.0, 1.5, math.pi]]
-    iou = box_iou(a, [row(0.0), row(2.0), row(9.0), [math.nan] * 7])
-    np.testing.assert_allclose(iou[0], [1.0, 1.0 / 3.0, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(iou[1, 0], 0.5 / 1.5)
-    np.testing.assert_allclose(iou[2], iou[0], atol=1e-9)
-    assert box_iou(np.zeros((0, 7)), a).shape == (0, 3)
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.integers(0, 4), st.integers(0, 4), st.integers(0, 10**6))
-def test_assignment_gains_the_most(n: int, m: int, seed: int) -> None:
-    rng = rng_of(seed)
-    gain = rng.random((n, m)) * (rng.random((n, m)) < 0.7)
-    column = np.empty(n, np.int64)
-    fill_assignment(gain, column)
-    made = np.flatnonzero(column >= 0)
-    assert len({*column[made].tolist()}) == len(made)
-    assert (gain[made, column[made]] > 0.0).all()
-    assert gain[made, column[made]].sum() == pytest.approx(twins.tracking.best_gain(gain))
-    frames = [gain, gain.T, gain[:1], gain[:, :1]]
-    pair = np.empty(sum(len(each) for each in frames), np.int64)
-    gains = np.concatenate([each.ravel() for each in frames])
-    fill_pairs(np.array([each.shape for each in frames]), gains, pair)
-    pairs, begun = iter(pair.tolist()), 0
-    for each in frames:
-        own = [k for k in itertools.islice(pairs, len(each)) if k >= 0]
-        assert all(begun <= k < begun + each.size for k in own)
-        assert gains[own].sum() == pytest.approx(twins.tracking.best_gain(each))
-        begun += each.size
-
-
-def test_gains_that_are_not_finite_or_not_positive_make_no_pair() -> None:
-    gain = np.array([[np.nan, 0.5], [-1.0, np.nan]])
-    column = np.empty(2, np.int64)
-    fill_assignment(gain, column)
-    assert column.tolist() == [1, -1]
-    assert twins.tracking.best_gain(np.maximum(np.nan_to_num(gain), 0.0)) == 0.5
-
-
-def test_pairs_are_made_within_a_frame() -> None:
-    gain = np.array([[0.3, 0.0], [0.9, 0.3], [0.0, 0.2]])
-    pair = np.empty(5, np.int64)
-    fill_pairs(np.array([[3, 2], [1, 0], [0, 4], [1, 1]]), np.array([*gain.ravel(), 0.5]), pair)
-    assert pair.tolist() == [-1, 2, 5, -1, 6]
-
-
-def test_matches_are_as_many_as_can_be() -> None:
-    """The best pair of all would leave the other box and the other track with nothing."""
-    truth = truth_of((1, 0.0), (2, 2.0))
-    tracks = tracks_of((5, 1.2), (6, 3.9))
-    iou = box_iou(truth.boxes, tracks.boxes)
-    assert iou[1, 0] > max(iou[0, 0], iou[1, 1]) > 0.25 > iou[0, 1]
-    best = evaluate_tracks([([truth] * 3, [tracks] * 3)]).best
-    assert (best.n_found, best.n_missed, best.n_false) == (6, 0, 0)
-    assert best.motp == pytest.approx((iou[0, 0] + iou[1, 1]) / 2.0)
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, 3), st.integers(-1, 2), st.booleans()), max_size=30))
-def test_breaks_are_counted_as_the_twin_does(frames: list[tuple[int, int, bool]]) -> None:
-    truth, ids = (np.array([frame[k] for frame in frames], np.int64) for k in (0, 1))
-    ignored = np.array([frame[2] for frame in frames], bool)
-    assert count_breaks(truth, ids, ignored) == twins.tracking.breaks(truth, ids, ignored)
-
-
-def test_breaks_by_hand() -> None:
-    def count(ids: list[int], ignored: tuple[int, ...] = ()) -> tuple[int, int]:
-        hidden = np.isin(np.arange(len(ids)), ignored)
-        return count_breaks(np.zeros(len(ids), np.int64), np.array(ids), hidden)
-
-    assert count([1, 1, 1, 1]) == (0, 0)
-    assert count([1, 1, 2, 2]) == (1, 1)
-    assert count([1, 1, -1, 1, 1]) == (0, 1)  # lost and taken up again
-    assert count([1, 1, -1, 2, 2]) == (0, 1)
-    assert count([1, 1, -1, -1]) == (0, 0)
-    assert count([1, 1, 2, 2], ignored=(1,)) == (0, 0)  # an ignored box makes a new beginning
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.lists(st.floats(-5.0, 5.0), max_size=120), st.integers(0, 40))
-def test_recall_thresholds_are_those_of_kittis_walk(scores: list[float], n_missed: int) -> None:
-    thresholds, recalls = recall_thresholds(scores, len(scores) + n_missed)
-    wanted, wanted_recalls = twins.tracking.thresholds_by_walking(scores, len(scores) + n_missed)
-    assert thresholds.tolist() == wanted
-    np.testing.assert_allclose(recalls, wanted_recalls)
-
-
-def test_a_perfect_tracker_has_full_marks() -> None:
-    frames = [truth_of((1, k), (2, 20.0 + k)) for k in range(50)]
-    tracks = [tracks_of((7, k), (8, 20.0 + k)) for k in range(50)]
-    scores = evaluate_tracks([(frames, tracks)])
-    assert (scores.best.mota, scores.best.motp, scores.samota) == pytest.approx((1.0, 1.0, 1.0))
-    assert (scores.hota.hota, scores.hota.deta, scores.hota.assa) == pytest.approx((1.0, 1.0, 1.0))
-    assert (scores.n_frames, scores.n_objects) == (50, 2)
-    # At recall r MOTA is r, so its mean over 1/40 .. 1 is 41/80; the first two tracks enter together.
-    assert scores.amotp == pytest.approx(1.0)
-
-
-def test_clear_by_hand() -> None:
-    """Missed, false, switched, ignored and excused boxes, counted on paper."""
-    truth = [truth_of((1, 0.0), (2, 30.0), (3, 60.0), ignored=(3,)) for _ in range(10)]
-    tracks = []
-    for k in range(10):
-        objects = [(5 if k < 5 else 6, 0.0), (7, 60.0), (8, 90.0), (9, 120.0)]  # switch, ignored, false, excused
-        tracks.append(tracks_of(*objects, excused=(9,)))
-    scores = evaluate_tracks([(truth, tracks)])
-    best = scores.best
-    assert (best.n_truth, best.n_found, best.n_false, best.n_missed) == (20, 20, 10, 10)
-    assert (best.n_switches, best.n_fragments) == (1, 1)
-    assert best.mota == pytest.approx(1.0 - 21.0 / 20.0)
-    assert best.motp == pytest.approx(1.0)
-    assert best.scaled_mota(0.5) == 0.0
-    assert replace(best, n_false=1).scaled_mota(0.5) == pytest.approx(1.0 - (12.0 - 10.0) / 10.0)
-    # TP 10, FN 10, FP 10; the object's ten matches fall to two tracks of five frames.
-    assert scores.hota.deta == pytest.approx(1.0 / 3.0)
-    assert scores.hota.assa == pytest.approx(0.5)
-    assert scores.hota.hota == pytest.approx(math.sqrt(0.5 / 3.0))
-
-
-def test_scores_part_good_tracks_from_bad_ones() -> None:
-    truth = [truth_of((1, 0.0)) for _ in range(80)]
-    good, bad = [tracks_of((5, 0.0), score=0.9)] * 80, [tracks_of((6, 50.0), score=0.3)] * 80
-    both = [
-        FrameTracks(*(np.concatenate([getattr(a, f), getattr(b, f)]) for f in ("ids", "boxes", "scores", "excused")))
-        for a, b in zip(good, bad, strict=True)
-    ]
-    scores = evaluate_tracks([(truth, both)])
-    assert (scores.best.mota, scores.best.n_false, scores.samota) == pytest.approx((1.0, 0, 1.0))
-    assert scores.best.threshold == pytest.approx(0.9)
-
-
-def test_nothing_at_all_has_no_marks() -> None:
-    empty = [truth_of()] * 3, [tracks_of()] * 3
-    scores = evaluate_tracks([empty])
-    assert math.isnan(scores.best.mota)
-    assert math.isnan(scores.hota.hota)
-    assert scores.samota == 0.0
-    missed = evaluate_tracks([([truth_of((1, 0.0))] * 3, [tracks_of()] * 3)])
-    assert (missed.best.mota, missed.best.n_missed, missed.hota.hota) == (0.0, 3, 0.0)
-    with pytest.raises(TrackingError, match="got 2 frames"):
-        evaluate_tracks([([truth_of()] * 3, [tracks_of()] * 2)])
-
-
-def test_clear_agrees_with_motmetrics() -> None:
-    motmetrics = pytest.importorskip("motmetrics")
-    rng = rng_of(1)
-    truth, tracks, theirs = [], [], motmetrics.MOTAccumulator(auto_id=True)
-    for k in range(60):
-        there = [(j, 12.0 * j + 0.2 * k) for j in range(5)]
-        found = [(j + 10 * (k > 30 and j == 2), x + rng.normal(0.0, 0.2)) for j, x in there if rng.random() < 0.9]
-        found += [(100 + k, -50.0 - 5.0 * k)] if rng.random() < 0.3 else []
-        truth.append(truth_of(*there))
-        tracks.append(tracks_of(*found))
-        distance = 1.0 - box_iou(truth[-1].boxes, tracks[-1].boxes)
-        theirs.update(truth[-1].ids, tracks[-1].ids, np.where(distance <= 0.75, distance, np.nan))
-    wanted = motmetrics.metrics.create().compute(
-        theirs, metrics=["num_false_positives", "num_misses", "num_switches", "motp"], name="all"
-    )
-    ours = evaluate_tracks([(truth, tracks)]).best
-    assert ours.n_false == wanted["num_false_positives"]["all"]
-    assert ours.n_missed == wanted["num_misses"]["all"]
-    assert wanted["num_switches"]["all"] == 1
-    assert ours.motp == pytest.approx(1.0 - wanted["motp"]["all"])
-
-
-# --- KITTI -----------------------------------------------------------------------------------------------------------
-
-CALIBRATION = """P2: 700.0 0.0 600.0 0.0 0.0 700.0 180.0 0.0 0.0 0.0 1.0 0.0
-R0_rect: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0
-Tr_velo_to_cam: 0.0 -1.0 0.0 0.0 0.0 0.0 -1.0 0.0 1.0 0.0 0.0 0.0
-"""
-
-
-@pytest.fixture
-def kitti(tmp_path: Path) -> Path:
-    """A sequence of a car that drives ahead, a van beside it, and a pedestrian whom nobody labeled."""
-    for folder in ("calib", "label_02", *(f"detections/pointrcnn_{of}" for of in ("Car", "Pedestrian", "Cyclist"))):
-        (tmp_path / folder).mkdir(parents=True)
-    (tmp_path / "calib/0000.txt").write_text(CALIBRATION)
-    labels, cars, pedestrians = [], [], []
-    for k in range(20):
-        z = 15.0 + 0.5 * k
-        labels += [
-            f"{k} 1 Car 0 0 0.0 100 100 300 200 1.5 1.8 4.2 0.0 1.7 {z} -1.57",
-            f"{k} 2 Van 0 0 0.0 100 100 300 200 2.0 1.9 5.0 6.0 1.7 {z} -1.57",
-            f"{k} -1 DontCare -1 -1 -10 0 100 200 300 -1000 -1000 -1000 -1000 -1000 -1000 -1000",
-        ]
-        cars.append(f"{k},2,100,100,300,200,5.0,1.5,1.8,4.2,0.0,1.7,{z},-1.57,0.0")
-        cars.append(f"{k},2,100,100,300,200,4.0,2.0,1.9,5.0,6.0,1.7,{z},-1.57,0.0")
-        pedestrians.append(f"{k},1,100,100,300,200,3.0,1.7,0.6,0.8,-10.0,1.7,14.0,0.0,0.0")
-    (tmp_path / "label_02/0000.txt").write_text("\n".join(labels) + "\n")
-    (tmp_path / "detections/pointrcnn_Car/0000.txt").write_text("\n".join(cars))
-    (tmp_path / "detections/pointrcnn_Pedestrian/0000.txt").write_text("\n".join(pedestrians))
-    (tmp_path / "detections/pointrcnn_Cyclist/0000.txt").write_text("")
-    return tmp_path
-
-
-def test_kitti_sequences_are_read_into_the_sensors_frame(kitti: Path) -> None:
-    sequence = read_sequence(kitti, "0000")
-    assert len(sequence.detections) == 20
-    first = sequence.detections[0][0]
-    assert first.center == pytest.approx((15.0, 0.0, -0.95))
-    assert first.size == (4.2, 1.8, 1.5)
-    assert first.yaw == pytest.approx(0.0, abs=1e-3)
-    assert first.score == pytest.approx(1.0 / (1.0 + math.exp(-5.0)))
-    truth = sequence.truth["car"][0]
-    assert truth.ignored.tolist() == [False, True]
-    np.testing.assert_allclose(truth.boxes[0, :3], first.center)
-    assert len(sequence.truth["pedestrian"][0].ids) == 0
-
-
-def test_kitti_is_evaluated_by_its_rules(kitti: Path) -> None:
-    seen = []
-    figures = evaluate_kitti(kitti, on_sequence=lambda done, total: seen.append((done, total)))
-    car, pedestrian = figures["classes"]["car"], figures["classes"]["pedestrian"]
-    assert (car["best"]["n_truth"], car["best"]["n_false"], car["best"]["n_switches"]) == (20, 0, 0)
-    assert car["best"]["mota"] == 1.0
-    assert car["hota"]["assa"] > 0.9
-    assert pedestrian["best"]["n_false"] == 0  # it stands where nothing was labeled
-    assert (seen, figures["sequences"]) == ([(1, 1)], ["0000"])
-
-
-def test_kitti_errors(kitti: Path, tmp_path: Path) -> None:
-    with pytest.raises(TrackingError, match="no label_02"):
-        evaluate_kitti(tmp_path / "elsewhere")
-    (kitti / "detections/pointrcnn_Car/0000.txt").write_text("0,2,100\n")
-    with pytest.raises(TrackingError, match="15 comma-separated"):
-        read_sequence(kitti, "0000")
-    (kitti / "label_02/0000.txt").write_text("0 1 Car\n")
-    with pytest.raises(TrackingError, match="17 columns"):
-        read_sequence(kitti, "0000")
-
-
-def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["eval-tracking", str(kitti), "--json", str(kitti / "out/figures.json")]
-    assert cli.main(arguments) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("1 sequence, given detections, 3-D IoU 0.25;")
-    words = [line.split() for line in lines]
-    assert ["car", "100.0"] in [line[:1] + line[4:5] for line in words if len(line) > 8]
-    assert any(line[:7] == ["sAMOTA", "AMOTA", "AMOTP", "MOTA", "MOTP", "HOTA", "DetA"] for line in words)
-    figures = json.loads((kitti / "out/figures.json").read_text())
-    assert figures["classes"]["cyclist"]["best"]["mota"] is None
-    assert figures["command"].startswith("edgeperc eval-tracking")
-    assert cli.main(["eval-tracking", str(kitti / "calib")]) == 2
-    assert "no label_02" in capsys.readouterr().err
-
-
-def test_a_models_boxes_are_evaluated(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What run --json prints takes the place of the detections, which need not be there."""
-    detections = read_sequence(kitti, "0000").detections
-    lines = [{"scan": "x", "boxes": [replace(one, label="van").to_dict() for one in of]} for of in detections]
-    for of in ("Car", "Pedestrian", "Cyclist"):
-        (kitti / f"detections/pointrcnn_{of}/0000.txt").unlink()
-    boxes = kitti / "boxes.jsonl"
-    boxes.write_text("\n".join(map(json.dumps, lines)))
-    arguments = [
-        "eval-tracking",
-        str(kitti),
-        "--sequences",
-        "0000",
-        "--boxes",
-        str(boxes),
-        "--classes",
-        "vehicle",
-        "car",
-    ]
-    assert cli.main([*arguments, "--json", str(kitti / "figures.json")]) == 0
-    figures = json.loads((kitti / "figures.json").read_text())["classes"]
-    assert figures["vehicle"]["best"]["mota"] > 0.9  # the car and the van
-    assert figures["vehicle"]["best"]["n_truth"] == 40
-    assert figures["car"]["best"]["n_missed"] == 20  # all were labeled as vans
-    boxes.write_text("\n".join(map(json.dumps, lines[:-1])))
-    assert cli.main(arguments) == 2
-    assert "19 frames for 20" in capsys.readouterr().err
-    boxes.write_text('{"scan": "x"}')
-    assert cli.main(arguments) == 2
-    assert "holds no boxes" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        cli.main([*arguments[:2], "--boxes", str(boxes)])
-
-
-@pytest.fixture
-def drive_root(kitti: Path, tmp_path: Path) -> Path:
-    """The same sequence as an object set with track ids: a label and a scan a frame, of two drives."""
-    root = tmp_path / "objects"
-    for folder in ("label_2", "track_id", "calib", "velodyne"):
-        (root / "training" / folder).mkdir(parents=True)
-    by_frame: dict[int, list[list[str]]] = {}
-    for line in (kitti / "label_02/0000.txt").read_text().splitlines():
-        words = line.split()
-        by_frame.setdefault(int(words[0]), []).append(words)
-    rows = ["name,drive"]
-    for k, labels in by_frame.items():
-        name = f"{100 + k:06}"
-        rows.append(f"{name},my_drive")
-        (root / f"training/label_2/{name}.txt").write_text("".join(" ".join(words[2:]) + "\n" for words in labels))
-        (root / f"training/track_id/{name}.txt").write_text("".join(words[1] + "\n" for words in labels))
-        (root / f"training/calib/{name}.txt").write_text(CALIBRATION)
-        (root / f"training/velodyne/{name}.bin").write_bytes(np.full((3, 4), 0.5 + k, np.float32).tobytes())
-    (root / "frames.csv").write_text("\n".join([*rows, "000000,unlabeled_drive"]) + "\n")
-    return root
-
-
-def test_an_object_set_with_track_ids_is_the_same_sequence(kitti: Path, drive_root: Path) -> None:
-    assert sequence_names(drive_root) == ["my_drive"]
-    scans = sequence_scans(drive_root, "my_drive")
-    assert [path.stem for path in scans.values()] == [f"{100 + k:06}" for k in range(20)]
-    given = read_sequence(kitti, "0000")
-    same = read_sequence(drive_root, "my_drive", boxes=given.detections)
-    for of in ("car", "pedestrian"):
-        for a, b in zip(given.truth[of], same.truth[of], strict=True):
-            np.testing.assert_array_equal(a.ids, b.ids)
-            np.testing.assert_array_equal(a.boxes, b.boxes)
-            np.testing.assert_array_equal(a.ignored, b.ignored)
-    (drive_root / "training/track_id/000103.txt").write_text("1\n")
-    with pytest.raises(TrackingError, match="3 labels, and 1 track ids"):
-        read_sequence(drive_root, "my_drive", boxes=given.detections)
-
-
-def test_a_drive_is_perceived_and_tracked(
-    kitti: Path, drive_root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """From scans to the table in one command; a scan that a model was trained on is refused."""
-    found = read_sequence(kitti, "0000").detections
-    card = SimpleNamespace(name="seer", version="1.0", training={})
-
-    def perceive(points: np.ndarray) -> SimpleNamespace:
-        return SimpleNamespace(boxes=found[int(points[0, 0])])
-
-    perceive.cards = (card,)
-    monkeypatch.setattr("edgeperc.cli.eval_tracking.make_perceiver", lambda *_, **__: perceive)
-    arguments = ["eval-tracking", str(drive_root), "--classes", "car", "--json", str(drive_root / "f.json")]
-    assert cli.main(arguments) == 0
-    assert "1 sequence, boxes of seer 1.0" in capsys.readouterr().out
-    best = json.loads((drive_root / "f.json").read_text())["classes"]["car"]["best"]
-    assert (best["n_truth"], best["n_missed"], best["n_false"]) == (20, 0, 0)
-
-    # Beside KITTI's own sequences, --model takes the place of the detections that are there.
-    assert cli.main(["eval-tracking", str(kitti), "--model", "seer"]) == 2
-    assert "no scans of 0000" in capsys.readouterr().err
-    (kitti / "velodyne/0000").mkdir(parents=True)
-    for k, path in sequence_scans(drive_root, "my_drive").items():
-        (kitti / f"velodyne/0000/{k:06}.bin").write_bytes(path.read_bytes())
-    (kitti / "velodyne/0000/000003.bin").unlink()  # as in KITTI's sequence 0001
-    assert cli.main(["eval-tracking", str(kitti), "--model", "seer", "--classes", "car"]) == 0
-
-    card.training = {"frames": {"x": scan_hash(np.full((3, 4), 4.5, np.float32))}}
-    assert cli.main(arguments) == 2
-    assert "seer 1.0 was trained on scan 000104" in capsys.readouterr().err
-
-
-def test_a_coarser_sensors_drive_has_every_second_beam(drive_root: Path, tmp_path: Path) -> None:
-    turn = np.radians(np.arange(0.5, 360.0, 30.0))
-    beams = [np.column_stack([9.0 * np.cos(turn), 9.0 * np.sin(turn), 0 * turn - k, 0 * turn + 0.5]) for k in range(5)]
-    for path in sequence_scans(drive_root, "my_drive").values():
-        np.concatenate(beams).astype(np.float32).tofile(path)
-    every_second_beam(drive_root, tmp_path / "coarse")
-    scans = sequence_scans(tmp_path / "coarse", "my_drive")
-    assert len(scans) == 20
-    points = np.fromfile(scans[7], np.float32).reshape(-1, 4)
-    assert points[:, 2].tolist() == [0.0] * 12 + [-2.0] * 12 + [-4.0] * 12
-    assert (points[:, 3] == 63.75).all()
-    sensor = get_sensor(tmp_path / "coarse/sensor.json")
-    assert (len(sensor.elevations_deg), sensor.remission_range) == (32, (0.0, 255.0))
-
-
-def test_real_sequences_are_tracked_well(data_root) -> None:
-    """Sequence 0004 with PointRCNN's detections; the figures of the whole set are in the documents."""
-    figures = evaluate_kitti(data_root("tracking"), sequences=["0004"])["classes"]["car"]
-    assert figures["best"]["mota"] > 0.85
-    assert figures["best"]["n_switches"] == 0
-    assert figures["hota"]["hota"] > 0.6
-
-
-# --- pictures and the command line -----------------------------------------------------------------------------------
-
-
-def test_tracks_are_animated(kitti: Path, tmp_path: Path) -> None:
-    image = pytest.importorskip("PIL.Image")
-    from edgeperc.view.tracks import draw_tracks
-
-    tracks, _ = track_sequence(read_sequence(kitti, "0000"))
-    content = draw_tracks(tracks, tmp_path / "tracks.gif", title="a drive")
-    assert (tmp_path / "tracks.gif").read_bytes() == content
-    with image.open(tmp_path / "tracks.gif") as animation:
-        assert animation.n_frames == 20
-        first = np.asarray(animation.convert("RGB")).copy()
-        animation.seek(19)
-        assert (np.asarray(animation.convert("RGB")) != first).any()
-        assert animation.info["duration"] == 1000
-    for few in ([], tracks[:1]):
-        with pytest.raises(TrackingError, match="two or more"):
-            draw_tracks(few, tmp_path / "none.gif")
-    assert not (tmp_path / "none.gif").exists()

@@ -26,7 +26,7 @@ OPENVINO = {"provider": "openvino", "precision": "bf16", "n_threads": None}
 CUDA = {"provider": "cuda", "precision": "fp32", "n_threads": 1}
 
 
-def test_settings_of_computers_and_models_live_side_by_side(tmp_path: Path) -> None:
+def test_file_holds_settings_of_several_computers_and_models(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "settings.json"
     assert read_setting(path, "m", "s") is None
     write_settings(path, "m", {"s": CPU_2})
@@ -50,14 +50,14 @@ def test_settings_of_computers_and_models_live_side_by_side(tmp_path: Path) -> N
         '{"schema": 2, "machines": {"m": {"s": {"provider": "cpu", "precision": "fp32", "n_threads": 0}}}}',
     ],
 )
-def test_what_is_no_setting_is_named(tmp_path: Path, text: str) -> None:
+def test_malformed_settings_are_named(tmp_path: Path, text: str) -> None:
     path = tmp_path / "settings.json"
     path.write_text(text)
     with pytest.raises(SettingsError, match=r"settings\.json.*delete it"):
         read_setting(path, "m", "s")
 
 
-def test_the_folder_is_where_it_is_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "here"))
     assert cache_folder() == tmp_path / "here"
     assert settings_path() == tmp_path / "here" / "settings.json"
@@ -68,7 +68,7 @@ def test_the_folder_is_where_it_is_asked_for(monkeypatch: pytest.MonkeyPatch, tm
         assert cache_folder() == tmp_path / "edgeperc"
 
 
-def test_compiled_models_are_found_by_what_they_were_made_of(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_compiled_folder_depends_on_engine_model_and_precision(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
     asked = [("a 1", "f" * 64, "fp32"), ("a 2", "f" * 64, "fp32"), ("a 1", "e" * 64, "fp32"), ("a 1", "f" * 64, "bf16")]
     folders = [compiled_folder(*each) for each in asked]
@@ -79,7 +79,7 @@ def test_compiled_models_are_found_by_what_they_were_made_of(monkeypatch: pytest
     assert compiled_folder(*asked[0]) not in folders
 
 
-def test_where_nothing_can_be_written_nothing_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_read_only_cache_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "file" / "below"))
     assert compiled_folder("a", "f" * 64, "fp32") is None
@@ -88,7 +88,7 @@ def test_where_nothing_can_be_written_nothing_is_kept(monkeypatch: pytest.Monkey
     assert compiled_folder("a", "f" * 64, "fp32") is None
 
 
-def test_alike_computers_have_one_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_equal_computers_have_one_fingerprint(monkeypatch: pytest.MonkeyPatch) -> None:
     assert cpu_model()
     assert len(fingerprint()) == 16
     assert fingerprint() == fingerprint()

@@ -211,7 +211,7 @@ def test_weights_in_other_files_are_refused(place: str, outside: bytes) -> None:
 def test_a_damaged_graph_is_refused(blob: bytes, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(onnx_file, "MAX_FIELDS", 1000)
     for trusted in (False, True):
-        with pytest.raises(ModelFileError, match=rf"model\.onnx is no complete \.onnx file \(.*{message}"):
+        with pytest.raises(ModelFileError, match=rf"model\.onnx is not a complete \.onnx file \(.*{message}"):
             check_graph(blob, "model.onnx", trusted=trusted)
 
 
@@ -316,7 +316,7 @@ def test_onnxruntime_prints_nothing_and_its_message_is_kept(tmp_path: Path, capf
 def test_a_graph_of_another_shape_than_the_cards(tmp_path: Path) -> None:
     card = replace(tiny_card(), classes=("background", "drivable", "car"))
     path = write(tmp_path, model(graph(CONVOLUTION, INITIALIZER), card=card))
-    with pytest.raises(CardMismatchError, match=r"its card says tensor\(float\) of shape \(1, 3, 16, 16\)"):
+    with pytest.raises(CardMismatchError, match=r"its card declares tensor\(float\) of shape \(1, 3, 16, 16\)"):
         Session(path, "cpu")
 
 
@@ -390,7 +390,7 @@ NAN, INF = float("nan"), float("inf")
         ("name", "x" * 201, "name 'x.*expected 1 to 200 printable"),
         ("name", "\x1b[31mred", "printable characters"),
         ("name", None, "name is None; expected a text"),
-        ("version", "\ud800", "no Unicode"),
+        ("version", "\ud800", "not valid Unicode"),
         ("classes", [str(i) for i in range(300)], "2 to 255"),
         ("classes", "ab", "classes is 'ab'; expected a list"),
         ("box_size_priors", {"drivable": [1e9, 1, 1]}, r"box_size_priors\.drivable\[0\] is 1000000000.0"),
@@ -408,8 +408,8 @@ NAN, INF = float("nan"), float("inf")
         ("golden.outputs", {"y": {}}, "lacks positions, std, values"),
         ("golden.outputs.y.std", NAN, "the number nan"),
         ("golden.outputs.y.std", -1.0, "std is -1.0; expected a number from 0"),
-        ("golden.outputs.y.values", [], "no lists of one length"),
-        ("golden.outputs.y.values", 3, "no lists of one length"),
+        ("golden.outputs.y.values", [], "not lists of one length"),
+        ("golden.outputs.y.values", 3, "not lists of one length"),
         ("golden.outputs.y.values.3", None, "values is None; expected a number"),
         ("golden.outputs.y.values.3", 1e31, r"values\[3\] is 1e\+31"),
         ("golden.outputs.y.positions.3", -1, r"positions\[3\] is -1; expected a number from 0"),

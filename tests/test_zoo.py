@@ -26,7 +26,7 @@ def variants(**losses: float) -> tuple[Variant, Variant]:
     )
 
 
-def test_every_name_has_one_file_a_variant() -> None:
+def test_every_name_has_one_file_per_variant() -> None:
     assert shipped_models() == ("lodnn", "pointseg", "ssadnet")
     assert set(DEFAULT) <= set(shipped_models())
     names = [str(variant) for variant in listed()]
@@ -37,7 +37,7 @@ def test_every_name_has_one_file_a_variant() -> None:
         assert model_path(str(variant)) == variant.path
 
 
-def test_a_name_stands_for_its_variants_fp32_first() -> None:
+def test_name_gives_its_variants_fp32_first() -> None:
     for name in DEFAULT:
         assert [variant.precision for variant in resolve(name)] == ["fp32", "int8"]
         assert model_path(name) == resolve(name)[0].path
@@ -100,14 +100,14 @@ def test_a_file_without_a_card_is_refused(tmp_path: Path) -> None:
         ("openvino", frozenset(), {"int8": 0.0, "bf16": 0.0}, "fp32"),
     ],
 )
-def test_auto_takes_what_is_native_and_proven(
+def test_auto_takes_native_precisions_with_a_measured_loss(
     provider: str, features: frozenset[str], losses: dict[str, float], precision: str
 ) -> None:
     fp32, int8 = variants(**losses)
     assert choose((fp32, int8), provider, "auto", features) == (int8 if precision == "int8" else fp32, precision)
 
 
-def test_what_is_asked_for_needs_no_proof() -> None:
+def test_requested_precision_needs_no_measured_loss() -> None:
     fp32, int8 = variants()
     for features in (frozenset[str](), BOTH):
         assert choose((fp32, int8), "cpu", "int8", features) == (int8, "int8")
@@ -131,7 +131,7 @@ def test_bf16_is_refused_where_it_is_not_native() -> None:
         choose(variants(bf16=0.0), "cpu", "bf16", BOTH)
 
 
-def test_the_shipped_cards_prove_every_precision() -> None:
+def test_shipped_cards_have_the_loss_of_every_precision() -> None:
     for name in DEFAULT:
         fp32, int8 = resolve(name)
         assert set(fp32.card.precisions) == {"fp32", "bf16"}
@@ -142,7 +142,7 @@ def test_the_shipped_cards_prove_every_precision() -> None:
             assert record["label_agreement"] > 0.99
 
 
-def test_a_digest_is_of_every_file() -> None:
+def test_digest_covers_every_file() -> None:
     fp32, int8 = resolve("pointseg")
     assert digest([fp32]) == hashlib.sha256(fp32.path.read_bytes()).hexdigest()
     assert len({digest([fp32]), digest([int8]), digest([fp32, int8])}) == 3

@@ -11,13 +11,17 @@ trap 'rm -rf "$away"' EXIT
 
 "$python" -m build --outdir "$away/dist" . >"$away/build.log" 2>&1 || { cat "$away/build.log"; exit 1; }
 "$python" - "$away"/dist/*.whl <<'END'
-import sys, zipfile
+import pathlib, sys, zipfile
 
 names = zipfile.ZipFile(sys.argv[1]).namelist()
 top = {name.split("/")[0] for name in names if ".dist-info/" not in name}
 assert top == {"edgeperc", "edgeperc_bench", "edgeperc_export"}, f"the wheel installs {sorted(top)}"
-assert "edgeperc/py.typed" in names and "edgeperc/models/__init__.py" in names, names
-assert [name for name in names if name.startswith("edgeperc/models/") and name.endswith(".onnx")], "no model in the wheel"
+assert "edgeperc/py.typed" in names and "edgeperc/zoo/__init__.py" in names, names
+models = {name for name in names if name.endswith(".onnx")}
+assert {"edgeperc/zoo/ssadnet.onnx", "edgeperc/zoo/pointseg.onnx"} <= models, f"the wheel has the models {sorted(models)}"
+assert not [name for name in names if "research" in name], "a research model is in the wheel"
+megabytes = pathlib.Path(sys.argv[1]).stat().st_size / 1e6
+assert megabytes <= 8.0, f"the wheel has {megabytes:.1f} MB, more than 8"
 END
 
 "$python" -m venv "$away/venv"

@@ -1,4 +1,4 @@
-"""What several commands do: start a document and write it, prepare the scans, measure several processes at once."""
+"""Steps of several commands: start and write a document, prepare the scans, measure several processes at once."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["job_of", "limits_of", "measure_offline", "new_document", "prepare_in
 
 @contextmanager
 def new_document(kind: str, arguments: argparse.Namespace) -> Iterator[tuple[dict[str, Any], LiveTable]]:
-    """An empty report; what it holds at the end is printed and written, even when measuring is interrupted."""
+    """Start an empty report. Its content is printed and written at the end, even after an interruption."""
     html = getattr(arguments, "html", None)  # not every command has a page
     if html:
         require("matplotlib", "view", "A page with plots")
@@ -75,7 +75,7 @@ def _write(document: Mapping[str, Any], json: Path | None, md: Path | None, html
 
 
 def prepare_input(arguments: argparse.Namespace, folder: Path, document: dict[str, Any], live: LiveTable) -> Input:
-    """The scans that ``--input`` or ``--scans`` ask for, as files in ``folder``, and their place in the report."""
+    """Write the scans of ``--input`` or ``--scans`` to files in ``folder``, and record them in the report."""
     from .. import inputs
 
     if arguments.input:
@@ -88,7 +88,7 @@ def prepare_input(arguments: argparse.Namespace, folder: Path, document: dict[st
 
 
 def job_of(arguments: argparse.Namespace) -> Job:
-    """The job that ``--model``, ``--provider``, ``--precision``, ``--threads`` and ``--sensor`` ask for."""
+    """The job from ``--model``, ``--provider``, ``--precision``, ``--threads`` and ``--sensor``."""
     return Job(
         tuple(arguments.model or DEFAULT),
         provider=arguments.provider,
@@ -99,7 +99,7 @@ def job_of(arguments: argparse.Namespace) -> Job:
 
 
 def limits_of(arguments: argparse.Namespace) -> Limits:
-    """What ``--min-scans``, ``--min-seconds`` and ``--warm-up`` ask for."""
+    """The limits from ``--min-scans``, ``--min-seconds`` and ``--warm-up``."""
     return Limits(arguments.min_scans, arguments.min_seconds, arguments.warm_up)
 
 
@@ -117,7 +117,7 @@ def measure_offline(
     Raises
     ------
     KeyboardInterrupt
-        After what was measured by then is in ``setting``.
+        Interrupted; the results so far are in ``setting``.
     """
     from ..measure import offline
 
@@ -126,7 +126,7 @@ def measure_offline(
     setting["offline"].append(measured)
     cpu_s = sum(part["cpu_s"] for part in measured["parts"])
     for disturbance in context.disturbances(document["machine"], measured["before"], measured["after"], cpu_s):
-        # The start of the measuring processes would count as other processes' work.
+        # The start-up of the measuring processes would count as work of other processes.
         if not disturbance.startswith("other processes"):
             document["disturbances"].append(f"offline x {n_processes}: {disturbance}")
     if measured["interrupted"]:

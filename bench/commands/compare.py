@@ -1,4 +1,4 @@
-"""``edgeperc-bench compare``: is one measurement slower than another?"""
+"""``edgeperc-bench compare``: test whether one measurement is slower than another."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def run_command(arguments: argparse.Namespace) -> int:
             verdicts.append(verdict.word)
             line = f"{'+'.join(one['models'])}, {name}: {setting_label(one)} -> {setting_label(other)}: {verdict.word}"
             if verdict.word == "unusable":
-                print(f"{line}; one repeat does not show the noise: measure with --repeats 3")
+                print(f"{line}; the noise is unknown with one repeat: measure with --repeats 3")
                 continue
             low, high = verdict.interval
             print(

@@ -110,7 +110,7 @@ def run_command(arguments: argparse.Namespace) -> int:
 def settings_to_try(
     model: str, providers: Sequence[str], precisions: Sequence[str], present: Sequence[str]
 ) -> tuple[list[tuple[str, str]], list[str]]:
-    """Which settings of a model this computer can run.
+    """Select the settings of a model that this computer can run.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def settings_to_try(
     -------
     settings : list of (provider, precision)
     skipped : list of str
-        One sentence for everything that the user asked for and this computer cannot run.
+        One sentence for each requested setting that this computer cannot run.
     """
     variants = resolve(model)
     settings, skipped = [], []
@@ -160,7 +160,7 @@ def _try(job: Job, right: Reference, scans: Input, n_repeats: int, document: dic
     except EdgepercError as exc:
         _skip(f"{name}: {' '.join(str(exc).split())}", document, live)
         return
-    # Only now: an interrupted setting must not be recommended.
+    # Added last: an interrupted setting must not be recommended.
     setting["accuracy"] = accuracy_of(right, predictions, scans.truth)
     document["settings"].append(setting)
     ms = percentile(pooled(setting, SINGLE_STREAM), 50.0)
@@ -168,7 +168,7 @@ def _try(job: Job, right: Reference, scans: Input, n_repeats: int, document: dic
 
 
 def recommend(document: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """For each model the fastest setting whose results agree, and whether the next fastest is really slower."""
+    """For each model, the fastest setting whose results agree, and whether the next one is significantly slower."""
 
     def median_ms(setting: Mapping[str, Any]) -> float:
         return percentile(pooled(setting, SINGLE_STREAM), 50.0)

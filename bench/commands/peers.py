@@ -1,4 +1,4 @@
-"""``edgeperc-bench peers``: edgeperc beside other engines and the limits of the machine."""
+"""``edgeperc-bench peers``: compare edgeperc with other engines and with the limits of the machine."""
 
 from __future__ import annotations
 

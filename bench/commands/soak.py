@@ -1,4 +1,4 @@
-"""``edgeperc-bench soak``: does memory grow over many scans?"""
+"""``edgeperc-bench soak``: test whether memory grows over many scans."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .common import job_of, new_document
 
 __all__ = ["add_parser", "memory_growth", "run_command"]
 
-# A run may gain this much memory and still be level [MB]: an allocator's pages come and go by about as much.
+# Growth up to this counts as level [MB]: an allocator's pages vary by about as much.
 LEVEL_MB = 1.0
 # The share of the scans during which the allocator settles.
 SETTLING_SHARE = 0.1
@@ -68,13 +68,13 @@ def run_command(arguments: argparse.Namespace) -> int:
 
 
 def memory_growth(rss_mb: Sequence[Sequence[float]], settling: int) -> dict[str, Any]:
-    """Whether memory grew.
+    """Test whether memory grew.
 
     Parameters
     ----------
     rss_mb : sequence of (scans done, MB)
     settling : int
-        Scans before the first of these.
+        Number of scans before the first sample.
 
     Returns
     -------

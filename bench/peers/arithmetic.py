@@ -1,9 +1,9 @@
-"""The least work of a network and the peak of this machine, which together bound every latency from below.
+"""Count the work of a network and measure the peak of this machine: together a lower bound for every latency.
 
 A network's multiplications are those of its convolutions and matrix products, counted from the ONNX graph; taps that
 only meet padding are counted separately, because an engine can skip them. The machine's peak is measured beside the
 networks, with the installed libraries: large matrix products, and a copy of more memory than any cache holds. The bound
-is that of direct convolution: Winograd's method takes fewer multiplications and more of everything else.
+holds for direct convolution; Winograd's method needs fewer multiplications but more of all other operations.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ COPY_BYTES = 1 << 28
 
 @dataclass(frozen=True)
 class Cost:
-    """The work of a network, counted in values, not bytes.
+    """The work of a network; traffic is counted in values, not bytes.
 
     Attributes
     ----------
     macs : int
-        Multiply-accumulates, with padding, the usual figure.
+        Multiply-accumulates including padding, as usually reported.
     padding_macs : int
-        Those of them that only meet padding.
+        Multiply-accumulates with padding only; part of ``macs``.
     weights, activations : int
         Values that convolutions and matrix products read, and read or write; other operators can be fused into them.
     """
@@ -107,7 +107,7 @@ def cost(model: Path | Any) -> Cost:
 
 
 def n_taps_inside(n_here: int, n_there: int, kernel: int, stride: int, pad: int, dilation: int) -> int:
-    """Pairs of a position and a tap, along one axis, that meet a position of the other side, not padding."""
+    """Number of pairs of a position and a tap, along one axis, that do not fall on padding."""
     at = np.arange(n_here)[:, None] * stride - pad + np.arange(kernel) * dilation
     return int(np.count_nonzero((at >= 0) & (at < n_there)))
 

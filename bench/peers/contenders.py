@@ -1,9 +1,9 @@
-"""What is measured beside edgeperc: torch, other engines, a pipeline in numpy, two networks in place of one.
+"""The contenders of ``peers``: edgeperc, torch, other engines, a pipeline in numpy, two networks in place of one.
 
 Every contender is a process of its own, so that libraries do not share an address space and memory can be measured. The
-contenders of a table take turns in a new random order each round, so that drift affects all of them alike. In its turn
-a contender handles every scan once, after a call that does not count, because the threads of the contender before may
-still be spinning. The peaks of the machine are contenders, too, measured in the same rounds as the networks.
+contenders of a table take turns in a new random order each round, so that drift affects all of them equally. In its
+turn, a contender processes every scan once, after a call that does not count, because threads of the previous contender
+may still be spinning. The peaks of the machine are contenders, too, measured in the same rounds as the networks.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Measured:
 
     @property
     def p50(self) -> float:
-        """Their median."""
+        """Median of all milliseconds."""
         return percentile(self.ms, 50.0)
 
 
@@ -112,11 +112,11 @@ def groups(
         Names or paths; a name stands for its variant in fp32. Range-image models are paired with top-view models, the
         first with the first.
     provider, precision : str
-        Of edgeperc itself.
+        For edgeperc itself.
     folder : Path
         For inputs and for the two networks in place of one.
     scan : Path
-        Input of networks alone.
+        The scan that is the input of networks alone.
     sensor : str
     """
     points, _ = condition(np.load(scan), get_sensor(sensor), rendered=False)
@@ -156,7 +156,7 @@ def groups(
 
 
 def _pipelines(models: Sequence[Variant], provider: str, precision: str) -> list[Contender]:
-    """Every way from scan to result; the first is edgeperc's, to which the ratios refer."""
+    """All pipelines from scan to result. The first one is edgeperc's, the reference of the ratios."""
     paths, cards = tuple(each.path for each in models), tuple(each.card.to_json() for each in models)
     int8 = any(each.precision == "int8" for each in models)
     own = dict.fromkeys(((provider, precision), ("cpu", "auto"), *([("openvino", "auto")] if int8 else OPENVINO)))
@@ -183,10 +183,10 @@ def _full_network(variant: Variant) -> list[Contender]:
 
 
 def _one_or_two(variant: Variant, folder: Path) -> list[Contender]:
-    """SSADNet, and two networks made of its parts: segmentation alone, and detection on a trunk of its own.
+    """Compare SSADNet with two networks made of its parts: segmentation, and detection with its own trunk.
 
-    Together the two give SSADNet's own results. The third row is a lower bound for any detector: the box head on the
-    bare input, without a trunk, with random weights.
+    The two networks together give SSADNet's results. The third row is a lower bound for any detector: the box head on
+    the bare input, without a trunk, with random weights.
     """
     card, path = variant.card, variant.path
     image = folder / f"{path.stem}-input.npy"

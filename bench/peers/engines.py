@@ -34,7 +34,7 @@ class Engine:
 
 
 def open_engine(library: str, precision: str, path: Path, n_threads: int) -> Engine:
-    """A model in an engine.
+    """Open a model in an engine.
 
     Parameters
     ----------
@@ -50,8 +50,8 @@ def open_engine(library: str, precision: str, path: Path, n_threads: int) -> Eng
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = n_threads
-        # As in edgeperc: otherwise the threads of one network spin while another's need the cores, and two networks
-        # took 77 ms that take 25 ms one at a time.
+        # As in edgeperc. Otherwise the threads of one network spin on the cores that another network needs: two
+        # networks took 77 ms instead of 25 ms.
         options.add_session_config_entry("session.force_spinning_stop", "1")
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
         (entry,) = session.get_inputs()
@@ -94,7 +94,7 @@ def open_engine(library: str, precision: str, path: Path, n_threads: int) -> Eng
 
 
 def torch_network(path: Path) -> tuple[Any, tuple[int, ...], list[str]]:
-    """A model's graph as a torch module, the shape of its input, and the names of its outputs.
+    """Translate a model's graph to a torch module; also the shape of its input and the names of its outputs.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""How long it takes to find the ground and to cluster the rest, beside other libraries, and how well it is done.
+"""Compare ground detection and clustering with other libraries: time, and accuracy of the ground.
 
 This module is a command of its own: ``python -m edgeperc_bench.peers.ground [SCAN]``.
 
@@ -69,7 +69,7 @@ def installed_peers() -> dict[str, Any]:
 
 
 def ground_finders(peers: Mapping[str, Any]) -> dict[str, Finder]:
-    """By name, what turns a scan into a call that finds its ground, (n,) bool; preparation is not measured."""
+    """By name: functions that prepare a scan and return a call that finds its ground, (n,) bool; only it is timed."""
 
     def edgeperc(regions: bool) -> Finder:
         return lambda points: lambda: find_ground(points, mount_height_m=SENSOR.mount_height_m, regions=regions).mask
@@ -88,7 +88,7 @@ def ground_finders(peers: Mapping[str, Any]) -> dict[str, Finder]:
         parameters = peers["pypatchworkpp"].Parameters()
         parameters.verbose = False
         parameters.sensor_height = SENSOR.mount_height_m
-        # It adapts its thresholds from scan to scan; every scan that is evaluated gets a new one.
+        # It adapts its thresholds from scan to scan, so every evaluated scan gets a new instance.
         finder = peers["pypatchworkpp"].patchworkpp(parameters)
 
         def call() -> NDArray[np.bool_]:
@@ -106,12 +106,12 @@ def ground_finders(peers: Mapping[str, Any]) -> dict[str, Finder]:
 
 
 def clusterers(points: Scan, peers: Mapping[str, Any]) -> dict[str, Clusterer]:
-    """By name, what clusters points, (n,) int.
+    """By name: calls that cluster the points, (n,) int.
 
     Raises
     ------
     AssertionError
-        DBSCAN finds other clusters than `find_clusters`.
+        DBSCAN's clusters differ from those of `find_clusters`.
     """
     calls: dict[str, Clusterer] = {
         "find_clusters": lambda: find_clusters(points),
@@ -159,7 +159,7 @@ def simulated() -> tuple[Scan, Truth]:
 
 
 def recall_and_precision(mask: NDArray[np.bool_], truth: Truth) -> tuple[float, float]:
-    """Of the points that count."""
+    """Recall and precision of a ground mask over the points that count."""
     ground, counts = truth
     right, n_ground, n_found = (int(np.count_nonzero(of & counts)) for of in (mask & ground, ground, mask))
     return right / max(n_ground, 1), right / max(n_found, 1)

@@ -14,7 +14,7 @@ __all__ = ["resized"]
 
 
 def resized(model: str, share: float, folder: Path) -> Path:
-    """The same network for a view of ``share`` times the pixels, with random weights in fp32.
+    """Make the same network for a view with ``share`` times the pixels, with random weights in fp32.
 
     A range image gets ``share`` times the columns, a top view ``share`` times the range.
 

@@ -1,8 +1,8 @@
-"""The whole way from scan to result as one would write it without edgeperc: numpy around a network in some engine.
+"""The pipeline from scan to result without edgeperc: numpy around a network in another engine.
 
-Projections are those of `projection`. Labels are an argmax; boxes are peaks of the heat map, decoded, suppressed by
-their overlap and classified; hidden points vote among their neighbors; everything on whole arrays at once. PointSeg's
-removal of outliers is left out, because numpy has no fast search for components: the pipeline does less than edgeperc.
+Projections are those of `projection`. Labels are an argmax. Boxes are decoded from peaks of the heat map, suppressed by
+overlap and classified. Hidden points take a vote of their neighbors. Everything is vectorized. PointSeg's removal of
+outliers is left out, because numpy has no fast search for components: the pipeline does less than edgeperc.
 
 Engines are onnxruntime, OpenVINO's own API, and torch, whose network is the model's own graph, translated: the same
 weights with batch norm folded in, as fast as a network written by hand.
@@ -56,7 +56,7 @@ class NumpyPipeline:
             self.networks.append((card, engine, projector, index))
 
     def __call__(self, points: NDArray[np.float32]) -> Prediction:
-        """Labels and boxes of a scan (n, 4) with remission in the sensor's raw unit."""
+        """Compute labels and boxes of a scan (n, 4) with remission in the sensor's raw unit."""
         scale, offset = np.float32(self.sensor.remission_scale), np.float32(self.sensor.remission_offset)
         if (scale, offset) != (1.0, 0.0):
             points = np.column_stack((points[:, :3], (points[:, 3] + offset) * scale))

@@ -1,4 +1,4 @@
-"""How long it takes to turn a scan into the networks' inputs, in edgeperc's kernels and in numpy.
+"""Time the projection of a scan to the networks' inputs, in edgeperc's kernels and in numpy.
 
 This module is a command of its own: ``python -m edgeperc_bench.peers.projection [SCAN]``.
 
@@ -62,7 +62,7 @@ def fill_copy(points: NDArray[np.float32], copy: NDArray[np.float32]) -> None:
 
 
 class _NumpyProjector:
-    """A projector in numpy: the kernel's decisions, in float32, on all points at once."""
+    """A projector in numpy: the kernel's computation in float32, on all points at once."""
 
     def __init__(self, view: TopViewGeometry | RangeImageGeometry, input: InputSpec) -> None:
         self.shape = (len(input.channels), view.height, view.width)
@@ -166,7 +166,7 @@ class NumpyRangeImage(_NumpyProjector):
 def look_up(
     values: NDArray[np.float32], table: tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]
 ) -> NDArray[np.int32]:
-    """Intervals of the values, by `tabulate`'s table: a third of searchsorted's time."""
+    """Find the intervals of the values with `tabulate`'s table; takes a third of searchsorted's time."""
     (first, _, cells_per_unit), base, split = table
     cells = ((first - values) * cells_per_unit).astype(np.int32)
     return base[cells] + (values <= split[cells])
@@ -178,7 +178,7 @@ def winners(
     """Write into ``index`` the row of the smallest rank, the earlier of two; return the pixels seen and their rows."""
     best = np.full(len(index), np.inf, np.float32)
     np.minimum.at(best, flat, rank)
-    # Of several values assigned to one pixel numpy keeps the last.
+    # If several values are assigned to one pixel, numpy keeps the last one.
     winning = np.flatnonzero(rank == best[flat])[::-1]
     index[:] = -1
     index[flat[winning]] = rows[winning]
@@ -187,7 +187,7 @@ def winners(
 
 
 def contenders(points: NDArray[np.float32]) -> dict[str, Callable[[], object]]:
-    """What is measured, by the names in the table, each with buffers of its own.
+    """The calls to measure, by their names in the table, each with its own buffers.
 
     Raises
     ------

@@ -26,7 +26,7 @@ def measure(calls: Mapping[str, Callable[[], object]], n_rounds: int) -> dict[st
     """Milliseconds of each call in each round, by name.
 
     Each round makes every call once, in a new random order, so that caches and other busy processes affect all of them
-    alike. The first `N_WARM_UP` rounds do not count.
+    equally. The first `N_WARM_UP` rounds do not count.
     """
     ms = {name: np.empty(N_WARM_UP + n_rounds) for name in calls}
     rng = np.random.default_rng(0)

@@ -20,7 +20,7 @@ __all__ = ["floor_table", "latency_table"]
 
 
 def latency_table(title: str, measured: Sequence[Measured], n_threads: int) -> dict[str, Any]:
-    """Times of all contenders but the machine's peaks, with ratios to the first."""
+    """Table of the times of all contenders except the machine's peaks, with ratios to the first."""
     shown = [each for each in measured if each.contender.kind != "peak"]
     first = shown[0]
     rows = []
@@ -59,7 +59,7 @@ def latency_table(title: str, measured: Sequence[Measured], n_threads: int) -> d
 
 
 def floor_table(title: str, measured: Sequence[Measured]) -> dict[str, Any]:
-    """The least time that the network of a table can take on this machine, and the time that it takes."""
+    """Table of the lower bound for a network's time on this machine, and of its measured time."""
     (path,) = measured[0].contender.paths
     peaks = {
         (each.contender.engine, each.contender.precision): min(each.ms)

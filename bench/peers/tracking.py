@@ -1,4 +1,4 @@
-"""How many scans per second the tracker follows, and Stone Soup's JPDA on the same boxes.
+"""Measure the tracker's scans per second, and those of Stone Soup's JPDA on the same boxes.
 
 This module is a command of its own: ``python -m edgeperc_bench.peers.tracking [ROOT] [--sequence SEQ]``.
 
@@ -107,11 +107,11 @@ def every_second_beam(root: Path, out: Path) -> None:
         kept = points[beam % 2 == 0]
         kept[:, 3] = 255.0 * kept[:, 3] ** 2
         kept.tofile(out / "training/velodyne" / path.name)
-    whole = get_sensor("hdl-64e")
+    full = get_sensor("hdl-64e")
     half = replace(
-        whole,
+        full,
         name="every second beam",
-        elevations_deg=whole.elevations_deg[::2],
+        elevations_deg=full.elevations_deg[::2],
         remission_range=(0.0, 255.0),
         remission=None,
     )
@@ -137,7 +137,7 @@ def endurance(n_scans: int, n_targets: int) -> str:
 
 
 def follow(sequences: Sequence[Scans]) -> int:
-    """Track every sequence from its beginning; scans done."""
+    """Track every sequence from its beginning; return the number of scans."""
     for scans in sequences:
         tracker = Tracker()
         for k, boxes in enumerate(scans):
@@ -146,7 +146,7 @@ def follow(sequences: Sequence[Scans]) -> int:
 
 
 def stone_soup(scans: Scans, seconds: float) -> int:
-    """Scans done before the time was up."""
+    """Track with Stone Soup for at most ``seconds``; return the number of scans."""
     from stonesoup.dataassociator.neighbour import NearestNeighbour
     from stonesoup.dataassociator.probability import JPDA
     from stonesoup.deleter.time import UpdateTimeStepsDeleter
@@ -245,7 +245,7 @@ def main() -> None:
     rows = [["", "scans", "boxes/scan", "scans/s", "by processor time"]]
 
     def add(name: str, run: Callable[[], int], boxes_per_scan: float) -> float:
-        """Measure a run, which returns the scans done; processor time of a scan [s]."""
+        """Time a run, which returns its number of scans; return the processor time of a scan [s]."""
         wall_s, cpu_s = time.perf_counter(), time.process_time()
         done = run()
         wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s

@@ -34,7 +34,7 @@ from .tables import floor_table, latency_table
 
 __all__ = ["measure", "run"]
 
-PAUSE_S = 0.02  # the threads of the contender before spin on for some milliseconds
+PAUSE_S = 0.02  # threads of the previous contender spin for some milliseconds
 Calls = list[Callable[[], object]]
 
 

@@ -1,4 +1,4 @@
-"""The ``edgeperc`` command: one file for each subcommand; `main` joins them."""
+"""The ``edgeperc`` command: one file for each subcommand, and `main`, which runs them."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ __all__ = [
 Commands = Any  # what ArgumentParser.add_subparsers returns; argparse keeps its class private
 _WIDTH = 78
 
-# As in `edgeperc.zoo` and `edgeperc.session`. They import numpy, and a help page has to come at once.
+# Copies of the values in `edgeperc.zoo` and `edgeperc.session`. Those modules import numpy, which would delay --help.
 DEFAULT = ("ssadnet", "pointseg")
 DEFAULT_SENSOR = "hdl-64e"
 PROVIDERS = ("auto", "cpu", "openvino", "cuda", "tensorrt", "tensorrt-rtx", "coreml", "directml")
@@ -71,7 +71,7 @@ def add_command(
         description="\n\n".join(textwrap.fill(paragraph, _WIDTH) for paragraph in description.split("\n\n")),
         epilog="\n".join(["examples:", *(f"  {example}" for example in examples)]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,  # an abbreviation would break when another option begins alike
+        allow_abbrev=False,  # an abbreviation would become ambiguous with a new option
     )
     parser.set_defaults(command=command, usage_error=parser.error)
     return parser
@@ -110,7 +110,7 @@ def add_model(group: Any, default: Sequence[str] = DEFAULT) -> None:
         action="append",
         metavar="MODEL",
         help="a name from 'edgeperc models', one of its variants such as pointseg:int8, or the path of an .onnx file "
-        f"with a card; repeat it for one model of each kind (default: {' and '.join(default)})",
+        f"with a card; repeat the option to run one model of each kind (default: {' and '.join(default)})",
     )
 
 
@@ -120,21 +120,21 @@ def add_provider(group: Any, *, provider: str = "auto", precision: str = "auto")
         "--provider",
         default=provider,
         metavar="PROVIDER",
-        help=f"the onnxruntime execution provider: {', '.join(PROVIDERS)}; auto takes the fastest that was measured "
-        "on this computer, else the first of cuda, openvino and cpu that runs the model; any other is required: "
-        "nothing falls back (default: %(default)s)",
+        help=f"the onnxruntime execution provider: {', '.join(PROVIDERS)}; auto takes the fastest one measured "
+        "on this computer or, without a measurement, the first of cuda, openvino and cpu that runs the model; with any "
+        "other name, it is an error if that provider is not available (default: %(default)s)",
     )
     group.add_argument(
         "--precision",
         choices=PRECISIONS,
         default=precision,
-        help="arithmetic of the networks; auto takes a reduced precision only where the model's card proves that its "
-        "answers agree with fp32's (default: %(default)s)",
+        help="number format of the networks' arithmetic; auto takes bf16 or int8 only if the model's card shows that "
+        "its results agree with fp32 (default: %(default)s)",
     )
 
 
 def add_network(group: Any) -> None:
-    """Add how networks are run: `add_provider`, ``--threads``, ``--trusted``, ``--boxes-from``, ``--full-turn``."""
+    """Add options of networks: `add_provider`, ``--threads``, ``--trusted``, ``--boxes-from``, ``--full-turn``."""
     add_provider(group)
     group.add_argument(
         "--threads",
@@ -145,15 +145,15 @@ def add_network(group: Any) -> None:
     group.add_argument(
         "--trusted",
         action="store_true",
-        help="open models whose graphs have unusual operators, subgraphs or sizes; only for files that you know the "
-        "origin of (default: refuse them)",
+        help="open models whose graphs have unusual operators, subgraphs or sizes; only for files whose "
+        "origin you know (default: refuse them)",
     )
     add_boxes_from(group, "both")
     group.add_argument(
         "--full-turn",
         action="store_true",
-        help="run the range-image model on all four quarters of the turn, for a class of every point around the "
-        "vehicle; takes four times as long (default: only the quarter ahead)",
+        help="run the range-image model on all four quarters of the turn, so that every point around the vehicle gets "
+        "a class; the network takes four times as long (default: only the quarter ahead)",
     )
     group.add_argument(
         "--all-around", action=Renamed, nargs=0, const="--full-turn", default=argparse.SUPPRESS, help=argparse.SUPPRESS
@@ -167,8 +167,8 @@ def add_boxes_from(group: Any, default: str) -> None:
         choices=("both", "network", "clusters"),
         default=default,
         help="network: boxes of the top-view model (vehicles ahead); clusters: boxes around clusters of labeled "
-        "points (every class, as far as points have a class); both: network boxes, and cluster boxes where there are "
-        "none (default: %(default)s)",
+        "points (every class, where points have a class); both: network boxes, and cluster boxes where there are no "
+        "network boxes (default: %(default)s)",
     )
 
 
@@ -179,13 +179,14 @@ def add_adapt(group: Any) -> None:
         type=_adaptation,
         choices=("both", "remission", "interpolation", "none"),
         default="both",
-        help="for a sensor other than the models': map its remission to the training sensor's (remission), fill the "
-        "range image between its beams (interpolation), both, or none; no effect on an hdl-64e (default: %(default)s)",
+        help="how to adapt scans of a sensor other than the training sensor: remission maps its remission to the "
+        "training sensor's, interpolation fills the range image between its beams; no effect on an hdl-64e (default: "
+        "%(default)s)",
     )
 
 
 def positive(text: str) -> int:
-    """A count of at least 1."""
+    """Parse a count of at least 1."""
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} is too small; expected 1 or more")
@@ -193,7 +194,7 @@ def positive(text: str) -> int:
 
 
 def positive_number(text: str) -> float:
-    """A finite number above 0."""
+    """Parse a finite number above 0."""
     value = float(text)
     if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{value} is out of range; expected a number above 0")
@@ -201,12 +202,12 @@ def positive_number(text: str) -> float:
 
 
 def add_figures_file(group: Any) -> None:
-    """Add ``--json FILE``, for the commands that print tables of figures."""
+    """Add ``--json FILE``, for the commands that print tables."""
     group.add_argument(
         "--json",
         type=Path,
         metavar="FILE",
-        help="write every figure to this file, with the command line that gave them (default: tables only)",
+        help="write all figures to this JSON file, with the command line that produced them (default: tables only)",
     )
 
 

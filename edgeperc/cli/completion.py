@@ -8,7 +8,7 @@ from typing import Any
 
 from ..extras import require
 from .arguments import PROVIDERS, Commands, add_command
-from .output import say
+from .output import print_line
 
 __all__ = ["add_parser", "completion_command"]
 
@@ -43,18 +43,18 @@ def completion_command(arguments: argparse.Namespace) -> int:
         **dict.fromkeys(("FILE", "PATH", "SCAN", "DATASET", "SENSOR=SOURCE", "ROOT"), shtab.FILE),
         "DIR": shtab.DIRECTORY,
     }
-    for kind, of in names.items():
-        function, words = f"_edgeperc_{kind}_or_file", " ".join(of)
-        completed[kind.upper()] = {"bash": function, "zsh": function, "tcsh": f"({words})"}
-        # The name has "file" in it, by which shtab knows that a folder's name is not the end of a word.
-        functions["bash"].append(f'{function}() {{ compgen -W \'{words}\' -- "$1"; compgen -f -- "$1"; }}')
-        functions["zsh"].append(f"{function}() {{ compadd {words}; _files; }}")
+    for kind, values in names.items():
+        function, choices = f"_edgeperc_{kind}_or_file", " ".join(values)
+        completed[kind.upper()] = {"bash": function, "zsh": function, "tcsh": f"({choices})"}
+        # For a function with "file" in its name, shtab adds no space after a completed folder.
+        functions["bash"].append(f'{function}() {{ compgen -W \'{choices}\' -- "$1"; compgen -f -- "$1"; }}')
+        functions["zsh"].append(f"{function}() {{ compadd {choices}; _files; }}")
     completed["MODEL|SCAN"] = completed["MODEL"]
     for action in _actions(arguments.parser):
         if action.choices is None and action.metavar in completed:
             action.complete = completed[action.metavar]
     preamble = {shell: "\n".join(lines) for shell, lines in functions.items()}
-    say(shtab.complete(arguments.parser, arguments.shell, preamble=preamble))
+    print_line(shtab.complete(arguments.parser, arguments.shell, preamble=preamble))
     return 0
 
 

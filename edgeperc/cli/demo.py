@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "demo_command"]
 
-# A junction with cars, a truck, pedestrians and a cyclist, most of which are found; its seed is far from those of the
-# training scenes.
+# A junction with cars, a truck, pedestrians and a cyclist, most of which the models detect. Training scenes have other
+# seeds.
 DEMO_SCENE = (2_000_000_110, "junction")
 
 
@@ -29,8 +29,8 @@ def add_parser(commands: Commands) -> None:
         "demo",
         demo_command,
         help="perceive a bundled scene: a table, a picture and a 3-D page",
-        description="Perceive one simulated scan of an hdl-64e whose true labels are known. Print what was found and "
-        "how long it took, and write scene.png (needs the extra 'view') and scene.html. It needs no data.",
+        description="Perceive one simulated hdl-64e scan with known labels. Print the results and the time, and write "
+        "scene.png (needs the extra 'view') and scene.html. The command needs no data.",
         examples=[
             "edgeperc demo",
             "edgeperc demo --out /tmp/demo --model pointseg --full-turn",
@@ -59,7 +59,7 @@ def demo_command(arguments: argparse.Namespace) -> int:
 
     perceive = make_perceiver(arguments, sensor="hdl-64e", on_mismatch="ignore")
     scan = simulate(random_scene(*DEMO_SCENE), "hdl-64e", DEMO_SCENE[0])
-    perceive(scan.points)  # the first pass over a whole scan meets cold caches
+    perceive(scan.points)  # warm-up: the first scan takes longer
     perception = perceive(scan.points)
 
     rows = [("scene", f"{perception.n_points:,} points, a simulated hdl-64e in a street with known labels")]

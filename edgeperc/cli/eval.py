@@ -21,9 +21,9 @@ def add_parser(commands: Commands) -> None:
         "eval",
         eval_command,
         help="accuracy on labeled scans: the papers' tables",
-        description="Compare what models find with the labels of scans: points, boxes, top view and road, over all "
-        "distances and by range, with 95 % intervals over drives. Scans that a model was trained on are refused, "
-        "except with --split train.",
+        description="Compare the models' results with the labels of scans: points, boxes, top view and road, over all "
+        "distances and by range, with 95 % intervals over drives. It is an error to evaluate a model on a scan that it "
+        "was trained on, except with --split train.",
         examples=[
             "edgeperc eval simulation:24",
             "edgeperc eval KITTI/ SemanticKITTI/ --model pointseg --json figures.json",
@@ -47,7 +47,7 @@ def add_parser(commands: Commands) -> None:
         "--fold",
         type=int,
         choices=(0, 1, 2),
-        help="take the drives that this fold of the training held back (default: none)",
+        help="evaluate on the validation drives of this training fold (default: none)",
     )
     models = parser.add_argument_group("models")
     add_model(models)
@@ -56,8 +56,8 @@ def add_parser(commands: Commands) -> None:
     models.add_argument(
         "--road-by",
         metavar="MODEL",
-        help="another top-view model whose drivable cells count as true on KITTI, which has no road labels (default: "
-        "no road figures there)",
+        help="another top-view model whose drivable cells are the ground truth on KITTI, which has no road labels "
+        "(default: no road figures on KITTI)",
     )
     output = parser.add_argument_group("output")
     add_figures_file(output)
@@ -126,7 +126,10 @@ def _figure_lines(figures: Mapping[str, Any]) -> list[str]:
             continue
         of_block = figures[block]
         lines += ["", f"== {name}: {many(of_block['n_frames'], 'scan')}, {many(of_block['n_drives'], 'drive')} =="]
-        for kind, title in (("points", "points"), ("pixels", "points, each as its pixel, unrefined")):
+        for kind, title in (
+            ("points", "points"),
+            ("pixels", "points with the class of their pixel, before refinement"),
+        ):
             lines += table_lines(title, _POINT_COLUMNS, _class_rows(of_block.get(kind, {}), "n_points"))
         for kind, of_kind in of_block.get("boxes", {}).items():
             means = {
@@ -142,17 +145,17 @@ def _figure_lines(figures: Mapping[str, Any]) -> list[str]:
             names = next(iter(of_kind.values()))["iou"]
             columns = (*_MAP_COLUMNS, *((name, name) for name in names), ("cells", "n_cells"))
             rows = [((band, ""), {**row, **row["iou"]}) for band, row in of_kind.items() if row["n_cells"]]
-            lines += table_lines(f"top view, {kind}; the classes' columns are IoU", columns, rows)
+            lines += table_lines(f"top view, {kind}; columns of classes are IoU", columns, rows)
         rows = [((band, ""), row) for band, row in of_block.get("road", {}).items() if row["n_cells"]]
         lines += table_lines("road", _ROAD_COLUMNS, rows)
         for (band, _), row in rows[:1]:  # over all distances
             titles = ("no road", "road")
             shares = [
-                ((band, f"is {name}"), dict(zip(titles, part, strict=True)))
+                ((band, f"true {name}"), dict(zip(titles, part, strict=True)))
                 for name, part in zip(titles, row["confusion"], strict=True)
             ]
             lines += table_lines(
-                "road, confusion in shares of all cells", [(f"taken for {t}", t) for t in titles], shares
+                "road, confusion in shares of all cells", [(f"predicted {t}", t) for t in titles], shares
             )
     return lines
 

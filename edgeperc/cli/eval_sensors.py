@@ -16,9 +16,9 @@ def add_parser(commands: Commands) -> None:
         commands,
         "eval-sensors",
         eval_sensors_command,
-        help="accuracy on other sensors, with and without adaptation",
-        description="IoU of points by class on labeled scans of other sensors than the model's: with no adaptation, "
-        "with the remission mapped, with interpolation between beams, and with both.",
+        help="accuracy on sensors that the model was not trained on",
+        description="IoU of points by class on labeled scans of sensors that the model was not trained on: without "
+        "adaptation, with the remission mapped, with interpolation between beams, and with both.",
         examples=[
             "edgeperc eval-sensors os1-64=simulation:24",
             "edgeperc eval-sensors pandar64=PandaSet/ vlp-16=simulation:8 --json out.json",
@@ -58,11 +58,12 @@ def eval_sensors_command(arguments: argparse.Namespace) -> int:
             on_scan=show,
         )
     lines = [f"{arguments.model}; IoU of points in per cent, mIoU over the classes shown"]
-    for name, of in figures.items():
-        rows = [((kind, ""), {**of[kind]["iou"], "mean": of[kind]["mean_iou"]}) for kind in ADAPTATIONS]
-        there = ", ".join(f"{count:,} {label}" for label, count in of["both"]["n_points"].items())
-        columns = [(label, label) for label in of["both"]["iou"] if label != "background"]
-        title = f"{name}: {many(of['n_scans'], 'scan')}, {there}; remission: {of['function'] or 'no function'}"
+    for name, result in figures.items():
+        rows = [((kind, ""), {**result[kind]["iou"], "mean": result[kind]["mean_iou"]}) for kind in ADAPTATIONS]
+        counts = ", ".join(f"{count:,} {label}" for label, count in result["both"]["n_points"].items())
+        columns = [(label, label) for label in result["both"]["iou"] if label != "background"]
+        function = result["function"] or "no function"
+        title = f"{name}: {many(result['n_scans'], 'scan')}, {counts}; remission: {function}"
         lines += table_lines(title, (*columns, ("mIoU", "mean")), rows)
     print("\n".join(lines))
     write_figures(arguments, figures)

@@ -37,9 +37,9 @@ def add_parser(commands: Commands) -> None:
         eval_tracking_command,
         help="tracking figures on KITTI's sequences",
         description="Track KITTI's sequences without ego poses and compare the tracks with the labels: CLEAR-MOT at "
-        "the score with the best MOTA, its averages over forty recalls, and HOTA.\n\nThe boxes are those of "
-        "detections/, if the root has that folder; those of --boxes; or, with --model or without either, what the "
-        "models find in velodyne/.",
+        "the score with the best MOTA, its averages over forty recalls, and HOTA.\n\nThe boxes come from "
+        "--boxes; without --boxes, from ROOT/detections; with --model, or if ROOT has no detections, from the models, "
+        "which run on the scans in ROOT/velodyne.",
         examples=[
             "edgeperc eval-tracking tracking/",
             "edgeperc eval-tracking tracking/ --sequences 0000 0002 --gif 0000.gif",
@@ -61,7 +61,7 @@ def add_parser(commands: Commands) -> None:
         "--boxes",
         type=Path,
         metavar="FILE",
-        help="track these boxes: what 'edgeperc run --json' printed of the scans of one sequence (default: none)",
+        help="track the boxes in this file, which 'edgeperc run --json' printed for one sequence (default: none)",
     )
     add_sensor(reading)
     rules = parser.add_argument_group("evaluation")
@@ -79,9 +79,9 @@ def add_parser(commands: Commands) -> None:
         type=positive_number,
         default=0.25,
         metavar="X",
-        help="least 3-D overlap (intersection over union) of a match, 0..1 (default: %(default)s)",
+        help="smallest 3-D overlap (intersection over union) of a match, 0..1 (default: %(default)s)",
     )
-    models = parser.add_argument_group("models, if the scans are perceived")
+    models = parser.add_argument_group("models, if the boxes come from scans")
     add_model(models)
     add_network(models)
     add_adapt(models)
@@ -91,7 +91,7 @@ def add_parser(commands: Commands) -> None:
         "--gif",
         type=Path,
         metavar="FILE",
-        help="write the first sequence's tracks seen from above (needs the extra 'view'; default: none)",
+        help="draw the first sequence's tracks from above, as an animation (needs the extra 'view'; default: none)",
     )
 
 
@@ -143,7 +143,7 @@ def eval_tracking_command(arguments: argparse.Namespace) -> int:
 
 
 def _perceived(arguments: argparse.Namespace, names: Sequence[str]) -> tuple[dict[str, list[list[Box]]], str]:
-    """By sequence and frame, the boxes that models find in the scans; and the models' names."""
+    """Run models on the scans: boxes by sequence and frame, and a text that names the models."""
     from ..evaluation.tracking import perceive_drive, sequence_scans
 
     scans = {name: sequence_scans(arguments.root, name) for name in names}

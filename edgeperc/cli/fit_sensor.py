@@ -21,8 +21,8 @@ def add_parser(commands: Commands) -> None:
         fit_sensor_command,
         help="fit a sensor's remission to the training sensor's and write a profile",
         description="Fit a function that maps the remission of one sensor to that of another, and write a sensor "
-        "profile for --sensor. It takes unlabeled scans of any streets, at least a dozen of different places, and "
-        "assumes that equal shares of the points of both sensors are equally bright.",
+        "profile for --sensor. It needs unlabeled scans of any streets, at least a dozen from different places. It "
+        "assumes that both sensors meet surfaces of the same brightness equally often.",
         examples=[
             "edgeperc fit-sensor drives/ --sensor os1-64 --out my-os1.json",
             "edgeperc run drives/ --sensor my-os1.json",
@@ -37,7 +37,7 @@ def add_parser(commands: Commands) -> None:
         "--to",
         default="hdl-64e",
         metavar="SENSOR",
-        help="the sensor whose remission comes out: the one that the models were trained on (default: %(default)s)",
+        help="the sensor to map to: the one that the models were trained on (default: %(default)s)",
     )
     output = parser.add_argument_group("output")
     output.add_argument(
@@ -55,7 +55,9 @@ def fit_sensor_command(arguments: argparse.Namespace) -> int:
     if found.empty:
         raise PointsError(f"{found.empty[0]}: no scan in this folder; expected scans or captures")
     if arguments.out.suffix != ".json":
-        raise SensorError(f"{arguments.out}: expected a name that ends in .json, by which --sensor knows a file")
+        raise SensorError(
+            f"{arguments.out}: expected a name that ends in .json: --sensor reads other names as built-in sensors"
+        )
     scans = [points for path in found.paths for _, points in read_scans(path)]
     profile, functions = fit_sensor(scans, get_sensor(arguments.sensor), arguments.to)
     assert profile.remission is not None

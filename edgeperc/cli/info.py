@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import EdgepercError, MissingExtraError, SensorError
 from .arguments import Commands, add_command, add_sensor
-from .output import complain, print_rows, say
+from .output import print_error, print_line, print_rows
 
 if TYPE_CHECKING:
     from ..zoo import Variant
 
 __all__ = ["add_parser", "info_command"]
 
-_WIDTH = 100  # of a line, with its name
-_LINES = 2  # of a row; --json has the rest
+_WIDTH = 100  # characters of a line, with its name
+_LINES = 2  # lines of a row; --json prints everything
 
 
 def add_parser(commands: Commands) -> None:
@@ -32,7 +32,7 @@ def add_parser(commands: Commands) -> None:
         help="what a model is; what a scan looks like and which models suit it",
         description="Describe models by their cards: view, classes, training data, licence and accuracy. Describe "
         "scans: extent [m], elevations [deg], remission, beams, ground height [m], and for each installed model "
-        "whether the scan is like those it was trained on. No model is run.",
+        "whether the scan resembles its training scans. No model is run.",
         examples=[
             "edgeperc info pointseg",
             "edgeperc info 000123.bin",
@@ -70,13 +70,13 @@ def info_command(arguments: argparse.Namespace) -> int:
             raise
         except EdgepercError as exc:
             n_failed += 1
-            complain(exc)
+            print_error(exc)
             continue
         if arguments.json:
-            say(json.dumps(document, allow_nan=False))
+            print_line(json.dumps(document, allow_nan=False))
         else:
             if n_printed:
-                say("")
+                print_line("")
             print_rows(_folded(rows))
         n_printed += 1
     return 1 if n_failed else 0
@@ -105,7 +105,7 @@ def _folded(rows: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
 
 
 def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
-    """What a user wants to know of a network; of its variants the first one's card."""
+    """Rows that describe a model; accuracy and geometry come from the card of its first variant."""
     from ..card import TopViewGeometry
     from ..listing import purpose
 
@@ -145,7 +145,7 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
 
 
 def _accuracy_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The main figures on each kind of scans that was evaluated, over all distances, in per cent."""
+    """The main figures on each evaluated kind of scans, over all distances, in per cent."""
     rows = []
     for block, of in (("real", "KITTI"), ("semantickitti", "SemanticKITTI"), ("simulated", "simulation")):
         figures = metrics.get(block, {})
@@ -173,7 +173,7 @@ def _megabytes(path: Path) -> str:
 
 
 def _scan_rows(path: Path, sensor_name: str) -> tuple[list[tuple[str, str]], dict[str, Any]]:
-    """What a scan looks like and which models suit it, as rows and as the same measurements for JSON."""
+    """Measure a scan and check which models suit it: rows to print, and the same measurements for JSON."""
     import numpy as np
 
     from ..adapt import condition
@@ -183,7 +183,7 @@ def _scan_rows(path: Path, sensor_name: str) -> tuple[list[tuple[str, str]], dic
     from ..zoo import listed
 
     sensor = get_sensor(sensor_name)
-    _, points = next(read_scans(path))  # of several the first
+    _, points = next(read_scans(path))  # the first scan of a capture
     finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
     n_lost = len(points) - len(finite)
     document: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""``edgeperc models``, ``edgeperc sensors`` and ``edgeperc providers``: what there is to choose from."""
+"""``edgeperc models``, ``edgeperc sensors`` and ``edgeperc providers``: tables of what is available."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import fields
 from typing import Any
 
 from .arguments import DEFAULT_SENSOR, Commands, add_command
-from .output import print_columns, say
+from .output import print_columns, print_line
 
 __all__ = ["add_parser", "models_command", "providers_command", "sensors_command"]
 
@@ -21,21 +21,21 @@ def add_parser(commands: Commands) -> None:
             "models",
             models_command,
             "the installed models: what each is for, its size, its speed here",
-            "List the installed models. The names are for --model. 'measured here' is the median time of a scan [ms] "
+            "List the installed models. Pass a name to --model. 'measured here' is the median time of a scan [ms] "
             "with the fastest setting that 'edgeperc-bench matrix --recommend' found on this computer.",
         ),
         (
             "sensors",
             sensors_command,
             "the built-in sensors: beams, field of view, remission",
-            "List the built-in sensors. The names are for --sensor; another sensor is described by a .json file, see "
-            "'edgeperc fit-sensor'. 'mapped to' names the sensor to whose remission its own is mapped.",
+            "List the built-in sensors. Pass a name to --sensor. For another sensor, pass a .json file, see 'edgeperc "
+            "fit-sensor'. 'mapped to' is the sensor whose remission scale the remission is mapped to.",
         ),
         (
             "providers",
             providers_command,
-            "the execution providers: which of them this computer has, and what installs the others",
-            "List onnxruntime's execution providers. The names are for --provider. If nothing was measured here, "
+            "the execution providers, which of them are available here, and how to install the others",
+            "List onnxruntime's execution providers. Pass a name to --provider. If nothing was measured here, "
             "--provider auto takes the first available one of cuda, openvino and cpu.",
         ),
     ):
@@ -127,7 +127,7 @@ def _mark(flag: bool) -> str:
 
 
 def _plain(value: object) -> object:
-    """What JSON has for a mapping that is no dict, and for a path."""
+    """A mapping as a dict and a path as text, for JSON."""
     return dict(value) if isinstance(value, Mapping) else str(value)
 
 
@@ -138,7 +138,7 @@ def _print(
 ) -> int:
     if arguments.json:
         for record in records:
-            say(json.dumps(record, allow_nan=False, default=_plain))
+            print_line(json.dumps(record, allow_nan=False, default=_plain))
     else:
         print_columns([*columns], [[cell(record) for cell in columns.values()] for record in records])
     return 0

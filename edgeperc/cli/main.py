@@ -1,7 +1,7 @@
 """The ``edgeperc`` command: one program, one level of subcommands, each in a file of its own.
 
-Exit codes: 0 all is well, 1 some scans failed (each is reported, the others are done), 2 nothing could be done
-(usage, model, provider, a missing extra), 130 interrupted, 141 the reader of the output went away.
+Exit codes: 0 success, 1 some scans failed (each is reported, the others are processed), 2 the command could not run
+(usage, model, provider, a missing extra), 130 interrupted, 141 the program that reads the output closed it.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-# A help page has to come at once: numpy, numba, onnxruntime and matplotlib are imported where a command needs them.
+# Commands import numpy, numba, onnxruntime and matplotlib inside functions, so that --help is fast.
 from .. import __version__
 from ..errors import EdgepercError
 from . import completion, demo, eval, eval_sensors, eval_tracking, fit_sensor, info, lists, run
-from .output import complain, show_warning
+from .output import print_error, show_warning
 
 __all__ = ["build_parser", "in_options", "main"]
 
-# Commands of two words that are one now.
+# Former two-part commands and their present names.
 _RENAMED = {
     "eval sensors": "eval-sensors",
     "eval tracking": "eval-tracking",
     "adapt fit": "fit-sensor",
 }
-# What the library calls an argument, and the option that sets it.
+# Arguments of the library and the options that set them.
 _OPTIONS = {
     "adapt": "--adapt",
     "boxes_from": "--boxes-from",
@@ -59,7 +59,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     code : int
-        The exit code; wrong usage leaves by argparse's ``SystemExit(2)``.
+        The exit code.
+
+    Raises
+    ------
+    SystemExit
+        With code 2, for wrong usage; raised by argparse.
     """
     given = sys.argv[1:] if argv is None else list(argv)
     parser = build_parser()
@@ -69,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     known = argparse.Namespace(typed=shlex.join(["edgeperc", *given]), parser=parser)
     arguments = parser.parse_args(given, known)
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # file names need not fit the terminal's encoding
+        sys.stdout.reconfigure(errors="backslashreplace")  # a file name may have characters that the terminal lacks
     try:
         with warnings.catch_warnings():
             warnings.showwarning = show_warning
@@ -77,17 +82,17 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
             return code
     except EdgepercError as exc:
-        complain(in_options(str(exc)))
+        print_error(in_options(str(exc)))
         return 2
     except BrokenPipeError:
-        # Python flushes stdout once more on its way out, and would complain.
+        # Python flushes stdout again at exit, and would print an error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except OSError as exc:
-        complain(exc)
+        print_error(exc)
         return 2
     except KeyboardInterrupt:
-        complain("interrupted")
+        print_error("interrupted")
         return 130
 
 
@@ -95,7 +100,7 @@ def build_parser() -> argparse.ArgumentParser:
     """The parser of the whole command line."""
     parser = argparse.ArgumentParser(
         prog="edgeperc",
-        description="A LiDAR scan in, perception out: drivable area, boxes, a class for every point, and tracks.",
+        description="From a LiDAR scan to drivable area, boxes, a class for every point, and tracks.",
         epilog="'edgeperc COMMAND --help' explains a command. Start with: edgeperc demo",
         allow_abbrev=False,
     )
@@ -109,10 +114,10 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def in_options(message: str) -> str:
-    """A message of the library with command-line options in place of the arguments of its functions.
+    """Replace the library's argument names in a message by command-line options.
 
     ``provider 'cuda' is ...``, ``n_threads is 0`` and ``precision="bf16"`` become ``--provider 'cuda' is ...``,
-    ``--threads is 0`` and ``--precision bf16``; the same word elsewhere in a sentence stays.
+    ``--threads is 0`` and ``--precision bf16``. The same word elsewhere in a sentence is not changed.
     """
     names = "|".join(_OPTIONS)
     message = re.sub(rf"(?<![\w-])({names})=(['\"]?)([\w.:-]+)\2", lambda m: f"{_OPTIONS[m[1]]} {m[3]}", message)

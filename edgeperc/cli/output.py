@@ -1,4 +1,4 @@
-"""What the commands print: lines, warnings, progress bars, tables and files of figures."""
+"""Output of the commands: lines, warnings, progress bars, tables and JSON files."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any, TextIO
 
 __all__ = [
-    "complain",
     "many",
     "one_line",
     "print_columns",
+    "print_error",
+    "print_line",
     "print_rows",
     "progress",
-    "say",
     "show_warning",
     "table_lines",
     "without_nan",
@@ -32,29 +32,29 @@ def one_line(text: object) -> str:
     return " ".join(str(text).split())
 
 
-def say(text: str, file: TextIO | None = None) -> None:
-    """Print a line at once, by default on stdout; a progress bar moves below it."""
+def print_line(text: str, file: TextIO | None = None) -> None:
+    """Print and flush a line, by default on stdout; a progress bar moves below it."""
     tqdm = getattr(sys.modules.get("tqdm"), "tqdm", None)  # imported only while a bar is drawn
     with contextlib.nullcontext() if tqdm is None else tqdm.external_write_mode(sys.stdout):
         print(text, file=file, flush=True)
 
 
-def complain(text: object) -> None:
+def print_error(text: object) -> None:
     """Print one line on stderr, with the program's name."""
-    say(f"edgeperc: {one_line(text)}", sys.stderr)
+    print_line(f"edgeperc: {one_line(text)}", sys.stderr)
 
 
 def show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
     """Print a warning as one line, in place of `warnings.showwarning`."""
-    complain(f"warning: {message}")
+    print_error(f"warning: {message}")
 
 
 @contextlib.contextmanager
 def progress(unit: str = "scan") -> Iterator[Callable[[int, int], None]]:
-    """Yield a function that shows how many of how many are done.
+    """Yield a function ``show(done, total)`` that draws a progress bar.
 
-    The bar is drawn on stderr if that is a terminal, if there is more than one thing to do, and if tqdm is installed
-    (extra ``progress``). Without tqdm the commands print the same lines and no bar.
+    The bar is drawn on stderr if stderr is a terminal, ``total`` is above 1 and tqdm is installed (extra ``progress``).
+    Without tqdm the commands print the same lines and no bar.
     """
     with contextlib.ExitStack() as stack:
         bars: list[Any] = []
@@ -75,7 +75,7 @@ def print_rows(rows: Sequence[tuple[str, str]]) -> None:
     """Print names and values as two aligned columns."""
     width = max(len(name) for name, _ in rows) + 2
     for name, value in rows:
-        say(f"{name:<{width}}{value}".rstrip())
+        print_line(f"{name:<{width}}{value}".rstrip())
 
 
 def print_columns(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -83,11 +83,11 @@ def print_columns(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Non
     lines = [headings, *rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for line in lines:
-        say("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
+        print_line("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
 
 
 def write_figures(arguments: argparse.Namespace, figures: Mapping[str, Any]) -> None:
-    """Write every figure, and the command line that gave them, to the file that ``--json`` names, if any."""
+    """Write all figures, and the command line that produced them, to the file of ``--json``, if it was passed."""
     path: Path | None = arguments.json
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -96,7 +96,7 @@ def write_figures(arguments: argparse.Namespace, figures: Mapping[str, Any]) -> 
 
 
 def without_nan(value: Any) -> Any:
-    """A copy with None in place of NaN and infinity, which JSON does not have."""
+    """Copy with None in place of NaN and infinity, which JSON lacks."""
     if isinstance(value, Mapping):
         return {key: without_nan(inner) for key, inner in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -110,14 +110,14 @@ def many(n: int, noun: str) -> str:
 def table_lines(
     title: str, columns: Sequence[tuple[str, str]], rows: Sequence[tuple[tuple[str, str], Mapping[str, Any]]]
 ) -> list[str]:
-    """A table of figures as lines of text.
+    """Lay out a table of figures as lines of text.
 
     Parameters
     ----------
     title : str
     columns : sequence of (heading, key)
     rows : sequence of ((first name, second name), figures by key)
-        A first name that repeats is printed once.
+        A first name that repeats in successive rows is printed once.
 
     Returns
     -------
@@ -141,7 +141,7 @@ def table_lines(
 
 
 def _cell(value: Any) -> str:
-    """Shares and their intervals in per cent, counts as they are."""
+    """Format a value: shares and their intervals in per cent, counts unchanged."""
     if value is None:
         return "-"
     if isinstance(value, list):

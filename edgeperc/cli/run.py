@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from ..errors import EdgepercError, MissingExtraError, ModelError, PointsError
 from ..extras import require
 from .arguments import DEFAULT, Commands, add_adapt, add_command, add_model, add_network, add_sensor, positive_number
-from .output import complain, many, one_line, progress, say
+from .output import many, one_line, print_error, print_line, progress
 from .scans import Scans, find_scans, output_names, scan_folders, scan_namer
 
 if TYPE_CHECKING:
@@ -40,7 +40,8 @@ def add_parser(commands: Commands) -> None:
         run_command,
         help="perceive scans: a line or a JSON object for each, and files",
         description="Perceive scans and print one line for each: drivable area [m2], boxes, points of each class and "
-        "the time it took [ms]. A scan that fails is reported, the others are done, and the exit code is 1.",
+        "processing time [ms]. If a scan fails, the error is printed, the other scans are processed, and the exit code "
+        "is 1.",
         examples=[
             "edgeperc run 000123.bin",
             "edgeperc run velodyne/ --out out --png --labels",
@@ -69,8 +70,8 @@ def add_parser(commands: Commands) -> None:
         "--on-mismatch",
         choices=("warn", "raise", "ignore"),
         default="warn",
-        help="if a scan is unlike those that a model was trained on: print a warning, fail that scan, or do not check "
-        "(default: %(default)s)",
+        help="if a scan differs from the scans that a model was trained on: print a warning, fail the scan, or do not "
+        "check (default: %(default)s)",
     )
     models = parser.add_argument_group("models")
     add_model(models)
@@ -86,7 +87,7 @@ def add_parser(commands: Commands) -> None:
     output.add_argument("--png", action="store_true", help="write NAME.png, a picture (needs the extra 'view')")
     output.add_argument("--html", action="store_true", help="write NAME.html, the labeled points in 3-D for a browser")
     output.add_argument(
-        "--labels", action="store_true", help="write NAME.label, one uint32 for each point as SemanticKITTI has it"
+        "--labels", action="store_true", help="write NAME.label, SemanticKITTI's layout: one uint32 for each point"
     )
     output.add_argument("--ply", action="store_true", help="write NAME.ply, the points with labels and colors")
     tracking = parser.add_argument_group("tracking")
@@ -96,20 +97,20 @@ def add_parser(commands: Commands) -> None:
     tracking.add_argument(
         "--gif",
         action="store_true",
-        help="write tracks.gif, the tracks seen from above; needs --track, --out and the extra 'view'",
+        help="write tracks.gif, the tracks drawn from above; needs --track, --out and the extra 'view'",
     )
     live = parser.add_argument_group("live")
     live.add_argument(
         "--live",
         action="store_true",
-        help="replay one PATH in real time; a scan that comes while another is perceived replaces the one that waits",
+        help="replay one PATH in real time; always take the newest scan and drop older ones that still wait",
     )
     live.add_argument(
         "--rate",
         type=positive_number,
         default=10.0,
         metavar="HZ",
-        help="scans per second of files that have no time stamps, for --live and --track (default: 10)",
+        help="scans per second, for files without time stamps with --live or --track (default: 10)",
     )
 
 
@@ -120,7 +121,7 @@ def make_perceiver(
     on_mismatch: Literal["warn", "raise", "ignore"],
     adapt: Literal["both", "remission", "interpolation", "none"] = "both",
 ) -> Perceiver:
-    """A perceiver with the options of the command line."""
+    """Make a perceiver with the options of the command line."""
     from ..perceiver import Perceiver
 
     return Perceiver(
@@ -138,7 +139,7 @@ def make_perceiver(
 
 
 def run_command(arguments: argparse.Namespace) -> int:
-    """Perceive scans; 1 if some failed."""
+    """Perceive scans; return 1 if some failed."""
     kinds = [kind for kind in _KINDS if getattr(arguments, kind)]
     _check_usage(arguments, kinds)
     found = Scans([_live_source(arguments)], [], False) if arguments.live else find_scans(arguments.paths)
@@ -181,12 +182,12 @@ def run_command(arguments: argparse.Namespace) -> int:
     if n_perceived > 1:
         each_ms = 1e3 * (time.perf_counter() - started) / n_perceived
         things = "answers" if arguments.live else "scans"
-        say(f"{report.n} {things}, {report.n_failed} failed, {each_ms:.0f} ms each with files", sys.stderr)
+        print_line(f"{report.n} {things}, {report.n_failed} failed, {each_ms:.0f} ms each with files", sys.stderr)
     return 1 if report.n_failed else 0
 
 
 def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
-    """Refuse options that contradict each other, and extras that are missing, before any work."""
+    """Check for contradictory options and missing extras before any work."""
     if arguments.live and (kinds or arguments.gif or len(arguments.paths) > 1):
         arguments.usage_error("--live replays one PATH and writes no files")
     if (kinds or arguments.gif) and arguments.out is None:
@@ -213,16 +214,16 @@ def _live_source(arguments: argparse.Namespace) -> Path:
 
 
 class _Report:
-    """What `run` prints for each scan, and counts.
+    """Prints the result of each scan, and counts scans and failures.
 
     Attributes
     ----------
     n, n_failed : int
-        Scans reported, and those of them that failed.
+        Number of scans, and of failed scans.
     tracks : list of Tracks
-        Of every scan, if ``--gif`` draws them.
+        Tracks of every scan, kept only for ``--gif``.
     under : list of bytes
-        What the animation shows under them.
+        `edgeperc.view.flatten_scan` of every scan, drawn under the tracks.
     """
 
     def __init__(self, arguments: argparse.Namespace) -> None:
@@ -238,7 +239,7 @@ class _Report:
         tracks: Tracks | None = None,
         under: bytes | None = None,
     ) -> None:
-        """Print one scan's line or JSON object; errors go to stderr too."""
+        """Print one scan's line or JSON object; print an error on stderr as well."""
         from ..perception import Perception
 
         if isinstance(outcome, MissingExtraError):
@@ -246,9 +247,9 @@ class _Report:
         self.n += 1
         if isinstance(outcome, Exception):
             self.n_failed += 1
-            complain(f"{source}: {str(outcome).removeprefix(f'{source}: ')}")
+            print_error(f"{source}: {str(outcome).removeprefix(f'{source}: ')}")
             if self._json:
-                say(json.dumps({"scan": str(source), "error": one_line(outcome)}))
+                print_line(json.dumps({"scan": str(source), "error": one_line(outcome)}))
             return
         answer, perception = (None, outcome) if isinstance(outcome, Perception) else (outcome, outcome.perception)
         timing = None if answer is None else _timing(answer)
@@ -260,7 +261,7 @@ class _Report:
 
             stamp_s = perception.stamp_s
             record = {"scan": str(source), "stamp_s": stamp_s, "live": timing, **scan_record(perception, tracks)}
-            say(json.dumps(record, allow_nan=False))
+            print_line(json.dumps(record, allow_nan=False))
             return
         parts = [str(source)]
         if timing is not None:
@@ -268,14 +269,14 @@ class _Report:
         parts.append(_summary(perception))
         if tracks is not None:
             parts.append(f"tracks: {many(len(tracks), 'object')}")
-        say("  ".join(parts))
+        print_line("  ".join(parts))
 
 
 Follow = Callable[["Perception"], "Tracks"]
 
 
 def _follower(rate_hz: float) -> Follow:
-    """A function from a scan's perception to the tracks after it; scans without stamps are 1 / rate apart."""
+    """Make a function from a perception to tracks. Scans without stamps are 1 / ``rate_hz`` apart."""
     from ..tracking.tracker import Tracker
 
     tracker, counted = Tracker(), itertools.count(1)
@@ -295,7 +296,7 @@ def _each(
     kinds: Sequence[str],
     arguments: argparse.Namespace,
 ) -> Iterator[tuple[Path, Perception | Exception, Tracks | None, bytes | None]]:
-    """Every scan of a file, those of a capture numbered, with its perception or the error."""
+    """Yield the name, perception or error, tracks and flattened scan of each scan in a file or capture."""
     from ..readers.captures import is_capture, read_scans
 
     try:
@@ -319,7 +320,7 @@ def _each(
 def _live(
     perceive: Perceiver, follow: Follow | None, path: Path, arguments: argparse.Namespace
 ) -> Iterator[tuple[Path, Answer | Exception, Tracks | None]]:
-    """Answers of a stream and errors as they come, each with the scan's name."""
+    """Yield scan name, answer or error, and tracks, as a stream delivers them."""
     from ..live import stream
 
     name_of = scan_namer(path)
@@ -330,7 +331,7 @@ def _live(
             except StopIteration:
                 return
             except (EdgepercError, OSError) as exc:
-                yield path, exc, None  # newer scans may have come since: which one failed is not known
+                yield path, exc, None  # newer scans may have arrived, so the failed scan's number is unknown
             else:
                 assert answer is not None
                 yield name_of(answer.n_scans - 1), answer, answer.tracks
@@ -360,7 +361,7 @@ def _under(points: NDArray[np.float32], perception: Perception) -> bytes:
 
 
 def _timing(answer: Answer) -> dict[str, Any]:
-    """What `run --live` reports of an answer beside the perception."""
+    """Age, health and counts of an answer, which ``run --live`` prints."""
     return {
         "age_ms": round(1e3 * answer.age_s, 3),
         "health": answer.health,
@@ -370,7 +371,7 @@ def _timing(answer: Answer) -> dict[str, Any]:
 
 
 def _summary(perception: Perception) -> str:
-    """One line: points, time, drivable area, boxes and points of each class."""
+    """Summarize on one line: points, time, drivable area, boxes and points of each class."""
     parts = [f"{perception.n_points:,} points", f"{sum(perception.stage_ms.values()):.1f} ms"]
     if perception.top_view is not None:
         parts.append(f"drivable {perception.top_view.drivable_area_m2:.1f} m2")

@@ -1,4 +1,4 @@
-"""Paths of the command line to scan files, and a name for the files that are written of each."""
+"""Find the scans below the paths of a command line, and name the output files of each scan."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from typing import NamedTuple
 
 __all__ = ["Scans", "find_scans", "output_names", "scan_folders", "scan_namer"]
 
-# Where data sets keep their scans: KITTI's object and tracking sets, SemanticKITTI, a KITTI raw drive, a day of them.
+# Folders of scans in data sets: KITTI object and tracking, SemanticKITTI, a KITTI raw drive, a day of raw drives.
 _LAYOUTS = (
     *("training/velodyne", "training/velodyne/*", "testing/velodyne", "testing/velodyne/*", "sequences/*/velodyne"),
     *("velodyne", "velodyne/*", "velodyne_points/data", "*/velodyne_points/data"),
 )
-# Folders of these layouts that say nothing about a scan.
+# Folder names of these layouts that do not identify a scan.
 _LAYOUT_FOLDERS = ("velodyne", "velodyne_points", "data")
 
 
 class Scans(NamedTuple):
-    """What lies at the paths of a command line.
+    """Scans found at the paths of a command line.
 
     Attributes
     ----------
     paths : list of Path
         Scan files and captures, each once.
     empty : list of Path
-        Folders without any.
+        Folders without scans.
     of_data_set : bool
-        Some paths were found below the root of a data set, whose sequences number their scans from 0 each.
+        Whether a path is the root of a data set. Its sequences all number their scans from 0.
     """
 
     paths: list[Path]
@@ -38,9 +38,9 @@ class Scans(NamedTuple):
 
 
 def scan_folders(root: Path) -> list[Path]:
-    """The folder itself if it holds scans, else those that do below the root of a data set.
+    """Folders with scans: ``root`` itself, or the folders of a data set below it.
 
-    Data sets are KITTI's object and tracking sets, SemanticKITTI, and KITTI's raw drives.
+    Data sets are KITTI's object and tracking sets, SemanticKITTI and KITTI's raw drives.
     """
     from ..readers.captures import scan_files
 
@@ -51,7 +51,7 @@ def scan_folders(root: Path) -> list[Path]:
 
 
 def find_scans(paths: Sequence[Path]) -> Scans:
-    """Scan files and captures in the order given; folders and data sets are opened, their scans sorted."""
+    """Find scan files and captures, in the order of ``paths``; the scans of a folder or data set are sorted."""
     from ..readers.captures import is_capture, scan_files
 
     scans: dict[str, Path] = {}
@@ -70,7 +70,7 @@ def find_scans(paths: Sequence[Path]) -> Scans:
 
 
 def scan_namer(path: Path) -> Callable[[int], Path]:
-    """A function from the number of a scan in a source, from 0, to a name: its file, or the capture and the number."""
+    """Make a function from the index of a scan in a source to a name: its file, or the capture and the index."""
     from ..readers.captures import is_capture, scan_files
 
     if path.is_dir() and not is_capture(path):
@@ -83,13 +83,13 @@ def scan_namer(path: Path) -> Callable[[int], Path]:
 
 
 def output_names(scans: Sequence[Path], *, keep_folder: bool = False) -> list[Path]:
-    """A name for each scan's files: its own, after as many of its folders as make all names different.
+    """Name the output files of each scan: its own name, after as few folder names as make all names different.
 
     Parameters
     ----------
     scans : sequence of Path
     keep_folder : bool
-        Name one folder at least, the sequence of a data set.
+        Include at least one folder, such as the sequence of a data set.
     """
     whole = [Path(_absolute(scan)).parts[1:] for scan in scans]
     short = [(*(p for p in parts[:-1] if p not in _LAYOUT_FOLDERS), parts[-1]) for parts in whole]
@@ -102,7 +102,7 @@ def output_names(scans: Sequence[Path], *, keep_folder: bool = False) -> list[Pa
 
 
 def _absolute(path: Path) -> str:
-    return os.path.abspath(path)  # noqa: PTH100 - resolve() follows links, and a linked scan keeps its name
+    return os.path.abspath(path)  # noqa: PTH100 - resolve() would follow links; a link keeps its name
 
 
 def _all_differ(names: Sequence[Path]) -> bool:

@@ -80,7 +80,20 @@ class Calibration:
             raise PointsError(f"{path} holds no KITTI calibration; expected P2, R0_rect and Tr_velo_to_cam") from exc
 
     def to_image(self, points: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Project points (n, 3+) in the sensor frame: pixels (n, 2) and depth (n,) [m]."""
+        """Project points into the image.
+
+        Parameters
+        ----------
+        points : (n, 3+) array
+            x, y, z [m] in the sensor frame; further columns are ignored.
+
+        Returns
+        -------
+        pixels : (n, 2) float64
+            Column and row [px]. Not valid for points behind the camera.
+        depth : (n,) float64
+            Distance along the optical axis [m], negative behind the camera.
+        """
         cam = np.asarray(points[:, :3], np.float64) @ self.T_cam_velo[:3, :3].T + self.T_cam_velo[:3, 3]
         image = cam @ self.P2[:, :3].T + self.P2[:, 3]
         depth = image[:, 2]
@@ -88,12 +101,12 @@ class Calibration:
             return image[:, :2] / depth[:, None], depth
 
     def sensor_boxes(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Boxes in KITTI's camera frame -> boxes in the sensor frame.
+        """Convert boxes from KITTI's camera frame to the sensor frame.
 
         Parameters
         ----------
         rows : (n, 7) float64
-            Height, width, length, x, y, z of the center of the bottom face [m], rotation about the camera's y axis.
+            Height, width, length, x, y, z of the bottom face's center [m], rotation about the camera's y axis [rad].
 
         Returns
         -------
@@ -108,7 +121,7 @@ class Calibration:
         return np.column_stack([centers, length, width, height, np.arctan2(ahead[:, 1], ahead[:, 0])])
 
     def in_image(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which points lie in the camera's field of view, (n,) bool."""
+        """Which points (n, 3+) in the sensor frame lie in the camera's field of view, (n,) bool."""
         pixel, depth = self.to_image(points)
         return (depth > 0.1) & (pixel >= 0).all(axis=1) & (pixel[:, 0] < IMAGE_SIZE[0]) & (pixel[:, 1] < IMAGE_SIZE[1])
 
@@ -123,10 +136,11 @@ class Frame:
     grade : str
         ``"A"`` if the boxes were checked to fit the scan.
     points : (n, 4) float32
+        x, y, z [m] in the sensor frame, remission.
     boxes : tuple of Box
         In the sensor frame, labels in lower case (car, van, truck, pedestrian, person_sitting, cyclist, tram, misc).
     unlabeled : (k, 4) float64
-        Image rectangles (left, top, right, bottom) whose objects are not labeled (DontCare).
+        Image rectangles (left, top, right, bottom) [px] in which objects are not labeled (DontCare).
     calibration : Calibration
     """
 
@@ -140,11 +154,11 @@ class Frame:
 
     @cached_property
     def known(self) -> NDArray[np.bool_]:
-        """Points whose truth is known, (n,) bool: in the camera's field of view, outside DontCare."""
+        """Which points have known labels, (n,) bool: those in the camera's field of view and outside DontCare."""
         return self.known_at(self.points)
 
     def known_at(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Whether the truth is known at places (n, 3+) in the sensor frame, (n,) bool."""
+        """Whether objects are labeled at places (n, 3+) in the sensor frame, (n,) bool."""
         known = self.calibration.in_image(points)
         pixel, _ = self.calibration.to_image(points)
         for left, top, right, bottom in self.unlabeled:
@@ -152,7 +166,7 @@ class Frame:
         return known
 
     def point_labels(self) -> NDArray[np.uint8]:
-        """True class of each point, (n,) uint8: that of the box around it, `IGNORE` where the truth is unknown."""
+        """True class of each point, (n,) uint8: the class of the box around it, `IGNORE` where the truth is unknown."""
         labels = np.where(self.known, 0, IGNORE).astype(np.uint8)
         for box in self.boxes:
             labels[inside(box, self.points)] = POINT_CLASS_OF.get(box.label, IGNORE)
@@ -160,7 +174,7 @@ class Frame:
 
 
 def read_objects(label_path: Path, calibration: Calibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
-    """Boxes of a KITTI label file in the sensor frame, and its DontCare rectangles (SSADNet 3.1.1)."""
+    """Read a KITTI label file: boxes in the sensor frame, and (k, 4) DontCare rectangles [px] (SSADNet 3.1.1)."""
     kinds, rows, unlabeled = [], [], []
     for line in label_path.read_text().splitlines():
         values = line.split()
@@ -181,15 +195,15 @@ def read_objects(label_path: Path, calibration: Calibration) -> tuple[tuple[Box,
 
 
 def scan_hash(points: NDArray[np.float32]) -> str:
-    """Name of a training scan in a model's card: the first 16 digits of the SHA-256 of its points."""
+    """Identify a scan in a model's card: the first 16 hexadecimal digits of the SHA-256 of its points."""
     return hashlib.sha256(points.tobytes()).hexdigest()[:16]
 
 
 class KittiObjects:
     """The labeled scans below a KITTI root (``training/velodyne``, ``label_2``, ``calib``), by drive.
 
-    ``frames.csv`` and ``frames-*.csv`` beside ``training`` name the drive of each scan (columns ``name``, ``drive`` and
-    optionally ``grade``). A scan that they do not name is left out: its drive may be one that a model was trained on.
+    ``frames.csv`` and ``frames-*.csv`` beside ``training`` list the drive of each scan (columns ``name``, ``drive`` and
+    optionally ``grade``). Scans without an entry are left out, because a model may have been trained on their drive.
     Without any table, each scan counts as a drive of its own.
 
     Parameters
@@ -206,7 +220,7 @@ class KittiObjects:
     Raises
     ------
     PointsError
-        There are no label files, or a table does not name the drive of a scan.
+        There are no label files, or a row of a table lacks the name or the drive.
     """
 
     def __init__(self, root: Path | str) -> None:
@@ -221,7 +235,7 @@ class KittiObjects:
             raise PointsError(f"{self.root} has no training/label_2/*.txt; expected the root of a KITTI object set")
 
     def names(self, split: str, *, fold: int | None = None, grades: str = "A") -> list[str]:
-        """Names of the labeled scans of a split (`splits.in_split`) whose labels have one of the ``grades``."""
+        """Names of the labeled scans of a split (`splits.in_split`) that have one of the ``grades``."""
         return [r["name"] for r in self.rows if in_split(r["drive"], split, fold) and r.get("grade", "A") in grades]
 
     def unlabeled(self, split: str, *, fold: int | None = None) -> list[str]:
@@ -240,7 +254,7 @@ class KittiObjects:
 
 
 def _frame_rows(root: Path) -> list[dict[str, str]]:
-    """Rows of ``frames.csv`` and ``frames-*.csv``; none if there is no table."""
+    """Rows of ``frames.csv`` and ``frames-*.csv``; an empty list without a table."""
     rows: list[dict[str, str]] = []
     for table in (root / "frames.csv", *sorted(root.glob("frames-*.csv"))):
         if not table.exists():
@@ -254,7 +268,7 @@ def _frame_rows(root: Path) -> list[dict[str, str]]:
 
 
 def layouts(root: Path | str) -> Iterator[tuple[Box, ...]]:
-    """Boxes of every KITTI label file below ``root`` that is not of a test drive: real layouts to simulate."""
+    """Yield the boxes of every KITTI label file below ``root``, except those of test drives: layouts to simulate."""
     root = Path(root)
     for name in [row["name"] for row in _frame_rows(root) if row["drive"] not in TEST_DRIVES]:
         calibration = Calibration.read(root / "calib" / f"{name}.txt")
@@ -291,6 +305,7 @@ class RoadFrame:
     ----------
     name, drive : str
     points : (n, 4) float32
+        x, y, z [m] in the sensor frame, remission.
     labels : (n,) uint8
         Index into `ROAD_CLASSES`, `IGNORE` for unlabeled points.
     """
@@ -301,9 +316,9 @@ class RoadFrame:
     labels: NDArray[np.uint8]
 
     def top_view(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
-        """True class of the observed cells, (rows, cols) uint8: index into `ROAD_CLASSES`.
+        """True class of each cell, (rows, columns) uint8: index into `ROAD_CLASSES`.
 
-        A cell is road, or vehicle, if more than half of its labeled returns are, and `IGNORE` without a labeled return.
+        A cell gets the class of more than half of its labeled returns, and `IGNORE` if it has no labeled return.
         """
         p, known = self.points, self.labels != IGNORE
         row, col, in_view = geometry.cells(p[:, 0], p[:, 1])
@@ -340,11 +355,11 @@ class SemanticKitti:
         }
 
     def names(self, split: str, *, fold: int | None = None) -> list[str]:
-        """Names, ``"00/000123"``, of the scans of a split (`edgeperc.evaluation.splits.in_split`)."""
+        """Names of the scans of a split (`splits.in_split`), such as ``"00/000123"``."""
         return [name for name, drive in self.drives.items() if in_split(drive, split, fold)]
 
     def frame(self, name: str) -> RoadFrame:
-        """Read one scan and its labels; `PointsError` if there is not one label for each point."""
+        """Read one scan and its labels; raise `PointsError` if their numbers differ."""
         sequence, stem = name.split("/")
         points = read_points(self.root / "sequences" / sequence / "velodyne" / f"{stem}.bin")
         path = self.root / "sequences" / sequence / "labels" / f"{stem}.label"

@@ -1,7 +1,8 @@
 """The papers' tables on labeled scans: points (PointSeg 5.1), boxes and top view (SSADNet 3.3, appendix A), road.
 
-Scans go through `edgeperc.Perceiver`, so the figures are of what a user gets. Each scan leaves a small `Record` of
-counts. Every figure is computed from sums of records, and its interval from the same sums over resampled drives.
+Scans go through `edgeperc.Perceiver`, so the figures apply to the results that users get. Each scan is reduced to a
+small `Record` of counts. Figures are computed from sums of records, and intervals from the same sums
+over resampled drives.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def evaluate(
     n_resamples: int = 1000,
     on_scan: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[dict[str, Any], list[Mistakes]]:
-    """Figures of models on labeled scans.
+    """Compute the figures of models on labeled scans.
 
     Parameters
     ----------
@@ -51,6 +52,7 @@ def evaluate(
         Drives of the real scans: ``"test"``, ``"train"``, ``"validation"`` or ``"all"`` (`splits.in_split`). None: the
         validation drives if there is a ``fold``, else the test drives.
     fold : int or None
+        Fold of the training drives, 0 to 2 (`splits.in_split`).
     n_resamples : int
         Number of resamples of the drives for the intervals.
     on_scan : callable
@@ -62,12 +64,12 @@ def evaluate(
         ``"models"``, ``"providers"`` (as `Perceiver` has them), ``"split"``, ``"fold"``, and the `figures` of each kind
         of scans in the datasets: ``"real"``, ``"semantickitti"``, ``"simulated"``.
     mistakes : list of Mistakes
-        The twenty scans with most mistakes, worst first; of real scans if there are any, else of simulated ones.
+        The twenty scans with most mistakes, worst first: real scans if there are any, else simulated ones.
 
     Raises
     ------
     PointsError
-        A dataset is not of a known kind, or has no scans of the split.
+        A dataset is of an unknown kind, or has no scans of the split.
     SplitError
         A model was trained on a scan, and ``split`` is not ``"train"``.
     """

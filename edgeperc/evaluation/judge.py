@@ -31,7 +31,7 @@ from .unseen import check_unseen, training_scans_of
 
 __all__ = ["Judge"]
 
-FARTHEST_M = 46.0  # an object beyond is evaluated by its points, but never listed as a mistake
+FARTHEST_M = 46.0  # farther objects are evaluated by their points, but never listed as mistakes
 
 
 class Judge:
@@ -40,18 +40,18 @@ class Judge:
     Parameters
     ----------
     models : sequence of str or Path
-        Names of shipped models, or paths. A range-image model is evaluated by points, a top-view model by boxes and
+        Names of shipped models, or paths. Range-image models are evaluated by points, top-view models by boxes and
         cells.
     provider, precision : str
         As in `Perceiver`.
     road_by : str, Path or None
-        A top-view model whose drivable cells are the truth of KITTI frames, whose labels have no road (SSADNet 3.1.2
-        uses LoDNN).
+        A top-view model that supplies the true road of KITTI frames, because KITTI's labels have no road. SSADNet
+        (3.1.2) uses LoDNN in this way.
     training_scans : bool
         Also evaluate scans that a model was trained on.
     boxes_from : {"network", "clusters", "both"}
-        As in `Perceiver`. Boxes of clusters are evaluated wherever the truth is known, boxes of a top-view model in its
-        view.
+        As in `Perceiver`. Cluster boxes are evaluated wherever the truth is known, boxes of a top-view model only in
+        its view.
 
     Raises
     ------
@@ -125,11 +125,17 @@ class Judge:
     def record(self, truth: Truth) -> tuple[Record, Mistakes | None]:
         """Evaluate one scan.
 
+        Parameters
+        ----------
+        truth : Truth
+            From `kitti`, `semantickitti` or `simulated`.
+
         Returns
         -------
         record : Record
+            Counts for `edgeperc.evaluation.tables.figures`.
         mistakes : Mistakes or None
-            None if the truth has no objects.
+            None if the objects of the scan are not labeled.
         """
         found = self.perceive(truth.points)
         tallies: dict[tuple[str, ...], Any] = {}
@@ -149,7 +155,7 @@ class Judge:
     def _count_boxes(
         self, tallies: dict[tuple[str, ...], Any], truth: Truth, found: Perception, mistakes: Mistakes
     ) -> Mistakes:
-        """Match the predicted boxes where truth is known, by axis-aligned and by oriented footprints."""
+        """Match predicted boxes where the truth is known, once by axis-aligned and once by oriented footprints."""
         centers = np.array([box.center for box in found.boxes], np.float64).reshape(-1, 3)
         predicted = [box for box, known in zip(found.boxes, truth.known(centers), strict=True) if known]
         returns = list(zip(truth.boxes, truth.returns, strict=True))
@@ -173,9 +179,9 @@ class Judge:
         mistakes: Mistakes,
         shown: NDArray[np.bool_],
     ) -> Mistakes:
-        """Count refined point labels, and pixel labels before refinement.
+        """Count point labels after refinement, and pixel labels before it.
 
-        An object whose boxes are not evaluated counts as found if at least half of its points have its label.
+        Objects of classes without evaluated boxes count as found if at least half of their points have their label.
         """
         assert self.from_sensor is not None
         assert truth.labels is not None
@@ -209,7 +215,7 @@ class Judge:
         return replace(mistakes, wrong=wrong[shown], found=tuple(hit), missed=tuple(missed), wrong_share=share)
 
     def _count_cells(self, tallies: dict[tuple[str, ...], Any], truth: Truth, found: TopView) -> None:
-        """Count the labels of cells in every table, and the probability of road where the truth has a road."""
+        """Count the labels of cells for each table, and the probability of road if the true road is known."""
         assert self.from_above is not None
         for table, (classes, right) in truth.cells.items():
             if not self.box_classes:
@@ -232,7 +238,7 @@ class Judge:
 
 
 class _Network:
-    """The raw outputs of the perceiver's last run, for figures that a perception does not hold."""
+    """Raw outputs of the perceiver's last run, for figures that need more than a perception."""
 
     def __init__(self, session: Session) -> None:
         self.session, self.card = session, session.card
@@ -240,14 +246,14 @@ class _Network:
         self.kind = next(output.kind for output in self.card.outputs if output.kind.startswith("class_"))
 
     def probability(self, name: str) -> NDArray[np.float64]:
-        """Probability of one class in each pixel, (H, W)."""
+        """Probability of one class in each pixel, (H, W) float64."""
         values = self.session.outputs[self.kind].astype(np.float64)
         if self.kind == "class_logits":
             values = np.exp(values - values.max(axis=0))
         return values[self.card.classes.index(name)] / values.sum(axis=0)
 
     def point_labels(self, points: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Label of the pixel of each point (n,), PointSeg's answer before refinement; 0 out of view."""
+        """Label of the pixel of each point before PointSeg's refinement, (n,) uint8; 0 out of view."""
         labels, _ = decode_classes(self.session.outputs[self.kind], self.kind, model=self.card.name)
         pixel = self.projector.project(points).pixel
         return np.where(pixel >= 0, labels.ravel()[pixel], 0).astype(np.uint8)
@@ -260,7 +266,7 @@ def _perceiver(
 
 
 def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
-    """Classes and truth of a table for a model without vehicles: a cell of a vehicle is not road."""
+    """Remove vehicles from a table, for a model without vehicle classes: their cells become the first class."""
     kept = tuple(name for name in classes if name not in (*VEHICLES, "vehicle"))
     number = np.full(256, IGNORE, np.uint8)
     number[: len(classes)] = [kept.index(name) if name in kept else 0 for name in classes]
@@ -268,7 +274,7 @@ def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tup
 
 
 def _renamed(labels: NDArray[np.uint8], names: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:
-    """Labels of a model as labels of a table; classes that the table does not have become its first class."""
+    """Convert a model's labels to those of a table; classes that the table lacks become its first class."""
     coarse = {"drivable": "road", **dict.fromkeys(VEHICLES, "vehicle")}
     own = [name if name in classes else coarse.get(name, "") for name in names]
     return np.array([classes.index(name) if name in classes else 0 for name in own], np.uint8)[labels]

@@ -25,19 +25,19 @@ __all__ = [
 ]
 
 EVERYWHERE = (0.0, math.inf)
-FEWEST_RETURNS = 3  # an object with fewer returns cannot be told from clutter
+FEWEST_RETURNS = 3  # an object with fewer returns cannot be distinguished from clutter
 
 
 class Confusion:
     """Counts of predicted against true labels, summed over scans or images.
 
-    The score of a class that neither occurs nor is predicted is NaN.
+    A class without true and predicted labels has NaN scores.
 
     Parameters
     ----------
     classes : sequence of str
     ignore : int
-        Cells or points with this true label are not counted.
+        True label of cells or points that are not counted.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Confusion:
         self.counts += np.bincount(right * n + guess, minlength=n * n).reshape(n, n)
 
     def __add__(self, other: Confusion) -> Confusion:
-        """The sum of the counts of both."""
+        """Add the counts of both; raise `PointsError` if their classes differ."""
         if (self.classes, self.ignore) != (other.classes, other.ignore):
             raise PointsError(f"got counts of {self.classes} and of {other.classes}; expected the same classes")
         both = Confusion(self.classes, ignore=self.ignore)
@@ -85,22 +85,22 @@ class Confusion:
         return both
 
     def merged(self, groups: Mapping[str, Sequence[str]]) -> Confusion:
-        """Counts of coarser classes: a group's name to the classes it joins. Classes in no group are dropped."""
+        """Join classes: ``groups`` maps a new class to the classes that it joins. Classes in no group are dropped."""
         member = np.array([[name in group for name in self.classes] for group in groups.values()], dtype=np.int64)
         coarse = Confusion(tuple(groups), ignore=self.ignore)
         coarse.counts = member @ self.counts @ member.T
         return coarse
 
     def precision(self) -> NDArray[np.float64]:
-        """Correct share of the predictions of each class, (C,): P of PointSeg 5.1, equation A3 of SSADNet."""
+        """Correct share of the predictions of each class, (C,) float64: P of PointSeg 5.1, equation A3 of SSADNet."""
         return _share(np.diag(self.counts), self.counts.sum(axis=0))
 
     def recall(self) -> NDArray[np.float64]:
-        """Correctly predicted share of each class, (C,): R of PointSeg 5.1."""
+        """Correctly predicted share of the true labels of each class, (C,) float64: R of PointSeg 5.1."""
         return _share(np.diag(self.counts), self.counts.sum(axis=1))
 
     def iou(self) -> NDArray[np.float64]:
-        """Intersection over union, (C,): IoU of PointSeg 5.1, equation A1 of SSADNet."""
+        """Intersection over union of each class, (C,) float64: IoU of PointSeg 5.1, equation A1 of SSADNet."""
         hits = np.diag(self.counts)
         return _share(hits, self.counts.sum(axis=0) + self.counts.sum(axis=1) - hits)
 
@@ -109,7 +109,7 @@ class Confusion:
         return float(_share(np.trace(self.counts), self.counts.sum()))
 
     def mean_iou(self) -> float:
-        """Mean of `iou` over the classes whose IoU is not NaN (SSADNet table 4, mIoU)."""
+        """Mean of `iou` over the classes, without NaN (SSADNet table 4, mIoU)."""
         return _mean(self.iou())
 
     def weighted_precision(self) -> float:
@@ -120,12 +120,12 @@ class Confusion:
 
 
 def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float:
-    """Mean of the best precision at recalls 0, 0.1 .. 1 (SSADNet appendix A, equation A4).
+    """Eleven-point average precision: mean of the best precision at recalls 0, 0.1 .. 1 (SSADNet equation A4).
 
     Parameters
     ----------
     scores : (n,) array_like of float
-        One for each prediction; of equal scores the earlier ranks higher.
+        One for each prediction. Equal scores keep their order.
     hits : (n,) array_like of bool
         Whether each prediction is correct.
     n_truth : int
@@ -151,7 +151,7 @@ def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float
 
 
 def _eleven_points(found: NDArray[np.int64], predicted: NDArray[np.int64], n_truth: int) -> float:
-    """Mean of the best precision at recalls 0, 0.1 .. 1; both counts are cumulative over falling thresholds."""
+    """Eleven-point average precision; both counts are cumulative, (k,), over falling thresholds."""
     best_from_here = np.maximum.accumulate((found / np.maximum(predicted, 1))[::-1])[::-1]
     # In integers, because 0.1 * 3 > 0.3: a recall of exactly 3 in 10 must reach the level 0.3.
     reached = np.searchsorted(found * 10, np.arange(11) * n_truth)
@@ -164,7 +164,7 @@ class ProbabilitySweep:
     Attributes
     ----------
     counts : (2, 256) int64
-        Histograms of the probability in steps of 1/255: row 0 of cells of other classes, row 1 of the class.
+        Histograms of the probability in steps of 1/255. Row 0: cells of other classes. Row 1: cells of the class.
     """
 
     def __init__(self) -> None:
@@ -178,7 +178,7 @@ class ProbabilitySweep:
         probability : array_like of float
             Probability of the class, in 0..1.
         truth : array_like of bool
-            Same shape. Leave out cells whose truth is unknown.
+            Same shape. Do not pass cells with unknown truth.
 
         Raises
         ------
@@ -194,7 +194,7 @@ class ProbabilitySweep:
         self.counts += np.bincount((right * 256 + level).ravel(), minlength=512).reshape(2, 256)
 
     def __add__(self, other: ProbabilitySweep) -> ProbabilitySweep:
-        """The sum of the counts of both."""
+        """Add the counts of both."""
         both = ProbabilitySweep()
         both.counts = self.counts + other.counts
         return both
@@ -206,12 +206,12 @@ class ProbabilitySweep:
         return float(np.max(2.0 * found / (predicted + n_truth))) if n_truth else float("nan")
 
     def average_precision(self) -> float:
-        """Mean of the best precision at recalls 0, 0.1 .. 1; NaN if the class does not occur."""
+        """Eleven-point average precision over the thresholds; NaN if the class does not occur."""
         n_truth = int(self.counts[1].sum())
         return _eleven_points(*self._above(), n_truth) if n_truth else float("nan")
 
     def _above(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """True positives and positives at each threshold, from the highest threshold down."""
+        """True positives and positives, (256,) each, from the highest threshold to the lowest."""
         found = np.cumsum(self.counts[1, ::-1])
         return found, np.cumsum(self.counts.sum(axis=0)[::-1])
 
@@ -225,9 +225,9 @@ class BoxScores:
     ap : float
         `average_precision`; NaN if there was no box to find.
     precision, recall : float
-        Over all predictions, whatever their score; NaN without predictions, or without boxes to find.
+        Over all predictions with any score; NaN without predictions, or without boxes to find.
     mean_iou_50, mean_iou_70 : float
-        Mean IoU of the predictions whose IoU is at least 0.5, or 0.7 (SSADNet table 5); NaN without any.
+        Mean IoU of the predictions with an IoU of at least 0.5, or 0.7 (SSADNet table 5); NaN without any.
     n_truth, n_predicted, n_hits : int
         Ignored boxes are not counted.
     """
@@ -261,15 +261,15 @@ class _Matches:
 class BoxEvaluator:
     """Matches predicted boxes to true boxes, over any number of scans.
 
-    In each scan, predictions are matched in the order of their scores. A prediction takes the free true box with the
-    largest IoU (the earlier one on ties), if that IoU reaches the threshold. An unmatched prediction is not counted if
-    its IoU with an ignored box reaches the threshold, or if at least half of it lies in an ignored region. Otherwise
-    it is a false positive.
+    In each scan, predictions are matched in the order of their scores. A prediction takes the unmatched true box with
+    the largest IoU (the earlier one on ties), if that IoU reaches the threshold. An unmatched prediction is ignored if
+    its IoU with an ignored box reaches the threshold, or if at least half of it lies in an ignored region. Other
+    unmatched predictions are false positives.
 
     Parameters
     ----------
     iou_threshold : float
-        Least IoU of the footprints, seen from above, of a match.
+        Smallest IoU of the footprints, seen from above, of a match.
     oriented : bool
         Compare the oriented footprints; False compares their axis-aligned bounds, as SSADNet does.
     together : collection of str, optional
@@ -278,7 +278,7 @@ class BoxEvaluator:
     Raises
     ------
     PointsError
-        The threshold does not lie above 0 and up to 1.
+        The threshold is not above 0, or above 1.
     """
 
     def __init__(
@@ -306,16 +306,16 @@ class BoxEvaluator:
         ----------
         predicted, truth : iterable of Box
         ignored : iterable of Box
-            Objects that need not be found but may be: out of view, with too few returns, or of a neighboring class.
-            A prediction of any class may match them.
+            Objects that a detector may find but need not: out of view, with too few returns, or of a neighboring
+            class. A prediction of any class may match them.
         ignored_regions : (r, 5) array_like
-            x, y, length, width [m], yaw [rad] of ground where the truth is unknown.
+            x, y, length, width [m], yaw [rad] of areas with unknown truth.
 
         Returns
         -------
         list of (Box or None, Box or None)
-            Predictions and the true box matched to each, regardless of class; None beside a false positive and beside
-            a missed true box. Predictions that are not counted are left out.
+            Pairs of a prediction and its true box, matched regardless of class. A false positive is (box, None), a
+            missed true box (None, box). Ignored predictions are left out.
         """
         guesses = sorted(predicted, key=lambda box: -box.score)
         rights, spares = list(truth), list(ignored)
@@ -329,7 +329,7 @@ class BoxEvaluator:
         return self._match(_Matches(), guesses, rights, overlap, excused)
 
     def __add__(self, other: BoxEvaluator) -> BoxEvaluator:
-        """The evaluator of the scans of both."""
+        """Add the scans of both; raise `PointsError` if their settings differ."""
         if (self.iou_threshold, self.oriented) != (other.iou_threshold, other.oriented):
             raise PointsError(
                 f"got boxes matched at {self.iou_threshold} (oriented: {self.oriented}) and at {other.iou_threshold} "
@@ -342,20 +342,20 @@ class BoxEvaluator:
         return both
 
     def per_class(self, within_m: tuple[float, float] = EVERYWHERE) -> dict[str, BoxScores]:
-        """Scores of every class seen so far; a prediction is compared with true boxes of its own class only.
+        """Scores of every class so far; predictions are matched to true boxes of their own class only.
 
-        ``within_m`` is a range of horizontal distances from the sensor [m], the lower bound included. It keeps the
-        true boxes whose center lies in it, the predictions matched to them, and the false positives whose own center
-        lies in it.
+        ``within_m`` is a range of horizontal distances from the sensor [m], with the lower and without the upper
+        bound. Only true boxes with their center in it, predictions matched to them, and false positives with their
+        center in it are counted.
         """
         return {label: self._scores(matches, within_m) for label, matches in self._classes.items()}
 
     def overall(self, within_m: tuple[float, float] = EVERYWHERE) -> BoxScores:
-        """Scores of all boxes, or of those of the classes ``together``, as if they were one class."""
+        """Scores of the boxes of the classes ``together``, by default all, as if they were one class."""
         return self._scores(self._all, within_m)
 
     def mean_ap(self, within_m: tuple[float, float] = EVERYWHERE) -> float:
-        """Mean AP over the classes with boxes to find (SSADNet appendix A, mAP)."""
+        """Mean AP over the classes that have true boxes (SSADNet appendix A, mAP)."""
         return _mean(np.array([scores.ap for scores in self.per_class(within_m).values()]))
 
     def _rectangles(self, boxes: list[Box]) -> NDArray[np.float64]:
@@ -423,24 +423,25 @@ def boxes_to_find(
     classes_anywhere: Collection[str] = (),
     known: Callable[[Box], bool] = lambda box: True,
 ) -> tuple[list[Box], list[Box]]:
-    """Split true boxes into those that a detector must find and those that it need not find but may.
+    """Split true boxes into those that a detector must find, and those that it may find but need not.
 
     Parameters
     ----------
     truth : iterable of (Box, int)
         True boxes, and the number of returns from each.
     view : TopViewGeometry or None
-        Boxes of ``classes`` count only if their center lies in this view; None takes every place.
+        Boxes of ``classes`` count only if their center is in this view; None: anywhere.
     classes : collection of str
+        Classes that count in ``view``.
     classes_anywhere : collection of str
-        Classes whose boxes count at any place.
+        Classes that count anywhere.
     known : callable
-        Whether the scan is labeled where a box stands.
+        Whether the scan is labeled at the place of a box.
 
     Returns
     -------
     to_find : list of Box
-        Of one of the classes, labeled, with at least `FEWEST_RETURNS` returns.
+        Boxes that count, where the scan is labeled, with at least `FEWEST_RETURNS` returns.
     ignored : list of Box
         All others. Pass them to `BoxEvaluator.update` as ``ignored``.
     """
@@ -458,7 +459,7 @@ def _range_m(box: Box) -> float:
 
 
 def _share_inside(rows: NDArray[np.float64], regions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Largest share of the area of each rectangle that lies in one region, (n,)."""
+    """Largest share of each rectangle's area that lies in one region, (n,)."""
     if len(rows) == 0 or regions.size == 0:
         return np.zeros(len(rows))
     shared = shared_area(oriented_iou(rows, regions), rows, regions)

@@ -1,4 +1,4 @@
-"""What a picture of mistakes needs to know about a scan."""
+"""Missed objects, false detections and wrong points of a scan, for a picture."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Mistakes:
     points : (n, 4) float32
         The points to draw: x, y, z [m] in the sensor frame, remission.
     wrong : (n,) uint8
-        1: a point of an object, not labeled as its class. 2: a point of no object, labeled as one. 0: all others.
+        1: point of an object with another label. 2: background point with the label of an object. 0: all others.
     found : tuple of Box
         True boxes that were found.
     missed : tuple of (Box, int)
@@ -32,7 +32,7 @@ class Mistakes:
     false : tuple of Box
         Predicted boxes where there is no object.
     wrong_share : float
-        Wrong points, as a share of the points that belong to objects or were labeled as objects.
+        Wrong points divided by all points that are on objects or were labeled as objects.
     """
 
     name: str
@@ -46,12 +46,12 @@ class Mistakes:
 
     @property
     def n_errors(self) -> float:
-        """Missed and false boxes, plus `wrong_share`, which ranks scans with equally many; 0 without any mistake."""
+        """Number of missed and false boxes, plus `wrong_share` to rank scans with equal numbers; 0 without mistakes."""
         return len(self.missed) + len(self.false) + self.wrong_share
 
     @property
     def summary(self) -> str:
-        """Such as ``"missed: 2 car, 1 cyclist (340 points); false: 1 car; 57 points wrong"``."""
+        """One line, such as ``"missed: 2 car, 1 cyclist (340 points); false: 1 car; 57 points wrong"``."""
 
         def listed(boxes: Sequence[Box]) -> str:
             return ", ".join(f"{n} {label}" for label, n in Counter(box.label for box in boxes).most_common())

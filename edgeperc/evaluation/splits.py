@@ -1,9 +1,9 @@
 """The drives for training, validation and testing.
 
-Frames of one drive look alike, so drives are split, not frames. Test drives are used for the final figures only: no
-model is trained on their scans or their layouts (the boxes that simulated scenes are built around), and no choice is
-made by them. Recipes are chosen on the folds of the training drives: for each fold, a model is trained on the others
-and evaluated on it. Shipped models are compared on the validation drives.
+Frames of one drive look similar, so whole drives are assigned to a split. Test drives are only used for the final
+figures. No model is trained on their scans or on their layouts (the boxes that simulated scenes are built around), and
+no decision is based on them. Training recipes are compared by cross-validation on the folds of the training drives.
+Shipped models are compared on the validation drives.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ FOLDS = (
 )
 
 
-# No shipped model was trained on these scans, but their boxes are among the layouts of simulated training scenes. They
-# decide which network gets a task's name, and which precision is accurate enough.
+# No shipped model was trained on these scans, but simulated training scenes use their layouts. These drives decide
+# which network is shipped for a task, and which precisions are accurate enough.
 VALIDATION_DRIVES = frozenset(
     {
         "2011_09_26_drive_0001",
@@ -75,8 +75,8 @@ def in_split(drive: str, split: str, fold: int | None = None) -> bool:
     """Whether a drive belongs to ``"train"``, ``"validation"``, ``"test"`` or ``"all"``.
 
     With a ``fold``, that fold is for validation and the other two for training. Without one, all folds are for training
-    and `VALIDATION_DRIVES` for validation. A drive that is listed nowhere (a user's own scans) is for both training and
-    testing; the hashes in a model's card then keep it from being evaluated on its training scans (`unseen`).
+    and `VALIDATION_DRIVES` for validation. A drive that is not listed here (a user's own scans) is for both training
+    and testing; `unseen` then detects training scans by the hashes in a model's card.
 
     Raises
     ------

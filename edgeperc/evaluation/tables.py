@@ -1,7 +1,7 @@
-"""Records of evaluated scans -> the papers' figures, with 95 % intervals.
+"""Compute the papers' figures from records of evaluated scans, with 95 % intervals.
 
-A figure is computed from the summed counts of its scans. Its interval comes from a bootstrap over drives, not frames,
-because frames of one drive look alike.
+A figure is computed from the summed counts of its scans. Its interval comes from a bootstrap over drives, not over
+frames, because frames of one drive look similar.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["BANDS", "VEHICLES", "Record", "banded", "figures", "within"]
 
 VEHICLES = ("car", "van", "truck")
 
-# Ranges of horizontal distance [m] of points, of centers of cells and of centers of boxes.
+# Ranges of the horizontal distance [m] of points, cell centers and box centers.
 BANDS = {
     "all": (0.0, math.inf),
     "0-15 m": (0.0, 15.0),
@@ -35,7 +35,15 @@ Tallies = Mapping[tuple[str, ...], Any]
 
 @dataclass(frozen=True)
 class Record:
-    """Counts of one evaluated scan, by the place of their figures in the result. Counts of scans can be added."""
+    """Counts of one evaluated scan.
+
+    Attributes
+    ----------
+    name, drive : str
+    tallies : mapping of tuple of str to object
+        Counts, by the keys of their figures in the result, such as ``("points", "0-15 m")``. Counts of several scans
+        can be added.
+    """
 
     name: str
     drive: str
@@ -43,7 +51,7 @@ class Record:
 
 
 def within(range_m: Any, within_m: tuple[float, float]) -> Any:
-    """Whether distances lie in a band, the lower bound included."""
+    """Whether distances lie in a band, with the lower and without the upper bound."""
     return (range_m >= within_m[0]) & (range_m < within_m[1])
 
 
@@ -54,7 +62,23 @@ def banded(
     right: NDArray[np.uint8],
     range_m: NDArray[Any],
 ) -> dict[tuple[str, ...], Confusion]:
-    """The confusion of each band, by ``(*table, band)``. Labels with an unknown truth (255) are not counted."""
+    """Count a confusion matrix for each band of distance.
+
+    Parameters
+    ----------
+    table : tuple of str
+        Start of the keys of the result.
+    classes : tuple of str
+    labels, right : uint8, one shape
+        Predicted and true class; a true class of 255 is unknown and not counted.
+    range_m : float, same shape
+        Horizontal distance [m].
+
+    Returns
+    -------
+    dict of tuple of str to Confusion
+        By ``(*table, band)``.
+    """
     known = right != 255
     labels, right, range_m = labels[known], right[known], range_m[known]
     confusions: dict[tuple[str, ...], Confusion] = {}
@@ -67,7 +91,7 @@ def banded(
 
 
 def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any]:
-    """All figures of some records, and the numbers of their scans and drives.
+    """Compute all figures of the records, and count their scans and drives.
 
     Parameters
     ----------
@@ -87,7 +111,7 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
     drives = [_summed(tallies) for tallies in by_drive.values()]
     whole = _figures(_summed(drives))
     draws = np.random.default_rng(0).integers(len(drives), size=(n_resamples if len(drives) > 1 else 0, len(drives)))
-    # Few drives have few different resamples: three drives have ten.
+    # Few drives have few different resamples (three drives have ten), so each is computed once.
     different, times = np.unique(np.sort(draws, axis=1), axis=0, return_counts=True)
     samples = [_figures(_summed([drives[k] for k in draw])) for draw in different]
     _add_intervals(whole, [_figures(drive) for drive in drives], samples, times)
@@ -149,9 +173,9 @@ def _map_row(confusion: Confusion) -> dict[str, Any]:
 
 
 def _road_row(sweep: ProbabilitySweep, decision: Confusion) -> dict[str, Any]:
-    """Figures at the model's own decision, and best F1 and average precision over thresholds of its probability.
+    """Figures of the model's own decision, and best F1 and average precision over thresholds of its probability.
 
-    ``"confusion"`` has shares of all cells, rows are the truth (Figure 21 of the top-view database's paper).
+    ``"confusion"`` holds shares of all cells; rows are the truth (top-view database, Figure 21).
     """
     (_, false), (missed, hits) = decision.counts.tolist()
     return {
@@ -171,7 +195,7 @@ def _road_row(sweep: ProbabilitySweep, decision: Confusion) -> dict[str, Any]:
 def _add_intervals(
     whole: dict[str, Any], drives: Sequence[dict[str, Any]], samples: Sequence[dict[str, Any]], times: NDArray[Any]
 ) -> None:
-    """Add the interval of each figure, in place; ``drives`` are the figures of single drives."""
+    """Add the interval of each figure to ``whole``; ``drives`` holds the figures of single drives."""
     for key, value in list(whole.items()):
         of_drives, of_samples = [each.get(key, {}) for each in drives], [each.get(key, {}) for each in samples]
         if key == "iou" and isinstance(value, dict):
@@ -186,18 +210,18 @@ def _add_intervals(
             values = [each.get(key, math.nan) for each in samples]
             whole[f"{key}_interval"] = _interval([each.get(count, 0) for each in drives], values, times)
     for mean in ("mean_iou", "mean_ap"):
-        # Means over different classes are not comparable: only drives and resamples with all classes count.
+        # Means over different classes are not comparable, so only drives and resamples with all classes count.
         meant = [name for name, (value, _) in _parts(whole, mean).items() if not math.isnan(value)]
         if meant:
             parts = [[_parts(each, mean).get(name, (math.nan, 0)) for name in meant] for each in (*drives, *samples)]
             fewest = [min(n for _, n in each) for each in parts[: len(drives)]]
-            alike = [not any(math.isnan(value) for value, _ in each) for each in parts[len(drives) :]]
-            values = [each[mean] if same else math.nan for each, same in zip(samples, alike, strict=True)]
+            complete = [not any(math.isnan(value) for value, _ in each) for each in parts[len(drives) :]]
+            values = [each[mean] if same else math.nan for each, same in zip(samples, complete, strict=True)]
             whole[f"{mean}_interval"] = _interval(fewest, values, times)
 
 
 def _parts(row: Mapping[str, Any], mean: str) -> dict[str, tuple[float, int]]:
-    """The value of each class in a mean over classes, and its number of cells or boxes."""
+    """For a mean over classes: value of each class, and its number of cells or boxes."""
     if mean == "mean_iou" and "iou" in row and "n_cells_of" in row:
         return {name: (value, row["n_cells_of"][name]) for name, value in row["iou"].items() if name != "vehicle"}
     if mean == "mean_ap" and mean in row:
@@ -216,7 +240,7 @@ def _interval(counts: Sequence[int], values: Sequence[float], times: NDArray[Any
 
 
 def _plain(value: Any) -> Any:
-    """For JSON: four decimals, None for NaN."""
+    """Prepare for JSON: four decimals, None for NaN."""
     if isinstance(value, dict):
         return {key: _plain(inner) for key, inner in value.items()}
     if isinstance(value, list):

@@ -124,7 +124,7 @@ def sequence_scans(root: Path | str, name: str) -> dict[int, Path]:
 
 
 def _labels(root: Path, name: str) -> tuple[Path, list[list[str]], Calibration]:
-    """Path of the labels, KITTI's 17 columns of each label as text, and the calibration."""
+    """Read the labels of a sequence: their path, KITTI's 17 columns of each label as text, and the calibration."""
     path = root / "label_02" / f"{name}.txt"
     if path.parent.is_dir():
         lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
@@ -145,7 +145,7 @@ def _labels(root: Path, name: str) -> tuple[Path, list[list[str]], Calibration]:
 def read_sequence(
     root: Path | str, name: str, classes: Sequence[str] = CLASSES, boxes: Sequence[Sequence[Box]] | None = None
 ) -> TrackingSequence:
-    """Read a sequence's labels, calibration and ``detections/DETECTOR_CLASS/NAME.txt`` below ``root``.
+    """Read labels, calibration and detections (``detections/DETECTOR_CLASS/NAME.txt``) of a sequence below ``root``.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def read_sequence(
     name : str
         Such as ``"0000"``.
     classes : sequence of str
-        Of `KINDS`.
+        Keys of `KINDS`.
     boxes : sequence of sequence of Box, optional
         Detections by frame, instead of the files.
 
@@ -210,7 +210,10 @@ def read_sequence(
 def _read_detections(
     root: Path, name: str, classes: Sequence[str], calibration: Calibration, n_frames: int
 ) -> list[list[Box]]:
-    """By frame; columns: frame, type, left, top, right, bottom, logit, height, width, length, x, y, z, turn, alpha."""
+    """Read detections by frame.
+
+    Columns: frame, type, left, top, right, bottom, logit, height, width, length, x, y, z, turn, alpha.
+    """
     detections: list[list[Box]] = [[] for _ in range(n_frames)]
     for of in classes:
         folders = sorted((root / "detections").glob(f"*_{of.capitalize()}"))
@@ -245,7 +248,7 @@ def track_sequence(
     tracks : list of Tracks
         One for each frame.
     seconds : float
-        Time spent in the tracker.
+        Time spent in the tracker [s].
     """
     # Labels and detections cover the field of view of the left color camera.
     (fx, _, cx), width_px = sequence.calibration.P2[0, :3], IMAGE_SIZE[0]
@@ -259,20 +262,20 @@ def track_sequence(
 
 
 def _frame_tracks(sequence: TrackingSequence, tracks: Sequence[Tracks], of: str) -> list[FrameTracks]:
-    """The tracks of one class by frame, for the metrics."""
+    """Convert the tracks of one class for the metrics, by frame."""
     frames = []
     for in_frame, unlabeled in zip(tracks, sequence.unlabeled, strict=True):
         mine = np.flatnonzero([label in KINDS[of] for label in in_frame.labels])
         boxes = in_frame.boxes[mine]
         excused = _excused(boxes, unlabeled, sequence.calibration)
-        with np.errstate(divide="ignore"):  # log odds, like the detections' scores: probabilities near 1 are too close
+        with np.errstate(divide="ignore"):  # log odds, because float64 probabilities near 1 cannot be distinguished
             scores = np.log(in_frame.scores[mine]) - np.log1p(-in_frame.scores[mine])
         frames.append(FrameTracks(in_frame.ids[mine], boxes, np.clip(scores, -36.0, 36.0), excused))
     return frames
 
 
 def _excused(boxes: NDArray[np.float64], unlabeled: NDArray[np.float64], calibration: Calibration) -> NDArray[np.bool_]:
-    """Boxes at most 25 pixels high in the image, or with more than half of their image area in DontCare."""
+    """Which boxes (n, 7) are at most 25 pixels high in the image, or have over half of their image area in DontCare."""
     signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
     local = signs[None] * boxes[:, None, 3:6]
     cos, sin = np.cos(boxes[:, 6])[:, None], np.sin(boxes[:, 6])[:, None]
@@ -312,13 +315,13 @@ def evaluate_kitti(
     root : str or Path
         As in `sequence_names`, with ``detections`` unless ``boxes`` are passed.
     sequences : sequence of str, optional
-        Default: all with labels.
+        Default: all labeled sequences.
     classes : sequence of str
     parameters : mapping of str to ClassParameters, optional
     boxes : mapping of str to sequence of sequence of Box, optional
         Detections by sequence and frame, instead of the files.
     iou_threshold : float
-        Least 3-D IoU of a match.
+        Smallest 3-D IoU of a match.
     on_sequence : callable, optional
         Called with the number of sequences done and the number of all sequences.
 
@@ -356,20 +359,22 @@ def evaluate_kitti(
 def perceive_drive(
     perceive: Perceiver, scans: Mapping[int, Path], drive: str, on_scan: Callable[[], None] = lambda: None
 ) -> list[list[Box]]:
-    """Boxes that a perceiver detects in the scans of a drive, by frame.
+    """Detect the boxes in the scans of a drive.
 
     Parameters
     ----------
     perceive : Perceiver
     scans : mapping of int to Path
-        By frame; a frame without a scan has no boxes.
+        Scan files by frame. A frame without a scan has no boxes.
     drive : str
+        Name of the drive, for error messages.
     on_scan : callable
         Called after each scan.
 
     Returns
     -------
     list of list of Box
+        By frame.
 
     Raises
     ------

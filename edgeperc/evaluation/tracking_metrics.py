@@ -41,10 +41,10 @@ class FrameTruth:
     Attributes
     ----------
     ids : (n,) int64
-        Object of each box, the same in all frames.
+        Id of the object in each box, the same in all frames.
     boxes : (n, 7) float64
     ignored : (n,) bool
-        Objects that need not be found but may be: occluded, truncated, or of a neighboring class.
+        Objects that a tracker may find but need not: occluded, truncated, or of a neighboring class.
     """
 
     ids: NDArray[np.int64]
@@ -61,9 +61,9 @@ class FrameTracks:
     ids : (m,) int64
     boxes : (m, 7) float64
     scores : (m,) float64
-        The score of a track is the mean of its scores over all its frames.
+        The score of a track is the mean over its frames.
     excused : (m,) bool
-        Boxes that are no false positive if they match nothing: too small in the image, or in a region without labels.
+        Boxes that do not count as false positives: too small in the image, or in a region without labels.
     """
 
     ids: NDArray[np.int64]
@@ -74,7 +74,7 @@ class FrameTracks:
 
 @dataclass(frozen=True, slots=True)
 class Clear:
-    """CLEAR-MOT counts of the tracks above one score (in KUL-Seg's Table 7: false alarms, missed, ID SW).
+    """CLEAR-MOT counts of the tracks above one score (false alarms, missed and ID SW in KUL-Seg's Table 7).
 
     Attributes
     ----------
@@ -87,9 +87,10 @@ class Clear:
     n_false, n_missed : int
         False alarms and missed detections.
     n_switches, n_fragments : int
-        How often the track of an object changed from one frame to the next; how often it was resumed after a gap.
+        How often the track of an object changed between frames, and how often it resumed after a gap.
     mota, motp : float
-        Accuracy, 1 - (missed + false + switches) / truth; mean IoU of the matches. NaN without true boxes, or matches.
+        Accuracy 1 - (missed + false + switches) / truth, NaN without true boxes; mean IoU of the matches, NaN
+        without matches.
     """
 
     threshold: float
@@ -115,7 +116,7 @@ class Hota:
     Attributes
     ----------
     hota, deta, assa : float
-        HOTA, detection accuracy and association accuracy, in 0..1; NaN without truth and tracks.
+        HOTA, detection accuracy and association accuracy, in 0..1; NaN if there are neither true boxes nor tracks.
     """
 
     hota: float
@@ -132,13 +133,13 @@ class TrackingScores:
     samota, amota, amotp : float
         Means over forty recalls of scaled MOTA, MOTA and MOTP (AB3DMOT); a recall that is never reached counts as 0.
     all_tracks : Clear
-        Of all reported tracks, with any score.
+        Counts of all reported tracks, with any score.
     best : Clear
-        At the score threshold with the highest MOTA.
+        Counts at the score threshold with the highest MOTA.
     hota : Hota
         At the same threshold.
     n_frames, n_objects : int
-        Number of frames, and of true objects that are not ignored in all of them.
+        Number of frames, and of true objects that are not ignored in every frame.
     """
 
     samota: float
@@ -190,7 +191,7 @@ def recall_thresholds(scores: ArrayLike, n_truth: int) -> tuple[NDArray[np.float
     Returns
     -------
     thresholds, recalls : (k,) float64
-        k is at most 40, thresholds fall. The lowest score stands for the first recall that is not reached.
+        At most 40, with falling thresholds. The lowest score is used for the first recall that is not reached.
     """
     falling = np.sort(np.asarray(scores, dtype=np.float64))[::-1]
     at: list[int] = []
@@ -210,16 +211,16 @@ def evaluate_tracks(
 ) -> TrackingScores:
     """Evaluate the tracks of any number of sequences by AB3DMOT's protocol.
 
-    In each frame, true boxes and tracks are matched for the largest number of pairs with at least ``iou_threshold``,
-    and among those for the largest sum of IoU. This is done for all tracks, and then for each of forty recalls, with
-    the tracks whose mean score reaches the threshold of that recall.
+    In each frame, true boxes and tracks are matched so that most pairs reach ``iou_threshold``; among such matchings,
+    the one with the largest sum of IoU is taken. This is done for all tracks, and then for each of forty recalls with
+    the tracks above the score threshold of that recall.
 
     Parameters
     ----------
     sequences : sequence of (sequence of FrameTruth, sequence of FrameTracks)
-        Frames in order, as many of truth as of tracks.
+        Frames in order, with equal numbers of frames of truth and of tracks.
     iou_threshold : float
-        Least 3-D IoU of a match.
+        Smallest 3-D IoU of a match.
 
     Returns
     -------
@@ -255,7 +256,7 @@ def evaluate_tracks(
 
 
 class _Packed:
-    """All frames of one sequence concatenated, ids counted from 0, with all pairs of true box and track of a frame."""
+    """All frames of one sequence concatenated, with ids from 0 and all pairs of a true box and a track in one frame."""
 
     def __init__(self, truth: Sequence[FrameTruth], tracks: Sequence[FrameTracks], iou_threshold: float) -> None:
         if len(truth) != len(tracks):
@@ -279,14 +280,14 @@ class _Packed:
         self.mean_score = np.bincount(self.track, scores, self.n_tracks) / np.maximum(counts, 1)
 
     def matched(self, threshold: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """The matched pairs, and which boxes of tracks count."""
+        """Indices of the matched pairs, and which boxes of tracks are above the threshold."""
         kept = (self.mean_score >= threshold)[self.track]
         most = 1.0 + float(self.shapes[:, 0].max(initial=0))  # one more pair outweighs any IoU
         may = kept[self.column] & (self.iou >= self.iou_threshold)
         return self.assigned(np.where(may, most + self.iou, 0.0)), kept
 
     def assigned(self, gain: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Pairs with the largest sum of gains in each frame; each box is in one pair at most."""
+        """Indices of the pairs with the largest sum of gains in each frame; each box is in at most one pair."""
         pair = np.empty(len(self.truth), np.int64)
         fill_pairs(self.shapes, gain, pair)
         return pair[pair >= 0]
@@ -298,7 +299,7 @@ def _counted(ids: Sequence[NDArray[np.int64]]) -> tuple[NDArray[np.int64], int]:
 
 
 def _clear(packed: Sequence[_Packed], threshold: float) -> tuple[Clear, NDArray[np.float64]]:
-    """CLEAR-MOT of the tracks whose mean score reaches the threshold, and the scores of all matches."""
+    """CLEAR-MOT of the tracks with at least this mean score, and the scores of all matches."""
     n_truth = n_found = n_false = n_missed = n_switches = n_fragments = 0
     total_overlap = 0.0
     scores = [np.zeros(0)]
@@ -368,7 +369,7 @@ def fill_assignment(gain: NDArray[np.float64], column: NDArray[np.int64]) -> Non
     Parameters
     ----------
     gain : (n, m) float64
-        A pair whose gain is not above 0 is never made.
+        Pairs with a gain of 0 or less are never made.
     column : (n,) int64, overwritten
     """
     n, m = gain.shape
@@ -425,7 +426,7 @@ def fill_pairs(shapes: NDArray[np.int64], gain: NDArray[np.float64], pair: NDArr
     shapes : (frames, 2) int64
         Number of true boxes and of tracks in each frame.
     gain : (pairs,) float64
-        Gain of each pair of a frame, ordered by true box; a pair whose gain is not above 0 is never made.
+        Gain of each pair of a frame, ordered by true box. Pairs with a gain of 0 or less are never made.
     pair : (truths,) int64, overwritten
         Index of the pair of each true box; -1 for none.
     """
@@ -454,8 +455,9 @@ def count_breaks(truth: NDArray[np.int64], ids: NDArray[np.int64], ignored: NDAr
     Returns
     -------
     switches, fragments : int
-        A switch: the object is tracked in this and the previous frame, by different tracks. A fragment: it is tracked
-        by another track than before, or again after a gap, and in the next frame too. An ignored box resets both.
+        Switch: different tracks follow the object in this and the previous frame. Fragment: the object is tracked by
+        another track than before, or again after a gap, and is also tracked in the next frame. Ignored boxes reset
+        both.
     """
     switches = 0
     fragments = 0

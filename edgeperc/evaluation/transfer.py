@@ -1,4 +1,4 @@
-"""Accuracy of a model on sensors that it was not trained on, without and with adaptation (KUL-Seg, Table 6)."""
+"""Accuracy of a model on sensors that it was not trained on, with and without adaptation (KUL-Seg, Table 6)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = ["Scan", "compare"]
 N_FITTED = 8  # scenes for a remission function, from seeds before the evaluated ones
 FARTHEST_M = 50.0
 
-# Point class -> names in label files. Names in neither list count as unlabeled.
+# Point class -> names in label files. Other names, except those of `BACKGROUND`, count as unlabeled.
 CLASSES = {
     1: ("car", "pickup_truck", "medium-sized_truck", "semi-truck", "truck", "van", "bus", "emergency_vehicle",
         "type_vehicle"),
@@ -59,7 +59,7 @@ class Scan:
     ----------
     name : str
     points : (n, 4) float32
-        In the sensor frame, raw remission.
+        x, y, z [m] in the sensor frame, raw remission.
     labels : (n,) uint8
         Index into `POINT_CLASSES`, `IGNORE` where unknown.
     """
@@ -77,16 +77,16 @@ def compare(
     precision: str = "auto",
     on_scan: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
-    """IoU of points by class, for each dataset and each adaptation of `edgeperc.perceiver.ADAPTATIONS`.
+    """Compute the IoU of points by class, for each dataset and each of `edgeperc.perceiver.ADAPTATIONS`.
 
     Parameters
     ----------
     datasets : sequence of str
         ``SENSOR=SOURCE``. The sensor is a built-in name or the file of a profile. The source is ``simulation:N``, a
         folder with ``velodyne/NAME.bin`` and ``label/NAME.txt`` (class, one unused column, x, y, z, extents, yaw), or a
-        folder with range images ``NAME.npy`` (H, W, 6). Real scans are labeled all around but the model sees a quarter
-        of the turn, so each is evaluated in four directions. The remission function of a simulated sensor is fitted to
-        eight other scenes; that of a real sensor is in its profile.
+        folder with range images ``NAME.npy`` (H, W, 6). Real scans are labeled over the full turn, but the model sees a
+        quarter of it, so each scan is evaluated in four directions. The remission function of a simulated sensor is
+        fitted to eight other scenes. That of a real sensor comes from its profile.
     model : str or Path
         A range-image model.
     provider, precision : str
@@ -105,7 +105,7 @@ def compare(
     PointsError
         A dataset cannot be read.
     ModelError
-        The model labels no points.
+        The model is not a range-image model.
     """
     result: dict[str, Any] = {}
     sets = [(name, *_dataset(name)) for name in datasets]
@@ -159,7 +159,7 @@ def _row(confusion: Confusion) -> dict[str, Any]:
 
 
 def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]]]:
-    """The sensor, the number of scans, and a function that reads them."""
+    """Sensor and number of scans of a dataset, and a function that reads them."""
     sensor_name, equals, source = name.partition("=")
     if not equals:
         raise PointsError(f"got {name!r}; expected SENSOR=SOURCE, such as os1-64=simulation:24 or pandar64=FOLDER")
@@ -243,7 +243,7 @@ def _from_boxes(scan: Path, label: Path, sensor: SensorProfile) -> Scan:
         labels[inside(Box(name, 1.0, (x, y, z), (size[0], size[1], size[2]), yaw), points, 0.05)] = kind
         if kind == 1:
             axes.append(yaw)
-    # Turn x along the road. Vehicles stand along it, modulo 90 degrees: some files swap length and width.
+    # Turn x along the road: vehicles are aligned with it, modulo 90 degrees because some files swap length and width.
     road = math.atan2(np.sin(np.multiply(axes, 4.0)).sum(), np.cos(np.multiply(axes, 4.0)).sum()) / 4.0 if axes else 0.0
     x, y, z = _origin(points, sensor)
     cos, sin = math.cos(road), math.sin(road)
@@ -253,7 +253,11 @@ def _from_boxes(scan: Path, label: Path, sensor: SensorProfile) -> Scan:
 
 
 def _origin(points: NDArray[np.float32], sensor: SensorProfile) -> tuple[float, float, float]:
-    """Place of the sensor: seen from above, the lines through points of one firing meet there."""
+    """Estimate the sensor's x, y, z [m] in the frame of the points.
+
+    Seen from above, lines through the points of one firing meet at the sensor. Its height is the mounting height above
+    the most frequent z at 5 to 20 m.
+    """
     xy = points[:, :2].astype(np.float64)
     along = np.diff(xy, axis=0)
     length = np.hypot(along[:, 0], along[:, 1])

@@ -1,4 +1,4 @@
-"""The truth of one scan, from KITTI's labels, SemanticKITTI's labels or the simulator."""
+"""Ground truth of one scan, from KITTI's labels, SemanticKITTI's labels or the simulator."""
 
 from __future__ import annotations
 
@@ -27,23 +27,25 @@ Cells = dict[str, tuple[tuple[str, ...], NDArray[np.uint8]]]
 
 @dataclass(frozen=True)
 class Truth:
-    """A scan and what is known about it.
+    """A scan and its ground truth.
 
     Attributes
     ----------
     name, drive : str
     points : (n, 4) float32
+        x, y, z [m] in the sensor frame, remission.
     labels : (n,) uint8 or None
-        Index into `POINT_CLASSES`, `IGNORE` where unknown; None if neither points nor objects are evaluated.
+        Index into `POINT_CLASSES`, `IGNORE` where unknown; None if points and objects are not labeled.
     boxes : tuple of Box
+        In the sensor frame.
     returns : tuple of int
-        Number of returns from the object of each box.
+        Number of returns from each box's object.
     known : callable
-        Places (k, 3) -> (k,) bool: whether the scan is labeled there.
+        Takes places (k, 3) [m] in the sensor frame and returns whether objects are labeled there, (k,) bool.
     cells : mapping
-        Name of a table -> its classes, and the true class of each cell (rows, columns) uint8, `IGNORE` where unknown.
+        By name of a table: its classes, and the true class of each cell (rows, columns) uint8, `IGNORE` where unknown.
     road : tuple of 2 str, or None
-        The table and the class in it that give the truth of the drivable cells.
+        The table, and its class that counts as drivable.
     """
 
     name: str
@@ -58,21 +60,21 @@ class Truth:
 
 
 def kitti_truth(frame: Frame, view: TopViewGeometry | None, road: tuple[str, NDArray[np.bool_]] | None = None) -> Truth:
-    """Boxes, points and cells of a KITTI frame: known in the camera's field of view, outside DontCare.
+    """Ground truth of a KITTI frame: boxes, points and cells in the camera's field of view, outside DontCare.
 
     Parameters
     ----------
     frame : Frame
     view : TopViewGeometry or None
-        Cells to give the truth of.
+        Grid of the cells; None: no cells.
     road : tuple of str and (rows, columns) bool, optional
-        A title and the drivable cells, for a second table: this road under the vehicles of the labels (SSADNet 3.1.2).
+        Name and drivable cells of a second table, which combines this road with the labeled vehicles (SSADNet 3.1.2).
     """
     cells: Cells = {}
     if view is not None:
         vehicles, unclear = np.zeros((2, view.height, view.width), np.uint8)
         draw_footprints(vehicles, frame.boxes, view, TOP_VIEW_CLASSES)
-        # A tram or a "misc" object is none of the classes, but it is not background either.
+        # Cells of trams and "misc" objects are ignored: they belong to no class, but are not background.
         strange = [replace(box, label="car") for box in frame.boxes if box.label in ("tram", "misc")]
         draw_footprints(unclear, strange, view, TOP_VIEW_CLASSES)
         known = frame.known_at(_cell_places(view)).reshape(vehicles.shape) & (unclear == 0)
@@ -88,13 +90,13 @@ def kitti_truth(frame: Frame, view: TopViewGeometry | None, road: tuple[str, NDA
 
 
 def semantickitti_truth(frame: RoadFrame, view: TopViewGeometry | None) -> Truth:
-    """Cells of a SemanticKITTI frame: known where labeled returns fell."""
+    """Ground truth of a SemanticKITTI frame: cells with labeled returns."""
     cells: Cells = {} if view is None else {OBSERVED: (ROAD_CLASSES, frame.top_view(view))}
     return Truth(frame.name, frame.drive, frame.points, None, (), (), _everywhere, cells, (OBSERVED, "road"))
 
 
 def simulated_truth(seed: int, view: TopViewGeometry | None) -> Truth:
-    """A simulated scene, which counts as a drive of its own: everything is known."""
+    """Ground truth of a simulated scene, where everything is known. Each scene counts as a drive of its own."""
     name, scan = f"scene {seed}", simulated_scan(seed)
     cells: Cells = {} if view is None else {EVERY_CELL: (TOP_VIEW_CLASSES, scan.top_view_labels(view))}
     labels, road = labels_by_boxes(scan), (EVERY_CELL, "drivable")
@@ -102,7 +104,7 @@ def simulated_truth(seed: int, view: TopViewGeometry | None) -> Truth:
 
 
 def _cell_places(view: TopViewGeometry) -> NDArray[np.float64]:
-    """Centers of the cells (rows * columns, 3), near the ground."""
+    """Centers of the cells near the ground, (rows * columns, 3) float64 [m]."""
     x, y = np.broadcast_arrays(*view.cell_centers())
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, GROUND_Z_M)], axis=1)
 

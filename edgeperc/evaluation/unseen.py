@@ -1,4 +1,4 @@
-"""Refuse to evaluate a model on a scan that it was trained on."""
+"""Raise an error when a model would be evaluated on a scan that it was trained on."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["check_unseen", "training_scans_of"]
 
 
 def training_scans_of(cards: Sequence[ModelCard]) -> dict[str, set[str]]:
-    """Name and version of each model -> `scan_hash` of every real scan that it was trained on, from its card."""
+    """Read from cards the `scan_hash` of every real training scan, by name and version of the model."""
     frames = {f"{card.name} {card.version}": card.training.get("frames", {}) for card in cards}
     return {name: set(of.values()) if isinstance(of, Mapping) else set() for name, of in frames.items()}
 
@@ -26,6 +26,6 @@ def check_unseen(trained_on: Mapping[str, set[str]], name: str, drive: str, poin
     for model, hashes in trained_on.items():
         if digest in hashes:
             raise SplitError(
-                f"{model} was trained on scan {name} of drive {drive}, so figures on it are meaningless; evaluate the "
+                f"{model} was trained on scan {name} of drive {drive}, so figures on it are too good; evaluate the "
                 "test split, or a model trained without this drive, or ask for split 'train'"
             )

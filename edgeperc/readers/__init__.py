@@ -1,4 +1,4 @@
-"""Sensor files and captures to points: one module for each family of formats.
+"""Read points from sensor files and captures; one module for each family of formats.
 
 `files` recognizes a file by its content and suffix and calls the parser; `captures` reads packet captures and bags.
 """

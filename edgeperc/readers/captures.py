@@ -1,4 +1,4 @@
-"""Recordings to scans: folders of scan files, Velodyne and Ouster packet captures, ROS 1 and 2 bags and MCAP."""
+"""Read the scans of recordings: folders of scan files, Velodyne and Ouster captures, ROS 1 and 2 bags, MCAP."""
 
 from __future__ import annotations
 
@@ -49,26 +49,26 @@ _SNIFFED_PACKETS = 2000
 def read_scans(
     source: str | os.PathLike[str], *, topic: str | None = None, remission_field: str | None = None
 ) -> Iterator[Scan]:
-    """The scans of a recording, one after another, as they are read.
+    """Read the scans of a recording, one after another.
 
     Parameters
     ----------
     source : str or path
-        A scan file (`edgeperc.read_points`); a folder of scan files and captures, taken in the order of their names; a
-        Velodyne ``.pcap``; an Ouster ``.pcap``, with its metadata beside it in a ``.json`` whose name has the same
-        beginning, or ``.osf``; a ROS 1 ``.bag``, a ROS 2 bag's folder or one ``.mcap`` file, of which the messages of
-        type ``sensor_msgs/PointCloud2`` are read. The first bytes of a file decide, not its name.
+        A scan file (`edgeperc.read_points`); a folder of scan files and captures, read in the order of their names; a
+        Velodyne ``.pcap``; an Ouster ``.osf``, or ``.pcap`` with its metadata beside it in a ``.json`` file whose name
+        has the same beginning; a ROS 1 ``.bag``, a ROS 2 bag's folder or one ``.mcap`` file. Bags are read for
+        messages of type ``sensor_msgs/PointCloud2``. The first bytes of a file decide its format, not its name.
     topic : str, optional
-        Which topic of a bag that has several with point clouds; which sensor, by serial number, of an Ouster capture
-        that has several.
+        The topic to read if a bag has several with point clouds; the serial number of the sensor if an Ouster capture
+        has several.
     remission_field : str, optional
-        Which field is the remission: as in `edgeperc.read_points`; of an Ouster capture by default ``reflectivity``.
+        Name of the remission field, as in `edgeperc.read_points`; ``reflectivity`` by default for an Ouster capture.
 
     Yields
     ------
     stamp_s : float or None
-        Time of the scan by the sensor's own clock [s]: the end of the scan for a Velodyne and an Ouster, the header's
-        stamp for a message. None for scan files.
+        Time of the scan on the sensor's clock [s]: the end of the scan for a Velodyne and an Ouster, the header's stamp
+        for a message. None for scan files.
     points : (n, 4) float32, C-contiguous
         x, y, z [m] in the sensor's frame, and the raw remission, which the `Perceiver` scales by its sensor's
         ``remission_range``: 0..255 for a Velodyne and an Ouster's reflectivity, but 0..1 for an HDL-64E, as in KITTI's
@@ -77,8 +77,8 @@ def read_scans(
     Raises
     ------
     PointsError
-        The source does not exist, is damaged, or holds no scan of a LiDAR. Of a packet capture that is cut short, the
-        scans before the cut come first; other captures are refused as a whole.
+        The source does not exist, is damaged, or holds no scan of a LiDAR. A truncated packet capture yields the scans
+        before its end first; other damaged captures yield none.
     MissingExtraError
         The library that reads this kind of capture is not installed.
     """
@@ -116,7 +116,7 @@ def scan_files(folder: Path) -> list[Path]:
 
 
 def cloud_points(message: Any, *, remission_field: str | None = None) -> NDArray[np.float32]:
-    """Points of a ROS ``sensor_msgs/PointCloud2`` message, as an object of any library.
+    """Convert a ROS ``sensor_msgs/PointCloud2`` message, from any library, to points.
 
     Parameters
     ----------
@@ -134,13 +134,13 @@ def cloud_points(message: Any, *, remission_field: str | None = None) -> NDArray
     Raises
     ------
     PointsError
-        When the message holds fewer bytes than it declares, or no x, y and z.
+        The message holds fewer bytes than it declares, or has no x, y and z.
     """
     try:
         height, width, step = int(message.height), int(message.width), int(message.point_step)
         row_step = int(message.row_step) if height > 1 else width * step
         data = np.frombuffer(message.data, np.uint8)
-        # A field of several values a point, such as a descriptor, is no coordinate.
+        # A field with several values per point, such as a descriptor, is not a coordinate.
         fields = {f.name: f for f in message.fields if f.count in (0, 1) and 1 <= f.datatype <= len(_CLOUD_TYPES)}
         order = ">" if message.is_bigendian else "<"
         dtype = np.dtype(
@@ -210,7 +210,7 @@ def _naming(path: Path, scans: Iterator[Scan]) -> Iterator[Scan]:
 
 
 def _choose(what: str, names: Sequence[str], wanted: str | None, others: str = "") -> int:
-    """Index of the wanted name, or of the only one; the `PointsError` lists the names."""
+    """Index of the wanted name, or of the only name; otherwise a `PointsError` lists the names."""
     if wanted in names:
         return names.index(str(wanted))
     there = f"there are {', '.join(names)}" if names else "there is none"
@@ -239,20 +239,20 @@ def _packet_scans(path: Path, kind: str, topic: str | None, remission_field: str
             frames = pcap.PcapFrameSetSource(str(path))
         except Exception as exc:  # the SDK's errors share no base
             raise PointsError(
-                f"no Velodyne's packets ({_VELODYNE_BYTES} bytes each), and as an Ouster's capture it cannot be read: "
-                f"{' '.join(str(exc).split())} Expected the sensor's metadata beside it, in a .json whose name begins "
-                "alike"
+                f"not a Velodyne capture (packets of {_VELODYNE_BYTES} bytes), and cannot be read as Ouster's: "
+                f"{' '.join(str(exc).split())} Expected the sensor's metadata beside it, in a .json file whose name "
+                "has the same beginning"
             ) from exc
         scans = _ouster_scans(frames, topic, remission_field)
     n_scans = 0
     for scan in scans:
         n_scans += 1
         yield scan
-    # Both libraries silently stop at a file that ends inside a packet or holds no packets of theirs.
+    # Both libraries stop without an error if the file ends inside a packet, or has no packets of their sensors.
     n_packets = 0 if kind == ".osf" else sum(1 for _ in _packets(path))
     if not n_scans:
-        held = "holds no scan" if kind == ".osf" else f"of its {n_packets} packets none is a LiDAR's that can be read"
-        raise PointsError(f"the capture {held}; expected those of a Velodyne, or of an Ouster and its metadata")
+        held = "holds no scan" if kind == ".osf" else f"has {n_packets} packets, none from a supported LiDAR"
+        raise PointsError(f"the capture {held}; expected a Velodyne capture, or an Ouster capture with its metadata")
 
 
 def _packets(path: Path, whole: bool = True) -> Iterator[memoryview]:
@@ -272,15 +272,15 @@ def _packets(path: Path, whole: bool = True) -> Iterator[memoryview]:
             return
         if end > size:
             raise PointsError(
-                f"cut short or damaged: the file ends inside packet {n_packets + 1}, at byte {size:,}; all before it "
-                "is read"
+                f"cut short or damaged: the file ends inside packet {n_packets + 1}, at byte {size:,}; all packets "
+                "before it were read"
             )
         yield data[at + 16 : end]
         at, n_packets = end, n_packets + 1
 
 
 def _check_osf(path: Path) -> None:
-    """Raise `PointsError` unless every checksum is right: a damaged file may make ouster-sdk 1.0 end the process."""
+    """Raise `PointsError` unless every checksum is right, because ouster-sdk 1.0 may crash on a damaged file."""
     data = np.memmap(path, np.uint8, "r").data
     kind, at, size = b"", 0, len(data)
     while at < size:
@@ -292,7 +292,7 @@ def _check_osf(path: Path) -> None:
             )
         kind, at = bytes(data[at + 8 : at + 12]), end + 4
     if kind != b"OSF#":
-        raise PointsError("the .osf file is cut short: its last block is not that of the metadata")
+        raise PointsError("the .osf file is cut short: its last block is not the metadata")
 
 
 def _is_velodyne(packet: memoryview) -> bool:
@@ -305,7 +305,7 @@ def _velodyne_scans(path: Path) -> Iterator[Scan]:
     config = velodyne.Config()
     for stamp, points in velodyne.read_pcap(str(path), config):
         scan = as_points(points[:, :4])
-        # By now the decoder has found the model of the sensor.
+        # After the first scan the decoder knows the model of the sensor.
         if config.model is not None and config.model.name.startswith("HDL64E"):
             scan[:, 3] /= 255.0
         yield stamp.device, scan
@@ -338,7 +338,7 @@ def _bag_scans(path: Path, kind: str, topic: str | None, remission_field: str | 
     typesys = require("rosbags.typesys", "io", "Reading a bag")
     storage = require("rosbags.rosbag2.storage_mcap", "io", "Reading a bag")
     humble = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    # A single .mcap is opened by AnyReader from rosbags 0.10 on only, and ouster-sdk 1.0 asks for 0.9.
+    # AnyReader opens a single .mcap only from rosbags 0.10 on, but ouster-sdk 1.0 requires 0.9.
     alone = kind == ".mcap" and hasattr(storage, "MCAPFile")
     opened = (
         _McapFile(storage.MCAPFile(path), humble) if alone else highlevel.AnyReader([path], default_typestore=humble)
@@ -361,7 +361,7 @@ def _bag_scans(path: Path, kind: str, topic: str | None, remission_field: str | 
 
 
 class _McapFile:
-    """One .mcap file without the folder of its bag, as `AnyReader` shows it."""
+    """A reader of one .mcap file without the folder of its bag, with the interface of `AnyReader`."""
 
     def __init__(self, file: Any, typestore: Any) -> None:
         self.file, self.typestore = file, typestore

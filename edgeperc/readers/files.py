@@ -1,4 +1,4 @@
-"""Sensor files to points: raw binary, .npy, .npz; other formats by their modules."""
+"""Read points from sensor files: raw binary, .npy and .npz here, .pcd and .ply in their own modules."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def read_points(
     columns: int | None = None,
     remission_field: str | None = None,
 ) -> NDArray[np.float32]:
-    """Points of one scan, from a file or an array.
+    """Read the points of one scan from a file or an array.
 
     The first bytes of a file decide its format: a PCD header, ``ply``, NumPy's or zip's magic. Raw float32 files have
     no header, so their name must end in ``.bin`` (KITTI, SemanticKITTI: x, y, z, remission) or ``.pcd.bin`` (nuScenes:
@@ -53,12 +53,12 @@ def read_points(
     Returns
     -------
     (n, 4) float32, C-contiguous
-        x, y, z [m] and remission as stored. An array that is this already is returned as it is.
+        x, y, z [m] and remission as stored. An array that already has this form is returned itself.
 
     Raises
     ------
     PointsError
-        The file cannot be read, is empty, cut short or not a scan. A scan of no points is valid if a header says so;
+        The file cannot be read, is empty, truncated or not a scan. A scan of no points is valid if a header says so;
         a file of 0 bytes is an error.
     """
     if not isinstance(source, str | os.PathLike):
@@ -109,17 +109,17 @@ def _parse_raw(data: NDArray[np.uint8], columns: int, by_name: bool) -> NDArray[
     record = 4 * int(columns)
     if data.size % record:
         raise PointsError(
-            f"{data.size} bytes are no whole number of points of {columns} float32 values ({record} bytes): the file "
-            "is cut short, or pass columns= with the right number of values a point"
+            f"{data.size} bytes are not a whole number of points of {columns} float32 values ({record} bytes): the "
+            "file is cut short, or pass columns= with the right number of values a point"
         )
     values = data.view("<f4").reshape(-1, columns)
     xyz = np.abs(values[:: max(1, len(values) // 4096), :3])
-    # Coordinates never look like this; float64, big-endian or other bytes read as float32 do, in most rows.
+    # Coordinates do not have such values. Most rows do if float64, big-endian or other bytes are read as float32.
     with np.errstate(invalid="ignore"):  # comparing signalling NaN
         absurd = ((xyz > 1e7) & (xyz < np.inf)) | ((xyz > 0.0) & (xyz < 1e-30))
     if absurd.any(axis=1).mean() > 0.2:
         raise PointsError(
-            "the values are not coordinates; expected little-endian float32 x, y, z, remission, not float64 nor "
+            "the values are not coordinates; expected little-endian float32 x, y, z, remission, not float64 or "
             "another format"
         )
     if by_name and columns == 4 and data.size % 20 == 0:
@@ -188,5 +188,5 @@ def _parse_npz(data: NDArray[np.uint8]) -> NDArray[Any]:
     except Exception as exc:
         raise PointsError(f"the .npz archive cannot be read: {exc}") from exc
     if not content.startswith(b"\x93NUMPY"):
-        raise PointsError(f"{member.filename!r} in the archive is no .npy array")
+        raise PointsError(f"{member.filename!r} in the archive is not a .npy array")
     return _parse_npy(np.frombuffer(content, dtype=np.uint8))

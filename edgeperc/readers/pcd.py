@@ -48,7 +48,7 @@ def _parse_pcd_header(head: bytes) -> _PcdHeader:
     while "DATA" not in entries:
         end = head.find(b"\n", at)
         if end < 0:
-            raise PointsError("the PCD header has no DATA line; the file is cut short or no PCD file")
+            raise PointsError("the PCD header has no DATA line; the file is cut short or not a PCD file")
         tokens = head[at:end].decode("latin-1").split()
         at = end + 1
         if tokens and not tokens[0].startswith("#"):
@@ -60,7 +60,7 @@ def _parse_pcd_header(head: bytes) -> _PcdHeader:
         width, height = (whole_number(entries[key][0]) if key in entries else None for key in ("WIDTH", "HEIGHT"))
         n_points = whole_number(entries["POINTS"][0]) if "POINTS" in entries else None
     except (ValueError, IndexError) as exc:
-        raise PointsError(f"the PCD header holds no number where one belongs ({exc})") from exc
+        raise PointsError(f"the PCD header has an entry that must be a number and is not ({exc})") from exc
     kinds = entries.get("TYPE", [])
     if not names or not len(names) == len(sizes) == len(kinds) == len(counts):
         raise PointsError("the PCD header's FIELDS, SIZE, TYPE and COUNT lines must be of equal length")
@@ -81,7 +81,27 @@ def _parse_pcd_header(head: bytes) -> _PcdHeader:
 
 
 def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> NDArray[np.float32]:
-    """Points of a PCD file: ascii, binary or binary_compressed."""
+    """Parse a PCD file: ascii, binary or binary_compressed.
+
+    Parameters
+    ----------
+    data : (n_bytes,) uint8
+        The whole file.
+    head : bytes
+        Its beginning, with the whole header.
+    remission_field : str or None
+        As in `edgeperc.read_points`.
+
+    Returns
+    -------
+    (n, 4) float32
+        x, y, z [m], remission.
+
+    Raises
+    ------
+    PointsError
+        The file is truncated or malformed.
+    """
     header = _parse_pcd_header(head)
     n = header.n_points
     widths = [int(np.dtype(kind).itemsize) * count for kind, count in zip(header.types, header.counts, strict=True)]

@@ -39,7 +39,7 @@ def _parse_ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
     while True:
         end = head.find(b"\n", at)
         if end < 0:
-            raise PointsError("the PLY header has no end_header line; the file is cut short or no PLY file")
+            raise PointsError("the PLY header has no end_header line; the file is cut short or not a PLY file")
         tokens = head[at:end].decode("latin-1").split()
         at = end + 1
         try:
@@ -68,7 +68,27 @@ def _parse_ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
 
 
 def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> NDArray[np.float32]:
-    """Points of a PLY file's vertices: ascii or binary of either byte order."""
+    """Parse the vertices of a PLY file: ascii, or binary in either byte order.
+
+    Parameters
+    ----------
+    data : (n_bytes,) uint8
+        The whole file.
+    head : bytes
+        Its beginning, with the whole header.
+    remission_field : str or None
+        As in `edgeperc.read_points`.
+
+    Returns
+    -------
+    (n, 4) float32
+        x, y, z [m], remission.
+
+    Raises
+    ------
+    PointsError
+        The file is truncated or malformed.
+    """
     encoding, elements, start = _parse_ply_header(head)
     before: list[_PlyElement] = []
     for vertex in elements:

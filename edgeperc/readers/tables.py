@@ -1,4 +1,4 @@
-"""Parts that several formats share: columns of binary records, rows of text, numbers of headers."""
+"""Helpers for several formats: columns of binary records, rows of text, numbers in headers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAX_HEADER_BYTES = 65536
 
 
 def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int) -> NDArray[Any]:
-    """A field of binary records, as a view."""
+    """View of one field of binary records, (n,); ``offset`` and ``stride`` in bytes."""
     if n == 0:
         return np.empty(0, dtype=kind)
     column: NDArray[Any] = np.ndarray((n,), kind, data.data, offset, (stride,))
@@ -26,7 +26,7 @@ def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int)
 
 
 def whole_number(text: str) -> int:
-    """An integer of a header that fits 64 bits."""
+    """Parse an integer of a header; ValueError if it does not fit 64 bits."""
     value = int(text)
     if abs(value) >= 1 << 63:
         raise ValueError("a number beyond 64 bits")
@@ -49,7 +49,7 @@ def parse_table(
     names: Sequence[str],
     remission_field: str | None,
 ) -> NDArray[np.float32]:
-    """Rows of text; ``places`` holds each field's position in a row."""
+    """Parse rows of numbers as text; ``places`` has each field's position in a row."""
     wanted = {name: places[name] for name in "xyz" if name in places}
     remission = remission_name(places, remission_field)
     if remission is not None:
@@ -67,7 +67,7 @@ def parse_table(
             io.BytesIO(text), np.float64, comments=None, usecols=list(wanted.values()), ndmin=2, encoding="latin-1"
         )
     except (ValueError, OverflowError) as exc:
-        raise PointsError(f"a row of text is no row of numbers: {exc}") from exc
+        raise PointsError(f"a row of text does not hold numbers: {exc}") from exc
     if len(rows) != n:
         raise PointsError(f"cut short: {n} rows declared, {len(rows)} of numbers are there")
     return assemble(n, dict(zip(wanted, rows.T, strict=True)), names, remission_field)

@@ -1,7 +1,7 @@
-"""Pictures, 3-D pages and label files of what was perceived.
+"""Pictures, 3-D pages and label files of a perception.
 
-`draw`, `draw_mistakes` and `draw_tracks` need the extra ``view``; the others need numpy alone. Each takes ``path`` and
-replaces an existing file whole; the pictures are returned as bytes too, and ``path`` may be left out.
+`draw`, `draw_mistakes` and `draw_tracks` need the extra ``view``; the others need numpy alone. All write
+to ``path`` and replace an existing file atomically. Pictures are also returned as bytes; their ``path`` is optional.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Figures measured in pixels, and text that neither is cut nor lies on what it names."""
+"""Figures in pixels, and labels that are neither cut off nor cover the things they name."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ __all__ = [
 ]
 
 _DPI = 100.0
-# More labels than this leave nothing of the picture; the rest is counted.
+# More labels would cover the picture; the rest is only counted.
 _MOST_LABELS = 60
-# A label farther from what it names is more in the way than of use [px].
+# Largest distance of a label from its object [px]; farther away it does not help.
 _FARTHEST = 150.0
 
 
 def new_figure(width: int, height: int) -> Any:
-    """An empty figure of a size in pixels, drawn without pyplot.
+    """Make an empty figure of a size in pixels, without pyplot.
 
     Raises
     ------
@@ -54,11 +54,11 @@ def new_figure(width: int, height: int) -> Any:
 
 
 def as_png(figure: Any, path: str | Path | None) -> bytes:
-    """The figure as a PNG in full color, also written to ``path`` if there is one."""
-    from PIL import Image  # matplotlib brings it along
+    """Encode the figure as a PNG, and write it to ``path`` unless that is None."""
+    from PIL import Image  # a dependency of matplotlib
 
     figure.canvas.draw()
-    # Six bits a channel look the same and make the file a third smaller.
+    # Six bits per channel look the same, and the file is a third smaller.
     picture = np.asarray(figure.canvas.buffer_rgba())[..., :3] & 0xFC | 0x02
     stream = io.BytesIO()
     Image.fromarray(picture).save(stream, "PNG")
@@ -68,7 +68,7 @@ def as_png(figure: Any, path: str | Path | None) -> bytes:
 
 
 def add_axes(figure: Any, left: float, top: float, width: float, height: float) -> Any:
-    """Axes at a place in pixels from the picture's upper left corner."""
+    """Add axes at a position in pixels from the upper left corner of the picture."""
     across, down = figure.bbox.width, figure.bbox.height
     axes = figure.add_axes((left / across, 1.0 - (top + height) / down, width / across, height / down))
     axes.set_facecolor(PANEL)
@@ -81,15 +81,15 @@ def add_axes(figure: Any, left: float, top: float, width: float, height: float) 
 
 
 def write_text(where: Any, x: float, y: float, text: str, **style: Any) -> Any:
-    """Text in the bundled font; characters that it lacks become question marks."""
-    # The font comes with matplotlib and holds Latin-1; "$" must not start a formula.
+    """Write text in matplotlib's own font; characters that it lacks become question marks."""
+    # Latin-1 is in the font. parse_math=False: "$" must not start a formula.
     text = "".join(c if c in "■…≥→↑" or (c.isprintable() and ord(c) < 256) else "?" for c in text)
     style = {"color": INK, "fontsize": 13.0, "fontfamily": "DejaVu Sans", **style}
     return where.text(x, y, text, parse_math=False, **style)
 
 
 def write_at(figure: Any, x: float, y: float, text: str, **style: Any) -> float:
-    """Write at pixels from the upper left corner, centered in height; the pixel where the text ends."""
+    """Write at pixels from the upper left corner, centered vertically; return the x at which the text ends [px]."""
     style = {"va": "center", **style}
     written = write_text(figure, x / figure.bbox.width, 1.0 - y / figure.bbox.height, text, **style)
     return float(written.get_window_extent().x1)
@@ -103,7 +103,7 @@ def _width(figure: Any, text: str, **style: Any) -> float:
 
 
 def shorten(figure: Any, text: str, width: float, **style: Any) -> str:
-    """The end of a text, as much as fits into ``width`` pixels."""
+    """Cut a text at its start so that it fits into ``width`` pixels."""
     kept = text
     while len(kept) > 1 and _width(figure, kept, **style) > width:
         kept = "…" + kept[1 + max(1, len(kept) // 12) :]
@@ -111,7 +111,7 @@ def shorten(figure: Any, text: str, width: float, **style: Any) -> str:
 
 
 def wrap(figure: Any, text: str, width: float, **style: Any) -> list[str]:
-    """A text in lines of at most ``width`` pixels."""
+    """Break a text into lines of at most ``width`` pixels."""
     text = " ".join(text.split())
     n = max(1, len(text))
     while True:
@@ -128,7 +128,7 @@ class Label:
     Attributes
     ----------
     area : tuple of 4 float
-        What it names, in pixels of the figure: left, bottom, right, top.
+        The named object, in pixels of the figure: left, bottom, right, top.
     text, color : str
     """
 
@@ -138,7 +138,7 @@ class Label:
 
 
 def area_of(axes: Any, places: Any) -> tuple[float, float, float, float]:
-    """The rectangle around places in the axes' own units, as `Label.area` has it [px]."""
+    """Rectangle around places in data coordinates: left, bottom, right, top [px], for `Label.area`."""
     pixels = axes.transData.transform(places)
     (left, bottom), (right, top) = pixels.min(axis=0).tolist(), pixels.max(axis=0).tolist()
     return left, bottom, right, top
@@ -147,16 +147,16 @@ def area_of(axes: Any, places: Any) -> tuple[float, float, float, float]:
 def place_labels(
     axes: Any, labels: Sequence[Label], avoid: Sequence[tuple[float, float, float, float]] = (), **style: Any
 ) -> int:
-    """Write each label at the free place nearest to what it names, joined by a line where that is not beside it.
+    """Write each label at the free place nearest to its object, with a line to the object if they are apart.
 
     Parameters
     ----------
     axes : Axes
         Labels stay inside.
     labels : sequence of Label
-        The most important first. No label covers what any of them names, nor another label.
+        The most important first. No label covers another label or any named object.
     avoid : sequence of tuple of 4 float
-        More that no label may cover [px].
+        Further rectangles that no label may cover [px].
 
     Returns
     -------
@@ -190,26 +190,27 @@ def place_labels(
 def free_place(
     area: Sequence[float], half: NDArray[np.float64], taken: NDArray[np.float64], panel: Sequence[float]
 ) -> tuple[NDArray[np.float64], float] | None:
-    """The place for a label nearest to what it names.
+    """Find the free place for a label that is nearest to its object.
 
     Parameters
     ----------
     area : sequence of 4 float
-        What it names [px]: smallest x and y, largest x and y.
+        The named object [px]: smallest x and y, largest x and y.
     half : (2,) float64
         Half the label's width and height [px].
     taken : (k, 4) float64
-        Rectangles that it must not cover.
+        Rectangles that the label must not cover [px], as ``area``.
     panel : sequence of 4 float
-        Rectangle that it must not leave.
+        Rectangle that the label must not leave [px], as ``area``.
 
     Returns
     -------
     middle : (2,) float64
+        Center of the label [px].
     apart : float
         Distance between label and area [px].
 
-    None where there is no free place near.
+    None if there is no free place within 150 pixels.
     """
     named = np.array(area, dtype=np.float64).reshape(2, 2)
     low = np.maximum(np.array(panel[:2]) + half, named[0] - half - _FARTHEST)
@@ -228,7 +229,7 @@ def free_place(
         return None
     middles = middles[free]
     apart = np.hypot(*np.maximum(np.maximum(named[0] - middles - half, middles - half - named[1]), 0.0).T)
-    # Distance between the rectangles first, between their middles second.
+    # Mainly the distance between the rectangles, then that between their centers.
     best = int(np.argmin(apart + 0.08 * np.hypot(*(middles - named.mean(axis=0)).T)))
     return (middles[best], float(apart[best])) if apart[best] < _FARTHEST else None
 

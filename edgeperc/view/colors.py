@@ -25,8 +25,8 @@ __all__ = [
     "rgb",
 ]
 
-# At least 21 apart in CIELAB for normal, deuteranope, protanope and tritanope vision (Machado et al. 2009). The palette
-# of Okabe and Ito is at 5: its pedestrian is the gray of the background for a deuteranope.
+# CIELAB distance of at least 21 for normal, deuteranope, protanope and tritanope vision (Machado et al. 2009). With the
+# palette of Okabe and Ito it is 5: a deuteranope sees pedestrians in the gray of the background.
 CLASS_COLORS = {
     "background": "#7c8a99",
     "drivable": "#0a7f52",
@@ -40,23 +40,23 @@ _OTHER_COLOR = "#ffffff"
 INK, FAINT, FRAME, PANEL, GROUND = "#eef2f6", "#9fb0c0", "#2a343f", "#0b0f14", "#131920"
 AMBER = "#ffc46b"
 
-# From the ground up (height) and from near to far (range): dim and cool, so that the classes stand out.
+# Ends of the ramp for height and range: dim and cool, so that the classes stand out.
 LOW, HIGH = "#48627d", "#ccd8e4"
 FOUND, MISSED, FALSE = "#5d7468", "#ff4d4d", "#ffe14d"
 
 
 def color_of(name: str) -> str:
-    """The color of a class."""
+    """Color of a class, ``"#rrggbb"``; white for a class without a color of its own."""
     return CLASS_COLORS.get(name, _OTHER_COLOR)
 
 
 def rgb(colors: list[str]) -> NDArray[np.float64]:
-    """Colors "#rrggbb" as (n, 3) in 0..1."""
+    """Colors "#rrggbb" as (n, 3) float64 in 0..1."""
     return np.array([[int(c[k : k + 2], 16) / 255.0 for k in (1, 3, 5)] for c in colors]).reshape(-1, 3)
 
 
 def ramp(value: NDArray[Any], low: float, high: float) -> NDArray[np.float64]:
-    """Shade ``value`` from LOW to HIGH, (n, 3)."""
+    """Interpolate from LOW (at ``low``) to HIGH (at ``high``): colors (n, 3) float64 in 0..1."""
     share = np.clip((value - low) / (high - low), 0.0, 1.0)[..., None]
     dim, bright = rgb([LOW, HIGH])
     return np.asarray(dim + share * (bright - dim))

@@ -1,4 +1,4 @@
-"""What pictures and pages show of a scan: classes of points, drawable boxes, the ground, short facts."""
+"""Contents of pictures and pages: classes of points, drawable boxes, the ground, short facts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
     "timing_line",
 ]
 
-# Nothing farther than this is drawn: no sensor reaches as far, and a drawing library may fail on huge coordinates.
+# Limits of what is drawn: no sensor reaches as far, and a drawing library may fail on huge coordinates.
 _REACH_M = 1000.0
 _LARGEST_BOX_M = 100.0
 
@@ -34,7 +34,7 @@ EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4),
 
 
 def check_points(points: NDArray[np.float32], perception: Perception) -> None:
-    """Raise `PointsError` unless the points are the scan that was perceived."""
+    """Raise `PointsError` if ``points`` has a wrong shape or another number of points than the perceived scan."""
     if points.ndim != 2 or points.shape[1] != 4:
         raise PointsError(f"points have shape {points.shape}; expected (n, 4): x, y, z, remission")
     if len(points) != perception.n_points:
@@ -44,12 +44,12 @@ def check_points(points: NDArray[np.float32], perception: Perception) -> None:
 
 
 def drawable_points(points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Rows that are finite and no farther than any sensor reaches, (n,)."""
+    """Which points are finite and within 1 km, (n,) bool."""
     return np.asarray(np.isfinite(points).all(axis=1) & (np.abs(points[:, :3]) < _REACH_M).all(axis=1))
 
 
 def drawable_boxes(boxes: Iterable[Box]) -> list[Box]:
-    """Boxes whose numbers are finite and whose place and size are possible."""
+    """Boxes that are finite, within 1 km and at most 100 m large."""
     return [
         box
         for box in boxes
@@ -60,7 +60,7 @@ def drawable_boxes(boxes: Iterable[Box]) -> list[Box]:
 
 
 def paint_points(points: NDArray[np.float32], perception: Perception) -> tuple[list[str], NDArray[np.uint8]]:
-    """Class of every point for a picture.
+    """Choose the class to show for every point.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def paint_points(points: NDArray[np.float32], perception: Perception) -> tuple[l
     names : list of str
         The classes of both views.
     painted : (n,) uint8
-        Index into ``names``: the point's own class; for background, the class of its cell in the top view.
+        Index into ``names``: the class of the point or, for background, that of its cell in the top view.
     """
     names = list(perception.points.classes if perception.points is not None else ("background",))
     painted = np.zeros(len(points), dtype=np.uint8)
@@ -93,32 +93,33 @@ def paint_points(points: NDArray[np.float32], perception: Perception) -> tuple[l
     if perception.points is not None:
         take &= lent == road
     if (lent == road).any():
-        # Leaves over the road are not road.
+        # Points more than 0.5 m above the road, such as leaves, are not road.
         take &= (lent != road) | (z < np.median(z[lent == road]) + 0.5)
     painted[near[take]] = lent[take]
     return names, painted
 
 
 def fit_ground(points: NDArray[np.float32], names: list[str], painted: NDArray[np.uint8]) -> tuple[float, float, float]:
-    """The ground for a picture to stand on: z = a + b x + c y [m].
+    """Fit the ground plane that a picture is drawn on: z = a + b x + c y [m].
 
     Parameters
     ----------
     points : (n, 4) float32
-        Drawable.
+        Only those of `drawable_points`.
     names : list of str
     painted : (n,) uint8
+        As in `paint_points`.
 
     Returns
     -------
     a, b, c : float
-        A plane through the drivable points; level where there are few.
+        A plane through the drivable points; a level plane if there are fewer than 50 of them.
     """
     if "drivable" in names:
         road = points[painted == names.index("drivable"), :3].astype(np.float64)
         if len(road) >= 50:
             level = float(np.median(road[:, 2])), 0.0, 0.0
-            # A second fit without what stands out of the first.
+            # The second fit leaves out the outliers of the first.
             for _ in range(2):
                 if len(road) < 50 or road[:, :2].std(axis=0).min() < 1.0:
                     return level
@@ -131,13 +132,13 @@ def fit_ground(points: NDArray[np.float32], names: list[str], painted: NDArray[n
 
 
 def box_corners(box: Box) -> NDArray[np.float64]:
-    """The eight corners, (8, 3) [m]: the four of `Box.corners` below, then above."""
+    """The eight corners, (8, 3) float64 [m]: the four of `Box.corners` at the bottom, then at the top."""
     z = box.center[2] + np.repeat([-0.5, 0.5], 4) * box.size[2]
     return np.column_stack([np.tile(box.corners(), (2, 1)), z])
 
 
 def class_facts(perception: Perception) -> dict[str, list[str]]:
-    """For each class of both views, what was found of it: area, boxes, points. The background comes last."""
+    """Area, number of boxes and number of points of each class, as texts. The background comes last."""
     counts = perception.points.counts() if perception.points is not None else {}
     labels = [box.label for box in perception.boxes]
     facts: dict[str, list[str]] = {}
@@ -155,11 +156,11 @@ def class_facts(perception: Perception) -> dict[str, list[str]]:
 
 
 def timing_line(perception: Perception) -> str:
-    """Milliseconds in all and by stage."""
+    """Processing time [ms], in total and by stage, as one line."""
     stages = ", ".join(f"{name} {ms:.1f}" for name, ms in perception.stage_ms.items())
     return f"{sum(perception.stage_ms.values()):.1f} ms ({stages})" if stages else "not timed"
 
 
 def provider_lines(perception: Perception) -> list[str]:
-    """For each model, what ran it."""
+    """One line for each model: variant, precision and execution provider."""
     return [text if name in text else f"{name}: {text}" for name, text in perception.providers.items()]

@@ -40,12 +40,12 @@ def write_ply(perception: Perception, points: NDArray[np.float32], path: str | P
     points : (n, 4) float32
         The scan that was perceived: x, y, z [m] in the sensor frame, remission.
     path : str or Path
-        An existing file is replaced whole.
+        An existing file is replaced atomically.
 
     Raises
     ------
     PointsError
-        ``points`` is not the scan that was perceived, or the perception holds no class for its points.
+        ``points`` is not the scan that was perceived, or the perception has no classes of points.
     OSError
         The file cannot be written.
     """
@@ -78,12 +78,12 @@ def write_labels(perception: Perception, path: str | Path) -> None:
     ----------
     perception : Perception
     path : str or Path
-        An existing file is replaced whole.
+        An existing file is replaced atomically.
 
     Raises
     ------
     PointsError
-        The perception holds no class for its points.
+        The perception has no classes of points.
     OSError
         The file cannot be written.
     """
@@ -95,6 +95,6 @@ def write_labels(perception: Perception, path: str | Path) -> None:
 
 def _no_labels(what: str) -> PointsError:
     return PointsError(
-        f"a {what} needs a class for every point, and this perception has none: no range-image model took part. "
+        f"a {what} needs a class for every point, but no range-image model ran for this perception. "
         "Add one, such as 'pointseg'"
     )

@@ -1,4 +1,4 @@
-"""The picture of scans with mistakes."""
+"""Picture of the mistakes in scans, from above."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from .content import drawable_boxes, drawable_points
 
 __all__ = ["draw_mistakes"]
 
-# All in pixels.
+# Sizes in pixels; the view reaches 27 m to each side and 52 m ahead.
 _WIDTH, _MARGIN, _TOP, _GAP, _CAPTION = 1600, 28, 168, 20, 84
 _RIGHT_M, _FAR_M = 27.0, 52.0
 _LEGEND = (
     (
         MISSED,
         "missed",
-        "an object that was not found, with its number of points; dots: points of objects, not labeled so",
+        "object that was not found, with its number of points; dots: points of objects with another label",
     ),
-    (FALSE, "false", "found where there is none; dots: points of no object, labeled as one"),
-    (FOUND, "found", "as it should be"),
+    (FALSE, "false", "box where there is no object; dots: background points with the label of an object"),
+    (FOUND, "found", "object that was found"),
 )
 
 
 def draw_mistakes(
     scans: Sequence[Mistakes], path: str | Path | None = None, *, title: str = "", columns: int = 3
 ) -> bytes:
-    """Draw what was missed and what was found where there is nothing, seen from above, a panel for each scan.
+    """Draw missed objects and false detections from above, one panel for each scan.
 
     Parameters
     ----------
     scans : sequence of Mistakes
-        Drawn in this order. Scans without a mistake are left out; the picture says so if none is left.
+        Drawn in this order. Scans without a mistake are only counted in the heading.
     path : str or Path, optional
-        Where to write the picture as well; an existing file is replaced whole.
+        File to write as well; an existing file is replaced atomically.
     title : str
-        Such as the names of the models.
+        For example the names of the models.
     columns : int
-        Panels side by side; at least 1.
+        Largest number of panels side by side.
 
     Returns
     -------
@@ -60,7 +60,7 @@ def draw_mistakes(
     """
     wrong = [scan for scan in scans if scan.n_errors > 0]
     columns = max(1, min(columns, max(1, len(wrong))))
-    # A single panel need not be as wide as the picture.
+    # A single panel takes half of the width.
     width = (_WIDTH - 2 * _MARGIN - (columns - 1) * _GAP) // max(columns, 2)
     height = round(width * (_FAR_M + 3.0) / (2.0 * _RIGHT_M))
     rows = -(-len(wrong) // columns)
@@ -76,7 +76,11 @@ def draw_mistakes(
         write_at(figure, end + 8, 84 + 27 * k, name, fontsize=14.0, fontweight="bold")
         write_at(figure, _MARGIN + 128, 84 + 27 * k, meaning, fontsize=14.0, color=FAINT)
     if not wrong:
-        text = "No mistakes: every object was found, and nothing else." if scans else "No scans were given."
+        text = (
+            "No mistakes: every object was found, and there are no false detections."
+            if scans
+            else "No scans were given."
+        )
         write_at(figure, _MARGIN, _TOP + 36, text, fontsize=17.0)
     for k, scan in enumerate(wrong):
         left = _MARGIN + k % columns * (width + _GAP)
@@ -96,7 +100,7 @@ def draw_mistakes(
 def _draw_panel(axes: Any, scan: Mistakes) -> None:
     from matplotlib.patches import Polygon
 
-    axes.set_xlim(_RIGHT_M, -_RIGHT_M)  # left is left
+    axes.set_xlim(_RIGHT_M, -_RIGHT_M)  # y grows to the left
     axes.set_ylim(-3.0, _FAR_M)
     for ring in (15.0, 30.0, 45.0):
         turn = np.linspace(-math.pi / 2.0, math.pi / 2.0, 90)

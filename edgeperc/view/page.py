@@ -32,16 +32,16 @@ __all__ = ["write_html"]
 
 
 def write_html(perception: Perception, points: NDArray[np.float32], path: str | Path, *, title: str = "") -> None:
-    """Write one page that shows the labeled points in a browser, to turn, zoom and pan. It needs no network.
+    """Write an interactive 3-D page for a browser. It needs no network.
 
     Parameters
     ----------
     perception : Perception
     points : (n, 4) float32
-        The scan that was perceived: x, y, z [m] in the sensor frame, remission. Rows that are not finite are left out,
-        and so are points and boxes at impossible places.
+        The scan that was perceived: x, y, z [m] in the sensor frame, remission. Not drawn are points and boxes that are
+        not finite or farther than 1 km.
     path : str or Path
-        An existing file is replaced whole.
+        An existing file is replaced atomically.
     title : str
         The scan's name.
 
@@ -58,7 +58,7 @@ def write_html(perception: Perception, points: NDArray[np.float32], path: str | 
     points, painted = points[seen], painted[seen]
     facts = class_facts(perception)
     listed = [*names, *(name for name in facts if name not in names)]
-    # Some sensors count remission up to 255, or 65535.
+    # Some sensors give remission up to 255 or 65535.
     remission = np.maximum(points[:, 3], 0.0) / max(1.0, float(points[:, 3].max(initial=0.0)))
     scene = {
         "xyz": _base64(points[:, :3].astype("<f4")),
@@ -79,7 +79,7 @@ def write_html(perception: Perception, points: NDArray[np.float32], path: str | 
             for box in drawable_boxes(perception.boxes)
         ],
     }
-    # "<" would let a class name close the script element.
+    # A class name with "</script>" must not close the script element.
     data = json.dumps(scene, allow_nan=False).replace("<", "\\u003c")
     ran = "".join(f"<br>{html.escape(line)}" for line in provider_lines(perception))
     filled = {
@@ -89,13 +89,13 @@ def write_html(perception: Perception, points: NDArray[np.float32], path: str | 
         "@@SCENE@@": data,
     }
     template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
-    # In one pass, so that a title that looks like a place to fill stays a title.
+    # One pass, so that a title such as "@@SCENE@@" is not replaced.
     page = re.sub("|".join(filled), lambda match: filled[match.group()], template)
     write_atomic(path, page.encode(errors="replace"))
 
 
 def _road(top_view: TopView) -> dict[str, Any]:
-    """The drivable cells as strips across: row, first column and one past the last."""
+    """The drivable cells, row by row: strips of row, first column and one past the last column."""
     padded = np.pad(top_view.drivable, ((0, 0), (1, 1))).astype(np.int8)
     change = np.diff(padded, axis=1)
     (row, first), (_, last) = np.nonzero(change == 1), np.nonzero(change == -1)

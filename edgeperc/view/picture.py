@@ -1,4 +1,4 @@
-"""The picture of a scan: from behind, from above and as the sensor sees it."""
+"""Picture of a scan: from behind, from above and as a range image."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from .content import (
 
 __all__ = ["draw"]
 
-# All in pixels. Where the README shows 1000 of the 1600 pixels, 13 points are as tall as 8.
+# Sizes in pixels. A page that shows the picture 1000 pixels wide reduces text of 13 points to 8.
 _WIDTH, _MARGIN, _TOP, _BOTTOM = 1600, 28, 128, 868
 _AXIS = 62
 _CLASSES_A_ROW = 7
@@ -47,17 +47,17 @@ def draw(
     perception : Perception
         Without a top view, the picture has no panel from above.
     points : (n, 4) float32
-        The scan that was perceived: x, y, z [m] in the sensor frame, remission. Rows that are not finite are left out,
-        and so are points and boxes at impossible places.
+        The scan that was perceived: x, y, z [m] in the sensor frame, remission. Not drawn are points and boxes that are
+        not finite or farther than 1 km.
     path : str or Path, optional
-        Where to write the picture as well; an existing file is replaced whole.
+        File to write as well; an existing file is replaced atomically.
     title : str
         The scan's name.
 
     Returns
     -------
     png : bytes
-        1600 pixels wide and about 1080 high: more where there are warnings.
+        1600 pixels wide and about 1080 high; warnings add height.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def _draw_legend(figure: Any, top: float, height: float, facts: dict[str, list[s
 
 
 def _strip(road: RoadAhead, x_near: float, x_far: float) -> tuple[str, NDArray[np.float64] | None]:
-    """What is free ahead in short words, and the arrow that shows it as corners x, y [m]."""
+    """The free distance ahead as text, and the corners x, y [m] of an arrow of that length; None for no arrow."""
     free_m = road.free_ahead_m(_HALF_STRIP_M)
     if not math.isfinite(free_m):
         return "", None
@@ -160,7 +160,7 @@ def _draw_top_view(
     boxes: Sequence[Box],
     ground: tuple[float, float, float],
 ) -> float:
-    """The panel from above; its width [px]."""
+    """Draw the panel from above; return its width [px]."""
     from matplotlib.patches import Polygon, Rectangle
 
     (x_near, x_far), (y_right, y_left) = top_view.x_range_m, top_view.y_range_m
@@ -168,7 +168,7 @@ def _draw_top_view(
     px_per_m = min((_BOTTOM - _TOP) / (high - low), 560.0 / (left - right))
     width = px_per_m * (left - right)
     axes = add_axes(figure, _MARGIN + _AXIS, _TOP, width, px_per_m * (high - low))
-    axes.set_xlim(left, right)  # left is left
+    axes.set_xlim(left, right)  # y grows to the left
     axes.set_ylim(low, high)
 
     layer = np.zeros((*top_view.labels.shape, 4))
@@ -233,7 +233,7 @@ def _draw_range_image(
     names: list[str],
     painted: NDArray[np.uint8],
 ) -> None:
-    """The front quarter turn as the sensor saw it. It is a picture, and no network's projection."""
+    """Draw the quarter turn ahead as a range image. It is only a picture, not the projection of a network."""
     axes = add_axes(figure, *place)
     _write_heading(figure, place[0], place[1] - 20, "as the sensor sees it", "90° ahead, a class for every point")
     x, y, z = points[:, :3].astype(np.float64).T
@@ -241,7 +241,7 @@ def _draw_range_image(
     azimuth = np.degrees(np.arctan2(y, x))
     ahead = np.flatnonzero((np.abs(azimuth) < 45.0) & (range_m > 0.5))
     elevation = np.degrees(np.arcsin(z[ahead] / range_m[ahead]))
-    # Stray reflections below the road would squeeze the rest.
+    # Percentiles, because stray reflections below the road would compress the image.
     low, high = np.percentile(elevation, [0.3, 99.9]) if len(ahead) else (-25.0, 3.0)
     low, high = low - 0.5, high + 0.5
     columns = 512
@@ -254,7 +254,7 @@ def _draw_range_image(
     index = np.full((rows, columns), -1, dtype=np.intp)
     index[row[nearest_last], col[nearest_last]] = ahead[nearest_last]
     for axis, shift in ((0, 1), (0, -1), (1, 1), (1, -1)):
-        # Beams are not spread evenly: a pixel that none met borrows its neighbor's return.
+        # Beams are not evenly spaced, so a pixel without a return takes that of a neighbor.
         neighbor = np.roll(index, shift, axis)
         edge = [slice(None), slice(None)]
         edge[axis] = slice(0, 1) if shift > 0 else slice(-1, None)
@@ -333,7 +333,7 @@ def _draw_from_behind(
             axes.add_patch(Polygon(flat, closed=True, facecolor=INK, alpha=0.3, zorder=3))
             axes.add_patch(Polygon(flat, closed=True, fill=False, edgecolor=INK, linewidth=1.5, zorder=3))
             labels.append(Label(area_of(axes, flat), text, INK))
-    # The nearest boxes last: they lie before the others.
+    # The nearest boxes last, because they occlude the others.
     for box in sorted(boxes, key=lambda box: -box.center[0]):
         corners = (box_corners(box) - eye) @ turn.T
         ends = [end for k, m in EDGES if (end := _clipped(corners[k], corners[m])) is not None]
@@ -356,7 +356,7 @@ def _draw_from_behind(
 
 
 def _clipped(start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """The part of an edge before the camera, (2, 3); None without one."""
+    """The part of an edge in front of the camera, (2, 3); None if all of it is behind."""
     if start[2] > end[2]:
         start, end = end, start
     if end[2] <= _NEAR_M:
@@ -374,7 +374,7 @@ def _ground_layer(
     wide: float,
     tall: float,
 ) -> NDArray[np.float64]:
-    """The drivable cells on the ground as the camera sees them, (rows, columns, 4)."""
+    """The drivable cells on the ground as seen by the camera: RGBA, (rows, columns, 4) float64 in 0..1."""
     columns = 1200
     rows = max(1, round(columns * tall / wide))
     u = np.linspace(-wide, wide, columns)

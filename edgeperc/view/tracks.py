@@ -25,29 +25,30 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_tracks", "flatten_scan"]
 
-# Ahead is to the right, left is up. All in pixels, 10 a meter; drawn twice as large and reduced, for smooth edges.
+# Forward is to the right, left is up. Sizes in pixels, 10 per meter. Frames are drawn twice as large and reduced, which
+# smooths the edges.
 _PX_PER_M, _FINE = 10, 2
 _BEHIND_M, _BESIDE_M = 22, 28
 _WIDTH, _HEIGHT, _HEAD, _FOOT = 960, 560, 44, 38
-# What a pixel of a flattened scan may be: nothing, road, a point low, higher and high above the ground, a class.
+# Values of a pixel of a flattened scan: 0 empty, 1 road, 2 to 4 a background point by height, from 5 a class.
 _ROAD, _POINT, _CLASS = 1, 2, 5
 _OTHER = _CLASS + len(CLASS_COLORS)
 
 
 def flatten_scan(points: NDArray[np.float32], perception: Perception | None = None) -> bytes:
-    """Reduce a scan to what `draw_tracks` shows of it under the tracks: some 20 kB.
+    """Reduce a scan to the image that `draw_tracks` shows under the tracks, about 20 kB.
 
     Parameters
     ----------
     points : (n, 4) float32
         x, y, z [m] in the sensor frame, remission.
     perception : Perception, optional
-        Of these points; without it, no point has a class and no road is shown.
+        Perception of these points; without it, points have no class and no road is shown.
 
     Returns
     -------
     flat : bytes
-        For `draw_tracks`.
+        Compressed image, for ``under`` of `draw_tracks`.
     """
     image = np.zeros((_HEIGHT, _WIDTH), np.uint8)
     names, painted = ["background"], np.zeros(len(points), np.uint8)
@@ -71,7 +72,7 @@ def flatten_scan(points: NDArray[np.float32], perception: Perception | None = No
     as_pixel = np.array([_CLASS + order.index(name) if name in order else _OTHER for name in names], np.uint8)
     value = np.where(painted == 0, _POINT + level.astype(np.uint8), as_pixel[painted])
     col, row = np.floor((x + _BEHIND_M) * _PX_PER_M), np.floor((_BESIDE_M - y) * _PX_PER_M)
-    # The road is shown as a surface: its points would only make the file larger.
+    # The road is shown as a surface; its points would only enlarge the file.
     inside = (col >= 0) & (col < _WIDTH) & (row >= 0) & (row < _HEIGHT) & (value != _CLASS + order.index("drivable"))
     shown = np.flatnonzero(inside)
     shown = shown[np.argsort(value[shown], kind="stable")]  # classes over the background
@@ -87,19 +88,19 @@ def draw_tracks(
     title: str = "",
     tail_s: float = 2.0,
 ) -> bytes:
-    """Draw tracks from above, scan by scan: boxes, ids, speeds, where each goes in the next second, and where it was.
+    """Draw an animation of tracks from above: boxes, ids, speeds, motion in the next second, and trails.
 
     Parameters
     ----------
     scans : sequence of Tracks
-        In order, two or more; each is shown for as long as it lasted.
+        In order, two or more. Each is shown until the stamp of the next, the last one for a second.
     path : str or Path, optional
-        Where to write the animation as well; an existing file is replaced whole.
+        File to write as well; an existing file is replaced atomically.
     under : sequence of bytes
-        What to show under the tracks: `flatten_scan` of each scan. Empty: the tracks alone.
+        `flatten_scan` of each scan, to show under the tracks. Empty: only the tracks.
     title : str
     tail_s : float
-        How long the trail behind a track is [s].
+        Length of the trail behind a track [s].
 
     Returns
     -------
@@ -111,7 +112,7 @@ def draw_tracks(
     MissingExtraError
         pillow is not installed.
     TrackingError
-        There are fewer than two scans, which are no animation, or not as many in ``under``.
+        There are fewer than two scans, or ``under`` has another number of scans.
     OSError
         The file cannot be written.
     """
@@ -173,7 +174,7 @@ def draw_tracks(
 
 
 def _layer_colors() -> NDArray[np.uint8]:
-    """Color of each value of a flattened scan, (values, 3)."""
+    """Color of each value of a flattened scan, (values, 3) uint8."""
     panel, low, high, drivable = rgb([PANEL, LOW, HIGH, CLASS_COLORS["drivable"]])
     points = [panel + share * (color - panel) for color, share in ((low, 0.5), (low, 0.95), (high, 0.6))]
     classes = [panel + 0.85 * (color - panel) for color in rgb([*CLASS_COLORS.values(), color_of("")])]
@@ -182,7 +183,7 @@ def _layer_colors() -> NDArray[np.uint8]:
 
 
 def _palette(Image: Any) -> Any:
-    """A picture with the palette of all frames: every color that is drawn, and its edges on every ground."""
+    """Make an image with the palette of all frames: all drawn colors, and their blends with the backgrounds."""
     front = np.concatenate([rgb([INK, FAINT, *CLASS_COLORS.values(), color_of("")]), _layer_colors()[_POINT:] / 255.0])
     ground = np.concatenate([rgb([PANEL, GROUND, FRAME]), _layer_colors()[[_ROAD]] / 255.0])
     edges = [back + share * (front - back) for back in ground for share in (0.35, 0.7)]
@@ -193,7 +194,7 @@ def _palette(Image: Any) -> Any:
 
 
 def _pixels(places: NDArray[np.float64]) -> list[tuple[float, float]]:
-    """x, y [m] in the sensor frame -> pixels of the large picture."""
+    """x, y [m] in the sensor frame -> pixels of the picture before it is reduced."""
     places = places[:, :2].clip(-1e3, 1e3)
     return [
         (_FINE * _PX_PER_M * (x + _BEHIND_M), _FINE * (_HEAD + _PX_PER_M * (_BESIDE_M - y))) for x, y in places.tolist()
@@ -204,18 +205,18 @@ def _draw_rings(pen: Any, font: Any) -> None:
     (middle,) = _pixels(np.zeros((1, 2)))
     for ring_m in (20, 40, 60):
         reach = ring_m * _PX_PER_M * _FINE
-        # The part in view; head and foot are drawn over the rest.
+        # Header and footer are drawn over the rest of the circle.
         pen.arc(
             [middle[0] - reach, middle[1] - reach, middle[0] + reach, middle[1] + reach], -90, 90, FRAME, width=_FINE
         )
-        y = min(24.0, 0.8 * ring_m)  # beside the road, where no names are
+        y = min(24.0, 0.8 * ring_m)  # beside the road, where there are few labels
         (at,) = _pixels(np.array([[math.sqrt(ring_m**2 - y**2), y]]))
         pen.text(at, f" {ring_m} m", fill=FAINT, font=font)
     pen.polygon(_pixels(np.array([[2.2, 0.0], [-1.4, 0.9], [-1.4, -0.9]])), fill=INK)
 
 
 def _draw_track(pen: Any, track: Track, trail: NDArray[np.float64]) -> None:
-    """Trail, box and velocity."""
+    """Draw trail, box and velocity."""
     color = color_of(track.label)
     if len(trail) > 1:
         pen.line(_pixels(trail), fill=color, width=_FINE + 1, joint="curve")
@@ -231,7 +232,7 @@ def _draw_track(pen: Any, track: Track, trail: NDArray[np.float64]) -> None:
 
 
 def _write_names(pen: Any, tracks: Sequence[Track], font: Any) -> None:
-    """Ids and speeds, none on a box or on another."""
+    """Write ids and speeds; no text covers a box or another text."""
     areas = [np.array(_pixels(track.box.corners())) for track in tracks]
     panel = (0.0, float(_FINE * _HEAD), float(_FINE * _WIDTH), float(_FINE * (_HEAD + _HEIGHT)))
     taken = [(*area.min(axis=0).tolist(), *area.max(axis=0).tolist()) for area in areas]
@@ -251,7 +252,7 @@ def _write_names(pen: Any, tracks: Sequence[Track], font: Any) -> None:
 
 
 def _write_frame(pen: Any, title: str, facts: str, labels: Sequence[str], fonts: dict[int, Any], tail_s: float) -> None:
-    """Head and foot: title, time, classes and what the lines mean."""
+    """Write header and footer: title, time, classes and a legend."""
     width, head, foot = _FINE * _WIDTH, _FINE * _HEAD, _FINE * (_HEAD + _HEIGHT)
     pen.rectangle([0, 0, width, head], fill=GROUND)
     pen.rectangle([0, foot, width, foot + _FINE * _FOOT], fill=GROUND)

@@ -1,11 +1,11 @@
-"""Builds a top-view database scene by scene, as section 3 says, on this computer or on a Ray cluster.
+"""Builds a top-view database scene by scene (section 3), on this computer or on a Ray cluster.
 
-Each scene is made on its own: first its files, each written whole or not at all, then a record of them. A scene with a
-record of the same inputs and settings is not made again, so a stopped build resumes. The index is made of the records,
-and the manifest is written last.
+Each scene is made on its own: first its files, each written completely or not at all, then a record of them. A scene
+with a record of the same inputs and settings is not made again, so a stopped build resumes. The index is made of the
+records, and the manifest is written last.
 
-Roads that nobody drew come from a model: a top-view network with a class "drivable", by name or path, or one trained
-for each fold on the drawn roads (`edgeperc_export.database.folds`).
+Roads that are not drawn by hand come from a model: a top-view network with a class "drivable", by name or path, or one
+trained for each fold on the drawn roads (`edgeperc_export.database.folds`).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Report:
     Attributes
     ----------
     scenes, made, kept : int
-        Scenes in the database; of these, the ones made by this build and the ones found finished.
+        Number of scenes in the database; number made by this build; number already finished.
     skipped : dict of str to str
         Name of each scene left out -> the reason.
     scores : dict
@@ -70,10 +70,20 @@ class Report:
 
 
 def folds(drives: Iterable[str]) -> dict[str, int]:
-    """Drive -> fold, of five (section 3.4, Figure 14), given the drive of every scene.
+    """Assign drives to five folds (section 3.4, Figure 14).
 
     All scenes of a drive are in one fold, because they look alike. Drives are assigned in order of their number of
-    scenes, most first, each to the fold with the fewest scenes.
+    scenes, largest first, each to the fold with the fewest scenes.
+
+    Parameters
+    ----------
+    drives : iterable of str
+        The drive of every scene.
+
+    Returns
+    -------
+    dict of str to int
+        Drive -> fold.
     """
     sizes = [0] * N_FOLDS
     chosen = {}
@@ -194,7 +204,7 @@ def _build(plan: Plan, jobs: list[Job], engine: str, workers: int, notes: tuple[
 
 
 def _finish(builder: SceneBuilder, jobs: list[Job], skipped: dict[str, str]) -> dict[str, dict[str, float | None]]:
-    """Write the indexes, delete leftovers, write the manifest, in this order; the scores of `Report`."""
+    """Write the indexes, delete leftovers and write the manifest, in this order; returns the scores of `Report`."""
     out = builder.plan.out
     rows: list[dict[str, Any]] = []
     road_rows: list[dict[str, Any]] = []
@@ -244,7 +254,7 @@ def _finish(builder: SceneBuilder, jobs: list[Job], skipped: dict[str, str]) -> 
 
 
 def _scores(confusion: Confusion) -> dict[str, float | None]:
-    """The paper's table 1 without AP, which needs probabilities; None where no road is drawn or found."""
+    """The scores of the paper's Table 1 without AP, which needs probabilities; None where a score is not defined."""
     iou = confusion.iou()[1]
     figures = {"f1": 2.0 * iou / (1.0 + iou), "accuracy": confusion.accuracy()}
     figures |= {"precision": confusion.precision()[1], "recall": confusion.recall()[1]}
@@ -252,7 +262,7 @@ def _scores(confusion: Confusion) -> dict[str, float | None]:
 
 
 def _write_table(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> str:
-    """Write a CSV file; its hash."""
+    """Write a CSV file; returns its SHA-256."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(columns)

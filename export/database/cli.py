@@ -16,7 +16,7 @@ DATABASE = "folder of a database made by edgeperc-export database-build"
 
 
 def add_database_commands(commands: argparse._SubParsersAction[Any]) -> None:
-    """Add the four commands to those of a parser."""
+    """Add the four commands to the parser's commands."""
     build = commands.add_parser(
         "database-build", help="make a top-view database of a KITTI object set, or resume a stopped build"
     )
@@ -27,8 +27,8 @@ def add_database_commands(commands: argparse._SubParsersAction[Any]) -> None:
         "--road-by",
         default="lodnn",
         metavar="NAME|PATH|train",
-        help="source of the roads that nobody drew: a shipped model (default lodnn), an .onnx file with a card, or "
-        "train, which trains a LoDNN for each fold on the drawn roads of the other folds",
+        help="source of the roads that are not drawn by hand: a shipped model (default lodnn), an .onnx file with a "
+        "card, or train, which trains a LoDNN for each fold on the drawn roads of the other folds",
     )
     build.add_argument(
         "--road-recipe",
@@ -89,10 +89,10 @@ def _build(args: argparse.Namespace) -> int:
         raise ValueError(f"--variations {args.variations} --workers {args.workers}; expected 0 or more, 1 or more")
     recipe = None
     if args.road_by == "train":
-        args.extra = "export"  # the package that may be missing is now torch
+        args.extra = "export"  # from here on, the package that may be missing is torch
         from ..recipe import MODELS, PAPER
 
-        # The model lodnn was also trained on other scans, their objects and a teacher; here there are none.
+        # The model lodnn also uses simulated scans, pasted objects and a teacher, which do not exist here.
         small = replace(MODELS["lodnn"].recipe, simulated_share=0.0, n_pasted=0.0, distil=0.0)
         recipe = {"paper": PAPER["lodnn"], "small": small}[args.road_recipe]
         if args.road_steps is not None:

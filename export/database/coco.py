@@ -1,4 +1,4 @@
-"""Drafts and variations of hand-drawn roads, and a database as a COCO file.
+"""Drafts and variations of hand-drawn roads, and the COCO file of a database.
 
 `edgeperc_export.roads` reads and writes the COCO files of drawn roads.
 """
@@ -26,7 +26,7 @@ SMOOTH_CELLS, SIMPLIFIED_CELLS = 5.0, 1.5
 
 
 def draft(labels: NDArray[np.uint8]) -> list[list[list[float]]]:
-    """Polygons around the road of a map, for a person to correct; holes are filled and details below 1 m smoothed.
+    """Polygons around the road of a map, for a person to correct. Holes are filled, and details below 1 m smoothed.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def draft(labels: NDArray[np.uint8]) -> list[list[list[float]]]:
     for row, line in enumerate(labels == CLASSES.index("road")):
         edges = np.nonzero(np.diff(line.astype(np.int8), prepend=0, append=0))[0]
         bars += [box(a, row, b, row + 1) for a, b in edges.reshape(-1, 2)]
-    # Closing, then opening: a person wants ten corners, not the hundred of a network's ragged edge.
+    # Closing, then opening: about ten corners to edit instead of the hundred of a network's ragged edge.
     whole = union_all(bars)
     for reach in (SMOOTH_CELLS, -2 * SMOOTH_CELLS, SMOOTH_CELLS):
         whole = whole.buffer(reach, join_style="mitre")
@@ -60,10 +60,20 @@ def draft(labels: NDArray[np.uint8]) -> list[list[list[float]]]:
 def varied(
     image: NDArray[np.uint8], mask: NDArray[np.uint8], name: str, k: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], float, bool]:
-    """Variation ``k`` of a drawn scene (section 3.4): image and mask, turned by the same angle and mirrored or not.
+    """Variation ``k`` of a drawn scene (section 3.4): image and mask, turned by the same angle and perhaps mirrored.
 
-    They turn about the sensor, so that the distances in the image stay true. Cells are moved without interpolation, so
-    the mask stays a mask. Variation 0 is the scene itself. The same name and number give the same variation.
+    They are turned about the sensor, so that the distances in the image stay correct. Cells are moved without
+    interpolation, so that the mask keeps its values. Variation 0 is the scene itself. The same name and number always
+    give the same variation.
+
+    Parameters
+    ----------
+    image : (400, 200, 3) uint8
+    mask : (400, 200) uint8
+        1 road, 0 no road.
+    name : str
+        Name of the scene.
+    k : int
 
     Returns
     -------
@@ -90,7 +100,7 @@ def varied(
 
 
 def write_database_coco(database: TopViewDatabase, file: IO[str]) -> int:
-    """Write a database as COCO, one annotation for each vehicle and each scene's road; the number of annotations.
+    """Write a database as COCO, an annotation for each vehicle and each scene's road; returns their number.
 
     Scenes are written one at a time, so that memory use does not grow with the database. Vehicles are complete, even if
     a nearer one covers part of them in the map.

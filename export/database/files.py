@@ -12,7 +12,8 @@ Electronics 12, 3165 (2023)::
 
 The index is CSV rather than Parquet: a few megabytes, the same bytes with every library, and diff can compare it.
 
-KITTI labels only what the camera sees: vehicles in the near corners, outside its view, are in no label and no map.
+KITTI labels only what the camera sees. Vehicles in the near corners of the image, outside the camera's view, are in
+neither labels nor maps.
 """
 
 from __future__ import annotations
@@ -63,8 +64,8 @@ def picture(points: NDArray[np.float32]) -> NDArray[np.uint8]:
     Parameters
     ----------
     points : (n, 4) float32
-        x, y, z [m], remission, clamped to 0..1 (`edgeperc.adapt.condition` scales a sensor's). Rows that are not finite
-        are left out.
+        x, y, z [m] in the sensor frame, remission, clamped to 0..1 (`edgeperc.adapt.condition` scales a sensor's). Rows
+        that are not finite are left out.
 
     Returns
     -------
@@ -80,7 +81,7 @@ def picture(points: NDArray[np.float32]) -> NDArray[np.uint8]:
     remission = np.clip(p[:, 3], 0.0, 1.0)
     height = (p[:, 2] - Z_RANGE_M[0]) / (Z_RANGE_M[1] - Z_RANGE_M[0])
     values = np.stack([np.hypot(p[:, 0], p[:, 1]) / FARTHEST_M, height, remission], axis=1)
-    # The last assignment to a pixel remains: lowest points first, and of equally high ones the later first.
+    # The last assignment to a pixel remains, so points are sorted by height, and equally high ones from last to first.
     order = len(p) - 1 - np.argsort(p[::-1, 2], kind="stable")
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[HEIGHT - 1 - ahead[order], WIDTH - 1 - left[order]] = np.rint(255.0 * values[order]).astype(np.uint8)
@@ -114,8 +115,22 @@ def vehicles(boxes: Iterable[Box]) -> tuple[Box, ...]:
 
 
 def road_and_vehicles(road: NDArray[Any], boxes: Iterable[Box]) -> NDArray[np.uint8]:
-    """The map of a scene (section 3.8): road 1, other ground 0, and over both the vehicles' classes.
+    """The map of a scene (section 3.8): the road, with the vehicles drawn over it.
 
+    Parameters
+    ----------
+    road : (400, 200) bool or integer
+        1 road, 0 other ground.
+    boxes : iterable of Box
+        From `vehicles`.
+
+    Returns
+    -------
+    (400, 200) uint8
+        Index into `CLASSES`.
+
+    Notes
+    -----
     A cell belongs to a vehicle if its center lies in the vehicle's rectangle. This is the paper's rotated box, without
     the holes left by rotating whole pixels. Where two vehicles overlap, the nearer one is drawn.
     """
@@ -125,7 +140,7 @@ def road_and_vehicles(road: NDArray[Any], boxes: Iterable[Box]) -> NDArray[np.ui
 
 
 def write_labels(boxes: Iterable[Box]) -> str:
-    """The text of a label file: a line ``class x y length width yaw`` for each vehicle."""
+    """The text of a label file: a line ``class x y length width yaw`` [m, rad] for each vehicle, sensor frame."""
     rows = [(b.label, *b.center[:2], *b.size[:2], b.yaw) for b in boxes]
     return "".join(
         f"{name} {x:.4f} {y:.4f} {length:.4f} {width:.4f} {yaw:.4f}\n" for name, x, y, length, width, yaw in rows
@@ -133,7 +148,13 @@ def write_labels(boxes: Iterable[Box]) -> str:
 
 
 def read_labels(path: Path) -> tuple[Box, ...]:
-    """Vehicles of a label file; their z and height are 0."""
+    """Vehicles of a label file; their z and height are 0.
+
+    Raises
+    ------
+    DatabaseError
+        A line is not of the format of `write_labels`.
+    """
     boxes = []
     for line in path.read_text().splitlines():
         try:
@@ -146,14 +167,14 @@ def read_labels(path: Path) -> tuple[Box, ...]:
 
 
 def png(array: NDArray[np.uint8]) -> bytes:
-    """An image (rows, cols) or (rows, cols, 3) as the bytes of a PNG file."""
+    """The bytes of a PNG file of an image (rows, cols) or (rows, cols, 3)."""
     buffer = io.BytesIO()
     Image.fromarray(array).save(buffer, "PNG")
     return buffer.getvalue()
 
 
 def read_png(path: Path) -> NDArray[np.uint8]:
-    """An image as `png` wrote it."""
+    """Read an image that `png` wrote."""
     try:
         with Image.open(path) as image:
             return np.asarray(image)
@@ -206,6 +227,7 @@ class TopViewDatabase:
     Attributes
     ----------
     manifest : dict
+        Content of ``manifest.json``.
     rows : list of dict of str to str
         The lines of the index that belong to the split.
 
@@ -213,6 +235,8 @@ class TopViewDatabase:
     ------
     DatabaseError
         ``root`` holds no finished database, one of another format, or an index that does not match the manifest.
+    ValueError
+        The split or the fold is unknown.
     """
 
     def __init__(self, root: Path | str, split: str = "all", fold: int | None = None) -> None:
@@ -246,7 +270,7 @@ class TopViewDatabase:
         return list(self._at)
 
     def scene(self, name: str) -> TopViewScene:
-        """Read a scene by its name."""
+        """Read a scene by its name; `DatabaseError` if there is none of this name."""
         if name not in self._at:
             raise DatabaseError(f"none of the {len(self)} scenes is called {name!r}; see .names")
         return self[self._at[name]]

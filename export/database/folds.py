@@ -40,9 +40,9 @@ class DrawnScene:
     ----------
     fold : int
     road : list
-        COCO segmentations.
+        COCO segmentations of the drawn road.
     inputs : str
-        Identifies the scene's files: `edgeperc_export.database.scenes.inputs_of`.
+        Key of the scene's input files, from `edgeperc_export.database.scenes.inputs_of`.
     """
 
     fold: int
@@ -57,10 +57,11 @@ def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: 
     ----------
     objects : KittiObjects
     drawn : mapping of str to DrawnScene
-        By name.
+        Name of the scene -> the scene.
     recipe : Recipe
-        Of a top-view network with a class "drivable".
+        Recipe of a top-view network with a class "drivable".
     out : Path
+        Folder for the models.
     work : Path
         Folder for checkpoints, from which a stopped training run resumes.
 
@@ -71,14 +72,17 @@ def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: 
     """
     made: dict[str, Path] = {}
     for fold in range(N_FOLDS):
-        shown = {name: scene for name, scene in sorted(drawn.items()) if scene.fold != fold}
+        trained_on = {name: scene for name, scene in sorted(drawn.items()) if scene.fold != fold}
         held_out = {name: scene for name, scene in sorted(drawn.items()) if scene.fold == fold}
-        if not shown:
+        if not trained_on:
             raise DatabaseError(
                 f"all {len(drawn)} drawn scenes are in fold {fold}, whose road model cannot be trained on them; draw "
-                "roads in two drives or more, or name a model by --road-by NAME"
+                "roads in two drives or more, or give a model with --road-by NAME"
             )
-        facts = [asdict(recipe), *({name: asdict(scene) for name, scene in part.items()} for part in (shown, held_out))]
+        facts = [
+            asdict(recipe),
+            *({name: asdict(scene) for name, scene in part.items()} for part in (trained_on, held_out)),
+        ]
         key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
         model, made_of = out / f"fold-{fold}.onnx", work / f"fold-{fold}.sha256"
         if model.exists() and made_of.exists() and made_of.read_text() == key:
@@ -86,12 +90,12 @@ def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: 
             continue
         made_of.unlink(missing_ok=True)
         name = f"{recipe.network}-fold-{fold}"
-        if key in made:  # folds without a drawn scene have the same model
+        if key in made:  # folds without a drawn scene share a model
             write_card(onnx.load(made[key]), replace(ModelCard.read(made[key]), name=name), model)
             made_of.write_text(key)
             continue
         made[key] = model
-        scans, watched = _labeled(objects, shown), _labeled(objects, held_out)
+        scans, watched = _labeled(objects, trained_on), _labeled(objects, held_out)
         hashes = {name: scan_hash(scan.points) for name, scan in scans.items()}
         given = RealScans([*scans.values()], hashes, [*watched.values()])
         checkpoint = train(recipe, work / key, kitti=None, simulated=None, given=given)
@@ -99,12 +103,13 @@ def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: 
         proof = [scan.points for scan in scans.values()][:4]
         export(checkpoint, model, scans=proof, fitness=fitness, name=name)
         made_of.write_text(key)
-    for left in work.iterdir():
-        if left.is_dir():
-            shutil.rmtree(left)
+    for folder in work.iterdir():
+        if folder.is_dir():
+            shutil.rmtree(folder)
 
 
 def _labeled(objects: KittiObjects, drawn: Mapping[str, DrawnScene]) -> dict[str, LabeledScan]:
+    """Name -> scan with its drawn road as ground truth; scans that cannot be read are left out."""
     found = {}
     for name, scene in drawn.items():
         try:

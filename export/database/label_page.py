@@ -1,6 +1,7 @@
-"""A local web page for drawing roads over a database's images (section 3.3).
+"""A local web page to draw roads over a database's images (section 3.3).
 
-The page is served to this computer only and loads nothing from the network. Each change is saved to the COCO file.
+Only this computer can open the page, and the page loads nothing from the network. Each change is saved to the COCO
+file.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ __all__ = ["LabelServer"]
 PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".webp": "image/webp"}
 LARGEST_REQUEST = 4_000_000
 
-# The page's own script and style, and pictures and data of this server only.
+# The page may use its own script and style, and pictures and data of this server only.
 POLICY = "default-src 'none'; img-src 'self'; connect-src 'self'; script-src 'unsafe-inline'; style-src 'unsafe-inline'"
 
 
 class LabelServer(ThreadingHTTPServer):
-    """The page's server, on 127.0.0.1; ``serve_forever`` runs it.
+    """The server of the page, on 127.0.0.1; ``serve_forever`` runs it.
 
     Parameters
     ----------
@@ -47,6 +48,7 @@ class LabelServer(ThreadingHTTPServer):
     Attributes
     ----------
     url : str
+        Address of the page.
 
     Raises
     ------
@@ -82,7 +84,7 @@ def _polygons(path: Path) -> tuple[dict[str, list[Any]], dict[str, str]]:
     roads = {}
     for name, segmentations in read_coco([path]).items():
         if not all(isinstance(each, list) for each in segmentations):
-            raise DatabaseError(f"{path} has run lengths for {name}; the page edits polygons only: give another file")
+            raise DatabaseError(f"{path} has run lengths for {name}; the page edits polygons only; give another file")
         rings = [ring for each in segmentations for ring in each]
         roads[name] = [[[x, y] for x, y in zip(ring[::2], ring[1::2], strict=True)] for ring in rings]
     images = json.loads(path.read_text())["images"]
@@ -93,7 +95,7 @@ class _Handler(BaseHTTPRequestHandler):
     server: LabelServer
 
     def do_GET(self) -> None:
-        # Pages of other sites can reach this address under their own host name; they get no answer.
+        # Pages of other sites can reach this address under their own host name; they are refused.
         if self.headers.get("Host") != urlsplit(self.server.url).netloc:
             return self.send_error(HTTPStatus.FORBIDDEN)
         what, _, name = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
@@ -135,7 +137,7 @@ class _Handler(BaseHTTPRequestHandler):
             return self.send_error(HTTPStatus.FORBIDDEN)
         what, _, name = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
         length = int(self.headers.get("Content-Length") or 0)
-        # Pages of other sites cannot send JSON: the browser asks for permission first, and gets no answer.
+        # Pages of other sites cannot send JSON: the browser asks this server for permission first, and is refused.
         json_sent = self.headers.get("Content-Type") == "application/json"
         if what != "road" or name not in self.server.names:
             return self.send_error(HTTPStatus.NOT_FOUND)
@@ -143,13 +145,13 @@ class _Handler(BaseHTTPRequestHandler):
             return self.send_error(HTTPStatus.BAD_REQUEST)
         try:
             polygons = json.loads(self.rfile.read(length))
-            whole = [[[_within(x, WIDTH), _within(y, HEIGHT)] for x, y in corners] for corners in polygons]
-            if any(len(corners) < 3 for corners in whole):
-                raise ValueError("a polygon of fewer than three corners")
+            clamped = [[[_within(x, WIDTH), _within(y, HEIGHT)] for x, y in corners] for corners in polygons]
+            if any(len(corners) < 3 for corners in clamped):
+                raise ValueError("a polygon has fewer than three corners")
         except (ValueError, TypeError) as exc:
             return self.send_error(HTTPStatus.BAD_REQUEST, str(exc).splitlines()[0])
-        self.server.save(name, whole)
-        return self._send_json(len(whole))
+        self.server.save(name, clamped)
+        return self._send_json(len(clamped))
 
     def _send_json(self, value: Any) -> None:
         self._send("application/json", json.dumps(value).encode())
@@ -168,6 +170,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _within(value: float, limit: int) -> float:
+    """A coordinate clamped to 0..limit, rounded to 0.01 pixels."""
     if isinstance(value, bool) or not math.isfinite(value):
-        raise ValueError(f"a corner at {value}")
+        raise ValueError(f"a corner has the coordinate {value}")
     return round(min(max(float(value), 0.0), float(limit)), 2)

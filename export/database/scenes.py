@@ -60,10 +60,10 @@ class Plan:
     Attributes
     ----------
     kitti, out : Path
-        Folders of the KITTI object set and of the database. On a Ray cluster, all its computers must see them there.
+        Folders of the KITTI object set and of the database. All computers of a Ray cluster need them at these paths.
     road_by : str
-        Source of the roads that nobody drew: the name of a shipped model, the path of an .onnx with a card, or
-        ``"train"``: a model for each fold, trained on the drawn roads of the other folds.
+        Source of the roads that are not drawn by hand: the name of a shipped model, the path of an .onnx with a card,
+        or ``"train"``: a model for each fold, trained on the drawn roads of the other folds.
     sensor : str
         Sensor of the scans, as `edgeperc.Perceiver` takes it.
     provider : str
@@ -80,13 +80,23 @@ class Plan:
     variations: int = 8
 
     def road_model(self, fold: int | None) -> str:
-        """The road model of a fold. Test scenes (None) take the first fold's, which was not trained on them either."""
+        """The road model of a fold. Test scenes (None) take the first fold's, whose training set has no test scene."""
         return str(self.out / f"road/models/fold-{fold or 0}.onnx") if self.road_by == TRAIN else self.road_by
 
 
 @dataclass(frozen=True)
 class Job:
-    """One scene to make; ``road`` are its drawn roads, if any, as COCO segmentations."""
+    """One scene to make.
+
+    Attributes
+    ----------
+    name, drive, grade, split : str
+        As in the index.
+    fold : int or None
+        None for test scenes.
+    road : list or None
+        COCO segmentations of the drawn road; None if none is drawn.
+    """
 
     name: str
     drive: str
@@ -130,8 +140,8 @@ class RoadModel:
         same = (view.height, view.width, view.cell_m) == (HEIGHT, WIDTH, VIEW.cell_m)
         if not same or np.abs(self._shift).max() > VIEW.cell_m:
             raise CardMismatchError(
-                f"{model} sees x {view.x_range_m}, y {view.y_range_m} in cells of {view.cell_m} m; expected the "
-                f"database's x {VIEW.x_range_m}, y {VIEW.y_range_m} in cells of {VIEW.cell_m} m, give or take a cell"
+                f"{model} covers x {view.x_range_m}, y {view.y_range_m} in cells of {view.cell_m} m; expected the "
+                f"database's x {VIEW.x_range_m}, y {VIEW.y_range_m} in cells of {VIEW.cell_m} m, to within one cell"
             )
         content = (Path(model) if Path(model).suffix == ".onnx" else model_path(model)).read_bytes()
         self.facts = {
@@ -143,7 +153,7 @@ class RoadModel:
 
     def __call__(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Road of a scan, (400, 200) bool."""
-        # Moved by the offset between the views, a scan falls into the same cells of the model as of the database.
+        # The scan is moved by the offset between the views, so that its points are in the same cells of both.
         top_view = self.perceive(points + self._shift.astype(np.float32)).top_view
         assert top_view is not None
         return top_view.drivable
@@ -176,7 +186,7 @@ class SceneBuilder:
         return self._road_model
 
     def is_made(self, job: Job) -> bool:
-        """Whether the scene exists, made from the same inputs with the same settings."""
+        """Whether the scene exists and was made from the same inputs with the same settings."""
         facts = self.road_model(job.fold).facts
         try:
             record = json.loads(self.record_path(job.name).read_text())
@@ -187,7 +197,7 @@ class SceneBuilder:
             return False  # no record, or not one of this format: the scene is made again
 
     def __call__(self, job: Job) -> str:
-        """Make a scene; the reason if it is left out, else "".
+        """Make a scene; returns the reason if it is left out, else "".
 
         Raises
         ------
@@ -198,7 +208,7 @@ class SceneBuilder:
             frame = self.objects.frame(job.name)
             boxes = vehicles(frame.boxes)
         except (EdgepercError, ValueError, OSError) as exc:
-            # Without the folder's path, so that a set gives the same database wherever it lies.
+            # Without the folder's path, so that the database does not depend on it.
             return (str(exc) or type(exc).__name__).replace(f"{self.plan.kitti}{os.sep}", "")
         image = picture(condition(frame.points, self.sensor, rendered=False)[0])
         model = self.road_model(job.fold)
@@ -260,7 +270,10 @@ class SceneBuilder:
 
 
 def inputs_of(kitti: Path, name: str) -> str:
-    """Identifies a scene's input files: hashes of label and calibration, and the size of the scan, which is large."""
+    """A key of a scene's input files: hashes of label and calibration, and the size of the scan.
+
+    The scan is not hashed, because it is large.
+    """
     training = kitti / "training"
     small = [training / "label_2" / f"{name}.txt", training / "calib" / f"{name}.txt"]
     facts = [hashlib.sha256(path.read_bytes()).hexdigest() for path in small]

@@ -1,4 +1,4 @@
-"""Scenes spread over processes or a Ray cluster."""
+"""Makes scenes in parallel, in processes or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _builder: SceneBuilder  # of this worker process
 
 
 def run_jobs(builder: SceneBuilder, jobs: list[Job], engine: str, workers: int) -> Iterator[tuple[str, str]]:
-    """Make scenes in any order; yields each name, and the reason if the scene is left out, else ""."""
-    # The first scene is made in this process: it warns if scans do not suit the model, and fails early if all would.
+    """Make scenes, in any order; yields each name with the reason if the scene is left out, else ""."""
+    # The first scene is made in this process: warnings are shown, and errors that concern all scenes stop the build.
     for job in jobs[:1]:
         yield job.name, builder(job)
     rest = jobs[1:]
@@ -43,7 +43,7 @@ def run_jobs(builder: SceneBuilder, jobs: list[Job], engine: str, workers: int) 
 
 
 def _run_in_processes(plan: Plan, jobs: list[Job], workers: int) -> Iterator[tuple[str, str]]:
-    # Spawned, because a fork of a process that runs onnxruntime may hang.
+    # Processes are spawned, because a fork of a process that runs onnxruntime may hang.
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(min(workers, len(jobs)), context, _start_worker, (plan,))
     try:
@@ -74,7 +74,7 @@ def _start_worker(plan: Plan) -> None:
 
 
 def _die_with_parent() -> None:
-    # Otherwise the worker of a killed parent would finish its jobs and then wait forever.
+    # Otherwise, after its parent is killed, a worker would finish its jobs and then wait forever.
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -86,7 +86,7 @@ def _make_scene(job: Job) -> str:
 
 
 class RayWorker:
-    """`SceneBuilder` as ``ray.data`` calls it: a row in, a row out; jobs are JSON because their shapes differ."""
+    """`SceneBuilder` for ``ray.data``, which maps rows to rows. Jobs are JSON, because their shapes differ."""
 
     def __init__(self, plan: Plan) -> None:
         self.builder = SceneBuilder(plan)
@@ -104,8 +104,8 @@ def _run_on_ray(plan: Plan, jobs: list[Job], workers: int) -> Iterator[tuple[str
     except ModuleNotFoundError as exc:
         raise MissingExtraError(exc.name or "ray", "ray", "--engine ray") from exc
 
-    ours = not ray.is_initialized()
-    if ours:
+    started = not ray.is_initialized()
+    if started:
         cores = None if "RAY_ADDRESS" in os.environ else workers
         ray.init(num_cpus=cores, include_dashboard=False, log_to_driver=False, configure_logging=False)
     try:
@@ -119,5 +119,5 @@ def _run_on_ray(plan: Plan, jobs: list[Job], workers: int) -> Iterator[tuple[str
         for row in done.iter_rows():
             yield str(row["scene"]), str(row["reason"])
     finally:
-        if ours:
+        if started:
             ray.shutdown()

@@ -24,9 +24,9 @@ def build(recipe: Recipe) -> nn.Module:
     Raises
     ------
     ValueError
-        There is no such network, no version of it for small computers, or no such head.
+        The network or its head is unknown, or the network has no version for small computers.
     """
-    task_name(recipe.network)  # raises for an unknown one
+    task_name(recipe.network)  # raises ValueError for an unknown network
     torch.manual_seed(recipe.seed)
     if recipe.edge:
         if recipe.network not in EDGE:

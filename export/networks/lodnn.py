@@ -1,9 +1,10 @@
 """LoDNN: the road in a top view (Caltagirone et al., 2017), and its new version LoDNN-I (Electronics 12, 3165, 2023).
 
-Both are the same network: an encoder, a context module of dilated convolutions, and a decoder with unpooling. LoDNN's
-input are six statistics of each cell (number of returns, mean remission; mean, deviation, minimum and maximum of the
-height). LoDNN-I's are three channels (distance, height, remission). It keeps all layers and improves the training:
-hand-drawn roads, varied and in five folds, and a search for the learning rate, the number of epochs and the batch size.
+Both are the same network: an encoder, a context module of dilated convolutions, and a decoder with unpooling. The
+input of LoDNN is six statistics of each cell (number of returns, mean remission; mean, deviation, minimum and maximum
+of the height). The input of LoDNN-I is three channels (distance, height, remission). LoDNN-I keeps all layers and
+improves the training: hand-drawn roads with variations, cross-validation in five folds, and a search for the learning
+rate, the number of epochs and the batch size.
 
 What the papers leave open, and the choices made here:
 
@@ -27,7 +28,8 @@ from .ssadnet import CONTEXT_DILATIONS, ELU_GAIN, ContextModule, conv_bn_elu, co
 __all__ = ["EDGE_DILATIONS", "LoDNN", "LoDNNEdge"]
 
 EDGE_DILATIONS = CONTEXT_DILATIONS[:-1]
-"""(width, height) at a quarter of the resolution: 65 x 127 of its cells are 26 x 51 m, as 129 x 255 are at a half."""
+"""Dilations (width, height) at a quarter of the resolution. Their receptive field, 65 x 127 cells of 0.4 m, covers
+26 x 51 m, as much as the 129 x 255 cells of 0.2 m of `CONTEXT_DILATIONS` at half the resolution."""
 
 
 class LoDNN(nn.Module):
@@ -38,15 +40,18 @@ class LoDNN(nn.Module):
     n_channels : int
         3 for LoDNN-I, 6 for LoDNN.
     n_classes : int
+        Classes of the output.
     context_width : int
-        Channels inside the context module; 128 in the papers, 18.5 of 20.1 GMAC.
+        Channels inside the context module; 128 in the papers, where the module takes 18.5 of 20.1 GMAC.
     dropout : float
         Probability of the spatial dropout in the context module.
     batch_norm : bool
+        Add batch norm after every convolution but the last.
 
     Notes
     -----
-    In: (B, n_channels, 400, 200); any even height and width will do. Out: logits (B, n_classes, 400, 200).
+    In: (B, n_channels, 400, 200) float32; any even height and width.
+    Out: logits (B, n_classes, 400, 200) float32.
     """
 
     def __init__(
@@ -90,7 +95,19 @@ class LoDNN(nn.Module):
 class LoDNNEdge(nn.Module):
     """LoDNN at a quarter of the resolution: two strided convolutions, the context module, and channels moved to pixels.
 
-    0.73 instead of 20.1 GMAC. Input and output as for `LoDNN`; any height and width divisible by 4.
+    It takes 0.73 instead of 20.1 GMAC.
+
+    Parameters
+    ----------
+    n_channels, n_classes : int
+        Channels of the input; classes of the output.
+    fine, context_width : int
+        Channels at half and at a quarter of the resolution.
+
+    Notes
+    -----
+    In: (B, n_channels, 400, 200) float32; any height and width divisible by 4.
+    Out: logits (B, n_classes, 400, 200) float32.
     """
 
     def __init__(self, *, n_channels: int = 3, n_classes: int = 2, fine: int = 16, context_width: int = 48) -> None:
@@ -111,7 +128,7 @@ class LoDNNEdge(nn.Module):
 
 
 class Dilated(nn.Module):
-    """A dilated 3x3 convolution added to a shortcut; untrained, it is the identity."""
+    """A dilated 3x3 convolution added to a shortcut. Before training, the block is the identity."""
 
     def __init__(self, channels: int, dilation: tuple[int, int]) -> None:
         super().__init__()

@@ -4,13 +4,13 @@ What the paper leaves open, and the choices made here:
 
 * Channels are not stated. They follow SqueezeSeg, which PointSeg extends: 64 after the first convolution, 128, 256, 384
   and 512 in the fire layers; each fire layer squeezes to a quarter of its input (section 4.1).
-* Fire1 is SqueezeNet's first convolution, as in SqueezeSeg. It halves the width, and three poolings halve it again, so
-  that the enlargement layer's input is 64 x 32 (section 4.2). The last layer of each resolution is a reweighting: SR-1
-  before the second pooling, SR-2 before the third, SR-3 before the enlargement layer, which replaces a fourth.
-* Equation 4 with "X = sigmoid(chi)" cannot be meant as printed: the two fully connected layers would have no input and
-  the feature map would be lost. As in squeeze-and-excitation (and the paper's Figure 6):
+* Fire1 is SqueezeNet's first convolution, as in SqueezeSeg. It halves the width, and each of three poolings halves it
+  again, so the enlargement layer's input is 64 x 32 (section 4.2). The last layer of each resolution is a reweighting:
+  SR-1 before the second pooling, SR-2 before the third, SR-3 before the enlargement layer, which replaces a fourth.
+* Equation 4 is not used as printed, with "X = sigmoid(chi)": the two fully connected layers would have no input, and
+  the feature map would be lost. The choice is that of squeeze-and-excitation and of the paper's Figure 6:
   Scale = sigmoid(FC(relu(FC(chi)))), Y = X * Scale. The first FC squeezes to a quarter.
-* Each branch of the enlargement layer is 80 wide; "compress to 1/4" is read as a quarter of the layer's input.
+* Each branch of the enlargement layer has 80 channels; "compress to 1/4" is read as a quarter of the layer's input.
 * Convolutions are followed by batch norm, which is folded into them on export.
 """
 
@@ -37,6 +37,7 @@ ENLARGEMENT_RATES = (6, 9, 12)
 def conv_bn_relu(
     c_in: int, c_out: int, kernel: int, *, stride: tuple[int, int] = (1, 1), dilation: int = 1
 ) -> nn.Sequential:
+    """A convolution without bias, batch norm and ReLU; with stride 1 it keeps the resolution."""
     padding = dilation * (kernel // 2)
     return nn.Sequential(
         nn.Conv2d(c_in, c_out, kernel, stride=stride, padding=padding, dilation=dilation, bias=False),
@@ -106,7 +107,7 @@ class Enlargement(nn.Module):
         super().__init__()
         self.point = conv_bn_relu(c_in, width, 1)
         self.dilated = nn.ModuleList(conv_bn_relu(c_in, width, 3, dilation=rate) for rate in ENLARGEMENT_RATES)
-        # No batch norm: of one pixel an image, a small batch's statistics are noise.
+        # No batch norm: the mean is one pixel for each image, and the statistics of so few pixels are noise.
         self.average = nn.Sequential(nn.Conv2d(c_in, width, 1), nn.ReLU())
         self.compress = conv_bn_relu(width * (2 + len(ENLARGEMENT_RATES)), c_in // 4, 1)
 
@@ -122,18 +123,18 @@ class PointSeg(nn.Module):
     Parameters
     ----------
     n_channels, n_classes : int
-        Of the input and of the output.
+        Channels of the input; classes of the output.
     enlargement_width : int
         Channels of each branch of the enlargement layer.
     dropout : float
-        Before the last convolution, as in SqueezeSeg.
+        Probability of dropping a channel before the last convolution, as in SqueezeSeg.
     deep_supervision : bool
-        In training also return logits (B, n_classes, H, W/4), made where a quarter of the width is reached again.
+        In training, also return early logits (B, n_classes, H, W/4), from the decoder at a quarter of the width.
 
     Notes
     -----
-    In: (B, 5, 64, 512); any height, and any width divisible by 16 (a full turn: 2048).
-    Out: logits (B, 4, 64, 512).
+    In: (B, 5, 64, 512) float32; any height, and any width divisible by 16 (a full turn: 2048).
+    Out: logits (B, 4, 64, 512) float32.
     """
 
     def __init__(
@@ -182,14 +183,14 @@ class PointSeg(nn.Module):
 
 
 def initialize(network: nn.Module, *last: nn.Conv2d) -> None:
-    """He initialization, and small weights in the output layers."""
+    """He initialization of all layers, and small weights in the output layers ``last``."""
     for module in network.modules():
         if isinstance(module, nn.Conv2d):
             nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
             if module.bias is not None:
                 nn.init.zeros_(module.bias)
         elif isinstance(module, nn.ConvTranspose2d):
-            # Of its four taps across, an output pixel meets two.
+            # An output pixel gets two of the four taps.
             nn.init.normal_(module.weight, std=(2.0 / (2 * module.in_channels)) ** 0.5)
     for module in last:
         nn.init.normal_(module.weight, std=0.01)

@@ -5,8 +5,8 @@ batch norm. The fourth is the focal loss (`edgeperc_export.losses.cross_entropy`
 
 What differs from the paper, and why:
 
-* The network computes the mask itself, from the pixels that are not 0 in every channel, so that the input stays x, y,
-  z, remission and range.
+* The network computes the mask itself: a pixel has a return if any channel is not 0. So the input remains x, y, z,
+  remission and range.
 * Batch norm comes before the ReLU instead of after it, so that it can be folded into the convolution on export.
 * SqueezeSeg's recurrent CRF is left out. KUL-Seg's section 4 does not mention one. With it, cars gain 3.7 points of
   IoU, and pedestrians and cyclists lose 1.0 and 1.3 (PointSeg's Table 1). The runtime corrects labels itself, by a vote
@@ -25,13 +25,13 @@ from .pointseg import Fire, FireDeconv, conv_bn_relu, initialize, pool
 __all__ = ["ContextAggregation", "SqueezeSegV2"]
 
 REACH = 7
-"""Rows and columns of the window whose maximum context aggregation takes."""
+"""Rows and columns of the max-pooling window of context aggregation."""
 
 
 class ContextAggregation(nn.Module):
-    """Scale each channel of each pixel by its surroundings, so that missing returns matter less.
+    """Scale each channel of each pixel by its surroundings, which reduces the effect of missing returns.
 
-    The scale is a sigmoid of the maximum of 7x7 pixels, squeezed to a sixteenth of the channels and expanded again.
+    The maximum of 7x7 pixels is squeezed to a sixteenth of the channels and expanded again; its sigmoid is the scale.
     """
 
     def __init__(self, channels: int) -> None:
@@ -52,14 +52,15 @@ class SqueezeSegV2(nn.Module):
     Parameters
     ----------
     n_channels, n_classes : int
-        Of the input and of the output.
+        Channels of the input; classes of the output.
     dropout : float
-        Before the last convolution.
+        Probability of dropping a channel before the last convolution.
 
     Notes
     -----
-    In: (B, 5, 64, 512), 0 in every channel where nothing returned; any height, and any width divisible by 16.
-    Out: logits (B, 4, 64, 512).
+    In: (B, 5, 64, 512) float32; any height, and any width divisible by 16. Pixels without a return are 0 in every
+    channel.
+    Out: logits (B, 4, 64, 512) float32.
     """
 
     def __init__(self, *, n_channels: int = 5, n_classes: int = 4, dropout: float = 0.25) -> None:

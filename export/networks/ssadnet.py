@@ -12,7 +12,7 @@ What the paper leaves open, and the choices made here:
   limited to ELU's range. Averaging comes last, as in network-in-network.
 * The number of boxes for each pass is not stated: ``n_slots``.
 * ``batch_norm`` adds batch norm after every convolution of the segmentation branch (not in the paper): without it, the
-  network did not separate the classes after 240 steps; with it, it does. It is folded into the convolutions on export.
+  network did not separate the classes after 240 steps; with it, it did. It is folded into the convolutions on export.
 * Head "dense" replaces the regressor (not in the paper): one prediction every four cells, so that boxes are predicted
   where they are, in any number.
 """
@@ -64,10 +64,22 @@ def receptive_fields(dilations: tuple[tuple[int, int], ...] = CONTEXT_DILATIONS)
 def max_pool_with_mask(x: Tensor) -> tuple[Tensor, Tensor]:
     """2x2 max-pooling with stride 2, and the positions of the maxima.
 
-    Returns the pooled map (B, C, H/2, W/2) and a bool map (B, C, H, W) that is true at exactly one pixel of each
-    window: its maximum, and the first in reading order of equal ones, like the indices of `torch.nn.MaxPool2d`. Empty
-    cells make ties common. (`torch.nn.MaxUnpool2d` exports as a scatter, which few runtimes do well; pooling, comparing
-    and multiplying run anywhere.)
+    Parameters
+    ----------
+    x : (B, C, H, W) float
+        H and W even.
+
+    Returns
+    -------
+    pooled : (B, C, H/2, W/2) float
+    mask : (B, C, H, W) bool
+        True at exactly one pixel of each window: its maximum. If several are equal, it is the first in reading order,
+        like the indices of `torch.nn.MaxPool2d`. Ties are common, because empty cells are equal.
+
+    Notes
+    -----
+    `torch.nn.MaxUnpool2d` exports as a scatter, which few engines run fast. Pooling, comparing and multiplying run
+    everywhere.
     """
     pooled = F.max_pool2d(x, 2)
     with torch.no_grad():
@@ -87,10 +99,12 @@ def _double(x: Tensor) -> Tensor:
 
 
 def conv_elu(c_in: int, c_out: int) -> nn.Sequential:
+    """A 3x3 convolution that keeps the resolution, and ELU."""
     return nn.Sequential(nn.Conv2d(c_in, c_out, 3, padding=1), nn.ELU())
 
 
 def conv_bn_elu(c_in: int, c_out: int) -> nn.Sequential:
+    """A 3x3 convolution that keeps the resolution, batch norm and ELU."""
     return nn.Sequential(nn.Conv2d(c_in, c_out, 3, padding=1, bias=False), nn.BatchNorm2d(c_out), nn.ELU())
 
 
@@ -142,7 +156,10 @@ class SegmentationBranch(nn.Module):
 
 
 class FeatureBlock(nn.Module):
-    """F.E. block: twice (3x3, batch norm, ELU), 2x2 max-pooling (Figure 6a); ``extra``: a 3x3 after it."""
+    """F.E. block: two 3x3 convolutions with batch norm and ELU, then 2x2 max-pooling (Figure 6a).
+
+    ``extra`` adds a third convolution after the pooling.
+    """
 
     def __init__(self, c_in: int, c_out: int, extra: bool) -> None:
         super().__init__()
@@ -212,7 +229,7 @@ class DenseHead(nn.Module):
         )
         self.coarse = nn.Sequential(
             FeatureBlock(32, 64, extra=True),  # -> (B, 64, 50, 25)
-            # Not pooled again, though trucks need a larger receptive field: 25 columns are odd.
+            # No further pooling, although trucks need a larger receptive field: 25 columns cannot be halved.
             conv_bn_elu(64, 64),
             conv_bn_elu(64, 64),
         )
@@ -226,12 +243,12 @@ class DenseHead(nn.Module):
 
 
 class SSADNet(nn.Module):
-    """Labels every cell of a top view and boxes the vehicles in it.
+    """Labels every cell of a top view and detects the vehicles in it.
 
     Parameters
     ----------
     n_channels, n_classes : int
-        Of the input and of the segmentation map.
+        Channels of the input; classes of the segmentation map.
     head : {"slots", "dense"}
         The paper's regressor, or one prediction every four cells.
     n_slots : int
@@ -241,12 +258,17 @@ class SSADNet(nn.Module):
     dropout : float
         Probability of the spatial dropout in the context module and of the dropout in the B.B.R. blocks.
     batch_norm : bool
-        In the segmentation branch too.
+        Use batch norm in the segmentation branch too.
+
+    Raises
+    ------
+    ValueError
+        The head is unknown.
 
     Notes
     -----
-    In: (B, 3, 400, 200); any height and width divisible by 8 will do ("slots": at least 32).
-    Out: segmentation logits (B, 5, 400, 200), and boxes: (B, n_slots, 4) or (B, 9, 100, 50).
+    In: (B, 3, 400, 200) float32; any height and width divisible by 8 (head "slots": at least 32).
+    Out: segmentation logits (B, 5, 400, 200), and boxes (B, n_slots, 4) or (B, 9, 100, 50), float32.
     """
 
     def __init__(

@@ -1,0 +1,53 @@
+"""What the tests of the command line share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from edgeperc import cli
+from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+
+POINTSEG = ModelCard(
+    name="pointseg",
+    version="1.2.3",
+    view=RangeImageGeometry((2.0, 0.0, -10.0), width=8),
+    input=InputSpec("range_image", ("x", "y", "z"), (0.0,) * 3, (1.0,) * 3),
+    outputs=(OutputSpec("logits", "class_logits"),),
+    classes=("background", "car", "pedestrian", "cyclist"),
+    training={
+        "data": "streets",
+        "licence": "CC0",
+        "frames": list(range(40)),
+        "drives": ["a", "b"],
+        "seen": dict.fromkeys("abcdefghijklmnopqrstuvwxyz", 0),
+    },
+    metrics={"real": {"n_frames": 21, "points": {"all": {"car": {"iou": 0.65123, "n_objects": 3}}}}},
+    parity={"max_abs_diff": 1.5e-5},
+    precisions={"int8": {"label_agreement": 0.99953, "loss": 0.1}},
+)
+
+
+SSADNET = ModelCard(
+    name="ssadnet",
+    version="1.0.0",
+    view=TopViewGeometry(),
+    input=InputSpec("top_view", ("height",), (0.0,), (1.0,)),
+    outputs=(OutputSpec("map", "class_probabilities"), OutputSpec("boxes", "box_dense")),
+    classes=("background", "drivable", "car", "van", "truck"),
+    box_classes=("car", "van"),
+)
+
+
+def write_scan(path: Path, n: int = 40, first_remission: float = 0.0) -> Path:
+    points = np.random.default_rng(n).uniform(-20.0, 20.0, (n, 4)).astype(np.float32)
+    points[:, 3] = 0.5
+    points[:1, 3] = first_remission
+    path.parent.mkdir(parents=True, exist_ok=True)
+    points.tofile(path)
+    return path
+
+
+def run(*arguments: object) -> int:
+    return cli.main([str(a) for a in arguments])

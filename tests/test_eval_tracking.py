@@ -1,0 +1,249 @@
+"""Evaluation of tracking on KITTI's sequences, and animated tracks."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from edgeperc import TrackingError, cli
+from edgeperc.evaluation.datasets import scan_hash
+from edgeperc.evaluation.tracking import evaluate_kitti, read_sequence, sequence_names, sequence_scans, track_sequence
+from edgeperc.sensor import get_sensor
+from edgeperc_bench.peers.tracking import every_second_beam
+
+# --- KITTI -----------------------------------------------------------------------------------------------------------
+
+CALIBRATION = """P2: 700.0 0.0 600.0 0.0 0.0 700.0 180.0 0.0 0.0 0.0 1.0 0.0
+R0_rect: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0
+Tr_velo_to_cam: 0.0 -1.0 0.0 0.0 0.0 0.0 -1.0 0.0 1.0 0.0 0.0 0.0
+"""
+
+
+@pytest.fixture
+def kitti(tmp_path: Path) -> Path:
+    """A sequence of a car that drives ahead, a van beside it, and a pedestrian whom nobody labeled."""
+    for folder in ("calib", "label_02", *(f"detections/pointrcnn_{of}" for of in ("Car", "Pedestrian", "Cyclist"))):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "calib/0000.txt").write_text(CALIBRATION)
+    labels, cars, pedestrians = [], [], []
+    for k in range(20):
+        z = 15.0 + 0.5 * k
+        labels += [
+            f"{k} 1 Car 0 0 0.0 100 100 300 200 1.5 1.8 4.2 0.0 1.7 {z} -1.57",
+            f"{k} 2 Van 0 0 0.0 100 100 300 200 2.0 1.9 5.0 6.0 1.7 {z} -1.57",
+            f"{k} -1 DontCare -1 -1 -10 0 100 200 300 -1000 -1000 -1000 -1000 -1000 -1000 -1000",
+        ]
+        cars.append(f"{k},2,100,100,300,200,5.0,1.5,1.8,4.2,0.0,1.7,{z},-1.57,0.0")
+        cars.append(f"{k},2,100,100,300,200,4.0,2.0,1.9,5.0,6.0,1.7,{z},-1.57,0.0")
+        pedestrians.append(f"{k},1,100,100,300,200,3.0,1.7,0.6,0.8,-10.0,1.7,14.0,0.0,0.0")
+    (tmp_path / "label_02/0000.txt").write_text("\n".join(labels) + "\n")
+    (tmp_path / "detections/pointrcnn_Car/0000.txt").write_text("\n".join(cars))
+    (tmp_path / "detections/pointrcnn_Pedestrian/0000.txt").write_text("\n".join(pedestrians))
+    (tmp_path / "detections/pointrcnn_Cyclist/0000.txt").write_text("")
+    return tmp_path
+
+
+def test_kitti_sequences_are_read_into_the_sensors_frame(kitti: Path) -> None:
+    sequence = read_sequence(kitti, "0000")
+    assert len(sequence.detections) == 20
+    first = sequence.detections[0][0]
+    assert first.center == pytest.approx((15.0, 0.0, -0.95))
+    assert first.size == (4.2, 1.8, 1.5)
+    assert first.yaw == pytest.approx(0.0, abs=1e-3)
+    assert first.score == pytest.approx(1.0 / (1.0 + math.exp(-5.0)))
+    truth = sequence.truth["car"][0]
+    assert truth.ignored.tolist() == [False, True]
+    np.testing.assert_allclose(truth.boxes[0, :3], first.center)
+    assert len(sequence.truth["pedestrian"][0].ids) == 0
+
+
+def test_kitti_is_evaluated_by_its_rules(kitti: Path) -> None:
+    seen = []
+    figures = evaluate_kitti(kitti, on_sequence=lambda done, total: seen.append((done, total)))
+    car, pedestrian = figures["classes"]["car"], figures["classes"]["pedestrian"]
+    assert (car["best"]["n_truth"], car["best"]["n_false"], car["best"]["n_switches"]) == (20, 0, 0)
+    assert car["best"]["mota"] == 1.0
+    assert car["hota"]["assa"] > 0.9
+    assert pedestrian["best"]["n_false"] == 0  # it stands where nothing was labeled
+    assert (seen, figures["sequences"]) == ([(1, 1)], ["0000"])
+
+
+def test_kitti_errors(kitti: Path, tmp_path: Path) -> None:
+    with pytest.raises(TrackingError, match="no label_02"):
+        evaluate_kitti(tmp_path / "elsewhere")
+    (kitti / "detections/pointrcnn_Car/0000.txt").write_text("0,2,100\n")
+    with pytest.raises(TrackingError, match="15 comma-separated"):
+        read_sequence(kitti, "0000")
+    (kitti / "label_02/0000.txt").write_text("0 1 Car\n")
+    with pytest.raises(TrackingError, match="17 columns"):
+        read_sequence(kitti, "0000")
+
+
+def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["eval-tracking", str(kitti), "--json", str(kitti / "out/figures.json")]
+    assert cli.main(arguments) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("1 sequence, given detections, 3-D IoU 0.25;")
+    words = [line.split() for line in lines]
+    assert ["car", "100.0"] in [line[:1] + line[4:5] for line in words if len(line) > 8]
+    assert any(line[:7] == ["sAMOTA", "AMOTA", "AMOTP", "MOTA", "MOTP", "HOTA", "DetA"] for line in words)
+    figures = json.loads((kitti / "out/figures.json").read_text())
+    assert figures["classes"]["cyclist"]["best"]["mota"] is None
+    assert figures["command"].startswith("edgeperc eval-tracking")
+    assert cli.main(["eval-tracking", str(kitti / "calib")]) == 2
+    assert "no label_02" in capsys.readouterr().err
+
+
+def test_a_models_boxes_are_evaluated(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What run --json prints takes the place of the detections, which need not be there."""
+    detections = read_sequence(kitti, "0000").detections
+    lines = [{"scan": "x", "boxes": [replace(one, label="van").to_dict() for one in of]} for of in detections]
+    for of in ("Car", "Pedestrian", "Cyclist"):
+        (kitti / f"detections/pointrcnn_{of}/0000.txt").unlink()
+    boxes = kitti / "boxes.jsonl"
+    boxes.write_text("\n".join(map(json.dumps, lines)))
+    arguments = [
+        "eval-tracking",
+        str(kitti),
+        "--sequences",
+        "0000",
+        "--boxes",
+        str(boxes),
+        "--classes",
+        "vehicle",
+        "car",
+    ]
+    assert cli.main([*arguments, "--json", str(kitti / "figures.json")]) == 0
+    figures = json.loads((kitti / "figures.json").read_text())["classes"]
+    assert figures["vehicle"]["best"]["mota"] > 0.9  # the car and the van
+    assert figures["vehicle"]["best"]["n_truth"] == 40
+    assert figures["car"]["best"]["n_missed"] == 20  # all were labeled as vans
+    boxes.write_text("\n".join(map(json.dumps, lines[:-1])))
+    assert cli.main(arguments) == 2
+    assert "19 frames for 20" in capsys.readouterr().err
+    boxes.write_text('{"scan": "x"}')
+    assert cli.main(arguments) == 2
+    assert "holds no boxes" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        cli.main([*arguments[:2], "--boxes", str(boxes)])
+
+
+@pytest.fixture
+def drive_root(kitti: Path, tmp_path: Path) -> Path:
+    """The same sequence as an object set with track ids: a label and a scan a frame, of two drives."""
+    root = tmp_path / "objects"
+    for folder in ("label_2", "track_id", "calib", "velodyne"):
+        (root / "training" / folder).mkdir(parents=True)
+    by_frame: dict[int, list[list[str]]] = {}
+    for line in (kitti / "label_02/0000.txt").read_text().splitlines():
+        words = line.split()
+        by_frame.setdefault(int(words[0]), []).append(words)
+    rows = ["name,drive"]
+    for k, labels in by_frame.items():
+        name = f"{100 + k:06}"
+        rows.append(f"{name},my_drive")
+        (root / f"training/label_2/{name}.txt").write_text("".join(" ".join(words[2:]) + "\n" for words in labels))
+        (root / f"training/track_id/{name}.txt").write_text("".join(words[1] + "\n" for words in labels))
+        (root / f"training/calib/{name}.txt").write_text(CALIBRATION)
+        (root / f"training/velodyne/{name}.bin").write_bytes(np.full((3, 4), 0.5 + k, np.float32).tobytes())
+    (root / "frames.csv").write_text("\n".join([*rows, "000000,unlabeled_drive"]) + "\n")
+    return root
+
+
+def test_an_object_set_with_track_ids_is_the_same_sequence(kitti: Path, drive_root: Path) -> None:
+    assert sequence_names(drive_root) == ["my_drive"]
+    scans = sequence_scans(drive_root, "my_drive")
+    assert [path.stem for path in scans.values()] == [f"{100 + k:06}" for k in range(20)]
+    given = read_sequence(kitti, "0000")
+    same = read_sequence(drive_root, "my_drive", boxes=given.detections)
+    for of in ("car", "pedestrian"):
+        for a, b in zip(given.truth[of], same.truth[of], strict=True):
+            np.testing.assert_array_equal(a.ids, b.ids)
+            np.testing.assert_array_equal(a.boxes, b.boxes)
+            np.testing.assert_array_equal(a.ignored, b.ignored)
+    (drive_root / "training/track_id/000103.txt").write_text("1\n")
+    with pytest.raises(TrackingError, match="3 labels, and 1 track ids"):
+        read_sequence(drive_root, "my_drive", boxes=given.detections)
+
+
+def test_a_drive_is_perceived_and_tracked(
+    kitti: Path, drive_root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From scans to the table in one command; a scan that a model was trained on is refused."""
+    found = read_sequence(kitti, "0000").detections
+    card = SimpleNamespace(name="seer", version="1.0", training={})
+
+    def perceive(points: np.ndarray) -> SimpleNamespace:
+        return SimpleNamespace(boxes=found[int(points[0, 0])])
+
+    perceive.cards = (card,)
+    monkeypatch.setattr("edgeperc.cli.eval_tracking.make_perceiver", lambda *_, **__: perceive)
+    arguments = ["eval-tracking", str(drive_root), "--classes", "car", "--json", str(drive_root / "f.json")]
+    assert cli.main(arguments) == 0
+    assert "1 sequence, boxes of seer 1.0" in capsys.readouterr().out
+    best = json.loads((drive_root / "f.json").read_text())["classes"]["car"]["best"]
+    assert (best["n_truth"], best["n_missed"], best["n_false"]) == (20, 0, 0)
+
+    # Beside KITTI's own sequences, --model takes the place of the detections that are there.
+    assert cli.main(["eval-tracking", str(kitti), "--model", "seer"]) == 2
+    assert "no scans of 0000" in capsys.readouterr().err
+    (kitti / "velodyne/0000").mkdir(parents=True)
+    for k, path in sequence_scans(drive_root, "my_drive").items():
+        (kitti / f"velodyne/0000/{k:06}.bin").write_bytes(path.read_bytes())
+    (kitti / "velodyne/0000/000003.bin").unlink()  # as in KITTI's sequence 0001
+    assert cli.main(["eval-tracking", str(kitti), "--model", "seer", "--classes", "car"]) == 0
+
+    card.training = {"frames": {"x": scan_hash(np.full((3, 4), 4.5, np.float32))}}
+    assert cli.main(arguments) == 2
+    assert "seer 1.0 was trained on scan 000104" in capsys.readouterr().err
+
+
+def test_a_coarser_sensors_drive_has_every_second_beam(drive_root: Path, tmp_path: Path) -> None:
+    turn = np.radians(np.arange(0.5, 360.0, 30.0))
+    beams = [np.column_stack([9.0 * np.cos(turn), 9.0 * np.sin(turn), 0 * turn - k, 0 * turn + 0.5]) for k in range(5)]
+    for path in sequence_scans(drive_root, "my_drive").values():
+        np.concatenate(beams).astype(np.float32).tofile(path)
+    every_second_beam(drive_root, tmp_path / "coarse")
+    scans = sequence_scans(tmp_path / "coarse", "my_drive")
+    assert len(scans) == 20
+    points = np.fromfile(scans[7], np.float32).reshape(-1, 4)
+    assert points[:, 2].tolist() == [0.0] * 12 + [-2.0] * 12 + [-4.0] * 12
+    assert (points[:, 3] == 63.75).all()
+    sensor = get_sensor(tmp_path / "coarse/sensor.json")
+    assert (len(sensor.elevations_deg), sensor.remission_range) == (32, (0.0, 255.0))
+
+
+def test_real_sequences_are_tracked_well(data_root) -> None:
+    """Sequence 0004 with PointRCNN's detections; the figures of the whole set are in the documents."""
+    figures = evaluate_kitti(data_root("tracking"), sequences=["0004"])["classes"]["car"]
+    assert figures["best"]["mota"] > 0.85
+    assert figures["best"]["n_switches"] == 0
+    assert figures["hota"]["hota"] > 0.6
+
+
+# --- pictures and the command line -----------------------------------------------------------------------------------
+
+
+def test_tracks_are_animated(kitti: Path, tmp_path: Path) -> None:
+    image = pytest.importorskip("PIL.Image")
+    from edgeperc.view.tracks import draw_tracks
+
+    tracks, _ = track_sequence(read_sequence(kitti, "0000"))
+    content = draw_tracks(tracks, tmp_path / "tracks.gif", title="a drive")
+    assert (tmp_path / "tracks.gif").read_bytes() == content
+    with image.open(tmp_path / "tracks.gif") as animation:
+        assert animation.n_frames == 20
+        first = np.asarray(animation.convert("RGB")).copy()
+        animation.seek(19)
+        assert (np.asarray(animation.convert("RGB")) != first).any()
+        assert animation.info["duration"] == 1000
+    for few in ([], tracks[:1]):
+        with pytest.raises(TrackingError, match="two or more"):
+            draw_tracks(few, tmp_path / "none.gif")
+    assert not (tmp_path / "none.gif").exists()
