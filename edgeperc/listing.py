@@ -1,4 +1,4 @@
-"""What there is to choose from: models, sensors and execution providers, as small records for printing."""
+"""Lists of the available models, sensors and execution providers, as small records."""
 
 from __future__ import annotations
 
@@ -35,19 +35,20 @@ class ModelInfo:
     Attributes
     ----------
     name : str
-        For ``Perceiver(models=...)``.
+        Name for ``Perceiver(models=...)``.
     version : str
     purpose : str
-        What it finds, e.g. ``"drivable area and boxes of car, van, truck"``.
+        What it detects, e.g. ``"drivable area and boxes of car, van, truck"``.
     default : bool
-        Whether it is one of the pair that ``models=None`` takes.
+        Whether it is one of the pair that ``models=None`` selects.
     path : Path
-        The file of its first variant, which has fp32 weights where there is such a variant.
+        File of its first variant: fp32, if there is an fp32 variant.
     variants : mapping of str to float
-        Size of the file [MB] by precision of the weights; ``"NAME:PRECISION"`` asks for one of them.
+        Size of the file [MB] by precision of the weights. ``"NAME:PRECISION"`` selects a variant.
     size_mb : float
         Size of ``path`` [MB].
     licence : str
+        Licence of the weights.
     """
 
     name: str
@@ -67,19 +68,19 @@ class SensorInfo:
     Attributes
     ----------
     name : str
-        For ``Perceiver(sensor=...)``.
+        Name for ``Perceiver(sensor=...)``.
     beams, columns : int
         Beams, and azimuth steps in one turn.
     field_of_view_deg : tuple of 2 float
         Elevation of the lowest and the highest beam [deg].
     remission_range : tuple of 2 float
-        Raw remission that means 0 and 1.
+        Raw remissions that are scaled to 0 and 1.
     range_m : tuple of 2 float
         Nearest and farthest return [m].
     mount_height_m : float
-        Height above the road [m].
+        Height of the sensor above the road [m].
     rendered_as : str or None
-        The sensor to whose remission its own is mapped; None where it is only scaled.
+        Sensor whose remission scale the remission is mapped to; None if it is only scaled to 0..1.
     """
 
     name: str
@@ -99,11 +100,11 @@ class ProviderInfo:
     Attributes
     ----------
     name : str
-        For ``Perceiver(provider=...)``.
+        Name for ``Perceiver(provider=...)``.
     available : bool
-        Whether the installed onnxruntime has it; False for all without onnxruntime.
+        Whether the installed onnxruntime offers it; False without onnxruntime.
     installed_by : str
-        What installs it.
+        How to install it.
     """
 
     name: str
@@ -112,7 +113,7 @@ class ProviderInfo:
 
 
 def models() -> tuple[ModelInfo, ...]:
-    """The installed models, by name; reads the cards alone, without onnxruntime.
+    """List the installed models, by name. Reads their cards only, without onnxruntime.
 
     Raises
     ------
@@ -142,7 +143,7 @@ def models() -> tuple[ModelInfo, ...]:
 
 
 def purpose(card: ModelCard) -> str:
-    """What a model finds, by its view and its classes."""
+    """Describe what a model detects, from its view and its classes."""
     if card.view.kind == "range_image":
         return f"a class for every point ({', '.join(card.classes[1:])})"
     found = ["drivable area"] if "drivable" in card.classes else []
@@ -151,7 +152,7 @@ def purpose(card: ModelCard) -> str:
 
 
 def sensors() -> tuple[SensorInfo, ...]:
-    """The built-in sensor profiles, by name; `edgeperc.sensor.get_sensor` gives the profile itself."""
+    """List the built-in sensor profiles, by name; `edgeperc.sensor.get_sensor` returns a profile."""
     return tuple(
         SensorInfo(
             name=profile.name,
@@ -168,12 +169,12 @@ def sensors() -> tuple[SensorInfo, ...]:
 
 
 def providers() -> tuple[ProviderInfo, ...]:
-    """The execution providers that edgeperc knows, and which of them are available here.
+    """List the execution providers that edgeperc supports, and which of them are available here.
 
     Raises
     ------
     ProviderError
-        The plugin of a provider is installed but does not load.
+        The plugin of a provider is installed but cannot be loaded.
     """
     try:
         present = available_providers()

@@ -1,4 +1,4 @@
-"""Live sources: perceive the newest scan, drop older ones, never queue."""
+"""Live sources: perceive the newest scan and drop older ones, without a queue."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["Answer", "Health", "Stream", "stream"]
 
 Health = Literal["OK", "LATE", "STALE"]
 
-# Time that `Stream.close` waits for a source that is reading.
+# Longest time that `Stream.close` waits for the reading thread.
 _PATIENCE_S = 1.0
 
 
@@ -31,20 +31,20 @@ class Answer:
     Attributes
     ----------
     points : array_like
-        The scan as given; ``perception.points.labels`` holds a label for each of its points.
+        The scan as the source supplied it; ``perception.points.labels`` holds a label for each of its points.
     perception : Perception
     tracks : object
-        What the tracker returned; None without a tracker.
+        Result of the tracker; None without a tracker.
     stamp_s : float
-        The time given with the scan [s]; without one, that of its arrival on this computer's monotonic clock.
+        Time stamp from the source [s]; without one, the arrival time on this computer's monotonic clock.
     age_s : float
         Time from the arrival of the scan until the answer was ready [s].
     health : {"OK", "LATE", "STALE"}
-        By ``age_s``, see `Stream`.
+        From ``age_s``, see `Stream`.
     n_scans : int
-        Scans that had arrived when this one was taken.
+        Number of scans that had arrived when this one was taken.
     n_dropped : int
-        Scans of these that were dropped because a newer one had arrived.
+        Number of them that were dropped because a newer scan had arrived.
     """
 
     points: Any
@@ -67,31 +67,36 @@ def stream(
     stale_after_s: float | None = None,
     topic: str | None = None,
 ) -> Stream:
-    """Perceive a live source, always its newest scan; reading begins at once.
+    """Perceive the newest scan of a live source, repeatedly. Reading begins immediately.
 
     Parameters
     ----------
     source : iterable, str or path
-        Any iterable of scans, each as points or as a tuple (stamp_s, points). A thread reads it as fast as it gives;
-        scans must not be changed afterwards. Or a scan, a folder or a capture (`edgeperc.read_scans`), replayed in real
-        time: by its stamps or, without stamps, at ``rate_hz``.
+        Either an iterable of scans, each as points or as a tuple (stamp_s, points). A thread reads it as fast as
+        possible; the source must not change a scan afterwards. Or the path of a scan, a folder or a capture
+        (`edgeperc.read_scans`), replayed in real time: by its stamps or, without stamps, at ``rate_hz``.
     perceiver : callable
         ``perceiver(points, stamp_s=stamp_s) -> Perception``, such as a `Perceiver`.
     tracker : callable, optional
         ``tracker(perception) -> tracks``.
     rate_hz : float
-        Scans a second of the sensor.
+        Scans per second of the sensor [Hz].
     late_after_s, stale_after_s : float, optional
-        Ages above which an answer is late or stale; by default two and five periods of the sensor.
+        Ages above which an answer is late or stale [s]; by default two and five periods of the sensor.
     topic : str, optional
         As in `edgeperc.read_scans`.
+
+    Returns
+    -------
+    Stream
+        An iterator of `Answer`; use it in a ``with`` block.
 
     Raises
     ------
     PointsError
-        The source is neither iterable nor a path, or nothing is at the path.
+        The source is neither iterable nor a path, or the path does not exist.
     OptionError
-        The rate is not above 0, or not 0 < late_after_s <= stale_after_s.
+        The rate is not above 0, or 0 < late_after_s <= stale_after_s does not hold.
 
     Examples
     --------
@@ -121,19 +126,21 @@ class Stream:
 
     Only the newest scan is kept. Perceiver and tracker run in the caller's thread when the next answer is requested.
     Their errors are raised there, and the next scan can still be requested. An error of the source is raised after the
-    answer to the last scan before it; then the stream is at its end.
+    answer to the last scan, and ends the stream.
 
     Health depends on age only: ``"OK"`` up to ``late_after_s``, ``"LATE"`` up to ``stale_after_s``, then ``"STALE"``.
-    An answer has the health it had when it was ready. The health of the stream is that of the newest answer now, so it
-    also shows that a source has stopped; any thread may read it while another waits for an answer.
+    The health of an answer refers to the moment when it was ready. The health of the stream refers to the present age
+    of the newest answer, so it also shows that a source has stopped. Any thread may read it while another waits for an
+    answer.
 
-    Reading stops when the ``with`` block is left, when `close` is called, and when the stream is deleted. A source that
-    blocks for ever cannot be interrupted; its thread holds neither perceiver nor results, ends with the next scan that
-    the source gives, and does not keep the process alive.
+    Reading stops at the end of the ``with`` block, at `close`, and when the stream is deleted. A source that blocks
+    forever cannot be interrupted. Its thread holds no reference to the perceiver or to results, ends at the next scan,
+    and does not keep the process alive.
 
     Attributes
     ----------
     late_after_s, stale_after_s : float
+        Ages above which an answer is late or stale [s].
     """
 
     def __init__(
@@ -178,7 +185,7 @@ class Stream:
         StopIteration
             The source is at its end, or the stream is closed.
         Exception
-            An error of the source, the perceiver or the tracker.
+            Any error of the source, the perceiver or the tracker.
         """
         taken = self._inbox.take(timeout_s)
         if taken is None:
@@ -207,16 +214,16 @@ class Stream:
 
     @property
     def n_scans(self) -> int:
-        """Scans that have arrived."""
+        """Number of scans that have arrived."""
         return self._inbox.n_scans
 
     @property
     def n_dropped(self) -> int:
-        """Scans dropped because a newer one had arrived."""
+        """Number of scans that were dropped because a newer scan had arrived."""
         return self._inbox.n_dropped
 
     def close(self) -> None:
-        """Stop reading, and wait for the thread unless its source blocks. Calls that wait raise StopIteration."""
+        """Stop reading. Wait up to 1 s for the reading thread. Waiting calls of `take` raise StopIteration."""
         self._inbox.stop()
         self._thread.join(_PATIENCE_S)
 
@@ -228,7 +235,7 @@ class Stream:
 
 
 class _Inbox:
-    """The newest scan, between the thread that reads and the one that answers."""
+    """Hands the newest scan from the reading thread to the caller's thread."""
 
     def __init__(self) -> None:
         self.stopped = threading.Event()
@@ -272,7 +279,7 @@ class _Inbox:
 
 
 def _read(scans: Iterator[Any], inbox: _Inbox) -> None:
-    """Run in the thread: put every scan into the inbox, then the end or the error."""
+    """Body of the reading thread: put every scan into the inbox, then the end or the error."""
     error: BaseException | None = None
     try:
         for scan in scans:
@@ -297,13 +304,13 @@ def _stamped(scan: Any) -> tuple[Any, float | None]:
 def _paced(
     scans: Iterator[tuple[float | None, Any]], rate_hz: float, stopped: threading.Event
 ) -> Iterator[tuple[float, Any]]:
-    """Recorded scans in real time: by their stamps or else at the sensor's rate. Late scans come at once."""
+    """Yield recorded scans in real time, by their stamps or at the sensor's rate. Late scans come immediately."""
     started_s = time.monotonic()
     first_s: float | None = None
     for k, (stamp_s, points) in enumerate(scans):
         moment_s = k / rate_hz if stamp_s is None else stamp_s
         if first_s is None:
-            # Reading the first scan may import libraries: the clock starts after it.
+            # The clock starts after the first scan, because reading it may import libraries.
             started_s, first_s = time.monotonic(), moment_s
         if stopped.wait(max(0.0, started_s + moment_s - first_s - time.monotonic())):
             return

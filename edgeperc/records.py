@@ -29,7 +29,7 @@ SCAN_KEYS = (
     "tracks",
     "fitness",
 )
-"""Keys of a record, in the order in which they are written; all are always there."""
+"""Keys of a record, in their written order; every record has all of them."""
 
 
 def scan_record(perception: Perception, tracks: Tracks | None = None) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def scan_record(perception: Perception, tracks: Tracks | None = None) -> dict[st
     Returns
     -------
     dict
-        The keys of `SCAN_KEYS`; None where no model of that kind took part.
+        With the keys of `SCAN_KEYS`; None for results of a kind of model that was not used.
     """
     record = perception.to_dict()
     record["road"] = _road_record(perception)
@@ -68,15 +68,17 @@ def read_boxes(path: Path | str) -> list[list[Box]]:
     Parameters
     ----------
     path : str or Path
+        A file of JSON lines.
 
     Returns
     -------
     list of list of Box
+        By scan, in the sensor frame.
 
     Raises
     ------
     TrackingError
-        A line is no such record.
+        A line is not such a record.
     OSError
         The file cannot be read.
     """

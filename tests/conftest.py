@@ -16,12 +16,18 @@ from typing import Any
 
 import numba
 import pytest
+from hypothesis import HealthCheck, settings
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 ARCHIVES = REPOSITORY.parent / "shared" / "data"
 
 
 CALLED = pytest.StashKey[set[str]]()
+
+
+# No test asserts a time, a busy computer's neither.
+settings.register_profile("edgeperc", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("edgeperc")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -1,8 +1,8 @@
 """A spinning-LiDAR simulator for the demo, the benchmark, tests and training.
 
-`drawn` makes random scenes and `layouts` scenes around real boxes, from the parts in `street` and `shapes`. `scene`
-turns a scene into a labeled scan with the ray-casting kernels of `raycast`. `samples` makes the scans of training and
-evaluation, labeled by boxes as KITTI's are.
+`drawn` makes random scenes, and `layouts` makes scenes around real boxes, from the parts in `street` and `shapes`.
+`scene` turns a scene into a labeled scan with the ray-casting kernels of `raycast`. `samples` makes the scans for
+training and evaluation, with point labels from boxes as in KITTI.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ ENVIRONMENTS = ("urban", "residential", "junction", "rural", "highway")
 
 
 def random_scene(seed: int, environment: str | None = None) -> Scene:
-    """A random street.
+    """Make a random street.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def _add_parked(street: Street, right: bool, left: bool, crossings: Sequence[flo
     for on, side in ((right, -1.0), (left, 1.0)):
         fill = rng.uniform(0.2, 0.95)
         edge = abs(float(street.strips[0, 6 if side > 0 else 5]))
-        shift = rng.uniform(-0.9, 0.1) if on else rng.uniform(0.3, 1.3)  # else: half on the pavement, now and then
+        shift = rng.uniform(-0.9, 0.1) if on else rng.uniform(0.3, 1.3)  # otherwise half on the pavement, for some cars
         if not on and (rng.random() > 0.25 or place in ("rural", "highway")):
             continue
         s = -70.0

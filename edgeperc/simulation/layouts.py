@@ -20,22 +20,23 @@ _ROW_GAP_M = 9.0  # between the centers of two parked cars
 
 
 def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float = 1.73) -> Scene:
-    """A street around a real layout of boxes.
+    """Make a street around a real layout of boxes.
 
     Parameters
     ----------
     boxes : sequence of Box
-        In a sensor frame whose origin is ``mount_height_m`` above the road. Boxes with other labels than car, van,
+        In a sensor frame with its origin ``mount_height_m`` above the road. Boxes with labels other than car, van,
         truck, pedestrian and cyclist become background obstacles.
     seed : int
-        Of everything else: the edges of the road, what stands beside it, what lies outside the labeled view.
+        Seed of everything else: road edges, roadside, and objects outside the labeled view.
     mount_height_m : float
+        Height of the sensor above the road [m].
 
     Returns
     -------
     Scene
-        Its first objects are the ``boxes`` of the five labels, in order. They stand on the scene's ground, so their z
-        differs slightly from that of the boxes.
+        Its first objects are the ``boxes`` of the five labels, in order. They stand on the ground of the scene, so z
+        differs slightly from the boxes.
     """
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 15485863))
     vehicles = [box for box in boxes if box.label in _VEHICLES]
@@ -110,7 +111,7 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
             share = 0.5 + 2.0 / away
             x, y = box.center[0] * share, box.center[1] * share
             street.take(x, y, away - 4.0, 1.0, math.atan2(box.center[1], box.center[0]))
-    # Nothing is labeled behind the sensor and far to its sides: mirror some of the labeled vehicles.
+    # Objects behind the sensor and far to its sides are not labeled, so mirror some of the labeled vehicles.
     for s, u, _, ahead in beside:
         if rng.random() < 0.7:
             x, y, yaw = street.on_strip(-s + float(rng.normal(0, 3.0)), u)
@@ -129,7 +130,7 @@ def _parking_rows(
     heading: float,
     curvature: float,
 ) -> tuple[float, float, list[Row]]:
-    """Edges of the road without an outermost row of parked vehicles, and bays for those rows.
+    """Find the road edges without the outermost rows of parked vehicles, and bays for those rows.
 
     A row counts as parked if it has at least two vehicles outside the sensor's lane, two of them close together.
     """
@@ -163,7 +164,7 @@ def _along(box: Box, heading: float, curvature: float) -> tuple[float, float]:
 
 
 def _road_direction(vehicles: Sequence[Box]) -> tuple[float, float]:
-    """Heading and curvature of the road, from the headings of the vehicles near the sensor's lane."""
+    """Estimate heading [rad] and curvature [1/m] of the road, from the vehicles near the sensor's lane."""
     leaning = []
     for box in vehicles:
         turn = wrapped(2.0 * box.yaw) / 2.0  # modulo pi

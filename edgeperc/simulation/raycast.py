@@ -91,7 +91,7 @@ def _mixed(value: np.uint64) -> np.uint64:
 
 @njit(cache=True, nogil=True)
 def _uniform(bits: np.uint64) -> float:
-    """In (0, 1)."""
+    """Convert random bits to a uniform number in (0, 1)."""
     return (float(bits >> np.uint64(11)) + 0.5) * (1.0 / 9007199254740992.0)
 
 
@@ -118,9 +118,10 @@ def _tile_at(tile: NDArray[np.float64], x: float, y: float, cell_m: float) -> fl
 def ground_at(
     strips: NDArray[np.float64], terrain: NDArray[np.float64], tile: NDArray[np.float64], x: float, y: float
 ) -> tuple[float, float, float, float, float]:
-    """The ground at x, y: height, distance outside the roads, outside the bays, u, s along the first road [m].
+    """Evaluate the ground at x, y [m], world frame.
 
-    Both distances are negative inside. u is the distance to the left of the first road's axis.
+    Returns height, distance outside the roads, distance outside the bays, and u and s in the first road's frame [m].
+    Both distances are negative inside. s is along the axis of the road, u to its left.
     """
     outside, outside_bays, u_first, s_first = 1e9, 1e9, 0.0, 0.0
     for k in range(strips.shape[0]):
@@ -134,7 +135,7 @@ def ground_at(
         elif k == 0:
             outside, u_first, s_first = d, u, s
         else:
-            # Smooth minimum: rounds the kerbs where roads meet.
+            # Smooth minimum, which rounds the kerbs where roads meet.
             blend = max(terrain[ROUNDING] - abs(outside - d), 0.0)
             outside = min(outside, d) - blend * blend / (4.0 * terrain[ROUNDING])
     z = terrain[SLOPE_X] * x + terrain[SLOPE_Y] * y
@@ -174,7 +175,7 @@ def fill_drivable(
     y: NDArray[np.float64],
     labels: NDArray[np.uint8],
 ) -> None:
-    """Write 1 into ``labels`` (rows, columns) if a road surface lies below the center of the cell, else 0."""
+    """Write 1 into ``labels`` (rows, columns) uint8 if a road surface is below the center of a cell, else 0."""
     T = T_world_sensor
     for i in range(x.shape[0]):
         for j in range(y.shape[0]):
@@ -224,15 +225,15 @@ def fill_placed(
 
 @njit(cache=True, nogil=True)
 def fill_bounds(primitives: NDArray[np.float64], bounds: NDArray[np.float64]) -> None:
-    """Bound every ray from the origin that can hit a primitive.
+    """Compute bounds of the rays from the origin that can hit each primitive.
 
     Parameters
     ----------
     primitives : (n, 20) float64
         In the sensor frame.
     bounds : (n, 5) float64, overwritten
-        First azimuth, width in azimuth [rad], lowest and highest tangent of the elevation, horizontal distance [m]; the
-        distance of a primitive that is not finite is infinite.
+        First azimuth, width in azimuth [rad], lowest and highest tangent of the elevation, horizontal distance [m].
+        Primitives that are not finite get an infinite distance.
     """
     corners = np.empty((8, 3))
     for k in range(primitives.shape[0]):
@@ -286,7 +287,7 @@ def fill_bounds(primitives: NDArray[np.float64], bounds: NDArray[np.float64]) ->
 
 @njit(cache=True, nogil=True)
 def _columns_of(bounds: NDArray[np.float64], k: int, n_columns: int) -> tuple[int, int]:
-    # One more column on either side, because azimuths jitter by a fraction of a step.
+    # One more column on each side, because azimuths jitter by a fraction of a step.
     step = 2.0 * math.pi / n_columns
     first = math.floor(bounds[k, 0] / step) - 1
     count = math.ceil(bounds[k, 1] / step) + 4
@@ -323,7 +324,7 @@ def fill_column_rows(
 
 @njit(cache=True, nogil=True)
 def _crossing(p: NDArray[np.float64], dx: float, dy: float, dz: float) -> tuple[float, float, int]:
-    """Ranges at which a ray from the origin enters and leaves a primitive, and the face; enter > leave if it misses."""
+    """Intersect a ray from the origin with a primitive: ranges of entry and exit [m], and face. entry > exit: miss."""
     ox = -(p[7] * p[4] + p[8] * p[5] + p[9] * p[6])
     oy = -(p[10] * p[4] + p[11] * p[5] + p[12] * p[6])
     oz = -(p[13] * p[4] + p[14] * p[5] + p[15] * p[6])
@@ -422,7 +423,7 @@ def _height_above(
     y: float,
     z: float,
 ) -> float:
-    """Height [m] above the ground of a point in the sensor frame."""
+    """Height above the ground [m] of a point in the sensor frame."""
     xw = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
     yw = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
     zw = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
@@ -453,25 +454,25 @@ def fill_cast(
     Parameters
     ----------
     primitives : (n, 20) float64
-        Sensor frame, nearest first.
+        In the sensor frame, nearest first.
     bounds, starts, rows
         From `fill_bounds`, `fill_column_counts`, `fill_column_rows`.
     elevations : (beams,) float64
-        Top to bottom [rad].
+        Elevation of each beam, top to bottom [rad].
     azimuths : (columns,) float64
-        [rad].
+        Azimuth of each column [rad].
     reach : float
-        Longest ray [m].
+        Length of the rays [m].
     key : uint64
-        Seed of leaves and fences.
+        Seed for leaves and fences.
     ranges, hits, exits, cosines : (beams, columns), overwritten
-        Range [m]; row of ``primitives``, -1 for the ground, -2 for nothing; range at which the ray leaves that
-        primitive; cosine of the angle of incidence.
+        Range [m]; row of ``primitives``, -1 for the ground, -2 for no hit; range at which the ray leaves the
+        primitive [m]; cosine of the angle of incidence.
     """
     n_beams, n_columns = elevations.shape[0], azimuths.shape[0]
     tangents = np.tan(elevations)
     T = T_world_sensor
-    # Radii of ground samples start well inside the ring of the lowest beam and grow by 3 %: at 30 m, a third of the
+    # Radii of ground samples start inside the ring of the lowest beam and grow by 3 %: at 30 m, by a third of the
     # distance between two rings.
     height = _height_above(strips, terrain, tile, T, 0.0, 0.0, 0.0)
     innermost = min(max(0.3, 0.4 * height / max(-tangents[n_beams - 1], 0.05)), 5.0)
@@ -490,7 +491,7 @@ def fill_cast(
             if not straight:
                 z -= _height_above(strips, terrain, tile, T, r * ca, r * sa, z) / T[2, 2]
             heights[i] = z
-        # A higher beam never meets the ground nearer than a lower one, so one pass over the radii serves all beams.
+        # Higher beams meet the ground no nearer than lower ones, so one pass over the radii is enough for all beams.
         i = 0
         for b in range(n_beams - 1, -1, -1):
             tan = tangents[b]
@@ -587,7 +588,7 @@ def _ground_remission(
 
 @njit(cache=True, nogil=True)
 def _in_ego_shadow(azimuth: float, elevation: float) -> bool:
-    # Measured on KITTI: directions without any return. The roof behind, its rear edges, its front, a mast to the right.
+    # Measured on KITTI, directions without returns: roof behind, its rear edges, its front, a mast to the right.
     a = azimuth - 2.0 * math.pi * math.floor((azimuth + math.pi) / (2.0 * math.pi))
     behind = math.pi - abs(a)
     if behind < 0.26:
@@ -628,7 +629,7 @@ def fill_points(
     points: NDArray[np.float32],
     objects: NDArray[np.int32],
 ) -> int:
-    """Turn hits into returns, beam by beam.
+    """Convert hits to returns, beam by beam.
 
     Parameters
     ----------
@@ -639,9 +640,9 @@ def fill_points(
     min_range, reach : float
         Shortest and longest range of a return [m].
     key : uint64
-        Seed of noise and drop-out.
+        Seed for noise and drop-out.
     noise, ego_shadow : bool
-        Whether there is noise and drop-out, and whether the own vehicle hides the directions measured on KITTI's car.
+        Whether to add noise and drop-out, and whether the ego vehicle hides the directions measured on KITTI's car.
     points : (beams * columns, 4) float32, first rows overwritten
     objects : (beams * columns,) int32, first rows overwritten
         Object of each point, -1 for none.
@@ -684,7 +685,7 @@ def fill_points(
                     T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
                     T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
                 )
-                # Measured: a road's remission is constant up to 20 m, 0.07 at 25..40 m, 0.00 beyond; returns get rarer.
+                # Measured: road remission is constant up to 20 m, 0.07 at 25..40 m, 0.00 beyond, with fewer returns.
                 value *= min(max((cosine - 0.04) / 0.034, 0.0), 1.0)
                 lost += min(max((0.045 - cosine) / 0.04, 0.0), 0.85)
             else:
@@ -696,7 +697,7 @@ def fill_points(
                     # Clear coat over a dark or light base; specular, so brightest along the normal.
                     value *= 0.5 + 0.5 * cosine
                     value += 0.5 * max((cosine - 0.97) / 0.03, 0.0) * (0.25 + value) - 0.11
-                    # Measured: a near car gives half of the returns that its surface would, beyond 45 m a fifth.
+                    # Measured: half of the rays on a near car return, a fifth beyond 45 m.
                     lost += 0.06 + p[3] * (1.0 - 0.7 * cosine) + min(max((t - 28.0) * 0.02, 0.0), 0.6)
                 elif material == GLASS:
                     lost += p[3]
@@ -708,7 +709,7 @@ def fill_points(
                 elif material == RETRO:
                     value *= 0.4 + 0.6 * cosine
                 elif material == FACADE:
-                    # Recessed windows on a grid; most of them reflect the ray away.
+                    # Recessed windows on a grid; most of them reflect rays away from the sensor.
                     qx, qy, qz = t * dx, t * dy, t * dz
                     wx = T[0, 0] * qx + T[0, 1] * qy + T[0, 2] * qz + T[0, 3]
                     wy = T[1, 0] * qx + T[1, 1] * qy + T[1, 2] * qz + T[1, 3]
@@ -729,7 +730,7 @@ def fill_points(
                 else:
                     value *= 0.55 + 0.45 * cosine
                 if material != RETRO:
-                    # Measured on facades: 0.43 near, 0.31 at 25..40 m, 0.22 beyond; leaves 0.36, 0.23, 0.11.
+                    # Measured: facades 0.43 nearby, 0.31 at 25..40 m, 0.22 beyond; leaves 0.36, 0.23, 0.11.
                     value *= min(1.0, max(1.0 - 0.022 * (t - 18.0), 0.35))
                     lost += min(max((t - 35.0) * 0.004, 0.0), 0.3)
                 else:
@@ -740,7 +741,7 @@ def fill_points(
                 t += range_offsets[b] + 0.01 * jitter * spread
                 spread = _normal(_mixed(np.uint64(ray ^ np.uint64(0xABCDEF))))
                 value += remission_offsets[b] * min(1.0, 0.2 + 4.0 * max(value, 0.0)) + 0.05 * jitter * spread
-                # Measured: hardly any value between 0 and 0.1, and 57 % of a car's returns at 0: a weak echo reads 0.
+                # Measured: few values between 0 and 0.1, and 57 % of a car's returns at 0: weak echoes read 0.
                 if value < 0.01 + 0.1 * luck or other > 0.965:
                     value = 0.0
             if not min_range <= t < reach:

@@ -1,4 +1,4 @@
-"""Simulated scans with labels, as evaluation and training use them."""
+"""Labeled simulated scans for evaluation and training."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ BOX_ABOVE_GROUND_M = 0.03
 def simulated_scan(
     seed: int, sensor: str | SensorProfile = "hdl-64e", boxes: Sequence[Box] | None = None
 ) -> SimulatedScan:
-    """One scan of a new scene. The sensor is a little off the middle of its lane, pitched and rolled.
+    """Simulate one scan of a new scene. The sensor is slightly pitched and rolled, beside the middle of its lane.
 
     Parameters
     ----------
     seed : int
-        Of the scene, the pose and the noise.
+        Seed of the scene, the pose and the noise.
     sensor : str or SensorProfile
     boxes : sequence of Box, optional
-        A real layout to build the scene around; by default the scene is random.
+        A real layout to build the scene around (`layouts.scene_from_boxes`); by default the scene is random.
     """
     rng = np.random.default_rng((seed, 1))
     if boxes is None:
@@ -48,9 +48,9 @@ def simulated_scan(
 
 
 def labels_by_boxes(scan: SimulatedScan) -> NDArray[np.uint8]:
-    """Point labels (n,) uint8 of a simulated scan by its boxes, as in KITTI: index into `POINT_CLASSES`.
+    """Label the points of a simulated scan by its boxes, as in KITTI: (n,) uint8, index into `POINT_CLASSES`.
 
-    Every point in the box of an object with returns gets the object's class, even the ground under it.
+    Every point in a box gets the class of the object, including ground points, if the object itself has returns.
     """
     labels = scan.labels.copy()
     for box, returns in zip(scan.boxes, scan.box_points, strict=True):
@@ -60,4 +60,4 @@ def labels_by_boxes(scan: SimulatedScan) -> NDArray[np.uint8]:
     return labels
 
 
-FIRST_SEED = 2 * 10**9  # of evaluated scenes; those of training start at 0, those that check exports at 10**9
+FIRST_SEED = 2 * 10**9  # seeds of evaluated scenes; training scenes start at 0, scenes that verify exports at 10**9

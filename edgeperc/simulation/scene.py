@@ -1,4 +1,4 @@
-"""Scenes and simulated scans; `simulate` casts a scan."""
+"""Scenes, and simulated scans of them."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ __all__ = [
 
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
 TOP_VIEW_CLASSES = ("background", "drivable", "car", "van", "truck")
-# Point class of an object: PointSeg's car holds every vehicle. KITTI also labels people who sit.
+# Point class of an object: PointSeg's car includes all vehicles. KITTI also labels sitting people.
 POINT_CLASS_OF = {"car": 1, "van": 1, "truck": 1, "pedestrian": 2, "person_sitting": 2, "cyclist": 3}
 
 
 @dataclass(frozen=True, slots=True)
 class SceneObject:
-    """An object with a box, standing or moving.
+    """A static or moving object with a box.
 
     Attributes
     ----------
@@ -59,9 +59,9 @@ class SceneObject:
     yaw : float
         Heading about +z from +x [rad].
     track_id : int
-        The same at all times of the scene.
+        Identity of the object at all times.
     speed_mps, yaw_rate_rps : float
-        Along the heading [m/s]; [rad/s].
+        Speed along the heading [m/s], turn rate [rad/s].
     """
 
     label: str
@@ -75,15 +75,16 @@ class SceneObject:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """The world at one moment.
+    """The simulated world at one time.
 
     Attributes
     ----------
     objects : tuple of SceneObject
     primitives : (n, 20) float64
-        Shapes; those of an object are in its frame (origin at the center of the footprint, on the ground).
+        Shapes; columns as in `raycast`. Shapes of an object are in its frame: origin at the center of the footprint, on
+        the ground.
     strips : (k, 10) float64
-        Road surfaces and parking bays; the first is the sensor's road.
+        Road surfaces and parking bays; columns as in `raycast`. The first is the sensor's road.
     terrain : (26,) float64
         Parameters of the ground, by the constants of `raycast`.
     tile : (256, 256) float64
@@ -97,7 +98,7 @@ class Scene:
     tile: NDArray[np.float64]
 
     def at(self, t_s: float) -> Scene:
-        """The scene ``t_s`` seconds later: objects move on the ground with constant speed and turn rate."""
+        """Move the objects by ``t_s`` [s] on the ground, with constant speed and turn rate; return the new scene."""
         moved = []
         for each in self.objects:
             turn = each.yaw_rate_rps * t_s
@@ -114,29 +115,30 @@ class Scene:
         return float(ground_at(self.strips, self.terrain, self.tile, float(x), float(y))[0])
 
     def on_road(self, x: float, y: float) -> bool:
-        """Whether x, y lies on a road surface, which excludes parking bays."""
+        """Whether x, y [m], world frame, is on a road surface; parking bays are not."""
         return bool(ground_at(self.strips, self.terrain, self.tile, float(x), float(y))[1] < 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedScan:
-    """One scan and its truth, in the sensor frame.
+    """One scan and its ground truth, in the sensor frame.
 
     Attributes
     ----------
     points : (n, 4) float32
-        x, y, z [m], remission 0..0.99 in steps of 0.01; beam by beam from the top, each counter-clockwise from ahead.
+        x, y, z [m], remission 0..0.99 in steps of 0.01. Beam by beam from the top, counter-clockwise from +x.
     labels : (n,) uint8
         Index into `POINT_CLASSES`.
     objects : (n,) int32
         Index into ``boxes``; -1 for the background.
     boxes : tuple of Box
-        All objects of the scene, visible or not.
+        All objects of the scene, including hidden ones.
     box_ids : tuple of int
         Track id of each box.
     box_points : tuple of int
-        Points on each box's object.
+        Number of points on each box's object.
     T_world_sensor : (4, 4) float64
+        Pose of the sensor.
     scene : Scene
     """
 
@@ -150,7 +152,7 @@ class SimulatedScan:
     scene: Scene
 
     def top_view_labels(self, geometry: TopViewGeometry | None = None) -> NDArray[np.uint8]:
-        """True class of each cell of a top view, visible or not.
+        """True class of each cell of a top view, including hidden cells.
 
         Parameters
         ----------
@@ -181,7 +183,7 @@ def sensor_pose(
     pitch: float = 0.0,
     roll: float = 0.0,
 ) -> NDArray[np.float64]:
-    """``T_world_sensor`` of a sensor at its mounting height above the ground at x, y.
+    """Make ``T_world_sensor`` for a sensor at its mounting height above the ground at x, y [m], world frame.
 
     Returns
     -------
@@ -217,15 +219,17 @@ def simulate(
     scene : Scene
     sensor : str or SensorProfile
     seed : int
-        Of noise, drop-out and leaves; the same seed gives the same bits.
+        Seed of noise, drop-out and leaves. The result is the same bit for bit for the same seed.
     T_world_sensor : (4, 4) array_like, optional
-        Default: level, along +x, ``mount_height_m`` above the ground at the origin. For tilts of a few degrees at most.
+        Pose of the sensor, tilted by a few degrees at most. Default: level, along +x, ``mount_height_m`` above the
+        ground at the origin.
     max_range_m : float
-        Longest range, limited by that of the sensor. KITTI's files end at 80 m.
+        Longest range; the sensor's range limits it too. KITTI's files end at 80 m.
     noise : bool
-        False: exact ranges and azimuths, no drop-out, no beam offsets.
+        False: exact ranges and azimuths, without drop-out and beam offsets.
     ego_shadow : bool
-        The own vehicle hides some directions of the lower beams, as on KITTI's car. Not if ``noise`` is False.
+        Whether the ego vehicle hides some directions of the lower beams, as on KITTI's car. Ignored if ``noise`` is
+        False.
 
     Returns
     -------
@@ -305,7 +309,7 @@ def simulate_sequence(
     ego_speed_mps: float = 0.0,
     seed: int = 0,
 ) -> Iterator[tuple[float, NDArray[np.float64], SimulatedScan]]:
-    """Simulate scans of a sensor that drives along the scene's first road, from the origin.
+    """Simulate scans of a sensor that moves along the scene's first road, from the origin.
 
     Yields
     ------
@@ -327,7 +331,7 @@ def simulate_sequence(
 
 
 def wrapped(angle: float) -> float:
-    """An angle in -pi..pi."""
+    """Wrap an angle [rad] to -pi..pi."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 

@@ -28,7 +28,7 @@ def block(
     taper: Vector = (0.0, 0.0, 0.0),
     kind: int = BOX,
 ) -> Row:
-    """An upright primitive; ``taper`` is how far front, rear and sides lean in at the top, in half sizes."""
+    """Make an upright primitive. ``taper``: how far front, rear and sides lean in at the top, in half sizes."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     a, b, c = (2.0 / max(edge, 1e-3) for edge in size)
     return (
@@ -38,12 +38,12 @@ def block(
 
 
 def blob(material: int, remission: float, center: Vector, size: Vector, density: float = 1.0) -> Row:
-    """An ellipsoid."""
+    """Make an ellipsoid."""
     return block(material, remission, center, size, density=density, kind=ELLIPSOID)
 
 
 def rod(remission: float, start: Vector, end: Vector, radius: float, material: int = MATTE) -> Row:
-    """A cylinder between two points."""
+    """Make a cylinder between two points."""
     along = [e - s for s, e in zip(start, end, strict=True)]
     length = math.sqrt(sum(v * v for v in along))
     ax, ay, az = (v / length for v in along)
@@ -80,7 +80,7 @@ def _lights(length: float, width: float, z: float, rng: np.random.Generator) -> 
 
 
 def _paint(rng: np.random.Generator, light_share: float) -> tuple[float, float]:
-    """Remission and drop-out of a coat of paint."""
+    """Draw remission and drop-out of car paint."""
     # Measured: mean remission of cars 0.01, 0.06, 0.11, 0.18, 0.27 (5, 25, 50, 75, 95 %), of vans 0.24 in the middle.
     if rng.random() < light_share:
         return float(rng.uniform(0.35, 0.6)), float(rng.uniform(0.0, 0.2))
@@ -88,7 +88,7 @@ def _paint(rng: np.random.Generator, light_share: float) -> tuple[float, float]:
 
 
 def _cloth(rng: np.random.Generator) -> float:
-    # Measured: mean remission of people is 0.29..0.47, and 0 for one in twelve; most cloth is bright in near infrared.
+    # Measured: mean remission of people is 0.29..0.47, and 0 for one in twelve. Most cloth is bright in near infrared.
     return float(rng.uniform(0.0, 0.15) if rng.random() < 0.06 else rng.uniform(0.3, 0.6))
 
 
@@ -99,7 +99,7 @@ def _car(size: Vector, rng: np.random.Generator) -> list[Row]:
     belt = height * rng.uniform(0.57, 0.64)
     hood = belt * rng.uniform(0.84, 0.95)
     style = rng.integers(0, 4)  # saloon, hatchback, estate, van-like
-    nose = length * (rng.uniform(0.18, 0.25) if style < 3 else rng.uniform(0.28, 0.36))  # where the screen starts
+    nose = length * (rng.uniform(0.18, 0.25) if style < 3 else rng.uniform(0.28, 0.36))  # where the windscreen starts
     tail = length * (-0.36 if style == 0 else -0.485)
     sides = rng.uniform(0.14, 0.24)
     screen = rng.uniform(0.45, 0.75) if style < 3 else 0.55
@@ -234,7 +234,7 @@ def _pedestrian(size: Vector, rng: np.random.Generator) -> list[Row]:
 
 
 def bicycle(length: float, half: float, rng: np.random.Generator, y: float = 0.0) -> list[Row]:
-    """Primitives of a bicycle: two wheels, a frame, a handlebar."""
+    """Make a bicycle: two wheels, a frame, a handlebar."""
     r = min(0.35, 0.2 * length)
     axle = length / 2 - r
 

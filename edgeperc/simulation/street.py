@@ -62,7 +62,7 @@ __all__ = [
 
 
 class Street:
-    """Builder of a scene: places objects on its roads and static shapes beside them, where the ground is free."""
+    """Builds a scene: places objects on its roads and static shapes beside them, where the ground is free."""
 
     def __init__(self, rng: np.random.Generator, strips: list[Row], terrain: NDArray[np.float64]) -> None:
         self.rng = rng
@@ -74,12 +74,12 @@ class Street:
         self.taken: list[tuple[float, float, float, float, float, float, float]] = []
 
     def scene(self) -> Scene:
-        """The finished scene."""
+        """Return the finished scene."""
         rows = np.array(self.rows, dtype=np.float64).reshape(-1, ROW)
         return Scene(tuple(self.objects), rows, self.strips, self.terrain, self.tile)
 
     def ground(self, x: float, y: float) -> tuple[float, float]:
-        """Height, and distance outside the roads (negative on a road) [m]."""
+        """Height of the ground and distance from the roads (negative on a road) at x, y [m]."""
         z, outside, _, _, _ = ground_at(self.strips, self.terrain, self.tile, float(x), float(y))
         return z, outside
 
@@ -90,7 +90,7 @@ class Street:
         return float((side * self.strips[beside, 6 if side > 0 else 5]).max())
 
     def on_strip(self, s: float, u: float, strip: int = 0) -> Vector:
-        """x, y and direction of the strip at s along and u to the left of its axis."""
+        """x, y [m] and direction [rad] of a strip at s along its axis and u to its left [m]."""
         x0, y0, cos, sin, curvature = self.strips[strip, :5]
         slope = curvature * s
         turn = math.atan(slope)
@@ -98,7 +98,7 @@ class Street:
         return x0 + cos * a - sin * b, y0 + sin * a + cos * b, math.atan2(sin, cos) + turn
 
     def free(self, x: float, y: float, length: float, width: float, yaw: float, gap: float = 0.25) -> bool:
-        """Whether a rectangle overlaps no occupied ground."""
+        """Whether a rectangle, enlarged by ``gap`` [m], is free of occupied ground."""
         a, b = length / 2 + gap, width / 2 + gap
         cos, sin = math.cos(yaw), math.sin(yaw)
         reach = math.hypot(a, b)
@@ -134,7 +134,7 @@ class Street:
         *,
         force: bool = False,
     ) -> bool:
-        """Place a labeled object if its ground is free, or by ``force``; says whether it was placed."""
+        """Place a labeled object if its ground is free, or always with ``force``. Return whether it was placed."""
         if size is None:
             mean, spread = SIZES[label]
             shift = np.clip(self.rng.normal(size=3), -2, 2)
@@ -155,7 +155,10 @@ class Street:
     def add_static(
         self, rows: list[Row], x: float, y: float, length: float, width: float, yaw: float, off_road: float = 0.1
     ) -> bool:
-        """Place static shapes, given in a frame at x, y on the ground, if the ground is free and off the roads."""
+        """Place static shapes if the ground is free and off the roads. Return whether they were placed.
+
+        ``rows`` are primitives in a frame at x, y on the ground, turned by ``yaw``.
+        """
         cos, sin = math.cos(yaw), math.sin(yaw)
         steps = max(1, math.ceil(length / 4.0))
         for k in range(-steps, steps + 1):
@@ -175,7 +178,7 @@ class Street:
             self.rows.append((*row[:4], x + cos * cx - sin * cy, y + sin * cx + cos * cy, z + cz, *axes, *row[16:]))
         return True
 
-    # What stands beside a road.
+    # Roadside.
 
     def tree(self, x: float, y: float) -> bool:
         """Place a tree, if its ground is free."""
@@ -267,7 +270,7 @@ class Street:
 
 
 def _noise_tile(rng: np.random.Generator) -> NDArray[np.float64]:
-    # Three octaves that wrap round: fine, half and eighth resolution.
+    # Three periodic octaves: full, half and eighth resolution.
     tile = rng.uniform(-1.0, 1.0, (TILE, TILE))
     for scale in (2, 8):
         coarse = rng.uniform(-1.0, 1.0, (TILE // scale, TILE // scale))
@@ -279,7 +282,7 @@ def _noise_tile(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def random_terrain(rng: np.random.Generator, environment: str) -> NDArray[np.float64]:
-    """Slopes, waves, kerbs and banks of an environment, at random."""
+    """Draw the terrain of an environment: slopes, waves, kerbs, banks, remissions."""
     terrain = np.zeros(TERRAIN)
     open_land = environment in ("rural", "highway")
     terrain[[SLOPE_X, SLOPE_Y]] = rng.normal(0.0, 0.008, 2)
@@ -303,7 +306,7 @@ def random_terrain(rng: np.random.Generator, environment: str) -> NDArray[np.flo
     terrain[LANE] = 3.4
     terrain[DROPPED] = rng.uniform(0.0, 23.0)
     terrain[WEAR] = rng.uniform(0.1, 0.35)
-    # Of parking bays: paved like the pavement with a lip, or the road's own asphalt behind a line.
+    # Parking bays are paved like the pavement, or have the road's asphalt.
     terrain[LIP] = rng.uniform(0.0, 0.04)
     terrain[BAY] = terrain[PAVING if rng.random() < 0.5 else ASPHALT]
     return terrain
@@ -313,7 +316,7 @@ def strip_row(
     x: float, y: float, yaw: float, curvature: float, right: float, left: float,
     s_range: tuple[float, float] = (-200.0, 200.0), bay: bool = False,
 ) -> Row:  # fmt: skip
-    """A strip of road or a bay as the row that the kernels read."""
+    """Make the row of a road strip or a bay for the kernels."""
     return (x, y, math.cos(yaw), math.sin(yaw), curvature, right, left, *s_range, float(bay))
 
 
@@ -324,12 +327,12 @@ IN_BAYS = 0.75
 
 
 def any_vehicle(rng: np.random.Generator, trucks: float) -> str:
-    """A class of vehicle at random, with a given share of trucks."""
+    """Draw a class of vehicle, with a given share of trucks."""
     return str(rng.choice(["car", "van", "truck"], p=[0.84 - trucks, 0.16, trucks]))
 
 
 def add_roadside(street: Street, place: str) -> None:
-    """What stands beside the road: buildings, borders, trees, bushes and poles."""
+    """Add the roadside: buildings, borders, trees, bushes and poles."""
     rng = street.rng
     pavement = float(street.terrain[PAVEMENT])
     built = {"urban": 0.85, "residential": 0.65, "junction": 0.6, "rural": 0.06, "highway": 0.0}[place]

@@ -1,8 +1,8 @@
 """Multi-object tracking: boxes of successive scans -> tracks with identity and velocity (IMM-UKF-JPDA, KUL-Seg 6).
 
-`tracker` runs the method step by step. `imm` mixes three motion models, `ukf` predicts and updates each of them by
+`tracker` runs the steps of the method. `imm` mixes three motion models, `ukf` predicts and updates each of them with
 sigma points, `jpda` associates detections with tracks, `lives` begins and ends tracks, and `egomotion` estimates the
-motion of the sensor if no poses are given. `tracks` holds the results and the parameters of each class.
+sensor's motion if no poses are passed. `tracks` holds the results and the parameters of each class.
 `edgeperc.evaluation.tracking` evaluates the tracks.
 """
 

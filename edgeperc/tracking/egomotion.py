@@ -1,7 +1,7 @@
-"""The motion of the sensor on the ground, by a robust rigid fit to tracked objects.
+"""Estimate the sensor's motion on the ground by a robust rigid fit to tracked objects, if no poses are passed.
 
-Used if no poses are given. The fit finds the motion that moves most detections to the places that their tracks predict.
-Objects that move on their own are outliers with little weight.
+The fit finds the motion that moves most detections to the places that their tracks predict. Objects that do not move as
+their tracks predict are outliers with little weight.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def fit_motion(
     motion: NDArray[np.float64],
     covariance: NDArray[np.float64],
 ) -> int:
-    """Fit the rigid motion that moves detections to the predicted places of tracks.
+    """Fit the rigid motion that moves detections to the predicted positions of tracks.
 
     Parameters
     ----------
@@ -39,10 +39,11 @@ def fit_motion(
     prior : (3,) float64
         Expected motion: x, y [m] and turn [rad] of the sensor in its previous frame.
     prior_variances : (3,) float64
+        [m2, m2, rad2]
     motion : (3,) float64, overwritten
-        The fit; the prior if no detection fits any track.
+        The fitted motion; the prior if no detection fits a track.
     covariance : (3, 3) float64, overwritten
-        Of the fit.
+        Covariance of ``motion``.
 
     Returns
     -------
@@ -51,9 +52,9 @@ def fit_motion(
 
     Notes
     -----
-    Each pair proposes the shift, and the turn, that moves the detection to the track, if it lies within three standard
-    deviations of the prior; there are at most 256 proposals. A Gauss-Newton iteration starts from the proposal with the
-    largest `support`. In it, each track is matched to its nearest detection with the weight of Geman and McClure,
+    Each pair of track and detection proposes a shift and a turn that move the detection to the track. Proposals within
+    three standard deviations of the prior are tried, at most 256. A Gauss-Newton iteration starts from the proposal
+    with the largest `support`. It matches each track to its nearest detection, with Geman and McClure's weight
     1 / (1 + r2 / 9)^2, where r is the distance in standard deviations.
     """
     motion[:] = prior
@@ -67,7 +68,7 @@ def fit_motion(
             x, y = detections[j, 0], detections[j, 1]
             if landmarks[i, 3] != detections[j, 3]:
                 continue
-            # Either a shift or a turn: far away, a small turn moves a landmark more than any shift does.
+            # A shift or a turn alone: for far landmarks, a small turn has more effect than any plausible shift.
             shift_x = landmarks[i, 0] - prior[0] - (cos * x - sin * y)
             shift_y = landmarks[i, 1] - prior[1] - (sin * x + cos * y)
             turn = math.atan2(landmarks[i, 1] - prior[1], landmarks[i, 0] - prior[0]) - math.atan2(y, x) - prior[2]
@@ -108,7 +109,7 @@ def fit_motion(
             weight = 1.0 / (1.0 + squared / 9.0) ** 2 / (landmarks[i, 2] + detections[nearest, 2])
             off_x = landmarks[i, 0] - motion[0] - turned_x
             off_y = landmarks[i, 1] - motion[1] - turned_y
-            # Derivatives of the detection's place by x, y and turn: (1, 0), (0, 1), (-turned_y, turned_x).
+            # Derivatives of the detection's position by x, y and turn: (1, 0), (0, 1), (-turned_y, turned_x).
             slope[0] += weight * off_x
             slope[1] += weight * off_y
             slope[2] += weight * (off_y * turned_x - off_x * turned_y)
@@ -137,10 +138,10 @@ def support(
     prior_variances: NDArray[np.float64],
     motion: NDArray[np.float64],
 ) -> float:
-    """Score of a motion, at most 0: minus its distance from the prior, minus the robust distances of all tracks.
+    """Score a motion: minus its distance from the prior, minus the robust distances of all tracks; at most 0.
 
-    The robust distance is Geman and McClure's r2 / (1 + r2 / 9) / 2, which stays below 4.5, the cost of a track without
-    a detection.
+    The robust distance is Geman and McClure's r2 / (1 + r2 / 9) / 2. It is below 4.5, the cost of a track without a
+    detection. Parameters as in `fit_motion`; ``motion`` is not changed.
     """
     total = 0.0
     for a in range(3):
@@ -155,7 +156,10 @@ def support(
 def nearest_detection(
     landmark: NDArray[np.float64], detections: NDArray[np.float64], motion: NDArray[np.float64]
 ) -> tuple[int, float]:
-    """The detection nearest to a landmark under a motion, -1 for none, and their squared distance in variances."""
+    """Find the detection nearest to a landmark (4,) under a motion (3,).
+
+    Returns its index, -1 if there is none of the same group, and the squared distance in variances.
+    """
     cos, sin = math.cos(motion[2]), math.sin(motion[2])
     nearest, smallest = -1, np.inf
     for j in range(len(detections)):
@@ -169,10 +173,10 @@ def nearest_detection(
     return nearest, smallest
 
 
-# As in `ukf`: a cached kernel that called a kernel of another file would not notice changes of that file.
+# A copy of that in `ukf`: numba would not recompile a cached kernel after a change in another file.
 @njit(cache=True, nogil=True)
 def fill_inverse(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> None:
-    """Invert a symmetric positive definite (3, 3) matrix by its cofactors."""
+    """Invert a symmetric positive definite (3, 3) matrix into ``inverse``, by cofactors."""
     a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
     d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
     determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)

@@ -24,10 +24,10 @@ def fill_interaction(
     Parameters
     ----------
     states : (n, k, s) float64
-        One for each of k motion models.
+        State for each of k motion models.
     covariances : (n, k, s, s) float64
     probabilities : (n, k) float64
-        Of each motion model after the last update.
+        Probability of each motion model after the last update.
     stay : (n,) float64
         Probability that a track keeps its motion model; the others share the rest.
     mixed : (n, k, s) float64, overwritten
@@ -76,12 +76,13 @@ def fill_mode_probabilities(
     prior : (n, k) float64
         From `fill_interaction`.
     likelihoods : (n, k, m) float64
-        Of each detection under each motion model; 0 outside the gate.
+        Likelihood of each detection under each motion model; 0 outside the gate.
     beta : (n, m + 1) float64
-        Probability that the track was not detected, and that each detection belongs to it.
+        Column 0: probability that the track was not detected. Others: that the detection belongs to it.
     shares : (n, k, m + 1) float64, overwritten
-        Association for each motion model, summing to 1.
+        Association for each motion model; sums to 1 over the last axis.
     probabilities : (n, k) float64, overwritten
+        Probability of each motion model after the update.
     """
     n, k, m = likelihoods.shape
     for t in range(n):
@@ -90,7 +91,7 @@ def fill_mode_probabilities(
             for d in range(m):
                 shares[t, j, d + 1] = 0.0
         for d in range(m):
-            if beta[t, d + 1] == 0.0:  # as nearly all are
+            if beta[t, d + 1] == 0.0:  # skips most pairs
                 continue
             total = 0.0
             for j in range(k):

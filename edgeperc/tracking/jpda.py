@@ -1,8 +1,9 @@
 """Joint probabilistic data association of detections with tracks (KUL-Seg 6).
 
-Clusters of tracks that share no detection are solved separately. A cluster with few joint events is solved exactly, by
-enumeration. A larger one is approximated by loopy belief propagation (Williams and Lau, "Approximate evaluation of
-marginal association probabilities with belief propagation", IEEE Trans. AES 2014), so the time of a scan is bounded.
+Tracks that share detections form a cluster, and each cluster is solved separately. A cluster with few joint events is
+solved exactly, by enumeration. A larger one is approximated by loopy belief propagation, which bounds the time of a
+scan (Williams and Lau, "Approximate evaluation of marginal association probabilities with belief propagation", IEEE
+Trans. AES 2014).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ __all__ = ["MAX_EVENTS", "fill_association", "fill_by_propagation", "fill_likeli
 MAX_EVENTS = 4096
 MAX_ROUNDS = 200
 TOLERANCE = 1e-6
-LARGEST_WEIGHT = 1e15  # practically certain; keeps the products of a cluster finite
+LARGEST_WEIGHT = 1e15  # keeps the products of a cluster finite
 
 
 @njit(cache=True, nogil=True)
@@ -35,41 +36,43 @@ def fill_likelihoods(
     likelihoods: NDArray[np.float64],
     weights: NDArray[np.float64],
 ) -> None:
-    """Write the likelihood of each detection under each motion model of each track, and its association weight.
+    """Compute the likelihood of each detection under each motion model of each track, and the association weights.
 
     Parameters
     ----------
     means : (n, 3, 5) float64
+        Predicted x, y [m], v [m/s], heading [rad], turn rate [rad/s] for each motion model.
     predicted : (n, 3, 5, 5) float64
-        Covariances of x, y, v, heading, turn rate.
+        Their covariances.
     sigmas : (n, 3) float64
         Standard deviations of a detection along and across the heading [m] and of the heading [rad].
     prior : (n, 3) float64
         Probability of each motion model.
     odds : (n,) float64
-        P_D / ((1 - P_D) lambda) [m2 rad]: detection probability, density of clutter.
+        P_D / ((1 - P_D) lambda) [m2 rad], from detection probability P_D and clutter density lambda.
     groups : (n,) int64
-        Group of classes that may be confused; a detection of another group is never associated.
+        Group of classes that may be confused. Detections of other groups are never associated.
     detections : (m, 3) float64
         x, y [m], heading [rad].
     detection_groups : (m,) int64
+        Group of each detection.
     gates : (n,) float64
-        Largest Mahalanobis distance of the place from the nearest motion model.
+        Largest Mahalanobis distance of a detection's position from the nearest motion model.
     likelihoods : (n, 3, m) float64, overwritten
         [1/(m2 rad)]; 0 for all motion models if the detection is outside the gate.
     weights : (n, m) float64, overwritten
-        odds_t sum_k prior_tk L_tkj, as `fill_association` takes them.
+        odds_t sum_k prior_tk L_tkj, the input of `fill_association`.
 
     Notes
     -----
-    A heading counts modulo pi, because a box looks the same from behind. Detectors are sometimes wrong by a right
-    angle, so a deviation of more than three standard deviations counts as three.
+    Headings are compared modulo pi, because a box looks the same from behind. Detectors are sometimes wrong by 90
+    degrees, so deviations are limited to three standard deviations.
     """
     n, m = len(groups), len(detection_groups)
     likelihoods[:] = 0.0
     weights[:] = 0.0
-    # For each motion model: covariance of the place, regression of the heading on the place, variance, limit and norm.
-    # Computed once, so that pairs outside the gate, which most are, need no sine, root or exponential.
+    # For each motion model: covariance of the position, regression of the heading on the position, variance, limit and
+    # norm. Computed once: most pairs are outside the gate and need no sine, root or exponential.
     forms = np.empty((3, 9))
     for i in range(n):
         gate, reach, apart = gates[i], 0.0, 0.0
@@ -83,7 +86,7 @@ def fill_likelihoods(
             c, e = cov[0, 3], cov[1, 3]
             f = cov[3, 3] + sigmas[i, 2] * sigmas[i, 2]
             place = a * d - b * b
-            # The heading given the place: its mean and its variance.
+            # Mean and variance of the heading, given the position.
             pull_x = (c * d - e * b) / place
             pull_y = (e * a - c * b) / place
             left = f - pull_x * c - pull_y * e
@@ -123,7 +126,7 @@ def fill_likelihoods(
 
 @njit(cache=True, nogil=True)
 def fill_association(weights: NDArray[np.float64], max_events: int, beta: NDArray[np.float64]) -> int:
-    """Write the marginal association probabilities.
+    """Compute the marginal association probabilities.
 
     A joint event assigns at most one detection to each track and at most one track to each detection. Its probability
     is proportional to the product of the weights of its pairs.
@@ -131,12 +134,12 @@ def fill_association(weights: NDArray[np.float64], max_events: int, beta: NDArra
     Parameters
     ----------
     weights : (n, m) float64
-        Likelihood ratio: the track made the detection, over the track was missed and the detection is clutter; 0
-        outside the gate.
+        Likelihood ratio of "the detection belongs to the track" to "the track was missed and the detection is
+        clutter"; 0 outside the gate.
     max_events : int
-        A cluster whose bound on joint events is larger is solved by belief propagation.
+        Clusters with a higher bound on the number of joint events are solved by belief propagation.
     beta : (n, m + 1) float64, overwritten
-        Column 0: the track was not detected. Rows sum to 1.
+        Column 0: probability that the track was not detected. Others: that the detection belongs to it. Rows sum to 1.
 
     Returns
     -------
@@ -153,7 +156,7 @@ def fill_association(weights: NDArray[np.float64], max_events: int, beta: NDArra
     for first in range(n):
         if done[first]:
             continue
-        # The cluster: everything reachable from this track over gated pairs.
+        # The cluster: all tracks and detections that gated pairs connect with this track.
         done[first] = True
         rows[0] = first
         n_rows, n_columns, at = 1, 0, 0
@@ -198,7 +201,7 @@ def fill_by_events(
         The rows of the cluster are overwritten.
     """
     n = len(rows)
-    choice = np.full(n, -2, np.int64)  # -2: not begun; -1: missed; else a place in columns
+    choice = np.full(n, -2, np.int64)  # -2: not begun; -1: missed; else an index into columns
     used = np.zeros(len(columns), np.bool_)
     product = np.ones(n + 1)
     total = 0.0
@@ -237,15 +240,16 @@ def fill_by_propagation(
 ) -> None:
     """Approximate the marginals of one cluster by messages between tracks and detections.
 
-    mu_ij = w_ij / (1 + sum_j' w_ij' nu_j'i) over the other detections, nu_ji = 1 / (1 + sum_i' mu_i'j) over the other
-    tracks, until no nu changes by more than 1e-6, at most 200 rounds; beta_ij is in proportion to w_ij nu_ji.
+    Messages: mu_ij = w_ij / (1 + sum_j' w_ij' nu_j'i) over the other detections j', and nu_ji = 1 / (1 + sum_i' mu_i'j)
+    over the other tracks i'. Rounds end when no nu changes by more than 1e-6, or after 200. beta_ij is proportional to
+    w_ij nu_ji.
 
     Parameters
     ----------
     weights, rows, columns, beta
         As in `fill_by_events`.
     """
-    # Only gated pairs: they are few in a large cluster.
+    # Only gated pairs, which are few in a large cluster.
     n_pairs = 0
     for i in range(len(rows)):
         for j in range(len(columns)):

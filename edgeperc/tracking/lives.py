@@ -1,4 +1,4 @@
-"""Birth, update and reporting of tracks (kernels)."""
+"""Kernels for birth, update and reporting of tracks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = [
     "update_shapes",
 ]
 
-# State of a track. All of it is here, so a scan that raises an error leaves the tracker unchanged.
+# Complete state of a track. The tracker replaces it as a whole, so a scan that raises an error changes nothing.
 TRACK = np.dtype(
     [
         ("id", np.int64),
@@ -73,12 +73,12 @@ CLASS = np.dtype(
     ]
 )
 
-# Existence is the log odds that the object is there: a track is reported above 0 and deleted below LEAST_EXISTENCE. A
-# detection adds its score, and EXPECTED for lying in the gate. Without the maximum, an object that was tracked for long
-# would be reported long after it is gone.
+# Existence is the log odds that the object exists: a track is reported above 0 and deleted below LEAST_EXISTENCE. A
+# detection adds its score, and EXPECTED because it lies in the gate. Without the maximum, an object that was tracked
+# for a long time would be reported for a long time after it left.
 EXPECTED, MOST_EXISTENCE, LEAST_EXISTENCE = 1.0, 5.0, -6.0
 
-# An occluding box may be a little larger than its object, so no track counts as wholly hidden.
+# A box may be larger than its object, so no track counts as completely hidden.
 MOST_HIDDEN = 0.9
 
 
@@ -93,11 +93,12 @@ def fill_newborn(
     ranges: NDArray[np.float64],
     tracks: NDArray[np.void],
 ) -> None:
-    """Begin a track with each detection, with speed 0.
+    """Begin a track at each detection, with speed 0.
 
     Parameters
     ----------
     first_id : int
+        Id of the first new track.
     kinds : (n,) int64
         Class of each detection.
     classes : (n,) record
@@ -107,7 +108,7 @@ def fill_newborn(
     shapes : (n, 4) float64
         Height of the center, length, width, height [m].
     logits : (n,) float64
-        Scores.
+        Log odds of the scores.
     ranges : (n,) float64
         Distances from the sensor [m].
     tracks : (n,) record, overwritten
@@ -146,7 +147,7 @@ def fill_newborn(
 def mark_out_of_view(
     tracks: NDArray[np.void], pose: NDArray[np.float64], left: float, right: float, reported: NDArray[np.bool_]
 ) -> None:
-    """Do not report undetected tracks with a corner of the footprint outside the field of view.
+    """Exclude undetected tracks from the report if a corner of the footprint is outside the field of view.
 
     Parameters
     ----------
@@ -154,7 +155,7 @@ def mark_out_of_view(
     pose : (4, 4) float64
         T_world_sensor.
     left, right : float
-        Azimuths of the edges [rad].
+        Azimuths of the edges of the view [rad].
     reported : (n,) bool
         Set to False for these tracks.
     """
@@ -181,20 +182,20 @@ def fill_hidden(
     sensor: NDArray[np.float64],
     hidden: NDArray[np.float64],
 ) -> None:
-    """Write the share of each track that others hide from the sensor.
+    """Compute the share of each track that other tracks hide from the sensor.
 
     Parameters
     ----------
     state : (n, 5) float64
-        x, y, v, heading, turn rate.
+        x, y [m], v [m/s], heading [rad], turn rate [rad/s].
     shape : (n, 4) float64
-        Height of the center, length, width, height.
+        Height of the center, length, width, height [m].
     seen : (n,) bool
-        Tracks detected in this scan; they hide others and count as visible.
+        Tracks detected in this scan. They can hide others, and are not hidden.
     sensor : (2,) float64
         x, y [m].
     hidden : (n,) float64, overwritten
-        In 0..1: share of nine rays over the width of the footprint.
+        Share of nine rays over the width of the footprint that meet a nearer track, in 0..1.
     """
     n = len(hidden)
     azimuth, half, distance = np.empty(n), np.empty(n), np.empty(n)
@@ -222,22 +223,22 @@ def fill_hidden(
 def mark_rivals(
     state: NDArray[np.float64], shape: NDArray[np.float64], strength: NDArray[np.float64], reported: NDArray[np.bool_]
 ) -> None:
-    """Do not report a track if its center lies in the footprint of a stronger track, or the other way round.
+    """Exclude a track from the report if its center lies in the footprint of a stronger track, or vice versa.
 
-    Two objects cannot share a place: a cyclist, for example, is often detected as a pedestrian too.
+    Two objects cannot occupy one place. A cyclist, for example, is often detected as a pedestrian too.
 
     Parameters
     ----------
     state : (n, 5) float64
-        x, y, v, heading, turn rate.
+        x, y [m], v [m/s], heading [rad], turn rate [rad/s].
     shape : (n, 4) float64
-        Height of the center, length, width, height.
+        Height of the center, length, width, height [m].
     strength : (n,) float64
-        Of equally strong tracks, the first is reported.
+        From `edgeperc.tracking.tracks.strength_of`. Among equal tracks, the first is reported.
     reported : (n,) bool
         Set to False for these tracks.
     """
-    # In this order all stronger tracks come before a track, so their flags are final.
+    # Strongest first, so the flags of all stronger tracks are final.
     order = np.argsort(-strength, kind="mergesort")
     for b in range(len(order)):
         weak = order[b]
@@ -249,7 +250,7 @@ def mark_rivals(
                 continue
             dx, dy = state[weak, 0] - state[strong, 0], state[weak, 1] - state[strong, 1]
             reach = 0.5 * max(shape[weak, 1] + shape[weak, 2], shape[strong, 1] + shape[strong, 2])
-            if abs(dx) > reach or abs(dy) > reach:  # true of nearly all pairs, and ten times faster
+            if abs(dx) > reach or abs(dy) > reach:  # excludes nearly all pairs; ten times faster
                 continue
             for i in (weak, strong):
                 cos, sin = math.cos(state[i, 3]), math.sin(state[i, 3])
@@ -276,7 +277,7 @@ def update_shapes(
     state : (n, 5) float64
         x, y, v, heading, turn rate after the update.
     beta : (n, m + 1) float64
-        Probability that the track was not detected, and that each detection belongs to it.
+        As in `edgeperc.tracking.jpda.fill_association`.
     detections : (m, 3) float64
         x, y [m], heading [rad].
     shapes : (m, 4) float64
@@ -286,8 +287,10 @@ def update_shapes(
     walk : (4,) float64
         Standard deviations of their random walks between the scans [m].
     shape, variance : (n, 4) float64
+        Estimates of ``shapes`` and their variances [m, m2].
     front : (n,) float64
-        Votes, in -10..10; below 0 the heading points to the rear. Most objects move forward.
+        Votes, in -10..10: of the detections' headings, and of the speed, because most objects move forward. Below 0,
+        the heading points to the rear.
     """
     for i in range(len(front)):
         vote = 0.5 * math.tanh(state[i, 2] / 3.0)
@@ -325,14 +328,15 @@ def update_lives(
     classes : (n,) record
         Parameters of each track's class.
     beta : (n, m + 1) float64
-        Probability that the track was not detected, and that each detection belongs to it.
+        As in `edgeperc.tracking.jpda.fill_association`.
     hidden : (n,) float64
         From `fill_hidden`.
     logits : (m,) float64
-        Scores of the detections.
+        Log odds of the detections' scores.
     kinds : (m,) int64
         Classes of the detections.
     dt : float
+        Time since the last scan [s].
     """
     for i in range(len(tracks)):
         track, of = tracks[i], classes[i]
@@ -341,7 +345,7 @@ def update_lives(
             track["chances"] += 1.0 - MOST_HIDDEN * hidden[i]
             track["misses"] += 1
             track["missed_s"] += dt
-            # Likelihood ratio of a miss: if the object is there, over 1 if it is not.
+            # Likelihood ratio of a miss: the numerator assumes that the object exists; without an object it is 1.
             track["existence"] += math.log(1.0 - of["detection"] * (1.0 - MOST_HIDDEN * hidden[i]))
             continue
         best = np.argmax(beta[i, 1:])
@@ -349,11 +353,11 @@ def update_lives(
         track["hits"] += 1
         track["chances"] += 1.0
         track["logit_sum"] += logits[best]
-        # Boyer-Moore majority vote: a label is replaced when the others outnumber it.
+        # Boyer-Moore majority vote: other labels count down, and replace the label below 0.
         weight = track["label_weight"] + (1.0 if track["label"] == kinds[best] else -1.0)
         if weight < 0.0:
             track["label"] = kinds[best]
         track["label_weight"] = min(abs(weight), 20.0)
-        # A repeated detection counts no less than a first one.
+        # A repeated detection leads to at least the existence of a first one.
         existence = max(track["existence"], -of["sure_logit"]) + max(logits[best], 0.0) + EXPECTED
         track["existence"] = min(existence, MOST_EXISTENCE)

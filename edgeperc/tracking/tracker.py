@@ -1,7 +1,7 @@
 """The tracker: interaction, prediction, association, mode update, combination, and the life of tracks.
 
-Tracks are kept in a fixed frame: the world frame of the given poses or, without poses, the sensor frame of the first
-scan, relative to which `edgeperc.tracking.egomotion` estimates the sensor's motion.
+Tracks are kept in a fixed frame: the world frame of the poses or, without poses, the sensor frame of the first scan. In
+the latter case, `edgeperc.tracking.egomotion` estimates the sensor's motion.
 """
 
 from __future__ import annotations
@@ -35,10 +35,11 @@ from .ukf import fill_predictions, fill_updates
 __all__ = ["Tracker"]
 
 SMALLEST_SHARE = 1e-13  # scores are clipped to this distance from 0 and 1
-SHAPE_WALK_M = np.array([0.5, 0.1, 0.05, 0.05])  # height of the center, length, width and height, after one second
+# Standard deviations of random walks of center height, length, width and height after one second.
+SHAPE_WALK_M = np.array([0.5, 0.1, 0.05, 0.05])
 
-# Standard deviations of the sensor's speed along x and y [m/s] and turn rate [rad/s]: at first, up to motorway speed
-# and straight ahead; then of their random walks after one second.
+# Standard deviations of the sensor's speed along x and y [m/s] and of its turn rate [rad/s]: at the start, allowing for
+# motorway speed ahead, and of their random walks after one second.
 FIRST_TWIST = np.array([15.0, 1.0, 0.3])
 TWIST_WALK = np.array([4.0, 0.5, 0.5])
 TURN_MEMORY_S = 2.0  # without evidence, the estimated turn rate decays with this time constant
@@ -48,19 +49,19 @@ MAX_LANDMARKS = 48
 class Tracker:
     """Track objects from scan to scan.
 
-    Takes the boxes of any detector. One instance tracks one stream, in one thread. The caller owns the results. An
-    error leaves the tracker unchanged.
+    The boxes may come from any detector. Use one instance for each stream, in one thread. The caller owns the results.
+    An error leaves the tracker unchanged.
 
     Parameters
     ----------
     parameters : mapping of str to ClassParameters, optional
-        By class. Other classes keep their defaults; a class without defaults gets those of cars, in a group of its own.
+        Parameters by class, in place of the defaults. A class without defaults gets those of cars, in its own group.
     field_of_view_deg : tuple of 2 float
-        Azimuths of the left and right edge of the detector's view, counter-clockwise from ahead. A track that leaves it
-        is no longer reported. Default: the full turn.
+        Azimuths of the left and right edge of the detector's view [deg], counter-clockwise from +x. A track that leaves
+        it is no longer reported. Default: the full turn.
     max_tracks : int
-        Largest number of tracks kept, tentative ones included; the least likely are deleted. Bounds the memory and the
-        time of a scan.
+        Largest number of tracks, including tentative ones. Beyond it, the least likely tracks are deleted. This bounds
+        memory and time.
 
     Examples
     --------
@@ -84,7 +85,7 @@ class Tracker:
         self.reset()
 
     def reset(self) -> None:
-        """Delete all tracks, and forget the time and the pose."""
+        """Delete all tracks, and reset the time and the pose."""
         self._labels: list[str] = []
         self._groups: list[str] = []
         self._tracks = np.zeros(0, TRACK)
@@ -113,7 +114,7 @@ class Tracker:
         Raises
         ------
         StampError
-            The perception has no stamp, or one not later than that of the last scan.
+            The perception has no stamp, or its stamp is not later than that of the last scan.
         TrackingError
             As in `update`.
         """
@@ -138,15 +139,15 @@ class Tracker:
         Returns
         -------
         Tracks
-            Tracks that are more likely there than not. A track without a detection coasts: for a few scans if it is
-            visible, for longer behind another track.
+            Tracks that probably exist. A track without a detection coasts: for a few scans if it should be visible,
+            for longer if another track hides it.
 
         Raises
         ------
         StampError
             ``stamp_s`` is not finite, or not later than that of the last scan.
         TrackingError
-            A box or the pose is malformed or not finite, or poses are passed with some scans only.
+            A box or the pose is malformed or not finite, or only some scans have poses.
         """
         stamp_s = float(stamp_s)
         if not math.isfinite(stamp_s) or stamp_s <= self._stamp_s:
@@ -231,7 +232,7 @@ class Tracker:
         logits = _logit(given[:, 7])
         update_lives(tracks, of, beta, hidden, logits, kinds, dt)
 
-        # A detection that most likely belongs to no track begins one.
+        # Detections that probably belong to no track begin new tracks.
         own = np.flatnonzero((beta[:, 1:].sum(axis=0) < 0.5) & (logits >= classes["birth_logit"]))
         if len(own):
             ranges = np.hypot(given[own, 0], given[own, 1])
@@ -253,7 +254,7 @@ class Tracker:
         return Tracks(tracks[reported], self._labels, stamp_s, pose.copy(), n_tentative, n_approximated)
 
     def _kinds(self, names: Sequence[str]) -> NDArray[np.int64]:
-        """Row of the class of each box; a new class gets a row."""
+        """Row in the table of classes for each label; new classes are added."""
         for name in names:
             if name in self._labels:
                 continue
@@ -283,7 +284,7 @@ class Tracker:
         classes: NDArray[np.void],
         dt: float,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Pose of the sensor, its motion (x, y [m/s], turn [rad/s]) and the variances of the motion."""
+        """Estimate the sensor's pose (4, 4), its motion (3,) [m/s, m/s, rad/s] and the variances of the motion."""
         if dt == 0.0:
             return self._T_world_sensor, self._twist, self._twist_variances
         seen = np.flatnonzero(tracks["misses"] == 0)
@@ -319,7 +320,7 @@ class Tracker:
 
 
 def _checked_boxes(boxes: Iterable[Box]) -> tuple[NDArray[np.float64], list[str]]:
-    """Rows x, y, z, length, width, height, yaw, score, and the labels."""
+    """Check boxes; return rows (m, 8) of x, y, z, length, width, height, yaw, score, and the labels."""
     given = list(boxes)
     try:
         rows = np.array([(*box.center, *box.size, box.yaw, box.score) for box in given], np.float64).reshape(-1, 8)
@@ -349,7 +350,7 @@ def _checked_pose(given: ArrayLike) -> NDArray[np.float64]:
 
 
 def _in_world(given: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """x, y and heading (m, 3), and the heights of the centers (m,), in the world frame."""
+    """Transform boxes to the world frame: x, y, heading (m, 3), and heights of the centers (m,)."""
     placed = given[:, :3] @ pose[:3, :3].T + pose[:3, 3]
     cos, sin = np.cos(given[:, 6]), np.sin(given[:, 6])
     heights = placed[:, 2].copy()

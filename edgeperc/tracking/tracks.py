@@ -1,4 +1,4 @@
-"""The result of a tracker, and its parameters for each class."""
+"""Results of a tracker, and its parameters for each class."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ __all__ = ["PARAMETERS", "ClassParameters", "Track", "Tracks", "strength_of"]
 
 @dataclass(frozen=True, slots=True)
 class ClassParameters:
-    """Motion, detection and track life of one class of objects.
+    """Parameters of motion, detection and life of tracks for one class of objects.
 
     Attributes
     ----------
     group : str
-        Classes of one group may be confused; a track stays in its group.
+        Classes of one group may be confused. The label of a track changes only within its group.
     acceleration_mps2, turn_acceleration_rps2 : float
-        Standard deviations of the white accelerations of constant velocity and CTRV.
+        Constant velocity and CTRV: standard deviations of acceleration [m/s2] and turn acceleration [rad/s2].
     walk_m, wander_rad : float
-        Random motion: standard deviations of the random walks of place and heading after one second.
+        Random motion: standard deviations of the random walks of position and heading after one second.
     still_mps : float
         Random motion: standard deviation of the speed.
     birth_speed_mps, birth_turn_rps : float
@@ -35,22 +35,24 @@ class ClassParameters:
     keep_motion_s : float
         Mean time for which a track keeps its motion model.
     along_m, across_m, heading_rad : float
-        Standard deviations of a detection next to the sensor; they grow linearly, and are doubled at ``range_m``.
+        Standard deviations of a detection near the sensor: along and across the heading, and of the heading. They grow
+        linearly with the distance.
     shape_m : tuple of 4 float
-        The same, of the height of the center, length, width and height.
+        The same for the height of the center, length, width and height.
     range_m : float
+        Distance at which these standard deviations are doubled.
     detection : float
         Probability that a visible object is detected in a scan.
     clutter : float
-        False detections and new objects per square meter and radian.
+        Density of false detections and new objects [1/(m2 rad)].
     gate : float
-        Largest Mahalanobis distance between a track and a detection of it.
+        Largest Mahalanobis distance between a track and its detection.
     birth_score : float
         Lowest score of a detection that begins a track.
     sure_score : float
         A detection with this score confirms a track immediately.
     memory_s : float
-        A track without detections is deleted after this time at the latest.
+        Longest time without detections before a track is deleted.
     """
 
     group: str
@@ -105,38 +107,39 @@ PARAMETERS: Mapping[str, ClassParameters] = {
     "pedestrian": _PEDESTRIAN,
     "cyclist": _CYCLIST,
 }
-DOUBT = 10.0  # scans of even odds before the first detection, in the score of a track
+DOUBT = 10.0  # scans with log odds 0 that are added to the mean in a track's score
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """One object, as it is now.
+    """One tracked object at the time of a scan.
 
     Attributes
     ----------
     id : int
-        Never used again.
+        Unique for this tracker until `Tracker.reset`.
     label : str
-        The class it was detected as most of the time.
+        Class of most of its detections.
     score : float
-        In 0..1: of its detections, taken together.
+        In 0..1, from the mean log odds of its detections.
     box : Box
-        In the sensor's frame of this scan.
+        In the sensor frame of this scan.
     world_box : Box
-        In the world's frame or, without poses, the sensor's frame of the first scan.
+        In the world frame or, without poses, in the sensor frame of the first scan.
     velocity : (2,) float64
-        Over ground, along x and y of the sensor's frame [m/s].
+        Velocity over ground along x and y of the sensor frame [m/s].
     state : (5,) float64
         x, y [m], speed along the heading [m/s], heading [rad], turn rate [rad/s], in the frame of ``world_box``.
     covariance : (5, 5) float64
+        Covariance of ``state``.
     modes : mapping
         Probability of ``constant_velocity``, ``constant_turn`` and ``random_motion``.
     age_s : float
-        Since its first detection.
+        Time since its first detection [s].
     hits : int
-        Scans in which it was detected.
+        Number of scans in which it was detected.
     coasting : bool
-        Not detected in this scan.
+        Whether it was not detected in this scan.
     """
 
     id: int
@@ -168,7 +171,7 @@ class Track:
         return self.box.yaw
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON: the entries of `Box.to_dict` and those of the track."""
+        """Convert to a dict for JSON: the entries of `Box.to_dict`, and those of the track."""
         return {
             "id": self.id,
             **self.box.to_dict(),
@@ -181,21 +184,23 @@ class Track:
 
 
 class Tracks(Sequence[Track]):
-    """The reported tracks after one scan, in the order of their ids. `Track` objects are made on access.
+    """The reported tracks after one scan, in the order of their ids; a sequence of `Track`.
 
     Attributes
     ----------
     stamp_s : float
+        Time of the scan [s].
     T_world_sensor : (4, 4) float64
         As passed to the tracker, or estimated.
     ids : (n,) int64
     boxes : (n, 7) float64
-        x, y, z, length, width, height [m], yaw [rad], in the sensor's frame of this scan.
+        x, y, z, length, width, height [m], yaw [rad], in the sensor frame of this scan.
     scores : (n,) float64
     n_tentative : int
-        Tracks that are not reported: new, not detected for some time, out of view, or in the place of another track.
+        Number of tracks that are not reported: new, not detected for some time, out of view, or in the place of another
+        track.
     n_approximated : int
-        Tracks whose association was solved by belief propagation.
+        Number of tracks with an association from belief propagation.
     """
 
     __slots__ = (
@@ -282,9 +287,9 @@ def _box(label: str, score: float, row: NDArray[np.float64]) -> Box:
 
 
 def strength_of(tracks: NDArray[np.void]) -> NDArray[np.float64]:
-    """Log odds of tracks (n,): mean over the log odds of their detections, 0 for a scan without one.
+    """Log odds of tracks (n,) float64: mean log odds of their detections, with 0 for a scan without one.
 
-    `DOUBT` scans with log odds 0 are added. A scan in which others hid a track counts by its visible share.
+    `DOUBT` scans with log odds 0 are added. If other tracks hide a track, the scan counts by its visible share.
     """
     return np.asarray(tracks["logit_sum"] / (tracks["chances"] + DOUBT))
 

@@ -18,9 +18,9 @@ __all__ = ["CONSTANT_VELOCITY", "CTRV", "MODES", "RANDOM_MOTION", "fill_predicti
 CONSTANT_VELOCITY, CTRV, RANDOM_MOTION = 0, 1, 2
 MODES = ("constant_velocity", "constant_turn", "random_motion")
 
-# n + kappa of the unscented transform. With kappa = 1 every weight is positive, so covariances stay positive definite.
+# n + kappa of the unscented transform. With kappa = 1 all weights are positive, so covariances stay positive definite.
 SPREAD = 6.0
-STRAIGHT_RAD_S = 1e-4  # below this turn rate, arc and chord differ by less than the rounding error
+STRAIGHT_RAD_S = 1e-4  # below this turn rate, arc and chord differ by less than rounding errors
 
 
 @njit(cache=True, nogil=True)
@@ -32,26 +32,26 @@ def fill_predictions(
     means: NDArray[np.float64],
     predicted: NDArray[np.float64],
 ) -> None:
-    """Predict each motion model of each track by sigma points (KUL-Seg's "prediction").
+    """Predict each motion model of each track with sigma points (KUL-Seg's "prediction").
 
     Parameters
     ----------
     states : (n, 3, 5) float64
-        One for each motion model: constant velocity, CTRV, random motion.
+        State for each motion model: constant velocity, CTRV, random motion.
     covariances : (n, 3, 5, 5) float64
     noise : (n, 5) float64
         Standard deviations: acceleration [m/s2], turn acceleration [rad/s2], random walk of the place [m/s^0.5], of the
         heading [rad/s^0.5], and speed of random motion [m/s].
     dt : float
-        [s], not negative.
+        Time step [s], not negative.
     means : (n, 3, 5) float64, overwritten
     predicted : (n, 3, 5, 5) float64, overwritten
-        With additive process noise.
+        Covariances, with additive process noise.
 
     Notes
     -----
-    Sigma points x and x +- columns of the Cholesky root of (n + kappa) P, weights kappa / (n + kappa) and
-    1 / (2 (n + kappa)), with n = 5 and kappa = 1.
+    The sigma points are x, and x plus and minus each column of the Cholesky root of (n + kappa) P. Their weights are
+    kappa / (n + kappa) and 1 / (2 (n + kappa)), with n = 5 and kappa = 1.
     """
     points = np.empty((11, 5))
     root = np.empty((5, 5))
@@ -83,7 +83,7 @@ def fill_predictions(
 
 @njit(cache=True, nogil=True)
 def move(mode: int, state: NDArray[np.float64], dt: float) -> None:
-    """Predict one state (5,) by ``dt`` [s], in place; only CTRV keeps a turn rate."""
+    """Predict one state (5,) by ``dt`` [s], in place; the turn rate becomes 0 except with CTRV."""
     v, heading, turn = state[2], state[3], state[4]
     if mode == CONSTANT_VELOCITY:
         state[0] += v * math.cos(heading) * dt
@@ -108,16 +108,17 @@ def move(mode: int, state: NDArray[np.float64], dt: float) -> None:
 def fill_process_noise(
     mode: int, heading: float, noise: NDArray[np.float64], dt: float, process: NDArray[np.float64]
 ) -> None:
-    """Write the process noise (5, 5) of one motion model: white accelerations, random walks of place and heading.
+    """Compute the process noise of one motion model: white accelerations, random walks of position and heading.
 
     Parameters
     ----------
     mode : int
     heading : float
-        [rad] before the prediction.
+        Heading before the prediction [rad].
     noise : (5,) float64
         As in `fill_predictions`.
     dt : float
+        Time step [s].
     process : (5, 5) float64, overwritten
     """
     process[:] = 0.0
@@ -127,7 +128,7 @@ def fill_process_noise(
         process[0, 0] = process[1, 1] = walk * walk * dt
         process[2, 2] = speed * speed
     else:
-        # A hundredth of random motion's: errors of the road model and of the estimated sensor motion.
+        # A hundredth of the walk in random motion, for errors of the motion model and of the estimated sensor motion.
         process[0, 0] = process[1, 1] = 0.01 * walk * walk * dt
         push = np.zeros(5)
         push[0] = 0.5 * dt * dt * math.cos(heading)
@@ -141,7 +142,7 @@ def fill_process_noise(
         process[3, 4] = process[4, 3] = 0.5 * dt**3 * turn * turn
         process[4, 4] = dt * dt * turn * turn
     else:
-        process[4, 4] = 0.01 * turn * turn  # turn rate at the beginning of a turn
+        process[4, 4] = 0.01 * turn * turn  # turn rate with which a turn begins
 
 
 @njit(cache=True, nogil=True)
@@ -154,7 +155,7 @@ def fill_updates(
     states: NDArray[np.float64],
     covariances: NDArray[np.float64],
 ) -> None:
-    """Update each motion model of each track with all detections, weighted by association: one PDA filter each.
+    """Update each motion model of each track with all detections, weighted by their association (PDA filter).
 
     Parameters
     ----------
@@ -165,15 +166,15 @@ def fill_updates(
     sigmas : (n, 3) float64
         Standard deviations of a detection along and across its heading [m] and of its heading [rad].
     beta : (n, 3, m + 1) float64
-        For each motion model: probability that the track was not detected, and that each detection belongs to it.
+        For each motion model, as in `edgeperc.tracking.jpda.fill_association`.
     states : (n, 3, 5) float64, overwritten
     covariances : (n, 3, 5, 5) float64, overwritten
 
     Notes
     -----
-    The measurement is part of the state. The unscented cross-covariance and innovation covariance are therefore exactly
-    columns and a block of the predicted covariance. A heading counts modulo pi, and a deviation of more than three
-    standard deviations counts as three (see `edgeperc.tracking.jpda`).
+    The measurement is part of the state, so the unscented cross-covariance and innovation covariance are exactly
+    columns and a block of the predicted covariance. Headings are compared modulo pi, and deviations are
+    limited to three standard deviations, as in `edgeperc.tracking.jpda.fill_likelihoods`.
     """
     innovation = np.empty((3, 3))
     inverse = np.empty((3, 3))
@@ -231,7 +232,7 @@ def fill_updates(
 def fill_innovation(
     heading: float, cov: NDArray[np.float64], sigmas: NDArray[np.float64], innovation: NDArray[np.float64]
 ) -> None:
-    """Write the innovation covariance (3, 3); the noise of a detection is along and across the heading."""
+    """Compute the innovation covariance (3, 3); the noise of a detection is along and across the heading."""
     cos, sin = math.cos(heading), math.sin(heading)
     along, across, turn = sigmas[0] * sigmas[0], sigmas[1] * sigmas[1], sigmas[2] * sigmas[2]
     innovation[0, 0] = cov[0, 0] + along * cos * cos + across * sin * sin
@@ -244,7 +245,7 @@ def fill_innovation(
 
 @njit(cache=True, nogil=True)
 def fill_inverse(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> None:
-    """Invert a symmetric positive definite (3, 3) matrix by its cofactors."""
+    """Invert a symmetric positive definite (3, 3) matrix into ``inverse``, by cofactors."""
     a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
     d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
     determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
@@ -258,7 +259,7 @@ def fill_inverse(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> N
 
 @njit(cache=True, nogil=True)
 def fill_cholesky(matrix: NDArray[np.float64], root: NDArray[np.float64]) -> None:
-    """Write the lower Cholesky root (5, 5); a pivot that rounding made negative counts as 0."""
+    """Compute the lower Cholesky root (5, 5); a pivot that is negative by rounding counts as 0."""
     root[:] = 0.0
     for a in range(5):
         for b in range(a + 1):
@@ -273,5 +274,5 @@ def fill_cholesky(matrix: NDArray[np.float64], root: NDArray[np.float64]) -> Non
 
 @njit(cache=True, nogil=True)
 def half_turn(angle: float) -> float:
-    """The angle modulo pi, in -pi/2..pi/2: a box looks the same from behind."""
+    """Angle [rad] modulo pi, in -pi/2..pi/2, because a box looks the same from behind."""
     return angle - math.pi * float(np.floor(angle / math.pi + 0.5))  # math.floor raises on NaN
