@@ -9,7 +9,8 @@ import itertools
 import json
 import math
 import os
-from collections.abc import Mapping
+import reprlib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -17,18 +18,49 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import CardError
-from .onnx_metadata import read_metadata
+from .onnx_file import read_metadata
 
 __all__ = ["CARD_KEY", "Golden", "InputSpec", "ModelCard", "OutputSpec", "RangeImageGeometry", "TopViewGeometry"]
 
 CARD_KEY = "edgeperc.card"
 Precision = Literal["fp32", "int8"]
 SCHEMA = 3
+MAX_CHARACTERS = 16 * 10**6
+MAX_DEPTH = 32
+MAX_TEXT = 100_000  # characters of one text of the free-form metadata
+MAX_NAME = 200
+MAX_ROWS, MAX_COLUMNS, MAX_PIXELS = 4096, 65_536, 16 * 10**6
+MAX_CHANNELS = 16
+MIN_GOLDEN_VALUES, MAX_GOLDEN_VALUES = 16, 100_000
 OUTPUT_KINDS = ("class_logits", "class_probabilities", "box_slots", "box_dense")
 CHANNELS = {
     "top_view": ("distance", "remission", "height"),
     "range_image": ("x", "y", "z", "remission", "range"),
 }
+
+
+def _check(field: str, value: float, low: float, high: float) -> None:
+    """Refuse a number of the card that is out of its bounds, or not finite."""
+    if not low <= value <= high:
+        raise CardError(f"{field} is {reprlib.repr(value)}; expected a number from {low:g} to {high:g}")
+
+
+def _check_each(field: str, values: Iterable[float], low: float, high: float) -> None:
+    for index, value in enumerate(values):
+        _check(f"{field}[{index}]", value, low, high)
+
+
+def _check_name(field: str, value: str) -> None:
+    if not 0 < len(value) <= MAX_NAME or not value.isprintable():
+        raise CardError(f"{field} {reprlib.repr(value)}; expected 1 to {MAX_NAME} printable characters")
+
+
+def _check_size(rows: int, columns: int) -> None:
+    if not (1 <= rows <= MAX_ROWS and 1 <= columns <= MAX_COLUMNS and rows * columns <= MAX_PIXELS):
+        raise CardError(
+            f"the view has {reprlib.repr(rows)} rows and {reprlib.repr(columns)} columns; expected 1 to {MAX_ROWS} "
+            f"rows, 1 to {MAX_COLUMNS} columns and at most {MAX_PIXELS} pixels"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +83,11 @@ class TopViewGeometry:
     def __post_init__(self) -> None:
         for name in ("x_range_m", "y_range_m", "z_range_m"):
             low, high = getattr(self, name)
-            if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            _check_each(f"view.{name}", (low, high), -1e4, 1e4)
+            if not high - low >= 1e-3:
                 raise CardError(f"view.{name} is {(low, high)}; expected two finite numbers, the lower first")
-        if not (math.isfinite(self.cell_m) and self.cell_m > 0.0):
-            raise CardError(f"view.cell_m is {self.cell_m}; expected a positive number of meters")
+        _check("view.cell_m", self.cell_m, 1e-3, 100.0)
+        _check_size(self.height, self.width)
 
     @property
     def kind(self) -> str:
@@ -131,8 +164,7 @@ class RangeImageGeometry:
                 f"view.row_elevations_deg holds {len(rows)} values; expected two or more, strictly decreasing, "
                 "between -90 and 90 degrees"
             )
-        if self.width < 1:
-            raise CardError(f"view.width is {self.width}; expected at least one column")
+        _check_size(len(rows), self.width)
         if not -180.0 <= self.azimuth_right_deg < self.azimuth_left_deg <= 180.0:
             raise CardError(
                 f"view azimuths are left {self.azimuth_left_deg}, right {self.azimuth_right_deg}; "
@@ -173,8 +205,10 @@ class InputSpec:
                 f"input has {len(self.channels)} channels, {len(self.mean)} means and {len(self.std)} standard "
                 "deviations; expected as many of each, at least one"
             )
-        if not all(math.isfinite(v) for v in self.mean) or not all(math.isfinite(v) and v > 0 for v in self.std):
-            raise CardError(f"input mean {self.mean}, std {self.std}; expected finite means and positive deviations")
+        _check("the number of input channels", len(self.channels), 1, MAX_CHANNELS)
+        _check_name("input.name", self.name)
+        _check_each("input.mean", self.mean, -1e6, 1e6)
+        _check_each("input.std", self.std, 1e-6, 1e6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +220,11 @@ class OutputSpec:
 
     def __post_init__(self) -> None:
         if self.kind not in OUTPUT_KINDS:
-            raise CardError(f"output {self.name!r} is of kind {self.kind!r}; expected one of {', '.join(OUTPUT_KINDS)}")
+            raise CardError(
+                f"output {reprlib.repr(self.name)} is of kind {reprlib.repr(self.kind)}; "
+                f"expected one of {', '.join(OUTPUT_KINDS)}"
+            )
+        _check_name("output.name", self.name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +232,8 @@ class Golden:
     """A known input, and the outputs that the exporting computer got for it.
 
     The input is uniform noise in -1..1 from ``numpy.random.PCG64(seed)``. Each output is stored at sampled flat
-    positions, so that any runtime can be compared with the exporter's.
+    positions, so that any runtime can be compared with the exporter's: at 16 or more different positions, or at all
+    positions of a smaller output.
 
     Attributes
     ----------
@@ -208,6 +247,40 @@ class Golden:
     seed: int
     input_sha256: str
     outputs: Mapping[str, Mapping[str, Any]]
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**64:
+            raise CardError(f"golden.seed is {reprlib.repr(self.seed)}; expected a whole number from 0 to 2**64 - 1")
+        _check("the length of golden.input_sha256", len(self.input_sha256), 0, 64)
+        _check("the number of golden.outputs", len(self.outputs), 1, MAX_CHANNELS)
+        for name, record in self.outputs.items():
+            field = f"golden.outputs[{reprlib.repr(name)}]"
+            missing = {"std", "positions", "values"} - record.keys()
+            if missing:
+                raise CardError(f"{field} lacks {', '.join(sorted(missing))}; export the model again")
+            positions, values = record["positions"], record["values"]
+            if not isinstance(positions, list) or not isinstance(values, list) or len(positions) != len(values):
+                raise CardError(f"{field} holds positions and values that are not lists of one length")
+            _check(f"the number of {field}.values", len(values), 1, MAX_GOLDEN_VALUES)
+            _check(f"{field}.std", _float(f"{field}.std", record["std"]), 0.0, 1e30)
+            for index, (position, value) in enumerate(zip(positions, values, strict=True)):
+                _check(f"{field}.positions[{index}]", _int(f"{field}.positions", position), 0, 2**40)
+                _check(f"{field}.values[{index}]", _float(f"{field}.values", value), -1e30, 1e30)
+
+    def check_output(self, name: str, size: int) -> None:
+        """Check the record of an output against the number of its values.
+
+        Raises
+        ------
+        CardError
+            A position is outside the output, or there are too few different positions.
+        """
+        positions = self.outputs[name]["positions"]
+        field, fewest = f"golden.outputs[{reprlib.repr(name)}]", min(MIN_GOLDEN_VALUES, size)
+        if max(positions) >= size:
+            raise CardError(f"{field} has position {max(positions)}; the output has {size} values")
+        if len({*positions}) < fewest:
+            raise CardError(f"{field} has {len({*positions})} different positions; expected {fewest} or more")
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,14 +346,18 @@ class ModelCard:
     def __post_init__(self) -> None:
         if self.precision not in ("fp32", "int8"):
             raise CardError(f"precision is {self.precision!r}; expected fp32 or int8, as the weights are stored")
-        if not self.name or not self.version:
-            raise CardError(f"name {self.name!r}, version {self.version!r}; expected both to be non-empty strings")
+        _check_name("name", self.name)
+        _check_name("version", self.version)
         if not 2 <= len(self.classes) <= 255 or len(set(self.classes)) != len(self.classes):
-            raise CardError(f"classes {self.classes}; expected 2 to 255 different names, the background first")
+            raise CardError(
+                f"classes {reprlib.repr(self.classes)}; expected 2 to 255 different names, the background first"
+            )
+        for each in self.classes:
+            _check_name("class", each)
         unknown = [c for c in self.input.channels if c not in CHANNELS[self.view.kind]]
         if unknown:
             raise CardError(
-                f"input channels {unknown} are unknown to a {self.view.kind}; "
+                f"input channels {reprlib.repr(unknown)} are unknown to a {self.view.kind}; "
                 f"expected some of {', '.join(CHANNELS[self.view.kind])}"
             )
         kinds = [o.kind for o in self.outputs]
@@ -293,7 +370,7 @@ class ModelCard:
                 raise CardError("a box output without box_classes; expected the classes that boxes may have")
         unlisted = [c for c in (*self.box_classes, *self.box_size_priors) if c not in self.classes]
         if unlisted:
-            raise CardError(f"box classes {unlisted} are not among the classes {self.classes}")
+            raise CardError(f"box classes {reprlib.repr(unlisted)} are not among the classes {self.classes}")
         if (
             self.box_size_spreads
             and not set(self.box_classes) <= self.box_size_spreads.keys() & self.box_size_priors.keys()
@@ -301,11 +378,30 @@ class ModelCard:
             raise CardError(
                 f"box_size_spreads of {[*self.box_size_spreads]}; expected a spread and a prior for each box class"
             )
-        if any(spread <= 0.0 for spreads in self.box_size_spreads.values() for spread in spreads):
-            raise CardError(f"box_size_spreads are {self.box_size_spreads}; expected numbers above 0")
-        for name in ("score_threshold", "nms_iou"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise CardError(f"{name} is {getattr(self, name)}; expected a number in 0..1")
+        for name, sizes in self.box_size_priors.items():
+            _check_each(f"box_size_priors.{name}", sizes, 0.01, 100.0)
+        for name, spreads in self.box_size_spreads.items():
+            _check_each(f"box_size_spreads.{reprlib.repr(name)}", spreads, 1e-6, 10.0)
+        _check("score_threshold", self.score_threshold, 0.0, 1.0)
+        _check("nms_iou", self.nms_iou, 0.0, 1.0)
+        _check("mount_height_m", self.mount_height_m, -100.0, 100.0)
+        for name, record in self.precisions.items():
+            _check_name("the precision", name)
+            if "loss" in record:
+                _check(f"precisions.{name}.loss", _float(f"precisions.{name}.loss", record["loss"]), 0.0, 100.0)
+        if self.golden is not None:
+            for output in self.outputs:
+                shape = self.output_shape(output.kind)
+                if output.name in self.golden.outputs and None not in shape:
+                    self.golden.check_output(output.name, math.prod(n for n in shape if n is not None))
+
+    def output_shape(self, kind: str) -> tuple[int | None, ...]:
+        """Shape of the output of a kind, with the batch; None where any length is allowed."""
+        if kind == "box_slots":
+            return (1, None, 4)
+        if kind == "box_dense":
+            return (1, 9, self.view.height // 4, self.view.width // 4)
+        return (1, len(self.classes), self.view.height, self.view.width)
 
     def to_json(self) -> str:
         """Canonical JSON: sorted keys, no blanks, no NaN."""
@@ -328,9 +424,9 @@ class ModelCard:
         Raises
         ------
         ModelFileError
-            The file cannot be read.
+            The file cannot be read, or is not a complete .onnx file.
         CardError
-            The file is not a complete .onnx file, has no card, or has a card that `from_json` refuses.
+            The file has no card, or has a card that `from_json` refuses.
         """
         text = read_metadata(path, CARD_KEY)
         if text is None:
@@ -349,21 +445,27 @@ class ModelCard:
         Raises
         ------
         CardError
-            Not JSON, no schema number, a newer schema, or a missing or malformed key. Unknown keys are ignored.
+            Not JSON, no schema number, a newer schema, or a key that is missing, malformed or out of its bounds.
+            Unknown keys are ignored.
         """
+        if len(text) > MAX_CHARACTERS:
+            raise CardError(f"the card has {len(text)} characters; expected at most {MAX_CHARACTERS}")
         try:
             document = json.loads(text)
         except (RecursionError, ValueError) as exc:
             raise CardError(f"the card is not JSON ({exc}); export the model again") from exc
+        _check_tree(document)
         if not isinstance(document, dict) or not isinstance(document.get("schema"), int):
             raise CardError("the card has no schema number; export the model again")
         if document["schema"] not in (2, SCHEMA):
             raise CardError(
-                f"the card has schema {document['schema']}, this edgeperc reads {SCHEMA}; "
+                f"the card has schema {reprlib.repr(document['schema'])}, this edgeperc reads {SCHEMA}; "
                 + ("upgrade edgeperc" if document["schema"] > SCHEMA else "export the model again")
             )
         try:
             return _card(document)
+        except CardError:
+            raise
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as exc:
             raise CardError(f"the card is malformed: {type(exc).__name__} {exc}; export the model again") from exc
 
@@ -374,59 +476,126 @@ def _card(document: dict[str, Any]) -> ModelCard:
     geometry: TopViewGeometry | RangeImageGeometry
     if kind == "top_view":
         geometry = TopViewGeometry(
-            x_range_m=_pair(view["x_range_m"]),
-            y_range_m=_pair(view["y_range_m"]),
-            z_range_m=_pair(view["z_range_m"]),
-            cell_m=float(view["cell_m"]),
+            x_range_m=_pair("view.x_range_m", view["x_range_m"]),
+            y_range_m=_pair("view.y_range_m", view["y_range_m"]),
+            z_range_m=_pair("view.z_range_m", view["z_range_m"]),
+            cell_m=_float("view.cell_m", view["cell_m"]),
         )
     elif kind == "range_image":
         geometry = RangeImageGeometry(
-            row_elevations_deg=tuple(float(e) for e in view["row_elevations_deg"]),
-            width=int(view["width"]),
-            azimuth_left_deg=float(view["azimuth_left_deg"]),
-            azimuth_right_deg=float(view["azimuth_right_deg"]),
+            row_elevations_deg=_floats("view.row_elevations_deg", view["row_elevations_deg"]),
+            width=_int("view.width", view["width"]),
+            azimuth_left_deg=_float("view.azimuth_left_deg", view["azimuth_left_deg"]),
+            azimuth_right_deg=_float("view.azimuth_right_deg", view["azimuth_right_deg"]),
         )
     else:
-        raise CardError(f"view.kind is {kind!r}; expected top_view or range_image")
+        raise CardError(f"view.kind is {reprlib.repr(kind)}; expected top_view or range_image")
     fitness, golden = document["fitness"], document["golden"]
     if document["schema"] == 2:  # schema 2 has the precision in the free-form metadata, and no measured agreement
         precision, precisions = document["training"].get("precision", "fp32"), {}
     else:
         precision, precisions = document["precision"], document["precisions"]
     return ModelCard(
-        name=str(document["name"]),
-        version=str(document["version"]),
+        name=_text("name", document["name"]),
+        version=_text("version", document["version"]),
         precision=precision,
         view=geometry,
         input=InputSpec(
-            name=str(document["input"]["name"]),
-            channels=tuple(str(c) for c in document["input"]["channels"]),
-            mean=tuple(float(v) for v in document["input"]["mean"]),
-            std=tuple(float(v) for v in document["input"]["std"]),
+            name=_text("input.name", document["input"]["name"]),
+            channels=_texts("input.channels", document["input"]["channels"]),
+            mean=_floats("input.mean", document["input"]["mean"]),
+            std=_floats("input.std", document["input"]["std"]),
         ),
-        outputs=tuple(OutputSpec(name=str(o["name"]), kind=str(o["kind"])) for o in document["outputs"]),
-        classes=tuple(str(c) for c in document["classes"]),
-        box_classes=tuple(str(c) for c in document["box_classes"]),
-        box_size_priors=_sizes(document["box_size_priors"]),
-        box_size_spreads=_sizes(document["box_size_spreads"]),
-        score_threshold=float(document["score_threshold"]),
-        nms_iou=float(document["nms_iou"]),
-        mount_height_m=float(document["mount_height_m"]),
+        outputs=tuple(
+            OutputSpec(name=_text("output.name", o["name"]), kind=_text("output.kind", o["kind"]))
+            for o in document["outputs"]
+        ),
+        classes=_texts("classes", document["classes"]),
+        box_classes=_texts("box_classes", document["box_classes"]),
+        box_size_priors=_sizes("box_size_priors", document["box_size_priors"]),
+        box_size_spreads=_sizes("box_size_spreads", document["box_size_spreads"]),
+        score_threshold=_float("score_threshold", document["score_threshold"]),
+        nms_iou=_float("nms_iou", document["nms_iou"]),
+        mount_height_m=_float("mount_height_m", document["mount_height_m"]),
         fitness=None if fitness is None else dict(fitness),
         training=dict(document["training"]),
         metrics=dict(document["metrics"]),
         parity=dict(document["parity"]),
         golden=None
         if golden is None
-        else Golden(int(golden["seed"]), str(golden["input_sha256"]), dict(golden["outputs"])),
-        precisions={str(name): dict(entry) for name, entry in precisions.items()},
+        else Golden(
+            _int("golden.seed", golden["seed"]),
+            _text("golden.input_sha256", golden["input_sha256"]),
+            {name: dict(record) for name, record in golden["outputs"].items()},
+        ),
+        precisions={name: dict(entry) for name, entry in precisions.items()},
     )
 
 
-def _sizes(document: dict[str, Any]) -> dict[str, tuple[float, float, float]]:
-    return {str(c): (float(length), float(width), float(height)) for c, (length, width, height) in document.items()}
+def _check_tree(document: Any) -> None:
+    """Refuse values anywhere in the document that JSON allows and a card does not."""
+    level = [document]
+    for _ in range(MAX_DEPTH):
+        inner: list[Any] = []
+        for value in level:
+            if isinstance(value, dict):
+                inner += value.keys()
+                inner += value.values()
+            elif isinstance(value, list):
+                inner += value
+            elif isinstance(value, str):
+                if len(value) > MAX_TEXT:
+                    raise CardError(f"the card has a text of {len(value)} characters; expected at most {MAX_TEXT}")
+                if any("\ud800" <= character <= "\udfff" for character in value):
+                    raise CardError(f"the card has a text that is not valid Unicode: {reprlib.repr(value)}")
+            elif isinstance(value, int | float) and not -1e300 <= value <= 1e300:
+                raise CardError(f"the card has the number {reprlib.repr(value)}; expected finite ones below 1e300")
+        level = inner
+        if not level:
+            return
+    raise CardError(f"the card is nested more than {MAX_DEPTH} deep; export the model again")
 
 
-def _pair(values: Any) -> tuple[float, float]:
-    low, high = values
-    return float(low), float(high)
+def _text(field: str, value: Any) -> str:
+    if not isinstance(value, str):
+        raise CardError(f"{field} is {reprlib.repr(value)}; expected a text")
+    return value
+
+
+def _float(field: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise CardError(f"{field} is {reprlib.repr(value)}; expected a number")
+    return float(value)
+
+
+def _int(field: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise CardError(f"{field} is {reprlib.repr(value)}; expected a whole number")
+    return value
+
+
+def _list(field: str, value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise CardError(f"{field} is {reprlib.repr(value)}; expected a list")
+    return value
+
+
+def _texts(field: str, values: Any) -> tuple[str, ...]:
+    return tuple(_text(field, value) for value in _list(field, values))
+
+
+def _floats(field: str, values: Any) -> tuple[float, ...]:
+    return tuple(_float(field, value) for value in _list(field, values))
+
+
+def _sizes(field: str, document: dict[str, Any]) -> dict[str, tuple[float, float, float]]:
+    sizes = {}
+    for name, values in document.items():
+        length, width, height = _floats(f"{field}.{reprlib.repr(name)}", values)
+        sizes[name] = length, width, height
+    return sizes
+
+
+def _pair(field: str, values: Any) -> tuple[float, float]:
+    low, high = _floats(field, values)
+    return low, high

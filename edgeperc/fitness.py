@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -341,26 +342,58 @@ class FitnessProfile:
         Raises
         ------
         CardError
-            An entry is missing, unknown or not a pair of numbers.
+            An entry is missing, unknown, not a pair of numbers or out of its bounds.
         """
         names = {field.name for field in fields(cls)}
         if not isinstance(document, Mapping) or set(document) != names:
             raise CardError(f"the card's fitness entry must hold exactly {', '.join(sorted(names))}")
         values: dict[str, Any] = {}
         for name, value in document.items():
-            try:
-                if name == "n_scans":
-                    values[name] = int(value)
-                elif value is None and name in ("ground_m", "road_ahead"):
-                    values[name] = None
-                else:
-                    low, high = (float(v) for v in value)
-                    if not math.isfinite(low) or not math.isfinite(high):
-                        raise ValueError("not finite")
-                    values[name] = (low, high)
-            except (TypeError, ValueError, OverflowError) as exc:
-                raise CardError(f"the card's fitness entry {name!r} is not a pair of numbers: {value!r}") from exc
+            if name == "n_scans":
+                if not isinstance(value, int) or not 1 <= value <= 10**9:
+                    raise CardError(
+                        f"the card's fitness entry 'n_scans' is {reprlib.repr(value)}; expected 1 to 1e9 scans"
+                    )
+                values[name] = value
+            elif value is None and name in ("ground_m", "road_ahead"):
+                values[name] = None
+            else:
+                values[name] = _range(name, value)
         return cls(**values)
+
+
+# Of the entries in a card. A median distance of 0 is impossible, and would be divided by.
+_BOUNDS = {
+    "azimuth_deg": (-180.0, 180.0),
+    "points_in_view": (0.0, 1e9),
+    "view_covered": (0.0, 1.0),
+    "remission_median": (0.0, 1.0),
+    "remission_p99": (0.0, 1.0),
+    "remission_zeros": (0.0, 1.0),
+    "elevation_p01_deg": (-91.0, 91.0),
+    "elevation_p99_deg": (-91.0, 91.0),
+    "beams": (0.0, 1e4),
+    "beams_per_deg": (0.0, 1e4),
+    "range_median_m": (1e-3, 1e7),
+    "ground_m": (-100.0, 100.0),
+    "road_ahead": (-100.0, 100.0),
+}
+
+
+def _range(name: str, value: Any) -> Range:
+    """An entry of a card's profile."""
+    least, most = _BOUNDS[name]
+    try:
+        first, second = (float(v) for v in value)
+    except (TypeError, ValueError, OverflowError):
+        first = second = math.nan
+    low, high = (second, first) if name == "azimuth_deg" else (first, second)  # left before right
+    if not least <= low <= high <= most:
+        raise CardError(
+            f"the card's fitness entry {name!r} is {reprlib.repr(value)}; expected two numbers from {least:g} to "
+            f"{most:g}, the {'left edge' if name == 'azimuth_deg' else 'lower'} first"
+        )
+    return first, second
 
 
 _MEASURED = tuple(field.name for field in fields(FitnessProfile) if field.name not in ("n_scans", "azimuth_deg"))

@@ -145,6 +145,9 @@ class Perceiver:
     full_turn : bool
         Run a range-image model once for each sector, four times for the shipped models. Every point then has a class,
         and there are boxes beside and behind the vehicle.
+    trusted : bool
+        Open model files whose graphs are otherwise refused: with unusual operators, functions, subgraphs or sizes
+        (`edgeperc.session.Session`). Only for files whose origin you know.
 
     Attributes
     ----------
@@ -198,6 +201,7 @@ class Perceiver:
         adapt: Adaptation = "both",
         boxes_from: BoxesFrom = "both",
         full_turn: bool = False,
+        trusted: bool = False,
     ) -> None:
         _check_choice("adapt", adapt, ADAPTATIONS, {"neither": "none"})
         _check_choice("on_mismatch", on_mismatch, ("warn", "raise", "ignore"))
@@ -223,7 +227,8 @@ class Perceiver:
         # Twice the spacing of beams or columns: points of one object are linked even if a return between is missing.
         self._distance_per_m = 2.0 * math.radians(max(np.median(gaps_deg or [0.0]), 360.0 / self.sensor.columns))
         self._networks = [
-            self._load(Session(model, provider, precision=precision, n_threads=n_threads)) for model in wanted
+            self._load(Session(model, provider, precision=precision, n_threads=n_threads, trusted=trusted))
+            for model in wanted
         ]
         views = [n.session.card.view.kind for n in self._networks]
         if not views or len(views) != len(set(views)):

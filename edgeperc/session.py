@@ -14,7 +14,9 @@ import importlib.metadata
 import json
 import logging
 import os
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,7 @@ from .errors import (
     SettingsError,
 )
 from .extras import require
+from .onnx_file import check_graph, read_model
 from .tuning import compiled_folder, cpu_features, fingerprint, read_setting, settings_path
 from .zoo import Variant, choose, digest, resolve
 
@@ -56,12 +59,14 @@ MAX_GOLDEN_DEVIATION = {"fp32": 0.02, "bf16": 0.5, "int8": 0.5}
 # Share of the golden values that must be within that deviation. If two maxima in max-pooling differ only by rounding,
 # engines may unpool to either one, and a few pixels differ from there on.
 GOLDEN_SHARE = 0.9
-# The key of a tensor's external-data entry in protobuf. A model with external data could read any file.
-EXTERNAL_DATA = b"\n\x08location\x12"
+# The largest network of this project takes 0.2 s on one core of a server.
+MAX_FIRST_RUN_S = 30.0
 
 
 def _onnxruntime() -> Any:
-    return require("onnxruntime", "cpu", "Running a model")
+    ort = require("onnxruntime", "cpu", "Running a model")
+    ort.set_default_logger_severity(4)  # its exceptions contain the messages, and ours repeat them
+    return ort
 
 
 def _version(package: str) -> str:
@@ -136,6 +141,10 @@ class Session:
         (`edgeperc.zoo.choose`). Any other value is required.
     n_threads : int or None
         Threads inside one run; None leaves it to the provider.
+    trusted : bool
+        Open graphs that are otherwise refused, because they could run without end or take all memory: with operators
+        that are not in `edgeperc.onnx_file.OPERATORS`, functions, subgraphs or sizes beyond the limits. The first run
+        is then not stopped after 30 s. Weights in other files are always refused.
 
     Attributes
     ----------
@@ -158,7 +167,7 @@ class Session:
         Raw outputs by output *kind*, without the batch axis; overwritten by every `run`.
     golden_deviation : float
         Deviation of the outputs for the card's golden input from the exporter's, in standard deviations of the output
-        (90th percentile). NaN if the card has no golden record.
+        (90th percentile). NaN if the card has no golden record, which is logged as a warning.
 
     Raises
     ------
@@ -181,10 +190,12 @@ class Session:
         *,
         precision: str = "auto",
         n_threads: int | None = None,
+        trusted: bool = False,
     ) -> None:
         if n_threads is not None and n_threads < 1:
             raise OptionError(f"n_threads is {n_threads}; expected at least 1, or None")
         _check_names(provider, precision)
+        self._trusted = trusted
         ort = _onnxruntime()
         variants = resolve(model)
         self.digest = digest(variants)
@@ -250,17 +261,14 @@ class Session:
     def _prepare(self, ort: Any, short: str, variant: Variant, precision: str, n_threads: int | None) -> None:
         self.path, self.card = variant.path, variant.card
         self.short, self.provider, self.precision = short, PROVIDERS[short], precision
-        try:
-            blob = self.path.read_bytes()
-        except OSError as exc:
-            raise ModelFileError(f"{self.path} cannot be read: {exc.strerror}") from exc
-        if EXTERNAL_DATA in blob:
-            raise ModelFileError(f"{self.path} keeps weights in other files; export it with its weights inside")
-        self.sha256 = digest([variant])
+        blob = read_model(self.path)
+        check_graph(blob, self.path, trusted=self._trusted)
+        self.sha256 = hashlib.sha256(blob).hexdigest()
         self._session = self._open(ort, blob, short, precision, n_threads)
         self._check_graph()
-        self._bind()
-        self.golden_deviation = self._warm_up(MAX_GOLDEN_DEVIATION[precision])
+        with _terminated(ort, None if self._trusted else MAX_FIRST_RUN_S) as run_options:
+            self._bind(run_options)
+            self.golden_deviation = self._warm_up(MAX_GOLDEN_DEVIATION[precision], run_options)
 
     @property
     def description(self) -> str:
@@ -269,7 +277,7 @@ class Session:
 
     def _open(self, ort: Any, blob: bytes, short: str, precision: str, n_threads: int | None) -> Any:
         options = ort.SessionOptions()
-        options.log_severity_level = 3
+        options.log_severity_level = 4
         options.inter_op_num_threads = 1
         options.use_deterministic_compute = True
         if n_threads is not None:
@@ -329,15 +337,7 @@ class Session:
                 raise CardMismatchError(
                     f"{self.path}: card names output {output.name!r}, the graph has {list(outputs)}"
                 )
-            self._match(output.name, outputs[output.name], self._output_shape(output.kind))
-
-    def _output_shape(self, kind: str) -> tuple[int | None, ...]:
-        height, width = self.card.view.height, self.card.view.width
-        if kind == "box_slots":
-            return (1, None, 4)
-        if kind == "box_dense":
-            return (1, 9, height // 4, width // 4)
-        return (1, len(self.card.classes), height, width)
+            self._match(output.name, outputs[output.name], self.card.output_shape(output.kind))
 
     def _match(self, name: str, node: Any, expected: tuple[int | None, ...]) -> None:
         shape = tuple(node.shape)
@@ -351,31 +351,31 @@ class Session:
                 f"of shape {expected} (None: any)"
             )
 
-    def _bind(self) -> None:
+    def _bind(self, run_options: Any) -> None:
         card = self.card
         batch = np.zeros((1, len(card.input.channels), card.view.height, card.view.width), np.float32)
         self.input: NDArray[np.float32] = batch[0]
         self._binding = self._session.io_binding()
         self.outputs: dict[str, NDArray[np.float32]] = {}
-        for output, shape in zip(card.outputs, self._shapes(batch), strict=True):
+        for output, shape in zip(card.outputs, self._shapes(batch, run_options), strict=True):
             buffer = np.zeros(shape, np.float32)
             self._binding.bind_output(output.name, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
             self.outputs[output.kind] = buffer[0]
         self._batch = batch  # the binding holds a bare pointer
         self._bound_input = (card.input.name, "cpu", 0, np.float32, batch.shape, batch.ctypes.data)
 
-    def _shapes(self, batch: NDArray[np.float32]) -> list[tuple[int, ...]]:
+    def _shapes(self, batch: NDArray[np.float32], run_options: Any) -> list[tuple[int, ...]]:
         """Shapes of the outputs, from the graph, or from a run if the graph leaves dimensions open."""
         declared = {o.name: tuple(o.shape) for o in self._session.get_outputs()}
         shapes = [declared[o.name] for o in self.card.outputs]
         if all(isinstance(n, int) for shape in shapes for n in shape):
             return shapes
         try:
-            answers = self._session.run([o.name for o in self.card.outputs], {self.card.input.name: batch})
+            answers = self._session.run([o.name for o in self.card.outputs], {self.card.input.name: batch}, run_options)
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             raise InferenceError(f"{self.path}: the first run on {self.provider} failed: {exc}") from exc
         for output, answer in zip(self.card.outputs, answers, strict=True):
-            expected = self._output_shape(output.kind)
+            expected = self.card.output_shape(output.kind)
             if answer.ndim != len(expected) or any(
                 e is not None and s != e for s, e in zip(answer.shape, expected, strict=True)
             ):
@@ -384,30 +384,33 @@ class Session:
                 )
         return [answer.shape for answer in answers]
 
-    def _warm_up(self, limit: float) -> float:
+    def _warm_up(self, limit: float, run_options: Any) -> float:
         golden = self.card.golden
         if golden is None:
-            self.run()
+            logger.warning(
+                "the card of %s has no golden record: the outputs on %s are not compared with the exporter's",
+                *(self.path, self.provider),
+            )
+            self._run(run_options)
             return float("nan")
         self.input[:] = golden_input(golden.seed, self._batch.shape)[0]
         if hashlib.sha256(self._batch.tobytes()).hexdigest() != golden.input_sha256:
             raise CardMismatchError(
                 f"{self.path}: the golden input does not have the card's SHA-256; export the model again"
             )
-        self.run()
+        self._run(run_options)
         self.input[:] = 0.0
         deviation = 0.0
         for output in self.card.outputs:
-            known = golden.outputs.get(output.name)
+            known, here = golden.outputs.get(output.name), self.outputs[output.kind].reshape(-1)
             if known is None:
                 raise CardMismatchError(f"{self.path}: the card's golden record lacks output {output.name!r}")
             try:
-                here = self.outputs[output.kind].reshape(-1)[np.asarray(known["positions"], np.int64)]
-                apart = np.abs(here - np.asarray(known["values"], np.float32)) / max(float(known["std"]), 1e-6)
-            except (ArithmeticError, LookupError, TypeError, ValueError) as exc:
-                raise CardError(
-                    f"{self.path}: the card's golden record of {output.name!r} is malformed: {exc}"
-                ) from exc
+                golden.check_output(output.name, len(here))
+            except CardError as exc:
+                raise CardError(f"{self.path}: {exc}; export the model again") from exc
+            here = here[np.asarray(known["positions"], np.int64)]
+            apart = np.abs(here - np.asarray(known["values"], np.float32)) / max(float(known["std"]), 1e-6)
             typical = np.quantile(apart, GOLDEN_SHARE) if np.isfinite(here).all() else np.inf
             deviation = max(deviation, float(typical))
         if deviation > limit:
@@ -430,13 +433,37 @@ class Session:
         InferenceError
             onnxruntime failed.
         """
+        self._run()
+        return self.outputs
+
+    def _run(self, *run_options: Any) -> None:
         try:
             # Bind before every run: a provider with its own memory copies the input only when it is bound.
             self._binding.bind_input(*self._bound_input)
-            self._session.run_with_iobinding(self._binding)
+            self._session.run_with_iobinding(self._binding, *run_options)
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             raise InferenceError(f"{self.path}: a run on {self.provider} failed: {exc}") from exc
-        return self.outputs
+
+
+@contextmanager
+def _terminated(ort: Any, after_s: float | None) -> Iterator[Any]:
+    """Run options with which onnxruntime stops between two operators after ``after_s`` seconds; None: never."""
+    options = ort.RunOptions()
+    options.log_severity_level = 4
+
+    def give_up() -> None:
+        options.terminate = True
+
+    if after_s is None:
+        yield options
+        return
+    timer = threading.Timer(after_s, give_up)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield options
+    finally:
+        timer.cancel()
 
 
 def golden_input(seed: int, shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from edgeperc.card import ModelCard
 from edgeperc.errors import ModelFileError, ProviderError
+from edgeperc.onnx_file import read_model
 
 __all__ = [
     "BF16_FEATURES",
@@ -220,8 +221,5 @@ def digest(variants: Sequence[Variant]) -> str:
     ModelFileError
         A file cannot be read.
     """
-    try:
-        hashes = [hashlib.sha256(variant.path.read_bytes()).hexdigest() for variant in variants]
-    except OSError as exc:
-        raise ModelFileError(f"{exc.filename} cannot be read: {exc.strerror}") from exc
+    hashes = [hashlib.sha256(read_model(variant.path)).hexdigest() for variant in variants]
     return hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()

@@ -30,7 +30,7 @@ TOP_VIEW_CARD = ModelCard(
     box_size_priors={"car": (3.9, 1.6, 1.5)},
     fitness={"a": 1.0},
     training={"licence": "Apache-2.0", "data": "Straße"},
-    golden=Golden(7, "00", {"map": {"positions": [0], "values": [0.5], "std": 1.0, "sha256": "11"}}),
+    golden=Golden(7, "00", {"map": {"positions": [*range(16)], "values": [0.5] * 16, "std": 1.0, "sha256": "11"}}),
 )
 RANGE_CARD = replace(
     TOP_VIEW_CARD,
@@ -93,12 +93,11 @@ def test_missing_keys_are_refused(key: str) -> None:
         ({"score_threshold": 1.5}, "score_threshold"),
         ({"box_size_priors": {"car": []}}, "malformed"),
         ({"box_size_priors": {"car": [1, 2, 3, 4]}}, "malformed"),
-        ({"golden": {"seed": float("inf"), "input_sha256": "", "outputs": {}}}, "malformed"),
         ({"view": {"kind": "sphere"}}, "'sphere'.*top_view"),
         ({"view": 3}, "malformed"),
         ({"input": {"name": "x", "channels": ["color"], "mean": [0], "std": [1]}}, "color"),
         ({"input": {"name": "x", "channels": ["height"], "mean": [0, 1], "std": [1]}}, "2 means"),
-        ({"input": {"name": "x", "channels": ["height"], "mean": [0], "std": [0]}}, "positive deviations"),
+        ({"input": {"name": "x", "channels": ["height"], "mean": [0], "std": [0]}}, r"input.std\[0\] is 0"),
     ],
 )
 def test_each_corruption_is_named(change: dict[str, Any], message: str) -> None:
@@ -240,14 +239,22 @@ def test_file_without_a_card_is_a_card_error(tmp_path: Path, content: bytes) -> 
         varint(7 << 3 | 7),
         b"\x00",
         b"\x80",
-        entry(CARD_KEY, b"\xff\xfe"),
         field(14, varint(1 << 3 | 2) + varint(5)),
         (varint(9 << 3) + b"\x00") * 20_000,
     ],
 )
-def test_a_damaged_file_is_a_card_error(tmp_path: Path, content: bytes) -> None:
-    with pytest.raises(CardError, match=r"model\.onnx is not a complete \.onnx file"):
+def test_damaged_file_is_a_model_file_error(tmp_path: Path, content: bytes) -> None:
+    with pytest.raises(ModelFileError, match=r"model\.onnx is not a complete \.onnx file"):
         ModelCard.read(write(tmp_path, content))
+
+
+def test_a_card_is_utf_8_of_at_most_16_mb(tmp_path: Path) -> None:
+    with pytest.raises(CardError, match=r"model\.onnx: the entry edgeperc\.card is not UTF-8"):
+        ModelCard.read(write(tmp_path, entry(CARD_KEY, b"\xff\xfe")))
+    with pytest.raises(CardError, match=r"model\.onnx: the entry edgeperc\.card has 16000001 bytes; expected at most"):
+        ModelCard.read(write(tmp_path, entry(CARD_KEY, b" " * 16_000_001)))
+    with pytest.raises(CardError, match="16000001 characters; expected at most 16000000"):
+        ModelCard.from_json(" " * 16_000_001)
 
 
 def test_a_damaged_card_names_its_file(tmp_path: Path) -> None:
@@ -275,7 +282,7 @@ def test_any_bytes_are_a_card_or_an_error(data: st.DataObject) -> None:
             content[at:at] = data.draw(st.binary(max_size=20))
         if not content:
             break
-    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(CardError):
+    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(CardError, ModelFileError):
         ModelCard.read(write(Path(folder), bytes(content)))
 
 

@@ -200,12 +200,11 @@ def test_run_prints_a_line_a_scan(
     assert "boxes: 1 car" in lines[1]
     assert "car 600, pedestrian 0, cyclist 0" in lines[1]
     assert fake.made[0].given == (["ssadnet", "pointseg"], "os1-64", "cpu", 2, "ignore")
-    assert (
-        run("run", scans[0], "--boxes-from", "clusters", "--full-turn", "--precision", "bf16", "--adapt", "none") == 0
-    )
+    options = ("--boxes-from", "clusters", "--full-turn", "--precision", "bf16", "--adapt", "none", "--trusted")
+    assert run("run", scans[0], *options) == 0
     assert [one.more for one in fake.made] == [
-        {"precision": "auto", "adapt": "both", "boxes_from": "both", "full_turn": False},
-        {"precision": "bf16", "adapt": "none", "boxes_from": "clusters", "full_turn": True},
+        {"precision": "auto", "adapt": "both", "boxes_from": "both", "full_turn": False, "trusted": False},
+        {"precision": "bf16", "adapt": "none", "boxes_from": "clusters", "full_turn": True, "trusted": True},
     ]
 
 

@@ -23,7 +23,7 @@ PACKAGES = {
 FLOORS = {
     "edgeperc": """
         errors atomic
-        extras onnx_metadata
+        extras onnx_file
         card points sensor tuning
         perception zoo.__init__
         geometry

@@ -292,7 +292,7 @@ def test_wrong_cards_are_refused():
     spec = InputSpec("input", ("x",), (0.0,), (1.0,))
     for view in (
         RangeImageGeometry((1.0, 1.0 - 1e-9, -1.0)),
-        RangeImageGeometry((1.0, -1.0), 200000),
+        RangeImageGeometry((1.0, -1.0), 60000, 46.0, 45.0),
         RangeImageGeometry((1.0, -1.0), 4, 45.0 + 1e-9, 45.0),
     ):
         with pytest.raises(CardError, match="closer than"):

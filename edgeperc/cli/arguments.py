@@ -134,13 +134,19 @@ def add_provider(group: Any, *, provider: str = "auto", precision: str = "auto")
 
 
 def add_network(group: Any) -> None:
-    """Add options of networks: ``--provider``, ``--precision``, ``--threads``, ``--boxes-from``, ``--full-turn``."""
+    """Add options of networks: `add_provider`, ``--threads``, ``--trusted``, ``--boxes-from``, ``--full-turn``."""
     add_provider(group)
     group.add_argument(
         "--threads",
         type=positive,
         metavar="N",
         help="threads inside one network (default: the provider's choice, usually one for each core)",
+    )
+    group.add_argument(
+        "--trusted",
+        action="store_true",
+        help="open models whose graphs have unusual operators, subgraphs or sizes; only for files whose "
+        "origin you know (default: refuse them)",
     )
     add_boxes_from(group, "both")
     group.add_argument(

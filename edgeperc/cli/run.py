@@ -134,6 +134,7 @@ def make_perceiver(
         adapt=adapt,
         boxes_from=arguments.boxes_from,
         full_turn=arguments.full_turn,
+        trusted=arguments.trusted,
     )
 
 
