@@ -544,7 +544,7 @@ def test_packets_without_a_lidar_are_refused(tmp_path: Path, ouster: Path) -> No
     ("name", "content", "error"),
     [
         ("empty.pcap", b"", "cut short: 0 bytes"),
-        ("header.pcap", struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1), "no Velodyne's packets"),
+        ("header.pcap", struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1), "not a Velodyne capture"),
         ("half.pcap", b"\xd4\xc3\xb2\xa1\x02\0\x04\0", "cut short: 8 bytes"),
         ("text.pcap", b"no capture at all, but text", "not a pcap file by its first bytes"),
         ("new.pcapng", b"\n\r\r\n" + bytes(40), "editcap -F pcap"),

@@ -318,8 +318,9 @@ def test_the_scans_of_a_capture_are_numbered(capture: Path, tmp_path: Path, caps
 
 def test_a_missing_reader_is_said_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
     (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n")
-    monkeypatch.setitem(sys.modules, "rosbags", None)
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    (tmp_path / "absent").mkdir()
+    (tmp_path / "absent" / "rosbags.py").write_text("raise ImportError('not installed')\n")
+    monkeypatch.syspath_prepend(tmp_path / "absent")  # the process that decodes captures has this process's path
     assert run("run", tmp_path / "drive.bag") == 2
     assert "pip install 'edgeperc[io]'" in capsys.readouterr().err
 
