@@ -11,11 +11,11 @@ import math
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from .card import RangeImageGeometry
 from .errors import PointsError, SensorError
+from .kernel_cache import njit
 from .points import as_points, read_only
 from .sensor import SensorProfile
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,7 @@ __all__ = ["open_atomic", "write_atomic"]
 
 
 @contextmanager
-def open_atomic(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
+def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) -> Iterator[IO[Any]]:
     """Open a temporary file in the target's folder; it replaces the target when the block ends without an error.
 
     Parameters
@@ -21,6 +22,8 @@ def open_atomic(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
         The target.
     mode : {"wb", "w"}
         ``"w"`` writes text as UTF-8.
+    permissions : int
+        Of a new file, reduced by the process's umask.
 
     Yields
     ------
@@ -33,16 +36,21 @@ def open_atomic(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
         The file cannot be written; the target is unchanged.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    # Process numbers are not unique: containers that share a folder have equal ones.
+    temporary = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.part")
+
+    def opener(name: str, flags: int) -> int:
+        return os.open(name, flags | os.O_EXCL, permissions)
+
     try:
-        with temporary.open(mode, encoding=None if "b" in mode else "utf-8") as file:
+        with open(temporary, mode, encoding=None if "b" in mode else "utf-8", opener=opener) as file:
             yield file
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
 
 
-def write_atomic(path: str | Path, content: bytes) -> None:
+def write_atomic(path: str | Path, content: bytes, permissions: int = 0o666) -> None:
     """Write ``content`` to a file; see `open_atomic`."""
-    with open_atomic(path) as file:
+    with open_atomic(path, permissions=permissions) as file:
         file.write(content)

@@ -12,11 +12,11 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from .errors import PointsError
 from .geometry import oriented_iou, rectangles, shared_area
+from .kernel_cache import njit
 from .perception import Box
 from .points import read_only
 

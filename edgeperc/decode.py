@@ -6,12 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from .card import ModelCard, TopViewGeometry
 from .errors import CardMismatchError, InferenceError
 from .geometry import draw_footprints, suppress_overlaps
+from .kernel_cache import njit
 from .perception import Box
 
 __all__ = ["decode_classes", "decode_dense", "decode_slots", "decode_top_view"]

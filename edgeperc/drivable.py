@@ -11,11 +11,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from .errors import PointsError
 from .geometry import draw_footprints
+from .kernel_cache import njit
 from .perception import Box, TopView
 
 __all__ = ["RoadAhead", "fill_corridor", "fill_free", "fill_rings", "mark_connected", "mark_kept", "road_ahead"]

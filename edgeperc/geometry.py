@@ -11,11 +11,11 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from .card import TopViewGeometry
 from .errors import PointsError
+from .kernel_cache import njit
 from .perception import Box
 from .points import read_only
 

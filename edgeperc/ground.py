@@ -12,10 +12,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from .errors import PointsError
+from .kernel_cache import njit
 from .points import read_only
 
 __all__ = ["Ground", "find_ground"]

@@ -13,11 +13,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from .card import InputSpec, RangeImageGeometry, TopViewGeometry
 from .errors import CardError, PointsError
+from .kernel_cache import njit
 from .points import read_only
 
 __all__ = [

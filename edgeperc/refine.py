@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from .errors import PointsError
+from .kernel_cache import njit
 from .points import read_only
 
 __all__ = ["OBJECT_RADIUS_M", "label_points", "remove_outliers"]

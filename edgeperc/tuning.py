@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import platform
+import stat
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,6 +26,7 @@ __all__ = [
     "fingerprint",
     "read_setting",
     "settings_path",
+    "unsafe_because",
     "write_settings",
 ]
 
@@ -41,6 +43,28 @@ def cache_folder() -> Path:
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches" / "edgeperc"
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "edgeperc"
+
+
+def unsafe_because(status: os.stat_result) -> str | None:
+    """Why compiled code in a file or folder may come from another user; None if only this user or root can write it.
+
+    Parameters
+    ----------
+    status : os.stat_result
+        Of the file or folder.
+
+    Returns
+    -------
+    str or None
+        The reason. Always None on Windows, where the user's folders have access lists.
+    """
+    if not hasattr(os, "geteuid"):
+        return None
+    if status.st_uid not in (0, os.geteuid()):
+        return f"it belongs to user {status.st_uid}, this process to user {os.geteuid()}"
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        return f"other users can write it (mode {stat.S_IMODE(status.st_mode):o}); run chmod go-w"
+    return None
 
 
 def compiled_folder(engine: str, sha256: str, precision: str) -> Path | None:

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import TrackingError
 from ..geometry import oriented_iou, shared_area
+from ..kernel_cache import njit
 
 __all__ = [
     "Clear",

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ..errors import PointsError
+from ..kernel_cache import njit
 from ..points import assemble, plain_name
 from .tables import MAX_BYTES, MAX_HEADER_BYTES, column, cut_short, parse_table, whole_number
 

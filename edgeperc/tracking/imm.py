@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from ..kernel_cache import njit
 
 __all__ = ["fill_combined", "fill_interaction", "fill_mode_probabilities"]
 

@@ -11,8 +11,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from ..kernel_cache import njit
 
 __all__ = ["MAX_EVENTS", "fill_association", "fill_by_propagation", "fill_likelihoods"]
 

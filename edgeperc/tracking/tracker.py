@@ -45,6 +45,12 @@ TWIST_WALK = np.array([4.0, 0.5, 0.5])
 TURN_MEMORY_S = 2.0  # without evidence, the estimated turn rate decays with this time constant
 MAX_LANDMARKS = 48
 
+# Beyond these limits squares and differences of numbers lose their meaning, or overflow.
+FARTHEST_M = 1e8  # coordinates of boxes and poses; projected map coordinates are up to 1e7
+SIZES_M = (1e-6, 1e6)
+LATEST_S = 1e12  # a clock that counts nanoseconds since 1970 is at 1.7e18
+SHORTEST_STEP_S = 1e-6
+
 
 class Tracker:
     """Track objects from scan to scan.
@@ -145,12 +151,14 @@ class Tracker:
         Raises
         ------
         StampError
-            ``stamp_s`` is not finite, or not later than that of the last scan.
+            ``stamp_s`` is not finite, beyond 1e12 s, or not at least 1 us later than that of the last scan.
         TrackingError
-            A box or the pose is malformed or not finite, or only some scans have poses.
+            A box or the pose is malformed, not finite or farther than 1e8 m, or only some scans have poses.
         """
         stamp_s = float(stamp_s)
-        if not math.isfinite(stamp_s) or stamp_s <= self._stamp_s:
+        if not abs(stamp_s) <= LATEST_S:
+            raise StampError(f"got a scan at {stamp_s} s; expected a finite time in seconds, up to {LATEST_S:g}")
+        if stamp_s < self._stamp_s + SHORTEST_STEP_S:
             raise StampError(
                 f"got a scan at {stamp_s} s after one at {self._stamp_s} s; pass scans in the order of their times, "
                 "each once, or call reset() before a new recording"
@@ -325,13 +333,18 @@ def _checked_boxes(boxes: Iterable[Box]) -> tuple[NDArray[np.float64], list[str]
     try:
         rows = np.array([(*box.center, *box.size, box.yaw, box.score) for box in given], np.float64).reshape(-1, 8)
         names = [box.label for box in given]
-    except (AttributeError, TypeError, ValueError) as exc:
+    except (AttributeError, OverflowError, TypeError, ValueError) as exc:
         raise TrackingError(f"got boxes that are not edgeperc.Box objects ({exc}); pass edgeperc.Box objects") from exc
-    right = np.isfinite(rows).all(axis=1) & (rows[:, 3:6] > 0.0).all(axis=1) & (rows[:, 7] >= 0.0) & (rows[:, 7] <= 1.0)
+    sizes = rows[:, 3:6]
+    right = np.isfinite(rows).all(axis=1) & (rows[:, 7] >= 0.0) & (rows[:, 7] <= 1.0)
+    right &= (np.abs(rows[:, :3]) <= FARTHEST_M).all(axis=1)
+    right &= ((sizes >= SIZES_M[0]) & (sizes <= SIZES_M[1])).all(axis=1)
+    right &= np.array([isinstance(name, str) for name in names], np.bool_)
     if not right.all():
         wrong = given[int(np.argmin(right))]
         raise TrackingError(
-            f"got {wrong}; expected finite numbers, sizes above 0 and a score in 0..1: drop such boxes before tracking"
+            f"got {wrong}; expected finite numbers, coordinates up to {FARTHEST_M:g} m, sizes from {SIZES_M[0]:g} to "
+            f"{SIZES_M[1]:g} m and a score in 0..1: drop such boxes before tracking"
         )
     return rows, names
 
@@ -339,10 +352,12 @@ def _checked_boxes(boxes: Iterable[Box]) -> tuple[NDArray[np.float64], list[str]
 def _checked_pose(given: ArrayLike) -> NDArray[np.float64]:
     try:
         pose = np.array(given, np.float64)
-    except (TypeError, ValueError) as exc:
+    except (OverflowError, TypeError, ValueError) as exc:
         raise TrackingError(f"got a T_world_sensor that is not a matrix ({exc}); expected (4, 4) numbers") from exc
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise TrackingError(f"got a T_world_sensor of shape {pose.shape}; expected (4, 4) finite numbers")
+    if pose.shape != (4, 4) or not (np.abs(pose) <= FARTHEST_M).all():
+        raise TrackingError(
+            f"got a T_world_sensor of shape {pose.shape}; expected (4, 4) finite numbers, up to {FARTHEST_M:g}"
+        )
     off = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max()
     if off > 1e-3 or np.linalg.det(pose[:3, :3]) < 0.0 or (pose[3] != [0.0, 0.0, 0.0, 1.0]).any():
         raise TrackingError("got a T_world_sensor that is not rigid; expected a rotation and a translation")

@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from ..kernel_cache import njit
 
 __all__ = ["CONSTANT_VELOCITY", "CTRV", "MODES", "RANDOM_MOTION", "fill_predictions", "fill_updates"]
 

@@ -1,0 +1,237 @@
+"""Compiled kernels on disk: checked before they are loaded, and never a reason for a start to fail.
+
+numba keeps compiled functions as pickled machine code. Its own cache loads whatever the files hold, so a damaged file
+raises an unrelated error or crashes the process. Here each file begins with a checksum. A damaged file is reported,
+compiled again and replaced. The checksum protects against damage only. Against other users, a folder or file is used
+only if it belongs to this user or to root and nobody else can write it.
+
+Folders, in this order: ``NUMBA_CACHE_DIR``, if it is set; otherwise ``__pycache__`` beside the source, and ``kernels``
+in `edgeperc.tuning.cache_folder`. If none can be written, every start compiles again, and a warning in the log says so.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import logging
+import os
+import pickle
+import sys
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import numba
+import numba.core.compiler
+import numba.core.config
+import numba.core.serialize
+import numba.core.sigutils
+import numpy as np
+
+from .atomic import write_atomic
+from .tuning import cache_folder, unsafe_because
+
+__all__ = ["KernelCache", "njit"]
+
+logger = logging.getLogger(__name__)
+
+_numba: Any = numba.core  # internals, which have no types
+_DIGEST_BYTES = hashlib.sha256().digest_size
+_reported: set[str] = set()
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """`numba.njit`, whose cache is a `KernelCache`.
+
+    Parameters
+    ----------
+    **options
+        As `numba.njit`. With ``cache=True`` the compiled function is kept on disk.
+
+    Returns
+    -------
+    callable
+        The decorator.
+    """
+
+    kept = options.pop("cache", False)
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        kernel = numba.njit(**options)(function)
+        if kept and hasattr(kernel, "_cache"):  # with NUMBA_DISABLE_JIT, the kernel is the function itself
+            kernel._cache = KernelCache(function)
+        return kernel
+
+    return decorate
+
+
+class KernelCache:
+    """The compiled forms of one kernel on disk, in place of `numba.core.caching.FunctionCache`.
+
+    One file holds the machine code for one signature, processor and version of Python. It begins with a SHA-256 of the
+    rest and a stamp of the source file and the versions of numba, llvmlite and numpy. With another stamp it is compiled
+    again and replaced.
+
+    Parameters
+    ----------
+    function : callable
+        The Python function.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        # In a frozen application there are no source files.
+        self._source = Path(sys.executable if getattr(sys, "frozen", False) else inspect.getfile(function)).absolute()
+        self._enabled = True
+
+    @property
+    def cache_path(self) -> str | None:
+        """The first folder that can be used; None if there is none."""
+        return next((str(folder) for folder in self._folders() if _unusable(folder) is None), None)
+
+    def enable(self) -> None:
+        """Load and save from now on."""
+        self._enabled = True
+
+    def disable(self) -> None:
+        """Neither load nor save from now on."""
+        self._enabled = False
+
+    def flush(self) -> None:
+        """Nothing: files of another stamp are replaced when they are met."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Load a compiled form.
+
+        Parameters
+        ----------
+        sig : tuple of types, Signature or str
+        target_context : BaseContext
+            numba's description of the processor.
+
+        Returns
+        -------
+        CompileResult or None
+            None if there is none that can be used.
+        """
+        target_context.refresh()
+        stamp = _stamp(str(self._source)) if self._enabled else None
+        if stamp is None:
+            return None
+        name, types = self._key(sig, target_context.codegen())
+        for folder in self._folders():
+            file = folder / name
+            try:
+                if _unusable(folder) is None and (content := _read(file)) is not None and content[0] == stamp:
+                    found, payload = pickle.loads(content[1])
+                    if found == types:
+                        return _numba.compiler.CompileResult._rebuild(target_context, *payload)
+            except Exception as exc:  # what a file holds, or what cannot be read, never stops the start
+                reason = f"{type(exc).__name__}: {exc}"
+                _report("damaged", "the compiled kernel %s cannot be used and is compiled again: %s", file, reason)
+        return None
+
+    def save_overload(self, sig: Any, result: Any) -> None:
+        """Save a compiled form in the first folder that takes it.
+
+        Parameters
+        ----------
+        sig : tuple of types, Signature or str
+        result : CompileResult
+        """
+        if not self._enabled or result.library.has_dynamic_globals:  # addresses in this process
+            return
+        stamp = _stamp(str(self._source))
+        reasons = []
+        if stamp is None:
+            reasons.append(f"{self._source} cannot be read")
+        else:
+            name, types = self._key(sig, result.codegen)
+            rest = stamp + _numba.serialize.dumps((types, result._reduce()))
+            for folder in self._folders():
+                try:
+                    # mkdir's mode, lessened by the umask, is that of the last folder only.
+                    folder.parent.mkdir(0o755, parents=True, exist_ok=True)
+                    folder.mkdir(0o755, exist_ok=True)
+                    reason = _unusable(folder)
+                    if reason is None:
+                        write_atomic(folder / name, hashlib.sha256(rest).digest() + rest, 0o644)
+                        return
+                except OSError as exc:
+                    reason = exc.strerror or str(exc)
+                reasons.append(f"{folder}: {reason}")
+        _report(
+            "not kept",
+            "compiled kernels are not kept, and every start compiles them again (%s); set NUMBA_CACHE_DIR to a folder "
+            "that exists and only you can write",
+            "; ".join(reasons) or "there is no home folder",
+        )
+
+    def _key(self, sig: Any, codegen: Any) -> tuple[str, Any]:
+        """The file's name for a signature, and the types that it is for."""
+        types = _numba.sigutils.normalize_signature(sig)
+        function, tag = self._function, sys.implementation.cache_tag
+        what = repr((function.__qualname__, *map(str, types), codegen.magic_tuple(), tag)).encode()
+        name = f"{self._source.stem}.{function.__qualname__}".translate({ord("<"): None, ord(">"): None})
+        return f"{name[:80]}-{hashlib.sha256(what).hexdigest()[:16]}.kernel", types
+
+    def _folders(self) -> Iterator[Path]:
+        """Where compiled forms may lie, best first."""
+        place = f"{self._source.parent.name}-{hashlib.sha256(bytes(self._source.parent)).hexdigest()[:16]}"
+        if _numba.config.CACHE_DIR:
+            yield Path(_numba.config.CACHE_DIR).absolute() / place
+            return
+        if not getattr(sys, "frozen", False):
+            yield self._source.parent / "__pycache__"
+        try:
+            yield cache_folder() / "kernels" / place
+        except RuntimeError:  # there is no home folder
+            return
+
+
+def _read(file: Path) -> tuple[bytes, bytes] | None:
+    """Stamp and content of a file; None if there is none. Raises ValueError or OSError."""
+    try:
+        with file.open("rb") as opened:
+            reason = unsafe_because(os.fstat(opened.fileno()))
+            content = opened.read()
+    except FileNotFoundError:
+        return None
+    if reason is not None:
+        raise ValueError(reason)
+    digest, rest = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+    if hashlib.sha256(rest).digest() != digest:
+        raise ValueError(f"its {len(content)} bytes do not have the checksum that they were written with")
+    return rest[:_DIGEST_BYTES], rest[_DIGEST_BYTES:]
+
+
+def _unusable(folder: Path) -> str | None:
+    """Why a folder for kernels is not used: other users could write it, or replace it; None if it may be used."""
+    for each in (folder, folder.parent):
+        try:
+            reason = unsafe_because(each.stat())
+        except OSError:
+            continue  # it does not exist, so it holds nothing
+        if reason is not None:
+            return reason if each == folder else f"in {each}, {reason}"
+    return None
+
+
+@cache
+def _stamp(source: str) -> bytes | None:
+    """Changes with the source file and everything else that the machine code depends on; None without a source."""
+    try:
+        text = Path(source).read_bytes()
+    except OSError:
+        return None
+    versions = f"{numba.__version__} {llvmlite.__version__} {np.__version__} {sys.version}"
+    return hashlib.sha256(versions.encode() + b"\n" + text).digest()
+
+
+def _report(kind: str, message: str, *values: object) -> None:
+    """Log a warning the first time in this process; further ones of its kind are logged as information."""
+    level = logging.INFO if kind in _reported else logging.WARNING
+    _reported.add(kind)
+    logger.log(level, message, *values)
