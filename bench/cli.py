@@ -2,7 +2,7 @@
 
 Without a command it is ``run``, or ``matrix`` if ``--providers`` or ``--precisions`` is among the options. Exit codes:
 0 success (``compare``: no difference, or faster), 1 ``compare``: slower, 2 nothing could be measured or compared,
-130 interrupted, after the results so far are written.
+130 interrupted, after the results so far are written, 141 the program that reads the output closed it, 143 terminated.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-from edgeperc import EdgepercError, __version__
+from edgeperc import __version__
+from edgeperc.cli.program import Parser, run_program
 
 from .commands import compare, matrix, peers, run, scaling, soak
-from .options import print_error
 
 __all__ = ["build_parser", "main", "with_command"]
 
@@ -36,18 +36,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code. Wrong usage raises argparse's ``SystemExit(2)``.
     """
     typed = with_command(sys.argv[1:] if argv is None else argv)
+    return run_program("edgeperc-bench", lambda: _run(typed))
+
+
+def _run(typed: list[str]) -> int:
     command_line = shlex.join(["edgeperc-bench", *typed])
     arguments = build_parser().parse_args(typed, argparse.Namespace(command_line=command_line))
-    try:
-        code: int = arguments.run(arguments)
-        sys.stdout.flush()
-        return code
-    except (EdgepercError, OSError) as exc:
-        print_error(exc)
-        return 2
-    except KeyboardInterrupt:
-        print_error("interrupted")
-        return 130
+    code: int = arguments.run(arguments)
+    return code
 
 
 def with_command(typed: Sequence[str]) -> list[str]:
@@ -60,7 +56,7 @@ def with_command(typed: Sequence[str]) -> list[str]:
 
 def build_parser() -> argparse.ArgumentParser:
     """Build the parser of the command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="edgeperc-bench",
         description="Measure how long edgeperc takes on this computer, from a scan to the result.",
         allow_abbrev=False,

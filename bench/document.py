@@ -38,7 +38,7 @@ KINDS = ("run", "matrix", "scaling", "soak", "peers")
 
 
 class ReportError(EdgepercError):
-    """A file is not a report, or has another schema."""
+    """A file is not a report, or has another schema, or two reports cannot be compared."""
 
 
 def write_report(document: Mapping[str, Any], path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeAlias
@@ -22,7 +21,6 @@ __all__ = [
     "model_options",
     "numbers",
     "output_options",
-    "print_error",
     "provider",
     "scan_options",
     "scenario",
@@ -31,11 +29,6 @@ __all__ = [
 
 SINGLE_STREAM = "single-stream"
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
-
-
-def print_error(message: object) -> None:
-    """Print one line to the standard error."""
-    print(f"edgeperc-bench: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 # Options that several commands share, each group as a parent parser

@@ -11,6 +11,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TextIO
 
+from edgeperc.printable import printable
+
 from .samples import summary
 
 __all__ = ["QUANTILES", "LiveTable", "Section", "html_page", "markdown", "number", "share", "text"]
@@ -28,10 +30,15 @@ class Section:
     rows: Sequence[Sequence[str]] = ()
 
 
+def _printable(part: Section) -> Section:
+    rows = [[printable(cell) for cell in row] for row in part.rows]
+    return Section(printable(part.title), [printable(sentence) for sentence in part.sentences], rows)
+
+
 def text(parts: Iterable[Section]) -> str:
     """Format sections for a terminal."""
     lines: list[str] = []
-    for part in parts:
+    for part in map(_printable, parts):
         lines += ["", part.title, *(f"  {sentence}" for sentence in part.sentences)]
         lines += _aligned(part.rows)
     return "\n".join(lines[1:])
@@ -58,8 +65,8 @@ def markdown(parts: Iterable[Section], title: str) -> str:
     def plain(cell: str) -> str:
         return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", cell)
 
-    lines = [f"# {plain(title)}"]
-    for part in parts:
+    lines = [f"# {plain(printable(title))}"]
+    for part in map(_printable, parts):
         lines += ["", f"## {plain(part.title)}", *([""] if part.sentences else [])]
         lines += [f"- {plain(sentence)}" for sentence in part.sentences]
         if part.rows:
@@ -75,6 +82,9 @@ td,th{padding:.2rem .7rem;border-bottom:1px solid #d8dee6;text-align:right}
 td:first-child,th:first-child,.text{text-align:left}
 svg{max-width:100%;height:auto}"""
 
+# The page runs no script and loads nothing; its drawings have style attributes, and may embed a picture.
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
+
 
 def html_page(parts: Iterable[Section], title: str, pictures: Sequence[str] = ()) -> str:
     """Format sections as an HTML page without external files.
@@ -86,9 +96,9 @@ def html_page(parts: Iterable[Section], title: str, pictures: Sequence[str] = ()
     pictures : sequence of str
         ``<svg>`` elements; shown after the second section.
     """
-    escape = html.escape
+    escape, title = html.escape, printable(title)
     body = [f"<h1>{escape(title)}</h1>"]
-    for k, part in enumerate(parts):
+    for k, part in enumerate(map(_printable, parts)):
         body.append(f"<h2>{escape(part.title)}</h2>")
         body += [f"<p>{escape(sentence)}</p>" for sentence in part.sentences]
         if part.rows:
@@ -99,7 +109,8 @@ def html_page(parts: Iterable[Section], title: str, pictures: Sequence[str] = ()
             body.append(f"<table>{''.join(rows)}</table>")
         if k == 1:
             body += [f"<figure>{picture}</figure>" for picture in pictures]
-    head = f'<meta charset="utf-8"/><title>{escape(title)}</title><style>{STYLE}</style>'
+    policy = f'<meta http-equiv="Content-Security-Policy" content="{POLICY}"/>'
+    head = f'<meta charset="utf-8"/>{policy}<title>{escape(title)}</title><style>{STYLE}</style>'
     return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>\n' + "\n".join(body) + "\n</body></html>\n"
 
 
@@ -153,7 +164,7 @@ class LiveTable:
     def note(self, line: str) -> None:
         """Print a line that stays."""
         self.clear()
-        self.stream.write(f"edgeperc-bench: {line}\n")
+        self.stream.write(f"edgeperc-bench: {printable(line)}\n")
         self.stream.flush()
 
     def clear(self) -> None:

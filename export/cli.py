@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from edgeperc import __version__
+from edgeperc.cli.output import print_error, print_line
+from edgeperc.cli.program import Parser, run_program
 from edgeperc.errors import EdgepercError, MissingExtraError
 
 from .database.cli import add_database_commands
@@ -34,26 +36,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0: success; 1: a model was refused or a scene was left out; 2: wrong usage or unusable files.
+        0: success; 1: a model was refused or a scene was left out; 2: wrong usage or unusable files; 130 interrupted,
+        141 the program that reads the output closed it, 143 terminated.
     """
-    parser, given = build_parser(), list(sys.argv[1:] if argv is None else argv)
+    given = list(sys.argv[1:] if argv is None else argv)
+    return run_program("edgeperc-export", lambda: _run(given))
+
+
+def _run(given: list[str]) -> int:
+    parser = build_parser()
     if given[:1] == ["database"]:
         parser.error(f'"{" ".join(given[:2])}" is now written {"-".join(given[:2])}; see edgeperc-export --help')
     args = parser.parse_args(given)
     try:
         return int(args.run(args))
     except ModuleNotFoundError as exc:
-        missing = MissingExtraError(exc.name or "a package", args.extra, "edgeperc-export")
-        print(f"edgeperc-export: {missing}", file=sys.stderr)
-        return 2
-    except (EdgepercError, ValueError, OSError) as exc:
-        print(f"edgeperc-export: {exc}", file=sys.stderr)
+        raise MissingExtraError(exc.name or "a package", args.extra, "edgeperc-export") from exc
+    except (EdgepercError, ValueError) as exc:
+        print_error(exc, "edgeperc-export")
         return 1 if type(exc).__name__ in ("ParityError", "RefusedError") else 2
 
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands; ``run`` of the parsed arguments is the command's function."""
-    parser = argparse.ArgumentParser(prog="edgeperc-export", description=__doc__)
+    parser = Parser(prog="edgeperc-export", description=__doc__)
     parser.add_argument("--version", action="version", version=f"edgeperc {__version__}")
     parser.set_defaults(extra="export")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
@@ -283,7 +289,7 @@ def _train(args: argparse.Namespace) -> int:
         n_threads=args.threads,
         compiled=args.compile,
     )
-    print(checkpoint)
+    print_line(str(checkpoint))
     return 0
 
 
@@ -302,7 +308,7 @@ def _export(args: argparse.Namespace) -> int:
         metrics=metrics,
         licence=args.licence,
     )
-    print(f"{args.out}: {card.name} {card.version}, parity {json.dumps(dict(card.parity))}")
+    print_line(f"{args.out}: {card.name} {card.version}, parity {json.dumps(dict(card.parity))}")
     return 0
 
 
@@ -310,7 +316,7 @@ def _verify(args: argparse.Namespace) -> int:
     from .simulate import parity_scans
     from .to_onnx import load, verify
 
-    print(json.dumps(verify(load(args.checkpoint)[0], args.model, parity_scans(args.scans))))
+    print_line(json.dumps(verify(load(args.checkpoint)[0], args.model, parity_scans(args.scans))))
     return 0
 
 
@@ -324,7 +330,7 @@ def _card(args: argparse.Namespace) -> int:
     model = onnx.load(args.model)
     card = with_golden(model, ModelCard.from_json(args.card.read_text()))
     write_card(model, card, args.out)
-    print(f"{args.out}: {card.name} {card.version}")
+    print_line(f"{args.out}: {card.name} {card.version}")
     return 0
 
 
@@ -344,11 +350,13 @@ def _quantize(args: argparse.Namespace) -> int:
         n_evaluated=args.evaluate_on,
         n_threads=args.threads,
     )
-    print(
+    print_line(
         f"{args.out}: {card.name} {card.version}, kept in fp32: {', '.join(card.training['quantized']['left_alone'])}"
     )
-    print(json.dumps(dict(card.parity)))
-    print(f"precision auto takes the model only if it agrees with fp32: edgeperc-export agree {args.model} {args.out}")
+    print_line(json.dumps(dict(card.parity)))
+    print_line(
+        f"precision auto takes the model only if it agrees with fp32: edgeperc-export agree {args.model} {args.out}"
+    )
     return 0
 
 
@@ -358,9 +366,10 @@ def _agree(args: argparse.Namespace) -> int:
     measured = agree(
         args.models, kitti=args.kitti, semantickitti=args.semantickitti, split=args.split, n_scans=args.scans
     )
-    print(*summary(measured), sep="\n")
+    for line in summary(measured):
+        print_line(line)
     if "bf16" not in measured:
-        print("bf16 was not measured; it needs a processor with bf16 and openvino: pip install 'edgeperc[peers]'")
+        print_line("bf16 was not measured; it needs a processor with bf16 and openvino: pip install 'edgeperc[peers]'")
     return 0
 
 
@@ -379,7 +388,7 @@ def _make(args: argparse.Namespace) -> int:
         compiled=args.compile,
         version=args.model_version,
     )
-    print(path)
+    print_line(str(path))
     return 0
 
 
@@ -400,7 +409,7 @@ def _ablate(args: argparse.Namespace) -> int:
         n_threads=args.threads,
     )
     for row in rows:
-        print(f"{row['network']}, fold {row['fold']}, {row['steps']} steps, {row['variant']}: {row['figures']}")
+        print_line(f"{row['network']}, fold {row['fold']}, {row['steps']} steps, {row['variant']}: {row['figures']}")
     if args.plot is not None:
         plot(rows, args.plot)
     return 0

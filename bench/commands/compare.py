@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..document import read_report, repeats_ms, scenario_names, setting_label
-from ..options import Subparsers, print_error
+from edgeperc.cli.output import print_line
+
+from ..document import ReportError, read_report, repeats_ms, scenario_names, setting_label
+from ..options import Subparsers
 from ..samples import compare
 
 __all__ = ["add_parser", "run_command"]
@@ -32,10 +34,11 @@ def run_command(arguments: argparse.Namespace) -> int:
     """Print a verdict for each setting and scenario that both reports have."""
     a, b = read_report(arguments.a), read_report(arguments.b)
     if not a["input"] or not b["input"] or a["input"]["sha256"] != b["input"]["sha256"]:
-        print_error("the reports are of different scans; measure both with the same --input, --scans and --sensor")
-        return 2
+        raise ReportError(
+            "the reports are of different scans; measure both with the same --input, --scans and --sensor"
+        )
     if a["machine"]["fingerprint"] != b["machine"]["fingerprint"]:
-        print(f"different machines: A on {a['machine']['cpu']}, B on {b['machine']['cpu']}")
+        print_line(f"different machines: A on {a['machine']['cpu']}, B on {b['machine']['cpu']}")
     verdicts = []
     for one, other in _pairs(a["settings"], b["settings"]):
         for name in scenario_names(one):
@@ -45,19 +48,20 @@ def run_command(arguments: argparse.Namespace) -> int:
             verdicts.append(verdict.word)
             line = f"{'+'.join(one['models'])}, {name}: {setting_label(one)} -> {setting_label(other)}: {verdict.word}"
             if verdict.word == "unusable":
-                print(f"{line}; the noise is unknown with one repeat: measure with --repeats 3")
+                print_line(f"{line}; the noise is unknown with one repeat: measure with --repeats 3")
                 continue
             low, high = verdict.interval
-            print(
+            print_line(
                 f"{line}; median x {verdict.ratio:.3f} (95 %: {low:.3f} to {high:.3f}), "
                 f"noise {100.0 * verdict.noise:.1f} %"
             )
     for letter, document in (("A", a), ("B", b)):
         for disturbance in document["disturbances"][:5]:
-            print(f"{letter} was disturbed: {disturbance}")
-    if not verdicts or "unusable" in verdicts:
-        print_error("not everything could be compared" if verdicts else "the reports share no setting and scenario")
-        return 2
+            print_line(f"{letter} was disturbed: {disturbance}")
+    if not verdicts:
+        raise ReportError("the reports share no setting and scenario; measure the same models, settings and scenarios")
+    if "unusable" in verdicts:
+        raise ReportError("not everything could be compared; measure with --repeats 3")
     return 1 if "slower" in verdicts else 0
 
 

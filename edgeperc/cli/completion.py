@@ -8,7 +8,6 @@ from typing import Any
 
 from ..extras import require
 from .arguments import PROVIDERS, Commands, add_command
-from .output import print_line
 
 __all__ = ["add_parser", "completion_command"]
 
@@ -54,7 +53,7 @@ def completion_command(arguments: argparse.Namespace) -> int:
         if action.choices is None and action.metavar in completed:
             action.complete = completed[action.metavar]
     preamble = {shell: "\n".join(lines) for shell, lines in functions.items()}
-    print_line(shtab.complete(arguments.parser, arguments.shell, preamble=preamble))
+    print(shtab.complete(arguments.parser, arguments.shell, preamble=preamble))
     return 0
 
 

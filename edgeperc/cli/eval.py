@@ -9,7 +9,7 @@ from typing import Any
 
 from ..extras import require
 from .arguments import DEFAULT, Commands, add_boxes_from, add_command, add_figures_file, add_model, add_provider
-from .output import many, progress, table_lines, write_figures
+from .output import many, print_line, progress, table_lines, write_figures
 
 __all__ = ["add_parser", "eval_command"]
 
@@ -89,7 +89,8 @@ def eval_command(arguments: argparse.Namespace) -> int:
             precision=arguments.precision,
             on_scan=show,
         )
-    print("\n".join(_figure_lines(figures)))
+    for line in _figure_lines(figures):
+        print_line(line)
     write_figures(arguments, figures)
     if arguments.worst is not None:
         from ..view.mistakes import draw_mistakes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from .arguments import Commands, add_command, add_figures_file, add_provider
-from .output import many, progress, table_lines, write_figures
+from .output import many, print_line, progress, table_lines, write_figures
 
 __all__ = ["add_parser", "eval_sensors_command"]
 
@@ -65,6 +65,7 @@ def eval_sensors_command(arguments: argparse.Namespace) -> int:
         function = result["function"] or "no function"
         title = f"{name}: {many(result['n_scans'], 'scan')}, {counts}; remission: {function}"
         lines += table_lines(title, (*columns, ("mIoU", "mean")), rows)
-    print("\n".join(lines))
+    for line in lines:
+        print_line(line)
     write_figures(arguments, figures)
     return 0

@@ -20,7 +20,7 @@ from .arguments import (
     add_sensor,
     positive_number,
 )
-from .output import many, progress, table_lines, without_nan, write_figures
+from .output import many, print_line, progress, table_lines, without_nan, write_figures
 from .run import make_perceiver
 
 if TYPE_CHECKING:
@@ -122,7 +122,8 @@ def eval_tracking_command(arguments: argparse.Namespace) -> int:
             iou_threshold=arguments.iou,
             on_sequence=show,
         )
-    print("\n".join(_tracking_lines(figures)))
+    for line in _tracking_lines(figures):
+        print_line(line)
     write_figures(arguments, without_nan(figures))
     if arguments.gif is not None:
         import numpy as np

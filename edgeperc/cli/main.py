@@ -1,25 +1,23 @@
 """The ``edgeperc`` command: one program, one level of subcommands, each in a file of its own.
 
 Exit codes: 0 success, 1 some scans failed (each is reported, the others are processed), 2 the command could not run
-(usage, model, provider, a missing extra), 130 interrupted, 141 the program that reads the output closed it.
+(usage, model, provider, a missing extra), 130 interrupted, 141 the program that reads the output closed it, 143
+terminated.
 """
 
 from __future__ import annotations
 
 import argparse
-import io
-import os
 import re
 import shlex
 import sys
-import warnings
 from collections.abc import Sequence
 
 # Commands import numpy, numba, onnxruntime and matplotlib inside functions, so that --help is fast.
 from .. import __version__
 from ..errors import EdgepercError
 from . import completion, demo, eval, eval_sensors, eval_tracking, fit_sensor, info, lists, run
-from .output import print_error, show_warning
+from .program import Parser, run_program
 
 __all__ = ["build_parser", "in_options", "main"]
 
@@ -67,38 +65,27 @@ def main(argv: Sequence[str] | None = None) -> int:
         With code 2, for wrong usage; raised by argparse.
     """
     given = sys.argv[1:] if argv is None else list(argv)
+
+    def message(exc: Exception) -> str:
+        return in_options(str(exc)) if isinstance(exc, EdgepercError) else str(exc)
+
+    return run_program("edgeperc", lambda: _run(given), message)
+
+
+def _run(given: list[str]) -> int:
     parser = build_parser()
     before = " ".join(given[:2])
     if before in _RENAMED:
         parser.error(f"{before!r} is now {_RENAMED[before]!r}: edgeperc {_RENAMED[before]} {shlex.join(given[2:])}")
     known = argparse.Namespace(typed=shlex.join(["edgeperc", *given]), parser=parser)
     arguments = parser.parse_args(given, known)
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # a file name may have characters that the terminal lacks
-    try:
-        with warnings.catch_warnings():
-            warnings.showwarning = show_warning
-            code: int = arguments.command(arguments)
-            sys.stdout.flush()
-            return code
-    except EdgepercError as exc:
-        print_error(in_options(str(exc)))
-        return 2
-    except BrokenPipeError:
-        # Python flushes stdout again at exit, and would print an error.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
-    except OSError as exc:
-        print_error(exc)
-        return 2
-    except KeyboardInterrupt:
-        print_error("interrupted")
-        return 130
+    code: int = arguments.command(arguments)
+    return code
 
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of the whole command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="edgeperc",
         description="From a LiDAR scan to drivable area, boxes, a class for every point, and tracks.",
         epilog="'edgeperc COMMAND --help' explains a command. Start with: edgeperc demo",

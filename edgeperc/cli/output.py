@@ -12,6 +12,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
+from ..printable import printable
+
 __all__ = [
     "many",
     "one_line",
@@ -33,20 +35,22 @@ def one_line(text: object) -> str:
 
 
 def print_line(text: str, file: TextIO | None = None) -> None:
-    """Print and flush a line, by default on stdout; a progress bar moves below it."""
+    """Print and flush a line, by default on stdout; a progress bar moves below it. See `printable`."""
     tqdm = getattr(sys.modules.get("tqdm"), "tqdm", None)  # imported only while a bar is drawn
     with contextlib.nullcontext() if tqdm is None else tqdm.external_write_mode(sys.stdout):
-        print(text, file=file, flush=True)
+        print(printable(text), file=file, flush=True)
 
 
-def print_error(text: object) -> None:
+def print_error(text: object, program: str = "edgeperc") -> None:
     """Print one line on stderr, with the program's name."""
-    print_line(f"edgeperc: {one_line(text)}", sys.stderr)
+    print_line(f"{program}: {one_line(text)}", sys.stderr)
 
 
-def show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+def show_warning(
+    message: Warning | str, category: type[Warning], *_: Any, program: str = "edgeperc", **__: Any
+) -> None:
     """Print a warning as one line, in place of `warnings.showwarning`."""
-    print_error(f"warning: {message}")
+    print_error(f"warning: {message}", program)
 
 
 @contextlib.contextmanager
@@ -73,14 +77,15 @@ def progress(unit: str = "scan") -> Iterator[Callable[[int, int], None]]:
 
 def print_rows(rows: Sequence[tuple[str, str]]) -> None:
     """Print names and values as two aligned columns."""
-    width = max(len(name) for name, _ in rows) + 2
-    for name, value in rows:
+    shown = [(printable(name), value) for name, value in rows]
+    width = max(len(name) for name, _ in shown) + 2
+    for name, value in shown:
         print_line(f"{name:<{width}}{value}".rstrip())
 
 
 def print_columns(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print a table: headings and left-aligned columns."""
-    lines = [headings, *rows]
+    lines = [[printable(cell) for cell in line] for line in (headings, *rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for line in lines:
         print_line("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
@@ -126,8 +131,8 @@ def table_lines(
     """
     if not rows:
         return []
-    cells = [["", "", *(heading for heading, _ in columns)]]
-    cells += [[*names, *(_cell(row.get(key)) for _, key in columns)] for names, row in rows]
+    cells = [["", "", *(printable(heading) for heading, _ in columns)]]
+    cells += [[*map(printable, names), *(_cell(row.get(key)) for _, key in columns)] for names, row in rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     for k in range(len(cells) - 1, 1, -1):
         if cells[k][0] == cells[k - 1][0]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import sys
 import webbrowser
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from edgeperc.cli.output import print_error, print_line
 
 __all__ = ["add_database_commands"]
 
@@ -107,13 +108,15 @@ def _build(args: argparse.Namespace) -> int:
         workers=args.workers,
     )
     for line in report.notes:
-        print(f"edgeperc-export: {line}", file=sys.stderr)
+        print_error(line, "edgeperc-export")
     for name, reason in report.skipped.items():
-        print(f"edgeperc-export: left out {name}: {reason}", file=sys.stderr)
+        print_error(f"left out {name}: {reason}", "edgeperc-export")
     for split, scores in report.scores.items():
         figures = ", ".join(f"{name} {value:.2%}" for name, value in scores.items() if value is not None)
-        print(f"{args.out}: road model against the drawn roads of {split} scenes: {figures}")
-    print(f"{args.out}: {report.scenes} scenes, {report.made} made, {report.kept} kept, {len(report.skipped)} left out")
+        print_line(f"{args.out}: road model against the drawn roads of {split} scenes: {figures}")
+    print_line(
+        f"{args.out}: {report.scenes} scenes, {report.made} made, {report.kept} kept, {len(report.skipped)} left out"
+    )
     return 1 if report.skipped else 0
 
 
@@ -122,7 +125,7 @@ def _label(args: argparse.Namespace) -> int:
 
     polygons = args.polygons or args.out / "road.coco.json"
     with LabelServer(args.out, polygons, kitti=args.kitti, port=args.port) as server:
-        print(f"{server.url} writes to {polygons}; stop with Ctrl+C", flush=True)
+        print_line(f"{server.url} writes to {polygons}; stop with Ctrl+C")
         if not args.no_browser:
             webbrowser.open(server.url)
         with contextlib.suppress(KeyboardInterrupt):
@@ -138,7 +141,7 @@ def _coco(args: argparse.Namespace) -> int:
 
     with open_atomic(args.file, "w") as file:
         n = write_database_coco(TopViewDatabase(args.out), file)
-    print(f"{args.file}: {n} annotations")
+    print_line(f"{args.file}: {n} annotations")
     return 0
 
 
@@ -148,6 +151,6 @@ def _check(args: argparse.Namespace) -> int:
     database = TopViewDatabase(args.out)
     damaged = database.damaged()
     for path in damaged:
-        print(f"edgeperc-export: {path} is missing or damaged; delete it and run database-build again", file=sys.stderr)
-    print(f"{args.out}: {len(database)} scenes, {len(damaged)} files missing or damaged")
+        print_error(f"{path} is missing or damaged; delete it and run database-build again", "edgeperc-export")
+    print_line(f"{args.out}: {len(database)} scenes, {len(damaged)} files missing or damaged")
     return 1 if damaged else 0

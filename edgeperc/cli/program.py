@@ -1,0 +1,131 @@
+"""What the project's programs have in common: one-line errors, signals, closed pipes and their exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import os
+import select
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, NoReturn, TextIO
+
+from ..errors import EdgepercError
+from ..printable import printable
+from .output import print_error, show_warning
+
+__all__ = ["Parser", "run_program"]
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose error messages may quote any argument, such as the name of a file from elsewhere."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and the message, and exit with code 2."""
+        super().error(printable(message))
+
+
+class _TerminatedError(SystemExit):
+    """SIGTERM arrived. Like `KeyboardInterrupt` it runs every ``finally``, so that files and processes are closed."""
+
+
+def run_program(program: str, command: Callable[[], int], message: Callable[[Exception], str] = str) -> int:
+    """Run a program's command line. Warnings and errors are printed on stderr, each as one line.
+
+    Parameters
+    ----------
+    program : str
+        Its name, printed before each line.
+    command : callable
+        Parses the arguments, does the work and returns the exit code.
+    message : callable
+        The text to print for an error.
+
+    Returns
+    -------
+    code : int
+        What ``command`` returned; 2 after an `EdgepercError` or `OSError`; 130 after SIGINT (Ctrl-C); 143 after
+        SIGTERM; 141, without a message, if the program that reads stdout or stderr closed it.
+
+    Raises
+    ------
+    SystemExit
+        From argparse: wrong usage (2), ``--help`` and ``--version`` (0).
+    """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a file name may have characters that the terminal lacks
+    try:
+        try:
+            with _terminable(), warnings.catch_warnings():
+                warnings.showwarning = partial(show_warning, program=program)
+                try:
+                    return command()
+                finally:
+                    print(end="", flush=True)
+        except (EdgepercError, OSError) as exc:
+            if isinstance(exc, BrokenPipeError) and _unread():
+                return 141
+            print_error(message(exc), program)
+            return 2
+        except KeyboardInterrupt:
+            print_error("interrupted", program)
+            return 130
+        except _TerminatedError:
+            print_error("terminated", program)
+            return 143
+    except BrokenPipeError:
+        if _unread():
+            return 141
+        raise
+
+
+def _unread() -> bool:
+    """Whether the reader of stdout or stderr closed it. Such a stream is discarded from here on."""
+    found = False
+    for stream in (sys.stdout, sys.stderr):
+        if _is_closed_pipe(stream):
+            # Python flushes the streams again at exit, and would print an error.
+            with Path(os.devnull).open("wb") as nowhere:
+                os.dup2(nowhere.fileno(), stream.fileno())
+            found = True
+    return found
+
+
+def _is_closed_pipe(stream: TextIO) -> bool:
+    """Whether the other end is closed. A `BrokenPipeError` can also come from a pipe to a process that died."""
+    if not hasattr(select, "poll"):
+        return stream is sys.stdout
+    pipes = select.poll()
+    try:
+        pipes.register(stream.fileno(), 0)
+    except (AttributeError, OSError):  # no stream, or one without a file
+        return False
+    return bool(pipes.poll(0))
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM raise, unless the process has its own answer to it."""
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    owner = os.getpid()
+
+    def terminate(number: int, _: Any) -> None:
+        if os.getpid() != owner:  # a fork inherits this function; it ends as any process does
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)
+        raise _TerminatedError(128 + number)
+
+    signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
