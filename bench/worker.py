@@ -117,6 +117,7 @@ def perceiver_arguments(job: Job) -> dict[str, Any]:
         "provider": job.provider,
         "precision": job.precision,
         "n_threads": job.n_threads,
+        "on_mismatch": "warn",  # the time is of interest even for scans that are too large or sparse for the models
     }
 
 

@@ -10,7 +10,7 @@
     ├── SplitError (ValueError)       a model would be evaluated on a scan that it was trained on
     ├── TrackingError (ValueError)    boxes or a pose that cannot be tracked
     │   └── StampError                a scan that is not later than the one before it
-    ├── FitnessError                  a scan differs from the training scans, and on_mismatch="raise"
+    ├── FitnessError                  a scan differs grossly from the training scans
     ├── ModelError
     │   ├── ModelFileError            missing, or onnxruntime cannot open it
     │   ├── CardError                 the card is missing, unreadable or of a newer schema
@@ -77,7 +77,7 @@ class StampError(TrackingError):
 
 
 class FitnessError(EdgepercError):
-    """A scan differs from the model's training scans, and ``on_mismatch`` is ``"raise"``."""
+    """A scan differs grossly from the model's training scans, or at all if ``on_mismatch`` is ``"raise"``."""
 
 
 class ModelError(EdgepercError):

@@ -23,7 +23,7 @@ from .card import ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, join_boxes, objects_from_points
 from .decode import decode_classes, decode_top_view
 from .errors import FitnessError, OptionError
-from .fitness import FitnessProfile, check_fitness
+from .fitness import Finding, FitnessProfile, check_fitness
 from .ground import find_ground
 from .perception import Box, Perception, PointLabels, TopView
 from .points import as_points
@@ -38,10 +38,11 @@ __all__ = ["ADAPTATIONS", "BoxesFrom", "Perceiver"]
 STAGES = ("check", "project", "infer", "decode", "refine", "cluster")
 Adaptation = Literal["both", "remission", "interpolation", "none"]
 BoxesFrom = Literal["both", "network", "clusters"]
-OnMismatch = Literal["warn", "raise", "ignore"]
+OnMismatch = Literal["refuse", "warn", "raise", "ignore"]
 ADAPTATIONS: tuple[Adaptation, ...] = ("none", "remission", "interpolation", "both")
 
 # A wrong set-up shows in any scan. Several are checked, because one may have been taken in a tunnel or a depot.
+# A refused scan does not count.
 CHECKED_SCANS = 5
 
 _P = ParamSpec("_P")
@@ -128,8 +129,10 @@ class Perceiver:
         card shows a loss of at most 0.3 points (`edgeperc.zoo.choose`). Any other value is required.
     n_threads : int or None
         Threads inside one call; None leaves it to the provider. The results do not depend on it.
-    on_mismatch : {"warn", "raise", "ignore"}
-        What to do when one of the first five scans is unlike the training scans. ``"ignore"`` skips the check.
+    on_mismatch : {"refuse", "warn", "raise", "ignore"}
+        What to do when one of the first five scans is unlike the training scans. ``"refuse"``: raise FitnessError,
+        before anything is perceived, if a difference is gross (`edgeperc.fitness.check_fitness` lists them), and warn
+        of others. ``"warn"``: warn of all. ``"raise"``: raise FitnessError for any. ``"ignore"``: skip the check.
     score_threshold : float or None
         Lowest score of a box, in 0..1. None takes the card's threshold for boxes of a network, and 0.3 for boxes of
         clusters.
@@ -196,7 +199,7 @@ class Perceiver:
         provider: str = "auto",
         precision: str = "auto",
         n_threads: int | None = None,
-        on_mismatch: OnMismatch = "warn",
+        on_mismatch: OnMismatch = "refuse",
         score_threshold: float | None = None,
         adapt: Adaptation = "both",
         boxes_from: BoxesFrom = "both",
@@ -204,7 +207,7 @@ class Perceiver:
         trusted: bool = False,
     ) -> None:
         _check_choice("adapt", adapt, ADAPTATIONS, {"neither": "none"})
-        _check_choice("on_mismatch", on_mismatch, ("warn", "raise", "ignore"))
+        _check_choice("on_mismatch", on_mismatch, ("refuse", "warn", "raise", "ignore"))
         _check_choice("boxes_from", boxes_from, ("both", "network", "clusters"))
         _check_choice("full_turn", full_turn, (True, False))
         if score_threshold is not None and not (isinstance(score_threshold, Real) and 0.0 <= score_threshold <= 1.0):
@@ -285,15 +288,13 @@ class Perceiver:
         InferenceError
             A network failed, or its output has values that are not finite.
         FitnessError
-            The scan differs from the training scans, and ``on_mismatch`` is ``"raise"``.
+            The scan differs from the training scans, grossly if ``on_mismatch`` is ``"refuse"``.
         """
         scan = as_points(points)
         with self._lock:
             check = self._to_check > 0 and len(scan) > 0
-            self._to_check -= check
             perception = self._perceive(scan, stamp_s, check)
-        if perception.fitness and self.on_mismatch == "raise":
-            raise FitnessError("; ".join(perception.fitness))
+            self._to_check -= check
         for sentence in perception.fitness:
             warnings.warn(sentence, stacklevel=2)
         return perception
@@ -305,6 +306,8 @@ class Perceiver:
         scan, n_dropped = condition(scan, self.sensor, rendered=self._renders)
         watch.lap("adapt" if self._renders else "check")
         fitness = self._check(scan) if check else ()
+        if infer:
+            self._refuse(fitness)
         watch.lap("check")
         points: PointLabels | None = None
         top_view: TopView | None = None
@@ -331,12 +334,22 @@ class Perceiver:
             stamp_s=stamp_s,
         )
 
-    def _check(self, scan: NDArray[np.float32]) -> tuple[str, ...]:
-        found: dict[str, None] = {}
+    def _check(self, scan: NDArray[np.float32]) -> tuple[Finding, ...]:
+        found: dict[Finding, None] = {}
         for network in self._networks:
             if network.fitness is not None:
                 found |= dict.fromkeys(check_fitness(scan, network.fitness, self.sensor))
         return tuple(found)
+
+    def _refuse(self, fitness: tuple[Finding, ...]) -> None:
+        """Raise FitnessError if ``on_mismatch`` asks for it."""
+        if self.on_mismatch == "raise" and fitness:
+            raise FitnessError(" ".join(fitness))
+        if self.on_mismatch == "refuse" and any(finding.gross for finding in fitness):
+            raise FitnessError(
+                f"{' '.join(fitness)} Results would be meaningless. To perceive it all the same, pass "
+                'on_mismatch="warn" (on the command line --anyway).'
+            )
 
     def _project(self, network: _Network, scan: NDArray[np.float32]) -> NDArray[np.int32]:
         pixel = np.empty(len(scan), np.int32)

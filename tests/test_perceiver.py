@@ -304,7 +304,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_warning_names_the_fault(scan: SimulatedScan, fault: str) -> None:
-    perceive = Perceiver("pointseg", provider="cpu")
+    perceive = Perceiver("pointseg", provider="cpu", on_mismatch="warn")
     with pytest.warns(UserWarning, match=FAULTS[fault]) as caught:
         answer = perceive(faulty(scan.points, fault))
     assert answer.fitness == tuple(str(w.message) for w in caught)
@@ -316,6 +316,28 @@ def test_mismatch_can_be_an_error(scan: SimulatedScan, fault: str) -> None:
         Perceiver("pointseg", provider="cpu", on_mismatch="raise")(faulty(scan.points, fault))
 
 
+@pytest.mark.parametrize("fault", FAULTS)
+def test_gross_differences_are_refused_before_a_network_runs(
+    scan: SimulatedScan, fault: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As often as such a scan comes; good scans are perceived."""
+    perceive = Perceiver("pointseg", provider="cpu")
+    with monkeypatch.context() as patch:
+        patch.setattr(perceive, "_label_sector", None)
+        for _ in range(7):
+            with pytest.raises(FitnessError, match=rf"(?s){FAULTS[fault]}.*on_mismatch=\"warn\".*--anyway"):
+                perceive(faulty(scan.points, fault))
+    assert perceive(scan.points).fitness == ()
+
+
+def test_other_differences_are_warned_of(scan: SimulatedScan) -> None:
+    raised = scan.points + np.float32([0, 0, 1.0, 0])
+    with pytest.warns(UserWarning, match=r"The ground lies at z = -0\.7 m"):
+        assert Perceiver("pointseg", provider="cpu")(raised).fitness
+    with pytest.raises(FitnessError, match=r"The ground lies at z = -0\.7 m"):
+        Perceiver("pointseg", provider="cpu", on_mismatch="raise")(raised)
+
+
 def test_mismatch_can_be_ignored(scan: SimulatedScan) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -324,7 +346,7 @@ def test_mismatch_can_be_ignored(scan: SimulatedScan) -> None:
 
 
 def test_only_the_first_scans_are_checked(scan: SimulatedScan) -> None:
-    perceive = Perceiver("pointseg", provider="cpu")
+    perceive = Perceiver("pointseg", provider="cpu", on_mismatch="warn")
     bad = faulty(scan.points, "no remission")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -365,7 +387,7 @@ def test_two_models_of_one_view_are_refused() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"on_mismatch": "panic"}, "on_mismatch is 'panic'; expected warn, raise or ignore"),
+        ({"on_mismatch": "panic"}, "on_mismatch is 'panic'; expected refuse, warn, raise or ignore"),
         ({"score_threshold": 2.0}, "score_threshold is 2.0"),
         ({"score_threshold": float("nan")}, "score_threshold is nan"),
         ({"score_threshold": "high"}, "score_threshold is 'high'"),
@@ -572,7 +594,7 @@ def test_the_first_call_compiles_nothing(scan: SimulatedScan, options: dict[str,
     }
     if not kernels:
         pytest.skip("numba compiles nothing")
-    perceive = Perceiver(**options, provider="cpu", n_threads=1)
+    perceive = Perceiver(**options, provider="cpu", n_threads=1, on_mismatch="warn")
     compiled = {name: list(kernel.signatures) for name, kernel in kernels.items()}
     for layout, change in LAYOUTS.items():
         with warnings.catch_warnings():
