@@ -19,6 +19,7 @@ __all__ = ["decode_classes", "decode_dense", "decode_slots", "decode_top_view"]
 STRIDE = 4  # cells of the top view behind one cell of a box_dense output, along each axis
 MIN_EXTENT_M = 0.5  # smaller slots are empty
 SIZE_RANGE_M = (0.2, 40.0)  # boxes are clipped to these sizes
+MAX_PROBABILITY = 1.02  # rounded to bfloat16, probabilities add up to a little more than 1
 
 
 def decode_classes(
@@ -44,7 +45,7 @@ def decode_classes(
     Raises
     ------
     InferenceError
-        The output holds values that are not finite.
+        The output holds values that are not finite, or probabilities that are not in 0..1.
     CardMismatchError
         The output has another shape, or ``kind`` is not a class output.
     """
@@ -54,6 +55,11 @@ def decode_classes(
     n_bad = fill_classes(values, kind == "class_logits", labels, scores)
     if n_bad:
         _raise_not_finite(n_bad, values.size, kind, model)
+    if kind == "class_probabilities" and scores.size and not (scores.min() >= 0.0 and scores.max() <= MAX_PROBABILITY):
+        raise InferenceError(
+            f"{model}: probabilities of classes are {scores.min():g} to {scores.max():g}; expected 0 to 1. "
+            "Check the card: an output without softmax is of kind class_logits"
+        )
     return labels, scores
 
 
@@ -134,7 +140,7 @@ def decode_slots(
             tall / 2.0 - mount_height_m,
         )
         size = (max(along_m, across_m), min(along_m, across_m), tall)
-        boxes.append(Box(label, float(scores[at]), center, size, 0.0 if along_m >= across_m else math.pi / 2.0))
+        boxes.append(Box(label, min(float(scores[at]), 1.0), center, size, 0.0 if along_m >= across_m else math.pi / 2.0))
     return sorted(boxes, key=lambda box: -box.score)
 
 
@@ -224,7 +230,8 @@ def decode_dense(
     best = np.argsort(-maps[0, rows, cols], kind="stable")[:max_boxes]
     rows, cols = rows[best], cols[best]
     heat, d_row, d_col, log_l, log_w, sin, cos, z, log_h = maps[:, rows, cols].astype(np.float64)
-    scores = 1.0 / (1.0 + np.exp(-heat))
+    with np.errstate(over="ignore"):  # a score of 0
+        scores = 1.0 / (1.0 + np.exp(-heat))
     shrink = STRIDE * geometry.cell_m
     low, high = np.log(SIZE_RANGE_M)
     rectangles = np.stack(

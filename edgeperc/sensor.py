@@ -64,16 +64,16 @@ class RemissionFunction:
             object.__setattr__(self, "rmse", float(self.rmse))
         except (TypeError, ValueError, OverflowError) as exc:
             raise SensorError(f"remission function: a value is not a number ({exc})") from exc
-        if self.kind not in REMISSION_KINDS:
+        if not isinstance(self.kind, str) or self.kind not in REMISSION_KINDS:
             raise SensorError(f"remission function of kind {self.kind!r}; expected one of {', '.join(REMISSION_KINDS)}")
-        if len(self.coefficients) != REMISSION_KINDS[self.kind] or not all(map(math.isfinite, self.coefficients)):
+        if len(self.coefficients) != REMISSION_KINDS[self.kind] or not all(abs(c) <= 1e9 for c in self.coefficients):
             raise SensorError(
-                f"a {self.kind} remission function has {REMISSION_KINDS[self.kind]} finite coefficients, "
+                f"a {self.kind} remission function has {REMISSION_KINDS[self.kind]} finite coefficients up to 1e9, "
                 f"got {self.coefficients!r}"
             )
-        if not 0.0 < self.full_scale < math.inf or not 0.0 <= self.rmse < math.inf:
+        if not 0.0 < self.full_scale <= 1e9 or not 0.0 <= self.rmse < math.inf:
             raise SensorError(
-                f"full_scale {self.full_scale!r} must be above 0 and rmse {self.rmse!r} not below, finite"
+                f"full_scale {self.full_scale!r} must be above 0 and at most 1e9, rmse {self.rmse!r} finite, from 0"
             )
         if not isinstance(self.to, str) or not self.to or not isinstance(self.source, str):
             raise SensorError(f"remission function to {self.to!r} from {self.source!r}; expected two str")
@@ -133,16 +133,21 @@ class SensorProfile:
             object.__setattr__(self, "columns", int(self.columns))
         except (TypeError, ValueError, OverflowError) as exc:
             raise SensorError(f"sensor {self.name!r}: a value is not a number ({exc})") from exc
-        if not self.elevations_deg or not all(-90.0 < e < 90.0 for e in self.elevations_deg):
-            raise SensorError(f"sensor {self.name!r}: elevations_deg needs one angle a beam, between -90 and 90")
+        if not 1 <= len(self.elevations_deg) <= 4096 or not all(-90.0 < e < 90.0 for e in self.elevations_deg):
+            raise SensorError(
+                f"sensor {self.name!r}: elevations_deg needs one angle a beam, between -90 and 90, of 1 to 4096 beams"
+            )
         if any(upper <= lower for upper, lower in pairwise(self.elevations_deg)):
             raise SensorError(f"sensor {self.name!r}: elevations_deg must strictly decrease, from the top beam down")
-        if not columns_are_whole or self.columns < 1:
-            raise SensorError(f"sensor {self.name!r}: columns is a whole number of at least 1, got {self.columns!r}")
-        if len(self.remission_range) != 2 or not 0.0 < self.remission_range[1] - self.remission_range[0] < math.inf:
+        if not columns_are_whole or not 1 <= self.columns <= 1_000_000:
             raise SensorError(
-                f"sensor {self.name!r}: remission_range is (lowest, highest) raw value, such as (0, 255), "
-                f"got {self.remission_range!r}"
+                f"sensor {self.name!r}: columns is a whole number from 1 to 1,000,000, got {self.columns!r}"
+            )
+        bounds = self.remission_range
+        if len(bounds) != 2 or not max(map(abs, bounds)) <= 1e9 or not bounds[1] - bounds[0] >= 1e-9:
+            raise SensorError(
+                f"sensor {self.name!r}: remission_range is (lowest, highest) raw value, such as (0, 255), up to 1e9, "
+                f"got {bounds!r}"
             )
         if not 0.0 < self.mount_height_m < math.inf:
             raise SensorError(f"sensor {self.name!r}: mount_height_m must be above 0, got {self.mount_height_m!r}")

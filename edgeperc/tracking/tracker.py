@@ -85,9 +85,17 @@ class Tracker:
         field_of_view_deg: tuple[float, float] = (180.0, -180.0),
         max_tracks: int = 1024,
     ) -> None:
-        self._parameters = {**PARAMETERS, **(parameters or {})}
+        self._parameters: Mapping[str, ClassParameters] = PARAMETERS
         self._left, self._right = np.radians(field_of_view_deg)
         self._max_tracks = max_tracks
+        self.reset()
+        self._compile()
+        self._parameters = {**PARAMETERS, **(parameters or {})}
+
+    def _compile(self) -> None:
+        """Compile every kernel here, not in the first updates: a track begins, and is found again."""
+        for stamp_s in (0.0, 0.1):
+            self.update([Box("car", 0.9, (10.0, 2.0, -0.9), (4.2, 1.8, 1.5), 0.0)], stamp_s)
         self.reset()
 
     def reset(self) -> None:
@@ -179,16 +187,18 @@ class Tracker:
         of = self._classes[tracks["label"]]
         n, m = len(tracks), len(given)
 
+        # Fields of records go to kernels as copies: of a single record a field is contiguous, of several it is not, and
+        # numba would compile a kernel for each layout in memory.
+
         # Interaction.
         mixed, mixed_covariances, prior = np.empty((n, 3, 5)), np.empty((n, 3, 5, 5)), np.empty((n, 3))
         stay = np.exp(-dt / of["keep_motion_s"])
-        fill_interaction(
-            tracks["states"], tracks["covariances"], tracks["modes"], stay, mixed, mixed_covariances, prior
-        )
+        states, covariances, modes = (tracks[field].copy() for field in ("states", "covariances", "modes"))
+        fill_interaction(states, covariances, modes, stay, mixed, mixed_covariances, prior)
 
         # Prediction.
         means, predicted = np.empty_like(mixed), np.empty_like(mixed_covariances)
-        fill_predictions(mixed, mixed_covariances, of["noise"], dt, means, predicted)
+        fill_predictions(mixed, mixed_covariances, of["noise"].copy(), dt, means, predicted)
         state, covariance = np.empty((n, 5)), np.empty((n, 5, 5))
         fill_combined(means, predicted, prior, state, covariance)
         twist, twist_variances = self._twist, self._twist_variances
@@ -207,11 +217,11 @@ class Tracker:
             predicted,
             sigmas,
             prior,
-            of["odds"],
-            tracks["group"],
+            of["odds"].copy(),
+            tracks["group"].copy(),
             detections,
-            classes["group"],
-            of["gate"],
+            classes["group"].copy(),
+            of["gate"].copy(),
             likelihoods,
             weights,
         )
@@ -219,24 +229,28 @@ class Tracker:
 
         # Mode probability update, with the update of each motion.
         shares = np.empty((n, 3, m + 1))
-        fill_mode_probabilities(prior, likelihoods, beta, shares, tracks["modes"])
-        fill_updates(means, predicted, detections, sigmas, shares, tracks["states"], tracks["covariances"])
+        fill_mode_probabilities(prior, likelihoods, beta, shares, modes)
+        fill_updates(means, predicted, detections, sigmas, shares, states, covariances)
 
         # Combination.
-        fill_combined(tracks["states"], tracks["covariances"], tracks["modes"], tracks["state"], tracks["covariance"])
+        fill_combined(states, covariances, modes, state, covariance)
+        shape, shape_variance, front = (tracks[field].copy() for field in ("shape", "shape_variance", "front"))
         update_shapes(
-            tracks["state"],
+            state,
             beta,
             detections,
             shapes,
             of["shape"] * farther[:, None],
             SHAPE_WALK_M * math.sqrt(dt),
-            tracks["shape"],
-            tracks["shape_variance"],
-            tracks["front"],
+            shape,
+            shape_variance,
+            front,
         )
         hidden = np.zeros(n)
-        fill_hidden(tracks["state"], tracks["shape"], beta[:, 0] < 0.5, pose[:2, 3], hidden)
+        fill_hidden(state, shape, beta[:, 0] < 0.5, pose[:2, 3].copy(), hidden)
+        tracks["states"], tracks["covariances"], tracks["modes"] = states, covariances, modes
+        tracks["state"], tracks["covariance"] = state, covariance
+        tracks["shape"], tracks["shape_variance"], tracks["front"] = shape, shape_variance, front
         logits = _logit(given[:, 7])
         update_lives(tracks, of, beta, hidden, logits, kinds, dt)
 
@@ -257,7 +271,7 @@ class Tracker:
         self._twist, self._twist_variances = twist, twist_variances
         reported = tracks["existence"] > 0.0
         mark_out_of_view(tracks, pose, self._left, self._right, reported)
-        mark_rivals(tracks["state"], tracks["shape"], strength_of(tracks), reported)
+        mark_rivals(tracks["state"].copy(), tracks["shape"].copy(), strength_of(tracks), reported)
         n_tentative = int(len(tracks) - np.count_nonzero(reported))
         return Tracks(tracks[reported], self._labels, stamp_s, pose.copy(), n_tentative, n_approximated)
 
@@ -351,7 +365,7 @@ def _checked_boxes(boxes: Iterable[Box]) -> tuple[NDArray[np.float64], list[str]
 
 def _checked_pose(given: ArrayLike) -> NDArray[np.float64]:
     try:
-        pose = np.array(given, np.float64)
+        pose = np.array(given, np.float64, order="C")
     except (OverflowError, TypeError, ValueError) as exc:
         raise TrackingError(f"got a T_world_sensor that is not a matrix ({exc}); expected (4, 4) numbers") from exc
     if pose.shape != (4, 4) or not (np.abs(pose) <= FARTHEST_M).all():

@@ -1,0 +1,1 @@
+"""Fuzzers of edgeperc: ``python -m tests.fuzz KIND --cases N --seed S``; see ``docs/howto/untrusted.md``."""

@@ -1,0 +1,109 @@
+"""``python -m tests.fuzz KIND ... [--cases N] [--seconds S] [--seed S] [--jobs J] [--out DIR] [--case INDEX]``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import mmap
+import os
+import sys
+import tempfile
+import time
+from importlib import import_module
+from pathlib import Path
+
+# One thread in each library: the jobs share the processors.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the tests' helpers
+
+from edgeperc.atomic import write_atomic
+
+from .running import Kind, State, attempt, new_case, run_job, supervise
+
+KINDS = ("scans", "captures", "models", "trackers", "commands")
+
+
+def kind_of(name: str, seed: int) -> Kind:
+    module = import_module(f".{name}", __package__)
+    made: Kind = module.make(seed)
+    return made
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser.add_argument("kinds", nargs="*", choices=[*KINDS, []], metavar="KIND", help=", ".join(KINDS))
+    parser.add_argument("--cases", type=int, default=1 << 40, help="cases of each kind (default: until the time is up)")
+    parser.add_argument("--seconds", type=float, default=None, help="time for all kinds together (default: no limit)")
+    parser.add_argument("--seed", type=int, default=None, help="default: the time")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument(
+        "--out", type=Path, default=Path("build/fuzz"), help="counts and failed cases; continued if there"
+    )
+    parser.add_argument("--case", type=int, default=None, help="run this case alone, in this process")
+    parser.add_argument("--worker", nargs=4, default=None, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    kinds = arguments.kinds or [*KINDS]
+    seed = int(time.time()) if arguments.seed is None else arguments.seed
+    if arguments.case is not None:
+        with tempfile.TemporaryDirectory() as folder:
+            case = new_case(kinds[0], seed, arguments.case, Path(folder))
+            outcome, failure, ms, mb = attempt(kind_of(kinds[0], seed), case)
+            print(f"{outcome}, {ms:.1f} ms, {mb:.0f} MB", *case.died)
+            print(failure["traceback"] or failure["error"] if failure else "no failure")
+        return int(failure is not None)
+    if arguments.worker is not None:
+        file, shared, jobs, seconds = arguments.worker
+        with open(shared, "r+b") as opened:  # noqa: PTH123
+            now = mmap.mmap(opened.fileno(), 0)
+            state = State.read(Path(file))
+            run_job(
+                lambda: kind_of(kinds[0], seed),
+                *(state,),
+                cases=arguments.cases,
+                jobs=int(jobs),
+                seconds=float(seconds),
+                out=arguments.out,
+                file=Path(file),
+                now=now,
+            )
+        return 0
+    if arguments.seconds is None and arguments.cases == 1 << 40:
+        parser.error("give --cases or --seconds")
+    n_failures = 0
+    print(f"seed {seed}", flush=True)
+    for name in kinds:
+        made = import_module(f".{name}", __package__)
+        command = [sys.executable, "-m", "tests.fuzz", name, "--cases", str(arguments.cases), "--seed", str(seed)]
+        whole = supervise(
+            [*command, "--out", str(arguments.out)],
+            name,
+            made.LIMIT_S,
+            seed=seed,
+            cases=arguments.cases,
+            jobs=arguments.jobs,
+            seconds=float("inf") if arguments.seconds is None else arguments.seconds / len(kinds),
+            out=arguments.out,
+            progress=lambda state: print(line(state), flush=True),
+        )
+        print(line(whole), flush=True)
+        for failure in whole.failures[:20]:
+            print("  ", json.dumps(failure), flush=True)
+        write_atomic(arguments.out / f"{name}-{seed}.json", whole.to_json())
+        n_failures += whole.n_failures
+    return int(n_failures > 0)
+
+
+def line(state: State) -> str:
+    outcomes = ", ".join(f"{name} {count:,}" for name, count in state.outcomes.most_common())
+    died = f"; died: {dict(state.died)}" if state.died else ""
+    return (
+        f"{state.kind} seed {state.seed}: {state.cases:,} cases, {state.n_failures} failures in {state.seconds:,.0f} s "
+        f"({1e3 * state.seconds / max(state.cases, 1):.2f} ms each; slowest {state.slowest['ms']:.0f} ms in case "
+        f"{state.slowest['case']:.0f}; at most {state.highest['mb']:.0f} MB in case {state.highest['case']:.0f}); "
+        f"{outcomes}{died}"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
