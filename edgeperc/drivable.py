@@ -18,7 +18,16 @@ from .geometry import draw_footprints
 from .kernel_cache import njit
 from .perception import Box, TopView
 
-__all__ = ["RoadAhead", "fill_corridor", "fill_free", "fill_rings", "mark_connected", "mark_kept", "road_ahead"]
+__all__ = [
+    "RoadAhead",
+    "compile_kernels",
+    "fill_corridor",
+    "fill_free",
+    "fill_rings",
+    "mark_connected",
+    "mark_kept",
+    "road_ahead",
+]
 
 USUAL_LANE_M = 3.25
 """Lanes of towns and country roads are 2.75 to 3.75 m wide. A road is divided into lanes nearest to this width."""
@@ -109,7 +118,7 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
     """
     if not tolerance_m >= 0.0:
         raise PointsError(f"tolerance_m is {tolerance_m}; expected 0 or more meters")
-    drivable = np.ascontiguousarray(top_view.drivable)
+    drivable = np.array(top_view.drivable, np.bool_, order="C")
     standing = list(boxes)
     if standing:
         taken = np.zeros(drivable.shape, np.uint8)
@@ -134,7 +143,7 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
     whole = there & (bounds[:, 0] > 0) & (bounds[:, 1] < width) & (x_m < x_near + LANE_RANGE_M)
 
     rings = [
-        _simplified(np.column_stack([x_far - ring[:, 0] * cell_m, y_left - ring[:, 1] * cell_m]), tolerance_m)
+        _simplified(np.column_stack([x_far - ring[:, 0] * cell_m, y_left - ring[:, 1] * cell_m]), float(tolerance_m))
         for ring in _rings(_nearest_part(drivable, y_m, x_m[::-1]))
     ]
     # Rings run with the road on their left, so only the outer ring has a positive area.
@@ -150,6 +159,15 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
         right_m=right_m,
         lane_width_m=_lane_width(x_m[whole], left_m[whole], right_m[whole]),
     )
+
+
+def compile_kernels() -> None:
+    """Compile what `road_ahead` calls. A `Perceiver` with a top view does this, so that the first call is fast."""
+    cells = np.ones((2, 2), np.bool_)
+    fill_free(cells, np.empty(2, np.int64))
+    fill_corridor(cells, 0.0, 2.0, np.empty((2, 2), np.int64))
+    for ring in _rings(_nearest_part(cells, np.zeros(2), np.zeros(2))):
+        _simplified(ring.astype(np.float64), 0.0)
 
 
 def _lane_width(x: NDArray[np.float64], left: NDArray[np.float64], right: NDArray[np.float64]) -> float:
