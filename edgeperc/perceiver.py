@@ -22,6 +22,7 @@ from .adapt import Interpolator, condition
 from .card import ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, join_boxes, objects_from_points
 from .decode import decode_classes, decode_top_view
+from .drivable import compile_kernels
 from .errors import FitnessError, OptionError
 from .fitness import Finding, FitnessProfile, check_fitness
 from .ground import find_ground
@@ -251,6 +252,8 @@ class Perceiver:
         self._perceive(warm_up, None, check=self._to_check > 0, infer=False)
         if boxes_from != "network" and "range_image" in views:
             self._find_objects(*self._warm_up_objects())
+        if "top_view" in views:
+            compile_kernels()  # of `edgeperc.road_ahead`
 
     def __setattr__(self, name: str, value: object) -> None:
         if not name.startswith("_") and "_lock" in vars(self):  # the last attribute of construction
