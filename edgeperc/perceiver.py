@@ -26,6 +26,7 @@ from .drivable import compile_kernels
 from .errors import FitnessError, OptionError
 from .fitness import Finding, FitnessProfile, check_fitness
 from .ground import find_ground
+from .observed import Observer
 from .perception import Box, Perception, PointLabels, TopView
 from .points import as_points
 from .projection import RangeImageProjector, TopViewProjector, make_projector
@@ -69,6 +70,7 @@ class _Network:
     index: NDArray[np.int32]
     fitness: FitnessProfile | None
     interpolator: Interpolator | None
+    observer: Observer | None
 
 
 def _renamed(**names: str) -> Callable[[Callable[_P, None]], Callable[_P, None]]:
@@ -271,6 +273,7 @@ class Perceiver:
             index=np.empty((card.view.height, card.view.width), np.int32),
             fitness=None if card.fitness is None else FitnessProfile.from_dict(card.fitness),
             interpolator=interpolator if interpolator is not None and interpolator.needed else None,
+            observer=Observer(card.view, self.sensor.columns) if isinstance(card.view, TopViewGeometry) else None,
         )
 
     def __call__(self, points: ArrayLike, stamp_s: float | None = None) -> Perception:
@@ -365,14 +368,16 @@ class Perceiver:
         """Class of every cell of the top view, and boxes (SSADNet)."""
         card = network.session.card
         assert isinstance(card.view, TopViewGeometry)
+        assert network.observer is not None
         self._project(network, scan)
+        observed = network.observer.observe(scan, network.index)
         watch.lap("project")
         outputs = network.session.run() if infer else network.session.outputs
         watch.lap("infer")
         threshold = card.score_threshold if self.score_threshold is None else self.score_threshold
         labels, found = decode_top_view(card, network.index >= 0, outputs, threshold)
         watch.lap("decode")
-        view = TopView(labels, card.classes, card.view.cell_m, card.view.x_range_m, card.view.y_range_m)
+        view = TopView(labels, card.classes, card.view.cell_m, card.view.x_range_m, card.view.y_range_m, observed)
         return view, tuple(found)
 
     def _label_sector(
@@ -412,8 +417,9 @@ class Perceiver:
         for k in range(1, math.ceil(360.0 / width_deg)):
             cos, sin = math.cos(math.radians(k * width_deg)), math.sin(math.radians(k * width_deg))
             turned = scan.copy()
-            turned[:, 0] = cos * scan[:, 0] + sin * scan[:, 1]
-            turned[:, 1] = cos * scan[:, 1] - sin * scan[:, 0]
+            with np.errstate(over="ignore"):  # what float32 cannot hold is not in view
+                turned[:, 0] = cos * scan[:, 0] + sin * scan[:, 1]
+                turned[:, 1] = cos * scan[:, 1] - sin * scan[:, 0]
             aside = self._label_sector(network, turned, watch, infer)
             labels = np.where(in_view, labels, aside.labels)
             in_view = in_view | aside.in_view

@@ -1,8 +1,8 @@
 """Run the cases of a kind: count outcomes, find slow cases and failures, survive a process that hangs or dies.
 
 A case depends on the kind, the seed and its index alone, so that ``--seed S --case INDEX`` repeats it. Each job is a
-process. It writes the case it works on to a small shared file, and its counts to a JSON file every second. If it dies or
-a case exceeds the hard time limit, the case is a failure, and a new process goes on behind it.
+process. It writes the case it works on to a small shared file, and its counts to a JSON file every second. If it dies
+or a case exceeds the hard time limit, the case is a failure, and a new process goes on behind it.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Case:
     index: int
     folder: Path
     rng: np.random.Generator
-    evidence: dict[str, bytes] = field(default_factory=dict)
+    evidence: dict[str, bytes | Callable[[], bytes]] = field(default_factory=dict)
     died: list[str] = field(default_factory=list)
     """How processes ended that may die, such as the one that decodes a capture."""
     peak_mb: float = 0.0
@@ -179,7 +179,7 @@ def keep(case: Case, failure: dict[str, Any], out: Path) -> dict[str, Any]:
     again = f"python -m tests.fuzz {case.kind} --seed {case.seed} --case {case.index}"
     (folder / "case.json").write_text(json.dumps({**record, "again": again}, indent=1) + "\n")
     for name, content in case.evidence.items():
-        (folder / name).write_bytes(content)
+        (folder / name).write_bytes(content if isinstance(content, bytes) else content())
     return {name: value for name, value in record.items() if name != "traceback"}
 
 
