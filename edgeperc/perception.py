@@ -93,6 +93,10 @@ class TopView:
         Edge of a cell [m].
     x_range_m, y_range_m : tuple of 2 float
         Nearest and farthest x, rightmost and leftmost y [m].
+    observed : (rows, columns) bool
+        Cells that the scan observed: with a return, or passed closely by a ray to a return on the ground
+        (`edgeperc.observed.Observer`). The labels of the other cells are only the network's guess. They lie behind
+        objects, between the rays of sensors with few beams, or beyond the last return.
     """
 
     labels: NDArray[np.uint8]
@@ -100,6 +104,7 @@ class TopView:
     cell_m: float
     x_range_m: tuple[float, float]
     y_range_m: tuple[float, float]
+    observed: NDArray[np.bool_]
 
     @property
     def geometry(self) -> TopViewGeometry:
@@ -107,15 +112,20 @@ class TopView:
         return TopViewGeometry(self.x_range_m, self.y_range_m, cell_m=self.cell_m)
 
     @property
-    def drivable(self) -> NDArray[np.bool_]:
-        """Cells labeled drivable, (rows, columns) bool; all False if the model has no such class."""
+    def road(self) -> NDArray[np.bool_]:
+        """Cells labeled drivable, observed or not, (rows, columns) bool; all False if the model has no such class."""
         if "drivable" not in self.classes:
             return np.zeros(self.labels.shape, dtype=np.bool_)
         return self.labels == self.classes.index("drivable")
 
     @property
+    def drivable(self) -> NDArray[np.bool_]:
+        """Cells labeled drivable that the scan observed, (rows, columns) bool. An empty scan has none."""
+        return self.road & self.observed
+
+    @property
     def drivable_area_m2(self) -> float:
-        """Area of the drivable cells [m2]."""
+        """Area of the drivable cells [m2], observed ones only."""
         return float(np.count_nonzero(self.drivable)) * self.cell_m**2
 
     def to_meters(self, row: float, col: float) -> tuple[float, float]:

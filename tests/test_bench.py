@@ -38,7 +38,8 @@ from edgeperc_bench.scenarios import Timings
 
 def prediction(labels: Sequence[int], cells: int, boxes: Sequence[Box]) -> worker.Prediction:
     points = PointLabels(np.array(labels, np.uint8), np.array([True, True, True, False]), ("background", "car"))
-    top_view = TopView(np.full((2, 2), cells, np.uint8), ("background", "drivable"), 0.1, (6.0, 6.2), (-0.1, 0.1))
+    labels_of_cells, observed = np.full((2, 2), cells, np.uint8), np.ones((2, 2), bool)
+    top_view = TopView(labels_of_cells, ("background", "drivable"), 0.1, (6.0, 6.2), (-0.1, 0.1), observed)
     return worker.Prediction(points, top_view, tuple(boxes))
 
 
@@ -63,7 +64,8 @@ def test_agreement_counts_labels_and_boxes() -> None:
 
 def test_correctness_of_the_truth_itself_is_full() -> None:
     scan = simulated_scan(3)
-    geometry = TopView(scan.top_view_labels(), TOP_VIEW_CLASSES, 0.1, (6.0, 46.0), (-10.0, 10.0))
+    cells = scan.top_view_labels()
+    geometry = TopView(cells, TOP_VIEW_CLASSES, 0.1, (6.0, 46.0), (-10.0, 10.0), np.ones(cells.shape, bool))
     boxes = [
         box
         for box, n in zip(scan.boxes, scan.box_points, strict=True)

@@ -62,7 +62,7 @@ class FakePerceiver:
         labels = np.arange(len(points), dtype=np.uint8) % 2
         cells = np.zeros((400, 200), dtype=np.uint8)
         cells[:100, :100] = 1
-        top_view = TopView(cells, SSADNET.classes, 0.1, (6.0, 46.0), (-10.0, 10.0))
+        top_view = TopView(cells, SSADNET.classes, 0.1, (6.0, 46.0), (-10.0, 10.0), np.ones(cells.shape, bool))
         box = Box("car", 0.912345, (20.0, -3.0, -0.9), (4.2, 1.8, 1.6), 0.3)
         return Perception(
             n_points=len(points),

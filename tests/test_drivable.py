@@ -36,7 +36,8 @@ MASKS = npst.arrays(np.bool_, npst.array_shapes(min_dims=2, max_dims=2, min_side
 def view(drivable: NDArray[np.bool_], classes: tuple[str, ...] = CLASSES[:2]) -> TopView:
     rows, cols = drivable.shape
     y = 0.1 * cols / 2.0
-    return TopView(drivable.astype(np.uint8), classes, 0.1, (6.0, 6.0 + 0.1 * rows), (-y, y))
+    observed = np.ones(drivable.shape, np.bool_)
+    return TopView(drivable.astype(np.uint8), classes, 0.1, (6.0, 6.0 + 0.1 * rows), (-y, y), observed)
 
 
 def blank() -> NDArray[np.bool_]:
@@ -167,7 +168,7 @@ def test_road_computed_by_hand() -> None:
     labels = blank().astype(np.uint8)
     labels[:, 65:130] = 1  # y from 3.5 to -3.0: 6.5 m
     labels[200:240, 90:110] = 2  # a car from x = 22.0 to 26.0
-    road = road_ahead(TopView(labels, CLASSES, 0.1, (6.0, 46.0), (-10.0, 10.0)))
+    road = road_ahead(TopView(labels, CLASSES, 0.1, (6.0, 46.0), (-10.0, 10.0), ~blank()))
     assert road.free_m[100] == pytest.approx(22.0)
     assert road.free_m[64] == 6.0
     assert road.free_m[65] == 46.0
@@ -198,7 +199,7 @@ def test_lanes_of_a_slanting_road(slope: float, width: float, lanes: int) -> Non
 def test_no_drivable_cell() -> None:
     for road in (
         road_ahead(view(blank())),
-        road_ahead(TopView(np.ones((4, 2), np.uint8), CLASSES[::2], 0.1, (6, 7), (0, 1))),
+        road_ahead(TopView(np.ones((4, 2), np.uint8), CLASSES[::2], 0.1, (6, 7), (0, 1), np.ones((4, 2), np.bool_))),
     ):
         assert road.outline.shape == (0, 2)
         assert (road.free_m == 6.0).all()

@@ -64,6 +64,7 @@ class World:
     def __init__(self) -> None:
         self.cards = {name: card(name) for name in ("pointseg", "ssadnet", "lodnn")}
         self.cells = dict.fromkeys(self.cards, np.zeros((400, 200), np.uint8))
+        self.observed = np.ones((400, 200), bool)
         self.probability = np.zeros((400, 200))
         self.boxes: tuple[Box, ...] = ()
 
@@ -71,7 +72,8 @@ class World:
         def perceive(points: np.ndarray) -> Perception:
             kinds = {self.cards[name].view.kind: name for name in models}
             labels = PointLabels(points[:, 3].astype(np.uint8), np.isfinite(points).all(axis=1), POINTS)
-            view = TopView(self.cells[kinds.get("top_view", "lodnn")], CELLS, 0.1, VIEW.x_range_m, VIEW.y_range_m)
+            cells = self.cells[kinds.get("top_view", "lodnn")]
+            view = TopView(cells, CELLS, 0.1, VIEW.x_range_m, VIEW.y_range_m, self.observed)
             return Perception(
                 n_points=len(points),
                 n_dropped=0,

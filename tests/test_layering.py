@@ -27,7 +27,7 @@ FLOORS = {
         card points sensor tuning
         perception zoo.__init__
         geometry
-        adapt cluster decode drivable fitness ground projection refine sensor_fit session
+        adapt cluster decode drivable fitness ground observed projection refine sensor_fit session
         readers.__init__ readers.tables
         readers.inflate readers.packets
         readers.pcd readers.ply

@@ -27,7 +27,7 @@ def perception_of(*boxes: Box, stamp_s: float | None = None, labels: bool = True
         n_points=4,
         n_dropped=1,
         points=seen if labels else None,
-        top_view=TopView(road, ("background", "drivable"), *VIEW) if labels else None,
+        top_view=TopView(road, ("background", "drivable"), *VIEW, np.ones_like(road, bool)) if labels else None,
         boxes=boxes,
         stage_ms={"infer": 1.23456},
         providers={"network": "network fp32, CPUExecutionProvider"},
@@ -133,7 +133,8 @@ def test_malformed_record_is_a_tracking_error(tmp_path: Path, line: str) -> None
 
 
 def test_cell_centers_of_a_top_view() -> None:
-    view = TopView(np.zeros((400, 200), np.uint8), ("background", "drivable"), *VIEW)
+    labels, observed = np.zeros((400, 200), np.uint8), np.ones((400, 200), bool)
+    view = TopView(labels, ("background", "drivable"), *VIEW, observed)
     assert (view.geometry.height, view.geometry.width) == view.labels.shape
     for cell in ((0, 0), (399, 199), (17, 101)):
         row, col, in_view = view.geometry.cells(*view.to_meters(*cell))

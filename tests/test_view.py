@@ -52,7 +52,7 @@ def a_perception(points: np.ndarray) -> Perception:
         n_points=len(points),
         n_dropped=1,
         points=PointLabels(labels, np.isfinite(points).all(axis=1) & (points[:, 0] > 0), POINT_CLASSES),
-        top_view=TopView(cells, TOP_CLASSES, 0.1, (6.0, 46.0), (-10.0, 10.0)),
+        top_view=TopView(cells, TOP_CLASSES, 0.1, (6.0, 46.0), (-10.0, 10.0), np.ones_like(cells, bool)),
         boxes=(CAR, VAN),
         stage_ms={"project": 1.0, "infer": 30.0},
         providers={"ssadnet": "CPUExecutionProvider (fp32)"},

@@ -74,7 +74,9 @@ class NumpyPipeline:
                 boxed = np.isin(labels, [card.classes.index(name) for name in card.box_classes])
                 labels[boxed & (engine.input == 0.0).all(axis=0)] = 0
                 draw_footprints(labels, boxes, card.view, card.classes)
-                top_view = TopView(labels, card.classes, card.view.cell_m, card.view.x_range_m, card.view.y_range_m)
+                observed = np.ones(labels.shape, np.bool_)  # only labels are compared
+                x_range_m, y_range_m = card.view.x_range_m, card.view.y_range_m
+                top_view = TopView(labels, card.classes, card.view.cell_m, x_range_m, y_range_m, observed)
             else:
                 found = vote(points, pixel, index, labels, len(card.classes))
                 labeled = PointLabels(found, pixel >= 0, card.classes)

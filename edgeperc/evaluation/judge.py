@@ -105,7 +105,7 @@ class Judge:
         (card,) = self.draw_road.cards
         drawn = self.draw_road(frame.points).top_view
         assert drawn is not None
-        return kitti_truth(frame, self.view, (f"road drawn by {card.name} {card.version}", drawn.drivable))
+        return kitti_truth(frame, self.view, (f"road drawn by {card.name} {card.version}", drawn.road))
 
     def semantickitti(self, frame: RoadFrame) -> Truth:
         """The truth of a SemanticKITTI frame.
@@ -229,7 +229,8 @@ class Judge:
         table, name = truth.road
         classes, right = truth.cells[table]
         road = np.where(right == IGNORE, IGNORE, right == classes.index(name)).astype(np.uint8)
-        tallies |= banded(("decision",), ("other", name), found.drivable.astype(np.uint8), road, self.cell_range_m)
+        for group, decided in (("decision", found.road), ("drivable", found.drivable)):
+            tallies |= banded((group,), ("other", name), decided.astype(np.uint8), road, self.cell_range_m)
         probability = self.from_above.probability("drivable")
         for band, within_m in BANDS.items():
             counted = (road != IGNORE) & within(self.cell_range_m, within_m)

@@ -156,7 +156,7 @@ class RoadModel:
         # The scan is moved by the offset between the views, so that its points are in the same cells of both.
         top_view = self.perceive(points + self._shift.astype(np.float32)).top_view
         assert top_view is not None
-        return top_view.drivable
+        return top_view.road
 
 
 class SceneBuilder:
