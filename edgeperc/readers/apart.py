@@ -22,12 +22,15 @@ from numpy.typing import NDArray
 from ..errors import MissingExtraError, PointsError
 from .decoders import Scan
 from .tables import MAX_BYTES
-from .worker import ALIVE, END, ERROR, HEADER, MISSING, READY, SCAN, WARNING
+from .worker import ALIVE, END, ERROR, FOUND, HEADER, MISSING, READY, SCAN, WARNING
 
-__all__ = ["SCAN_LIMIT_S", "decode_apart"]
+__all__ = ["SCAN_LIMIT_S", "decode_apart", "describe_apart"]
 
 # Longest time to decode one scan [s]; the slowest library takes well under one.
 SCAN_LIMIT_S = 60.0
+
+# Longest text of a reply: an Ouster's metadata, or a message.
+_MOST_TEXT_BYTES = 1 << 24
 
 # The module path is that of this process; the current folder, which may hold foreign files, is not added to it.
 _START = "import sys; sys.path[:] = sys.argv[1:]; from edgeperc.readers.worker import main; main()"
@@ -44,6 +47,28 @@ def decode_apart(path: Path, kind: str, topic: str | None, remission_field: str 
         As `decoders.decode`, or the process ended, or it exceeded the limits of memory or time.
     """
     request = {"path": str(path), "kind": kind, "topic": topic, "remission_field": remission_field}
+    return _serve(request, path, [])
+
+
+def describe_apart(path: Path, kind: str, topic: str | None) -> dict[str, Any]:
+    """Like `decoders.describe`, in a process of its own.
+
+    Raises
+    ------
+    PointsError
+        As `decode_apart`.
+    """
+    found: list[Any] = []
+    for _ in _serve({"path": str(path), "kind": kind, "topic": topic}, path, found):
+        break  # a scan was not asked for
+    if not found or not isinstance(found[0], dict):
+        raise PointsError(f"{path}: the process that decodes captures replied nonsense; the capture is damaged")
+    description: dict[str, Any] = found[0]
+    return description
+
+
+def _serve(request: dict[str, Any], path: Path, found: list[Any]) -> Iterator[Scan]:
+    """The scans of a request's reply; a description is appended to ``found``."""
     request_line = json.dumps(request).encode() + b"\n"
     with (
         tempfile.TemporaryDirectory(prefix="edgeperc-", ignore_cleanup_errors=True) as folder,
@@ -55,7 +80,7 @@ def decode_apart(path: Path, kind: str, topic: str | None, remission_field: str 
         try:
             with suppress(OSError), process.stdin as stdin:  # its end is found when it does not reply
                 stdin.write(request_line)
-            yield from _replies(process, process.stdout, path, watch)
+            yield from _replies(process, process.stdout, path, watch, found)
         finally:
             process.kill()
 
@@ -109,7 +134,9 @@ class _Watch:
         self._thread.join()
 
 
-def _replies(process: subprocess.Popen[bytes], replies: IO[bytes], path: Path, watch: _Watch) -> Iterator[Scan]:
+def _replies(
+    process: subprocess.Popen[bytes], replies: IO[bytes], path: Path, watch: _Watch, found: list[Any]
+) -> Iterator[Scan]:
     n_scans, ready = 0, False
     while True:
         watch.since_s = time.monotonic()
@@ -117,7 +144,8 @@ def _replies(process: subprocess.Popen[bytes], replies: IO[bytes], path: Path, w
         if len(header) < HEADER.size:
             break
         kind, stamp, n_bytes = HEADER.unpack(header)
-        if kind not in (ALIVE, END, ERROR, MISSING, READY, SCAN, WARNING) or not 0 <= n_bytes <= MAX_BYTES:
+        known = kind in (ALIVE, END, ERROR, FOUND, MISSING, READY, SCAN, WARNING)
+        if not known or not 0 <= n_bytes <= (MAX_BYTES if kind == SCAN else _MOST_TEXT_BYTES):
             break
         if kind == SCAN and n_bytes % 16 == 0:
             points: NDArray[np.float32] = np.empty((n_bytes // 16, 4), "<f4")
@@ -134,8 +162,15 @@ def _replies(process: subprocess.Popen[bytes], replies: IO[bytes], path: Path, w
             return
         if kind == ERROR:
             raise PointsError(text.decode("utf-8", "replace"))
-        if kind == MISSING:
-            raise MissingExtraError(*json.loads(text))
+        if kind in (FOUND, MISSING):
+            try:
+                content = json.loads(text)
+            except (RecursionError, ValueError):
+                break
+            if kind == MISSING:
+                raise MissingExtraError(*content)
+            found.append(content)
+            return
         if kind == WARNING:
             warnings.warn(text.decode("utf-8", "replace"), UserWarning, stacklevel=2)
         ready = ready or kind == READY

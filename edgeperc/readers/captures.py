@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from ..errors import PointsError
-from .apart import decode_apart
+from ..errors import PointsError, SensorError
+from ..sensor import SensorProfile
+from .apart import decode_apart, describe_apart
 from .decoders import Scan
 from .files import read_points
+from .identify import KnownSensor, of_cloud, of_metadata, of_packets
 from .packets import PCAP_MAGIC
 
-__all__ = ["CAPTURE_SUFFIXES", "SCAN_SUFFIXES", "is_capture", "read_scans", "scan_files"]
+__all__ = [
+    "CAPTURE_SUFFIXES",
+    "SCAN_SUFFIXES",
+    "is_capture",
+    "known_sensor",
+    "read_scans",
+    "scan_files",
+    "sensor_of",
+]
 
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 CAPTURE_SUFFIXES = (".bag", ".db3", ".mcap", ".osf", ".pcap", ".pcapng")
@@ -93,6 +104,63 @@ def read_scans(
 def is_capture(path: Path) -> bool:
     """Whether a path is a recording of many scans: a bag's folder, or a file with the first bytes of a capture."""
     return _kind(path) not in ("scan", "folder")
+
+
+def sensor_of(source: str | os.PathLike[str], *, topic: str | None = None) -> SensorProfile | None:
+    """Find out which sensor recorded a capture; pass the result to the `Perceiver`.
+
+    An Ouster's metadata names it and has the beam angles of the unit. The packets of a Velodyne name the model. The
+    clouds of a bag name the maker by their fields, topic or frame, and the model by the elevations of their rings.
+
+    Parameters
+    ----------
+    source : str or path
+        As in `edgeperc.read_scans`.
+    topic : str, optional
+        As in `edgeperc.read_scans`.
+
+    Returns
+    -------
+    SensorProfile or None
+        None for scan files and folders of them: they do not name their sensor.
+
+    Raises
+    ------
+    SensorError
+        The capture does not say which sensor recorded it, or there is no profile of that one; the message lists the
+        choices. Or the captures of a folder are of several sensors.
+    PointsError, MissingExtraError
+        As `edgeperc.read_scans`.
+    """
+    known = known_sensor(Path(source), topic)
+    return None if known is None else known.profile
+
+
+def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
+    """Like `sensor_of`, with how it is known."""
+    kind = _kind(path)
+    if kind == "folder":
+        each = {file: known_sensor(file, topic) for file in scan_files(path)}
+        profiles = {None if known is None else known.profile for known in each.values()}
+        if len(profiles) > 1:
+            names = sorted({"scan files" if profile is None else profile.name for profile in profiles})
+            raise SensorError(
+                f"{path}: the captures in this folder are of several sensors ({', '.join(names)}); read them one by one"
+            )
+        return next(iter(each.values()), None)
+    try:
+        if kind == ".pcap":
+            return of_packets(path, topic)
+        if kind in (".osf", ".bag", ".mcap", "ros2"):
+            found = describe_apart(path, kind, topic)
+            if "metadata" in found:
+                return of_metadata(json.loads(found["metadata"]), "the metadata")
+            return of_cloud(found)
+    except SensorError as exc:
+        raise SensorError(f"{path}: {exc}") from exc
+    except PointsError as exc:
+        raise PointsError(f"{path}: {str(exc).removeprefix(f'{path}: ')}") from exc
+    return None
 
 
 def scan_files(folder: Path) -> list[Path]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,21 +15,22 @@ from ..points import as_points
 from .inflate import inflate
 from .mcap import McapFile
 from .ouster import check_osf, open_capture
-from .packets import pcap_packets
+from .packets import pcap_packets, refuse_hesai, velodyne_packets
 from .tables import MAX_BYTES
 
-__all__ = ["Scan", "cloud_points", "decode"]
+__all__ = ["Scan", "cloud_points", "decode", "describe", "is_ouster_cloud"]
 
 Scan = tuple[float | None, NDArray[np.float32]]
+_Item = TypeVar("_Item")
 
 _CLOUD = "sensor_msgs/msg/PointCloud2"
 
 # PointField.datatype, from 1.
 _CLOUD_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
-_VELODYNE_BYTES = 1206
+_MOST_RINGS = 256
 
-# Enough to find a LiDAR's packet among those of a GPS, and quick to read.
-_SNIFFED_PACKETS = 2000
+# Nearer, a laser's own place in the housing shows in its elevation.
+_ELEVATION_FROM_M = 3.0
 
 
 def decode(
@@ -60,16 +60,60 @@ def decode(
         Every error becomes one that names the file.
     MissingExtraError
     """
+    scans = (
+        _packet_scans(path, kind, topic, remission_field, warn, alive)
+        if kind in (".pcap", ".osf")
+        else _bag_scans(path, kind, topic, remission_field)
+    )
+    yield from _with_typed_errors(path, scans)
+
+
+def describe(path: Path, kind: str, topic: str | None) -> dict[str, Any]:
+    """What a capture says about its sensor, as JSON types; `identify` draws the conclusion.
+
+    Parameters
+    ----------
+    path : Path
+    kind : {".osf", ".bag", ".mcap", "ros2"}
+    topic : str, optional
+        As in `edgeperc.read_scans`.
+
+    Returns
+    -------
+    dict
+        ``metadata`` of an Ouster, as text; or ``topic``, ``frame``, ``fields`` and ``elevations_deg`` of a point cloud:
+        the median elevation of each ring or, without rings, of each row of an organized cloud [deg], None where a ring
+        has no return; empty without both.
+
+    Raises
+    ------
+    PointsError, MissingExtraError
+        As `decode`.
+    """
+
+    def found() -> Iterator[dict[str, Any]]:
+        if kind == ".osf":
+            frames = _open_osf(path)
+            chosen = frames.sensor_info[_choose("sensor", [str(info.sn) for info in frames.sensor_info], topic)]
+            yield {"metadata": chosen.to_json_string()}
+        else:
+            for name, message, _ in _clouds(path, kind, topic):
+                yield {
+                    "topic": name,
+                    "frame": str(message.header.frame_id),
+                    "fields": [str(f.name) for f in message.fields],
+                    "elevations_deg": _ring_elevations(message),
+                }
+
+    return next(_with_typed_errors(path, found()))
+
+
+def _with_typed_errors(path: Path, items: Iterator[_Item]) -> Iterator[_Item]:
     n_scans = 0
     try:
-        scans = (
-            _packet_scans(path, kind, topic, remission_field, warn, alive)
-            if kind in (".pcap", ".osf")
-            else _bag_scans(path, kind, topic, remission_field)
-        )
-        for scan in scans:
+        for item in items:
             n_scans += 1
-            yield scan
+            yield item
     except MissingExtraError:
         raise
     except PointsError as exc:
@@ -92,7 +136,7 @@ def cloud_points(message: Any, *, remission_field: str | None = None) -> NDArray
         With the message's attributes: height, width, fields, is_bigendian, point_step, row_step, data. Organized or
         not; fields in any order, of any type, padded or not.
     remission_field : str, optional
-        As in `edgeperc.read_points`.
+        As in `edgeperc.read_points`; by default ``reflectivity`` if the fields are those of Ouster's driver.
 
     Returns
     -------
@@ -104,6 +148,14 @@ def cloud_points(message: Any, *, remission_field: str | None = None) -> NDArray
     PointsError
         The message holds fewer bytes than it declares, or has no x, y and z.
     """
+    cloud = _as_table(message)
+    if remission_field is None and is_ouster_cloud(cloud.dtype.names or ()):
+        remission_field = "reflectivity"
+    return as_points(cloud, remission_field=remission_field)
+
+
+def _as_table(message: Any) -> NDArray[Any]:
+    """The points of a cloud as a structured array, (height, width)."""
     try:
         height, width, step = int(message.height), int(message.width), int(message.point_step)
         row_step = int(message.row_step) if height > 1 else width * step
@@ -129,7 +181,31 @@ def cloud_points(message: Any, *, remission_field: str | None = None) -> NDArray
         )
     shape = (height, width) if n_bytes else (0, 0)
     cloud: NDArray[Any] = np.ndarray(shape, dtype, data, strides=(row_step, step) if n_bytes else None)
-    return as_points(cloud, remission_field=remission_field)
+    return cloud
+
+
+def is_ouster_cloud(names: Sequence[str]) -> bool:
+    """Whether these are the fields of Ouster's driver; its ``intensity`` is a count of photons."""
+    return "reflectivity" in names and not {"range", "ambient", "noise", "near_ir", "signal"}.isdisjoint(names)
+
+
+def _ring_elevations(message: Any) -> list[float | None]:
+    """See `describe`."""
+    cloud = _as_table(message)
+    names = cloud.dtype.names or ()
+    if "ring" in names:
+        ring = cloud["ring"].ravel().astype(np.float64)
+    elif cloud.ndim == 2 and 1 < len(cloud) <= _MOST_RINGS:
+        ring = np.repeat(np.arange(len(cloud), dtype=np.float64), cloud.shape[1])
+    else:
+        return []
+    points = as_points(cloud).astype(np.float64)
+    across = np.hypot(points[:, 0], points[:, 1])
+    with np.errstate(invalid="ignore"):
+        far = np.isfinite(points).all(axis=1) & (across > _ELEVATION_FROM_M)
+        n_rings = int(ring[(ring >= 0.0) & (ring < _MOST_RINGS)].max(initial=-1.0)) + 1
+    elevation, ring = np.degrees(np.arctan2(points[far, 2], across[far])), ring[far]
+    return [round(float(np.median(elevation[ring == k])), 3) if np.any(ring == k) else None for k in range(n_rings)]
 
 
 def _choose(what: str, names: Sequence[str], wanted: str | None, others: str = "") -> int:
@@ -157,12 +233,11 @@ def _packet_scans(
 ) -> Iterator[Scan]:
     scans: Iterator[Scan] = iter(())
     if kind == ".osf":
-        osf = require("ouster.sdk.osf", "io", "Reading an Ouster capture", package="ouster-sdk")
-        check_osf(path)
-        scans = _ouster_scans(osf.OsfFrameSetSource(str(path)), topic, remission_field)
-    elif any(_is_velodyne(packet) for _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS)):
+        scans = _ouster_scans(_open_osf(path), topic, remission_field)
+    elif next(velodyne_packets(path), None) is not None:
         scans = _velodyne_scans(path)
     else:
+        refuse_hesai(path)
         frames = open_capture(path, warn, alive)
         if frames is not None:
             scans = _ouster_scans(frames, topic, remission_field)
@@ -177,9 +252,10 @@ def _packet_scans(
         raise PointsError(f"the capture {held}; expected a Velodyne capture, or an Ouster capture with its metadata")
 
 
-def _is_velodyne(packet: memoryview) -> bool:
-    # The first of twelve blocks begins with the flag 0xEEFF, behind the headers of Ethernet, IP and UDP.
-    return len(packet) > _VELODYNE_BYTES and bytes(packet[-_VELODYNE_BYTES : 2 - _VELODYNE_BYTES]) == b"\xff\xee"
+def _open_osf(path: Path) -> Any:
+    osf = require("ouster.sdk.osf", "io", "Reading an Ouster capture", package="ouster-sdk")
+    check_osf(path)
+    return osf.OsfFrameSetSource(str(path))
 
 
 def _velodyne_scans(path: Path) -> Iterator[Scan]:
@@ -216,6 +292,12 @@ def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -
 
 
 def _bag_scans(path: Path, kind: str, topic: str | None, remission_field: str | None) -> Iterator[Scan]:
+    for _, message, stamp_s in _clouds(path, kind, topic):
+        yield stamp_s, cloud_points(message, remission_field=remission_field)
+
+
+def _clouds(path: Path, kind: str, topic: str | None) -> Iterator[tuple[str, Any, float]]:
+    """Topic, message and stamp [s] of each point cloud."""
     highlevel = require("rosbags.highlevel", "io", "Reading a bag")
     typesys = require("rosbags.typesys", "io", "Reading a bag")
     rosbag2 = require("rosbags.rosbag2", "io", "Reading a bag")
@@ -236,7 +318,7 @@ def _bag_scans(path: Path, kind: str, topic: str | None, remission_field: str | 
             stamp = message.header.stamp
             stamp_s = stamp.sec + 1e-9 * stamp.nanosec
             n_scans += 1
-            yield stamp_s or 1e-9 * stamp_ns, cloud_points(message, remission_field=remission_field)
+            yield chosen, message, stamp_s or 1e-9 * stamp_ns
         if not n_scans:
             raise PointsError(f"topic {chosen} has no message; expected point clouds")
 

@@ -17,7 +17,7 @@ from ..errors import PointsError
 from ..extras import require
 from .packets import check_datagrams, copy_without
 
-__all__ = ["check_metadata", "check_osf", "open_capture"]
+__all__ = ["check_metadata", "check_osf", "metadata_beside", "open_capture", "read_metadata"]
 
 # Sensors have up to 128 beams, 4,096 columns in a turn and 32 columns in a packet.
 _MOST_BEAMS, _MOST_COLUMNS = 1024, 65536
@@ -34,15 +34,10 @@ def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], No
     """
     pcap = require("ouster.sdk.pcap", "io", "Reading a capture of another sensor than Velodyne's", package="ouster-sdk")
     core = require("ouster.sdk.core", "io", "Reading an Ouster capture", package="ouster-sdk")
-    metadata = _metadata_beside(path)
-    if not metadata:
-        raise PointsError(
-            "not a Velodyne capture (packets of 1206 bytes), and cannot be read as Ouster's: there is no "
-            "metadata beside it. Expected a .json file whose name has the same beginning"
-        )
+    metadata = metadata_beside(path)
     sizes = set()
     for file in metadata:
-        text = _read_metadata(file)
+        text = read_metadata(file)
         layout = core.PacketFormat(core.SensorInfo(text))
         sizes |= {int(getattr(layout, f"{kind}_packet_size", 0)) for kind in ("lidar", "imu", "zone")}
     found = check_datagrams(path, sizes - {0}, alive)
@@ -61,8 +56,14 @@ def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], No
     return pcap.PcapFrameSetSource(str(source), meta=[str(file) for file in metadata])
 
 
-def _metadata_beside(path: Path) -> list[Path]:
-    """The .json files whose names have the longest beginning in common with the capture's, as ouster-sdk chooses."""
+def metadata_beside(path: Path) -> list[Path]:
+    """The .json files whose names have the longest beginning in common with the capture's, as ouster-sdk chooses.
+
+    Raises
+    ------
+    PointsError
+        There is none.
+    """
     files = sorted(file for file in path.absolute().parent.iterdir() if file.suffix.lower() == ".json")
     alike = {
         file: len(os.path.commonprefix([file.name, path.name]))  # noqa: RUF071 - of the characters
@@ -70,10 +71,15 @@ def _metadata_beside(path: Path) -> list[Path]:
         if file.is_file()
     }
     longest = max(alike.values(), default=0)
-    return [file for file, n in alike.items() if n == longest > 0]
+    if not longest:
+        raise PointsError(
+            "not a Velodyne capture (packets of 1206 bytes), and cannot be read as Ouster's: there is no "
+            "metadata beside it. Expected a .json file whose name has the same beginning"
+        )
+    return [file for file, n in alike.items() if n == longest]
 
 
-def _read_metadata(path: Path) -> str:
+def read_metadata(path: Path) -> str:
     """The text of a sensor's metadata, once it is checked."""
     if path.stat().st_size > _MOST_JSON_BYTES:
         raise PointsError(f"the metadata {path.name} is larger than {_MOST_JSON_BYTES:,} bytes")

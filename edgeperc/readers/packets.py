@@ -6,6 +6,7 @@ import struct
 from array import array
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +14,15 @@ import numpy as np
 
 from ..errors import PointsError
 
-__all__ = ["PCAP_MAGIC", "Checked", "check_datagrams", "copy_without", "pcap_packets"]
+__all__ = [
+    "PCAP_MAGIC",
+    "Checked",
+    "check_datagrams",
+    "copy_without",
+    "pcap_packets",
+    "refuse_hesai",
+    "velodyne_packets",
+]
 
 # First bytes of a pcap file, and the byte order that they stand for.
 PCAP_MAGIC = {
@@ -25,6 +34,12 @@ PCAP_MAGIC = {
 
 # Bytes in front of the IP header and the place of the EtherType, by the link type: Ethernet, Linux cooked 1 and 2.
 _LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
+
+_VELODYNE_BYTES = 1206
+_GPS_BYTES = 600  # what LiDARs send of their GPS is shorter, their points are longer
+
+# Enough to find a LiDAR's packet among those of a GPS, and quick to read.
+_SNIFFED_PACKETS = 2000
 
 # Datagrams of which fragments are awaited; more than a few at once are damage.
 _PENDING = 256
@@ -105,10 +120,7 @@ def check_datagrams(path: Path, sizes: Collection[int], alive: Callable[[], None
     other_sizes: dict[int, array[int]] = {}  # port: places of the records of whole datagrams of another size
     n_others: Counter[int] = Counter()
     pending: dict[bytes, tuple[list[int], int, int]] = {}  # source: places, bytes so far, port and length of UDP
-    with path.open("rb") as file:
-        head = file.read(24)
-    order = PCAP_MAGIC.get(head[:4], "<")
-    link = struct.unpack(f"{order}I", head[20:24])[0] & 0xFFFF if len(head) == 24 else 1
+    link = _link_type(path)
     for k, (at, packet) in enumerate(pcap_packets(path, whole=False)):
         if k % 10_000 == 0:
             alive()
@@ -162,6 +174,59 @@ def check_datagrams(path: Path, sizes: Collection[int], alive: Callable[[], None
     if end < size:
         bad.append(end)
     return Checked(n_good, n_bad, bad)
+
+
+def _link_type(path: Path) -> int:
+    with path.open("rb") as file:
+        head = file.read(24)
+    order = PCAP_MAGIC.get(head[:4], "<")
+    return int(struct.unpack(f"{order}I", head[20:24])[0]) & 0xFFFF if len(head) == 24 else 1
+
+
+def velodyne_packets(path: Path) -> Iterator[memoryview]:
+    """A Velodyne's packets among the first of a pcap file, of 1206 bytes each."""
+    for _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
+        # The first of twelve blocks begins with the flag 0xEEFF, behind the headers of Ethernet, IP and UDP.
+        if len(packet) > _VELODYNE_BYTES and bytes(packet[-_VELODYNE_BYTES : 2 - _VELODYNE_BYTES]) == b"\xff\xee":
+            yield packet[-_VELODYNE_BYTES:]
+
+
+def refuse_hesai(path: Path) -> None:
+    """Raise `PointsError` if most of the first packets of a pcap file are a Hesai's."""
+    # One of 65,536 packets of other sensors begins like them by chance.
+    names = Counter(_hesai_name(payload) for payload in _first_payloads(path) if len(payload) > _GPS_BYTES)
+    name, n = max(names.items(), key=lambda item: item[1], default=(None, 0))
+    if name is not None and 2 * n > names.total():
+        raise PointsError(
+            f"a capture of a {name}, which cannot be decoded; expected a Velodyne or an Ouster. Convert it with "
+            "Hesai's driver, to a ROS bag or to .pcd files"
+        )
+
+
+def _first_payloads(path: Path) -> Iterator[memoryview]:
+    """What the first UDP datagrams of a pcap file carry; fragments and damaged packets are left out."""
+    link = _link_type(path)
+    for _, packet in islice(pcap_packets(path, whole=False), _SNIFFED_PACKETS):
+        try:
+            part = _fragment(packet, link)
+        except ValueError:
+            continue
+        if part is not None and part.start == 0 and not part.more:
+            yield part.payload[8:]
+
+
+def _hesai_name(payload: memoryview) -> str | None:
+    """The Hesai sensor that sends such a packet, e.g. ``"Hesai Pandar64"``; None if it is not one of Hesai's."""
+    # Pandar40P: ten blocks of 124 bytes, each with the same flag, and a tail.
+    if len(payload) in (1262, 1266) and all(bytes(payload[k : k + 2]) == b"\xff\xee" for k in range(0, 1240, 124)):
+        return "Hesai Pandar40P"
+    if len(payload) < 12 or bytes(payload[:2]) != b"\xee\xff":
+        return None
+    # Pandar20 and Pandar64 have the numbers of lasers and blocks here, later sensors the version of the protocol.
+    lasers, blocks = payload[2], payload[3]
+    if (lasers, blocks) in ((20, 20), (64, 6)):
+        return f"Hesai Pandar{lasers}"
+    return f"Hesai sensor of {payload[6]} lasers (version {payload[2]}.{payload[3]} of the packets)"
 
 
 def _fragment(packet: memoryview, link: int) -> _Fragment | None:

@@ -1,4 +1,4 @@
-"""The process that decodes one capture: reads a request from standard input, writes scans to standard output.
+"""The process that decodes or describes one capture: a request from standard input, replies to standard output.
 
 Every reply is a header (`HEADER`: kind, stamp, number of bytes) and its bytes; `apart` reads them.
 """
@@ -16,17 +16,17 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import MissingExtraError, PointsError
-from .decoders import decode
+from .decoders import decode, describe
 from .tables import MAX_BYTES
 
-__all__ = ["ALIVE", "END", "ERROR", "HEADER", "MISSING", "READY", "SCAN", "WARNING", "main"]
+__all__ = ["ALIVE", "END", "ERROR", "FOUND", "HEADER", "MISSING", "READY", "SCAN", "WARNING", "main"]
 
 HEADER = struct.Struct("<cdq")
-ALIVE, END, ERROR, MISSING, READY, SCAN, WARNING = b"A", b"Z", b"E", b"M", b"R", b"S", b"W"
+ALIVE, END, ERROR, FOUND, MISSING, READY, SCAN, WARNING = b"A", b"Z", b"E", b"F", b"M", b"R", b"S", b"W"
 
 
 def main() -> None:
-    """Decode the capture of the request: a JSON object with path, kind, topic, remission_field."""
+    """Serve the request: a JSON object with path, kind, topic, and remission_field unless it asks for a description."""
     # What the libraries print must not come between the replies.
     replies = os.fdopen(os.dup(1), "wb", 0)
     os.dup2(2, 1)
@@ -41,11 +41,13 @@ def main() -> None:
                     view = view[replies.write(view) :]
 
         reply(READY)
+        capture = Path(request["path"]), request["kind"], request["topic"]
         try:
+            if "remission_field" not in request:
+                reply(FOUND, json.dumps(describe(*capture)).encode())
+                return
             for stamp_s, points in decode(
-                Path(request["path"]),
-                request["kind"],
-                request["topic"],
+                *capture,
                 request["remission_field"],
                 lambda text: reply(WARNING, text.encode("utf-8", "replace")),
                 lambda: reply(ALIVE),

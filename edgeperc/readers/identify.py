@@ -1,0 +1,247 @@
+"""Which sensor recorded a capture: read from packets, metadata and the fields of point clouds, without native code."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..errors import PointsError, SensorError
+from ..sensor import SENSORS, SensorProfile
+from .decoders import is_ouster_cloud
+from .ouster import check_metadata, metadata_beside, read_metadata
+from .packets import refuse_hesai, velodyne_packets
+
+__all__ = ["KnownSensor", "of_cloud", "of_metadata", "of_packets"]
+
+_CHOICES = f"Pass its name, sensor= or --sensor: {', '.join(SENSORS)}; or a profile of your own, a .json file."
+
+# The last byte of a Velodyne's packet, behind the return mode: the model's beam angles. VLS-128 has two by firmware.
+_PRODUCTS = {
+    0x21: "hdl-32e",
+    0x22: "vlp-16",
+    0x23: "VLP-32A or VLP-32B",
+    0x24: "Puck Hi-Res",
+    0x28: "vlp-32c",
+    0x63: "VLS-128",
+    0xA1: "VLS-128",
+}
+_RETURN_MODES = (0x37, 0x38, 0x39, 0x3A, 0x3B)
+
+# Vertical field of view [deg] of Ouster's families: lowest and highest of their units; a first-generation OS1 has 33.
+_OUSTER_SPANS = {"os2": (18.0, 27.0), "os1": (30.0, 48.0), "os0": (75.0, 100.0)}
+
+# Words in the topic or frame of a point cloud.
+_MAKERS = {
+    "velodyne": r"velodyne|vlp|hdl|puck",
+    "ouster": r"ouster|os_?(sensor|lidar|cloud)|(?<![a-z])os[012]",
+    "hesai": r"hesai|pandar",
+}
+# First letters of the profiles of each maker.
+_PREFIXES = {"velodyne": ("hdl", "vlp"), "ouster": ("os",), "hesai": ("pandar",)}
+
+# Between the median elevation of the rings of a scan and those of the profile of their sensor [deg]. Units differ by up
+# to 1.4 from the profile, models with the same number of beams by 3 and more.
+_RING_ERROR_DEG = 1.0
+
+
+class KnownSensor(NamedTuple):
+    """The sensor of a capture, and how it is known."""
+
+    profile: SensorProfile
+    because: str
+
+
+def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
+    """The sensor of a pcap file.
+
+    Parameters
+    ----------
+    path : Path
+    topic : str, optional
+        The serial number, if there is metadata of several Ouster sensors.
+
+    Raises
+    ------
+    PointsError
+        The file is not a capture of a sensor that can be decoded.
+    SensorError
+        The packets name no sensor, or several, or one of which there is no profile.
+    """
+    names = {_velodyne_name(packet) for packet in velodyne_packets(path)}
+    if names:
+        name = ", ".join(sorted(map(str, names)))
+        if name in SENSORS:
+            return KnownSensor(SENSORS[name], "named by the packets")
+        if names == {None}:
+            raise SensorError(f"the packets are a Velodyne's but do not name the model. {_CHOICES}")
+        raise SensorError(f"the packets are of a Velodyne {name}, of which no profile is built in. {_CHOICES}")
+    refuse_hesai(path)
+    files = metadata_beside(path)
+    contents = [(file.name, json.loads(read_metadata(file))) for file in files]
+    chosen = [each for each in contents if topic is None or _serial(each[1]) == topic] or contents
+    known = [of_metadata(content, f"the metadata {name}") for name, content in chosen]
+    if len({each.profile for each in known}) > 1:
+        raise SensorError(
+            f"there is metadata of several sensors: {', '.join(name for name, _ in contents)}; say which by topic="
+        )
+    return known[0]
+
+
+def _velodyne_name(packet: memoryview) -> str | None:
+    """The model, None if the packet does not name it."""
+    blocks = {bytes(packet[k : k + 2]) for k in range(0, 1200, 100)}
+    if blocks & {b"\xff\xcc", b"\xff\xbb"}:
+        return "VLS-128"
+    if b"\xff\xdd" in blocks:  # the second half of the lasers; the last bytes hold its status instead
+        return "hdl-64e"
+    return _PRODUCTS.get(packet[-1]) if packet[-2] in _RETURN_MODES else None
+
+
+def of_metadata(content: Any, source: str) -> KnownSensor:
+    """The sensor that an Ouster's metadata describes, with its own beam angles and columns.
+
+    Parameters
+    ----------
+    content : object
+        The metadata as `json.loads` returns it.
+    source : str
+        What to call it in messages.
+
+    Raises
+    ------
+    PointsError
+        The metadata is impossible.
+    SensorError
+        It names no sensor, or one of which there is no profile.
+    """
+    try:
+        check_metadata(content)
+    except PointsError as exc:
+        raise PointsError(f"{source} cannot be read: {exc}") from exc
+    layout = _object(content, "lidar_data_format") or _object(content, "data_format")
+    angles = _object(content, "beam_intrinsics").get("beam_altitude_angles", content.get("beam_altitude_angles"))
+    elevations = _distinct(angles)
+    line = str(_object(content, "sensor_info").get("prod_line", content.get("prod_line", "")))
+    family = re.match(r"OS-?([012])(?!\d)", line)
+    if family:
+        model, because = f"os{family[1]}", f"{source} (prod_line {line})"
+    elif line or not elevations:
+        named = f"a sensor {line!r}, of which no profile is built in" if line else "no sensor"
+        raise SensorError(f"{source} names {named}. {_CHOICES}")
+    else:
+        model, because = _family(elevations[0] - elevations[-1], source), f"the beam angles in {source}"
+    in_line = re.search(r"-(16|32|64|128)(?!\d)", line)
+    n_beams = len(elevations) or layout.get("pixels_per_column") or (int(in_line[1]) if in_line else 0)
+    name = f"{model}-{n_beams}"
+    profile = SENSORS.get(name)
+    if elevations:
+        profile = replace(profile or SENSORS[f"{model}-32"], name=name, elevations_deg=elevations)
+        because += ", with its beam angles" if family else ""
+    elif profile is None:
+        raise SensorError(f"{source} names a sensor {line!r} and no usable beam angles. {_CHOICES}")
+    mode = re.match(r"(\d{3,4})x", str(content.get("lidar_mode", _object(content, "config_params").get("lidar_mode"))))
+    columns = layout.get("columns_per_frame") or (int(mode[1]) if mode else profile.columns)
+    return KnownSensor(replace(profile, columns=columns), because)
+
+
+def of_cloud(found: Mapping[str, Any]) -> KnownSensor:
+    """The sensor of a point cloud of ROS: its maker by fields, frame and topic, its model by the angles of its rings.
+
+    Parameters
+    ----------
+    found : mapping
+        ``topic``, ``frame``, ``fields`` and ``elevations_deg``, from `decoders.describe`.
+
+    Raises
+    ------
+    SensorError
+        The cloud names no sensor, or one of which there is no profile.
+    """
+    topic, frame, fields = str(found["topic"]), str(found["frame"]), [str(name) for name in found["fields"]]
+    rings = [np.nan if angle is None else float(angle) for angle in found["elevations_deg"]]
+    if np.isnan(rings).all():
+        rings = []
+    words = f"{topic} {frame}".lower()
+    source = f"topic {topic}, frame {frame!r}, fields {', '.join(fields)}"
+    makers = {maker for maker, pattern in _MAKERS.items() if re.search(pattern, words)}
+    if is_ouster_cloud(fields):
+        makers.add("ouster")
+    elif not makers and {"intensity", "ring", "time"} <= set(fields):  # converters of other sensors write these too
+        makers.add("velodyne")
+    if len(makers) != 1:
+        raise SensorError(f"the point clouds do not name their sensor ({source}). {_CHOICES}")
+    (maker,) = makers
+    of_maker = [profile for name, profile in SENSORS.items() if name.startswith(_PREFIXES[maker])]
+    named = [profile for profile in of_maker if re.search(_pattern(profile.name), words)]
+    if rings:
+        fitting = _ouster_by_rings(rings, of_maker) if maker == "ouster" else _by_rings(rings, of_maker)
+        named = [profile for profile in fitting if not named or profile in named]
+    if len(named) != 1:
+        angles = f"; {len(rings)} rings from {np.nanmin(rings):.1f} to {np.nanmax(rings):.1f} deg" if rings else ""
+        raise SensorError(
+            f"the point clouds are of a sensor by {maker.capitalize()}, but its model is unknown ({source}{angles}). "
+            f"{_CHOICES}"
+        )
+    profile = named[0]
+    if profile.name == "hdl-64e":  # its driver keeps remission in 0..255, KITTI's files divide by 255
+        profile = replace(profile, remission_range=(0.0, 255.0))
+    return KnownSensor(profile, f"{source}{'; the elevations of its rings' if rings else ''}")
+
+
+def _by_rings(rings: Sequence[float], profiles: Sequence[SensorProfile]) -> list[SensorProfile]:
+    """Profiles whose beams, from the top or from the bottom, have the elevations of the rings."""
+    fitting = []
+    for profile in profiles:
+        if not profile.n_beams / 2 < len(rings) <= profile.n_beams:
+            continue
+        beams = np.array(profile.elevations_deg)
+        errors = [np.nanmedian(np.abs(order[: len(rings)] - rings)) for order in (beams, beams[::-1])]
+        if min(errors) < _RING_ERROR_DEG:
+            fitting.append(profile)
+    return fitting
+
+
+def _ouster_by_rings(rings: Sequence[float], profiles: Sequence[SensorProfile]) -> list[SensorProfile]:
+    """The profile with so many beams over such a field of view; the beams of units differ from their profile."""
+    steps = np.abs(np.diff(rings))
+    if np.isnan(steps).all():
+        return []
+    span = float(np.nanmedian(steps)) * (len(rings) - 1)
+    families = [family for family, (low, high) in _OUSTER_SPANS.items() if low <= span <= high]
+    return [profile for profile in profiles if profile.name in {f"{family}-{len(rings)}" for family in families}]
+
+
+def _pattern(name: str) -> str:
+    """Matches ways to write a model: os1-64, os1_64, OS1 64; the letter behind hdl-64 may be absent."""
+    return r"(?<![a-z0-9])" + name.replace("-", "[-_ ]?").replace("e", "e?") + r"(?![a-z0-9])"
+
+
+def _family(span_deg: float, source: str) -> str:
+    for family, (low, high) in _OUSTER_SPANS.items():
+        if low <= span_deg <= high:
+            return family
+    raise SensorError(f"{source} names no sensor, and its beams span {span_deg:.1f} deg, as no Ouster's. {_CHOICES}")
+
+
+def _distinct(angles: Any) -> tuple[float, ...]:
+    """Beam angles from the top down; empty if there are none, or not one for each beam."""
+    if not isinstance(angles, list) or not all(isinstance(angle, int | float) for angle in angles):
+        return ()
+    distinct = sorted({float(angle) for angle in angles}, reverse=True)
+    usable = len(distinct) == len(angles) > 1 and -90.0 < distinct[-1] <= distinct[0] < 90.0
+    return tuple(distinct) if usable else ()
+
+
+def _object(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    value = content.get(name)
+    return value if isinstance(value, dict) else {}
+
+
+def _serial(content: Mapping[str, Any]) -> str:
+    return str(_object(content, "sensor_info").get("prod_sn", content.get("prod_sn", "")))
