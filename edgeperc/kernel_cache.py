@@ -16,6 +16,7 @@ import inspect
 import logging
 import os
 import pickle
+import stat
 import sys
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -48,7 +49,8 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     Parameters
     ----------
     **options
-        As `numba.njit`. With ``cache=True`` the compiled function is kept on disk.
+        As `numba.njit`. With ``cache=True`` the compiled function is kept on disk, unless it is defined inside another
+        function and uses its variables.
 
     Returns
     -------
@@ -60,7 +62,9 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         kernel = numba.njit(**options)(function)
-        if kept and hasattr(kernel, "_cache"):  # with NUMBA_DISABLE_JIT, the kernel is the function itself
+        if (
+            kept and function.__closure__ is None and hasattr(kernel, "_cache")
+        ):  # with NUMBA_DISABLE_JIT, the kernel is the function itself
             kernel._cache = KernelCache(function)
         return kernel
 
@@ -120,13 +124,13 @@ class KernelCache:
         stamp = _stamp(str(self._source)) if self._enabled else None
         if stamp is None:
             return None
-        name, types = self._key(sig, target_context.codegen())
+        name, known = self._key(sig, target_context.codegen())
         for folder in self._folders():
             file = folder / name
             try:
                 if _unusable(folder) is None and (content := _read(file)) is not None and content[0] == stamp:
                     found, payload = pickle.loads(content[1])
-                    if found == types:
+                    if found == known:
                         return _numba.compiler.CompileResult._rebuild(target_context, *payload)
             except Exception as exc:  # what a file holds, or what cannot be read, never stops the start
                 reason = f"{type(exc).__name__}: {exc}"
@@ -148,8 +152,8 @@ class KernelCache:
         if stamp is None:
             reasons.append(f"{self._source} cannot be read")
         else:
-            name, types = self._key(sig, result.codegen)
-            rest = stamp + _numba.serialize.dumps((types, result._reduce()))
+            name, known = self._key(sig, result.codegen)
+            rest = stamp + _numba.serialize.dumps((known, result._reduce()))
             for folder in self._folders():
                 try:
                     # mkdir's mode, lessened by the umask, is that of the last folder only.
@@ -170,12 +174,12 @@ class KernelCache:
         )
 
     def _key(self, sig: Any, codegen: Any) -> tuple[str, Any]:
-        """The file's name for a signature, and the types that it is for."""
-        types = _numba.sigutils.normalize_signature(sig)
+        """The file's name for a signature; and the function's place in its source and the types that it is for."""
         function, tag = self._function, sys.implementation.cache_tag
-        what = repr((function.__qualname__, *map(str, types), codegen.magic_tuple(), tag)).encode()
+        known = function.__code__.co_firstlineno, *_numba.sigutils.normalize_signature(sig)
+        what = repr((function.__qualname__, *map(str, known[1:]), codegen.magic_tuple(), tag)).encode()
         name = f"{self._source.stem}.{function.__qualname__}".translate({ord("<"): None, ord(">"): None})
-        return f"{name[:80]}-{hashlib.sha256(what).hexdigest()[:16]}.kernel", types
+        return f"{name[:80]}-{hashlib.sha256(what).hexdigest()[:16]}.kernel", known
 
     def _folders(self) -> Iterator[Path]:
         """Where compiled forms may lie, best first."""
@@ -197,7 +201,7 @@ def _read(file: Path) -> tuple[bytes, bytes] | None:
         with file.open("rb") as opened:
             reason = unsafe_because(os.fstat(opened.fileno()))
             content = opened.read()
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     if reason is not None:
         raise ValueError(reason)
@@ -211,9 +215,10 @@ def _unusable(folder: Path) -> str | None:
     """Why a folder for kernels is not used: other users could write it, or replace it; None if it may be used."""
     for each in (folder, folder.parent):
         try:
-            reason = unsafe_because(each.stat())
+            status = each.stat()
         except OSError:
             continue  # it does not exist, so it holds nothing
+        reason = unsafe_because(status) if stat.S_ISDIR(status.st_mode) else "it is not a folder"
         if reason is not None:
             return reason if each == folder else f"in {each}, {reason}"
     return None

@@ -69,8 +69,8 @@ def site(tmp_path: Path) -> Path:
 
 
 def run(site: Path, code: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run Python with the copy first on its path, and with no settings of numba but those given."""
-    inherited = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    """Run Python with the copy first on its path, and with no settings of numba or edgeperc but those given."""
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("EDGEPERC_", "NUMBA_"))}
     return subprocess.run(
         [sys.executable, "-c", code, *arguments],
         cwd=site,

@@ -25,7 +25,7 @@ FLOORS = {
         errors atomic
         extras onnx_file
         card points sensor tuning
-        perception zoo.__init__
+        kernel_cache perception zoo.__init__
         geometry
         adapt cluster decode drivable fitness ground observed projection refine sensor_fit session
         readers.__init__ readers.tables

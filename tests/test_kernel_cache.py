@@ -1,0 +1,447 @@
+"""Compiled kernels on disk: damage, other users, full and missing folders never stop a start."""
+
+from __future__ import annotations
+
+import errno
+import importlib.util
+import logging
+import os
+import pkgutil
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from numba.core.caching import FunctionCache
+from numba.core.dispatcher import Dispatcher
+
+import edgeperc
+from edgeperc import kernel_cache, tuning
+from edgeperc.kernel_cache import KernelCache
+from edgeperc.tuning import unsafe_because
+
+pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled with the JIT off")
+
+SOURCE = """
+import numba
+import numpy as np
+from edgeperc.kernel_cache import njit
+
+@njit(cache=True, nogil=True)
+def squared(x):
+    return x * x
+
+@njit(cache=True, nogil=True)
+def total(values):
+    found = 0.0
+    for k in range(values.shape[0]):
+        found += squared(values[k])
+    return found
+"""
+VALUES = np.arange(5.0)
+ANSWER = 30.0
+
+
+class Place:
+    """A folder of kernels, used as by one new process after another."""
+
+    def __init__(self, source: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.source, self._caplog, self._monkeypatch = source, caplog, monkeypatch
+
+    def start(self) -> tuple[list[str], int]:
+        """Load the kernels and call one; return the warnings and the number of compilations."""
+        self._monkeypatch.setattr(kernel_cache, "_reported", set())
+        self._caplog.clear()
+        kernel_cache._stamp.cache_clear()
+        spec = importlib.util.spec_from_file_location("some_kernels", self.source)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        self._monkeypatch.setitem(sys.modules, "some_kernels", module)
+        spec.loader.exec_module(module)
+        assert module.total(VALUES) == ANSWER
+        n_compiled = sum(sum(kernel.stats.cache_misses.values()) for kernel in (module.total, module.squared))
+        warnings = [r.getMessage() for r in self._caplog.records if r.levelno >= logging.WARNING]
+        return warnings, n_compiled
+
+    @property
+    def files(self) -> list[Path]:
+        """What lies in the folder given by ``NUMBA_CACHE_DIR``."""
+        folder = Path(numba.config.CACHE_DIR)
+        return sorted(path for path in folder.rglob("*") if not path.is_dir())
+
+
+@pytest.fixture
+def place(tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
+    source = tmp_path / "package" / "some_kernels.py"
+    source.parent.mkdir(mode=0o755)
+    source.write_text(SOURCE)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    caplog.set_level(logging.INFO, logger="edgeperc.kernel_cache")
+    umask = os.umask(0o022)
+    yield Place(source, caplog, monkeypatch)
+    os.umask(umask)
+
+
+def flipped(at: int) -> Callable[[bytes], bytes]:
+    def flip(content: bytes) -> bytes:
+        damaged = bytearray(content)
+        damaged[at % len(content)] ^= 1 << at % 8
+        return bytes(damaged)
+
+    return flip
+
+
+DAMAGE: dict[str, Callable[[bytes], bytes]] = {
+    **{f"cut to {n}": lambda content, n=n: content[:n] for n in (0, 1, 31, 32, 33, 63, 64, 65, 100, 1000)},
+    "cut in half": lambda content: content[: len(content) // 2],
+    "without its last byte": lambda content: content[:-1],
+    "one byte longer": lambda content: content + b"\0",
+    "twice": lambda content: content * 2,
+    "zeros": lambda content: bytes(len(content)),
+    "text": lambda _: b"not machine code\n" * 100,
+    "random": lambda content: np.random.default_rng(0).bytes(len(content)),
+    **{f"bit flipped at {at}": flipped(at) for at in [*range(0, 70, 9), *range(101, 8000, 997)]},
+}
+
+
+def test_the_second_start_compiles_nothing(place: Place) -> None:
+    assert place.start() == ([], 2)
+    assert [file.name[:19] for file in place.files] == ["some_kernels.square", "some_kernels.total-"]
+    assert place.start() == ([], 0)
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damaged_files_are_reported_once_and_compiled_again(place: Place, damage: str) -> None:
+    place.start()
+    files = place.files
+    for file in files:
+        content = file.read_bytes()
+        file.write_bytes(DAMAGE[damage](content))
+        assert file.read_bytes() != content
+    (warning,), n_compiled = place.start()
+    assert re.search(r"the compiled kernel .*some_kernels.* cannot be used and is compiled again: ValueError", warning)
+    assert n_compiled == 2
+    assert place.start() == ([], 0)
+    assert place.files == files
+
+
+def test_one_damaged_file_costs_one_compilation(place: Place) -> None:
+    place.start()
+    file = place.files[1]
+    file.write_bytes(b"")
+    (warning,), n_compiled = place.start()
+    assert str(file) in warning
+    assert n_compiled == 1
+
+
+def test_contents_that_cannot_be_loaded_are_compiled_again(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as those of a numba that was changed without another version number."""
+    place.start()
+
+    def refuse(*_: object) -> None:
+        raise AttributeError("no such function")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(kernel_cache.pickle, "loads", refuse)
+        (warning,), n_compiled = place.start()
+    assert "AttributeError: no such function" in warning
+    assert n_compiled == 2
+
+
+def test_folder_in_place_of_a_file_is_reported(place: Place) -> None:
+    place.start()
+    file = place.files[1]
+    file.unlink()
+    file.mkdir()
+    for _ in range(2):
+        warnings, n_compiled = place.start()
+        assert n_compiled == 1
+        assert str(file) in warnings[0]
+        assert "compiled kernels are not kept" in warnings[1]
+    assert not [each for each in place.files if each.suffix == ".part"]
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root reads every file")
+def test_unreadable_file_is_compiled_again(place: Place) -> None:
+    place.start()
+    place.files[1].chmod(0)
+    (warning,), n_compiled = place.start()
+    assert "PermissionError" in warning
+    assert n_compiled == 1
+
+
+def test_an_edited_source_replaces_its_files(place: Place) -> None:
+    place.start()
+    names = [file.name for file in place.files]
+    for edit in range(3):
+        with place.source.open("a") as source:
+            source.write(f"# {edit}\n")
+        assert place.start() == ([], 2)
+        assert place.start() == ([], 0)
+        assert [file.name for file in place.files] == names
+
+
+def test_each_signature_has_its_file(place: Place) -> None:
+    place.start()
+    module = sys.modules["some_kernels"]
+    for dtype in (np.float32, np.int64, np.float64):
+        assert module.total(VALUES.astype(dtype)) == ANSWER
+    assert len([file for file in place.files if "total" in file.name]) == 3
+
+
+def test_functions_of_one_name_are_not_confused(place: Place) -> None:
+    place.source.write_text(
+        SOURCE
+        + "def times(factor):\n"
+        + "    @njit(cache=True)\n"
+        + "    def product(x):\n"
+        + "        return factor * x\n"
+        + "    return product\n"
+        + "@njit(cache=True)\ndef shifted(x):\n    return x + 1.0\n"
+        + "up = shifted\n"
+        + "@njit(cache=True)\ndef shifted(x):\n    return x - 1.0\n"
+    )
+    for _ in range(2):
+        place.start()
+        module = sys.modules["some_kernels"]
+        assert [module.times(factor)(5.0) for factor in (2.0, 3.0, 2.0)] == [10.0, 15.0, 10.0]
+        assert (module.up(1.0), module.shifted(1.0), module.up(1.0)) == (2.0, 0.0, 2.0)
+
+
+# --- folders ---------------------------------------------------------------------------------------------------------
+
+
+def status(**changed: int) -> Any:
+    return SimpleNamespace(**{"st_uid": 1000, "st_mode": 0o40755, **changed})
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="Windows has access lists")
+def test_code_of_other_users_is_unsafe(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tuning.os, "geteuid", lambda: 1000)
+    assert unsafe_because(status()) is None
+    assert unsafe_because(status(st_uid=0)) is None
+    assert unsafe_because(status(st_mode=0o40700)) is None
+    assert unsafe_because(status(st_uid=1001)) == "it belongs to user 1001, this process to user 1000"
+    for mode in (0o40775, 0o40757, 0o41777, 0o100666):
+        assert f"(mode {mode & 0o7777:o}); run chmod go-w" in str(unsafe_because(status(st_mode=mode)))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has access lists")
+@pytest.mark.parametrize("inside", [False, True])
+def test_folder_that_others_can_write_is_not_used(place: Place, inside: bool) -> None:
+    place.start()
+    folder = place.files[0].parent if inside else place.files[0].parent.parent
+    for file in place.files:
+        file.unlink()
+    folder.chmod(0o777)
+    for _ in range(2):
+        (warning,), n_compiled = place.start()
+        assert n_compiled == 2
+        assert re.search(r"compiled kernels are not kept.*other users can write it \(mode 777\)", warning)
+    assert not place.files
+    folder.chmod(0o755)
+    assert place.start() == ([], 2)
+    assert place.start() == ([], 0)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has access lists")
+def test_kernels_in_a_folder_that_others_can_write_are_not_loaded(place: Place) -> None:
+    place.start()
+    place.files[0].parent.chmod(0o775)
+    _, n_compiled = place.start()
+    assert n_compiled == 2
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has access lists")
+def test_file_that_others_can_write_is_not_loaded(place: Place) -> None:
+    """It may have been put there before the folder's mode was corrected."""
+    place.start()
+    place.files[1].chmod(0o666)
+    (warning,), n_compiled = place.start()
+    assert "other users can write it (mode 666)" in warning
+    assert n_compiled == 1
+    assert place.start() == ([], 0)  # it was replaced
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="Windows has access lists")
+def test_folder_of_another_user_is_not_used(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    place.start()
+    if os.geteuid() == 0:
+        os.chown(place.files[0].parent, 54321, -1)
+    else:
+        monkeypatch.setattr(tuning.os, "geteuid", lambda: 54321)
+    (warning,), n_compiled = place.start()
+    assert "belongs to user" in warning
+    assert n_compiled == 2
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES])
+def test_disk_that_takes_nothing_is_reported(place: Place, monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(kernel_cache, "write_atomic", refuse)
+    (warning,), n_compiled = place.start()
+    assert n_compiled == 2
+    assert os.strerror(code) in warning
+    assert "set NUMBA_CACHE_DIR to a folder" in warning
+
+
+def test_full_disk(place: Place, tmp_path: Path) -> None:
+    folder = tmp_path / "full"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=32k,mode=755", "tmpfs", str(folder)]
+    if sys.platform != "linux" or os.geteuid() != 0 or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("no small file system can be mounted")
+    try:
+        (folder / "filler").write_bytes(bytes(28 << 10))
+        numba.config.CACHE_DIR = str(folder / "cache")  # the fixture resets it
+        (warning,), n_compiled = place.start()
+        assert n_compiled == 2
+        assert os.strerror(errno.ENOSPC) in warning
+        assert not place.files
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+@pytest.fixture
+def without_setting(place: Place, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Place:
+    """Not ``NUMBA_CACHE_DIR`` but the package's and the user's folder."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "user"))
+    return place
+
+
+def test_kernels_lie_beside_their_source(without_setting: Place) -> None:
+    folder = without_setting.source.parent / "__pycache__"
+    assert without_setting.start() == ([], 2)
+    assert len([*folder.glob("*.kernel")]) == 2
+    assert sys.modules["some_kernels"].total.stats.cache_path == str(folder)
+    assert without_setting.start() == ([], 0)
+
+
+@pytest.mark.parametrize("why", ["no folder", "others can write it"])
+def test_users_folder_is_used_if_the_packages_cannot_be(without_setting: Place, tmp_path: Path, why: str) -> None:
+    folder = without_setting.source.parent / "__pycache__"
+    if why == "no folder":
+        folder.write_bytes(b"")
+    elif os.name == "posix":
+        folder.mkdir()
+        folder.chmod(0o777)
+    else:
+        pytest.skip("Windows has access lists")
+    os.umask(0o002)  # with which some systems make folders that the user's group can write
+    assert without_setting.start() == ([], 2)
+    assert without_setting.start() == ([], 0)
+    assert len([*(tmp_path / "user" / "kernels").glob("package-*/*.kernel")]) == 2
+
+
+def test_read_only_package_and_home_are_reported(without_setting: Place, tmp_path: Path) -> None:
+    (without_setting.source.parent / "__pycache__").write_bytes(b"")
+    (tmp_path / "user").write_bytes(b"")
+    for _ in range(2):
+        (warning,), n_compiled = without_setting.start()
+        assert n_compiled == 2
+        assert all(str(folder) in warning for folder in (without_setting.source.parent, tmp_path / "user"))
+
+
+def test_no_home(without_setting: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    (without_setting.source.parent / "__pycache__").write_bytes(b"")
+
+    def missing() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("EDGEPERC_CACHE_DIR")
+    for name in ("XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", missing)
+    (warning,), n_compiled = without_setting.start()
+    assert n_compiled == 2
+    assert "compiled kernels are not kept" in warning
+
+
+def test_without_its_source_a_kernel_is_not_kept(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(_: str) -> None:
+        return None
+
+    unknown.cache_clear = lambda: None  # type: ignore[attr-defined]
+    monkeypatch.setattr(kernel_cache, "_stamp", unknown)
+    (warning,), n_compiled = place.start()
+    assert n_compiled == 2
+    assert "some_kernels.py cannot be read" in warning
+
+
+# --- the kernels of edgeperc -----------------------------------------------------------------------------------------
+
+
+def test_every_kernel_of_edgeperc_is_kept_here() -> None:
+    n_kernels = 0
+    for found in pkgutil.walk_packages(edgeperc.__path__, "edgeperc."):
+        if found.name.endswith("__main__"):
+            continue
+        for name, thing in vars(import_module(found.name)).items():
+            if isinstance(thing, Dispatcher) and thing.py_func.__module__ == found.name:
+                n_kernels += 1
+                assert isinstance(thing._cache, KernelCache), f"{found.name}.{name}: import njit from kernel_cache"
+    assert n_kernels > 80
+
+
+def test_caches_of_other_libraries_are_untouched(place: Place) -> None:
+    with place.source.open("a") as source:
+        source.write("@numba.njit(cache=True)\ndef tripled(x):\n    return 3.0 * x\n")
+    place.start()
+    other = sys.modules["some_kernels"].tripled
+    assert type(other._cache) is FunctionCache
+    assert other(2.0) == 6.0
+    assert {file.suffix for file in place.files if "tripled" in file.name} == {".nbi", ".nbc"}
+
+
+START = """
+import numpy as np
+from edgeperc import projection
+from edgeperc.card import InputSpec, TopViewGeometry
+
+channels = ("distance", "remission", "height")
+points = np.random.default_rng(7).uniform(-2.0, 40.0, (1000, 4)).astype(np.float32)
+projector = projection.make_projector(TopViewGeometry(), InputSpec("image", channels, (0.0,) * 3, (1.0,) * 3))
+print(float(projector.project(points).image.sum(dtype=np.float64)))
+print(sum(sum(kernel.stats.cache_misses.values()) for kernel in (projection.mark_top_view, projection.fill_image)))
+"""
+
+
+def start(folder: Path) -> subprocess.Popen[str]:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder)}
+    command = [sys.executable, "-c", START]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def outcome(process: subprocess.Popen[str]) -> tuple[str, int, list[str]]:
+    """The sum that it printed, the number of compilations, and the lines on standard error."""
+    out, err = process.communicate()
+    assert process.returncode == 0, err
+    total, n_compiled = out.splitlines()
+    return total, int(n_compiled), err.splitlines()
+
+
+def test_processes_start_from_a_damaged_cache_and_together(tmp_path: Path) -> None:
+    together = [start(tmp_path / "cache") for _ in range(2)]
+    (total, _, _), *others = found = [outcome(process) for process in together]
+    assert all((other[0], lines) == (total, []) for other in others for *_, lines in found)
+    assert outcome(start(tmp_path / "cache")) == (total, 0, [])
+    for k, file in enumerate(sorted((tmp_path / "cache").rglob("*.kernel"))):
+        content = file.read_bytes()
+        file.write_bytes(content[: len(content) // 2] if k % 2 else flipped(len(content) // 2)(content))
+    total_again, n_compiled, (line,) = outcome(start(tmp_path / "cache"))
+    assert (total_again, n_compiled) == (total, 2)
+    assert "cannot be used and is compiled again" in line
+    assert outcome(start(tmp_path / "cache")) == (total, 0, [])
+    shutil.rmtree(tmp_path / "cache")
