@@ -212,7 +212,7 @@ def read_coco(paths: Iterable[Path]) -> dict[str, list[Any]]:
             images = {image["id"]: image for image in content["images"]}
             road = {c["id"] for c in content["categories"] if str(c["name"]).lower() in ROAD}
             drawn = [(a["image_id"], a["category_id"], a["segmentation"]) for a in content["annotations"]]
-        except (ValueError, KeyError, TypeError) as exc:
+        except (ValueError, KeyError, TypeError, RecursionError) as exc:
             raise DatabaseError(
                 f"{path} is not a COCO file ({exc!r}); expected images, categories and annotations"
             ) from exc
@@ -267,7 +267,7 @@ def mask_of(segmentations: Sequence[Any], source: str = "a polygon") -> NDArray[
                 if covered not in (None, HEIGHT * WIDTH):
                     raise ValueError(f"run lengths cover {covered} pixels")
             mask |= coco.decode(runs)
-        except (ValueError, KeyError, TypeError) as exc:
+        except (ValueError, KeyError, TypeError, OverflowError) as exc:
             raise DatabaseError(
                 f"{source}: {exc}; expected polygons x y x y ... of three corners or more, or run lengths of the image"
             ) from exc

@@ -7,6 +7,7 @@ import functools
 import hashlib
 import inspect
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -181,3 +182,18 @@ def kitti_root(data_root: Callable[[str], Path]) -> Path:
 def semantickitti_root(data_root: Callable[[str], Path]) -> Path:
     """SemanticKITTI: ``sequences/00/{velodyne,labels,label_origin}``."""
     return data_root("semantickitti")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Chromium, driven by playwright."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no chromium, chromium-browser or google-chrome on the path")
+    with playwright.sync_playwright() as play:
+        browser = play.chromium.launch(
+            executable_path=chromium, args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        )
+        yield browser
+        browser.close()

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import json
-import os
 import random
 import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 import tracemalloc
-import urllib.error
-import urllib.request
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,17 +27,17 @@ for package in ("filelock", "tqdm", "onnx", "onnxruntime"):
     pytest.importorskip(package)
 shapely = pytest.importorskip("shapely")
 
-import onnx
+from database_helpers import INPUT, TRAPEZIUM, drawn, plan_of, road_network, simulated_kitti
 from shapely import Polygon
 
 import twins.database
 from edgeperc.atomic import write_atomic
-from edgeperc.card import CARD_KEY, InputSpec, ModelCard, OutputSpec, TopViewGeometry
+from edgeperc.card import ModelCard, TopViewGeometry
 from edgeperc.errors import CardMismatchError, MissingExtraError
 from edgeperc.evaluation.datasets import KittiObjects
 from edgeperc.perception import Box
 from edgeperc.projection import make_projector
-from edgeperc.simulation.samples import IGNORE, simulated_scan
+from edgeperc.simulation.samples import IGNORE
 from edgeperc_export.cli import main
 from edgeperc_export.database import build as build_module
 from edgeperc_export.database import scenes as scenes_module
@@ -57,64 +51,12 @@ from edgeperc_export.database.files import (
     vehicles,
     write_labels,
 )
-from edgeperc_export.database.label_page import LabelServer
-from edgeperc_export.database.scenes import Plan
 from edgeperc_export.roads import CLASSES, VIEW, DatabaseError, mask_of, read_coco, write_coco
-
-DRIVES = ("0005", "0005", "0005", "0048", "0029", "0013", "0014", "0011")
-TRAPEZIUM = [[40.0, 399.5], [90.0, 10.0], [120.0, 10.0], [160.0, 399.5]]
-INPUT = InputSpec("top_view", ("distance", "remission", "height"), (0.0, 0.0, -2.5), (47.07, 1.0, 5.0))
 
 
 @pytest.fixture(scope="module")
 def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated KITTI object set: seven scenes of training drives and one of a test drive."""
-    root = tmp_path_factory.mktemp("kitti")
-    for part in ("velodyne", "label_2", "calib", "image_2"):
-        (root / "training" / part).mkdir(parents=True)
-    # The camera is tilted a little, like KITTI's.
-    calibration = "P2: 700 0 620 0 0 700 180 0 0 0 1 0\nR0_rect: 1 0 0 0 0.99995 -0.01 0 0.01 0.99995\n"
-    calibration += "Tr_velo_to_cam: 0 -1 0 0.1 0 0 -1 -0.08 1 0 0 -0.27\n"
-    rows = ["name,drive"]
-    T = np.eye(4)
-    T[:3, :3] = [[1, 0, 0], [0, 0.99995, -0.01], [0, 0.01, 0.99995]]
-    T_cam_velo = T @ [[0, -1, 0, 0.1], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]
-    for k, drive in enumerate(DRIVES):
-        scan = simulated_scan(10**9 + k)
-        scan.points.tofile(root / "training/velodyne" / f"{k:06d}.bin")
-        rows.append(f"{k:06d},2011_09_26_drive_{drive}")
-        lines = ["DontCare -1 -1 -10 500 170 590 190 -1 -1 -1 -1000 -1000 -1000 -10"]
-        for box in [*scan.boxes, Box("truck", 1.0, (30.0, 6.5, 0.0), (9.0, 2.5, 3.0), 0.1 * k)]:
-            if box.center[0] > 1.0:
-                x, y, z = (T_cam_velo @ [*box.center, 1.0])[:3]
-                length, width, height = box.size
-                shape = f"{height} {width} {length} {x} {y + height / 2} {z} {-box.yaw - np.pi / 2}"
-                lines.append(f"{box.label.capitalize()} 0 0 0 0 0 0 0 {shape}")
-        (root / "training/label_2" / f"{k:06d}.txt").write_text("\n".join(lines) + "\n")
-        (root / "training/calib" / f"{k:06d}.txt").write_text(calibration)
-    Image.new("RGB", (1242, 375), (90, 120, 160)).save(root / "training/image_2/000000.png")
-    (root / "frames.csv").write_text("\n".join(rows) + "\n")
-    return root
-
-
-def road_network(path: Path, view: TopViewGeometry, classes: tuple[str, ...] = ("background", "drivable")) -> Path:
-    """One convolution that calls low ground drivable."""
-    weight = np.zeros((2, 3, 1, 1), np.float32)
-    weight[1, 2] = -3.0
-    tensors = [onnx.numpy_helper.from_array(weight, "w"), onnx.numpy_helper.from_array(np.float32([0, 0.7]), "b")]
-    shapes = [("top_view", 3), ("segmentation", 2)]
-    (given, answer) = (
-        onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, n, view.height, view.width])
-        for name, n in shapes
-    )
-    node = onnx.helper.make_node("Conv", ["top_view", "w", "b"], ["segmentation"])
-    graph = onnx.helper.make_graph([node], "road", [given], [answer], tensors)
-    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
-    outputs = (OutputSpec("segmentation", "class_logits"),)
-    card = ModelCard(name="low", version="1.0.0", view=view, input=INPUT, outputs=outputs, classes=classes)
-    model.metadata_props.add(key=CARD_KEY, value=card.to_json())
-    onnx.save(model, path)
-    return path
+    return simulated_kitti(tmp_path_factory.mktemp("kitti"))
 
 
 @pytest.fixture(scope="module")
@@ -128,10 +70,6 @@ def polygons(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("drawn") / "road.json"
     path.write_text(write_coco({"000001": [TRAPEZIUM], "000007": [TRAPEZIUM]}))
     return path
-
-
-def plan_of(kitti: Path, out: Path, model: str, **changes: object) -> Plan:
-    return replace(Plan(kitti, out, model, provider="cpu", variations=3), **changes)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -715,17 +653,6 @@ def test_notes_report_what_a_data_set_lacks(kitti: Path, model: str, polygons: P
 # --- polygons --------------------------------------------------------------------------------------------------------
 
 
-def drawn(**changes: object) -> str:
-    image = {"id": 1, "file_name": "a/000001.png", "width": 200, "height": 400}
-    annotation = {"id": 1, "image_id": 1, "category_id": 2, "segmentation": [[10, 20, 30, 20, 30, 60, 10, 60]]}
-    content: dict[str, object] = {
-        "images": [image | changes.pop("image", {})],  # type: ignore[operator]
-        "categories": [{"id": 1, "name": "background"}, {"id": 2, "name": "Road"}],
-        "annotations": [annotation | changes.pop("annotation", {})],  # type: ignore[operator]
-    }
-    return json.dumps(content | changes)
-
-
 def test_polygons_and_run_lengths_become_masks(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(drawn())
     mask = mask_of(read_coco([tmp_path / "a.json"])["000001"])
@@ -780,212 +707,3 @@ def test_a_draft_matches_the_road() -> None:
     truth = mask_of([[np.ravel(TRAPEZIUM).tolist()]]) != 0
     assert np.count_nonzero(covered & truth) / np.count_nonzero(covered | truth) > 0.98
     assert draft(np.zeros((400, 200), np.uint8)) == []
-
-
-# --- the page --------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def server(out: Path, kitti: Path, tmp_path: Path) -> Iterator[LabelServer]:
-    with LabelServer(out, tmp_path / "road.json", kitti=kitti) as server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.02,))
-        thread.start()
-        yield server
-        server.shutdown()
-        thread.join()
-
-
-def ask(server: LabelServer, path: str, body: str | None = None, **headers: str) -> bytes:
-    request = urllib.request.Request(server.url + path, None if body is None else body.encode(), headers)
-    if body is not None:
-        request.method = "PUT"
-        request.add_header("Content-Type", headers.get("Type", "application/json"))
-    with urllib.request.urlopen(request) as answer:
-        content: bytes = answer.read()
-    return content
-
-
-def test_the_page_saves_drawn_polygons(server: LabelServer, out: Path) -> None:
-    scenes = json.loads(ask(server, "scenes"))
-    assert [scene["name"] for scene in scenes] == TopViewDatabase(out).names
-    assert ask(server, "image/000003") == (out / "images/000003.png").read_bytes()
-    assert ask(server, "camera/000000").startswith(b"\x89PNG")
-    assert json.loads(ask(server, "draft/000000"))
-    assert json.loads(ask(server, "road/000003")) == []
-    ask(server, "road/000003", json.dumps([TRAPEZIUM]))
-    ask(server, "road/000004", json.dumps([[[-5, 0], [300, 0], [100, 500]]]))
-    assert json.loads(ask(server, "road/000004")) == [[[0, 0], [200, 0], [100, 400]]]  # clamped to the image
-    roads = read_coco([server.polygons])
-    np.testing.assert_array_equal(mask_of(roads["000003"]), mask_of([[np.ravel(TRAPEZIUM).tolist()]]))
-    ask(server, "road/000004", "[]")
-    assert [*read_coco([server.polygons])] == ["000003"]
-    (image,) = json.loads(server.polygons.read_text())["images"]
-    assert image["scan"] == TopViewDatabase(out).rows[3]["scan_sha256"]
-    with LabelServer(out, server.polygons) as again:
-        assert again.roads == {"000003": [TRAPEZIUM]}
-        assert again.server_address[0] == "127.0.0.1"
-
-
-@pytest.mark.parametrize(
-    ("path", "body", "headers", "status"),
-    [
-        ("image/000099", None, {}, 404),
-        ("image/../index.csv", None, {}, 404),
-        ("image/%2e%2e%2findex.csv", None, {}, 404),
-        ("camera/000001", None, {}, 404),
-        ("nothing", None, {}, 404),
-        ("scenes", None, {"Host": "evil.example"}, 403),
-        ("road/000001", "[]", {"Host": "evil.example"}, 403),
-        ("road/000001", "[]", {"Type": "text/plain"}, 400),
-        ("road/000099", "[]", {}, 404),
-        ("road/000001", "{", {}, 400),
-        ("road/000001", "7", {}, 400),
-        ("road/000001", "[[[1, 2], [3, 4]]]", {}, 400),
-        ("road/000001", '[[[1, 2], [3, 4], ["x", 1]]]', {}, 400),
-        ("road/000001", "[[[1, 2], [3, 4], [NaN, 1]]]", {}, 400),
-    ],
-)
-def test_the_page_refuses_invalid_requests(
-    server: LabelServer, path: str, body: str | None, headers: dict[str, str], status: int
-) -> None:
-    with pytest.raises(urllib.error.HTTPError) as caught:
-        ask(server, path, body, **headers)
-    assert caught.value.code == status
-    caught.value.close()
-    assert not server.polygons.exists()
-
-
-def test_run_lengths_cannot_be_edited(out: Path, tmp_path: Path) -> None:
-    runs = {"size": [400, 200], "counts": [80_000]}
-    (tmp_path / "road.json").write_text(drawn(annotation={"segmentation": runs}))
-    with pytest.raises(DatabaseError, match="run lengths"):
-        LabelServer(out, tmp_path / "road.json")
-
-
-def test_drawing_undoing_saving_and_reloading_in_a_browser(server: LabelServer) -> None:
-    """In a real browser, with mouse and keys. ``EDGEPERC_SCREENSHOTS`` names a folder for screenshots."""
-    playwright = pytest.importorskip("playwright.sync_api")
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if chromium is None:
-        pytest.skip("no chromium, chromium-browser or google-chrome on the path")
-
-    def saved() -> list[list[list[float]]]:
-        return json.loads(ask(server, "road/000000"))
-
-    with playwright.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 1400, "height": 900})
-        page.set_default_timeout(60_000)
-        troubles: list[str] = []
-        page.on("pageerror", lambda error: troubles.append(str(error)))
-        asked: list[str] = []
-        page.on("request", lambda request: asked.append(request.url))
-
-        def look(name: str) -> None:
-            if "EDGEPERC_SCREENSHOTS" in os.environ:
-                page.screenshot(path=Path(os.environ["EDGEPERC_SCREENSHOTS"]) / f"{name}.png")
-
-        def place(x: float, y: float) -> tuple[float, float]:
-            """Position of a pixel of the top view on the screen."""
-            shown = page.evaluate(
-                "() => { const b = canvas.getBoundingClientRect(); return [b.x, b.y, view.x, view.y, view.scale]; }"
-            )
-            left, top, view_x, view_y, scale = shown
-            return left + view_x + x * scale, top + view_y + y * scale
-
-        def wait_saved(n: int) -> None:
-            text = f"Saved 000000: {n} polygon{'s' * (n != 1)}"
-            page.wait_for_function(f"() => document.getElementById('saved').textContent === '{text}'")
-            assert len(saved()) == n
-
-        page.goto(server.url)
-        page.wait_for_selector("body[data-scene='000000']")
-        page.wait_for_selector("#camera:visible")
-        look("1-opened")
-
-        corners = [(60, 390), (80, 100), (120, 100), (140, 390)]
-        for x, y in corners:
-            page.mouse.click(*place(x, y))
-        look("2-drawing")
-        assert saved() == []  # not closed yet
-        page.keyboard.press("Backspace")
-        page.mouse.click(*place(150, 390))
-        page.keyboard.press("Enter")
-        wait_saved(1)
-        np.testing.assert_allclose(saved()[0], [*corners[:3], (150, 390)], atol=1.0)
-        look("3-closed")
-
-        page.keyboard.press("Control+z")
-        wait_saved(0)
-        page.keyboard.press("Control+y")
-        wait_saved(1)
-
-        # A corner is dragged in the zoomed view.
-        page.mouse.move(*place(150, 390))
-        page.mouse.wheel(0, -400)
-        page.wait_for_function("() => view.scale > 3")
-        page.mouse.move(*place(150, 390))
-        page.mouse.down()
-        page.mouse.move(*place(155, 380), steps=4)
-        page.mouse.up()
-        page.wait_for_function("() => Math.abs(polygons[0][3][0] - 155) < 1")
-        wait_saved(1)
-        look("4-corner-moved")
-
-        page.keyboard.press("f")
-        page.keyboard.press("d")
-        page.wait_for_function(
-            "() => polygons.length > 1 && /Saved 000000: [2-9]/.test(document.getElementById('saved').textContent)"
-        )
-        assert len(saved()) > 1
-        look("5-draft")
-        page.click("#undo")
-        wait_saved(1)
-
-        # Dragging the middle of a selected polygon's edge adds a corner, which is then removed.
-        page.mouse.click(*place(100, 300))
-        page.wait_for_function("() => selected === 0")
-        x, y = page.evaluate("() => middles(polygons[0])[1]")
-        page.mouse.move(*place(x, y))
-        page.mouse.down()
-        page.mouse.move(*place(100, 80), steps=4)
-        page.mouse.up()
-        page.wait_for_function("() => polygons[0].length === 5")
-        wait_saved(1)
-        np.testing.assert_allclose(saved()[0][2], (100, 80), atol=1.0)
-        look("6-edge-bent")
-        page.keyboard.down("Shift")
-        page.mouse.click(*place(100, 80))
-        page.keyboard.up("Shift")
-        page.wait_for_function("() => polygons[0].length === 4")
-        page.keyboard.press("Escape")
-
-        # A second polygon stays open across a reload; the first one is in the file.
-        for x, y in [(10, 50), (40, 50)]:
-            page.mouse.click(*place(x, y))
-        page.reload()
-        page.wait_for_selector("body[data-scene='000000']")
-        page.wait_for_function("() => polygons.length === 1 && open.length === 2")
-        page.mouse.click(*place(25, 90))
-        page.mouse.dblclick(*place(10, 90))
-        wait_saved(2)
-        assert len(saved()[1]) == 4
-        look("7-reloaded")
-
-        page.mouse.click(*place(30, 60))
-        page.keyboard.press("Delete")
-        wait_saved(1)
-
-        page.keyboard.press("ArrowRight")
-        page.wait_for_selector("body[data-scene='000001']")
-        page.wait_for_selector("#no-camera:visible")
-        page.keyboard.press("4")
-        look("8-next-scene")
-        page.keyboard.press("ArrowLeft")
-        page.wait_for_selector("body[data-scene='000000']")
-        page.wait_for_function("() => polygons.length === 1")
-        browser.close()
-    assert not troubles
-    assert all(url.startswith((server.url, "data:")) for url in asked)
-    (road,) = read_coco([server.polygons]).values()
-    assert mask_of(road)[250, 100] == 1

@@ -24,7 +24,7 @@ import io
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -262,6 +262,12 @@ class TopViewDatabase:
             raise DatabaseError(f"{self.root / 'index.csv'} does not match the manifest; build the database again")
         rows = csv.DictReader(io.StringIO(content.decode()))
         self.rows = [row for row in rows if _belongs(row, split, fold)]
+        for name in (row.get("scene") or "" for row in self.rows):
+            # The name becomes part of paths.
+            if name in ("", ".", "..") or PureWindowsPath(name).name != name or "\0" in name:
+                raise DatabaseError(
+                    f"{self.root / 'index.csv'} has a scene called {name!r}; expected a plain file name"
+                )
         self._at = {row["scene"]: k for k, row in enumerate(self.rows)}
 
     @property

@@ -1,22 +1,33 @@
 """A local web page to draw roads over a database's images (section 3.3).
 
 Only this computer can open the page, and the page loads nothing from the network. Each change is saved to the COCO
-file.
+file. Pages of other sites, which a browser on this computer may have open, can neither read nor write: a request must
+name this server as its host, and a write also needs the page's origin and its token. No site can show the page in a
+frame. Requests are limited in size, number and time.
 """
 
 from __future__ import annotations
 
+import contextlib
+import http.client
 import json
 import math
+import secrets
+import socket
+import sys
 import threading
+from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from pathlib import Path
-from typing import Any
-from urllib.parse import unquote, urlsplit
+from typing import Any, cast
+from urllib.parse import unquote
 
 from edgeperc.atomic import write_atomic
+from edgeperc.cli.output import print_error
+from edgeperc.errors import EdgepercError
+from edgeperc.printable import printable
 
 from ..roads import HEIGHT, WIDTH, DatabaseError, read_coco, write_coco
 from .coco import draft
@@ -25,10 +36,26 @@ from .files import TopViewDatabase
 __all__ = ["LabelServer"]
 
 PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".webp": "image/webp"}
-LARGEST_REQUEST = 4_000_000
+LARGEST_BODY = 1_000_000  # bytes; about 60,000 corners
+LARGEST_HEAD = 32_768  # bytes of all header lines; a browser sends the cookies of every server on this computer
+MOST_CONNECTIONS = 32  # a browser opens six
+REQUEST_S = 20.0  # to receive, answer and send
 
-# The page may use its own script and style, and pictures and data of this server only.
-POLICY = "default-src 'none'; img-src 'self'; connect-src 'self'; script-src 'unsafe-inline'; style-src 'unsafe-inline'"
+TOKEN = "X-Edgeperc-Token"
+EXPECTED = f"expected a list of polygons, each of three corners [x, y] or more, with 0..{WIDTH} x 0..{HEIGHT} pixels"
+
+# The page may use its own script and style, marked with a nonce, and pictures and data of this server only.
+POLICY = (
+    "default-src 'none'; script-src 'nonce-{0}'; style-src 'nonce-{0}'; img-src 'self' data:; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+}
 
 
 class LabelServer(ThreadingHTTPServer):
@@ -49,6 +76,10 @@ class LabelServer(ThreadingHTTPServer):
     ----------
     url : str
         Address of the page.
+    token : str
+        Random; every write has it in the header ``X-Edgeperc-Token``.
+    hosts : set of str
+        The ``Host`` headers that are answered.
 
     Raises
     ------
@@ -67,16 +98,58 @@ class LabelServer(ThreadingHTTPServer):
         self.lock = threading.Lock()
         self.roads, scans = _polygons(polygons) if polygons.exists() else ({}, {})
         self.scans = scans | {row["scene"]: row["scan_sha256"] for row in self.database.rows}
+        self.token = secrets.token_urlsafe(32)
+        self.slots = threading.BoundedSemaphore(MOST_CONNECTIONS)
         super().__init__(("127.0.0.1", port), _Handler)
-        self.url = f"http://127.0.0.1:{self.server_address[1]}/"
+        taken = self.server_address[1]
+        self.url = f"http://127.0.0.1:{taken}/"
+        self.hosts = {
+            f"{name}{end}" for name in ("127.0.0.1", "localhost") for end in (f":{taken}", "")[: 1 + (taken == 80)]
+        }
 
     def save(self, name: str, polygons: list[Any]) -> None:
         """Set a scene's polygons and write the file."""
         with self.lock:
-            self.roads.pop(name, None)
+            roads = {known: of for known, of in self.roads.items() if known != name}
             if polygons:
-                self.roads[name] = polygons
-            write_atomic(self.polygons, write_coco(self.roads, self.scans).encode())
+                roads[name] = polygons
+            write_atomic(self.polygons, write_coco(roads, self.scans).encode())
+            self.roads = roads
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer in a thread; refuse the connection if too many are open."""
+        if self.slots.acquire(blocking=False):
+            try:
+                super().process_request(request, client_address)
+            except BaseException:
+                self.slots.release()
+                raise
+        else:
+            with contextlib.suppress(OSError):
+                request.sendall(b"HTTP/1.0 503 Service Unavailable\r\nRetry-After: 1\r\nContent-Length: 0\r\n\r\n")
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer one connection, and close it when its time is over."""
+        limit = threading.Timer(REQUEST_S, _hang_up, (request,))
+        limit.daemon = True
+        limit.start()
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            limit.cancel()
+            self.slots.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print an error, but not that the browser closed a connection."""
+        exc = sys.exc_info()[1]
+        if not isinstance(exc, (ConnectionError, TimeoutError)):
+            print_error(f"a request failed: {exc!r}", "edgeperc-export")
+
+
+def _hang_up(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):  # it may be closed already
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 def _polygons(path: Path) -> tuple[dict[str, list[Any]], dict[str, str]]:
@@ -86,91 +159,191 @@ def _polygons(path: Path) -> tuple[dict[str, list[Any]], dict[str, str]]:
         if not all(isinstance(each, list) for each in segmentations):
             raise DatabaseError(f"{path} has run lengths for {name}; the page edits polygons only; give another file")
         rings = [ring for each in segmentations for ring in each]
-        roads[name] = [[[x, y] for x, y in zip(ring[::2], ring[1::2], strict=True)] for ring in rings]
+        roads[name] = [[[float(x), float(y)] for x, y in zip(ring[::2], ring[1::2], strict=True)] for ring in rings]
     images = json.loads(path.read_text())["images"]
     return roads, {Path(image["file_name"]).stem: image["scan"] for image in images if "scan" in image}
 
 
+class _RefusedError(Exception):
+    """A request is answered with a status and a text."""
+
+    def __init__(self, status: HTTPStatus, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+class _Head:
+    """The header lines of a request, up to `LARGEST_HEAD` bytes."""
+
+    def __init__(self, file: Any) -> None:
+        self.file, self.left = file, LARGEST_HEAD
+
+    def readline(self, limit: int) -> bytes:
+        line: bytes = self.file.readline(min(limit, self.left + 1))
+        self.left -= len(line)
+        if self.left < 0:
+            raise http.client.LineTooLong(f"headers of more than {LARGEST_HEAD:,} bytes")
+        return line
+
+
 class _Handler(BaseHTTPRequestHandler):
     server: LabelServer
+    server_version, sys_version = "edgeperc-export", ""
+
+    def parse_request(self) -> bool:
+        whole, self.rfile = self.rfile, cast(Any, _Head(self.rfile))
+        try:
+            return super().parse_request()
+        finally:
+            self.rfile = whole
 
     def do_GET(self) -> None:
-        # Pages of other sites can reach this address under their own host name; they are refused.
-        if self.headers.get("Host") != urlsplit(self.server.url).netloc:
-            return self.send_error(HTTPStatus.FORBIDDEN)
-        what, _, name = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
-        database = self.server.database
+        self._answer(self._get)
+
+    def do_PUT(self) -> None:
+        """Set the polygons of a scene: corners [x, y] in pixels of the image."""
+        self._answer(self._put)
+
+    def _answer(self, method: Callable[[str, str], None]) -> None:
+        try:
+            hosts = self.headers.get_all("Host", [])
+            if len(hosts) != 1 or hosts[0].lower() not in self.server.hosts:
+                # A site can give its own name the address of this computer.
+                raise _RefusedError(
+                    HTTPStatus.FORBIDDEN, f"this server is called {' or '.join(sorted(self.server.hosts))}"
+                )
+            what, _, name = unquote(self.path.partition("?")[0]).lstrip("/").partition("/")
+            method(what, name)
+        except _RefusedError as exc:
+            self.send_error(exc.status, str(exc))
+        except (ConnectionError, TimeoutError):
+            raise
+        except (EdgepercError, OSError) as exc:
+            print_error(exc, "edgeperc-export")
+            self.send_error(HTTPStatus.INTERNAL_SERVER_ERROR, str(exc))
+
+    def _get(self, what: str, name: str) -> None:
+        server = self.server
         if what == "":
-            return self._send(
-                "text/html; charset=utf-8", resources.files(__package__).joinpath("label_page.html").read_bytes()
-            )
+            nonce = secrets.token_urlsafe(16)
+            page = resources.files(__package__).joinpath("label_page.html").read_text(encoding="utf-8")
+            page = page.replace("@@NONCE@@", nonce).replace("@@TOKEN@@", server.token)
+            return self._send("text/html; charset=utf-8", page.encode(), policy=POLICY.format(nonce))
+        if self.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
+            raise _RefusedError(HTTPStatus.FORBIDDEN, "another site asked for it")
         if what == "scenes":
             return self._send_json(
                 [
                     {
-                        "name": r["scene"],
-                        "drive": r["drive"],
-                        "split": r["split"],
-                        "drawn": r["scene"] in self.server.roads,
+                        "name": row["scene"],
+                        "title": printable(row["scene"]),
+                        "drive": printable(row["drive"]),
+                        "split": printable(row["split"]),
+                        "drawn": row["scene"] in server.roads,
                     }
-                    for r in database.rows
+                    for row in server.database.rows
                 ]
             )
-        if name not in self.server.names:
-            return self.send_error(HTTPStatus.NOT_FOUND)
-        if what == "image":
-            return self._send("image/png", (database.root / "images" / f"{name}.png").read_bytes())
-        if what == "camera" and self.server.kitti is not None:
-            for suffix, kind in PICTURES.items():
-                path = self.server.kitti / "training/image_2" / f"{name}{suffix}"
-                if path.exists():
-                    return self._send(kind, path.read_bytes())
-        if what == "draft":
-            return self._send_json(draft(database.scene(name).map))
-        if what == "road":
-            return self._send_json(self.server.roads.get(name, []))
-        return self.send_error(HTTPStatus.NOT_FOUND)
+        if name in server.names:
+            if what == "image":
+                return self._send("image/png", (server.database.root / "images" / f"{name}.png").read_bytes())
+            if what == "camera" and server.kitti is not None:
+                for suffix, kind in PICTURES.items():
+                    path = server.kitti / "training/image_2" / f"{name}{suffix}"
+                    if path.exists():
+                        return self._send(kind, path.read_bytes())
+            if what == "draft":
+                return self._send_json(draft(server.database.scene(name).map))
+            if what == "road":
+                return self._send_json(server.roads.get(name, []))
+        raise _RefusedError(HTTPStatus.NOT_FOUND, "there is no such thing here")
 
-    def do_PUT(self) -> None:
-        """Set the polygons of a scene: corners [x, y] in pixels of the image."""
-        if self.headers.get("Host") != urlsplit(self.server.url).netloc:
-            return self.send_error(HTTPStatus.FORBIDDEN)
-        what, _, name = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
-        length = int(self.headers.get("Content-Length") or 0)
-        # Pages of other sites cannot send JSON: the browser asks this server for permission first, and is refused.
-        json_sent = self.headers.get("Content-Type") == "application/json"
+    def _put(self, what: str, name: str) -> None:
+        body = self._body()  # read in any case: a connection closed with unread data may lose the answer
+        if self.headers.get("Origin") != f"http://{self.headers['Host']}".lower():
+            raise _RefusedError(HTTPStatus.FORBIDDEN, "only the page of this server can write")
+        if self.headers.get("Sec-Fetch-Site", "same-origin") != "same-origin":
+            raise _RefusedError(HTTPStatus.FORBIDDEN, "another site asked for it")
+        if not secrets.compare_digest(self.headers.get(TOKEN, "").encode(), self.server.token.encode()):
+            raise _RefusedError(HTTPStatus.FORBIDDEN, "the page belongs to an earlier start of this server; reload it")
+        if self.headers.get_content_type() != "application/json":
+            raise _RefusedError(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "expected application/json")
         if what != "road" or name not in self.server.names:
-            return self.send_error(HTTPStatus.NOT_FOUND)
-        if not json_sent or length > LARGEST_REQUEST:
-            return self.send_error(HTTPStatus.BAD_REQUEST)
-        try:
-            polygons = json.loads(self.rfile.read(length))
-            clamped = [[[_within(x, WIDTH), _within(y, HEIGHT)] for x, y in corners] for corners in polygons]
-            if any(len(corners) < 3 for corners in clamped):
-                raise ValueError("a polygon has fewer than three corners")
-        except (ValueError, TypeError) as exc:
-            return self.send_error(HTTPStatus.BAD_REQUEST, str(exc).splitlines()[0])
-        self.server.save(name, clamped)
-        return self._send_json(len(clamped))
+            raise _RefusedError(HTTPStatus.NOT_FOUND, "there is no such scene")
+        polygons = _clamped(body)
+        self.server.save(name, polygons)
+        self._send_json(len(polygons))
+
+    def _body(self) -> bytes:
+        lengths = self.headers.get_all("Content-Length", [])
+        if not lengths or "Transfer-Encoding" in self.headers:
+            raise _RefusedError(HTTPStatus.LENGTH_REQUIRED, "expected a Content-Length and no Transfer-Encoding")
+        (length,) = lengths if len(lengths) == 1 else [""]
+        if not (length.isascii() and length.isdigit()):
+            raise _RefusedError(HTTPStatus.BAD_REQUEST, "Content-Length is not one number of bytes")
+        if len(length) > 18 or int(length) > LARGEST_BODY:
+            raise _RefusedError(
+                HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+                f"the body has more than {LARGEST_BODY:,} bytes; draw fewer corners",
+            )
+        body = self.rfile.read(int(length))
+        if len(body) < int(length):
+            raise _RefusedError(HTTPStatus.BAD_REQUEST, f"the body ends after {len(body)} of {length} bytes")
+        return body
 
     def _send_json(self, value: Any) -> None:
         self._send("application/json", json.dumps(value).encode())
 
-    def _send(self, kind: str, content: bytes) -> None:
-        self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(content)))
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("Content-Security-Policy", POLICY)
+    def _send(
+        self,
+        kind: str,
+        content: bytes,
+        status: int = HTTPStatus.OK,
+        policy: str = "default-src 'none'; frame-ancestors 'none'",
+    ) -> None:
+        self.send_response(status)
+        headers = {"Content-Type": kind, "Content-Length": str(len(content)), "Content-Security-Policy": policy}
+        for name, value in (headers | HEADERS).items():
+            self.send_header(name, value)
         self.end_headers()
         self.wfile.write(content)
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Answer with a status and a line of text; http.server calls this for malformed requests."""
+        self.close_connection = True
+        text = printable(message or HTTPStatus(code).phrase)
+        self._send("text/plain; charset=utf-8", f"{text}\n".encode(), code)
 
     def log_message(self, *_: Any) -> None:
         """Log no requests."""
 
 
+def _clamped(body: bytes) -> list[list[list[float]]]:
+    """The polygons of a request, inside the image, rounded to 0.01 pixels."""
+    try:
+        content = json.loads(body)
+    except (ValueError, RecursionError) as exc:
+        raise _RefusedError(HTTPStatus.BAD_REQUEST, f"not JSON ({str(exc)[:200]}); {EXPECTED}") from exc
+    if not isinstance(content, list):
+        raise _RefusedError(HTTPStatus.BAD_REQUEST, EXPECTED)
+    return [_clamped_ring(ring) for ring in content]
+
+
+def _clamped_ring(ring: Any) -> list[list[float]]:
+    if not isinstance(ring, list) or len(ring) < 3:
+        raise _RefusedError(HTTPStatus.BAD_REQUEST, f"a polygon has fewer than three corners; {EXPECTED}")
+    for corner in ring:
+        if not (isinstance(corner, list) and len(corner) == 2 and all(map(_is_finite, corner))):
+            raise _RefusedError(HTTPStatus.BAD_REQUEST, f"a corner is not a pair of finite numbers; {EXPECTED}")
+    return [[_within(x, WIDTH), _within(y, HEIGHT)] for x, y in ring]
+
+
+def _is_finite(value: Any) -> bool:
+    try:
+        return type(value) in (int, float) and math.isfinite(value)
+    except OverflowError:  # an integer of more than 308 digits
+        return False
+
+
 def _within(value: float, limit: int) -> float:
-    """A coordinate clamped to 0..limit, rounded to 0.01 pixels."""
-    if isinstance(value, bool) or not math.isfinite(value):
-        raise ValueError(f"a corner has the coordinate {value}")
     return round(min(max(float(value), 0.0), float(limit)), 2)
