@@ -6,15 +6,18 @@ import math
 import os
 import threading
 import time
+import warnings
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from .errors import OptionError, PointsError
+from .errors import EdgepercError, OptionError, PointsError
 from .perception import Perception
-from .readers.captures import read_scans
+from .readers.captures import read_scans, sensor_of
+from .readers.identify import contradicts
+from .sensor import SensorProfile
 
 __all__ = ["Answer", "Health", "Stream", "stream"]
 
@@ -98,6 +101,11 @@ def stream(
     OptionError
         The rate is not above 0, or 0 < late_after_s <= stale_after_s does not hold.
 
+    Warns
+    -----
+    UserWarning
+        The source is a capture of another sensor than the perceiver's.
+
     Examples
     --------
     >>> with stream("drive/velodyne", perceive) as live:        # doctest: +SKIP
@@ -112,6 +120,7 @@ def stream(
         raise OptionError(f"late_after_s is {late_s} and stale_after_s {stale_s}; expected 0 < late <= stale")
     inbox = _Inbox()
     if isinstance(source, str | os.PathLike):
+        _warn_of_another_sensor(source, perceiver, topic)
         scans: Iterator[Any] = _paced(read_scans(Path(source), topic=topic), rate_hz, inbox.stopped)
     else:
         try:
@@ -119,6 +128,20 @@ def stream(
         except TypeError as exc:
             raise PointsError(f"got a source of type {type(source).__name__}; expected scans or a path") from exc
     return Stream(inbox, scans, perceiver, tracker, late_s, stale_s)
+
+
+def _warn_of_another_sensor(source: str | os.PathLike[str], perceiver: object, topic: str | None) -> None:
+    profile = getattr(perceiver, "sensor", None)
+    try:
+        recorded_by = sensor_of(source, topic=topic) if isinstance(profile, SensorProfile) else None
+    except EdgepercError:  # it need not name its sensor, and reading it tells of damage
+        return
+    if profile is not None and recorded_by is not None and contradicts(profile, recorded_by):
+        warnings.warn(
+            f"{os.fspath(source)}: the perceiver's sensor is {profile.name}, the capture names {recorded_by.name}; "
+            "pass sensor=edgeperc.readers.captures.sensor_of(source) to the Perceiver",
+            stacklevel=3,
+        )
 
 
 class Stream:

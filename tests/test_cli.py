@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from test_captures import vlp16_packets, write_pcap
 
 from cli_helpers import POINTSEG, SSADNET, run, write_scan
 from edgeperc import __version__, session, zoo
@@ -279,8 +280,7 @@ def test_folders_are_opened_and_sorted(tmp_path: Path, capsys: pytest.CaptureFix
 @pytest.fixture
 def capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A capture of three scans, cut short; the second of them makes the perceiver choke."""
-    path = tmp_path / "drive.pcap"
-    path.write_bytes(b"\xd4\xc3\xb2\xa1")
+    path = write_pcap(tmp_path / "drive.pcap", vlp16_packets(0.1))
 
     def read_scans(source: Path, topic: str | None = None) -> Iterator[tuple[float, np.ndarray]]:
         if source != path:

@@ -24,6 +24,7 @@ __all__ = [
     "add_network",
     "add_provider",
     "add_sensor",
+    "add_topic",
     "positive",
     "positive_number",
 ]
@@ -91,15 +92,26 @@ class Renamed(argparse.Action):
         parser.error(f"{option_string} is now {self.const}")
 
 
-def add_sensor(group: Any, *, required: bool = False) -> None:
-    """Add ``--sensor``."""
+def add_sensor(group: Any, *, required: bool = False, of_capture: bool = False) -> None:
+    """Add ``--sensor``; with ``of_capture``, it is None by default, for the sensor that a capture names."""
+    default = f"the one that a capture names; {DEFAULT_SENSOR} for scan files" if of_capture else DEFAULT_SENSOR
     group.add_argument(
         "--sensor",
         required=required,
-        default=None if required else DEFAULT_SENSOR,
+        default=None if required or of_capture else DEFAULT_SENSOR,
         metavar="SENSOR",
         help="the LiDAR that recorded the scans: a name from 'edgeperc sensors', or a .json file written by "
-        "'edgeperc fit-sensor'" + (" (required)" if required else " (default: %(default)s)"),
+        "'edgeperc fit-sensor'" + (" (required)" if required else f" (default: {default})"),
+    )
+
+
+def add_topic(group: Any) -> None:
+    """Add ``--topic``."""
+    group.add_argument(
+        "--topic",
+        metavar="NAME",
+        help="the topic of a bag with several point clouds, or the serial number of a sensor in an Ouster capture "
+        "(default: the only one)",
     )
 
 

@@ -10,9 +10,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import EdgepercError, MissingExtraError, SensorError
-from .arguments import Commands, add_command, add_sensor
+from ..errors import EdgepercError, MissingExtraError
+from .arguments import Commands, add_command, add_sensor, add_topic
 from .output import print_error, print_line, print_rows
+from .scans import scan_sensor
 
 if TYPE_CHECKING:
     from ..zoo import Variant
@@ -36,7 +37,7 @@ def add_parser(commands: Commands) -> None:
         examples=[
             "edgeperc info pointseg",
             "edgeperc info 000123.bin",
-            "edgeperc info drive.pcap --sensor os1-64",
+            "edgeperc info drive.pcap",
             "edgeperc info pointseg:int8 --json",
         ],
     )
@@ -47,7 +48,8 @@ def add_parser(commands: Commands) -> None:
         metavar="MODEL|SCAN",
         help="a name from 'edgeperc models', an .onnx file, a scan, or a capture (its first scan)",
     )
-    add_sensor(reading)
+    add_sensor(reading, of_capture=True)
+    add_topic(reading)
     output = parser.add_argument_group("output")
     output.add_argument(
         "--json",
@@ -58,6 +60,10 @@ def add_parser(commands: Commands) -> None:
 
 def info_command(arguments: argparse.Namespace) -> int:
     """Describe models and scans; 1 if some failed."""
+    if arguments.sensor is not None:
+        from ..sensor import get_sensor
+
+        get_sensor(arguments.sensor)
     n_failed = n_printed = 0
     for thing in arguments.things:
         try:
@@ -65,8 +71,8 @@ def info_command(arguments: argparse.Namespace) -> int:
                 variants = _variants(thing)
                 rows, document = _model_rows(variants), json.loads(variants[0].card.to_json())
             else:
-                rows, document = _scan_rows(Path(thing), arguments.sensor)
-        except (SensorError, MissingExtraError):
+                rows, document = _scan_rows(Path(thing), arguments)
+        except MissingExtraError:
             raise
         except EdgepercError as exc:
             n_failed += 1
@@ -172,7 +178,7 @@ def _megabytes(path: Path) -> str:
     return f"{path.stat().st_size / 1e6:.1f} MB"
 
 
-def _scan_rows(path: Path, sensor_name: str) -> tuple[list[tuple[str, str]], dict[str, Any]]:
+def _scan_rows(path: Path, arguments: argparse.Namespace) -> tuple[list[tuple[str, str]], dict[str, Any]]:
     """Measure a scan and check which models suit it: rows to print, and the same measurements for JSON."""
     import numpy as np
 
@@ -182,8 +188,9 @@ def _scan_rows(path: Path, sensor_name: str) -> tuple[list[tuple[str, str]], dic
     from ..sensor import get_sensor
     from ..zoo import listed
 
-    sensor = get_sensor(sensor_name)
-    _, points = next(read_scans(path))  # the first scan of a capture
+    named, because = scan_sensor(path, arguments)
+    sensor = get_sensor(named)
+    _, points = next(read_scans(path, topic=arguments.topic))  # the first scan of a capture
     finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
     n_lost = len(points) - len(finite)
     document: dict[str, Any] = {
@@ -191,8 +198,13 @@ def _scan_rows(path: Path, sensor_name: str) -> tuple[list[tuple[str, str]], dic
         "n_points": len(points),
         "n_not_finite": n_lost,
         "sensor": sensor.name,
+        "sensor_from": because,
     }
-    rows = [("scan", str(path)), ("points", f"{len(points):,}, of which {n_lost:,} are not finite")]
+    rows = [
+        ("scan", str(path)),
+        ("points", f"{len(points):,}, of which {n_lost:,} are not finite"),
+        ("sensor", f"{sensor.name}: {because}"),
+    ]
     if not len(finite):
         return rows, document
     flat = np.hypot(finite[:, 0], finite[:, 1])

@@ -14,9 +14,20 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import EdgepercError, MissingExtraError, ModelError, PointsError
 from ..extras import require
-from .arguments import DEFAULT, Commands, add_adapt, add_command, add_model, add_network, add_sensor, positive_number
+from .arguments import (
+    DEFAULT,
+    DEFAULT_SENSOR,
+    Commands,
+    add_adapt,
+    add_command,
+    add_model,
+    add_network,
+    add_sensor,
+    add_topic,
+    positive_number,
+)
 from .output import many, one_line, print_error, print_line, progress
-from .scans import Scans, find_scans, output_names, scan_folders, scan_namer
+from .scans import Scans, find_scans, output_names, scan_folders, scan_namer, scan_sensor
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,6 +36,7 @@ if TYPE_CHECKING:
     from ..live import Answer
     from ..perceiver import Perceiver
     from ..perception import Perception
+    from ..sensor import SensorProfile
     from ..tracking.tracks import Tracks
 
 __all__ = ["add_parser", "make_perceiver", "run_command"]
@@ -46,7 +58,8 @@ def add_parser(commands: Commands) -> None:
             "edgeperc run 000123.bin",
             "edgeperc run velodyne/ --out out --png --labels",
             "edgeperc run KITTI/ --json > perceptions.jsonl",
-            "edgeperc run drive.pcap --sensor os1-64 --track --gif --out out",
+            "edgeperc run drive.pcap --track --gif --out out",
+            "edgeperc run scans/ --sensor os1-64",
             "edgeperc run velodyne/ --live --rate 10",
         ],
     )
@@ -59,19 +72,22 @@ def add_parser(commands: Commands) -> None:
         help="scan files (.bin, .pcd, .ply, .npy, .npz); folders of them; the root of a KITTI object set, of "
         "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .osf, .bag, .mcap, a ROS 2 bag's folder (extra 'io')",
     )
-    add_sensor(reading)
-    reading.add_argument(
-        "--topic",
-        metavar="NAME",
-        help="the topic of a bag with several point clouds, or the serial number of a sensor in an Ouster capture "
-        "(default: the only one)",
-    )
+    add_sensor(reading, of_capture=True)
+    add_topic(reading)
     reading.add_argument(
         "--on-mismatch",
-        choices=("warn", "raise", "ignore"),
-        default="warn",
-        help="if a scan differs from the scans that a model was trained on: print a warning, fail the scan, or do not "
-        "check (default: %(default)s)",
+        choices=("refuse", "warn", "raise", "ignore"),
+        default="refuse",
+        help="if a scan differs from the scans that a model was trained on. refuse: fail the scan if the difference is "
+        "gross (another unit, other axes, no remission, a room), print a warning otherwise; warn: print a warning; "
+        "raise: fail the scan; ignore: do not check (default: %(default)s)",
+    )
+    reading.add_argument(
+        "--anyway",
+        dest="on_mismatch",
+        action="store_const",
+        const="warn",
+        help="perceive scans that differ grossly too, with a warning: --on-mismatch warn",
     )
     models = parser.add_argument_group("models")
     add_model(models)
@@ -117,8 +133,8 @@ def add_parser(commands: Commands) -> None:
 def make_perceiver(
     arguments: argparse.Namespace,
     *,
-    sensor: str,
-    on_mismatch: Literal["warn", "raise", "ignore"],
+    sensor: str | SensorProfile,
+    on_mismatch: Literal["refuse", "warn", "raise", "ignore"],
     adapt: Literal["both", "remission", "interpolation", "none"] = "both",
 ) -> Perceiver:
     """Make a perceiver with the options of the command line."""
@@ -151,11 +167,8 @@ def run_command(arguments: argparse.Namespace) -> int:
         if os.path.realpath(file) in sources:
             arguments.usage_error(f"{file} is one of the scans and would be overwritten; choose another --out")
 
-    perceive = make_perceiver(
-        arguments, sensor=arguments.sensor, on_mismatch=arguments.on_mismatch, adapt=arguments.adapt
-    )
-    if (arguments.labels or arguments.ply) and not any(card.view.kind == "range_image" for card in perceive.cards):
-        raise ModelError("--labels and --ply need a class for every point; add a range-image model: --model pointseg")
+    perceivers = _Perceivers(arguments)
+    perceivers.check(scans)
     for target in targets if kinds else ():
         target.parent.mkdir(parents=True, exist_ok=True)
     follow = _follower(arguments.rate) if arguments.track else None
@@ -167,9 +180,9 @@ def run_command(arguments: argparse.Namespace) -> int:
         for done, (scan, target) in enumerate(zip(scans, targets, strict=True)):
             show(done, len(scans))
             outcomes = (
-                _live(perceive, follow, scan, arguments)
+                _live(perceivers, follow, scan, arguments)
                 if arguments.live
-                else _each(perceive, follow, scan, target, kinds, arguments)
+                else _each(perceivers, follow, scan, target, kinds, arguments)
             )
             for outcome in outcomes:
                 report.add(*outcome)
@@ -272,6 +285,52 @@ class _Report:
         print_line("  ".join(parts))
 
 
+# Perceivers kept for the sensors of captures; each has its own networks in memory.
+_MOST_PERCEIVERS = 4
+
+
+class _Perceivers:
+    """A perceiver for each sensor, made when its first scan comes."""
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self._arguments = arguments
+        self._made: dict[str | SensorProfile, Perceiver] = {}
+        self._sensors: dict[Path, str | SensorProfile] = {}
+
+    def check(self, scans: Sequence[Path]) -> None:
+        """Make the first perceiver, so that errors of options and models come before any file is written."""
+        for scan in scans:
+            try:
+                self.sensor_of(scan)
+            except (EdgepercError, OSError):  # reported when the scan's turn comes
+                continue
+            break
+        else:
+            if scans:
+                return
+        cards = self.of(self.sensor_of(scan) if scans else self._arguments.sensor or DEFAULT_SENSOR).cards
+        if (self._arguments.labels or self._arguments.ply) and not any(c.view.kind == "range_image" for c in cards):
+            raise ModelError(
+                "--labels and --ply need a class for every point; add a range-image model: --model pointseg"
+            )
+
+    def sensor_of(self, path: Path) -> str | SensorProfile:
+        """The sensor of ``--sensor``, of the capture, or the default."""
+        if path not in self._sensors:
+            self._sensors[path], _ = scan_sensor(path, self._arguments)
+        return self._sensors[path]
+
+    def of(self, sensor: str | SensorProfile) -> Perceiver:
+        """The perceiver of a sensor."""
+        if sensor not in self._made:
+            if len(self._made) >= _MOST_PERCEIVERS:
+                del self._made[next(iter(self._made))]
+            self._made[sensor] = make_perceiver(
+                self._arguments, sensor=sensor, on_mismatch=self._arguments.on_mismatch, adapt=self._arguments.adapt
+            )
+        return self._made[sensor]
+
+
 Follow = Callable[["Perception"], "Tracks"]
 
 
@@ -289,7 +348,7 @@ def _follower(rate_hz: float) -> Follow:
 
 
 def _each(
-    perceive: Perceiver,
+    perceivers: _Perceivers,
     follow: Follow | None,
     path: Path,
     target: Path,
@@ -299,6 +358,12 @@ def _each(
     """Yield the name, perception or error, tracks and flattened scan of each scan in a file or capture."""
     from ..readers.captures import is_capture, read_scans
 
+    try:
+        sensor = perceivers.sensor_of(path)
+    except (EdgepercError, OSError) as exc:
+        yield path, exc, None, None
+        return
+    perceive = perceivers.of(sensor)
     try:
         numbered = is_capture(path)
         for k, (stamp_s, points) in enumerate(read_scans(path, topic=arguments.topic)):
@@ -318,12 +383,15 @@ def _each(
 
 
 def _live(
-    perceive: Perceiver, follow: Follow | None, path: Path, arguments: argparse.Namespace
+    perceivers: _Perceivers, follow: Follow | None, path: Path, arguments: argparse.Namespace
 ) -> Iterator[tuple[Path, Answer | Exception, Tracks | None]]:
     """Yield scan name, answer or error, and tracks, as a stream delivers them."""
     from ..live import stream
 
     name_of = scan_namer(path)
+    perceive = perceivers.of(
+        perceivers.sensor_of(path)
+    ).__call__  # without a sensor, of which `stream` would warn again
     with stream(path, perceive, follow, rate_hz=arguments.rate, topic=arguments.topic) as answers:
         while True:
             try:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-__all__ = ["Scans", "find_scans", "output_names", "scan_folders", "scan_namer"]
+from ..errors import EdgepercError
+from .arguments import DEFAULT_SENSOR
+
+if TYPE_CHECKING:
+    from ..readers.identify import KnownSensor
+    from ..sensor import SensorProfile
+
+__all__ = ["Scans", "find_scans", "output_names", "scan_folders", "scan_namer", "scan_sensor"]
 
 # Folders of scans in data sets: KITTI object and tracking, SemanticKITTI, a KITTI raw drive, a day of raw drives.
 _LAYOUTS = (
@@ -80,6 +89,47 @@ def scan_namer(path: Path) -> Callable[[int], Path]:
     elif not is_capture(path):
         return lambda k: path
     return lambda k: path / f"{k:06d}"
+
+
+def scan_sensor(path: Path, arguments: argparse.Namespace) -> tuple[str | SensorProfile, str]:
+    """The sensor of a scan or capture, and how it is known: by ``--sensor``, by the capture, or as the default.
+
+    Parameters
+    ----------
+    path : Path
+    arguments : argparse.Namespace
+        With ``sensor`` and ``topic``.
+
+    Raises
+    ------
+    SensorError, PointsError, MissingExtraError
+        The sensor of a capture is unknown (`edgeperc.readers.captures.sensor_of`).
+
+    Warns
+    -----
+    UserWarning
+        ``--sensor`` contradicts the capture.
+    """
+    from ..readers.captures import known_sensor
+    from ..readers.identify import contradicts
+    from ..sensor import get_sensor
+
+    known: KnownSensor | None
+    if arguments.sensor is None:
+        known = known_sensor(path, arguments.topic)
+        return (DEFAULT_SENSOR, "the default for scan files") if known is None else known
+    given = get_sensor(arguments.sensor)
+    try:
+        known = known_sensor(path, arguments.topic)
+    except EdgepercError:  # it need not name its sensor, and reading it tells of damage
+        known = None
+    if known is not None and contradicts(given, known.profile):
+        warnings.warn(
+            f"{path}: --sensor says {given.name}, the capture {known.profile.name} ({known.because}); it is read as "
+            f"{given.name}",
+            stacklevel=2,
+        )
+    return arguments.sensor, "as --sensor says"
 
 
 def output_names(scans: Sequence[Path], *, keep_folder: bool = False) -> list[Path]:

@@ -17,7 +17,7 @@ from .decoders import is_ouster_cloud
 from .ouster import check_metadata, metadata_beside, read_metadata
 from .packets import refuse_hesai, velodyne_packets
 
-__all__ = ["KnownSensor", "of_cloud", "of_metadata", "of_packets"]
+__all__ = ["KnownSensor", "contradicts", "of_cloud", "of_metadata", "of_packets"]
 
 _CHOICES = f"Pass its name, sensor= or --sensor: {', '.join(SENSORS)}; or a profile of your own, a .json file."
 
@@ -55,6 +55,11 @@ class KnownSensor(NamedTuple):
 
     profile: SensorProfile
     because: str
+
+
+def contradicts(given: SensorProfile, recorded_by: SensorProfile) -> bool:
+    """Whether a profile is of another sensor than that of a capture; one of your own may have any name."""
+    return given.n_beams != recorded_by.n_beams or (given.name in SENSORS and given.name != recorded_by.name)
 
 
 def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
