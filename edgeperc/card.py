@@ -31,6 +31,7 @@ MAX_TEXT = 100_000  # characters of one text of the free-form metadata
 MAX_NAME = 200
 MAX_ROWS, MAX_COLUMNS, MAX_PIXELS = 4096, 65_536, 16 * 10**6
 MAX_CHANNELS = 16
+MIN_SECTOR_DEG = 1.0
 MIN_GOLDEN_VALUES, MAX_GOLDEN_VALUES = 16, 100_000
 OUTPUT_KINDS = ("class_logits", "class_probabilities", "box_slots", "box_dense")
 CHANNELS = {
@@ -165,10 +166,12 @@ class RangeImageGeometry:
                 "between -90 and 90 degrees"
             )
         _check_size(len(rows), self.width)
-        if not -180.0 <= self.azimuth_right_deg < self.azimuth_left_deg <= 180.0:
+        left, right = self.azimuth_left_deg, self.azimuth_right_deg
+        # A full turn takes a run of the network for each sector.
+        if not (-180.0 <= right and right + MIN_SECTOR_DEG <= left and left <= 180.0):
             raise CardError(
-                f"view azimuths are left {self.azimuth_left_deg}, right {self.azimuth_right_deg}; "
-                "expected -180 <= right < left <= 180"
+                f"view azimuths are left {left}, right {right}; expected -180 <= right < left <= 180, at least "
+                f"{MIN_SECTOR_DEG:g} degree apart"
             )
 
     @property

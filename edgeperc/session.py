@@ -309,10 +309,10 @@ class Session:
                         cpu["CACHE_DIR"] = str(compiled)
                     settings["load_config"] = json.dumps({"CPU": cpu})
                 options.add_provider_for_devices(plugin[:1], settings)
-                session = ort.InferenceSession(blob, sess_options=options)
+                session = ort.InferenceSession(blob, options, enable_fallback=0)
             else:
-                session = ort.InferenceSession(blob, sess_options=options, providers=[PROVIDERS[short]])
-            session.disable_fallback()
+                session = ort.InferenceSession(blob, options, [PROVIDERS[short]], enable_fallback=0)
+            session.disable_fallback()  # of runs; enable_fallback=0: of opening, which would print to stdout
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             if short == "cpu":
                 raise ModelFileError(f"{self.path}: onnxruntime {ort.__version__} cannot open it: {exc}") from exc

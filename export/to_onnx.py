@@ -7,7 +7,6 @@ A file is written only if onnxruntime reproduces the torch network's outputs on 
 from __future__ import annotations
 
 import hashlib
-import json
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -29,7 +28,7 @@ from edgeperc.projection import make_projector
 from edgeperc.session import Session, golden_input
 
 from .cards import card_of
-from .networks import build
+from .checkpoint import build_network, read_checkpoint
 from .recipe import Recipe
 
 __all__ = ["ParityError", "export", "load", "to_graph", "verify", "with_golden", "write_card"]
@@ -56,13 +55,9 @@ class ParityError(EdgepercError):
 
 def load(checkpoint: Path) -> tuple[nn.Module, Recipe, dict[str, Any]]:
     """The averaged network of a checkpoint in inference mode, its recipe, and notes on its training."""
-    state = torch.load(checkpoint, weights_only=True, map_location="cpu")
-    recipe = Recipe(**json.loads(state["recipe"]))
-    network = build(recipe)
-    network.load_state_dict(state["best"] or state["averaged"])
-    notes = {"frames": json.loads(state["frames"]), "n_simulated": state["n_simulated"], "step": state["step"]}
-    notes |= {"before": json.loads(state["before"]), "curve": json.loads(state["curve"])}
-    return network.eval(), recipe, notes
+    state = read_checkpoint(checkpoint)
+    notes = {name: state[name] for name in ("frames", "n_simulated", "step", "before", "curve")}
+    return build_network(state, checkpoint).eval(), state["recipe"], notes
 
 
 def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from tqdm import tqdm
 from edgeperc.atomic import open_atomic
 from edgeperc.evaluation.datasets import KittiObjects
 
+from .checkpoint import build_network, read_checkpoint
 from .networks import build
 from .recipe import Recipe
 from .roads import sure_surface
@@ -135,10 +136,10 @@ def train(
     best_figure, lowest_loss = -1.0, math.inf
     curve: list[dict[str, Any]] = []
     if checkpoint.exists():
-        state = torch.load(checkpoint, weights_only=True, map_location=device)
-        if Recipe(**json.loads(state["recipe"])) != recipe:
+        state = read_checkpoint(checkpoint, device)
+        if state["recipe"] != recipe:
             raise ValueError(f"{checkpoint} is of another recipe: {state['recipe']}; give an empty folder")
-        before, curve = json.loads(state["before"]), json.loads(state["curve"])
+        before, curve = state["before"], state["curve"]
         network.load_state_dict(state["network"])
         averaged.load_state_dict(state["averaged"])
         optimizer.load_state_dict(state["optimizer"])
@@ -252,24 +253,22 @@ def _optimizer(recipe: Recipe, network: nn.Module) -> torch.optim.Optimizer:
 
 def _start(network: nn.Module, checkpoint: Path) -> list[dict[str, object]]:
     """Copy the weights that a checkpoint shares with the network; returns the recipes of its training runs in order."""
-    state = torch.load(checkpoint, weights_only=True, map_location="cpu")
+    state = read_checkpoint(checkpoint)
     own, saved = network.state_dict(), state["best"] or state["averaged"]
     common = {name: value for name, value in saved.items() if name in own and own[name].shape == value.shape}
     if not common:
         raise ValueError(f"{checkpoint} has no weight in common with the network to train")
     network.load_state_dict(common, strict=False)
-    return [*json.loads(state["before"]), json.loads(state["recipe"])]
+    return [*state["before"], asdict(state["recipe"])]
 
 
 def _teacher(checkpoint: Path, task: Task) -> nn.Module:
     """The network of a checkpoint with the same view and input as the task."""
-    state = torch.load(checkpoint, weights_only=True, map_location="cpu")
-    recipe = Recipe(**json.loads(state["recipe"]))
+    state = read_checkpoint(checkpoint)
+    recipe = state["recipe"]
     if (task_of(recipe).view, task_of(recipe).input) != (task.view, task.input):
         raise ValueError(f"{checkpoint} is of {recipe.network}, which sees another view than {task.recipe.network}")
-    network = build(recipe)
-    network.load_state_dict(state["best"] or state["averaged"])
-    return network.eval()
+    return build_network(state, checkpoint).eval()
 
 
 @torch.no_grad()

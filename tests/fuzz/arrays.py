@@ -180,7 +180,7 @@ def many_duplicates(scan: Points, case: Case) -> Points:
 
 def one_column(scan: Points, case: Case) -> Points:
     """Points above one another, or a constant coordinate."""
-    scan = scan.copy()
+    scan = scan.astype(np.float32)
     for k in case.rng.choice(3, int(case.rng.integers(1, 4)), replace=False):
         scan[:, k] = case.pick([0.0, 10.0, -1.73])
     return scan
@@ -368,7 +368,8 @@ def sparse_far(scan: Points, case: Case) -> Points:
 
 
 def from_buffer(scan: Points, case: Case) -> Points:
-    return np.frombuffer(np.ascontiguousarray(scan).tobytes() or bytes(16), scan.dtype).reshape(-1, scan.shape[1])
+    empty = bytes(scan.shape[1] * scan.itemsize)
+    return np.frombuffer(np.ascontiguousarray(scan).tobytes() or empty, scan.dtype).reshape(-1, scan.shape[1])
 
 
 MUTATIONS: list[Callable[[Points, Case], Any]] = [
