@@ -55,7 +55,8 @@ def fill_scan_sums(
     remissions : (258,) int64, overwritten
         Points of remission <= 0, 256 even bins in 0..1, points above 1.
     elevations : (360,) int64, overwritten
-        Bins of half a degree from -90.
+        Bins of half a degree from -90, of the points farther than 3 m: nearer, it depends on where in its housing a
+        laser sits, and on how far the origin is from the sensor.
     ranges : (200,) int64, overwritten
         Horizontal distance, 20 bins a decade from 1 mm.
     heights : (3, 100) int64, overwritten
@@ -104,9 +105,10 @@ def fill_scan_sums(
         if view_right <= azimuth <= view_left:
             sums[1] += 1.0
         horizontal = math.sqrt(x * x + y * y)
-        elevations[min(int((math.atan(z / horizontal) * (180.0 / math.pi) + 90.0) * 2.0), 359)] += 1
         ranges[min(max(int((math.log10(horizontal) + 3.0) * 20.0), 0), 199)] += 1
         square = x * x + y * y + z * z
+        if square > 9.0:
+            elevations[min(int((math.atan(z / horizontal) * (180.0 / math.pi) + 90.0) * 2.0), 359)] += 1
         if 9.0 < square < 625.0:
             sums[7] += 1.0
             for axis, value in enumerate((x, y, z)):
@@ -228,7 +230,7 @@ def _measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> _
         if count
     ]
     n_beams = float(np.percentile(beams, 75)) if beams else 0.0
-    low, high = (_quantile(elevations, share) / 2.0 - 90.0 for share in (0.01, 0.99))
+    low, high = (_quantile(elevations, share) / 2.0 - 90.0 if elevations.any() else 0.0 for share in (0.01, 0.99))
     peaks = heights.max(axis=1) / max(1.0, sums[7])
     flattest = int(peaks.argmax())
     has_ground = bool(peaks[2] >= _GROUND_SHARE)
@@ -278,7 +280,7 @@ class FitnessProfile:
     remission_median, remission_p99, remission_zeros : tuple of 2 float
         Median, 99th percentile and share of zeros of the remission, scaled to 0..1.
     elevation_p01_deg, elevation_p99_deg : tuple of 2 float
-        1st and 99th percentile of the points' elevation [deg].
+        1st and 99th percentile of the elevation of points farther than 3 m [deg].
     beams, beams_per_deg : tuple of 2 float
         Rows of points above one another, and their number per degree of elevation.
     range_median_m : tuple of 2 float
@@ -522,7 +524,8 @@ def _geometry_findings(scan: _Measures, profile: FitnessProfile, sensor: SensorP
 
     low, high = profile.elevation_p01_deg[1], profile.elevation_p99_deg[1]
     # The lowest beams are missing from a crop to a camera's view (9 deg) and from a scan cut short (up to 13).
-    if scan.elevation_p01_deg > low + 13.0 or scan.elevation_p99_deg > high + 8.0:
+    unlike = scan.elevation_p01_deg > low + 13.0 or scan.elevation_p99_deg > high + 8.0
+    if unlike and scan.elevation_p01_deg < scan.elevation_p99_deg:  # both are 0 if no point is far
         findings.append(
             Finding(
                 f"The points lie between {scan.elevation_p01_deg:.0f} and {scan.elevation_p99_deg:.0f} deg of "

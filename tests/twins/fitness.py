@@ -26,7 +26,8 @@ def scan_sums(points, step, beam_step, view_right, view_left):
         seen[min(int((azimuth + 2) * 16), 63)] = True
         n_view += view_right <= azimuth <= view_left
         horizontal = math.sqrt(x * x + y * y)
-        elevations[min(int((math.atan(z / horizontal) * (180 / math.pi) + 90) * 2), 359)] += 1
+        if x * x + y * y + z * z > 9:
+            elevations[min(int((math.atan(z / horizontal) * (180 / math.pi) + 90) * 2), 359)] += 1
         ranges[min(max(int((math.log10(horizontal) + 3) * 20), 0), 199)] += 1
         if 9 < x * x + y * y + z * z < 625:
             n_near += 1
