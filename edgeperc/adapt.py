@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from .card import RangeImageGeometry
 from .errors import PointsError, SensorError
 from .kernel_cache import njit
+from .mounting import MODEL_HEIGHT_M
 from .points import as_points, read_only
 from .sensor import SensorProfile
 
@@ -183,7 +184,7 @@ class Interpolator:
     view : RangeImageGeometry
         The model's view.
     sensor : SensorProfile
-        The sensor that takes the scans; the ground lies its mounting height below it.
+        The sensor that takes the scans. The ground is where it is in the frame of the models.
 
     Attributes
     ----------
@@ -199,7 +200,7 @@ class Interpolator:
         azimuths = np.radians(view.azimuth_left_deg - (np.arange(view.width) + 0.5) * column_deg)
         self._row_slopes = np.tan(np.radians(rows))
         self._directions = np.stack([np.cos(azimuths), np.sin(azimuths)])
-        self._ground_z = -sensor.mount_height_m
+        self._ground_z = -MODEL_HEIGHT_M
         # Row coordinates of the beams; then, for each row, how many rows below it the next beam's return may be.
         places = np.interp(-np.array(sensor.elevations_deg), -rows, np.arange(len(rows)), left=-1.0, right=len(rows))
         self._row_reach = np.zeros(len(rows), np.int64)

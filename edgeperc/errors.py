@@ -10,6 +10,7 @@
     ├── SplitError (ValueError)       a model would be evaluated on a scan that it was trained on
     ├── TrackingError (ValueError)    boxes or a pose that cannot be tracked
     │   └── StampError                a scan that is not later than the one before it
+    ├── MountingError (ValueError)    scans do not show how the sensor is mounted
     ├── FitnessError                  a scan differs grossly from the training scans
     ├── ModelError
     │   ├── ModelFileError            missing, or onnxruntime cannot open it
@@ -33,6 +34,7 @@ __all__ = [
     "MissingExtraError",
     "ModelError",
     "ModelFileError",
+    "MountingError",
     "OptionError",
     "PointsError",
     "ProviderError",
@@ -58,6 +60,10 @@ class PointsError(EdgepercError, ValueError):
 
 class SensorError(EdgepercError, ValueError):
     """A sensor profile is unknown or describes no possible sensor."""
+
+
+class MountingError(EdgepercError, ValueError):
+    """Scans do not show how the sensor is mounted, and it was not given."""
 
 
 class SettingsError(EdgepercError, ValueError):

@@ -77,8 +77,6 @@ class SensorInfo:
         Raw remissions that are scaled to 0 and 1.
     range_m : tuple of 2 float
         Nearest and farthest return [m].
-    mount_height_m : float
-        Height of the sensor above the road [m].
     rendered_as : str or None
         Sensor whose remission scale the remission is mapped to; None if it is only scaled to 0..1.
     """
@@ -89,7 +87,6 @@ class SensorInfo:
     field_of_view_deg: tuple[float, float]
     remission_range: tuple[float, float]
     range_m: tuple[float, float]
-    mount_height_m: float
     rendered_as: str | None
 
 
@@ -161,7 +158,6 @@ def sensors() -> tuple[SensorInfo, ...]:
             field_of_view_deg=(profile.fov_down_deg, profile.fov_up_deg),
             remission_range=profile.remission_range,
             range_m=(profile.min_range_m, profile.max_range_m),
-            mount_height_m=profile.mount_height_m,
             rendered_as=None if profile.remission is None else profile.remission.to,
         )
         for profile in SENSORS.values()

@@ -23,9 +23,11 @@ from .card import ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, join_boxes, objects_from_points
 from .decode import decode_classes, decode_top_view
 from .drivable import compile_kernels
-from .errors import FitnessError, OptionError
+from .errors import FitnessError, MountingError, OptionError
 from .fitness import Finding, FitnessProfile, check_fitness
 from .ground import find_ground
+from .level import ModelFrame, MountingEstimate, MountingEstimator
+from .mounting import MODEL_HEIGHT_M, Mounting
 from .observed import Observer
 from .perception import Box, Perception, PointLabels, TopView
 from .points import as_points
@@ -124,6 +126,10 @@ class Perceiver:
     sensor : str, Path or SensorProfile
         The sensor that takes the scans: a built-in name (`edgeperc.sensors`), a file written by ``edgeperc
         fit-sensor``, or a profile.
+    mounting : Mounting or None
+        How the sensor is mounted. What is None in it is estimated from the ground in the first five scans that show
+        it (`edgeperc.level.MountingEstimator`). None: as the sensor's profile says, which for the built-in ones is
+        nothing.
     provider : str
         ``"auto"``, ``"cpu"``, ``"openvino"``, ... Any other value than ``"auto"`` is required, without fallback
         (`edgeperc.session.PROVIDERS`).
@@ -158,6 +164,8 @@ class Perceiver:
     Attributes
     ----------
     sensor : SensorProfile
+    mounting : MountingEstimate or None
+        The mounting by the scans so far; None if it is to be estimated and no scan has shown the ground.
     on_mismatch, score_threshold, adapt, boxes_from, full_turn
         As given; read-only.
     cards : tuple of ModelCard
@@ -199,6 +207,7 @@ class Perceiver:
         models: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None,
         *,
         sensor: str | os.PathLike[str] | SensorProfile = "hdl-64e",
+        mounting: Mounting | None = None,
         provider: str = "auto",
         precision: str = "auto",
         n_threads: int | None = None,
@@ -221,7 +230,10 @@ class Perceiver:
             if not isinstance(given, str):
                 raise OptionError(f"{option} is {given!r}; expected a str")
         wanted = _listed(models)
+        if mounting is not None and not isinstance(mounting, Mounting):
+            raise OptionError(f"mounting is {mounting!r:.80}; expected a Mounting, or None")
         self.sensor = get_sensor(sensor)
+        self._set_mounting(MountingEstimator(self.sensor.mounting if mounting is None else mounting))
         self.on_mismatch = on_mismatch
         self.score_threshold = score_threshold
         self.adapt = adapt
@@ -254,6 +266,7 @@ class Perceiver:
         self._perceive(warm_up, None, check=self._to_check > 0, infer=False)
         if boxes_from != "network" and "range_image" in views:
             self._find_objects(*self._warm_up_objects())
+        self._estimator.add(self._warm_up_objects()[0])
         if "top_view" in views:
             compile_kernels()  # of `edgeperc.road_ahead`
 
@@ -261,6 +274,19 @@ class Perceiver:
         if not name.startswith("_") and "_lock" in vars(self):  # the last attribute of construction
             raise AttributeError(f"{name} of a Perceiver cannot be set after construction; make another Perceiver")
         super().__setattr__(name, value)
+
+    @property
+    def mounting(self) -> MountingEstimate | None:
+        """See the class."""
+        try:
+            return self._estimator.estimate()
+        except MountingError:
+            return None
+
+    def _set_mounting(self, estimator: MountingEstimator) -> None:
+        self._estimator = estimator
+        self._mounting = estimator.mounting()
+        self._frame = ModelFrame(self._mounting)
 
     def _load(self, session: Session) -> _Network:
         card = session.card
@@ -273,7 +299,7 @@ class Perceiver:
             index=np.empty((card.view.height, card.view.width), np.int32),
             fitness=None if card.fitness is None else FitnessProfile.from_dict(card.fitness),
             interpolator=interpolator if interpolator is not None and interpolator.needed else None,
-            observer=Observer(card.view, self.sensor.columns) if isinstance(card.view, TopViewGeometry) else None,
+            observer=Observer(card.view, self.sensor) if isinstance(card.view, TopViewGeometry) else None,
         )
 
     def __call__(self, points: ArrayLike, stamp_s: float | None = None) -> Perception:
@@ -282,8 +308,8 @@ class Perceiver:
         Parameters
         ----------
         points : (n, 4) or (n, 3) array_like, or a structured array
-            x, y, z [m] in the sensor frame, remission in the sensor's raw unit. Not modified. Rows that are not finite
-            are counted, labeled 0 and otherwise ignored; an empty scan gives an empty perception.
+            x, y, z [m] about the sensor, z up; remission in the sensor's raw unit. Not modified. Rows that are not
+            finite are counted, labeled 0 and otherwise ignored; an empty scan gives an empty perception.
         stamp_s : float or None
             Time of the scan [s], for the tracker; returned in the perception.
 
@@ -311,9 +337,23 @@ class Perceiver:
         watch = _Stopwatch()
         scan, n_dropped = condition(scan, self.sensor, rendered=self._renders)
         watch.lap("adapt" if self._renders else "check")
-        fitness = self._check(scan) if check else ()
+        before = self._estimator
+        hidden: tuple[Finding, ...] = ()
+        if infer and not before.is_complete and len(scan):
+            try:
+                self._set_mounting(before.add(scan))
+            except MountingError as exc:
+                hidden = self._without_ground(exc)
+            watch.lap("check")
+        scan = self._frame.move(scan)
+        watch.lap("adapt")
+        fitness = (*self._check(scan), *hidden) if check else ()
         if infer:
-            self._refuse(fitness)
+            try:
+                self._refuse(fitness)
+            except FitnessError:
+                self._set_mounting(before)  # nothing is learnt from a refused scan
+                raise
         watch.lap("check")
         points: PointLabels | None = None
         top_view: TopView | None = None
@@ -333,11 +373,24 @@ class Perceiver:
             n_dropped=n_dropped,
             points=points,
             top_view=top_view,
-            boxes=boxes,
+            boxes=self._frame.boxes_back(boxes),
             stage_ms=MappingProxyType(watch.ms),
             providers=self.providers,
             fitness=fitness,
             stamp_s=stamp_s,
+            mounting=self._mounting,
+        )
+
+    def _without_ground(self, reason: MountingError) -> tuple[Finding, ...]:
+        """What to say of a scan that does not show how the sensor is mounted, if no other scan has."""
+        if self.mounting is not None:
+            return ()
+        return (
+            Finding(
+                f"The mounting of the sensor cannot be estimated ({reason}); it is taken as "
+                f"{self._mounting.height_m:g} m above the road and level: pass mounting= (on the command line "
+                "--mount-height or --extrinsic)."
+            ),
         )
 
     def _check(self, scan: NDArray[np.float32]) -> tuple[Finding, ...]:
@@ -369,8 +422,9 @@ class Perceiver:
         card = network.session.card
         assert isinstance(card.view, TopViewGeometry)
         assert network.observer is not None
+        assert self._mounting.height_m is not None
         self._project(network, scan)
-        observed = network.observer.observe(scan, network.index)
+        observed = network.observer.observe(scan, network.index, self._mounting.height_m)
         watch.lap("project")
         outputs = network.session.run() if infer else network.session.outputs
         watch.lap("infer")
@@ -429,7 +483,7 @@ class Perceiver:
         """Nine points of a car on a floor: enough to compile every kernel of `_find_objects`."""
         x, y = np.meshgrid(np.arange(-8.0, 8.0), np.arange(-8.0, 8.0))
         scan = np.zeros((x.size + 9, 4), np.float32)
-        scan[:-9, 0], scan[:-9, 1], scan[:-9, 2] = x.ravel(), y.ravel(), -self.sensor.mount_height_m
+        scan[:-9, 0], scan[:-9, 1], scan[:-9, 2] = x.ravel(), y.ravel(), -MODEL_HEIGHT_M
         scan[-9:, 0], scan[-9:, 1] = 5.0, np.linspace(-0.2, 0.2, 9)
         labels = (np.arange(len(scan)) >= x.size).astype(np.uint8)
         return scan, PointLabels(labels, np.ones(len(scan), np.bool_), ("background", "car"))
@@ -440,7 +494,7 @@ class Perceiver:
         Points out of the network's view count as background. An object cut by the view's edge therefore gets either a
         box of the whole object or none.
         """
-        ground = find_ground(scan, mount_height_m=self.sensor.mount_height_m)
+        ground = find_ground(scan, mount_height_m=MODEL_HEIGHT_M)
         return objects_from_points(
             scan,
             points.labels,

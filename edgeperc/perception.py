@@ -1,4 +1,4 @@
-"""Immutable results, in the sensor frame (x forward, y left, z up, meters, radians)."""
+"""Immutable results, in the frame of the scan (meters, radians); the top view in that of the models."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from .card import TopViewGeometry
 from .errors import PointsError
+from .mounting import MODEL_MOUNTING, Mounting
 
 __all__ = ["Box", "Perception", "PointLabels", "TopView"]
 
@@ -26,7 +27,7 @@ class Box:
     score : float
         Confidence in 0..1.
     center : tuple of 3 float
-        Middle of the box, x, y, z [m], sensor frame.
+        Middle of the box, x, y, z [m], in the frame of the scan.
     size : tuple of 3 float
         Length (along the heading), width, height [m].
     yaw : float
@@ -83,6 +84,10 @@ class Box:
 @dataclass(frozen=True, slots=True, eq=False)
 class TopView:
     """A class for every cell of the ground ahead (SSADNet 2.1.2, 3.1.2).
+
+    Cells lie in the frame of the models: x forward, y left, the road 1.73 m below the origin. It is the frame of the
+    scan if the sensor is mounted as on the training vehicle; otherwise ``ModelFrame(perception.mounting).move(points)``
+    (`edgeperc.ModelFrame`) moves points of the scan into it.
 
     Attributes
     ----------
@@ -181,6 +186,9 @@ class Perception:
         How the scan differs from the training scans, one sentence for each difference; empty if there is none.
     stamp_s : float or None
         The time given with the scan [s].
+    mounting : Mounting
+        The mounting with which the scan was moved into the frame of the models: as given, or as estimated from the
+        scans so far. ``MODEL_MOUNTING``: the scan was not moved.
     """
 
     n_points: int
@@ -192,6 +200,7 @@ class Perception:
     providers: Mapping[str, str]
     fitness: tuple[str, ...]
     stamp_s: float | None
+    mounting: Mounting = MODEL_MOUNTING
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to a dict for JSON, with the number of points of each class in place of their labels.
@@ -213,4 +222,5 @@ class Perception:
             "drivable_area_m2": None if self.top_view is None else round(self.top_view.drivable_area_m2, 2),
             "point_counts": None if self.points is None else self.points.counts(),
             "fitness": list(self.fitness),
+            "mounting": self.mounting.to_dict(),
         }

@@ -1,4 +1,4 @@
-"""Sensor profiles: beams, columns, remission range and mounting height."""
+"""Sensor profiles: beams, columns, remission range and mounting."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from types import MappingProxyType
 import numpy as np
 
 from .errors import SensorError
+from .mounting import MODEL_HEIGHT_M, UNKNOWN_MOUNTING, Mounting
 
 __all__ = ["REMISSION_KINDS", "SENSORS", "RemissionFunction", "SensorProfile", "get_sensor"]
 
-SCHEMA = 1  # of a sensor profile's file
+SCHEMA = 2  # of a sensor profile's file
 REMISSION_KINDS = {"linear": 2, "polynomial": 3, "logarithm": 2}  # number of coefficients
 
 
@@ -85,8 +86,8 @@ class SensorProfile:
 
     A built-in profile (`SENSORS`) describes a usual set-up of the sensor. Change single values with
     ``dataclasses.replace``, e.g.
-    ``replace(get_sensor("os1-64"), remission_range=(0, 65535), mount_height_m=2.1)`` for an Ouster whose 16-bit
-    signal is used instead of its 8-bit reflectivity. Describe another sensor with ``SensorProfile(...)``, or with
+    ``replace(get_sensor("os1-64"), remission_range=(0, 65535))`` for an Ouster whose 16-bit signal is used instead of
+    its 8-bit reflectivity. Describe another sensor with ``SensorProfile(...)``, or with
     `SensorProfile.uniform` if its beams are evenly spaced.
 
     Attributes
@@ -98,8 +99,8 @@ class SensorProfile:
         Azimuth steps in one turn.
     remission_range : tuple of 2 float
         Raw remissions that are scaled to 0 and 1.
-    mount_height_m : float
-        Height of the sensor above the road [m].
+    mounting : Mounting
+        How it is mounted on the vehicle. What is None is estimated from the scans.
     min_range_m, max_range_m : float
         Nearest and farthest return to expect [m].
     remission : RemissionFunction or None
@@ -116,7 +117,7 @@ class SensorProfile:
     elevations_deg: tuple[float, ...]
     columns: int
     remission_range: tuple[float, float] = (0.0, 1.0)
-    mount_height_m: float = 1.73
+    mounting: Mounting = UNKNOWN_MOUNTING
     min_range_m: float = 0.9
     max_range_m: float = 120.0
     remission: RemissionFunction | None = None
@@ -127,7 +128,7 @@ class SensorProfile:
         try:
             object.__setattr__(self, "elevations_deg", tuple(float(e) for e in self.elevations_deg))
             object.__setattr__(self, "remission_range", tuple(float(v) for v in self.remission_range))
-            for field in ("mount_height_m", "min_range_m", "max_range_m"):
+            for field in ("min_range_m", "max_range_m"):
                 object.__setattr__(self, field, float(getattr(self, field)))
             columns_are_whole = int(self.columns) == self.columns
             object.__setattr__(self, "columns", int(self.columns))
@@ -149,8 +150,8 @@ class SensorProfile:
                 f"sensor {self.name!r}: remission_range is (lowest, highest) raw value, such as (0, 255), up to 1e9, "
                 f"got {bounds!r}"
             )
-        if not 0.0 < self.mount_height_m < math.inf:
-            raise SensorError(f"sensor {self.name!r}: mount_height_m must be above 0, got {self.mount_height_m!r}")
+        if not isinstance(self.mounting, Mounting):
+            raise SensorError(f"sensor {self.name!r}: mounting is a Mounting, got {self.mounting!r:.80}")
         if not 0.0 <= self.min_range_m < self.max_range_m < math.inf:
             raise SensorError(
                 f"sensor {self.name!r}: 0 <= min_range_m < max_range_m must hold, "
@@ -180,12 +181,16 @@ class SensorProfile:
             ) from exc
         if not isinstance(document, dict) or document.get("schema") != SCHEMA:
             found = document.get("schema") if isinstance(document, dict) else None
-            raise SensorError(f"the sensor profile has schema {found!r}, this edgeperc reads {SCHEMA}")
+            raise SensorError(
+                f"the sensor profile has schema {found!r}, this edgeperc reads {SCHEMA}; write it again with edgeperc "
+                "fit-sensor or edgeperc info --write"
+            )
         _check_entries(document, {"schema", *(field.name for field in fields(cls))}, "sensor profile")
         del document["schema"]
         if document["remission"] is not None:
             _check_entries(document["remission"], {field.name for field in fields(RemissionFunction)}, "remission")
             document["remission"] = RemissionFunction(**document["remission"])
+        document["mounting"] = Mounting.from_dict(document["mounting"])
         return cls(**document)
 
     @classmethod
@@ -198,7 +203,7 @@ class SensorProfile:
         *,
         columns: int = 1800,
         remission_range: tuple[float, float] = (0.0, 1.0),
-        mount_height_m: float = 1.73,
+        mounting: Mounting = UNKNOWN_MOUNTING,
         min_range_m: float = 0.9,
         max_range_m: float = 120.0,
         remission: RemissionFunction | None = None,
@@ -211,7 +216,7 @@ class SensorProfile:
         n_beams : int
         fov_up_deg, fov_down_deg : float
             Elevation of the top and of the bottom beam [deg].
-        columns, remission_range, mount_height_m, min_range_m, max_range_m, remission
+        columns, remission_range, mounting, min_range_m, max_range_m, remission
             As the attributes.
 
         Raises
@@ -229,7 +234,7 @@ class SensorProfile:
             tuple(round(float(e), 4) for e in np.linspace(fov_up_deg, fov_down_deg, int(n_beams))),
             columns,
             remission_range,
-            mount_height_m,
+            mounting,
             min_range_m,
             max_range_m,
             remission,
@@ -254,6 +259,11 @@ class SensorProfile:
     def azimuth_resolution_deg(self) -> float:
         """Azimuth step between columns [deg]."""
         return 360.0 / self.columns
+
+    @property
+    def mount_height_m(self) -> float:
+        """Height above the road [m] in simulated scans: that of the mounting, or else of the training vehicle."""
+        return MODEL_HEIGHT_M if self.mounting.height_m is None else self.mounting.height_m
 
     @property
     def remission_offset(self) -> float:
@@ -325,7 +335,7 @@ _OF_PANDASET = RemissionFunction(
 _OF_VELODYNE = replace(_OF_NUSCENES, source=f"the hdl-32e's, calibrated to the same scale: {_OF_NUSCENES.source}")
 _BUILT_IN = (
     # KITTI, where a turn has up to 2,160 returns a laser; its files hold remission / 255.
-    SensorProfile("hdl-64e", _HDL_64E, 2083, (0.0, 1.0), 1.73, 0.9, 120.0),
+    SensorProfile("hdl-64e", _HDL_64E, 2083),
     # nuScenes (20 Hz, on the roof).
     SensorProfile.uniform(
         "hdl-32e",
@@ -334,19 +344,17 @@ _BUILT_IN = (
         -30.67,
         columns=1084,
         remission_range=_BYTE,
-        mount_height_m=1.84,
         max_range_m=105.0,
         remission=_OF_NUSCENES,
     ),
     SensorProfile.uniform(
         "vlp-16", 16, 15.0, -15.0, remission_range=_BYTE, min_range_m=0.5, max_range_m=105.0, remission=_OF_VELODYNE
     ),
-    SensorProfile("vlp-32c", _VLP_32C, 1800, _BYTE, 1.73, 1.0, 200.0, _OF_VELODYNE),
+    SensorProfile("vlp-32c", _VLP_32C, 1800, _BYTE, min_range_m=1.0, max_range_m=200.0, remission=_OF_VELODYNE),
     *_ouster("os0", 45.0, 0.3, 75.0),
     *_ouster("os1", 22.5 - 1.25, 0.3, 170.0),
     *_ouster("os2", 11.25, 0.8, 350.0),
-    # PandaSet, whose files have their origin on the road: the beams meet 2.1 m above it.
-    SensorProfile("pandar64", _PANDAR_64, 1800, _BYTE, 2.1, 0.3, 200.0, _OF_PANDASET),
+    SensorProfile("pandar64", _PANDAR_64, 1800, _BYTE, min_range_m=0.3, max_range_m=200.0, remission=_OF_PANDASET),
     SensorProfile.uniform("pandarxt-32", 32, 15.0, -16.0, columns=2000, remission_range=_BYTE, min_range_m=0.05),
 )
 SENSORS: Mapping[str, SensorProfile] = MappingProxyType({profile.name: profile for profile in _BUILT_IN})

@@ -89,7 +89,6 @@ def sensors_command(arguments: argparse.Namespace) -> int:
             "columns": lambda of: str(of["columns"]),
             "remission": lambda of: "{:g} .. {:g}".format(*of["remission_range"]),
             "range [m]": lambda of: "{:g} .. {:g}".format(*of["range_m"]),
-            "height [m]": lambda of: f"{of['mount_height_m']:g}",
             "mapped to": lambda of: of["rendered_as"] or "-",
         },
         arguments,

@@ -16,6 +16,7 @@ from ..card import TopViewGeometry
 from ..decode import decode_classes
 from ..errors import ModelError
 from ..geometry import inside
+from ..mounting import MODEL_MOUNTING
 from ..perceiver import BoxesFrom, Perceiver
 from ..perception import Perception, PointLabels, TopView
 from ..projection import make_projector
@@ -263,7 +264,15 @@ class _Network:
 def _perceiver(
     models: Sequence[str | Path], provider: str, precision: str, boxes_from: BoxesFrom = "network"
 ) -> Perceiver:
-    return Perceiver(list(models), provider=provider, precision=precision, on_mismatch="ignore", boxes_from=boxes_from)
+    # The truth of cells is in the frame of the scan. KITTI's vehicle is the training vehicle.
+    return Perceiver(
+        list(models),
+        mounting=MODEL_MOUNTING,
+        provider=provider,
+        precision=precision,
+        on_mismatch="ignore",
+        boxes_from=boxes_from,
+    )
 
 
 def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tuple[tuple[str, ...], NDArray[np.uint8]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,7 +29,7 @@ FARTHEST_M = 50.0
 # Point class -> names in label files. Other names, except those of `BACKGROUND`, count as unlabeled.
 CLASSES = {
     1: ("car", "pickup_truck", "medium-sized_truck", "semi-truck", "truck", "van", "bus", "emergency_vehicle",
-        "type_vehicle"),
+        "type_vehicle", "regular_vehicle", "large_vehicle", "box_truck", "truck_cab", "bus/rv/caravan"),
     2: ("pedestrian", "pedestrian_with_object", "person", "type_pedestrian"),
     3: ("cyclist", "type_cyclist"),
 }  # fmt: skip
@@ -83,10 +82,11 @@ def compare(
     ----------
     datasets : sequence of str
         ``SENSOR=SOURCE``. The sensor is a built-in name or the file of a profile. The source is ``simulation:N``, a
-        folder with ``velodyne/NAME.bin`` and ``label/NAME.txt`` (class, one unused column, x, y, z, extents, yaw), or a
-        folder with range images ``NAME.npy`` (H, W, 6). Real scans are labeled over the full turn, but the model sees a
-        quarter of it, so each scan is evaluated in four directions. The remission function of a simulated sensor is
-        fitted to eight other scenes. That of a real sensor comes from its profile.
+        folder with ``velodyne/NAME.bin`` and ``label/NAME.txt`` (class, x, y, z, length, width, height, yaw; a column
+        of zeros after the class is skipped), or a folder with range images ``NAME.npy`` (H, W, 6). Scans go through a
+        `Perceiver` as a user's do, with ``full_turn=True``: it finds the mounting, and nothing from the labels helps
+        it. The remission function of a simulated sensor is fitted to eight other scenes. That of a real sensor comes
+        from its profile.
     model : str or Path
         A range-image model.
     provider, precision : str
@@ -120,6 +120,7 @@ def compare(
                 on_mismatch="ignore",
                 adapt=adaptation,
                 boxes_from="network",  # only points are evaluated
+                full_turn=True,
             )
             for adaptation in ADAPTATIONS
         }
@@ -182,11 +183,11 @@ def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]
 
     def read() -> Iterator[Scan]:
         for file in images:
-            yield from _turned(_from_image(file))
+            yield _from_image(file)
         for file in boxed:
-            yield from _turned(_from_boxes(root / "velodyne" / f"{file.stem}.bin", file, sensor))
+            yield _from_boxes(root / "velodyne" / f"{file.stem}.bin", file)
 
-    return sensor, 4 * (len(images) + len(boxed)), read
+    return sensor, len(images) + len(boxed), read
 
 
 def _raw_model(sensor: SensorProfile) -> tuple[float, tuple[float, ...], tuple[float, ...]]:
@@ -205,15 +206,6 @@ def _simulated(sensor: SensorProfile, seed: int) -> Scan:
     return Scan(f"scene {seed}", points, labels_by_boxes(scan))
 
 
-def _turned(scan: Scan) -> Iterator[Scan]:
-    for k in range(4):
-        cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[k]
-        points = scan.points.copy()
-        points[:, 0] = cos * scan.points[:, 0] - sin * scan.points[:, 1]
-        points[:, 1] = sin * scan.points[:, 0] + cos * scan.points[:, 1]
-        yield Scan(f"{scan.name}, turned by {90 * k} deg", points, scan.labels)
-
-
 def _from_image(path: Path) -> Scan:
     image = np.load(path, allow_pickle=False)
     if image.ndim != 3 or image.shape[2] != 6:
@@ -229,47 +221,16 @@ def _from_image(path: Path) -> Scan:
     return Scan(path.stem, np.ascontiguousarray(pixels[:, :4], np.float32), IMAGE_LABELS[labels])
 
 
-def _from_boxes(scan: Path, label: Path, sensor: SensorProfile) -> Scan:
+def _from_boxes(scan: Path, label: Path) -> Scan:
     points = read_points(scan)
     labels = np.zeros(len(points), np.uint8)
-    axes = []
-    for line in label.read_text().splitlines():
-        columns = line.split()
-        x, y, z, *size, yaw = (float(v) for v in columns[2:9])
+    lines = [line.split() for line in label.read_text().splitlines() if line.strip()]
+    first = 2 if all(columns[1] == "0" for columns in lines) else 1  # some files have a column that is always 0
+    for columns in lines:
+        x, y, z, length, width, height, yaw = (float(v) for v in columns[first : first + 7])
         name = columns[0].lower()
         kind = next((k for k, names in CLASSES.items() if name in names), 0 if name in BACKGROUND else IGNORE)
-        if name == "bicycle" and size[2] >= RIDDEN_M:
+        if name == "bicycle" and height >= RIDDEN_M:
             kind = 3
-        labels[inside(Box(name, 1.0, (x, y, z), (size[0], size[1], size[2]), yaw), points, 0.05)] = kind
-        if kind == 1:
-            axes.append(yaw)
-    # Turn x along the road: vehicles are aligned with it, modulo 90 degrees because some files swap length and width.
-    road = math.atan2(np.sin(np.multiply(axes, 4.0)).sum(), np.cos(np.multiply(axes, 4.0)).sum()) / 4.0 if axes else 0.0
-    x, y, z = _origin(points, sensor)
-    cos, sin = math.cos(road), math.sin(road)
-    moved = points - np.array([x, y, z, 0.0], np.float32)
-    moved[:, 0], moved[:, 1] = cos * moved[:, 0] + sin * moved[:, 1], cos * moved[:, 1] - sin * moved[:, 0]
-    return Scan(scan.stem, moved, labels)
-
-
-def _origin(points: NDArray[np.float32], sensor: SensorProfile) -> tuple[float, float, float]:
-    """Estimate the sensor's x, y, z [m] in the frame of the points.
-
-    Seen from above, lines through the points of one firing meet at the sensor. Its height is the mounting height above
-    the most frequent z at 5 to 20 m.
-    """
-    xy = points[:, :2].astype(np.float64)
-    along = np.diff(xy, axis=0)
-    length = np.hypot(along[:, 0], along[:, 1])
-    kept = length > 1.0
-    normals = np.stack([-along[kept, 1], along[kept, 0]], axis=1) / length[kept, None]
-    offsets = (normals * xy[:-1][kept]).sum(axis=1)
-    middle = np.median(xy, axis=0)
-    for sigma in np.repeat([5.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.05], 10):  # m
-        weight = np.exp(-(((normals @ middle - offsets) / sigma) ** 2))
-        middle = np.linalg.lstsq(normals * weight[:, None], offsets * weight, rcond=None)[0]
-    flat = np.hypot(*(xy - middle).T)
-    near = points[(flat > 5.0) & (flat < 20.0), 2]
-    counts, edges = np.histogram(near, np.arange(-10.0, 10.0, 0.1))
-    ground = edges[int(np.argmax(counts))] + 0.05
-    return float(middle[0]), float(middle[1]), float(ground + sensor.mount_height_m)
+        labels[inside(Box(name, 1.0, (x, y, z), (length, width, height), yaw), points, 0.05)] = kind
+    return Scan(scan.stem, points, labels)

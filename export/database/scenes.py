@@ -20,6 +20,7 @@ from edgeperc.atomic import write_atomic
 from edgeperc.card import TopViewGeometry
 from edgeperc.errors import CardMismatchError, EdgepercError
 from edgeperc.evaluation.datasets import KittiObjects, scan_hash
+from edgeperc.mounting import MODEL_MOUNTING
 from edgeperc.sensor import get_sensor
 from edgeperc.zoo import model_path
 
@@ -126,7 +127,12 @@ class RoadModel:
     def __init__(self, plan: Plan, model: str, on_mismatch: Literal["warn", "ignore"]) -> None:
         # One thread each, because scenes are made in parallel.
         self.perceive = Perceiver(
-            model, sensor=plan.sensor, provider=plan.provider, n_threads=1, on_mismatch=on_mismatch
+            model,
+            sensor=plan.sensor,
+            mounting=MODEL_MOUNTING,  # the cells are those of the scan's frame
+            provider=plan.provider,
+            n_threads=1,
+            on_mismatch=on_mismatch,
         )
         (card,) = self.perceive.cards
         view = card.view
