@@ -1,7 +1,7 @@
 """The road in a top view for a planner: its outline as a polygon, the free distance, the lane width.
 
-Everything is in the sensor frame [m]: x forward, y left. Cells without a return have the class that the network
-predicted; outside the view nothing is known.
+Everything is in the sensor frame [m]: x forward, y left. Only cells that the scan observed are drivable
+(`TopView.observed`): where the sensor saw nothing, and outside the view, nothing is known.
 """
 
 from __future__ import annotations
@@ -51,13 +51,14 @@ class RoadAhead:
         Middles of the top view's columns, leftmost first.
     free_m : (columns,) float64
         x up to which each column is drivable without a gap, from the near edge of the view. It is the near edge if the
-        nearest cell is not drivable, and the far edge if all cells are drivable.
+        nearest cell is not drivable, and the far edge if all cells are drivable. A cell that the scan did not observe
+        ends it like an obstacle. With a VLP-16 this is often 14 to 20 m ahead, in the gap between two of its beams.
     x_m : (rows,) float64
         Middles of the top view's rows, nearest first.
     left_m, right_m : (rows,) float64
         y of the edges of the corridor ahead. In each row, the corridor is the run of drivable cells that continues the
         run of the row before. NaN before the corridor begins and after it ends, and everywhere if none begins within
-        2 m of the sensor's axis.
+        2 m of the sensor's axis. An edge may be the edge of the road, an object, or the edge of what the scan observed.
     lane_width_m : float
         Estimated from the corridor's width across its direction (median of the nearest 20 m of view), because the map
         has no lane markings. The width is divided by the number of lanes, at least one, that gives about 3.25 m. NaN if
@@ -93,6 +94,7 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
     Parameters
     ----------
     top_view : TopView
+        Cells that the scan did not observe are not free, whatever their label.
     boxes : iterable of Box
         Obstacles that are not road, such as `Perception.boxes`: the top view has no class for pedestrians.
     tolerance_m : float

@@ -2,8 +2,8 @@
 
 A network labels every cell, including those that the sensor could not see. The rays tell which ones it saw. The scan is
 sorted into a polar grid around the sensor, and each sector is followed outwards from one return on the ground to the
-next. Between two such returns, the ray to the farther one passes over the ground. Where it passes at most `CLEARANCE_M`
-above the ground, nothing higher stands, because it would have stopped the ray.
+next. Between the returns of neighboring beams, the ray to the farther one passes over the ground. Where it passes at
+most `CLEARANCE_M` above the ground, nothing higher stands, because it would have stopped the ray.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from .card import TopViewGeometry
 from .errors import PointsError
 from .kernel_cache import njit
 from .points import read_only
+from .sensor import SensorProfile
 
 __all__ = ["CLEARANCE_M", "OVERHEAD_M", "Observer", "fill_lowest_returns", "follow_rays", "mark_cells"]
 
@@ -29,13 +30,19 @@ whose beams are 2 degrees apart, observes the road without gaps up to 20 m; fart
 returns. In 10 simulated scenes, an HDL-64E observes 82 % of all road, an OS1-64 81 % and a VLP-16 54 %; with 0.3 m
 82, 72 and 39 %, with 0.7 m 83, 82 and 61 %. Vehicles hide the 16 % that no sensor at this place sees.
 """
+MAX_BEAMS = 2.2
+"""Two returns on the ground are connected if their beams are at most this many steps of the sensor's beams apart.
+
+One beam may have no return. In a wider gap the ground itself is missing: a pit, water, a floor that reflects nothing.
+"""
 OVERHEAD_M = 2.0
 """A return higher above the ground [m], such as a tree's crown or a ceiling, does not observe the cell below it."""
 
 ROAD_Z_M = -1.73  # the road below the sensor
+MIN_MOUNT_HEIGHT_M = 0.5
 SECTOR_RAD = math.radians(0.4)
 MAX_RINGS = 4096
-FARTHER = 1.25  # rays to returns up to this many times as far as the view may pass closely over its ground
+FARTHER = 1.4  # returns up to this many times as far as the view are used, for the rays that pass over it
 
 # A return is on the ground if it is at most MAX_STEP_M + MAX_SLOPE * distance above or below the previous one, with a
 # distance of at most MAX_REACH_M: returns that follow a long gap are mostly objects.
@@ -52,19 +59,19 @@ class Observer:
     Parameters
     ----------
     view : TopViewGeometry
-    columns : int
-        Number of returns of one beam in a full turn (`SensorProfile.columns`). Sectors are at least twice as wide as
-        the angle between them, so that a missing return leaves no gap, and at least 0.4 degrees.
+    sensor : SensorProfile
+        Its columns and beams. Sectors are at least 0.4 degrees wide, and at least two columns, so that a missing return
+        leaves no gap.
     """
 
-    def __init__(self, view: TopViewGeometry, columns: int) -> None:
+    def __init__(self, view: TopViewGeometry, sensor: SensorProfile) -> None:
         self.shape = (view.height, view.width)
         x, y = np.broadcast_arrays(*view.cell_centers())
         length = np.abs(x) + np.abs(y)
         folded = y / np.where(length > 0.0, length, 1.0)
         azimuth = np.where(x >= 0.0, folded, np.copysign(2.0, y) - folded)
         distance_m = np.hypot(x, y)
-        width = max(SECTOR_RAD, 4.0 * math.pi / columns)
+        width = max(SECTOR_RAD, 4.0 * math.pi / sensor.columns)
         ring_m = max(2.0 * view.cell_m, FARTHER * float(distance_m.max()) / MAX_RINGS)
         first = float(azimuth.min())
         sector, ring = ((azimuth - first) / width).astype(np.int64), (distance_m / ring_m).astype(np.int64)
@@ -74,10 +81,16 @@ class Observer:
         self._bounds = FARTHER * np.array(
             [(min(low, 0.0), max(high, 0.0)) for low, high in (view.x_range_m, view.y_range_m)]
         )
+        # Gradients dz / dx of the beams that meet level ground. A sensor without such beams connects no returns.
+        gradients = np.tan(np.deg2rad([max(angle, -80.0) for angle in sensor.elevations_deg if angle < 0.0]))
+        widest_step = float(np.abs(np.diff(gradients)).max(initial=0.0))
+        self._beams = float(gradients.min(initial=0.0)), MAX_BEAMS * widest_step
         self._lowest, self._level = np.empty((2, *shape), np.float32)
         self._seen = np.empty(shape, np.bool_)
 
-    def observe(self, points: NDArray[np.float32], index: NDArray[np.int32]) -> NDArray[np.bool_]:
+    def observe(
+        self, points: NDArray[np.float32], index: NDArray[np.int32], mount_height_m: float = 1.73
+    ) -> NDArray[np.bool_]:
         """Find the observed cells.
 
         Parameters
@@ -87,12 +100,15 @@ class Observer:
             rows that are not finite are ignored.
         index : (rows, columns) int32
             Highest point of each cell, -1 without one (`TopViewProjector`).
+        mount_height_m : float
+            Height of the beams above the road [m]. Below 0.5 m, 1.73 m is used: either the origin of the points is not
+            at the beams, or the rays are so flat that this only connects fewer returns.
 
         Returns
         -------
         (rows, columns) bool
-            True for a cell with a return at most 2 m above the ground, and for a cell that a ray to a return on the
-            ground passes at most 0.5 m above the ground.
+            True for a cell with a return at most 2 m above the ground, and for a cell between two connected returns on
+            the ground that the ray to the farther one passes at most 0.5 m above the ground.
 
         Raises
         ------
@@ -101,10 +117,12 @@ class Observer:
 
         Notes
         -----
-        Two consecutive returns of a sector are on the ground if they differ in height by at most 0.1 m and 10 % of
-        their distance, or 0.6 m. The first one is compared with the road below the sensor. The ground between them is
-        their connecting line. Cells behind an object are not observed, unless rays pass beside or above it. No ray
-        leads to cells beyond the last return, so they are not observed either.
+        Each sector is followed outwards, by the lowest return of each ring of two cells' width. A return is on the
+        ground if the line from the last return on the ground is level: it rises or falls by at most 0.1 m and 10 % of
+        the distance, with at most 0.6 m in total. The line begins on the road below the sensor. Two returns are
+        connected if one beam at most has no return between them, and no return lies below the line: then the ground
+        between them is that line. Cells behind objects are observed only if rays pass beside them or above them. Cells
+        beyond the last return are not observed.
         """
         if points.ndim != 2 or points.shape[1] != 4 or points.dtype != np.float32:
             raise PointsError(f"points are {points.shape} {points.dtype}; expected (n, 4) float32")
@@ -113,7 +131,8 @@ class Observer:
         rows, of_cell = read_only(points), read_only(index, np.int32)
         observed = np.empty(self.shape, np.bool_)
         fill_lowest_returns(rows, self._bounds, self._grid, self._lowest)
-        follow_rays(self._lowest, float(self._grid[2]), self._level, self._seen)
+        z_beams = mount_height_m + ROAD_Z_M if mount_height_m >= MIN_MOUNT_HEIGHT_M else 0.0
+        follow_rays(self._lowest, float(self._grid[2]), z_beams, *self._beams, self._level, self._seen)
         mark_cells(rows, of_cell, self._bin_of_cell, self._level, self._seen, observed)
         return observed
 
@@ -162,7 +181,13 @@ def fill_lowest_returns(
 
 @njit(cache=True, nogil=True)
 def follow_rays(
-    lowest: NDArray[np.float32], ring_m: float, level: NDArray[np.float32], seen: NDArray[np.bool_]
+    lowest: NDArray[np.float32],
+    ring_m: float,
+    z_beams: float,
+    first_gradient: float,
+    max_apart: float,
+    level: NDArray[np.float32],
+    seen: NDArray[np.bool_],
 ) -> None:
     """Follow the ground outwards in every sector.
 
@@ -171,33 +196,46 @@ def follow_rays(
     lowest : (sectors, rings) float32
         From `fill_lowest_returns`.
     ring_m : float
+        Width of a ring [m].
+    z_beams : float
+        z of the beams [m], from which all rays start.
+    first_gradient : float
+        dz / dx of the lowest beam.
+    max_apart : float
+        Largest difference of the gradients of two connected returns.
     level : (sectors, rings) float32, overwritten
         z of the ground [m]: on the line between two returns on the ground; that of the last one beyond it.
     seen : (sectors, rings) bool, overwritten
-        Bins with a return below `OVERHEAD_M`, and bins that a ray passes at most `CLEARANCE_M` above the ground.
+        Bins with a return below `OVERHEAD_M`, and bins between two connected returns that the ray to the farther one
+        passes at most `CLEARANCE_M` above the ground.
     """
     n_sectors, n_rings = lowest.shape
     for sector in range(n_sectors):
-        last = -1  # the last return on the ground, its distance and z; first the road below the sensor
-        x_last = 0.0
-        z_last = ROAD_Z_M
+        # The last return on the ground: distance, z, gradient of its ray. At first the road below the sensor; it is
+        # connected with the return of the lowest beam.
+        x_last, z_last, gradient = 0.0, ROAD_Z_M, first_gradient
+        begin = 0  # the ring after it, or after a return below the ground
         for ring in range(n_rings):
             z = np.float64(lowest[sector, ring])
             rise = z - z_last
             level[sector, ring] = z_last
             seen[sector, ring] = rise <= OVERHEAD_M
             x = (ring + 0.5) * ring_m
-            if not abs(rise) <= MAX_STEP_M + MAX_SLOPE * min(x - x_last, MAX_REACH_M):
+            limit = MAX_STEP_M + MAX_SLOPE * min(x - x_last, MAX_REACH_M)
+            if rise < -limit:
+                begin = ring + 1
+            if not abs(rise) <= limit:
                 continue
             # The ray is on the ground at x and this high above it at x_last; in between, its height is linear.
-            height = z * x_last / x - z_last
+            height = z_beams + (z - z_beams) * x_last / x - z_last
             share = CLEARANCE_M / height if height > CLEARANCE_M else 1.0
-            for between in range(last + 1, ring):
+            apart = (z - z_beams) / x - gradient
+            for between in range(begin, ring):
                 back = (x - (between + 0.5) * ring_m) / (x - x_last)
                 level[sector, between] = z - rise * back
-                seen[sector, between] |= back <= share
+                seen[sector, between] |= (back <= share) & (apart <= max_apart)
             level[sector, ring] = z
-            last, x_last, z_last = ring, x, z
+            x_last, z_last, gradient, begin = x, z, (z - z_beams) / x, ring + 1
 
 
 @njit(cache=True, nogil=True)

@@ -110,7 +110,8 @@ _BOX_COLUMNS = (
 _MAP_COLUMNS = (("ACC", "accuracy"), ("mAP", "mean_ap"), ("mIoU", "mean_iou"), ("95 %", "mean_iou_interval"))
 _ROAD_COLUMNS = (
     *(("F1", "f1"), ("95 %", "f1_interval"), ("AP", "ap"), ("ACC", "accuracy"), ("PRE", "precision")),
-    *(("REC", "recall"), ("IoU", "iou"), ("MaxF", "max_f1"), ("cells", "n_cells")),
+    *(("REC", "recall"), ("IoU", "iou"), ("MaxF", "max_f1"), ("observed PRE", "drivable_precision")),
+    *(("observed REC", "drivable_recall"), ("cells", "n_cells")),
 )
 _BLOCKS = {"real": "real scans with boxes", "semantickitti": "SemanticKITTI", "simulated": "simulated scans"}
 

@@ -135,7 +135,7 @@ def _figures(tallies: Tallies) -> dict[str, Any]:
         elif group == "segmentation":
             found.setdefault(group, {}).setdefault(key[1], {})[band] = _map_row(tally)
         elif group == "road":
-            found.setdefault(group, {})[band] = _road_row(tally, tallies["decision", band])
+            found.setdefault(group, {})[band] = _road_row(tally, tallies["decision", band], tallies["drivable", band])
     return found
 
 
@@ -172,10 +172,11 @@ def _map_row(confusion: Confusion) -> dict[str, Any]:
     }
 
 
-def _road_row(sweep: ProbabilitySweep, decision: Confusion) -> dict[str, Any]:
+def _road_row(sweep: ProbabilitySweep, decision: Confusion, drivable: Confusion) -> dict[str, Any]:
     """Figures of the model's own decision, and best F1 and average precision over thresholds of its probability.
 
-    ``"confusion"`` holds shares of all cells; rows are the truth (top-view database, Figure 21).
+    ``"confusion"`` holds shares of all cells; rows are the truth (top-view database, Figure 21). The figures
+    ``"drivable_..."`` are of `TopView.drivable`, which leaves out road that the scan did not observe.
     """
     (_, false), (missed, hits) = decision.counts.tolist()
     return {
@@ -183,6 +184,8 @@ def _road_row(sweep: ProbabilitySweep, decision: Confusion) -> dict[str, Any]:
         "precision": float(decision.precision()[1]),
         "recall": float(decision.recall()[1]),
         "f1": 2 * hits / (2 * hits + false + missed) if hits + missed else math.nan,
+        "drivable_precision": float(drivable.precision()[1]),
+        "drivable_recall": float(drivable.recall()[1]),
         "accuracy": decision.accuracy(),
         "max_f1": sweep.max_f1(),
         "ap": sweep.average_precision(),

@@ -175,6 +175,7 @@ def _draw_top_view(
     for k, name in enumerate(top_view.classes):
         if k:
             layer[top_view.labels == k] = (*rgb([color_of(name)])[0], 0.62 if name == "drivable" else 0.45)
+    layer[~top_view.observed & ((top_view.labels == 0) | top_view.road)] = (*rgb([FAINT])[0], 0.22)
     extent = (y_left, y_right, x_near, x_far)
     axes.imshow(layer, extent=extent, aspect="auto", interpolation="nearest", zorder=1)
     x, y, z = points[:, :3].astype(np.float64).T
@@ -218,7 +219,7 @@ def _draw_top_view(
     if text:
         labels.append(Label(beside_arrow, text, AMBER if arrow is None else INK))
     n_omitted = place_labels(axes, labels, avoid)
-    _write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", _omitted("scores", n_omitted))
+    _write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", _omitted("scores; gray: not observed", n_omitted))
     return width
 
 
