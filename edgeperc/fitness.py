@@ -438,7 +438,7 @@ def check_fitness(points: NDArray[np.float32], profile: FitnessProfile, sensor: 
     -------
     tuple of Finding
         One sentence for each difference; empty if there is none. Gross are: another unit; a vertical axis that is not
-        z, or points down; ground more than 1.5 m from where it lay in training; no points below the horizon; points
+        z, or points down; ground more than 1.3 m from where it lay in training; no points below the horizon; points
         far above the sensor's field of view; points in less than a quarter of the model's view; half of the points as
         near as in a room; less than 1/20 of the fewest or more than 20 times the most points in training; fewer than
         eight rows of points; remission that is constant, missing or off the sensor's range.
@@ -468,8 +468,9 @@ def _too_few(scan: _Measures, profile: FitnessProfile) -> Finding:
 _UNITS = (("millimeters", 1e3), ("centimeters", 1e2), ("kilometers", 1e-3))
 
 # Bounds of a gross difference.
-# A ground this much higher is level with the roofs of cars; the ground of 481 KITTI scans varies by 0.4 m.
-_GROUND_OFF_M = 1.5
+# Less than the height of a sensor on a car, so that an origin on the road is found. The ground of 481
+# KITTI scans varies by 0.4 m.
+_GROUND_OFF_M = 1.3
 # Points this far above the sensor's field of view and that of training. At most 2 deg in KITTI and PandaSet; 16 deg if
 # PandaSet's origin is on the road.
 _TOO_HIGH_DEG = 12.0
