@@ -32,6 +32,7 @@ import numba.core.sigutils
 import numpy as np
 
 from .atomic import write_atomic
+from .errors import SettingsError
 from .tuning import cache_folder, unsafe_because
 
 __all__ = ["KernelCache", "njit"]
@@ -191,7 +192,7 @@ class KernelCache:
             yield self._source.parent / "__pycache__"
         try:
             yield cache_folder() / "kernels" / place
-        except RuntimeError:  # there is no home folder
+        except SettingsError:  # there is no home folder
             return
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Literal, ParamSpec
+from typing import Literal, NoReturn, ParamSpec
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +23,7 @@ from .card import ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, join_boxes, objects_from_points
 from .decode import decode_classes, decode_top_view
 from .drivable import compile_kernels
-from .errors import FitnessError, MountingError, OptionError
+from .errors import EdgepercError, FitnessError, MountingError, OptionError
 from .fitness import Finding, FitnessProfile, check_fitness
 from .ground import find_ground
 from .level import ModelFrame, MountingEstimate, MountingEstimator
@@ -259,7 +259,8 @@ class Perceiver:
         self.cards = tuple(n.session.card for n in self._networks)
         self.providers = MappingProxyType({n.session.card.name: n.session.description for n in self._networks})
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
-        self._lock = threading.Lock()
+        # A lock for each process: after a fork, the one that held the lock may be missing.
+        self._locks = {os.getpid(): threading.Lock()}
         # Compile every kernel here, not in the first call, with a scan of two points. The networks have already run on
         # their golden inputs, and those outputs are decoded.
         warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
@@ -271,9 +272,12 @@ class Perceiver:
             compile_kernels()  # of `edgeperc.road_ahead`
 
     def __setattr__(self, name: str, value: object) -> None:
-        if not name.startswith("_") and "_lock" in vars(self):  # the last attribute of construction
+        if not name.startswith("_") and "_locks" in vars(self):  # the last attribute of construction
             raise AttributeError(f"{name} of a Perceiver cannot be set after construction; make another Perceiver")
         super().__setattr__(name, value)
+
+    def __reduce__(self) -> NoReturn:
+        raise EdgepercError("a Perceiver cannot be pickled or copied; construct it in the process that calls it")
 
     @property
     def mounting(self) -> MountingEstimate | None:
@@ -323,7 +327,7 @@ class Perceiver:
             The scan differs from the training scans, grossly if ``on_mismatch`` is ``"refuse"``.
         """
         scan = as_points(points)
-        with self._lock:
+        with self._locks.setdefault(os.getpid(), threading.Lock()):
             check = self._to_check > 0 and len(scan) > 0
             perception = self._perceive(scan, stamp_s, check)
             self._to_check -= check

@@ -17,7 +17,7 @@ import os
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from .errors import (
     CardError,
     CardMismatchError,
+    EdgepercError,
     InferenceError,
     ModelFileError,
     OptionError,
@@ -33,6 +34,7 @@ from .errors import (
 )
 from .extras import require
 from .onnx_file import check_graph, read_model
+from .printable import printable
 from .tuning import compiled_folder, cpu_features, fingerprint, read_setting, settings_path
 from .zoo import Variant, choose, digest, resolve
 
@@ -181,6 +183,11 @@ class Session:
         The first run failed.
     MissingExtraError
         onnxruntime is not installed.
+
+    Notes
+    -----
+    A session belongs to its process. In a forked child it runs only with ``provider="cpu"`` and ``n_threads=1``: the
+    threads of a provider do not exist there, and waiting for them would never end. It cannot be pickled.
     """
 
     def __init__(
@@ -196,6 +203,7 @@ class Session:
             raise OptionError(f"n_threads is {n_threads}; expected at least 1, or None")
         _check_names(provider, precision)
         self._trusted = trusted
+        self._made_in, self._running_in = os.getpid(), 0
         ort = _onnxruntime()
         variants = resolve(model)
         self.digest = digest(variants)
@@ -253,7 +261,7 @@ class Session:
         if setting["provider"] not in present:
             logger.warning(
                 "provider auto skips %s on %s, which was measured as the fastest: it is no longer available",
-                *(name, setting["provider"]),
+                *(name, printable(setting["provider"])),
             )
             return []
         return [(setting["provider"], setting["precision"], setting["n_threads"] if n_threads is None else n_threads)]
@@ -264,6 +272,7 @@ class Session:
         blob = read_model(self.path)
         check_graph(blob, self.path, trusted=self._trusted)
         self.sha256 = hashlib.sha256(blob).hexdigest()
+        self._has_threads = short != "cpu" or n_threads != 1
         self._session = self._open(ort, blob, short, precision, n_threads)
         self._check_graph()
         with _terminated(ort, None if self._trusted else MAX_FIRST_RUN_S) as run_options:
@@ -431,10 +440,27 @@ class Session:
         Raises
         ------
         InferenceError
-            onnxruntime failed.
+            onnxruntime failed, or this process was forked from the one that made the session, and the session has
+            threads or was running then.
         """
-        self._run()
+        here = os.getpid()
+        if here != self._made_in and (self._has_threads or self._running_in not in (0, here)):
+            raise InferenceError(
+                f"{self.path}: this session was made in process {self._made_in}, whose threads do not exist in process "
+                f"{here}; construct the Perceiver in the process that calls it. With provider 'cpu' and n_threads=1 it "
+                "also works in a process that is forked between two calls"
+            )
+        self._running_in = here
+        try:
+            self._run()
+        finally:
+            self._running_in = 0
         return self.outputs
+
+    def __reduce__(self) -> NoReturn:
+        raise EdgepercError(
+            f"a session of {self.path} cannot be pickled or copied; construct a Perceiver or Session in each process"
+        )
 
     def _run(self, *run_options: Any) -> None:
         try:

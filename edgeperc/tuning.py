@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
+import math
 import os
 import platform
+import reprlib
 import stat
 import sys
 from collections.abc import Mapping
@@ -30,19 +33,33 @@ __all__ = [
     "write_settings",
 ]
 
+logger = logging.getLogger(__name__)
+
 SCHEMA = 2
+MAX_BYTES = 1 << 24  # of a settings file; an entry has about 200
+MAX_THREADS = 4096
 
 
 def cache_folder() -> Path:
-    """``$EDGEPERC_CACHE_DIR``, or ``edgeperc`` in the system's cache folder; not created by this call."""
+    """``$EDGEPERC_CACHE_DIR``, or ``edgeperc`` in the system's cache folder; not created by this call.
+
+    Raises
+    ------
+    SettingsError
+        The user has no home folder, and no variable names another one.
+    """
     given = os.environ.get("EDGEPERC_CACHE_DIR")
     if given:
         return Path(given)
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local")) / "edgeperc"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "edgeperc"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "edgeperc"
+    name = {"win32": "LOCALAPPDATA", "darwin": ""}.get(sys.platform, "XDG_CACHE_HOME")
+    system = os.environ.get(name)
+    try:
+        if not system:
+            inside = {"win32": "AppData/Local", "darwin": "Library/Caches"}.get(sys.platform, ".cache")
+            system = str(Path.home() / inside)
+    except RuntimeError as exc:
+        raise SettingsError("this user has no home folder; set EDGEPERC_CACHE_DIR to a folder") from exc
+    return Path(system) / "edgeperc"
 
 
 def unsafe_because(status: os.stat_result) -> str | None:
@@ -81,15 +98,23 @@ def compiled_folder(engine: str, sha256: str, precision: str) -> Path | None:
     Returns
     -------
     Path or None
-        None if the folder is not writable; the engine then compiles at every start.
+        None if there is no folder that this user can write and other users cannot. The engine then compiles at every
+        start, and a warning in the log says so.
     """
     name = hashlib.sha256(f"{engine} {fingerprint()} {precision}".encode()).hexdigest()[:16]
     try:
         folder = cache_folder() / "compiled" / f"{sha256[:16]}-{name}"
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):  # RuntimeError: there is no home folder
-        return None
-    return folder if os.access(folder, os.W_OK) else None
+        # mkdir's mode, lessened by the umask, is that of the last folder only.
+        folder.parent.mkdir(0o755, parents=True, exist_ok=True)
+        folder.mkdir(0o755, exist_ok=True)
+        reason = unsafe_because(folder.parent.stat()) or unsafe_because(folder.stat())
+        if reason is None and os.access(folder, os.W_OK):
+            return folder
+        message = f"{folder}: {reason or 'it cannot be written'}"
+    except (OSError, SettingsError) as exc:
+        message = str(exc)
+    logger.warning("the compiled model is not kept, and every start compiles it again: %s", message)
+    return None
 
 
 def cpu_model() -> str:
@@ -150,11 +175,17 @@ def write_settings(path: Path, machine: str, entries: Mapping[str, Mapping[str, 
     ------
     SettingsError
         The file exists and is not a settings file.
+    OSError
+        The file cannot be written; it is unchanged.
     """
-    document: dict[str, Any] = _read(path) if path.exists() else {"schema": SCHEMA, "machines": {}}
+    document = _read(path) or {"schema": SCHEMA, "machines": {}}
     document["machines"].setdefault(machine, {}).update({sha: dict(entry) for sha, entry in entries.items()})
+    try:
+        text = json.dumps(document, indent=1, sort_keys=True, allow_nan=False)
+    except RecursionError as exc:
+        raise SettingsError(f"{path} is nested too deeply for settings; delete it, or name another file") from exc
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, (json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n").encode())
+    write_atomic(path, f"{text}\n".encode())
 
 
 def read_setting(path: Path, machine: str, digest: str) -> dict[str, Any] | None:
@@ -170,14 +201,14 @@ def read_setting(path: Path, machine: str, digest: str) -> dict[str, Any] | None
     SettingsError
         The file is not a settings file, or the entry is malformed.
     """
-    if not path.exists():
-        return None
-    entry = _read(path)["machines"].get(machine, {}).get(digest)
+    document = _read(path)
+    entry = None if document is None else document["machines"].get(machine, {}).get(digest)
     if entry is None:
         return None
     if not isinstance(entry, dict) or not _is_setting(entry):
         raise SettingsError(
-            f"{path} has the entry {entry!r} for a model; expected a provider, a precision and n_threads; delete it"
+            f"{path} has the entry {reprlib.repr(entry)} for a model; expected a provider, a precision and n_threads, "
+            f"at most {MAX_THREADS}; delete it"
         )
     return entry
 
@@ -185,13 +216,23 @@ def read_setting(path: Path, machine: str, digest: str) -> dict[str, Any] | None
 def _is_setting(entry: Mapping[str, Any]) -> bool:
     n_threads = entry.get("n_threads")
     are_names = all(isinstance(entry.get(key), str) for key in ("provider", "precision"))
-    return are_names and (n_threads is None or (isinstance(n_threads, int) and n_threads >= 1))
+    is_timed = type(entry.get("p50_ms", 0.0)) in (int, float)
+    return are_names and is_timed and (n_threads is None or (type(n_threads) is int and 1 <= n_threads <= MAX_THREADS))
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> dict[str, Any] | None:
+    """The document; None if there is no file."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as exc:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise ValueError("it is not a regular file")
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+        if len(content) > MAX_BYTES:
+            raise ValueError(f"it has more than {MAX_BYTES:,} bytes")
+        document = json.loads(content, parse_constant=_refuse, parse_float=_finite)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, RecursionError) as exc:
         raise SettingsError(f"{path} cannot be read as settings: {exc}; delete it, or name another file") from exc
     machines = document.get("machines") if isinstance(document, dict) else None
     if machines is None or document.get("schema") != SCHEMA or not isinstance(machines, dict):
@@ -199,3 +240,12 @@ def _read(path: Path) -> dict[str, Any]:
     if not all(isinstance(models, dict) for models in machines.values()):
         raise SettingsError(f"{path} holds no settings by model; name another file, or delete it")
     return document
+
+
+def _refuse(constant: str) -> float:
+    raise ValueError(f"{constant} is not a number of JSON")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    return number if math.isfinite(number) else _refuse(text)

@@ -74,10 +74,10 @@ def add_parser(subparsers: Subparsers) -> None:
         "--recommend",
         type=Path,
         nargs="?",
-        const=settings_path(),
+        const="",
         metavar="FILE",
-        help="save the recommendation to FILE; without FILE, where Perceiver(provider='auto') finds it "
-        f"({settings_path()})",
+        help="save the recommendation to FILE; without FILE, to settings.json in the folder EDGEPERC_CACHE_DIR, by "
+        "default edgeperc in the user's cache folder, where Perceiver(provider='auto') finds it",
     )
     parser.set_defaults(run=run_command)
 
@@ -86,6 +86,8 @@ def run_command(arguments: argparse.Namespace) -> int:
     """Measure all settings, one model at a time."""
     from ..measure import reference
 
+    if arguments.recommend == "":
+        arguments.recommend = settings_path()
     with new_document("matrix", arguments) as (document, live), tempfile.TemporaryDirectory() as folder:
         scans = prepare_input(arguments, Path(folder), document, live)
         scenario = Scenario(SINGLE_STREAM, scans.files, limits_of(arguments))

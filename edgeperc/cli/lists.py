@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
+from ..errors import SettingsError
 from .arguments import DEFAULT_SENSOR, Commands, add_command
 from .output import print_columns, print_line
 
@@ -57,12 +59,14 @@ def models_command(arguments: argparse.Namespace) -> int:
     from ..tuning import fingerprint, read_setting, settings_path
     from ..zoo import digest, resolve
 
-    machine = fingerprint()
+    machine, listed = fingerprint(), models()
+    measured: list[dict[str, Any] | None] = [None] * len(listed)
+    try:
+        measured = [read_setting(settings_path(), machine, digest(resolve(model.name))) for model in listed]
+    except SettingsError as exc:
+        warnings.warn(f"what was measured on this computer is not shown: {exc}", stacklevel=2)
     return _print(
-        [
-            {**_fields(model), "measured": read_setting(settings_path(), machine, digest(resolve(model.name)))}
-            for model in models()
-        ],
+        [{**_fields(model), "measured": setting} for model, setting in zip(listed, measured, strict=True)],
         {
             "name": lambda of: of["name"],
             "default": lambda of: _mark(of["default"]),
