@@ -32,6 +32,7 @@ from .errors import (
     MissingExtraError,
     ModelError,
     ModelFileError,
+    MountingError,
     OptionError,
     PointsError,
     ProviderError,
@@ -45,8 +46,10 @@ from .errors import (
 if TYPE_CHECKING:
     from .card import ModelCard
     from .drivable import RoadAhead, road_ahead
+    from .level import ModelFrame
     from .listing import ModelInfo, ProviderInfo, SensorInfo, models, providers, sensors
     from .live import Answer, Stream, stream
+    from .mounting import Mounting
     from .perceiver import Perceiver
     from .perception import Box, Perception, PointLabels, TopView
     from .readers.captures import read_scans
@@ -67,7 +70,10 @@ __all__ = [
     "ModelCard",
     "ModelError",
     "ModelFileError",
+    "ModelFrame",
     "ModelInfo",
+    "Mounting",
+    "MountingError",
     "OptionError",
     "Perceiver",
     "Perception",
@@ -105,7 +111,9 @@ _MODULES = {
     "Answer": "live",
     "Box": "perception",
     "ModelCard": "card",
+    "ModelFrame": "level",
     "ModelInfo": "listing",
+    "Mounting": "mounting",
     "Perceiver": "perceiver",
     "Perception": "perception",
     "PointLabels": "perception",

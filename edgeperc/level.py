@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .perception import Box
 from .points import read_only
 
-__all__ = ["ModelFrame", "MountingEstimate", "MountingEstimator"]
+__all__ = ["FROZEN_AFTER", "ModelFrame", "MountingEstimate", "MountingEstimator"]
 
 # What differs from the training vehicle by less is taken for the street's own slope and camber, and scans stay as they
 # are. In single KITTI scans the estimates of one mounting scatter by 0.03 m, 1.0 deg of roll and 0.3 deg of pitch. An
@@ -105,6 +106,10 @@ class MountingEstimate:
     yaw_sd_deg: float
     n_scans: int
 
+    def to_dict(self) -> dict[str, Any]:
+        """Convert to a dict for JSON."""
+        return {**asdict(self), "mounting": self.mounting.to_dict()}
+
     def __str__(self) -> str:
         m = self.mounting
         parts = [
@@ -158,6 +163,11 @@ class MountingEstimator:
     def __init__(self, known: Mounting) -> None:
         self.known = known
         self._found: tuple[tuple[float, float, float, float], ...] = ()
+
+    @property
+    def n_scans(self) -> int:
+        """Scans that were used."""
+        return len(self._found)
 
     @property
     def is_complete(self) -> bool:

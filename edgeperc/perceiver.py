@@ -349,9 +349,12 @@ class Perceiver:
             except MountingError as exc:
                 hidden = self._without_ground(exc)
             watch.lap("check")
-        scan = self._frame.move(scan)
-        watch.lap("adapt")
-        fitness = (*self._check(scan), *hidden) if check else ()
+        if not self._frame.is_identity:
+            scan = self._frame.move(scan)
+            watch.lap("adapt")
+        fitness = self._check(scan) if check else ()
+        if check and not any(finding.gross for finding in fitness):
+            fitness = (*fitness, *hidden)
         if infer:
             try:
                 self._refuse(fitness)

@@ -38,6 +38,7 @@ from edgeperc import (
 )
 from edgeperc.card import RangeImageGeometry, TopViewGeometry
 from edgeperc.geometry import inside, oriented_iou
+from edgeperc.mounting import MODEL_MOUNTING
 from edgeperc.perception import PointLabels
 from edgeperc.sensor import get_sensor
 from edgeperc.simulation.drawn import random_scene
@@ -333,9 +334,9 @@ def test_gross_differences_are_refused_before_a_network_runs(
 def test_other_differences_are_warned_of(scan: SimulatedScan) -> None:
     raised = scan.points + np.float32([0, 0, 1.0, 0])
     with pytest.warns(UserWarning, match=r"The ground lies at z = -0\.7 m"):
-        assert Perceiver("pointseg", provider="cpu")(raised).fitness
+        assert Perceiver("pointseg", mounting=MODEL_MOUNTING, provider="cpu")(raised).fitness
     with pytest.raises(FitnessError, match=r"The ground lies at z = -0\.7 m"):
-        Perceiver("pointseg", provider="cpu", on_mismatch="raise")(raised)
+        Perceiver("pointseg", mounting=MODEL_MOUNTING, provider="cpu", on_mismatch="raise")(raised)
 
 
 def test_mismatch_can_be_ignored(scan: SimulatedScan) -> None:
@@ -545,8 +546,10 @@ def test_car_cut_by_the_views_edge_gets_a_full_box_or_none(seen: float, n_boxes:
 
 
 def test_boxes_all_around_the_vehicle(scan: SimulatedScan) -> None:
-    ahead = Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore")
-    around = Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore", full_turn=True)
+    ahead = Perceiver("pointseg", mounting=MODEL_MOUNTING, provider="cpu", n_threads=1, on_mismatch="ignore")
+    around = Perceiver(
+        "pointseg", mounting=MODEL_MOUNTING, provider="cpu", n_threads=1, on_mismatch="ignore", full_turn=True
+    )
     seen, every = ahead(scan.points), around(scan.points)
     assert seen.points is not None
     assert every.points is not None

@@ -109,7 +109,6 @@ def test_sensors_agree_with_the_profiles() -> None:
         assert (sensor.beams, sensor.columns) == (len(profile.elevations_deg), profile.columns)
         assert sensor.field_of_view_deg == (min(profile.elevations_deg), max(profile.elevations_deg))
         assert sensor.remission_range == profile.remission_range
-        assert sensor.mount_height_m == profile.mount_height_m
         assert (sensor.rendered_as is None) == (profile.remission is None)
 
 

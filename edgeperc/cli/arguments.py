@@ -21,10 +21,12 @@ __all__ = [
     "add_command",
     "add_figures_file",
     "add_model",
+    "add_mounting",
     "add_network",
     "add_provider",
     "add_sensor",
     "add_topic",
+    "finite_number",
     "positive",
     "positive_number",
 ]
@@ -103,6 +105,34 @@ def add_sensor(group: Any, *, required: bool = False, of_capture: bool = False) 
         help="the LiDAR that recorded the scans: a name from 'edgeperc sensors', or a .json file written by "
         "'edgeperc fit-sensor'" + (" (required)" if required else f" (default: {default})"),
     )
+
+
+def add_mounting(group: Any) -> None:
+    """Add ``--mount-height``, ``--turn`` and ``--extrinsic``; `edgeperc.cli.scans.with_mounting` reads them."""
+    group.add_argument(
+        "--mount-height",
+        type=finite_number,
+        metavar="M",
+        help="height of the scan's origin above the road [m] (default: found from the ground in the scans)",
+    )
+    group.add_argument(
+        "--turn",
+        type=_yaw,
+        metavar="DEG",
+        help="direction of the scan's x axis, counter-clockwise from straight ahead [deg]: -90 for x right, y forward; "
+        "or 'street': the direction of the street, found from the scans (default: 0)",
+    )
+    group.add_argument(
+        "--extrinsic",
+        type=Path,
+        metavar="FILE",
+        help="T_vehicle_sensor, a 4 x 4 matrix as JSON or text: maps points of a scan into a vehicle frame with x "
+        "forward, z up, and z = 0 on the road (default: tilt is found from the ground in the scans)",
+    )
+
+
+def _yaw(text: str) -> float | str:
+    return text if text == "street" else finite_number(text)
 
 
 def add_topic(group: Any) -> None:
@@ -210,6 +240,14 @@ def positive_number(text: str) -> float:
     value = float(text)
     if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{value} is out of range; expected a number above 0")
+    return value
+
+
+def finite_number(text: str) -> float:
+    """Parse a finite number."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{value} is not finite; expected a number")
     return value
 
 

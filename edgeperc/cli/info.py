@@ -7,15 +7,20 @@ import hashlib
 import json
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import EdgepercError, MissingExtraError
-from .arguments import Commands, add_command, add_sensor, add_topic
+from ..atomic import write_atomic
+from ..errors import EdgepercError, MissingExtraError, MountingError
+from .arguments import Commands, add_command, add_mounting, add_sensor, add_topic
 from .output import print_error, print_line, print_rows
 from .scans import scan_sensor
 
 if TYPE_CHECKING:
+    from ..level import MountingEstimator
+    from ..sensor import SensorProfile
     from ..zoo import Variant
 
 __all__ = ["add_parser", "info_command"]
@@ -32,12 +37,13 @@ def add_parser(commands: Commands) -> None:
         info_command,
         help="what a model is; what a scan looks like and which models suit it",
         description="Describe models by their cards: view, classes, training data, licence and accuracy. Describe "
-        "scans: extent [m], elevations [deg], remission, beams, ground height [m], and for each installed model "
-        "whether the scan resembles its training scans. No model is run.",
+        "scans: extent [m], elevations [deg], remission, beams, the mounting that the ground shows, and for each "
+        "installed model whether the scan resembles its training scans. No model is run.",
         examples=[
             "edgeperc info pointseg",
             "edgeperc info 000123.bin",
             "edgeperc info drive.pcap",
+            "edgeperc info velodyne/*.bin --write my-sensor.json",
             "edgeperc info pointseg:int8 --json",
         ],
     )
@@ -46,15 +52,23 @@ def add_parser(commands: Commands) -> None:
         "things",
         nargs="+",
         metavar="MODEL|SCAN",
-        help="a name from 'edgeperc models', an .onnx file, a scan, or a capture (its first scan)",
+        help="a name from 'edgeperc models', an .onnx file, a scan, or a capture (its first scan; its mounting by the "
+        "first five)",
     )
     add_sensor(reading, of_capture=True)
+    add_mounting(reading)
     add_topic(reading)
     output = parser.add_argument_group("output")
     output.add_argument(
         "--json",
         action="store_true",
         help="print one JSON object for each thing: a model's whole card, a scan's measurements",
+    )
+    output.add_argument(
+        "--write",
+        type=Path,
+        metavar="FILE",
+        help="write the sensor's profile with the mounting that the scans show, for --sensor, a .json file",
     )
 
 
@@ -64,6 +78,9 @@ def info_command(arguments: argparse.Namespace) -> int:
         from ..sensor import get_sensor
 
         get_sensor(arguments.sensor)
+    if arguments.write is not None and arguments.write.suffix != ".json":
+        arguments.usage_error(f"--write {arguments.write}: expected a name that ends in .json")
+    estimators: dict[SensorProfile, MountingEstimator] = {}
     n_failed = n_printed = 0
     for thing in arguments.things:
         try:
@@ -71,7 +88,7 @@ def info_command(arguments: argparse.Namespace) -> int:
                 variants = _variants(thing)
                 rows, document = _model_rows(variants), json.loads(variants[0].card.to_json())
             else:
-                rows, document = _scan_rows(Path(thing), arguments)
+                rows, document = _scan_rows(Path(thing), arguments, estimators)
         except MissingExtraError:
             raise
         except EdgepercError as exc:
@@ -85,7 +102,31 @@ def info_command(arguments: argparse.Namespace) -> int:
                 print_line("")
             print_rows(_folded(rows))
         n_printed += 1
+    n_failed += _mounting_of_all(arguments, estimators)
     return 1 if n_failed else 0
+
+
+def _mounting_of_all(arguments: argparse.Namespace, estimators: Mapping[SensorProfile, MountingEstimator]) -> bool:
+    """Print the mounting by all scans of a sensor, if there are several, and write ``--write``; whether it failed."""
+    for sensor, estimator in estimators.items():
+        if estimator.n_scans > 1 and not arguments.json:
+            print_line("")
+            print_rows([("mounting", f"{estimator.estimate()}; {sensor.name}, by {estimator.n_scans} scans")])
+    if arguments.write is None:
+        return False
+    if len(estimators) != 1:
+        print_error(f"--write: the scans are of {len(estimators)} sensors; expected scans of one")
+        return True
+    ((sensor, estimator),) = estimators.items()
+    try:
+        profile = replace(sensor, mounting=estimator.estimate().mounting)
+    except MountingError as exc:
+        print_error(f"--write: {exc}")
+        return True
+    write_atomic(arguments.write, (profile.to_json() + "\n").encode())
+    if not arguments.json:
+        print_rows([("written", f"{arguments.write}: pass it as --sensor")])
+    return False
 
 
 def _is_model(thing: str) -> bool:
@@ -178,19 +219,23 @@ def _megabytes(path: Path) -> str:
     return f"{path.stat().st_size / 1e6:.1f} MB"
 
 
-def _scan_rows(path: Path, arguments: argparse.Namespace) -> tuple[list[tuple[str, str]], dict[str, Any]]:
+def _scan_rows(
+    path: Path, arguments: argparse.Namespace, estimators: dict[SensorProfile, MountingEstimator]
+) -> tuple[list[tuple[str, str]], dict[str, Any]]:
     """Measure a scan and check which models suit it: rows to print, and the same measurements for JSON."""
     import numpy as np
 
     from ..adapt import condition
     from ..fitness import FitnessProfile, check_fitness
+    from ..level import FROZEN_AFTER, ModelFrame, MountingEstimator
     from ..readers.captures import read_scans
     from ..sensor import get_sensor
     from ..zoo import listed
 
     named, because = scan_sensor(path, arguments)
     sensor = get_sensor(named)
-    _, points = next(read_scans(path, topic=arguments.topic))  # the first scan of a capture
+    first = [points for _, points in islice(read_scans(path, topic=arguments.topic), FROZEN_AFTER)]
+    points = first[0]
     finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
     n_lost = len(points) - len(finite)
     document: dict[str, Any] = {
@@ -225,10 +270,23 @@ def _scan_rows(path: Path, arguments: argparse.Namespace) -> tuple[list[tuple[st
     if sensor.remission is not None:
         rows.append(("", f"mapped to that of the {sensor.remission.to} by a {sensor.remission.kind}"))
     scan, _ = condition(points, sensor)
+    own = MountingEstimator(sensor.mounting)
+    shared = estimators.setdefault(sensor, own)
+    try:
+        for each in first:
+            conditioned, _ = condition(each, sensor)
+            own, shared = own.add(conditioned), shared.add(conditioned)
+        estimate = own.estimate()
+    except MountingError as exc:
+        rows.append(("mounting", f"cannot be estimated: {exc}"))
+        document["mounting"] = None
+    else:
+        rows.append(("mounting", str(estimate)))
+        document["mounting"] = estimate.to_dict()
+    estimators[sensor] = shared
+    scan = ModelFrame(own.mounting()).move(scan)
     profile = FitnessProfile.from_scans([scan])
-    ground_m = None if profile.ground_m is None else round(float(profile.ground_m[0]), 2)
     rows.append(("beams", f"about {profile.beams[0]:.0f} rows of points ({sensor.name}: {sensor.n_beams})"))
-    rows.append(("ground", "not found" if ground_m is None else f"at z = {ground_m:.1f} m"))
     findings: dict[str, list[str] | None] = {}
     for card in {variant.name: variant.card for variant in listed()}.values():
         if card.fitness is None:
@@ -240,5 +298,5 @@ def _scan_rows(path: Path, arguments: argparse.Namespace) -> tuple[list[tuple[st
         rows += [(card.name, f"as a scan of {sensor.name}: {sentence}") for sentence in found]
         if not found:
             rows.append((card.name, f"suits this scan, taken as one of {sensor.name}"))
-    document |= {"beams": round(float(profile.beams[0])), "ground_m": ground_m, "models": findings}
+    document |= {"beams": round(float(profile.beams[0])), "models": findings}
     return rows, document

@@ -21,6 +21,7 @@ from .arguments import (
     add_adapt,
     add_command,
     add_model,
+    add_mounting,
     add_network,
     add_sensor,
     add_topic,
@@ -73,6 +74,7 @@ def add_parser(commands: Commands) -> None:
         "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .osf, .bag, .mcap, a ROS 2 bag's folder (extra 'io')",
     )
     add_sensor(reading, of_capture=True)
+    add_mounting(reading)
     add_topic(reading)
     reading.add_argument(
         "--on-mismatch",

@@ -7,6 +7,7 @@ import os
 import re
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from ..readers.identify import KnownSensor
     from ..sensor import SensorProfile
 
-__all__ = ["Scans", "find_scans", "output_names", "scan_folders", "scan_namer", "scan_sensor"]
+__all__ = ["Scans", "find_scans", "output_names", "scan_folders", "scan_namer", "scan_sensor", "with_mounting"]
 
 # Folders of scans in data sets: KITTI object and tracking, SemanticKITTI, a KITTI raw drive, a day of raw drives.
 _LAYOUTS = (
@@ -117,7 +118,8 @@ def scan_sensor(path: Path, arguments: argparse.Namespace) -> tuple[str | Sensor
     known: KnownSensor | None
     if arguments.sensor is None:
         known = known_sensor(path, arguments.topic)
-        return (DEFAULT_SENSOR, "the default for scan files") if known is None else known
+        sensor, because = (DEFAULT_SENSOR, "the default for scan files") if known is None else known
+        return with_mounting(sensor, arguments), because
     given = get_sensor(arguments.sensor)
     try:
         known = known_sensor(path, arguments.topic)
@@ -129,7 +131,30 @@ def scan_sensor(path: Path, arguments: argparse.Namespace) -> tuple[str | Sensor
             f"{given.name}",
             stacklevel=2,
         )
-    return arguments.sensor, "as --sensor says"
+    return with_mounting(given, arguments), "as --sensor says"
+
+
+def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:
+    """The sensor with the mounting of ``--extrinsic``, ``--mount-height`` and ``--turn``, where they are given.
+
+    Raises
+    ------
+    SensorError
+        A value is impossible, or the file of ``--extrinsic`` cannot be read.
+    """
+    from ..mounting import Mounting
+    from ..sensor import get_sensor
+
+    height_m, turn, file = (getattr(arguments, name, None) for name in ("mount_height", "turn", "extrinsic"))
+    if height_m is None and turn is None and file is None:
+        return sensor
+    profile = get_sensor(sensor)
+    mounting = profile.mounting if file is None else Mounting.from_file(file)
+    if height_m is not None:
+        mounting = replace(mounting, height_m=height_m)
+    if turn is not None:
+        mounting = replace(mounting, yaw_deg=None if turn == "street" else turn)
+    return replace(profile, mounting=mounting)
 
 
 def output_names(scans: Sequence[Path], *, keep_folder: bool = False) -> list[Path]:
