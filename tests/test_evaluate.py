@@ -284,6 +284,7 @@ def test_road_by_hand(world: World) -> None:
     said[259, cols[[0, 1, 5, 8]]] = 1
     said[259, cols[[4, 6]]] = 3
     world.cells["ssadnet"] = said
+    world.observed[259, cols[[1, 3]]] = False
     world.probability = np.full((400, 200), 0.9)
     world.probability[259, cols[:8]] = [1.0, 0.8, 0.4, 0.3, 0.0, 0.6, 0.0, 0.0]
     judge = Judge(["ssadnet"])
@@ -299,6 +300,7 @@ def test_road_by_hand(world: World) -> None:
         [2 / 3, 2 / 4, 2 / 5, 4 / 7], abs=1e-4
     )
     assert road["accuracy"] == pytest.approx(5 / 8)
+    assert (road["drivable_precision"], road["drivable_recall"]) == (1 / 2, 1 / 4)  # the second cell is not observed
     assert road["confusion"] == [[3 / 8, 1 / 8], [2 / 8, 2 / 8]]  # shares of all, rows the truth
     # By falling probability: road, road, other, road, road. With all four taken: 4 of 5 right.
     assert road["max_f1"] == pytest.approx(8 / 9, abs=1e-4)

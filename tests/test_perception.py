@@ -90,6 +90,19 @@ def test_perception_as_json_counts_points_by_class() -> None:
     assert empty["point_counts"] is empty["drivable_area_m2"] is empty["stamp_s"] is None
 
 
+def test_only_observed_road_is_in_the_json() -> None:
+    found = perception_of()
+    assert found.top_view is not None
+    found.top_view.observed[:100] = False  # farther than 30 m
+    assert found.to_dict()["drivable_area_m2"] == 240.0
+    assert scan_record(found)["road"]["free_ahead_m"] == 30.0
+    assert np.count_nonzero(found.top_view.road) == 400 * 80
+    found.top_view.observed[:] = False
+    nothing = scan_record(found)
+    assert nothing["drivable_area_m2"] == 0.0
+    assert nothing["road"]["outline"] == []
+
+
 def test_a_record_adds_road_and_tracks() -> None:
     tracker = Tracker()
     for k in range(5):

@@ -128,6 +128,25 @@ def test_picture_of_one_view(scan: np.ndarray, perception: Perception) -> None:
 
 
 @pytest.mark.usefixtures("matplotlib")
+def test_road_that_was_not_observed_is_gray(scan: np.ndarray, perception: Perception) -> None:
+    assert perception.top_view is not None
+    bare = replace(perception, n_points=0, points=None, boxes=())
+    observed = np.ones((400, 200), bool)
+    observed[:250] = False  # from 21 m on
+    half = replace(bare, top_view=replace(perception.top_view, observed=observed))
+    gray, green = (pixels(view.draw(each, scan[:0])) for each in (half, bare))
+    # The panel from above: 2 to 3.5 m left of the sensor, 28 to 24 m and 18 to 10 m ahead. Beside the arrow.
+    far, close = (slice(421, 480), slice(245, 266)), (slice(568, 684), slice(245, 266))
+    for picture, place, is_green in ((green, far, True), (green, close, True), (gray, close, True), (gray, far, False)):
+        red, more, _ = picture[place].mean(axis=(0, 1))
+        assert (more > red + 30) == is_green
+    assert gray[far].mean() > 30  # gray, not black like observed background
+    # From behind, the road is green only where it was observed.
+    strong = [(p[128:648, 540:, 1] > p[128:648, 540:, 0] + 30).sum() for p in (gray, green)]
+    assert 0 < strong[0] < 0.95 * strong[1]
+
+
+@pytest.mark.usefixtures("matplotlib")
 def test_picture_is_the_same_again_and_in_other_threads(scan: np.ndarray, perception: Perception) -> None:
     wanted = view.draw(perception, scan)
     got: list[bytes] = []
