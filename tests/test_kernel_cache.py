@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import importlib.util
+import json
 import logging
 import os
 import pkgutil
@@ -445,3 +446,109 @@ def test_processes_start_from_a_damaged_cache_and_together(tmp_path: Path) -> No
     assert "cannot be used and is compiled again" in line
     assert outcome(start(tmp_path / "cache")) == (total, 0, [])
     shutil.rmtree(tmp_path / "cache")
+
+
+# --- what is compiled when -------------------------------------------------------------------------------------------
+
+CALLS = """
+import itertools, json, pkgutil, sys, warnings
+from importlib import import_module
+
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+
+import edgeperc
+from edgeperc import Box, Perceiver, Tracker, road_ahead
+
+warnings.simplefilter("ignore")  # some scans are unlike the training scans
+# Rings of a road around the vehicle, and the rears of some cars.
+turn, down = np.meshgrid(np.linspace(-np.pi, np.pi, 900, endpoint=False), np.radians(np.linspace(1.2, 24.9, 60)))
+radius = 1.73 / np.tan(down)
+columns = radius * np.cos(turn), radius * np.sin(turn), np.full_like(turn, -1.73), 0.3 + 0.1 * np.sin(turn)
+points = np.stack(columns, -1).reshape(-1, 4).astype(np.float32)
+for k in range(6):
+    rear = (points[:, 0] > 8 + 5 * k) & (abs(points[:, 1] - 6 + 2 * k) < 0.9)
+    points[rear, 0], points[rear, 2] = 8 + 5 * k, np.linspace(-1.7, 0, rear.sum())
+names = [m.name for m in pkgutil.walk_packages(edgeperc.__path__, "edgeperc.") if not m.name.endswith("__main__")]
+kernels = {
+    f"{name}.{key}": thing
+    for name in names
+    for key, thing in vars(import_module(name)).items()
+    if isinstance(thing, Dispatcher) and thing.py_func.__module__ == name
+}
+
+def snapshot():
+    return {name: len(kernel.signatures) for name, kernel in kernels.items()}
+
+def perceptions(options):
+    perceive = Perceiver(**options, provider="cpu", n_threads=1, on_mismatch="warn")
+    yield
+    fields = np.zeros(len(points), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "u1")])
+    for k, name in enumerate("xyz"):
+        fields[name] = points[:, k]
+    shapes = [
+        points.copy(), np.frombuffer(points.tobytes(), np.float32).reshape(-1, 4), np.asfortranarray(points),
+        points[::2], points[:, ::-1][:, ::-1], points.astype(np.float64), points.astype(">f4"), points[:, :3],
+        points.astype(np.int16), fields, points[:1], points[:0], points[:1].tolist(),
+        np.where(np.arange(len(points))[:, None] % 7, points, np.nan).astype(np.float32),
+        np.frombuffer(b"x" + points.tobytes(), np.float32, offset=1).reshape(-1, 4), points * np.float32(1e6),
+    ]
+    for k, scan in enumerate(shapes):
+        try:
+            found = perceive(scan, stamp_s=k)
+        except edgeperc.FitnessError:
+            continue
+        if found.top_view is not None:
+            for boxes, tolerance_m in itertools.product([found.boxes, []], [0.1, 0, np.float32(0.2)]):
+                road_ahead(found.top_view, boxes, tolerance_m=tolerance_m)
+
+def tracks():
+    for posed in (None, np.asfortranarray(np.eye(4)), np.eye(4, dtype=np.float32), np.eye(4).tolist()):
+        tracker = Tracker()
+        yield
+        for k, n in enumerate([0, 1, 0, 2, 5, 0, 0, 1, 40, 3, 3, 0, 0, 0]):
+            names = itertools.islice(itertools.cycle(["car", "cyclist", "tram"]), n)
+            boxes = [Box(name, 0.9, (8 * i + k, 2.0, -0.9), (4.2, 1.8, 1.5), 0) for i, name in enumerate(names)]
+            found = tracker.update(boxes, np.float32(k) if k % 2 else k, posed)
+            [track.to_dict() for track in found]
+
+options = json.loads(sys.argv[1])
+calls = tracks() if options is None else perceptions(options)
+next(calls)
+before = snapshot()
+for _ in calls:
+    pass
+after = snapshot()
+later = [name for name in after if after[name] > before[name]]
+print(json.dumps({"constructed": sum(before.values()), "later": later}))
+"""
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param({"models": ["ssadnet", "pointseg"]}, id="both"),
+        pytest.param({"models": "lodnn"}, id="road"),
+        pytest.param({"models": "pointseg", "full_turn": True}, id="full turn"),
+        pytest.param({"models": "pointseg", "sensor": "vlp-16"}, id="coarse sensor"),
+        pytest.param({"models": "pointseg", "sensor": "os1-64", "boxes_from": "network", "adapt": "none"}, id="raw"),
+        pytest.param(None, id="tracker"),
+    ],
+)
+def test_construction_compiles_what_calls_need(options: dict[str, Any] | None) -> None:
+    """Whatever the layout of a scan in memory and the number of boxes, in a process that does nothing else."""
+    command = [sys.executable, "-c", CALLS, json.dumps(options)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["constructed"] > 5
+    assert report["later"] == []
+
+
+def test_construction_compiles_nothing_of_the_tracker() -> None:
+    code = """
+import edgeperc, sys
+edgeperc.Perceiver("pointseg", provider="cpu", n_threads=1)
+sys.exit("edgeperc.tracking" in sys.modules or "edgeperc.simulation" in sys.modules)
+"""
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
