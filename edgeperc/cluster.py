@@ -8,6 +8,7 @@ box to every kept cluster. It gives boxes of every class of points, all around t
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from .errors import PointsError
 from .geometry import oriented_iou, rectangles, shared_area
 from .kernel_cache import njit
+from .linkage import COLUMN_EDGE, MAX_COLUMNS, TESTS_PER_POINT, fill_clusters
 from .perception import Box
 from .points import read_only
 
@@ -38,13 +40,6 @@ PART_OF = MappingProxyType({"pedestrian": "cyclist"})
 # A cluster is a cyclist if at least 25 % of its pedestrian and cyclist points are cyclist.
 MIN_OF_WHOLE = 0.25
 
-# A column's edge is slightly more than half the distance, so that linked points are at most 2 columns apart. Points of
-# one column are linked if their heights differ by at most 0.7 of the distance: 2 * 0.50005^2 + 0.7^2 < 1.
-COLUMN_EDGE = 0.50005
-RUN_GAP = 0.7
-MAX_COLUMNS = 2**26
-N_LAYERS = 1024  # each half a gap high, so that points of neighboring layers of a column are linked; 179 m for 0.5 m
-
 N_ANGLES = 90
 MAX_FITTED = 256  # a rectangle's heading is fitted to at most this many points
 MIN_SIDE_M = 0.1
@@ -58,6 +53,8 @@ def find_clusters(
     points: NDArray[np.float32],
     *,
     among: NDArray[np.bool_] | None = None,
+    seeds: NDArray[np.bool_] | None = None,
+    min_share: float = 0.0,
     min_distance_m: float = 0.5,
     distance_per_m: float = 0.015,
     max_range_m: float = 100.0,
@@ -71,13 +68,18 @@ def find_clusters(
         x, y, z [m] in the sensor frame.
     among : (n,) bool, optional
         The points to cluster, such as those above the ground; all by default.
+    seeds : (n,) bool, optional
+        Points that a cluster must hold, such as those labeled as an object; all by default. Only the parts of the scan
+        that are linked with seeds are searched.
+    min_share : float
+        Clusters are dropped unless more than this share of their points are seeds.
     min_distance_m, distance_per_m : float
         Two points are linked if their distance is at most ``max(min_distance_m, distance_per_m * range)``, with the
         range of the nearer one. ``distance_per_m`` is twice the angle [rad] between neighboring beams, so that points
         of neighboring beams are linked at any range: 0.015 for an HDL-64E, 0.07 for a VLP-16. 0: one distance
         for all ranges.
     max_range_m : float
-        Points with a larger x or y are in no cluster.
+        Points with a larger x, y or z are in no cluster.
     min_points : int
         Smaller clusters are dropped.
 
@@ -96,14 +98,26 @@ def find_clusters(
     Notes
     -----
     With ``distance_per_m=0`` and ``min_points=1``, the result is exactly that of DBSCAN with ``min_samples=1``. Points
-    are sorted into columns that are half the distance wide. Consecutive points of a column that are close in height are
-    linked without a test and form a run. Two runs of neighboring columns whose bounds are near enough are joined at the
-    first pair of points that is near enough. For 60,000 points in 8,000 runs, 60,000 pairs are tested.
+    are sorted into columns that are half the distance wide, wider where the distance is longer. Consecutive points of
+    a column that are close in height are linked without a test and form a run. Clusters grow from run to run: a run of
+    a neighboring column is joined if its bounds, and one pair of points, are near enough. Runs of many points are
+    halved again and again, and only halves whose bounds are near enough are tested.
+
+    The time is bounded for any scan: a run has a bounded number of neighbors, and at most 64 tests a point are made.
+    Real scans need up to 4. More are needed if thousands of points lie between one and 1.01 distances from thousands
+    of others. After that only the nearest parts of two runs are tested, and they are not linked if there is no link:
+    a cluster may be split in two at such a place. A warning says how many pairs of runs this concerns.
+
+    Warns
+    -----
+    UserWarning
+        The 64 tests a point were not enough.
     """
     if points.ndim != 2 or points.shape[1] < 3:
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
-    if among is not None and among.shape != (len(points),):
-        raise PointsError(f"got among of shape {among.shape} for {len(points)} points; expected one bool a point")
+    for name, mask in (("among", among), ("seeds", seeds)):
+        if mask is not None and mask.shape != (len(points),):
+            raise PointsError(f"got {name} of shape {mask.shape} for {len(points)} points; expected one bool a point")
     if not (
         0.0 < min_distance_m < math.inf
         and 0.0 <= distance_per_m <= 1.0
@@ -115,9 +129,27 @@ def find_clusters(
             "expected a distance above 0 and at least 1/2000 of the range, and distance_per_m in 0..1"
         )
     rows = read_only(points)
-    chosen = read_only(np.ones(len(rows)) if among is None else among, np.bool_)
+    every = np.ones(len(rows), np.bool_)
     clusters = np.empty(len(rows), dtype=np.int32)
-    fill_clusters(rows, chosen, min_distance_m, distance_per_m, max_range_m, min_points, clusters)
+    work = np.empty(3, dtype=np.int64)
+    fill_clusters(
+        rows,
+        read_only(every if among is None else among, np.bool_),
+        read_only(every if seeds is None else seeds, np.bool_),
+        min_share,
+        min_distance_m,
+        distance_per_m,
+        max_range_m,
+        min_points,
+        clusters,
+        work,
+    )
+    if work[2]:
+        warnings.warn(
+            f"{work[2]} neighboring parts of the scan were not compared completely, because that needs more than "
+            f"{TESTS_PER_POINT} tests a point; a cluster may be split there. Is this the scan of a LiDAR, in meters?",
+            stacklevel=2,
+        )
     return clusters
 
 
@@ -343,188 +375,6 @@ def _completed(
     height = max(top - bottom, usual[2], MIN_SIDE_M)
     yaw = (yaw + math.pi / 2.0) % math.pi - math.pi / 2.0
     return Box(name, score, (x, y, bottom + 0.5 * height), (length, width, height), yaw)
-
-
-@njit(cache=True, nogil=True)
-def fill_clusters(
-    points: NDArray[np.float32],
-    among: NDArray[np.bool_],
-    min_distance: float,
-    distance_per_m: float,
-    max_range: float,
-    min_points: int,
-    clusters: NDArray[np.int32],
-) -> None:
-    """Compute every point's cluster; see `find_clusters`.
-
-    Parameters
-    ----------
-    points : (n, 3 or more) float32, C-contiguous
-    among : (n,) bool
-    min_distance, distance_per_m, max_range : float
-    min_points : int
-    clusters : (n,) int32, overwritten
-    """
-    columns_per_m = 1.0 / (COLUMN_EDGE * min_distance)
-    layers_per_m = 1.0 / (0.5 * RUN_GAP * min_distance)
-    low_x, low_y, high_x, high_y = math.inf, math.inf, -math.inf, -math.inf
-    rows = np.empty(points.shape[0], dtype=np.int32)  # of the points that take part
-    m = 0
-    for i in range(points.shape[0]):
-        clusters[i] = -1
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        if among[i] and abs(x) <= max_range and abs(y) <= max_range and abs(z) < math.inf:
-            rows[m] = i
-            m += 1
-            low_x, high_x = min(low_x, x), max(high_x, x)
-            low_y, high_y = min(low_y, y), max(high_y, y)
-    if m == 0:
-        return
-    n_rows = int((high_x - low_x) * columns_per_m) + 1
-    n_cols = int((high_y - low_y) * columns_per_m) + 1
-
-    # Points sorted by layer, then by column, so that those of a column are in upward order. Points beyond the layers
-    # are in any order: that makes more runs and costs time, but does not change the clusters.
-    layer = np.empty(m, dtype=np.int32)
-    column = np.empty(m, dtype=np.int32)
-    layer_starts = np.zeros(N_LAYERS + 1, dtype=np.int32)
-    starts = np.zeros(n_rows * n_cols + 1, dtype=np.int32)
-    for k in range(m):
-        i = rows[k]
-        row = int((np.float64(points[i, 0]) - low_x) * columns_per_m)
-        column[k] = row * n_cols + int((np.float64(points[i, 1]) - low_y) * columns_per_m)
-        layer[k] = int(min(max(np.float64(points[i, 2]) * layers_per_m + 0.5 * N_LAYERS, 0.0), N_LAYERS - 1.0))
-        layer_starts[layer[k] + 1] += 1
-        starts[column[k] + 1] += 1
-    for at in range(N_LAYERS):
-        layer_starts[at + 1] += layer_starts[at]
-    for at in range(n_rows * n_cols):
-        starts[at + 1] += starts[at]
-    upwards = np.empty(m, dtype=np.int32)
-    for k in range(m):
-        upwards[layer_starts[layer[k]]] = k
-        layer_starts[layer[k]] += 1
-    order = np.empty(m, dtype=np.int32)
-    xyz = np.empty((m, 3), dtype=np.float32)
-    for source in upwards:
-        place, i = starts[column[source]], rows[source]
-        starts[column[source]] += 1
-        order[place] = i
-        xyz[place, 0], xyz[place, 1], xyz[place, 2] = points[i, 0], points[i, 1], points[i, 2]
-
-    # Runs: points of one column, each linked with the one before. From here on starts holds each column's first run.
-    run_starts = np.empty(m + 1, dtype=np.int32)
-    run_column = np.empty(m, dtype=np.int32)
-    n_runs = 0
-    start = 0
-    for at in range(n_rows * n_cols):
-        stop = starts[at]
-        starts[at] = n_runs
-        for k in range(start, stop):
-            if k == start or abs(np.float64(xyz[k, 2]) - xyz[k - 1, 2]) > RUN_GAP * min_distance:
-                run_starts[n_runs] = k
-                run_column[n_runs] = at
-                n_runs += 1
-        start = stop
-    starts[n_rows * n_cols] = n_runs
-    run_starts[n_runs] = m
-
-    # The reach of a point is the distance up to which it is linked; the reach of a run is that of its farthest point.
-    reach = np.empty(m)
-    run_reach = np.empty(n_runs)
-    bounds = np.empty((n_runs, 6))
-    for run in range(n_runs):
-        longest = 0.0
-        low_x, low_y, low_z = math.inf, math.inf, math.inf
-        high_x, high_y, high_z = -math.inf, -math.inf, -math.inf
-        for k in range(run_starts[run], run_starts[run + 1]):
-            x, y, z = np.float64(xyz[k, 0]), np.float64(xyz[k, 1]), np.float64(xyz[k, 2])
-            reach[k] = max(min_distance, distance_per_m * math.sqrt(x * x + y * y + z * z))
-            longest = max(longest, reach[k])
-            low_x, high_x = min(low_x, x), max(high_x, x)
-            low_y, high_y = min(low_y, y), max(high_y, y)
-            low_z, high_z = min(low_z, z), max(high_z, z)
-        run_reach[run] = longest
-        bounds[run, 0], bounds[run, 1], bounds[run, 2] = low_x, low_y, low_z
-        bounds[run, 3], bounds[run, 4], bounds[run, 5] = high_x, high_y, high_z
-
-    parent = np.arange(n_runs).astype(np.int32)
-    for run in range(n_runs):
-        row, col = run_column[run] // n_cols, run_column[run] % n_cols
-        far = int(run_reach[run] * columns_per_m + 1e-9) + 1  # safe against rounding
-        root = root_of(parent, run)
-        for near_row in range(row, min(row + far + 1, n_rows)):
-            # Each pair of runs is tested once, from the earlier one.
-            first = run + 1 if near_row == row else starts[near_row * n_cols + max(col - far, 0)]
-            last = starts[near_row * n_cols + min(col + far, n_cols - 1) + 1]
-            for other in range(first, last):
-                longest = min(run_reach[run], run_reach[other])
-                if squared_gap(bounds, run, other) > longest * longest:
-                    continue
-                other_root = root_of(parent, other)
-                if root != other_root and are_linked(xyz, reach, run_starts, bounds, run, other):
-                    root, other_root = min(root, other_root), max(root, other_root)
-                    parent[other_root] = root
-
-    sizes = np.zeros(n_runs, dtype=np.int32)
-    for run in range(n_runs):
-        root = root_of(parent, run)
-        sizes[root] += run_starts[run + 1] - run_starts[run]
-        for k in range(run_starts[run], run_starts[run + 1]):
-            clusters[order[k]] = root
-    number = np.full(n_runs, -1, dtype=np.int32)
-    n_clusters = 0
-    for i in rows[:m]:
-        root = clusters[i]
-        if sizes[root] < min_points:
-            clusters[i] = -1
-            continue
-        if number[root] < 0:
-            number[root] = n_clusters
-            n_clusters += 1
-        clusters[i] = number[root]
-
-
-@njit(cache=True, nogil=True)
-def root_of(parent: NDArray[np.int32], run: int) -> int:
-    """The root of the set of joined runs that this run belongs to (union-find with path halving)."""
-    while parent[run] != run:
-        parent[run] = parent[parent[run]]
-        run = parent[run]
-    return run
-
-
-@njit(cache=True, nogil=True)
-def squared_gap(bounds: NDArray[np.float64], a: int, b: int) -> float:
-    """Squared distance between two axis-aligned bounds (lowest x, y, z, highest x, y, z); 0 if they overlap."""
-    gap_x = max(bounds[a, 0] - bounds[b, 3], bounds[b, 0] - bounds[a, 3], 0.0)
-    gap_y = max(bounds[a, 1] - bounds[b, 4], bounds[b, 1] - bounds[a, 4], 0.0)
-    gap_z = max(bounds[a, 2] - bounds[b, 5], bounds[b, 2] - bounds[a, 5], 0.0)
-    return gap_x * gap_x + gap_y * gap_y + gap_z * gap_z
-
-
-@njit(cache=True, nogil=True)
-def are_linked(
-    xyz: NDArray[np.float32],
-    reach: NDArray[np.float64],
-    run_starts: NDArray[np.int32],
-    bounds: NDArray[np.float64],
-    a: int,
-    b: int,
-) -> bool:
-    """Whether a point of one run is near enough to a point of another."""
-    low_x, low_y, low_z, high_x, high_y, high_z = bounds[b]
-    for k in range(run_starts[a], run_starts[a + 1]):
-        x, y, z = np.float64(xyz[k, 0]), np.float64(xyz[k, 1]), np.float64(xyz[k, 2])
-        dx, dy, dz = max(low_x - x, x - high_x, 0.0), max(low_y - y, y - high_y, 0.0), max(low_z - z, z - high_z, 0.0)
-        if dx * dx + dy * dy + dz * dz > reach[k] * reach[k]:
-            continue
-        for j in range(run_starts[b], run_starts[b + 1]):
-            dx, dy, dz = xyz[j, 0] - x, xyz[j, 1] - y, xyz[j, 2] - z
-            shorter = min(reach[k], reach[j])
-            if dx * dx + dy * dy + dz * dz <= shorter * shorter:
-                return True
-    return False
 
 
 @njit(cache=True, nogil=True)

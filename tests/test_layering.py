@@ -26,7 +26,7 @@ FLOORS = {
         extras onnx_file
         card points sensor tuning
         kernel_cache perception zoo.__init__
-        geometry
+        geometry linkage
         adapt cluster decode drivable fitness ground observed projection refine sensor_fit session
         readers.__init__ readers.tables
         readers.inflate readers.packets

@@ -6,9 +6,9 @@ import numpy as np
 
 
 def clusters(points, among, min_distance, distance_per_m, max_range, min_points):
-    """Twin of `edgeperc.cluster.fill_clusters`: every pair is looked at."""
+    """Twin of `edgeperc.linkage.fill_clusters` with every point as a seed: every pair is looked at."""
     xyz = points[:, :3].astype(np.float64)
-    used = np.flatnonzero(among & np.isfinite(xyz).all(axis=1) & (abs(xyz[:, :2]) <= max_range).all(axis=1))
+    used = np.flatnonzero(among & np.isfinite(xyz).all(axis=1) & (abs(xyz) <= max_range).all(axis=1))
     x, y, z = xyz[used].T
     reach = np.maximum(min_distance, distance_per_m * np.sqrt(x * x + y * y + z * z))
     dx, dy, dz = (np.subtract.outer(v, v) for v in (x, y, z))
