@@ -70,7 +70,7 @@ class Box:
             (x, y, z), (length, width, height) = document["center"], document["size"]
             numbers = [float(v) for v in (document["score"], x, y, z, length, width, height, document["yaw"])]
             label = document["label"]
-        except (KeyError, TypeError, ValueError) as exc:
+        except (KeyError, OverflowError, TypeError, ValueError) as exc:
             raise PointsError(
                 f"got a box that cannot be read ({type(exc).__name__}: {exc}); expected label, score, yaw, center "
                 "(x, y, z) and size (length, width, height)"
@@ -102,6 +102,8 @@ class TopView:
         Cells that the scan observed: with a return, or passed closely by a ray to a return on the ground
         (`edgeperc.observed.Observer`). The labels of the other cells are only the network's guess. They lie behind
         objects, between the rays of sensors with few beams, or beyond the last return.
+    mounting : Mounting
+        That of the scan, as in `Perception`.
     """
 
     labels: NDArray[np.uint8]
@@ -110,6 +112,7 @@ class TopView:
     x_range_m: tuple[float, float]
     y_range_m: tuple[float, float]
     observed: NDArray[np.bool_]
+    mounting: Mounting = MODEL_MOUNTING
 
     @property
     def geometry(self) -> TopViewGeometry:

@@ -85,5 +85,5 @@ def read_boxes(path: Path | str) -> list[list[Box]]:
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
         return [[Box.from_dict(box) for box in json.loads(line)["boxes"]] for line in lines]
-    except (KeyError, TypeError, ValueError) as exc:
+    except (KeyError, RecursionError, TypeError, ValueError) as exc:
         raise TrackingError(f"{path} holds no boxes ({exc}); expected what edgeperc run --json printed") from exc

@@ -67,7 +67,8 @@ def main() -> int:
                 file=Path(file),
                 now=now,
             )
-        return 0
+        sys.stdout.flush()
+        os._exit(0)  # a library would list what it leaked
     if arguments.seconds is None and arguments.cases == 1 << 40:
         parser.error("give --cases or --seconds")
     n_failures = 0

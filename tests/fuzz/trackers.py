@@ -40,7 +40,7 @@ class Trackers:
         )
         posed = bool(rng.random() < 0.3)
         wild = float(rng.choice([0.0, 0.02, 0.2, 1.0]))
-        stamp_s, answers = float(case.pick([0.0, -1e300, 1e9, 1e300, 1.7e308, 5e-324])), 0
+        stamp_s, answers = float(case.pick([0.0, -1.0, 1e9, 1.7e9, 5e-324, -1e6, 1e11, case.pick(FAR)])), 0
         n = int(rng.choice([0, 1, 3, 10, 40])) if rng.random() < 0.998 else int(rng.choice([1000, 10_000]))
         n_scans = 3 if n > 100 else int(rng.integers(1, 12))
         starts = rng.uniform((0, -20, -2), (60, 20, 0), (n, 3))

@@ -1,0 +1,365 @@
+"""Captures and scan files: damaged ones through `edgeperc.read_scans`.
+
+The process that decodes a capture is forked from this one, where the libraries are loaded already; otherwise it runs
+what the product runs, `edgeperc.readers.worker.main` with its limits, and `edgeperc.readers.apart` reads its replies.
+Every 200th case starts the process as the product does. If that process dies, the answer is a `PointsError`, which is
+allowed; such deaths are counted by signal.
+"""
+
+from __future__ import annotations
+
+import functools
+import gc
+import json
+import os
+import re
+import resource
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import zlib
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+from edgeperc.errors import PointsError
+from edgeperc.readers import apart, worker
+from edgeperc.readers.captures import read_scans
+from edgeperc.readers.files import read_points
+
+from .mutate import mutated_bytes, mutated_json, noise
+from .running import Case, check
+from .seeds import Seed, data_root, pcap_records, real_seeds, scan_files, synthetic_seeds
+
+__all__ = ["LIMIT_MB", "LIMIT_S", "Captures", "make"]
+
+LIMIT_S, LIMIT_MB = 65.0, 2700.0  # 60 s and 2 GiB of data for the process that decodes
+END_TO_END_EVERY = 200
+FORKED_LIMIT_S = 1.0  # in place of 60 s: some damaged .osf files never end in the library
+MOST_SCANS = 20
+REAL_SHARE, FILE_SHARE = 0.1, 0.2
+
+LIBRARIES = (
+    "ouster.sdk.core", "ouster.sdk.osf", "ouster.sdk.pcap", "velodyne_decoder", "rosbags.highlevel", "rosbags.typesys",
+    "rosbags.rosbag1", "rosbags.rosbag2", "lz4.frame", "zstandard", "sqlite3", "multiprocessing.pool",
+)  # fmt: skip
+
+
+class Forked:
+    """A process as `subprocess.Popen`, forked from this one; runs `edgeperc.readers.worker.main`."""
+
+    def __init__(self, folder: str) -> None:
+        requests, self_in = os.pipe()
+        self_out, replies = os.pipe()
+        self.returncode: int | None = None
+        self.peak_mb = 0.0
+        self.pid = os.fork()
+        if self.pid == 0:
+            _be_worker(requests, replies, folder, (self_in, self_out))
+        os.close(requests)
+        os.close(replies)
+        self.stdin, self.stdout = os.fdopen(self_in, "wb"), os.fdopen(self_out, "rb")
+
+    def __enter__(self) -> Forked:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stdout.close()
+        if not self.stdin.closed:
+            self.stdin.close()
+        self.wait()
+
+    def kill(self) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, signal.SIGKILL)
+
+    def poll(self) -> int | None:
+        if self.returncode is None:
+            self._reap(os.WNOHANG)
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        end = None if timeout is None else time.monotonic() + timeout
+        while self.returncode is None:
+            self._reap(0 if end is None else os.WNOHANG)
+            if self.returncode is None and end is not None:
+                if time.monotonic() > end:
+                    raise subprocess.TimeoutExpired("worker", timeout or 0.0)
+                time.sleep(0.001)
+        return self.returncode
+
+    def _reap(self, options: int) -> None:
+        pid, status, usage = os.wait4(self.pid, options)
+        if pid:
+            self.returncode, self.peak_mb = os.waitstatus_to_exitcode(status), usage.ru_maxrss / 1e3
+
+
+def _be_worker(requests: int, replies: int, folder: str, others: tuple[int, int]) -> None:
+    code = 1
+    try:
+        os.setsid()
+        quiet = os.open(os.devnull, os.O_WRONLY)
+        for source, target in ((requests, 0), (replies, 1), (quiet, 2)):
+            os.dup2(source, target)
+        for descriptor in (*others, requests, replies, quiet):
+            os.close(descriptor)
+        sys.stdin = os.fdopen(0)
+        os.environ.update(dict.fromkeys(("TMPDIR", "TEMP", "TMP"), folder))
+        tempfile.tempdir = None
+        worker.main()
+        code = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(code)
+
+
+class Captures:
+    """The kind ``captures``."""
+
+    name, limit_s, limit_mb = "captures", LIMIT_S, LIMIT_MB
+
+    def __init__(self) -> None:
+        for library in LIBRARIES:
+            import_module(library)
+        typesys = import_module("rosbags.typesys")
+        made = functools.lru_cache(typesys.get_typestore)
+        made(typesys.Stores.ROS2_HUMBLE)  # 0.1 s, which every process would spend
+        typesys.get_typestore = made
+        with tempfile.TemporaryDirectory() as folder:
+            self.seeds = synthetic_seeds(Path(folder))
+        root = data_root()
+        self.real = [] if root is None else real_seeds(root)
+        self.files = scan_files()
+        self.process: Forked | None = None
+        weights = {"ouster": 8, "osf": 2, "velodyne": 3}
+        self.weighted = [seed for seed in self.seeds for _ in range(weights.get(seed.kind, 1))]
+        # What forked processes share is not to be copied because a collector wrote to it.
+        gc.collect()
+        gc.freeze()
+        resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
+
+    def run(self, case: Case) -> str:
+        if case.chance(FILE_SHARE):
+            return self.file(case)
+        seed = case.pick(self.real) if self.real and case.chance(REAL_SHARE) else case.pick(self.weighted)
+        files = DAMAGES[seed.kind](dict(seed.files), case, seed)
+        for name, content in files.items():
+            path = case.folder / name
+            path.parent.mkdir(exist_ok=True)
+            path.write_bytes(content)
+            if seed not in self.real:  # of real captures, the seed and index suffice
+                case.evidence[name.replace("/", "_")] = content
+        end_to_end = case.index % END_TO_END_EVERY == END_TO_END_EVERY - 1
+        if end_to_end:
+            return f"{seed.kind}, end to end: {self.read(case, case.folder / seed.entry)}"
+        with mock.patch.multiple(apart, _start=self.start, SCAN_LIMIT_S=FORKED_LIMIT_S):
+            answer = self.read(case, case.folder / seed.entry)
+        if self.process is not None:
+            check(self.process.returncode is not None, "the process that decodes is left behind")
+            case.peak_mb, self.process = self.process.peak_mb, None
+        return f"{seed.kind}: {answer}"
+
+    def start(self, folder: str) -> Any:
+        self.process = Forked(folder)
+        return self.process
+
+    def read(self, case: Case, path: Path) -> str:
+        options: dict[str, Any] = {}
+        if case.chance(0.1):
+            options["topic"] = case.pick(["/lidar/points", "991", "", "\0", "x" * 1000, "/imu/text"])
+        if case.chance(0.1):
+            options["remission_field"] = case.pick(["reflectivity", "signal", "", "RANGE", "x"])
+        n_scans = 0
+        try:
+            for stamp_s, points in read_scans(path, **options):
+                n_scans += 1
+                check_scan(stamp_s, points)
+                if n_scans >= MOST_SCANS:
+                    break
+        except PointsError as exc:
+            died = re.search(r"failed \((.*?)\)", str(exc)) or re.search(r"(took longer|did not start)", str(exc))
+            if died:
+                case.died.append(died[1])
+                return "died"
+            check(str(path) in str(exc) or path.name in str(exc), f"a message without the file's name: {exc}")
+            return "PointsError" if n_scans == 0 else "scans, then PointsError"
+        return "scans" if n_scans else "no scan"
+
+    def file(self, case: Case) -> str:
+        """A scan file, which is read in this process."""
+        name = case.pick([*self.files])
+        content = self.files[name]
+        content = mutated_bytes(content, case, 6, near=case.pick([0, 30, 250])) if case.chance(0.95) else noise(case)
+        case.evidence[name] = content
+        path = case.folder / name
+        path.write_bytes(content)
+        suffix = name.partition(".")[2]
+        options = {"columns": case.pick([3, 4, 5, 64, 65, 0, -1])} if case.chance(0.05) else {}
+        try:
+            check_scan(None, read_points(path, **options))
+        except PointsError:
+            return f"{suffix}: PointsError"
+        return f"{suffix}: scan"
+
+
+def check_scan(stamp_s: Any, points: Any) -> None:
+    """Raise `Failure` unless a scan is one."""
+    check(stamp_s is None or (isinstance(stamp_s, float) and stamp_s == stamp_s), f"a stamp of {stamp_s!r}")
+    check(isinstance(points, np.ndarray) and points.dtype == np.float32, "dtype of the points")
+    check(points.ndim == 2 and points.shape[1] == 4, f"points of shape {points.shape}")
+
+
+# --- damage -----------------------------------------------------------------------------------------------------------
+
+Files = dict[str, bytes]
+
+
+def _pcap(content: bytes, case: Case) -> bytes:
+    rng, records = case.rng, pcap_records(content)
+    head = content[:24]
+    if rng.random() < 0.1:
+        head = mutated_bytes(head, case, 2)
+    for _ in range(int(rng.integers(1, 8))):
+        if not records:
+            break
+        k, way = int(rng.integers(len(records))), int(rng.integers(10))
+        if way <= 4:
+            # Of Ethernet, IP and UDP, then of the columns.
+            near = int(case.pick([16, 60, 60, 100, 400]))
+            body = mutated_bytes(records[k][16:], case, 4, near=near)
+            length = len(body) if rng.random() < 0.8 else int(rng.integers(0, 70_000))
+            records[k] = records[k][:8] + struct.pack("<II", length, len(body)) + body
+        elif way == 5:
+            records[k] = mutated_bytes(records[k], case, 2, near=16)
+        elif way == 6:
+            del records[k]
+        elif way == 7:
+            records.insert(int(rng.integers(len(records) + 1)), records[k])
+        elif way == 8:
+            rng.shuffle(records)  # type: ignore[arg-type]
+        else:
+            fragment = bytearray(records[k])
+            if len(fragment) > 38:
+                fragment[36:38] = struct.pack(">H", int(rng.integers(65536)))  # flags and offset
+            records[k] = bytes(fragment)
+    content = head + b"".join(records)
+    return content[: int(rng.integers(len(content) + 1))] if rng.random() < 0.05 else content
+
+
+def _of_ouster(files: Files, case: Case, seed: Seed) -> Files:
+    way = case.rng.random()
+    if way < 0.65 and "cap.json" in files:
+        files["cap.json"] = mutated_json(json.loads(files["cap.json"]), case)
+    if way > 0.55:
+        files["cap.pcap"] = _pcap(files["cap.pcap"], case)
+    if case.chance(0.02):
+        del files["cap.json"]
+    return files
+
+
+def _of_velodyne(files: Files, case: Case, seed: Seed) -> Files:
+    return {**files, "cap.pcap": _pcap(files["cap.pcap"], case)}
+
+
+def _of_osf(files: Files, case: Case, seed: Seed) -> Files:
+    content = bytearray(files["cap.osf"])
+    blocks, at = [], 0
+    while at + 4 <= len(content):
+        end = at + 4 + struct.unpack_from("<I", content, at)[0]
+        blocks.append((at, end))
+        at = end + 4
+    for _ in range(int(case.rng.integers(1, 6))):
+        start, end = case.pick(blocks)
+        near = min(end, start + int(case.pick([60, 400, 4000, 1 << 20])))
+        if near <= start + 4:
+            continue
+        place, size = int(case.rng.integers(start + 4, near)), int(case.pick([1, 1, 4, 8]))
+        value = case.pick([bytes(size), b"\xff" * size, case.rng.bytes(size), b"\xff" * (size - 1) + b"\x7f"])
+        content[place : min(place + size, end)] = value[: max(0, min(place + size, end) - place)]
+        if case.chance(0.95):
+            content[end : end + 4] = struct.pack("<I", zlib.crc32(content[start:end]))
+    return {"cap.osf": bytes(content)}
+
+
+def _of_bytes(files: Files, case: Case, seed: Seed) -> Files:
+    name = case.pick([*files])
+    return {**files, name: mutated_bytes(files[name], case, 8, near=case.pick([0, 0, 200, 4000]))}
+
+
+def _of_chunks(files: Files, case: Case, seed: Seed) -> Files:
+    """A chunk's records changed before they are packed, with the checksum right, wrong or absent."""
+    content = files["cap.mcap"]
+    if case.chance(0.4):
+        return _of_bytes(files, case, seed)
+    out, at = bytearray(content[:8]), 8
+    while at + 9 <= len(content) - 8:
+        opcode, size = struct.unpack_from("<BQ", content, at)
+        body = content[at + 9 : at + 9 + size]
+        at += 9 + size
+        if opcode == 6:
+            body = _chunk(body, case)
+        elif opcode == 2:
+            body = struct.pack("<QQI", 0, 0, 0)  # places have moved
+        elif case.chance(0.05):
+            body = mutated_bytes(body, case, 2)
+        out += bytes([opcode]) + struct.pack("<Q", len(body)) + body
+    return {"cap.mcap": bytes(out + content[-8:])}
+
+
+def _chunk(body: bytes, case: Case) -> bytes:
+    from edgeperc.readers.inflate import inflate
+
+    times, (size, crc, length) = body[:16], struct.unpack_from("<QII", body, 16)
+    method = body[32 : 32 + length]
+    packed = body[32 + length + 8 :]
+    records = mutated_bytes(inflate(packed, method.decode(), size), case, 3, near=case.pick([0, 100, 1000]))
+    crc = case.pick([zlib.crc32(records), zlib.crc32(records), 0, crc])
+    if case.chance(0.1):
+        method = case.pick([b"", b"lz4", b"zstd", b"rar", b"\xff"])
+    packers: dict[bytes, Callable[[bytes], bytes]] = {
+        b"lz4": lambda data: bytes(import_module("lz4.frame").compress(data)),
+        b"zstd": lambda data: bytes(import_module("zstandard").ZstdCompressor().compress(data)),
+    }
+    packed = packers.get(method, bytes)(records)
+    if case.chance(0.2):
+        packed = mutated_bytes(packed, case, 2)
+    size = len(records) if case.chance(0.8) else int(case.pick([0, 1, 1 << 20, 1 << 33, (1 << 64) - 1]))
+    head = times + struct.pack("<QII", size, crc, len(method)) + method
+    return bytes(head + struct.pack("<Q", len(packed)) + packed)
+
+
+def _of_bag2(files: Files, case: Case, seed: Seed) -> Files:
+    name = case.pick([*files])
+    if name.endswith(".yaml") and case.chance(0.7):
+        lines = files[name].split(b"\n")
+        k = int(case.rng.integers(len(lines)))
+        key, _, _ = lines[k].partition(b":")
+        lines[k] = (
+            key + b": " + case.pick([b"", b"-1", b"zstd", b"[", b"{}", b"&a [*a]", b"../../etc/passwd", b"!!python"])
+        )
+        return {**files, name: b"\n".join(lines)}
+    return {**files, name: mutated_bytes(files[name], case, 8, near=case.pick([0, 0, 100, 4000]))}
+
+
+DAMAGES: dict[str, Callable[[Files, Case, Seed], Files]] = {
+    "ouster": _of_ouster,
+    "velodyne": _of_velodyne,
+    "osf": _of_osf,
+    "bag1": _of_bytes,
+    "bag2": _of_bag2,
+    "mcap": _of_bytes,
+    "chunked": _of_chunks,
+}
+
+
+def make(seed: int) -> Captures:
+    return Captures()
