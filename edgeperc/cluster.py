@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import PointsError
-from .geometry import oriented_iou, rectangles, shared_area
+from .geometry import oriented_iou, rectangles, shared_area, suppress_overlaps
 from .kernel_cache import njit
 from .linkage import COLUMN_EDGE, MAX_COLUMNS, TESTS_PER_POINT, fill_clusters
 from .perception import Box
@@ -42,6 +42,7 @@ MIN_OF_WHOLE = 0.25
 
 N_ANGLES = 90
 MAX_FITTED = 256  # a rectangle's heading is fitted to at most this many points
+MAX_OBJECTS = 1000  # clusters that get a box; KITTI scans have at most 40
 MIN_SIDE_M = 0.1
 MAX_OVERLAP = 0.1  # IoU of two objects; the completed boxes of two pieces of one object overlap by more
 MAX_INSIDE = 0.5  # of the smaller of two footprints
@@ -190,19 +191,26 @@ def cluster_labels(
         raise PointsError(
             f"got labels of shape {labels.shape} for clusters of shape {clusters.shape}; expected the same"
         )
-    inside = clusters >= 0
+    inside = np.flatnonzero(clusters >= 0)
     n = int(clusters.max(initial=-1)) + 1
-    n_labels = 1 + max(1, int(labels.max(initial=0)), *part_of, *part_of.values())
-    pairs = clusters[inside].astype(np.int64) * n_labels + labels[inside]
-    counts = np.bincount(pairs, minlength=n * n_labels).reshape(n, n_labels)
+    sizes = np.bincount(clusters[inside], minlength=n)
+    # Only pairs of cluster and label that occur: a table of all may need gigabytes.
+    found, counts = np.unique(clusters[inside].astype(np.int64) * 256 + labels[inside], return_counts=True)
+    cluster, label = found // 256, found % 256
     for part, whole in part_of.items():
-        moved = np.where(counts[:, whole] >= MIN_OF_WHOLE * (counts[:, whole] + counts[:, part]), counts[:, part], 0)
-        counts[:, part] -= moved
-        counts[:, whole] += moved
-    votes = counts[:, 1:]
-    best = votes.argmax(axis=1)
-    shares = votes[np.arange(n), best] / np.maximum(counts.sum(axis=1), 1)
-    return np.where(shares > min_share, best + 1, 0).astype(np.uint8), shares
+        n_part, n_whole = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        n_part[cluster[label == part]] = counts[label == part]
+        n_whole[cluster[label == whole]] = counts[label == whole]
+        moved = np.where(n_whole >= MIN_OF_WHOLE * (n_whole + n_part), n_part, 0)
+        counts[label == part] -= moved[cluster[label == part]]
+        counts[label == whole] += moved[cluster[label == whole]]
+    votes = np.zeros(n, np.int64)
+    best = np.zeros(n, np.int64)
+    cluster, label, counts = cluster[label > 0], label[label > 0], counts[label > 0]
+    order = np.lexsort((-label, counts))  # later entries replace earlier ones
+    votes[cluster[order]], best[cluster[order]] = counts[order], label[order]
+    shares = votes / np.maximum(sizes, 1)
+    return np.where(shares > min_share, best, 0).astype(np.uint8), shares
 
 
 def objects_from_points(
@@ -263,7 +271,8 @@ def objects_from_points(
     from the usual width. A side that is shorter than usual was seen only in part: it is extended to the usual length,
     away from the sensor, or at both ends if the sensor is beside it. The height is extended upwards in the same way.
     Longer sides are kept. Two boxes are pieces of one object if they overlap by more than 0.1, or if more than half of
-    one footprint lies in the other; the box with the higher score is kept.
+    one footprint lies in the other; the box with the higher score is kept. Boxes are fitted to at most 1000 clusters,
+    those with the highest product of the first two factors: no real scan has as many, and the time stays bounded.
 
     Parameters were chosen on KITTI's training drives (`edgeperc.evaluation.splits.FOLDS`), with labels of networks that
     were not trained on them. ``bench/RESULTS.md`` has the results on the test drives.
@@ -279,6 +288,8 @@ def objects_from_points(
     clusters = find_clusters(
         points,
         among=among,
+        seeds=labels > 0,
+        min_share=min_share,
         min_distance_m=min_distance_m,
         distance_per_m=distance_per_m,
         min_points=min_points,
@@ -287,9 +298,12 @@ def objects_from_points(
     part_of = {number[part]: number[whole] for part, whole in PART_OF.items() if part in number and whole in number}
     found, shares = cluster_labels(clusters, labels, min_share=min_share, part_of=part_of)
     rows = np.flatnonzero(clusters >= 0)
-    rows = rows[found[clusters[rows]] > 0]
+    sizes = np.bincount(clusters[rows], minlength=len(found))
+    highest = np.where(found > 0, shares * sizes / (sizes + EVIDENCE), -math.inf)  # the box may reduce this score
+    kept = np.argsort(-highest, kind="stable")[:MAX_OBJECTS]
+    kept = np.sort(kept[(found[kept] > 0) & (highest[kept] >= min_score)])
+    rows = rows[np.isin(clusters[rows], kept)]
     rows = rows[np.argsort(clusters[rows], kind="stable")]
-    kept = np.flatnonzero(found)
     boxes = []
     for k, members in zip(kept, np.split(rows, np.searchsorted(clusters[rows], kept[1:])), strict=False):
         name = classes[found[k]]
@@ -307,12 +321,8 @@ def objects_from_points(
             score *= min(1.0, float(max(rectangle[2:4])) / width)
         if score >= min_score:
             boxes.append(_completed(name, score, rectangle, bottom, top, size_m.get(name, (0.0, 0.0, 0.0))))
-    boxes.sort(key=lambda box: -box.score)
-    same = _same_object(boxes, boxes)
-    best: list[int] = []
-    for row in range(len(boxes)):
-        if not same[row, best].any():
-            best.append(row)
+    scores = [box.score for box in boxes]
+    best = suppress_overlaps(rectangles(boxes), scores, MAX_OVERLAP, max_inside=MAX_INSIDE)
     return tuple(boxes[row] for row in best)
 
 

@@ -18,6 +18,7 @@ __all__ = ["decode_classes", "decode_dense", "decode_slots", "decode_top_view"]
 
 STRIDE = 4  # cells of the top view behind one cell of a box_dense output, along each axis
 MIN_EXTENT_M = 0.5  # smaller slots are empty
+MAX_SUMMED = 2**18  # values under a box: 23 x 23 m of a map of 5 classes in cells of 0.1 m
 SIZE_RANGE_M = (0.2, 40.0)  # boxes are clipped to these sizes
 MAX_PROBABILITY = 1.02  # rounded to bfloat16, probabilities add up to a little more than 1
 
@@ -73,6 +74,7 @@ def decode_slots(
     box_size_priors: Mapping[str, tuple[float, float, float]],
     mount_height_m: float,
     *,
+    max_boxes: int = 100,
     model: str = "the model",
 ) -> list[Box]:
     """Decode axis-aligned boxes; each gets the class of the segmentation at its center (SSADNet 2.2.1 B).
@@ -93,6 +95,8 @@ def decode_slots(
         Class to (length, width, height) [m]; only the height is used, because the top view has none.
     mount_height_m : float
         Height of the sensor above the road [m]; boxes stand on the road.
+    max_boxes : int
+        Only this many boxes with the best scores are returned.
     model : str
         Name for messages.
 
@@ -122,17 +126,19 @@ def decode_slots(
     if missing:
         raise CardMismatchError(f"{model}: no box_size_priors for {missing}; box_slots needs one for each box class")
     _check_finite(rows, "box_slots", model)
+    values = rows.astype(np.float64)
+    smaller = np.minimum(values[:, 3] * height * geometry.cell_m, values[:, 2] * width * geometry.cell_m)
+    values = values[((values[:, :2] >= 0.0) & (values[:, :2] < 1.0)).all(axis=1) & (smaller >= MIN_EXTENT_M)]
+    at_row, at_col = (values[:, 1] * height).astype(np.int64), (values[:, 0] * width).astype(np.int64)
+    is_box = np.array([name in box_classes for name in classes])[labels[at_row, at_col]]
+    values, score = values[is_box], np.minimum(scores[at_row, at_col][is_box], 1.0)
     boxes = []
-    for center_col, center_row, across_share, along_share in rows.tolist():
+    best = np.argsort(-score, kind="stable")[:max_boxes]
+    for center_col, center_row, across_share, along_share in values[best].tolist():
         along_m = along_share * height * geometry.cell_m
         across_m = across_share * width * geometry.cell_m
-        inside = 0.0 <= center_col < 1.0 and 0.0 <= center_row < 1.0
-        if not inside or min(along_m, across_m) < MIN_EXTENT_M:
-            continue
         at = (int(center_row * height), int(center_col * width))
         label = classes[labels[at]]
-        if label not in box_classes:
-            continue
         tall = float(box_size_priors[label][2])
         center = (
             geometry.x_range_m[1] - center_row * height * geometry.cell_m,
@@ -140,8 +146,10 @@ def decode_slots(
             tall / 2.0 - mount_height_m,
         )
         size = (max(along_m, across_m), min(along_m, across_m), tall)
-        boxes.append(Box(label, min(float(scores[at]), 1.0), center, size, 0.0 if along_m >= across_m else math.pi / 2.0))
-    return sorted(boxes, key=lambda box: -box.score)
+        boxes.append(
+            Box(label, min(float(scores[at]), 1.0), center, size, 0.0 if along_m >= across_m else math.pi / 2.0)
+        )
+    return boxes
 
 
 def decode_dense(
@@ -419,7 +427,8 @@ def fill_footprint_sums(
     cell : float
         Edge of a pixel [m].
     sums : (n, C) float64, overwritten
-        A rectangle that holds no pixel center gets the nearest pixel in view.
+        A rectangle that holds no pixel center gets the nearest pixel in view. If its bounds hold more than 2^18
+        values, only every other row and column is summed, or fewer still.
     """
     n_classes, height, width = values.shape
     pixel = np.empty(n_classes)
@@ -433,10 +442,12 @@ def fill_footprint_sums(
         last_row = min(math.ceil((x_far - x + reach) / cell), height)
         first_col = max(math.floor((y_left - y - reach) / cell), 0)
         last_col = min(math.ceil((y_left - y + reach) / cell), width)
+        n_values = n_classes * max(last_row - first_row, 0) * max(last_col - first_col, 0)
+        step = max(math.ceil(math.sqrt(n_values / MAX_SUMMED)), 1)
         n_inside = 0
-        for row in range(first_row, last_row):
+        for row in range(first_row, last_row, step):
             dx = x_far - (row + 0.5) * cell - x
-            for col in range(first_col, last_col):
+            for col in range(first_col, last_col, step):
                 dy = y_left - (col + 0.5) * cell - y
                 if abs(dx * cos + dy * sin) <= 0.5 * length and abs(dy * cos - dx * sin) <= 0.5 * across:
                     n_inside += 1

@@ -112,7 +112,9 @@ def shared_area(iou: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.
     return np.asarray(iou / (1.0 + iou) * areas, np.float64)
 
 
-def suppress_overlaps(rectangles: ArrayLike, scores: ArrayLike, iou_threshold: float) -> NDArray[np.int64]:
+def suppress_overlaps(
+    rectangles: ArrayLike, scores: ArrayLike, iou_threshold: float, *, max_inside: float = math.inf
+) -> NDArray[np.int64]:
     """Greedy non-maximum suppression of oriented rectangles.
 
     Parameters
@@ -122,6 +124,8 @@ def suppress_overlaps(rectangles: ArrayLike, scores: ArrayLike, iou_threshold: f
     scores : (n,) array_like
     iou_threshold : float
         A rectangle is dropped if it overlaps a kept one with a better score by more than this.
+    max_inside : float
+        It is also dropped if the area shared with a better one is more than this share of the smaller one's area.
 
     Returns
     -------
@@ -140,7 +144,7 @@ def suppress_overlaps(rectangles: ArrayLike, scores: ArrayLike, iou_threshold: f
         raise PointsError(f"got scores of shape {values.shape} for {len(rows)} rectangles; pass one score a rectangle")
     order = np.argsort(-values, kind="stable")
     keep = np.empty(len(rows), dtype=np.bool_)
-    mark_nms(rows[order], iou_threshold, keep)
+    mark_nms(rows[order], iou_threshold, max_inside, keep)
     return order[keep]
 
 
@@ -197,20 +201,27 @@ def fill_oriented_iou(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArr
 
 
 @njit(cache=True, nogil=True)
-def mark_nms(rectangles: NDArray[np.float64], iou_threshold: float, keep: NDArray[np.bool_]) -> None:
-    """Mark the rectangles that overlap no better kept rectangle by more than ``iou_threshold``.
+def mark_nms(rectangles: NDArray[np.float64], iou_threshold: float, max_inside: float, keep: NDArray[np.bool_]) -> None:
+    """Mark the rectangles that overlap no better kept rectangle too much.
 
     Parameters
     ----------
     rectangles : (n, 5) float64, C-contiguous
         Best first.
     iou_threshold : float
+    max_inside : float
+        Of the smaller area of two.
     keep : (n,) bool, overwritten
     """
     for i in range(rectangles.shape[0]):
         keep[i] = True
+        area = rectangles[i, 2] * rectangles[i, 3]
         for j in range(i):
-            if keep[j] and pair_iou(rectangles[j], rectangles[i]) > iou_threshold:
+            if not keep[j]:
+                continue
+            iou = pair_iou(rectangles[j], rectangles[i])
+            other = rectangles[j, 2] * rectangles[j, 3]
+            if iou > iou_threshold or iou / (1.0 + iou) * (other + area) > max_inside * min(other, area):
                 keep[i] = False
                 break
 

@@ -54,12 +54,15 @@ def oriented_iou(a, b):
     return iou
 
 
-def nms(rectangles, iou_threshold):
+def nms(rectangles, iou_threshold, max_inside=np.inf):
     """Twin of `edgeperc.geometry.mark_nms`."""
     iou = oriented_iou(rectangles, rectangles)
+    area = rectangles[:, 2] * rectangles[:, 3]
+    shared = iou / (1.0 + iou) * np.add.outer(area, area)
+    same = (iou > iou_threshold) | (shared > max_inside * np.minimum.outer(area, area))
     keep = np.ones(len(rectangles), dtype=bool)
     for i in range(len(rectangles)):
-        keep[i] = not (iou[i, :i][keep[:i]] > iou_threshold).any()
+        keep[i] = not same[i, :i][keep[:i]].any()
     return keep
 
 
@@ -92,7 +95,7 @@ def peaks(heat, threshold):
     return peak
 
 
-def footprint_sums(values, are_logits, rectangles, x_far, y_left, cell):
+def footprint_sums(values, are_logits, rectangles, x_far, y_left, cell, max_summed=2**18):
     """Twin of `edgeperc.decode.fill_footprint_sums`."""
     probabilities = softmax(values) if are_logits else values.astype(np.float64)
     _, height, width = values.shape
@@ -103,6 +106,18 @@ def footprint_sums(values, are_logits, rectangles, x_far, y_left, cell):
         along = (x - at_x) * np.cos(yaw) + (y - at_y) * np.sin(yaw)
         aside = (y - at_y) * np.cos(yaw) - (x - at_x) * np.sin(yaw)
         inside = (abs(along) <= length / 2) & (abs(aside) <= across / 2)
+        # Under huge rectangles only some rows and columns are summed.
+        reach = 0.5 * np.hypot(length, across)
+        first = [max(int(np.floor((edge - at - reach) / cell)), 0) for edge, at in ((x_far, at_x), (y_left, at_y))]
+        last = [
+            min(int(np.ceil((edge - at + reach) / cell)), size)
+            for edge, at, size in ((x_far, at_x, height), (y_left, at_y, width))
+        ]
+        n_values = len(values) * max(last[0] - first[0], 0) * max(last[1] - first[1], 0)
+        step = max(int(np.ceil(np.sqrt(n_values / max_summed))), 1)
+        summed = np.zeros_like(inside)
+        summed[first[0] :: step, first[1] :: step] = True
+        inside &= summed
         if not inside.any():
             row = min(max(int(np.floor((x_far - at_x) / cell)), 0), height - 1)
             col = min(max(int(np.floor((y_left - at_y) / cell)), 0), width - 1)
