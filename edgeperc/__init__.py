@@ -46,7 +46,7 @@ from .errors import (
 if TYPE_CHECKING:
     from .card import ModelCard
     from .drivable import RoadAhead, road_ahead
-    from .level import ModelFrame
+    from .frame import ModelFrame
     from .listing import ModelInfo, ProviderInfo, SensorInfo, models, providers, sensors
     from .live import Answer, Stream, stream
     from .mounting import Mounting
@@ -111,7 +111,7 @@ _MODULES = {
     "Answer": "live",
     "Box": "perception",
     "ModelCard": "card",
-    "ModelFrame": "level",
+    "ModelFrame": "frame",
     "ModelInfo": "listing",
     "Mounting": "mounting",
     "Perceiver": "perceiver",

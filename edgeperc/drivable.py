@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import PointsError
+from .frame import ModelFrame
 from .geometry import draw_footprints
 from .kernel_cache import njit
 from .perception import Box, TopView
@@ -38,7 +39,7 @@ BESIDE_M = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoadAhead:
-    """The road in a top view, in the sensor frame [m].
+    """The road in a top view, in the frame of the models [m] (see `TopView`).
 
     Attributes
     ----------
@@ -96,7 +97,8 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
     top_view : TopView
         Cells that the scan did not observe are not free, whatever their label.
     boxes : iterable of Box
-        Obstacles that are not road, such as `Perception.boxes`: the top view has no class for pedestrians.
+        Obstacles that are not road, such as `Perception.boxes`, in the frame of the scan: the top view has no class for
+        pedestrians.
     tolerance_m : float
         Largest distance of the polygon from the edges of the cells [m] (Douglas and Peucker, 1973); 0 keeps every
         corner. The default is one cell of the shipped models, which removes the steps of a slanting edge. With more
@@ -121,7 +123,7 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
     if not tolerance_m >= 0.0:
         raise PointsError(f"tolerance_m is {tolerance_m}; expected 0 or more meters")
     drivable = np.array(top_view.drivable, np.bool_, order="C")
-    standing = list(boxes)
+    standing = ModelFrame(top_view.mounting).move_boxes(boxes)
     if standing:
         taken = np.zeros(drivable.shape, np.uint8)
         draw_footprints(taken, standing, top_view.geometry, ("free", *{box.label for box in standing}))

@@ -1,87 +1,26 @@
-"""The frame that the models work in, and a sensor's mounting as its scans show it.
-
-The models were trained on scans of one vehicle: x forward, the road 1.73 m below the sensor. `ModelFrame` moves a scan
-of any mounting into that frame, and boxes back. `MountingEstimator` finds height and tilt from the ground in the scans,
-without labels.
-"""
+"""Find how a sensor is mounted from the ground in its scans."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import MountingError
+from .frame import ModelFrame
 from .ground import N_CELLS, TOLERANCE_M, fill_lowest, fit_first_plane
 from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
-from .perception import Box
 from .points import read_only
 
-__all__ = ["FROZEN_AFTER", "ModelFrame", "MountingEstimate", "MountingEstimator"]
+__all__ = ["FROZEN_AFTER", "MountingEstimate", "MountingEstimator"]
 
 # What differs from the training vehicle by less is taken for the street's own slope and camber, and scans stay as they
 # are. In single KITTI scans the estimates of one mounting scatter by 0.03 m, 1.0 deg of roll and 0.3 deg of pitch. An
 # error of 0.2 m, 2 deg of roll or 0.75 deg of pitch costs about one, one and three points of IoU of cars.
 SAME_HEIGHT_M, SAME_ROLL_DEG, SAME_PITCH_DEG = 0.15, 2.5, 0.75
-
-
-class ModelFrame:
-    """Moves scans into the frame of the models, and boxes back.
-
-    Parameters
-    ----------
-    mounting : Mounting
-        A known one.
-
-    Attributes
-    ----------
-    is_identity : bool
-        Scans need not be moved.
-    R : (3, 3) float64
-    t : (3,) float64
-        A point p of the scan lies at ``R p + t`` [m] in the models' frame.
-    """
-
-    def __init__(self, mounting: Mounting) -> None:
-        assert mounting.height_m is not None
-        from_vehicle = MODEL_MOUNTING.rotation().T
-        self.R: NDArray[np.float64] = from_vehicle @ mounting.rotation()
-        raised = from_vehicle @ np.array([0.0, 0.0, mounting.height_m - MODEL_HEIGHT_M])
-        self.t: NDArray[np.float64] = raised - self.R @ np.array([*mounting.origin_m, 0.0])
-        self.is_identity = bool(np.allclose(self.R, np.eye(3), atol=1e-9) and np.allclose(self.t, 0.0, atol=1e-6))
-
-    def move(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Scan (n, 4) in the models' frame; the same array if nothing moves."""
-        if self.is_identity:
-            return points
-        moved = np.empty_like(points, order="C")
-        moved[:, 3] = points[:, 3]
-        with np.errstate(over="ignore", invalid="ignore"):
-            # Coordinates of a world frame need more than float32 until they are shifted.
-            xyz = points[:, :3].astype(np.float64) if abs(self.t).max() > 1e3 else points[:, :3]
-            moved[:, :3] = xyz @ self.R.T.astype(xyz.dtype) + self.t.astype(xyz.dtype)
-        return read_only(moved)
-
-    def move_boxes(self, boxes: Sequence[Box]) -> tuple[Box, ...]:
-        """Boxes of the scan's frame in the models' frame. They stay upright: a box has no tilt."""
-        return tuple(boxes) if self.is_identity else _moved(boxes, self.R, self.t)
-
-    def boxes_back(self, boxes: Sequence[Box]) -> tuple[Box, ...]:
-        """Boxes of the models' frame in the frame of the scan."""
-        return tuple(boxes) if self.is_identity else _moved(boxes, self.R.T, -self.R.T @ self.t)
-
-
-def _moved(boxes: Sequence[Box], R: NDArray[np.float64], t: NDArray[np.float64]) -> tuple[Box, ...]:
-    moved = []
-    for box in boxes:
-        x, y, z = (R @ np.array(box.center) + t).tolist()
-        ahead = R[:, 0] * math.cos(box.yaw) + R[:, 1] * math.sin(box.yaw)
-        moved.append(replace(box, center=(x, y, z), yaw=math.atan2(ahead[1], ahead[0])))
-    return tuple(moved)
 
 
 @dataclass(frozen=True)

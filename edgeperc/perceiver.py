@@ -25,8 +25,9 @@ from .decode import decode_classes, decode_top_view
 from .drivable import compile_kernels
 from .errors import EdgepercError, FitnessError, MountingError, OptionError
 from .fitness import Finding, FitnessProfile, check_fitness
+from .frame import ModelFrame
 from .ground import find_ground
-from .level import ModelFrame, MountingEstimate, MountingEstimator
+from .level import MountingEstimate, MountingEstimator
 from .mounting import MODEL_HEIGHT_M, Mounting
 from .observed import Observer
 from .perception import Box, Perception, PointLabels, TopView
@@ -438,7 +439,8 @@ class Perceiver:
         threshold = card.score_threshold if self.score_threshold is None else self.score_threshold
         labels, found = decode_top_view(card, network.index >= 0, outputs, threshold)
         watch.lap("decode")
-        view = TopView(labels, card.classes, card.view.cell_m, card.view.x_range_m, card.view.y_range_m, observed)
+        grid = card.view
+        view = TopView(labels, card.classes, grid.cell_m, grid.x_range_m, grid.y_range_m, observed, self._mounting)
         return view, tuple(found)
 
     def _label_sector(

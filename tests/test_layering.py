@@ -22,17 +22,19 @@ PACKAGES = {
 # A module imports from the lines above its own, never from its own line. A new module gets its place here.
 FLOORS = {
     "edgeperc": """
-        errors atomic
-        extras onnx_file
+        errors atomic printable
+        extras mounting onnx_file
         card points sensor tuning
         kernel_cache perception zoo.__init__
-        geometry linkage
+        frame geometry linkage
         adapt cluster decode drivable fitness ground observed projection refine sensor_fit session
+        level
         readers.__init__ readers.tables
         readers.inflate readers.packets
         readers.pcd readers.ply
         readers.files readers.mcap readers.ouster
         readers.decoders
+        readers.identify
         readers.worker
         readers.apart
         readers.captures
@@ -58,8 +60,9 @@ FLOORS = {
         view.canvas view.content
         view.files view.mistakes view.page view.picture view.tracks
         view.__init__
-        cli.arguments cli.output cli.scans
-        cli.completion cli.fit_sensor cli.info cli.run
+        cli.arguments cli.output
+        cli.scans
+        cli.completion cli.fit_sensor cli.info cli.program cli.run
         cli.demo cli.eval cli.eval_sensors cli.eval_tracking cli.lists
         cli.main
         cli.__init__
@@ -70,7 +73,7 @@ FLOORS = {
         augment cards losses networks.edge networks.lodnn networks.squeezesegv2 roads simulate
         models_page networks.kulseg task
         networks.__init__ samples teacher
-        watch
+        checkpoint watch
         to_onnx train
         agree quantize ablation make
         database.__init__ database.files

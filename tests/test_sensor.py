@@ -75,7 +75,6 @@ def test_an_unknown_sensor_lists_the_known(name):
         {"remission_range": (1, 0)},
         {"remission_range": (0, float("inf"))},
         {"remission_range": (0, 1, 2)},
-        {"mount_height_m": 0.0},
         {"min_range_m": -1.0},
         {"max_range_m": 0.5},
         {"max_range_m": float("inf")},

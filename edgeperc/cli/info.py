@@ -227,7 +227,8 @@ def _scan_rows(
 
     from ..adapt import condition
     from ..fitness import FitnessProfile, check_fitness
-    from ..level import FROZEN_AFTER, ModelFrame, MountingEstimator
+    from ..frame import ModelFrame
+    from ..level import FROZEN_AFTER, MountingEstimator
     from ..readers.captures import read_scans
     from ..sensor import get_sensor
     from ..zoo import listed

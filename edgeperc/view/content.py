@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
+from ..frame import ModelFrame
+from ..mounting import MODEL_MOUNTING
 from ..perception import Box, Perception
 from .colors import CLASS_COLORS
 
@@ -20,6 +23,7 @@ __all__ = [
     "drawable_boxes",
     "drawable_points",
     "fit_ground",
+    "in_model_frame",
     "paint_points",
     "provider_lines",
     "timing_line",
@@ -41,6 +45,18 @@ def check_points(points: NDArray[np.float32], perception: Perception) -> None:
         raise PointsError(
             f"{len(points)} points with a perception of {perception.n_points}; expected the scan that was perceived"
         )
+
+
+def in_model_frame(perception: Perception, points: NDArray[np.float32]) -> tuple[Perception, NDArray[np.float32]]:
+    """The perception with its boxes, and its scan, in the frame of the models, where the top view lies."""
+    frame = ModelFrame(perception.mounting)
+    if frame.is_identity:
+        return perception, points
+    boxes = frame.move_boxes(drawable_boxes(perception.boxes))
+    top_view = perception.top_view
+    if top_view is not None:
+        top_view = replace(top_view, mounting=MODEL_MOUNTING)
+    return replace(perception, boxes=boxes, top_view=top_view, mounting=MODEL_MOUNTING), frame.move(points)
 
 
 def drawable_points(points: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import html
 import json
 import re
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..atomic import write_atomic
 from ..perception import Perception, TopView
+from ..printable import printable
 from .colors import HIGH, LOW, color_of
 from .content import (
     box_corners,
@@ -23,6 +25,7 @@ from .content import (
     drawable_boxes,
     drawable_points,
     fit_ground,
+    in_model_frame,
     paint_points,
     provider_lines,
     timing_line,
@@ -53,6 +56,7 @@ def write_html(perception: Perception, points: NDArray[np.float32], path: str | 
         The file cannot be written.
     """
     check_points(points, perception)
+    perception, points = in_model_frame(perception, points)
     names, painted = paint_points(points, perception)
     seen = drawable_points(points)
     points, painted = points[seen], painted[seen]
@@ -64,34 +68,52 @@ def write_html(perception: Perception, points: NDArray[np.float32], path: str | 
         "xyz": _base64(points[:, :3].astype("<f4")),
         "remission": _base64((remission * 255.0).astype(np.uint8)),
         "label": _base64(painted),
-        "classes": [{"name": name, "color": color_of(name), "facts": facts.get(name, [])} for name in listed],
+        "classes": [
+            {"name": printable(name), "color": color_of(name), "facts": facts.get(name, [])} for name in listed
+        ],
         "low": LOW,
         "high": HIGH,
         "ground": [round(value, 5) for value in fit_ground(points, names, painted)],
         "road": None if perception.top_view is None else _road(perception.top_view),
         "boxes": [
             {
-                "name": box.label,
+                "name": printable(box.label),
                 "corners": np.round(box_corners(box), 3).tolist(),
                 "color": color_of(box.label),
-                "text": f"{box.label} {box.score:.2f}",
+                "text": f"{printable(box.label)} {box.score:.2f}",
             }
             for box in drawable_boxes(perception.boxes)
         ],
     }
-    # A class name with "</script>" must not close the script element.
+    # A class name with "</script>" or "<!--" must not end the script element.
     data = json.dumps(scene, allow_nan=False).replace("<", "\\u003c")
-    ran = "".join(f"<br>{html.escape(line)}" for line in provider_lines(perception))
+    ran = "".join(f"<br>{_escaped(line)}" for line in provider_lines(perception))
+    template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
     filled = {
-        "@@TITLE@@": html.escape(title or "A scan"),
-        "@@FACTS@@": f"{perception.n_points:,} points · {html.escape(timing_line(perception))}{ran}",
-        "@@FITNESS@@": "".join(f"<p class=warning>{html.escape(line)}</p>" for line in perception.fitness),
+        "@@POLICY@@": _policy(template),
+        "@@TITLE@@": _escaped(title or "A scan"),
+        "@@FACTS@@": f"{perception.n_points:,} points · {_escaped(timing_line(perception))}{ran}",
+        "@@FITNESS@@": "".join(f"<p class=warning>{_escaped(line)}</p>" for line in perception.fitness),
         "@@SCENE@@": data,
     }
-    template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
     # One pass, so that a title such as "@@SCENE@@" is not replaced.
     page = re.sub("|".join(filled), lambda match: filled[match.group()], template)
-    write_atomic(path, page.encode(errors="replace"))
+    write_atomic(path, page.encode())
+
+
+def _escaped(text: str) -> str:
+    """A text from outside, as HTML."""
+    return html.escape(printable(text))
+
+
+def _policy(template: str) -> str:
+    """The content security policy: the page loads nothing, and runs no script but its own, named by its hash."""
+    allowed = ["default-src 'none'", "base-uri 'none'", "form-action 'none'"]
+    for element in ("script", "style"):
+        (content,) = re.findall(f"<{element}>(.*?)</{element}>", template, flags=re.DOTALL)
+        digest = hashlib.sha256(content.encode()).digest()
+        allowed.append(f"{element}-src 'sha256-{base64.b64encode(digest).decode()}'")
+    return "; ".join(allowed)
 
 
 def _road(top_view: TopView) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from .content import (
     drawable_boxes,
     drawable_points,
     fit_ground,
+    in_model_frame,
     paint_points,
     provider_lines,
     timing_line,
@@ -69,6 +70,7 @@ def draw(
         The file cannot be written.
     """
     check_points(points, perception)
+    perception, points = in_model_frame(perception, points)
     names, painted = paint_points(points, perception)
     seen = drawable_points(points)
     points, painted = points[seen], painted[seen]

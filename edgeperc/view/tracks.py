@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..atomic import write_atomic
 from ..errors import TrackingError
 from ..extras import require
+from ..frame import ModelFrame
 from ..perception import Perception
 from .canvas import free_place
 from .colors import CLASS_COLORS, FAINT, FRAME, GROUND, HIGH, INK, LOW, PANEL, color_of, rgb
@@ -58,10 +59,14 @@ def flatten_scan(points: NDArray[np.float32], perception: Perception | None = No
             view = perception.top_view
             x = (np.arange(_WIDTH) + 0.5) / _PX_PER_M - _BEHIND_M
             y = _BESIDE_M - (np.arange(_HEIGHT) + 0.5) / _PX_PER_M
+            x, y = np.broadcast_arrays(x, y[:, None])
+            frame = ModelFrame(perception.mounting)
+            if not frame.is_identity:
+                road_z = -(perception.mounting.height_m or 0.0)
+                x, y = np.einsum("ij,jhw->ihw", frame.R[:2], [x, y, np.full_like(x, road_z)]) + frame.t[:2, None, None]
             row = np.floor((view.x_range_m[1] - x) / view.cell_m)
-            col = np.floor((view.y_range_m[1] - y) / view.cell_m)[:, None]
+            col = np.floor((view.y_range_m[1] - y) / view.cell_m)
             inside = (row >= 0) & (row < view.labels.shape[0]) & (col >= 0) & (col < view.labels.shape[1])
-            row, col = np.broadcast_arrays(row, col)
             image[inside] = _ROAD * view.drivable[row[inside].astype(np.intp), col[inside].astype(np.intp)]
     seen = drawable_points(points)
     points, painted = points[seen], painted[seen]
@@ -257,7 +262,8 @@ def _write_frame(pen: Any, title: str, facts: str, labels: Sequence[str], fonts:
     pen.rectangle([0, 0, width, head], fill=GROUND)
     pen.rectangle([0, foot, width, foot + _FINE * _FOOT], fill=GROUND)
     middle = head // 2
-    title = "".join(c if c.isprintable() and ord(c) < 256 else "?" for c in title)
+    # A longer title does not fit, and would take minutes to measure.
+    title = "".join(c if c.isprintable() and ord(c) < 256 else "?" for c in title[: width // 8])
     facts_left = width - 32 - pen.textlength(facts, font=fonts[17])
     while len(title) > 1 and pen.textlength(title, font=fonts[17]) > facts_left - 64:
         title = f"{title[:-4]}..."
