@@ -9,6 +9,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from numbers import Integral, Real
@@ -268,7 +269,8 @@ class Perceiver:
         self._perceive(warm_up, None, check=self._to_check > 0, infer=False)
         if boxes_from != "network" and "range_image" in views:
             self._find_objects(*self._warm_up_objects())
-        self._estimator.add(self._warm_up_objects()[0])
+        with suppress(MountingError):  # it has a floor, but no street
+            self._estimator.add(self._warm_up_objects()[0])
         if "top_view" in views:
             compile_kernels()  # of `edgeperc.road_ahead`
 
