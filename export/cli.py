@@ -13,7 +13,7 @@ from typing import Any
 from edgeperc import __version__
 from edgeperc.cli.output import print_error, print_line
 from edgeperc.cli.program import Parser, run_program
-from edgeperc.errors import EdgepercError, MissingExtraError
+from edgeperc.errors import EdgepercError, MissingExtraError, ModelError
 
 from .database.cli import add_database_commands
 from .recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe
@@ -322,12 +322,16 @@ def _verify(args: argparse.Namespace) -> int:
 
 def _card(args: argparse.Namespace) -> int:
     import onnx
+    from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 
     from edgeperc.card import ModelCard
 
     from .to_onnx import with_golden, write_card
 
-    model = onnx.load(args.model)
+    try:
+        model = onnx.load(args.model)
+    except DecodeError as exc:
+        raise ModelError(f"{args.model} is not an ONNX model: {exc}") from exc
     card = with_golden(model, ModelCard.from_json(args.card.read_text()))
     write_card(model, card, args.out)
     print_line(f"{args.out}: {card.name} {card.version}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import http.client
 import http.server
@@ -30,6 +31,7 @@ for package in ("faster_coco_eval", "filelock", "tqdm", "onnx", "onnxruntime"):
 from database_helpers import TRAPEZIUM, drawn, plan_of, road_network, simulated_kitti
 
 from edgeperc.card import TopViewGeometry
+from edgeperc.printable import printable
 from edgeperc_export.database import label_page
 from edgeperc_export.database.build import build
 from edgeperc_export.database.files import TopViewDatabase
@@ -664,3 +666,44 @@ def test_other_sites_cannot_frame_read_or_write(server: LabelServer, browser: An
     assert page.evaluate(width, f"{server.url}image/000001") == 200
     page.close()
     assert not server.polygons.exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="elsewhere files cannot have these names")
+def test_names_of_scenes_are_only_text(out: Path, tmp_path: Path, browser: Any) -> None:
+    hostile = {
+        "000001": "<img src=x onerror='window.stolen=1'>",
+        "000002": "\"'<svg onload=window.stolen=1>",
+        "000003": "\u202egpj@@TOKEN@@ #?%2e&\n",
+    }
+    shutil.copytree(out, tmp_path / "out")
+    rows = [{**row, "scene": hostile.get(row["scene"], row["scene"])} for row in TopViewDatabase(out).rows]
+    for row in rows:
+        row["drive"] = "<script>window.stolen=1</script>"
+    for old, new in hostile.items():
+        for folder, suffix in (("images", "png"), ("labels", "txt"), ("maps", "png")):
+            (tmp_path / "out" / folder / f"{old}.{suffix}").rename(tmp_path / "out" / folder / f"{new}.{suffix}")
+    with (tmp_path / "out/index.csv").open("w", newline="") as file:
+        index = csv.DictWriter(file, rows[0])
+        index.writeheader()
+        index.writerows(rows)
+    known = json.loads((out / "manifest.json").read_text())
+    known["sha256"]["index.csv"] = hashlib.sha256((tmp_path / "out/index.csv").read_bytes()).hexdigest()
+    (tmp_path / "out/manifest.json").write_text(json.dumps(known))
+    with running(LabelServer(tmp_path / "out", tmp_path / "road.json")) as server:
+        page = browser.new_page()
+        page.goto(server.url)
+        page.wait_for_selector("body[data-scene]")
+        listed = page.evaluate(
+            "[...document.querySelectorAll('nav button')].map(button => button.firstChild.textContent)"
+        )
+        assert set(map(printable, hostile.values())) < set(listed)
+        assert server.token not in str(listed)
+        for k, row in enumerate(rows):
+            page.click(f"nav button >> nth={k}")
+            page.wait_for_function("name => document.body.dataset.scene === name", arg=row["scene"])
+            assert page.text_content("h1") == f"{printable(row['scene'])} {row['drive']}, {row['split']}"
+            assert page.evaluate("window.stolen") is None
+            page.keyboard.press("d")
+            page.wait_for_function("() => /^(Saved|The model)/.test(document.getElementById('saved').textContent)")
+        page.close()
+        assert {*hostile.values()} & {*server.roads}

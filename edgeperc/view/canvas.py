@@ -102,9 +102,15 @@ def _width(figure: Any, text: str, **style: Any) -> float:
     return width
 
 
+def _most_characters(width: float, fontsize: float) -> int:
+    """More characters than fit into ``width`` pixels. Measuring a name of thousands of characters would take seconds."""
+    return int(width / (0.25 * fontsize * _DPI / 72.0)) + 1  # the font's narrowest character has 0.275 of its size
+
+
 def shorten(figure: Any, text: str, width: float, **style: Any) -> str:
     """Cut a text at its start so that it fits into ``width`` pixels."""
-    kept = text
+    most = _most_characters(width, style["fontsize"])
+    kept = text if len(text) <= most else "…" + text[-most:]
     while len(kept) > 1 and _width(figure, kept, **style) > width:
         kept = "…" + kept[1 + max(1, len(kept) // 12) :]
     return kept
@@ -113,7 +119,7 @@ def shorten(figure: Any, text: str, width: float, **style: Any) -> str:
 def wrap(figure: Any, text: str, width: float, **style: Any) -> list[str]:
     """Break a text into lines of at most ``width`` pixels."""
     text = " ".join(text.split())
-    n = max(1, len(text))
+    n = max(1, min(len(text), _most_characters(width, style["fontsize"])))
     while True:
         lines = textwrap.wrap(text, n)
         if n == 1 or all(_width(figure, line, **style) <= width for line in lines):
