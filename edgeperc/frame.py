@@ -13,11 +13,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .kernel_cache import njit
 from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .perception import Box
 from .points import read_only
 
-__all__ = ["ModelFrame"]
+__all__ = ["ModelFrame", "fill_moved"]
 
 
 class ModelFrame:
@@ -46,15 +47,11 @@ class ModelFrame:
         self.is_identity = bool(np.allclose(self.R, np.eye(3), atol=1e-9) and np.allclose(self.t, 0.0, atol=1e-6))
 
     def move(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Scan (n, 4) in the models' frame; the same array if nothing moves."""
+        """Scan (n, 4) float32 in the models' frame, read-only; the same array if nothing moves."""
         if self.is_identity:
             return points
-        moved = np.empty_like(points, order="C")
-        moved[:, 3] = points[:, 3]
-        with np.errstate(over="ignore", invalid="ignore"):
-            # Coordinates of a world frame need more than float32 until they are shifted.
-            xyz = points[:, :3].astype(np.float64) if abs(self.t).max() > 1e3 else points[:, :3]
-            moved[:, :3] = xyz @ self.R.T.astype(xyz.dtype) + self.t.astype(xyz.dtype)
+        moved = np.empty(points.shape, np.float32)
+        fill_moved(read_only(points), self.R, self.t, moved)
         return read_only(moved)
 
     def move_boxes(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
@@ -73,3 +70,24 @@ def _moved(boxes: Iterable[Box], R: NDArray[np.float64], t: NDArray[np.float64])
         ahead = R[:, 0] * math.cos(box.yaw) + R[:, 1] * math.sin(box.yaw)
         moved.append(replace(box, center=(x, y, z), yaw=math.atan2(ahead[1], ahead[0])))
     return tuple(moved)
+
+
+@njit(cache=True, nogil=True)
+def fill_moved(
+    points: NDArray[np.float32], R: NDArray[np.float64], t: NDArray[np.float64], moved: NDArray[np.float32]
+) -> None:
+    """Write ``R p + t`` of every point into ``moved`` (n, 4) float32, with its remission.
+
+    Parameters
+    ----------
+    points : (n, 4) float32, C-contiguous
+    R : (3, 3) float64
+    t : (3,) float64
+    moved : (n, 4) float32, overwritten
+        A coordinate beyond the range of float32 becomes infinite.
+    """
+    for i in range(points.shape[0]):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        for axis in range(3):
+            moved[i, axis] = R[axis, 0] * x + R[axis, 1] * y + R[axis, 2] * z + t[axis]
+        moved[i, 3] = points[i, 3]

@@ -13,7 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+import twins.frame
 from edgeperc import Box, FitnessError, ModelFrame, Mounting, MountingError, OptionError, Perceiver, SensorError
+from edgeperc.frame import fill_moved
 from edgeperc.level import FROZEN_AFTER, MountingEstimator
 from edgeperc.mounting import MODEL_MOUNTING
 from edgeperc.sensor import SensorProfile, get_sensor
@@ -176,6 +178,20 @@ def test_moved_points_lie_where_the_rule_says(mounting: Mounting, seed: int) -> 
     np.testing.assert_array_equal(moved[:, 3], points[:, 3])
     assert moved.dtype == np.float32
     assert len(ModelFrame(mounting).move(points[:0])) == 0
+
+
+@pytest.mark.parametrize("kind", ["random", "empty", "one", "not finite", "huge"])
+def test_the_kernel_agrees_with_its_twin(kind: str) -> None:
+    points = np.random.default_rng(1).normal(0.0, 30.0, (200, 4)).astype(np.float32)
+    if kind == "huge":
+        points *= np.float32(3e36)
+    if kind == "not finite":
+        points[::3, 1], points[::5, 3] = np.inf, np.nan
+    points = points[: {"empty": 0, "one": 1}.get(kind, 200)]
+    frame = ModelFrame(Mounting(2.0, 3.0, -5.0, 70.0, (1.0, 2.0)))
+    found = np.empty_like(points)
+    fill_moved(points, frame.R, frame.t, found)
+    np.testing.assert_array_equal(found, twins.frame.moved(points, frame.R, frame.t))
 
 
 @given(mountings, st.floats(-3.0, 3.0))
