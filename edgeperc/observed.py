@@ -27,8 +27,8 @@ CLEARANCE_M = 0.5
 Anything higher is seen: vehicles, people, a child. At the far edge of the view, 46 m, a ray of an HDL-64E passes 0.27 m
 above the return of the beam below it, so its road is observed without gaps, even if one beam has no return. A VLP-16,
 whose beams are 2 degrees apart, observes the road without gaps up to 20 m; farther out there are gaps between its
-returns. In 10 simulated scenes, an HDL-64E observes 82 % of all road, an OS1-64 81 % and a VLP-16 54 %; with 0.3 m
-82, 72 and 39 %, with 0.7 m 83, 82 and 61 %. Vehicles hide the 16 % that no sensor at this place sees.
+returns. In 10 simulated scenes, an HDL-64E observes 82 % of all road, an OS1-64 80 % and a VLP-16 54 %; with 0.3 m
+82, 71 and 39 %, with 0.7 m 82, 81 and 62 %. Objects hide about 16 % from any sensor at this place.
 """
 MAX_BEAMS = 2.2
 """Two returns on the ground are connected if their beams are at most this many steps of the sensor's beams apart.
