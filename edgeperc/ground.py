@@ -239,19 +239,22 @@ def fill_planes(
                 if total > 0.0:
                     expected /= total
                 else:
-                    expected[:] = first
+                    expected[0], expected[1], expected[2] = first[0], first[1], first[2]
                     expected[2] += first[0] * middle_x + first[1] * middle_y
                 row, col = r * CELLS_A_REGION, q * CELLS_A_REGION
                 n = fill_residuals(
                     points, lowest, row, col, CELLS_A_REGION, middle_x, middle_y, expected, BAND_M, 0.0, residuals
                 )
-                planes[r, q] = expected
+                # Element by element: to copy an array, numba compiles a broadcast with its error messages, for 3 s.
+                for k in range(3):
+                    planes[r, q, k] = expected[k]
                 solved[r, q] = 1.0
                 if n >= MIN_SUPPORT:
                     find_plane(residuals, n, MAX_BEND, MAX_SHIFT_M, N_HYPOTHESES, r * N_REGIONS + q, fitted)
                     support = refine_plane(residuals, n, prior, MAX_BEND, MAX_SHIFT_M, fitted)
                     if support >= MIN_SUPPORT:
-                        planes[r, q] += fitted
+                        for k in range(3):
+                            planes[r, q, k] += fitted[k]
                         solved[r, q] += support
 
 

@@ -191,7 +191,10 @@ def fill_without_outliers(
     cleaned : (H, W) uint8, overwritten
     """
     height, width = labels.shape
-    cleaned[:] = labels
+    # Element by element: to copy an array, numba compiles a broadcast with its error messages, for 3 s.
+    for row in range(height):
+        for col in range(width):
+            cleaned[row, col] = labels[row, col]
     seen = np.zeros((height, width), dtype=np.bool_)
     rim = np.full((height, width), -1, dtype=np.int32)  # the component that has an object near this pixel
     rows = np.empty(height * width, dtype=np.int32)
@@ -232,7 +235,7 @@ def fill_without_outliers(
                     if not is_near(ground, k, center[0], center[1], squared_radius):
                         rows[n_left] = row
                         cols[n_left] = col
-                        ground[n_left] = ground[k]
+                        ground[n_left, 0], ground[n_left, 1] = ground[k, 0], ground[k, 1]
                         n_left += 1
                         continue
                     for r in range(max(row - RIM, 0), min(row + RIM + 1, height)):

@@ -58,7 +58,9 @@ def fit_motion(
     with the largest `support`. It matches each track to its nearest detection, with Geman and McClure's weight
     1 / (1 + r2 / 9)^2, where r is the distance in standard deviations.
     """
-    motion[:] = prior
+    # Element by element: to copy an array, numba compiles a broadcast with its error messages, for 3 s.
+    for a in range(3):
+        motion[a] = prior[a]
     best = support(landmarks, detections, prior, prior_variances, motion)
     proposal = np.empty(3)
     cos, sin = math.cos(prior[2]), math.sin(prior[2])
@@ -75,7 +77,8 @@ def fit_motion(
             turn = math.atan2(landmarks[i, 1] - prior[1], landmarks[i, 0] - prior[0]) - math.atan2(y, x) - prior[2]
             turn -= 2.0 * math.pi * np.floor(turn / (2.0 * math.pi) + 0.5)  # math.floor raises on NaN
             for by_turn in (False, True):
-                proposal[:] = prior
+                for a in range(3):
+                    proposal[a] = prior[a]
                 if by_turn:
                     proposal[2] += turn
                     near = abs(turn) < 3.0 * math.sqrt(prior_variances[2])
@@ -88,7 +91,8 @@ def fit_motion(
                     fit = support(landmarks, detections, prior, prior_variances, proposal)
                     if fit > best:
                         best = fit
-                        motion[:] = proposal
+                        for a in range(3):
+                            motion[a] = proposal[a]
 
     information = np.empty((3, 3))
     slope = np.empty(3)

@@ -111,7 +111,11 @@ def fill_mode_probabilities(
                 shares[t, j, 0] = 1.0
             # A model with probability 0 could never recover, and its association would be 0 / 0.
             probabilities[t, j] = max(total, 1e-12)
-        probabilities[t] /= probabilities[t].sum()
+        total = 0.0
+        for j in range(k):
+            total += probabilities[t, j]
+        for j in range(k):
+            probabilities[t, j] /= total
 
 
 @njit(cache=True, nogil=True)

@@ -232,7 +232,8 @@ def fill_by_events(
             column = columns[choice[k]] + 1 if choice[k] >= 0 else 0
             beta[rows[k], column] += product[n]
     for k in range(n):
-        beta[rows[k]] /= total
+        for column in range(beta.shape[1]):
+            beta[rows[k], column] /= total
 
 
 @njit(cache=True, nogil=True)
