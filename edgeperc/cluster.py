@@ -104,10 +104,10 @@ def find_clusters(
     a neighboring column is joined if its bounds, and one pair of points, are near enough. Runs of many points are
     halved again and again, and only halves whose bounds are near enough are tested.
 
-    The time is bounded for any scan: a run has a bounded number of neighbors, and at most 64 tests a point are made.
-    Real scans need up to 4. More are needed if thousands of points lie between one and 1.01 distances from thousands
-    of others. After that only the nearest parts of two runs are tested, and they are not linked if there is no link:
-    a cluster may be split in two at such a place. A warning says how many pairs of runs this concerns.
+    The time is bounded for any scan: a run has a bounded number of neighbors, and 64 tests a point decide which are
+    linked. Real scans need up to 6. More are needed if thousands of points lie just beyond the distance from thousands
+    of others. From then on, only the nearest parts of two runs are tested, and the runs are not linked if that finds
+    no link: clusters may be split there. A warning gives the number of these pairs of runs.
 
     Warns
     -----

@@ -20,8 +20,9 @@ LEVEL_STEP = 1.5  # 2 took 8 % longer on KITTI scans
 SAFE = 1.0 + 1e-6  # against rounding
 MAX_SCANNED = 32  # runs of neighboring columns that are looked at in any order
 MAX_TESTED = 32  # points of a part that is not halved
+MAX_LAST_TESTED = 4  # the same, after the last of the tests
 MAX_PAIRS = 2048  # bounds of float32 coordinates can be halved 831 times
-TESTS_PER_POINT = 64  # real scans of 15 sensors need at most 4
+TESTS_PER_POINT = 64  # 570 real scans of 10 sensors need at most 6
 FREE, DROPPED = -1, -2  # runs in no cluster; runs of clusters with too few seeds
 
 
@@ -168,16 +169,15 @@ def fill_clusters(
     is_kept = np.zeros(n_runs, dtype=np.bool_)
     queue = np.empty(n_runs, dtype=np.int32)
     pairs = np.empty((MAX_PAIRS, 2), dtype=np.int32)
-    state = np.array([n_runs, TESTS_PER_POINT * m])  # number of parts, tests left
+    state = np.array([n_runs, 2 * TESTS_PER_POINT * m, TESTS_PER_POINT * m])  # number of parts, tests left, reserve
     n_clusters = 0
-    for first_point in rows[:m]:
-        if not seeds[first_point] or owner[clusters[first_point]] != FREE:
+    for seed in range(n_runs):
+        if run_seeds[seed] == 0 or owner[seed] != FREE:
             continue
-        queue[0] = clusters[first_point]
-        owner[queue[0]] = n_clusters
+        queue[0], owner[seed] = seed, n_clusters
         n_queued, n_done = 1, 0
-        size = parts[queue[0], 1] - parts[queue[0], 0]
-        n_seeds = run_seeds[queue[0]]
+        size = parts[seed, 1] - parts[seed, 0]
+        n_seeds = run_seeds[seed]
         n_left -= n_seeds
         is_dropped = False
         while n_done < n_queued and not is_dropped:
@@ -222,7 +222,7 @@ def fill_clusters(
                                 continue
                             n_points = max(parts[run, 1] - parts[run, 0], parts[other, 1] - parts[other, 0])
                             if n_points <= MAX_TESTED:
-                                n_tests = test_points(xyz, reach, parts, bounds, run, other)
+                                n_tests = test_points(xyz, reach, parts, bounds, state, run, other)
                                 state[1] -= abs(n_tests)
                                 linked = n_tests > 0
                             else:
@@ -243,7 +243,7 @@ def fill_clusters(
         else:
             is_kept[n_clusters] = size >= min_points and n_seeds / size > min_share
             n_clusters += 1
-    work[1] = TESTS_PER_POINT * m - state[1]
+    work[1] = 2 * TESTS_PER_POINT * m - state[1]
 
     number = np.full(n_clusters, -1, dtype=np.int32)
     n_kept = 0
@@ -337,13 +337,13 @@ def are_linked(
         if not split(xyz, reach, order, parts, bounds, state, a):
             a, b = b, a
             if not split(xyz, reach, order, parts, bounds, state, a):
-                n_tests = test_points(xyz, reach, parts, bounds, a, b)
+                n_tests = test_points(xyz, reach, parts, bounds, state, a, b)
                 state[1] -= abs(n_tests)
                 if n_tests > 0:
                     return True
                 continue
-        if state[1] <= 0:
-            n_pairs = 0  # no tests are left: only the nearest parts are halved further
+        if state[1] <= state[2]:
+            n_pairs = 0  # only the reserve is left: only the nearest parts are halved further
         left, right = parts[a, 2], parts[a, 2] + 1
         gap_left, gap_right = squared_gap(bounds, left, b), squared_gap(bounds, right, b)
         if gap_left < gap_right:
@@ -351,14 +351,14 @@ def are_linked(
             gap_left, gap_right = gap_right, gap_left
         state[1] -= 2
         longest = min(bounds[left, 6], bounds[b, 6])
-        if state[1] > 0 and gap_left <= longest * longest:
+        if state[1] > state[2] and gap_left <= longest * longest:
             pairs[n_pairs, 0], pairs[n_pairs, 1] = left, b
             n_pairs += 1
         longest = min(bounds[right, 6], bounds[b, 6])
         if gap_right <= longest * longest:  # the nearer half comes next
             pairs[n_pairs, 0], pairs[n_pairs, 1] = right, b
             n_pairs += 1
-    work[2] += 1 if state[1] <= 0 else 0
+    work[2] += 1 if state[1] <= state[2] else 0
     return False
 
 
@@ -368,12 +368,13 @@ def test_points(
     reach: NDArray[np.float64],
     parts: NDArray[np.int32],
     bounds: NDArray[np.float64],
+    state: NDArray[np.int64],
     a: int,
     b: int,
 ) -> int:
     """Number of tests until a point of one part was near enough to a point of another; negative if none was."""
-    stop_a = min(parts[a, 1], parts[a, 0] + MAX_TESTED)
-    stop_b = min(parts[b, 1], parts[b, 0] + MAX_TESTED)
+    most = MAX_TESTED if state[1] > 0 else MAX_LAST_TESTED
+    stop_a, stop_b = min(parts[a, 1], parts[a, 0] + most), min(parts[b, 1], parts[b, 0] + most)
     low_x, low_y, low_z = bounds[b, 0], bounds[b, 1], bounds[b, 2]
     high_x, high_y, high_z = bounds[b, 3], bounds[b, 4], bounds[b, 5]
     n_tests = 0
@@ -406,7 +407,7 @@ def split(
     if parts[part, 2] > 0:
         return True
     if state[0] + 2 > len(parts):
-        state[1] = min(state[1], 0)
+        state[1] = min(state[1], 0)  # no room for more parts
     if parts[part, 1] - parts[part, 0] <= MAX_TESTED or state[1] <= 0:
         return False
     axis = 0

@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import twins.cluster
-from edgeperc import cluster
+from edgeperc import cluster, linkage
 from edgeperc.cluster import OBJECT_SIZE_M, cluster_labels, find_clusters, objects_from_points
 from edgeperc.errors import PointsError
 from edgeperc.geometry import oriented_iou
+from edgeperc.points import read_only
 
 CLASSES = ("background", "car", "pedestrian", "cyclist")
 
@@ -71,6 +72,109 @@ def test_random_scans_match_the_twin(rows, per_m, min_points):
     among = np.ones(len(points), bool)
     found = find_clusters(points, min_distance_m=0.5, distance_per_m=per_m, min_points=min_points)
     np.testing.assert_array_equal(found, twins.cluster.clusters(points, among, 0.5, per_m, 100.0, min_points))
+
+
+def hostile(kind, rng, n):
+    """Points that make a clustering by distances up to 0.5 m slow, or lie just inside or outside of it."""
+    k = np.arange(n)
+    edge = math.ceil(n ** (1 / 3))
+    cube = np.column_stack([k % edge, k // edge % edge, k // edge // edge]) - edge / 2
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    on_sphere = rng.normal(size=(n, 3))
+    on_sphere /= np.linalg.norm(on_sphere, axis=1)[:, None]
+    first = (k % 2)[:, None]
+    if kind == "tall column":
+        return rng.uniform(0, 1, (n, 3)) * [0.6, 0.6, 200] - [0, 0, 100]
+    if kind == "towers":
+        return np.column_stack([k % 2 * 0.25, k // 2 % 2 * 0.25, k // 4 * 0.36 % 190 - 95]) + 5
+    if kind == "row number for z":
+        return np.column_stack([rng.uniform(-3, 3, (n, 2)), k])
+    if kind == "identical":
+        return np.full((n, 3), 3.3)
+    if kind == "line":
+        return np.linspace(-1, 1, n)[:, None] * rng.uniform(0, 60, 3)
+    if kind == "lattice":
+        return cube * rng.choice([0.25, 0.2887, 0.3499, 0.3501, 0.499, 0.5, 0.501, 0.7072])
+    if kind == "chains":
+        return cube * [0.5005, 0.5005, 0.36] + rng.normal(0, 0.002, (n, 3))
+    if kind == "far shell":
+        return on_sphere * rng.uniform(0.97, 1.0, (n, 1)) * rng.choice([34.0, 53.0, 66.0, 99.0])
+    if kind == "ball":
+        return on_sphere * rng.uniform(0, 1, (n, 1)) * rng.choice([1e-3, 0.3, 2.0]) + 4
+    if kind == "tilted slabs":
+        return np.column_stack([k % 2 * 0.501, rng.uniform(-1, 1, (n, 2))]) @ turn + 5
+    if kind == "skew lines":
+        place = np.linspace(-0.1, 0.1, n)[:, None]
+        return np.where(first, place * [0, 1, 0], place * [0, 0, 1] + [0.5003, 0, 0]) @ turn + 4
+    if kind == "arc and axis":  # every point of one is nearly at the distance of every point of the other
+        angle, gap = rng.uniform(0, 6.3, n), rng.choice([1e-3, 1e-5])
+        arc = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]) * (0.5 + gap)
+        return np.where(first, arc, np.outer(rng.uniform(-1, 1, n), [0, 0, math.sqrt(gap)])) @ turn
+    assert kind == "many scales"
+    return np.exp(rng.uniform(-80, 5, (n, 3))) * rng.choice([-1, 1], (n, 3))
+
+
+KINDS = (
+    "tall column", "towers", "row number for z", "identical", "line", "lattice", "chains", "far shell", "ball",
+    "tilted slabs", "skew lines", "arc and axis", "many scales",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=5, deadline=None)
+@given(st.integers(0, 2**31), st.sampled_from([0.0, 0.014, 0.1, 1.0]))
+def test_hostile_scans_match_the_twin(kind, seed, per_m):
+    points = as_points(hostile(kind, np.random.default_rng(seed), 160))
+    found = find_clusters(points, distance_per_m=per_m, min_points=1)
+    every = np.ones(len(points), bool)
+    np.testing.assert_array_equal(found, twins.cluster.clusters(points, every, 0.5, per_m, 100.0, 1))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=3, deadline=None)
+@given(st.integers(0, 2**31), st.sampled_from([0.014, 0.1]))
+def test_the_work_on_hostile_scans_is_bounded(kind, seed, per_m):
+    points = read_only(as_points(hostile(kind, np.random.default_rng(seed), 20_000)))
+    every = read_only(np.ones(len(points)), np.bool_)
+    clusters, work = np.empty(len(points), np.int32), np.empty(3, np.int64)
+    linkage.fill_clusters(points, every, every, 0.0, 0.5, per_m, 100.0, 1, clusters, work)
+    assert work[0] <= 100 * len(points)
+    assert work[1] <= 2 * linkage.TESTS_PER_POINT * len(points)
+    again = np.empty_like(clusters)
+    linkage.fill_clusters(points, every, every, 0.0, 0.5, per_m, 100.0, 1, again, work)
+    np.testing.assert_array_equal(again, clusters)
+
+
+def test_a_scan_that_needs_too_many_tests_is_split_where_no_link_was_found_and_warns():
+    rng = np.random.default_rng(0)
+    shell = hostile("far shell", rng, 20_000)
+    shell *= (0.5 + 2e-4) / np.linalg.norm(shell, axis=1)[:, None]
+    middle = rng.normal(0, 2e-5, (20_000, 3))
+    near = np.array([[9.0, 0, 0], [9.4, 0, 0]])
+    points = as_points(np.concatenate([shell, middle, near]))
+    with pytest.warns(UserWarning, match="64 tests a point"):
+        found = find_clusters(points, min_points=1)
+    assert found.tolist() == [0] * 20_000 + [1] * 20_000 + [2, 2]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**31), st.floats(0.0, 1.0), st.sampled_from([0.0, 0.1]), st.sampled_from([0.0, 0.3, 0.7, 1.0]))
+def test_clusters_with_enough_seeds_are_kept(seed, share, per_m, min_share):
+    rng = np.random.default_rng(seed)
+    centers = rng.uniform(-12, 12, (12, 3)) * [1, 1, 0.1]
+    of = rng.integers(0, 12, 200)
+    points = as_points(centers[of] + rng.normal(0, rng.choice([0.1, 0.4]), (200, 3)))
+    seeds = (rng.random(200) < share) | (of % 3 == 0)
+    among = rng.random(200) > 0.1
+    options = {"among": among, "distance_per_m": per_m, "min_points": 3}
+    found = find_clusters(points, seeds=seeds, min_share=min_share, **options)
+    everything = find_clusters(points, **options)
+    expected, number = np.full(200, -1), 0
+    for k in range(everything.max(initial=-1) + 1):
+        if seeds[everything == k].mean() > min_share:
+            expected[everything == k] = number
+            number += 1
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("spread", [0.02, 0.5, 20.0])
@@ -136,6 +240,7 @@ def test_one_point_is_a_cluster_if_min_points_is_1():
         {"max_range_m": np.inf},
         {"max_range_m": 0.0},
         {"among": np.ones(3, bool)},
+        {"seeds": np.ones(3, bool)},
     ],
 )
 def test_impossible_options_are_refused(options):
@@ -158,6 +263,19 @@ def test_cluster_is_kept_if_more_than_min_share_has_one_class():
     assert classes.tolist() == [1, 0, 0, 0]
     np.testing.assert_allclose(shares, [0.8, 0.7, 0.5, 0.0])
     assert cluster_labels(clusters, labels, min_share=0.4)[0].tolist() == [1, 1, 2, 0]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 400), st.sampled_from([2, 4, 256]), st.floats(0.0, 1.0))
+def test_votes_agree_with_the_twin(seed, n, n_labels, min_share):
+    rng = np.random.default_rng(seed)
+    clusters = rng.integers(-1, max(n // 10, 1), n).astype(np.int32)
+    labels = rng.integers(0, n_labels, n).astype(np.uint8)
+    part_of = {2: 3, 5: 2}
+    classes, shares = cluster_labels(clusters, labels, min_share=min_share, part_of=part_of)
+    expected, expected_shares = twins.cluster.votes(clusters, labels, min_share, part_of)
+    np.testing.assert_array_equal(classes, expected)
+    np.testing.assert_array_equal(shares, expected_shares)
 
 
 def test_no_cluster_has_no_class():
@@ -252,6 +370,15 @@ def test_every_class_has_boxes_and_better_ones_come_first():
     assert 1.0 > boxes[0].score > boxes[1].score > 0.0
     np.testing.assert_allclose(boxes[1].size[:2], OBJECT_SIZE_M["pedestrian"][:2], atol=0.01)
     assert objects_from_points(points, labels, CLASSES) == boxes
+
+
+def test_at_most_1000_clusters_get_a_box():
+    person = side((0.0, -0.3), (0.0, 0.3), z=(-1.7, 0.0), spacing=0.2)
+    x, y = np.meshgrid(np.arange(-60.0, 60.0, 3.0), np.arange(-60.0, 60.0, 3.0))
+    places = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    points = as_points((places[:, None] + person).reshape(-1, 3))
+    boxes = objects_from_points(points, np.full(len(points), 2, np.uint8), CLASSES)
+    assert find_clusters(points).max() + 1 == x.size > len(boxes) == cluster.MAX_OBJECTS == 1000
 
 
 def test_objects_below_the_ground_are_dropped():

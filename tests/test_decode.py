@@ -306,6 +306,27 @@ def test_footprint_sums_agree_with_the_twin(are_logits):
     )
 
 
+def test_huge_footprints_are_sampled():
+    values = np.random.default_rng(7).normal(0.0, 3.0, (20, 150, 150)).astype(np.float32)
+    rectangles = np.array([[7.5, 0.0, 15.0, 14.0, 0.3], [7.5, 0.0, 4.0, 2.0, 0.3]])
+    sums = np.empty((2, 20))
+    decode.fill_footprint_sums(values, True, rectangles, 15.0, 7.5, 0.1, sums)
+    expected = twins.decode.footprint_sums(values, True, rectangles, 15.0, 7.5, 0.1)
+    np.testing.assert_allclose(sums, expected, rtol=1e-9)
+    assert sums.sum(axis=1).max() < 150 * 140 / 3  # every second row and column
+    assert sums[1].sum() == pytest.approx(40 * 20, rel=0.05)
+
+
+def test_only_the_best_slots_become_boxes():
+    scores = np.random.default_rng(8).random(SHAPE).astype(np.float32)
+    labels = np.full(SHAPE, 2, np.uint8)
+    slots = np.column_stack([np.random.default_rng(9).uniform(0, 1, (5000, 2)), np.full((5000, 2), 0.1)])
+    boxes = slots_for(slots, labels, scores)
+    at = (np.float32(slots[:, :2]).astype(float) * [SHAPE[1], SHAPE[0]]).astype(int)
+    best = np.sort(scores[at[:, 1], at[:, 0]])[::-1][:100]
+    np.testing.assert_array_equal([box.score for box in boxes], best)
+
+
 def test_boxes_are_drawn_into_the_map():
     card = card_of("ssadnet", version="1")
     drivable, stray = CLASSES.index("drivable"), CLASSES.index("van")

@@ -97,6 +97,8 @@ def test_suppression_agrees_with_the_twin():
             order = np.argsort(-scores, kind="stable")
             expected = order[twins.decode.nms(rectangles[order], threshold)]
             np.testing.assert_array_equal(suppress_overlaps(rectangles, scores, threshold), expected)
+            expected = order[twins.decode.nms(rectangles[order], threshold, 0.5)]
+            np.testing.assert_array_equal(suppress_overlaps(rectangles, scores, threshold, max_inside=0.5), expected)
 
 
 def test_suppression_keeps_the_earlier_of_equals_and_chains_greedily():
@@ -107,6 +109,12 @@ def test_suppression_keeps_the_earlier_of_equals_and_chains_greedily():
     assert suppress_overlaps(row, [0.5, 0.5, 0.5], 0.3).tolist() == [0, 2]
     assert suppress_overlaps(row, [0.5, 0.5, 0.5], 0.34).tolist() == [0, 1, 2]
     assert suppress_overlaps([row[0], row[0]], [0.5, 0.5], 0.99).tolist() == [0]
+
+
+def test_suppression_of_small_rectangles_in_large_ones():
+    rows = [[0.0, 0.0, 10.0, 10.0, 0.0], [1.0, 1.0, 1.0, 1.0, 0.3], [5.1, 0.0, 1.0, 1.0, 0.0]]
+    assert suppress_overlaps(rows, [0.9, 0.8, 0.7], 0.1).tolist() == [0, 1, 2]
+    assert suppress_overlaps(rows, [0.9, 0.8, 0.7], 0.1, max_inside=0.5).tolist() == [0, 2]
 
 
 def test_bounds_hold_the_corners_tightly():

@@ -29,6 +29,18 @@ def clusters(points, among, min_distance, distance_per_m, max_range, min_points)
     return found
 
 
+def votes(clusters, labels, min_share, part_of):
+    """Twin of `edgeperc.cluster.cluster_labels`: a table of all clusters and labels."""
+    counts = np.zeros((clusters.max(initial=-1) + 1, 256), int)
+    np.add.at(counts, (clusters[clusters >= 0], labels[clusters >= 0]), 1)
+    for part, whole in part_of.items():
+        moved = np.where(counts[:, whole] >= 0.25 * (counts[:, whole] + counts[:, part]), counts[:, part], 0)
+        counts[:, part] -= moved
+        counts[:, whole] += moved
+    shares = counts[:, 1:].max(axis=1) / np.maximum(counts.sum(axis=1), 1)
+    return np.where(shares > min_share, counts[:, 1:].argmax(axis=1) + 1, 0), shares
+
+
 def rectangle(members, l_shaped):
     """Twin of `edgeperc.cluster.fill_rectangle`: x, y, extent along, across, heading."""
     voting = members[:: -(-len(members) // 256)]
