@@ -16,6 +16,8 @@ __all__ = ["open_atomic", "write_atomic"]
 def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) -> Iterator[IO[Any]]:
     """Open a temporary file in the target's folder; it replaces the target when the block ends without an error.
 
+    A link is followed. A target that is no regular file, such as ``/dev/stdout`` or a named pipe, is written directly.
+
     Parameters
     ----------
     path : str or Path
@@ -35,7 +37,11 @@ def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) ->
     OSError
         The file cannot be written; the target is unchanged.
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path))
+    if path.exists() and not path.is_file():
+        with path.open(mode, encoding=None if "b" in mode else "utf-8") as file:
+            yield file
+        return
     # Process numbers are not unique: containers that share a folder have equal ones.
     temporary = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.part")
 

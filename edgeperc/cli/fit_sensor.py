@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..atomic import write_atomic
 from ..errors import PointsError, SensorError
 from .arguments import Commands, add_command, add_sensor
 from .output import print_rows
@@ -62,7 +63,7 @@ def fit_sensor_command(arguments: argparse.Namespace) -> int:
     profile, functions = fit_sensor(scans, get_sensor(arguments.sensor), arguments.to)
     assert profile.remission is not None
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(profile.to_json() + "\n", encoding="utf-8")
+    write_atomic(arguments.out, (profile.to_json() + "\n").encode())
     rows = [
         (f.kind, f"RMSE {f.rmse:.4f}; coefficients {', '.join(f'{c:.5g}' for c in f.coefficients)}") for f in functions
     ]

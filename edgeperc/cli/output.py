@@ -12,6 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
+from ..atomic import write_atomic
 from ..printable import printable
 
 __all__ = [
@@ -97,7 +98,7 @@ def write_figures(arguments: argparse.Namespace, figures: Mapping[str, Any]) -> 
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps({"command": arguments.typed, **figures}, indent=1, allow_nan=False)
-        path.write_text(text + "\n", encoding="utf-8")
+        write_atomic(path, f"{text}\n".encode())
 
 
 def without_nan(value: Any) -> Any:
