@@ -41,10 +41,19 @@ def main() -> int:
         "--out", type=Path, default=Path("build/fuzz"), help="counts and failed cases; continued if there"
     )
     parser.add_argument("--case", type=int, default=None, help="run this case alone, in this process")
+    parser.add_argument("--here", action="store_true", help="run the cases in this process, which may end with them")
     parser.add_argument("--worker", nargs=4, default=None, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     kinds = arguments.kinds or [*KINDS]
     seed = int(time.time()) if arguments.seed is None else arguments.seed
+    cache = arguments.out.absolute() / "cache"  # nothing of this computer's user is read or changed
+    os.environ.setdefault("EDGEPERC_CACHE_DIR", str(cache))
+    if arguments.here:
+        state = run_job(
+            lambda: kind_of(kinds[0], seed), State(kinds[0], seed), cases=arguments.cases, out=arguments.out
+        )
+        print(line(state), *map(json.dumps, state.failures), sep="\n", flush=True)
+        os._exit(int(state.n_failures > 0))
     if arguments.case is not None:
         with tempfile.TemporaryDirectory() as folder:
             case = new_case(kinds[0], seed, arguments.case, Path(folder))

@@ -57,7 +57,7 @@ def synthetic_seeds(folder: Path) -> list[Seed]:
 
 
 def real_seeds(root: Path, n_packets: int = 40) -> list[Seed]:
-    """The first packets of the real captures of a folder, if there are any. They are never written to the repository."""
+    """The first packets of the real captures of a folder, if there are any; never written to the repository."""
     seeds = []
     for file in sorted(root.glob("**/*.pcap")):
         with file.open("rb") as opened:
