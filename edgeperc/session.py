@@ -322,7 +322,8 @@ class Session:
             else:
                 session = ort.InferenceSession(blob, options, [PROVIDERS[short]], enable_fallback=0)
             session.disable_fallback()  # of runs; enable_fallback=0: of opening, which would print to stdout
-            session.get_inputs(), session.get_outputs()  # fails if a name is not UTF-8
+            for each in (*session.get_inputs(), *session.get_outputs()):
+                _ = each.name, each.shape  # fails if one is not UTF-8
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             if short == "cpu":
                 raise ModelFileError(f"{self.path}: onnxruntime {ort.__version__} cannot open it: {exc}") from exc
