@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import io
 import json
 import os
@@ -149,6 +150,25 @@ def test_signals_raise_and_their_handlers_are_restored(capsys: pytest.CaptureFix
     assert done == ["closed", "closed"]
     assert capsys.readouterr().err == "program: interrupted\nprogram: terminated\n"
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+@posix
+def test_a_signal_waits_for_the_end_of_an_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A native module would turn the exception into an ImportError, and LLVM's callbacks would lose it."""
+    (tmp_path / "imported_slowly.py").write_text(
+        "import signal, time\nsignal.raise_signal(signal.SIGTERM)\ntime.sleep(0.3)\ndone = True\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    done: list[bool] = []
+
+    def command() -> int:
+        module = importlib.import_module("imported_slowly")
+        done.append(module.done)
+        threading.Event().wait(60.0)
+        return 0
+
+    assert run_program("program", command) == 143
+    assert done == [True]
 
 
 @posix

@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from types import FrameType
 from typing import Any, NoReturn, TextIO
 
 from ..errors import EdgepercError
@@ -62,7 +63,7 @@ def run_program(program: str, command: Callable[[], int], message: Callable[[Exc
         sys.stdout.reconfigure(errors="backslashreplace")  # a file name may have characters that the terminal lacks
     try:
         try:
-            with _terminable(), warnings.catch_warnings():
+            with _signals_raise(), warnings.catch_warnings():
                 warnings.showwarning = partial(show_warning, program=program)
                 try:
                     return command()
@@ -110,22 +111,55 @@ def _is_closed_pipe(stream: TextIO) -> bool:
 
 
 @contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """Let SIGTERM raise, unless the process has its own answer to it."""
-    in_main = threading.current_thread() is threading.main_thread()
-    if not in_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+def _signals_raise() -> Iterator[None]:
+    """Let SIGINT and SIGTERM raise, unless the process has its own answer to them."""
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    owner = os.getpid()
+    owner, main_thread = os.getpid(), threading.get_ident()
+    waiting: list[threading.Timer] = []
 
-    def terminate(number: int, _: Any) -> None:
+    def answer(number: int, frame: FrameType | None) -> None:
         if os.getpid() != owner:  # a fork inherits this function; it ends as any process does
-            signal.signal(number, signal.SIG_DFL)
+            signal.signal(number, defaults[number])
             signal.raise_signal(number)
-        raise _TerminatedError(128 + number)
+        elif _is_delicate(frame):
+            waiting[:] = [threading.Timer(0.05, _send_again, (number, main_thread))]
+            waiting[0].daemon = True
+            waiting[0].start()
+        elif number == signal.SIGINT:
+            raise KeyboardInterrupt
+        else:
+            raise _TerminatedError(128 + number)
 
-    signal.signal(signal.SIGTERM, terminate)
+    defaults: dict[int, Any] = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    defaults = {number: handler for number, handler in defaults.items() if signal.getsignal(number) is handler}
+    for number in defaults:
+        signal.signal(number, answer)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number, handler in defaults.items():
+            signal.signal(number, handler)
+        for timer in waiting:
+            timer.cancel()
+
+
+def _is_delicate(frame: FrameType | None) -> bool:
+    """Whether LLVM or an import is at work in this program.
+
+    LLVM calls Python back. An exception there is lost, and the process may crash. Native modules turn it into an
+    `ImportError`, which looks as if a package were missing.
+    """
+    while frame is not None and frame.f_code is not run_program.__code__:
+        if str(frame.f_globals.get("__name__")).startswith(("llvmlite.", "importlib._bootstrap")):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _send_again(number: int, main_thread: int) -> None:
+    if hasattr(signal, "pthread_kill"):  # only a signal to the main thread wakes it
+        signal.pthread_kill(main_thread, number)
+    else:
+        signal.raise_signal(number)
