@@ -1,0 +1,359 @@
+"""Perceivers in processes: fork, spawn, signals, full disks, missing homes. Each behavior is described in the
+documentation, in "Embed edgeperc in a process".
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from edgeperc import EdgepercError, Perceiver
+from edgeperc.session import Session, available_providers
+from edgeperc.simulation import random_scene, simulate
+
+posix = pytest.mark.skipif(os.name != "posix", reason="forks, signals and limits differ elsewhere")
+
+
+@pytest.fixture(scope="module")
+def scan() -> NDArray[np.float32]:
+    return simulate(random_scene(5), "hdl-64e", 5).points
+
+
+@pytest.fixture
+def folder(scan: NDArray[np.float32], tmp_path: Path) -> Path:
+    """A folder with two scans."""
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for k in range(2):
+        scan.tofile(folder / f"{k:06d}.bin")
+    return folder
+
+
+def python(code: str, *arguments: str, timeout_s: float = 120.0, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run Python; a process that hangs fails the test."""
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, **options)
+
+
+# --- fork and spawn --------------------------------------------------------------------------------------------------
+
+FORK = """
+import json, os, sys, threading, warnings
+import numpy as np
+import edgeperc
+
+warnings.simplefilter("ignore")
+options, when = json.loads(sys.argv[1]), sys.argv[2]
+perceive = edgeperc.Perceiver("pointseg", on_mismatch="ignore", **options)
+scan = np.random.default_rng(0).normal(0.0, 10.0, (20_000, 4)).astype(np.float32)
+scan[:, 2] = -1.7
+right = perceive(scan).points.labels
+session = perceive.sessions[0]
+begun, finish = threading.Event(), threading.Event()
+real = session._session
+
+class Slow:
+    def run_with_iobinding(self, binding):
+        begun.set()
+        finish.wait()
+        real.run_with_iobinding(binding)
+
+if when == "in a call":
+    session._session = Slow()
+    thread = threading.Thread(target=perceive, args=(scan,))
+    thread.start()
+    begun.wait()
+elif when == "under the lock":
+    next(iter(perceive._locks.values())).acquire()
+child = os.fork()
+if child == 0:
+    session._session = real
+    try:
+        print("equal" if (perceive(scan).points.labels == right).all() else "different")
+    except edgeperc.InferenceError as error:
+        print(error)
+    sys.stdout.flush()
+    os._exit(0)
+os.waitpid(child, 0)
+if when == "in a call":
+    finish.set()
+    thread.join()
+elif when == "under the lock":
+    next(iter(perceive._locks.values())).release()
+assert (perceive(scan).points.labels == right).all()
+"""
+
+
+def forked(when: str = "between calls", **options: Any) -> str:
+    """What the child of a fork prints."""
+    done = python(FORK, json.dumps(options), when)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+@posix
+@pytest.mark.parametrize("when", ["between calls", "under the lock"])
+def test_a_fork_of_a_perceiver_without_threads_works(when: str) -> None:
+    assert forked(when, provider="cpu", n_threads=1) == "equal"
+
+
+@posix
+@pytest.mark.parametrize(
+    ("when", "options"),
+    [
+        ("between calls", {"provider": "cpu", "n_threads": 2}),
+        ("between calls", {"provider": "cpu"}),
+        ("in a call", {"provider": "cpu", "n_threads": 1}),
+        ("between calls", {"provider": "openvino", "n_threads": 1}),
+    ],
+)
+def test_a_fork_that_cannot_work_is_refused_at_once(when: str, options: dict[str, Any]) -> None:
+    if options["provider"] not in available_providers():
+        pytest.skip(f"no provider {options['provider']} here")
+    assert "construct the Perceiver in the process that calls it" in forked(when, **options)
+
+
+def test_perceivers_are_not_pickled_or_copied() -> None:
+    perceive = Perceiver("pointseg", provider="cpu", n_threads=1)
+    for thing in (perceive, perceive.sessions[0]):
+        for attempt in (pickle.dumps, copy.copy, copy.deepcopy):
+            with pytest.raises(EdgepercError, match="cannot be pickled or copied; construct"):
+                attempt(thing)
+
+
+SPAWN = """
+import multiprocessing, sys, warnings
+import numpy as np
+
+def work(scan):
+    import edgeperc
+    warnings.simplefilter("ignore")
+    perceive = edgeperc.Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore")
+    return perceive(scan).points.labels
+
+if __name__ == "__main__":
+    import edgeperc
+    perceive = edgeperc.Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore")
+    scan = np.ones((100, 4), np.float32)
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(1) as pool:
+        assert (pool.apply(work, (scan,)) == perceive(scan).points.labels).all()
+    try:
+        context.Process(target=perceive, args=(scan,)).start()
+    except edgeperc.EdgepercError as error:
+        print(error)
+"""
+
+
+def test_spawned_processes_construct_their_own(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(SPAWN)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "cannot be pickled or copied; construct it in the process that calls it" in done.stdout
+
+
+def test_a_failed_run_is_not_a_running_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Session("pointseg", "cpu", n_threads=1)
+    real = session._session
+
+    class Broken:
+        def run_with_iobinding(self, _: object) -> None:
+            raise RuntimeError("no memory")
+
+    session._session = Broken()
+    with pytest.raises(EdgepercError, match="no memory"):
+        session.run()
+    session._session = real
+    monkeypatch.setattr(os, "getpid", lambda: 1)  # as in a child
+    session.run()
+
+
+# --- signals ---------------------------------------------------------------------------------------------------------
+
+
+def edgeperc_run(*arguments: object, **options: Any) -> subprocess.Popen[str]:
+    def with_signals() -> None:  # a shell starts programs in the background with SIGINT ignored
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    command = [sys.executable, "-m", "edgeperc", "run", *map(str, arguments)]
+    command += ["--provider", "cpu", "--threads", "1", "--on-mismatch", "ignore"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, preexec_fn=with_signals, **pipes, **options)
+
+
+@posix
+@pytest.mark.parametrize(("number", "code"), [(2, 130), (15, 143), (9, -9)])  # SIGINT, SIGTERM, SIGKILL
+def test_a_signal_leaves_whole_files(folder: Path, tmp_path: Path, scan: Any, number: int, code: int) -> None:
+    scans = [folder / "000000.bin"]
+    for k in range(300):
+        scans.append(folder / f"copy{k}.bin")
+        scans[-1].hardlink_to(scans[0])
+    out = tmp_path / "out"
+    process = edgeperc_run(*scans, "--model", "pointseg", "--labels", "--ply", "--out", out)
+    assert process.stdout is not None
+    for _ in range(3):
+        assert process.stdout.readline()
+    time.sleep(0.05)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == code
+    assert "Traceback" not in errors
+    files = [*out.iterdir()]
+    assert 3 <= len([file for file in files if file.suffix == ".label"]) < 300
+    assert {file.stat().st_size for file in files if file.suffix == ".label"} == {4 * len(scan)}
+    assert len({file.stat().st_size for file in files if file.suffix == ".ply"}) == 1
+    # A process that is killed cannot delete the file that it is writing; it has no name of a result.
+    assert len([file for file in files if file.suffix == ".part"]) <= (number == 9)
+
+
+def children(pid: int) -> list[int]:
+    return [int(child) for file in Path(f"/proc/{pid}/task").glob("*/children") for child in file.read_text().split()]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="no /proc")
+@pytest.mark.parametrize("number", [2, 15, 9])  # SIGINT, SIGTERM, SIGKILL
+def test_a_signal_ends_the_process_that_decodes_a_capture(tmp_path: Path, number: int) -> None:
+    pytest.importorskip("rosbags")
+    from test_captures import write_bag2
+
+    process = edgeperc_run(write_bag2(tmp_path / "bag"), "--live", "--model", "pointseg")
+    try:
+        deadline = time.monotonic() + 100.0
+        while not (decoders := children(process.pid)):
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() < deadline, "no process decodes the capture"
+            time.sleep(0.01)
+    finally:
+        process.send_signal(number)
+        process.communicate(timeout=120)
+    assert process.returncode == {2: 130, 15: 143, 9: -9}[number]
+    deadline = time.monotonic() + 60.0
+    while any(Path(f"/proc/{pid}/cmdline").exists() and Path(f"/proc/{pid}/cmdline").read_bytes() for pid in decoders):
+        assert time.monotonic() < deadline, "the process that decodes the capture still runs"
+        time.sleep(0.05)
+
+
+# --- full disks ------------------------------------------------------------------------------------------------------
+
+
+def check_failed(process: subprocess.Popen[str], out: Path, reason: str) -> None:
+    """Each scan has its error, on one line, and no part of a file is left."""
+    records, errors = process.communicate(timeout=120)
+    assert process.returncode == 1, errors
+    assert "Traceback" not in errors
+    assert [reason in json.loads(line)["error"] for line in records.splitlines()] == [True, True]
+    assert len([line for line in errors.splitlines() if reason in line and ".bin" in line]) == 2
+    assert not [file for file in out.rglob("*") if file.is_file() and file.name != "filler"]
+
+
+@posix
+@pytest.mark.parametrize("kind", ["--labels", "--ply", "--html", "--png"])
+def test_files_that_are_too_large_fail_their_scan(folder: Path, tmp_path: Path, kind: str) -> None:
+    resource = pytest.importorskip("resource")
+    if kind == "--png":
+        pytest.importorskip("matplotlib")
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+
+    command = [sys.executable, "-m", "edgeperc", "run", str(folder), "--json", "--model", "pointseg"]
+    command += ["--provider", "cpu", "--threads", "1", "--on-mismatch", "ignore", kind, "--out", str(tmp_path / "out")]
+    process = subprocess.Popen(command, preexec_fn=limit, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    check_failed(process, tmp_path / "out", "File too large")
+
+
+def test_full_disk_fails_its_scan(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(out)]
+    if sys.platform != "linux" or os.geteuid() != 0 or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("no small file system can be mounted")
+    try:
+        (out / "filler").write_bytes(bytes(40 << 10))
+        process = edgeperc_run(folder, "--json", "--model", "pointseg", "--labels", "--out", out)
+        check_failed(process, out, "No space left on device")
+    finally:
+        subprocess.run(["umount", str(out)], check=True)
+
+
+# --- homes -----------------------------------------------------------------------------------------------------------
+
+HOMES = ("HOME", "USERPROFILE", "LOCALAPPDATA", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME")
+WITHOUT_PASSWD = """
+import sys
+try:
+    import pwd
+    def getpwuid(uid):
+        raise KeyError(uid)
+    pwd.getpwuid = getpwuid
+except ImportError:
+    pass
+from edgeperc.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def nothing(_: Path) -> dict[str, str]:
+    return {}
+
+
+def read_only(folder: Path) -> dict[str, str]:
+    """Homes that cannot be made, because a file is in their place; permissions would not stop root."""
+    (folder / "file").write_bytes(b"")
+    return dict.fromkeys(HOMES, str(folder / "file" / "home"))
+
+
+@pytest.mark.parametrize("home", [nothing, read_only])
+@pytest.mark.parametrize("command", ["run", "models"])
+def test_without_a_home_everything_works(
+    folder: Path, tmp_path: Path, home: Callable[[Path], dict[str, str]], command: str
+) -> None:
+    kept = {name: value for name, value in os.environ.items() if name not in (*HOMES, "EDGEPERC_CACHE_DIR")}
+    arguments = ["models"]
+    if command == "run":
+        arguments = ["run", str(folder), "--json", "--model", "pointseg", "--labels", "--out", str(tmp_path / "out")]
+    done = python(WITHOUT_PASSWD, *arguments, env=kept | home(tmp_path), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(done.stdout.splitlines()) >= 2
+    assert len([*tmp_path.glob("out/*.label")]) == (2 if command == "run" else 0)
+    left = {"scans", "out", "file"}
+    assert {file.name for file in tmp_path.iterdir()} <= left  # no folder "~" or ".cache"
+
+
+def test_without_a_home_kernels_are_compiled_and_it_is_said(tmp_path: Path) -> None:
+    """Of a package that cannot be written, too."""
+    import numba
+
+    if numba.config.DISABLE_JIT:
+        pytest.skip("nothing is compiled with the JIT off")
+    package = Path(sys.modules["edgeperc"].__file__ or "").parent
+    shutil.copytree(package, tmp_path / "edgeperc", ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "edgeperc" / "__pycache__").write_bytes(b"")
+    code = WITHOUT_PASSWD.partition("from edgeperc")[0] + (
+        "import numpy as np\n"
+        "from edgeperc.geometry import oriented_iou\n"
+        "print(oriented_iou(np.ones((1, 5)), np.ones((1, 5))))\n"
+    )
+    kept = {name: value for name, value in os.environ.items() if name not in (*HOMES, "EDGEPERC_CACHE_DIR")}
+    kept = {name: value for name, value in kept.items() if not name.startswith("NUMBA_")}
+    done = python(code, env=kept | {"PYTHONPATH": str(tmp_path)}, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (0, "[[1.]]\n"), done.stderr
+    (line,) = done.stderr.splitlines()
+    assert "compiled kernels are not kept" in line
+    assert str(tmp_path / "edgeperc" / "__pycache__") in line
