@@ -85,20 +85,12 @@ def read_scans(
         Damaged packets of an Ouster capture were dropped; the message has their number.
     """
     path = Path(source)
-    if not path.exists():
-        raise PointsError(
-            f"{path}: there is no such file or folder; expected a scan, a folder of scans, a .pcap, .osf, .bag or .mcap"
-        )
-    kind = _kind(path)
+    kind = _readable_kind(path)
     if kind == "folder":
         return _folder(path, topic, remission_field)
-    if kind in (".pcap", ".osf", ".bag", ".mcap", "ros2"):
-        return decode_apart(path, kind, topic, remission_field)
-    if kind == ".pcapng":
-        raise PointsError(f"{path}: a pcapng file; expected pcap. Run: editcap -F pcap {path.name} {path.stem}.pcap")
-    if kind == ".db3":
-        raise PointsError(f"{path}: a .db3 is read with the folder it lies in; expected metadata.yaml beside it")
-    return iter([(None, read_points(path, remission_field=remission_field))])
+    if kind == "scan":
+        return iter([(None, read_points(path, remission_field=remission_field))])
+    return decode_apart(path, kind, topic, remission_field)
 
 
 def is_capture(path: Path) -> bool:
@@ -138,7 +130,7 @@ def sensor_of(source: str | os.PathLike[str], *, topic: str | None = None) -> Se
 
 def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
     """Like `sensor_of`, with how it is known."""
-    kind = _kind(path)
+    kind = _readable_kind(path)
     if kind == "folder":
         each = {file: known_sensor(file, topic) for file in scan_files(path)}
         profiles = {None if known is None else known.profile for known in each.values()}
@@ -148,19 +140,17 @@ def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
                 f"{path}: the captures in this folder are of several sensors ({', '.join(names)}); read them one by one"
             )
         return next(iter(each.values()), None)
+    if kind == "scan":
+        return None
     try:
         if kind == ".pcap":
             return of_packets(path, topic)
-        if kind in (".osf", ".bag", ".mcap", "ros2"):
-            found = describe_apart(path, kind, topic)
-            if "metadata" in found:
-                return of_metadata(json.loads(found["metadata"]), "the metadata")
-            return of_cloud(found)
+        found = describe_apart(path, kind, topic)
+        return of_metadata(json.loads(found["metadata"]), "the metadata") if "metadata" in found else of_cloud(found)
     except SensorError as exc:
         raise SensorError(f"{path}: {exc}") from exc
     except PointsError as exc:
         raise PointsError(f"{path}: {str(exc).removeprefix(f'{path}: ')}") from exc
-    return None
 
 
 def scan_files(folder: Path) -> list[Path]:
@@ -170,6 +160,20 @@ def scan_files(folder: Path) -> list[Path]:
         for entry in folder.iterdir()
         if entry.suffix.lower() in SCAN_SUFFIXES + CAPTURE_SUFFIXES and entry.name[0] != "." and entry.is_file()
     )
+
+
+def _readable_kind(path: Path) -> str:
+    """`_kind`, if `read_scans` reads it; PointsError otherwise."""
+    if not path.exists():
+        raise PointsError(
+            f"{path}: there is no such file or folder; expected a scan, a folder of scans, a .pcap, .osf, .bag or .mcap"
+        )
+    kind = _kind(path)
+    if kind == ".pcapng":
+        raise PointsError(f"{path}: a pcapng file; expected pcap. Run: editcap -F pcap {path.name} {path.stem}.pcap")
+    if kind == ".db3":
+        raise PointsError(f"{path}: a .db3 is read with the folder it lies in; expected metadata.yaml beside it")
+    return kind
 
 
 def _kind(path: Path) -> str:
