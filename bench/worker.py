@@ -12,7 +12,7 @@ import signal
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from multiprocessing.connection import wait
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 import edgeperc.errors
 from edgeperc import EdgepercError, Perceiver
 
+from .application import Application
 from .context import EnergyMeter, conditions, peak_rss_mb, rss_mb
 from .loadgen import single_stream
 from .scenarios import Limits, Perceive, Timings, back_to_back, paced
@@ -62,12 +63,15 @@ class Scenario:
     limits : Limits
     rate_hz : float or None
         None for back to back.
+    application : bool
+        Also stream, track, write JSON and draw, as `Application` does.
     """
 
     name: str
     scans: tuple[Path, ...]
     limits: Limits
     rate_hz: float | None = None
+    application: bool = False
 
 
 @dataclass(frozen=True)
@@ -162,7 +166,8 @@ def _work(connection: Any, job: Job) -> dict[str, Any]:
                 run: Callable[..., Timings] = partial(single_stream, folder=job.loadgen)
             else:
                 run = back_to_back if scenario.rate_hz is None else partial(paced, rate_hz=scenario.rate_hz)
-            timings = run(perceive, own, limits=scenario.limits, keep_going=watch, on_start=watch.start)
+            with closing(Application(perceive)) if scenario.application else nullcontext(perceive) as called:
+                timings = run(called, own, limits=scenario.limits, keep_going=watch, on_start=watch.start)
             result["scenarios"][scenario.name] = watch.record(timings)
             stopped = watch.stopped
         result |= {"interrupted": stopped, "rss_mb": rss_mb(), "peak_rss_mb": peak_rss_mb()}

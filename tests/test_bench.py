@@ -11,6 +11,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edgeperc import tuning
+from edgeperc import Perceiver, tuning
 from edgeperc.errors import ModelFileError, PointsError, ProviderError
 from edgeperc.perception import Box, PointLabels, TopView
 from edgeperc.simulation.samples import simulated_scan
@@ -490,6 +491,18 @@ def test_a_soak_reports_memory(
     assert (timings["n"], len(timings["warm_up_ms"]), len(timings["ms"])) == (900, 100, 450)
     assert measured["soak"] == memory_growth(timings["rss_mb"], 100)
     assert "Memory over a long run" in capsys.readouterr().out
+
+
+def test_an_application_uses_every_answer(matplotlib: None) -> None:
+    from edgeperc_bench.application import Application
+
+    perceive = Perceiver("lodnn", provider="cpu", n_threads=1, on_mismatch="ignore")
+    application = Application(perceive, draw_every=2)
+    scans = [np.full((n, 4), 5.0, np.float32) for n in (3, 4, 5)]
+    before = threading.active_count()
+    assert [application(scan).n_points for scan in scans] == [3, 4, 5]
+    application.close()
+    assert threading.active_count() <= before
 
 
 HAS_EXPORT = all(importlib.util.find_spec(name) for name in ("torch", "onnx"))

@@ -42,6 +42,11 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="N",
         help="the number of scans, 1000 at least (default: %(default)s)",
     )
+    parser.add_argument(
+        "--application",
+        action="store_true",
+        help="also stream, track, write JSON and draw every 100th scan, as applications do (extra 'view')",
+    )
     parser.set_defaults(run=run_command)
 
 
@@ -55,7 +60,8 @@ def run_command(arguments: argparse.Namespace) -> int:
         scans = inputs.simulated_input(Path(folder), 8, arguments.sensor)
         document["input"] = scans.record
         limits = Limits(arguments.scans - settling, 0.0, settling, max(1, arguments.scans // MEMORY_SAMPLES))
-        job = replace(job_of(arguments), scenarios=(Scenario("soak", scans.files, limits),))
+        scenario = Scenario("soak", scans.files, limits, application=arguments.application)
+        job = replace(job_of(arguments), scenarios=(scenario,))
         setting = new_setting(job)
         document["settings"].append(setting)
         try:
