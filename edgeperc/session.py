@@ -261,7 +261,7 @@ class Session:
         if setting["provider"] not in present:
             logger.warning(
                 "provider auto skips %s on %s, which was measured as the fastest: it is no longer available",
-                *(name, printable(setting["provider"])),
+                *(name, printable(setting["provider"][:80])),
             )
             return []
         return [(setting["provider"], setting["precision"], setting["n_threads"] if n_threads is None else n_threads)]

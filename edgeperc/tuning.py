@@ -214,7 +214,7 @@ def read_setting(path: Path, machine: str, digest: str) -> dict[str, Any] | None
 
 
 def _is_setting(entry: Mapping[str, Any]) -> bool:
-    n_threads = entry.get("n_threads")
+    n_threads = entry.get("n_threads", 0)
     are_names = all(isinstance(entry.get(key), str) for key in ("provider", "precision"))
     is_timed = type(entry.get("p50_ms", 0.0)) in (int, float)
     return are_names and is_timed and (n_threads is None or (type(n_threads) is int and 1 <= n_threads <= MAX_THREADS))
