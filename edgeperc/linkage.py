@@ -195,6 +195,8 @@ def fill_clusters(
                 highest += 1
             far = SAFE * bounds[run, 6]
             for at in range(lowest, highest + 1):
+                if n_rows[at] == 0:
+                    continue
                 scale = columns_per_m[at]
                 first_row = int(max((bounds[run, 0] - far - low[at, 0]) * scale, 0.0))
                 last_row = int(min((bounds[run, 3] + far - low[at, 0]) * scale, n_rows[at] - 1.0))
