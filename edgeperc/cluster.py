@@ -42,7 +42,7 @@ MIN_OF_WHOLE = 0.25
 
 N_ANGLES = 90
 MAX_FITTED = 256  # a rectangle's heading is fitted to at most this many points
-MAX_OBJECTS = 1000  # clusters that get a box; KITTI scans have at most 40
+MAX_OBJECTS = 1000  # clusters that get a box; 40 KITTI scans have at most 16
 MIN_SIDE_M = 0.1
 MAX_OVERLAP = 0.1  # IoU of two objects; the completed boxes of two pieces of one object overlap by more
 MAX_INSIDE = 0.5  # of the smaller of two footprints
