@@ -12,7 +12,13 @@ BIN := .venv/bin
 TEST := .venv-test/bin
 MINIMAL := .venv-minimal/bin
 
-.PHONY: help demo test check test-full test-kernels test-wheel test-minimal docs clean
+# Of make fuzz: time for all kinds together, the kinds (all), the seed (the time; it is printed). Of make soak: scans.
+SECONDS = 300
+KINDS ?=
+SEED ?=
+SCANS ?= 20000
+
+.PHONY: help demo test check test-full test-kernels test-wheel test-minimal docs fuzz soak release sbom clean
 
 help:
 	@echo "make demo          perceive the bundled scene: a table, and a picture in demo/"
@@ -23,6 +29,9 @@ help:
 	@echo "make test-wheel    build the wheel, run the demo from it outside the checkout"
 	@echo "make test-minimal  pytest with nothing but the runtime: no torch, no onnx, no matplotlib"
 	@echo "make docs          build the documentation into docs/_build/html; warnings are errors"
+	@echo "make fuzz          hostile scans, captures, models, boxes and commands; SECONDS=300 SEED=7 KINDS='scans models'"
+	@echo "make soak          whether memory grows over SCANS=20000 scans with stream, tracker and pictures"
+	@echo "make release       the packages, their SBOM and SHA256SUMS in dist/; make sbom does the same"
 	@echo "make clean         remove the environments and whatever else is made here"
 
 demo: .venv/installed
@@ -53,6 +62,15 @@ test-wheel: .venv-test/installed
 test-minimal: .venv-minimal/installed
 	$(MINIMAL)/python -c "import importlib.util as u; assert not any(map(u.find_spec, ['torch', 'onnx', 'matplotlib']))"
 	$(MINIMAL)/pytest -n $(JOBS) --dist worksteal
+
+fuzz: .venv-test/installed
+	$(TEST)/python -m tests.fuzz $(KINDS) --jobs $(JOBS) --seconds $(SECONDS) $(if $(SEED),--seed $(SEED))
+
+soak: .venv-test/installed
+	$(TEST)/edgeperc-bench soak --application --scans $(SCANS)
+
+release sbom:
+	PYTHON=$(PYTHON) bash .ci/release
 
 # The stamp inside each environment is as new as what it was installed from, so a second `make` installs nothing.
 .venv/installed: pyproject.toml
