@@ -290,6 +290,11 @@ class Perceiver:
         except MountingError:
             return None
 
+    def reset_mounting(self) -> None:
+        """Estimate the mounting anew, for scans of another vehicle; the next five scans settle it."""
+        with self._locks.setdefault(os.getpid(), threading.Lock()):
+            self._set_mounting(MountingEstimator(self._estimator.known))
+
     def _set_mounting(self, estimator: MountingEstimator) -> None:
         self._estimator = estimator
         self._mounting = estimator.mounting()

@@ -8,7 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from ..extras import require
-from .arguments import DEFAULT, Commands, add_boxes_from, add_command, add_figures_file, add_model, add_provider
+from .arguments import (
+    DEFAULT,
+    Commands,
+    add_boxes_from,
+    add_command,
+    add_figures_file,
+    add_model,
+    add_provider,
+    finite_number,
+)
 from .output import many, print_line, progress, table_lines, write_figures
 
 __all__ = ["add_parser", "eval_command"]
@@ -49,6 +58,13 @@ def add_parser(commands: Commands) -> None:
         choices=(0, 1, 2),
         help="evaluate on the validation drives of this training fold (default: none)",
     )
+    reading.add_argument(
+        "--mounted",
+        type=_mounted,
+        metavar="M,DEG,DEG",
+        help="perceive each scan as a sensor of this height, roll and pitch would have recorded it, the mounting to be "
+        "estimated from that scan alone; evaluates points and boxes (default: as recorded)",
+    )
     models = parser.add_argument_group("models")
     add_model(models)
     add_provider(models, provider="cpu")
@@ -69,6 +85,11 @@ def add_parser(commands: Commands) -> None:
     )
 
 
+def _mounted(text: str) -> tuple[float, float, float]:
+    height_m, roll_deg, pitch_deg = (finite_number(part) for part in text.split(","))
+    return height_m, roll_deg, pitch_deg
+
+
 def eval_command(arguments: argparse.Namespace) -> int:
     """Compare models with labeled scans."""
     if arguments.worst is not None:
@@ -76,6 +97,7 @@ def eval_command(arguments: argparse.Namespace) -> int:
     for file in filter(None, (arguments.json, arguments.worst)):
         file.parent.mkdir(parents=True, exist_ok=True)
     from ..evaluation.evaluate import evaluate
+    from ..mounting import Mounting
 
     with progress() as show:
         figures, mistakes = evaluate(
@@ -85,6 +107,7 @@ def eval_command(arguments: argparse.Namespace) -> int:
             fold=arguments.fold,
             road_by=arguments.road_by,
             boxes_from=arguments.boxes_from,
+            mounted=None if arguments.mounted is None else Mounting(*arguments.mounted),
             provider=arguments.provider,
             precision=arguments.precision,
             on_scan=show,

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import PointsError
+from ..mounting import Mounting
 from ..perceiver import BoxesFrom
 from ..simulation.samples import FIRST_SEED
 from ..zoo import DEFAULT
@@ -37,6 +38,7 @@ def evaluate(
     provider: str = "cpu",
     precision: str = "auto",
     boxes_from: BoxesFrom = "network",
+    mounted: Mounting | None = None,
     n_resamples: int = 1000,
     on_scan: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[dict[str, Any], list[Mistakes]]:
@@ -46,7 +48,7 @@ def evaluate(
     ----------
     datasets : sequence of str or Path
         Roots of a KITTI object set or of SemanticKITTI, or ``"simulation:N"`` for N simulated scans (default 24).
-    models, road_by, provider, precision, boxes_from
+    models, road_by, provider, precision, boxes_from, mounted
         As in `Judge`.
     split : str or None
         Drives of the real scans: ``"test"``, ``"train"``, ``"validation"`` or ``"all"`` (`splits.in_split`). None: the
@@ -81,6 +83,7 @@ def evaluate(
         road_by=road_by,
         training_scans=split == "train",
         boxes_from=boxes_from,
+        mounted=mounted,
     )
     scans = [scan for dataset in datasets for scan in _scans(judge, dataset, split, fold)]
     records: dict[str, list[Record]] = {}

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from ..card import TopViewGeometry
 from ..decode import decode_classes
 from ..errors import ModelError
+from ..frame import ModelFrame
 from ..geometry import inside
-from ..mounting import MODEL_MOUNTING
+from ..mounting import MODEL_MOUNTING, Mounting
 from ..perceiver import BoxesFrom, Perceiver
 from ..perception import Perception, PointLabels, TopView
 from ..projection import make_projector
@@ -53,6 +54,9 @@ class Judge:
     boxes_from : {"network", "clusters", "both"}
         As in `Perceiver`. Cluster boxes are evaluated wherever the truth is known, boxes of a top-view model only in
         its view.
+    mounted : Mounting or None
+        Perceive each scan as a sensor mounted so would have recorded it, with the mounting to be estimated from this
+        scan alone. Points (not pixels) and boxes are evaluated. None: as recorded, on the training vehicle.
 
     Raises
     ------
@@ -69,8 +73,12 @@ class Judge:
         road_by: str | Path | None = None,
         training_scans: bool = False,
         boxes_from: BoxesFrom = "network",
+        mounted: Mounting | None = None,
     ) -> None:
-        self.perceive = _perceiver(models, provider, precision, boxes_from)
+        self.perceive = _perceiver(
+            models, provider, precision, boxes_from, MODEL_MOUNTING if mounted is None else Mounting()
+        )
+        self.mounted = None if mounted is None else ModelFrame(mounted)
         networks = [_Network(session) for session in self.perceive.sessions]
         self.from_sensor = next((n for n in networks if n.card.view.kind == "range_image"), None)
         self.from_above = next((n for n in networks if n.card.view.kind == "top_view"), None)
@@ -138,7 +146,7 @@ class Judge:
         mistakes : Mistakes or None
             None if the objects of the scan are not labeled.
         """
-        found = self.perceive(truth.points)
+        found = self._perceive(truth.points)
         tallies: dict[tuple[str, ...], Any] = {}
         mistakes = None
         if truth.labels is not None:
@@ -149,9 +157,18 @@ class Judge:
                 mistakes = self._count_boxes(tallies, truth, found, mistakes)
             if found.points is not None:
                 mistakes = self._count_points(tallies, truth, found.points, mistakes, shown)
-        if found.top_view is not None:
+        if found.top_view is not None and self.mounted is None:
             self._count_cells(tallies, truth, found.top_view)
         return Record(truth.name, truth.drive, tallies), mistakes
+
+    def _perceive(self, points: NDArray[np.float32]) -> Perception:
+        if self.mounted is None:
+            return self.perceive(points)
+        seen = points.copy()
+        seen[:, :3] = (points[:, :3] - self.mounted.t) @ self.mounted.R
+        self.perceive.reset_mounting()
+        found = self.perceive(seen)
+        return replace(found, boxes=self.mounted.move_boxes(found.boxes))
 
     def _count_boxes(
         self, tallies: dict[tuple[str, ...], Any], truth: Truth, found: Perception, mistakes: Mistakes
@@ -189,9 +206,10 @@ class Judge:
         right = np.where(found.in_view, truth.labels, IGNORE).astype(np.uint8)
         range_m = np.hypot(truth.points[:, 0], truth.points[:, 1])
         labels = _renamed(found.labels, found.classes, POINT_CLASSES)
-        pixels = _renamed(self.from_sensor.point_labels(truth.points), found.classes, POINT_CLASSES)
         tallies |= banded(("points",), POINT_CLASSES, labels, right, range_m)
-        tallies |= banded(("pixels",), POINT_CLASSES, pixels, right, range_m)
+        if self.mounted is None:
+            pixels = _renamed(self.from_sensor.point_labels(truth.points), found.classes, POINT_CLASSES)
+            tallies |= banded(("pixels",), POINT_CLASSES, pixels, right, range_m)
         tallies |= {("objects", band): Counter() for band in BANDS}
         by_box = {id(box) for box in (*mistakes.found, *(box for box, _ in mistakes.missed))}
         hit, missed = [*mistakes.found], [*mistakes.missed]
@@ -262,12 +280,15 @@ class _Network:
 
 
 def _perceiver(
-    models: Sequence[str | Path], provider: str, precision: str, boxes_from: BoxesFrom = "network"
+    models: Sequence[str | Path],
+    provider: str,
+    precision: str,
+    boxes_from: BoxesFrom = "network",
+    mounting: Mounting = MODEL_MOUNTING,  # the truth of cells is in the frame of the scan
 ) -> Perceiver:
-    # The truth of cells is in the frame of the scan. KITTI's vehicle is the training vehicle.
     return Perceiver(
         list(models),
-        mounting=MODEL_MOUNTING,
+        mounting=mounting,
         provider=provider,
         precision=precision,
         on_mismatch="ignore",
