@@ -13,9 +13,9 @@
 `models`, `sensors` and `providers` list the available models, sensor profiles and execution providers.
 
 Importing this package compiles nothing, starts no thread and reads no file. A name is looked up in its module on first
-use, because numba probes the cache folder of every kernel when it reads the kernel's decorator. onnxruntime is an
-optional extra, because only one of its builds can be installed at a time. Without it, everything works except running a
-model: `Perceiver` raises `MissingExtraError`, whose message gives the install command.
+use, because importing numpy and numba takes half a second. onnxruntime is an optional extra, because only one of its
+builds can be installed at a time. Without it, everything works except running a model: `Perceiver` raises
+`MissingExtraError`, whose message gives the install command.
 """
 
 from __future__ import annotations
