@@ -168,7 +168,7 @@ class RangeImageGeometry:
         _check_size(len(rows), self.width)
         left, right = self.azimuth_left_deg, self.azimuth_right_deg
         # A full turn takes a run of the network for each sector.
-        if not (-180.0 <= right and right + MIN_SECTOR_DEG <= left and left <= 180.0):
+        if not (right >= -180.0 and right + MIN_SECTOR_DEG <= left and left <= 180.0):
             raise CardError(
                 f"view azimuths are left {left}, right {right}; expected -180 <= right < left <= 180, at least "
                 f"{MIN_SECTOR_DEG:g} degree apart"

@@ -70,6 +70,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         seed = 4 + len(name)
         (folder / name).parent.mkdir(exist_ok=True)
         simulate(random_scene(seed, "urban"), "hdl-64e", seed=seed).points.tofile(folder / name)
+    (folder / "T_vehicle_sensor.json").write_text("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1.7], [0, 0, 0, 1]]")
     if sys.platform != "win32":
         (folder / "models").symlink_to(REPOSITORY / "models")
     return folder

@@ -13,12 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..atomic import write_atomic
-from ..errors import EdgepercError, MissingExtraError, MountingError
+from ..errors import EdgepercError, MissingExtraError, MountingError, PointsError
 from .arguments import Commands, add_command, add_mounting, add_sensor, add_topic
 from .output import print_error, print_line, print_rows
 from .scans import scan_sensor
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from ..level import MountingEstimator
     from ..sensor import SensorProfile
     from ..zoo import Variant
@@ -68,7 +71,8 @@ def add_parser(commands: Commands) -> None:
         "--write",
         type=Path,
         metavar="FILE",
-        help="write the sensor's profile with the mounting that the scans show, for --sensor, a .json file",
+        help="write the sensor's profile with the mounting that the scans show, a .json file for --sensor "
+        "(default: none)",
     )
 
 
@@ -235,7 +239,14 @@ def _scan_rows(
 
     named, because = scan_sensor(path, arguments)
     sensor = get_sensor(named)
-    first = [points for _, points in islice(read_scans(path, topic=arguments.topic), FROZEN_AFTER)]
+    first: list[NDArray[np.float32]] = []
+    damage = ""
+    try:
+        first.extend(points for _, points in islice(read_scans(path, topic=arguments.topic), FROZEN_AFTER))
+    except PointsError as exc:
+        if not first:
+            raise
+        damage = str(exc)
     points = first[0]
     finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
     n_lost = len(points) - len(finite)
@@ -251,6 +262,8 @@ def _scan_rows(
         ("points", f"{len(points):,}, of which {n_lost:,} are not finite"),
         ("sensor", f"{sensor.name}: {because}"),
     ]
+    if damage:
+        rows.append(("damage", f"after {len(first)} scans: {damage}"))
     if not len(finite):
         return rows, document
     flat = np.hypot(finite[:, 0], finite[:, 1])

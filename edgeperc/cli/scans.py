@@ -131,7 +131,7 @@ def scan_sensor(path: Path, arguments: argparse.Namespace) -> tuple[str | Sensor
             f"{given.name}",
             stacklevel=2,
         )
-    return with_mounting(given, arguments), "as --sensor says"
+    return with_mounting(arguments.sensor, arguments), "as --sensor says"
 
 
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:

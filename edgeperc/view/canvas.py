@@ -103,7 +103,7 @@ def _width(figure: Any, text: str, **style: Any) -> float:
 
 
 def _most_characters(width: float, fontsize: float) -> int:
-    """More characters than fit into ``width`` pixels. Measuring a name of thousands of characters would take seconds."""
+    """More characters than fit into ``width`` pixels: measuring a name of thousands of them would take seconds."""
     return int(width / (0.25 * fontsize * _DPI / 72.0)) + 1  # the font's narrowest character has 0.275 of its size
 
 
