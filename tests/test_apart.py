@@ -11,6 +11,7 @@ import sqlite3
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 import zipfile
 import zlib
@@ -521,27 +522,124 @@ def test_chunks_of_a_bag_stop_at_the_limit(monkeypatch: pytest.MonkeyPatch) -> N
             unpack(pack(bytes(1001), method))
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux limits the memory of a process")
-def test_a_message_that_takes_more_memory_than_the_limit(tmp_path: Path) -> None:
+def compressed_bag(folder: Path, mode: str) -> Path:
+    """The bag of `write_bag2` with its messages or its file compressed."""
     zstandard = pytest.importorskip("zstandard")
-    folder = write_bag2(tmp_path / "bag")
-    metadata = folder / "metadata.yaml"
-    text = metadata.read_text()
-    for name, value in (("compression_format", "zstd"), ("compression_mode", "message")):
+    write_bag2(folder)
+    (database,) = folder.glob("*.db3")
+    text = (folder / "metadata.yaml").read_text()
+    for name, value in (("compression_format", "zstd"), ("compression_mode", mode)):
         text = "".join(
             f"  {name}: {value}\n" if line.strip().startswith(f"{name}:") else line for line in text.splitlines(True)
         )
-    metadata.write_text(text)
+    if mode == "file":
+        text = text.replace(database.name, f"{database.name}.zstd")
+        packed = zstandard.ZstdCompressor().compress(database.read_bytes())
+        database.with_name(f"{database.name}.zstd").write_bytes(packed)
+        database.unlink()
+    else:
+        connection = sqlite3.connect(database)
+        for number, data in connection.execute("SELECT id, data FROM messages").fetchall():
+            packed = zstandard.ZstdCompressor().compress(data)
+            connection.execute("UPDATE messages SET data = ? WHERE id = ?", (packed, number))
+        connection.commit()
+        connection.close()
+    (folder / "metadata.yaml").write_text(text)
+    return folder
+
+
+@pytest.mark.parametrize("mode", ["message", "file"])
+def test_a_bag_of_ros_2_that_is_compressed(tmp_path: Path, mode: str) -> None:
+    scans = list(read_scans(compressed_bag(tmp_path / "bag", mode)))
+    assert len(scans) == 3
+    np.testing.assert_array_equal(scans[0][1], POINTS)
+
+
+def zstd_zeros(n: int) -> bytes:
+    packer = pytest.importorskip("zstandard").ZstdCompressor().compressobj()
+    return b"".join(packer.compress(bytes(1 << 24)) for _ in range(n >> 24)) + packer.flush()
+
+
+# A frame of one block, whose header says 8 GiB.
+ZSTD_CLAIM = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", 8 << 30) + b"\x03\0\0\0"
+
+
+@pytest.mark.parametrize("bomb", ["zeros", "claim"])
+def test_messages_of_a_bag_stop_at_the_limit(tmp_path: Path, bomb: str) -> None:
+    folder = compressed_bag(tmp_path / "bag", "message")
     (database,) = folder.glob("*.db3")
-    # A frame of one block, whose header says 8 GiB.
-    bomb = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", 8 << 30) + b"\x03\0\0\0"
+    packed = ZSTD_CLAIM if bomb == "claim" else zstd_zeros(1 << 28)
     connection = sqlite3.connect(database)
-    rows = connection.execute("SELECT id, data FROM messages ORDER BY timestamp").fetchall()
-    for k, (number, data) in enumerate(rows):
-        packed = bomb if k >= 2 else zstandard.ZstdCompressor().compress(data)
-        connection.execute("UPDATE messages SET data = ? WHERE id = ?", (packed, number))
+    (last,) = connection.execute("SELECT max(timestamp) FROM messages WHERE topic_id = 1").fetchone()
+    connection.execute("UPDATE messages SET data = ? WHERE timestamp = ?", (packed, last))
     connection.commit()
     connection.close()
     scans, error = read_until_error(folder)
+    assert len(scans) == 2
+    assert ("unpack to more than 67,108,864" if bomb == "zeros" else "damaged") in error
+
+
+def test_files_of_a_bag_stop_at_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No more reaches the disk, and the temporary folder is deleted."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    folder = compressed_bag(tmp_path / "bag", "file")
+    (file,) = folder.glob("*.zstd")
+    file.write_bytes(zstd_zeros(1 << 30))
+    scans, error = read_until_error(folder)
+    assert not scans
+    assert "compressed bytes unpack to more than 67,108,864, which is not done" in error
+    assert not [*(tmp_path / "temporary").iterdir()]
+    file.write_bytes(file.read_bytes()[:-9])
+    assert "unpack to more" in read_until_error(folder)[1]
+    file.write_bytes(b"no zstd")
+    assert "the zstd data is damaged" in read_until_error(folder)[1]
+
+
+def test_a_chunk_stops_at_a_ratio() -> None:
+    """Whatever it claims: 100 times its size, and at least 64 MiB."""
+    packed = zstd_zeros(1 << 27)
+    assert len(packed) < 100_000
+    with pytest.raises(PointsError, match="unpack to more than 67,108,864"):
+        inflate(packed, "zstd", 1 << 30)
+
+
+# Appended to the program of the process: what decoding does instead.
+ALLOCATES = """
+import numpy as np
+from edgeperc.readers import decoders, worker
+def scans(*_):
+    yield None, np.zeros((1, 4), "f4")
+    yield None, np.zeros((1 << 28, 4), "f4")
+decoders._packet_scans = scans
+worker.main()
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux limits the memory of a process")
+def test_decoding_that_takes_more_memory_than_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(apart, "_START", "import sys; sys.path[:] = sys.argv[1:]" + ALLOCATES)
+    scans, error = read_until_error(write_pcap(tmp_path / "any.pcap", []))
     assert len(scans) == 1
     assert "after 1 scans decoding the capture takes more than 2,147,483,648 bytes of memory" in error
+
+
+def test_a_scan_that_is_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = ALLOCATES.replace("1 << 28", "(1 << 24) + 1")
+    monkeypatch.setattr(apart, "_START", "import sys; sys.path[:] = sys.argv[1:]" + program)
+    scans, error = read_until_error(write_pcap(tmp_path / "any.pcap", []))
+    assert len(scans) == 1
+    assert "a scan of 16,777,217 points is too large; expected at most 16,777,216" in error
+
+
+def test_too_little_memory_for_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    POINTS.tofile(tmp_path / "a.bin")
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise MemoryError
+
+    for name in ("fromfile", "abs"):
+        with monkeypatch.context() as patch:
+            patch.setattr(files.np, name, fail)
+            with pytest.raises(PointsError, match=r"a\.bin: .*(cannot be read|more memory than there is)"):
+                read_points(tmp_path / "a.bin")

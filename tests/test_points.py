@@ -306,7 +306,7 @@ def test_bad_file_names_the_fault(tmp_path, name):
 def test_a_zip_bomb_is_not_unpacked(tmp_path):
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("points.npy", npy(np.zeros((2_000_000, 4), np.float32)))
+        archive.writestr("points.npy", npy(np.zeros((5_000_000, 4), np.float32)))
     with pytest.raises(PointsError, match="not unpacked"):
         read_points(save(tmp_path, "bomb.npz", stream.getvalue()))
 

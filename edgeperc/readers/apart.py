@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..errors import MissingExtraError, PointsError
 from .decoders import Scan
-from .tables import MAX_BYTES
+from .tables import MAX_BYTES, MAX_SCAN_BYTES
 from .worker import ALIVE, END, ERROR, FOUND, HEADER, MISSING, READY, SCAN, WARNING
 
 __all__ = ["SCAN_LIMIT_S", "decode_apart", "describe_apart"]
@@ -145,7 +145,7 @@ def _replies(
             break
         kind, stamp, n_bytes = HEADER.unpack(header)
         known = kind in (ALIVE, END, ERROR, FOUND, MISSING, READY, SCAN, WARNING)
-        if not known or not 0 <= n_bytes <= (MAX_BYTES if kind == SCAN else _MOST_TEXT_BYTES):
+        if not known or not 0 <= n_bytes <= (MAX_SCAN_BYTES if kind == SCAN else _MOST_TEXT_BYTES):
             break
         if kind == SCAN and n_bytes % 16 == 0:
             points: NDArray[np.float32] = np.empty((n_bytes // 16, 4), "<f4")

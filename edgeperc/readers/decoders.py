@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,7 +15,7 @@ from numpy.typing import NDArray
 from ..errors import MissingExtraError, PointsError
 from ..extras import require
 from ..points import as_points
-from .inflate import inflate
+from .inflate import inflate, inflate_file, most_bytes
 from .mcap import McapFile
 from .ouster import check_osf, open_capture
 from .packets import pcap_packets, refuse_hesai, velodyne_packets
@@ -63,12 +66,12 @@ def decode(
     scans = (
         _packet_scans(path, kind, topic, remission_field, warn, alive)
         if kind in (".pcap", ".osf")
-        else _bag_scans(path, kind, topic, remission_field)
+        else _bag_scans(path, kind, topic, remission_field, alive)
     )
     yield from _with_typed_errors(path, scans)
 
 
-def describe(path: Path, kind: str, topic: str | None) -> dict[str, Any]:
+def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]) -> dict[str, Any]:
     """What a capture says about its sensor, as JSON types; `identify` draws the conclusion.
 
     Parameters
@@ -77,6 +80,8 @@ def describe(path: Path, kind: str, topic: str | None) -> dict[str, Any]:
     kind : {".osf", ".bag", ".mcap", "ros2"}
     topic : str, optional
         As in `edgeperc.read_scans`.
+    alive : callable
+        As in `decode`.
 
     Returns
     -------
@@ -97,7 +102,7 @@ def describe(path: Path, kind: str, topic: str | None) -> dict[str, Any]:
             chosen = frames.sensor_info[_choose("sensor", [str(info.sn) for info in frames.sensor_info], topic)]
             yield {"metadata": chosen.to_json_string()}
         else:
-            for name, message, _ in _clouds(path, kind, topic):
+            for name, message, _ in _clouds(path, kind, topic, alive):
                 yield {
                     "topic": name,
                     "frame": str(message.header.frame_id),
@@ -291,22 +296,30 @@ def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -
 # --- bags ------------------------------------------------------------------------------------------------------------
 
 
-def _bag_scans(path: Path, kind: str, topic: str | None, remission_field: str | None) -> Iterator[Scan]:
-    for _, message, stamp_s in _clouds(path, kind, topic):
+def _bag_scans(
+    path: Path, kind: str, topic: str | None, remission_field: str | None, alive: Callable[[], None]
+) -> Iterator[Scan]:
+    for _, message, stamp_s in _clouds(path, kind, topic, alive):
         yield stamp_s, cloud_points(message, remission_field=remission_field)
 
 
-def _clouds(path: Path, kind: str, topic: str | None) -> Iterator[tuple[str, Any, float]]:
+def _clouds(path: Path, kind: str, topic: str | None, alive: Callable[[], None]) -> Iterator[tuple[str, Any, float]]:
     """Topic, message and stamp [s] of each point cloud."""
     highlevel = require("rosbags.highlevel", "io", "Reading a bag")
     typesys = require("rosbags.typesys", "io", "Reading a bag")
     rosbag2 = require("rosbags.rosbag2", "io", "Reading a bag")
     humble = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    if kind == "ros2":
+        path = _unpacked_files(path, rosbag2.Reader(path), alive)
     files = [path] if kind == ".mcap" else _mcap_files(rosbag2.Reader(path)) if kind == "ros2" else []
     opened = _McapBag(files, humble) if files else highlevel.AnyReader([path], default_typestore=humble)
     with opened as bag:
+        packed = False
         for reader in getattr(bag, "readers", []):
             _limit_chunks(reader)
+            if getattr(reader, "compression_mode", None) == "message":
+                packed = True
+                reader.metadata["compression_mode"] = ""  # unpacked below, within limits
         clouds = [c for c in bag.connections if c.msgtype == _CLOUD]
         others = sorted({f"{c.topic} ({c.msgtype})" for c in bag.connections if c.msgtype != _CLOUD})
         names = sorted({c.topic for c in clouds})
@@ -314,13 +327,32 @@ def _clouds(path: Path, kind: str, topic: str | None) -> Iterator[tuple[str, Any
         chosen = names[_choose("topic of type sensor_msgs/PointCloud2", names, topic, beside)]
         n_scans = 0
         for connection, stamp_ns, raw in bag.messages([c for c in clouds if c.topic == chosen]):
-            message = bag.deserialize(raw, connection.msgtype)
+            message = bag.deserialize(inflate(bytes(raw), "zstd") if packed else raw, connection.msgtype)
             stamp = message.header.stamp
             stamp_s = stamp.sec + 1e-9 * stamp.nanosec
             n_scans += 1
             yield chosen, message, stamp_s or 1e-9 * stamp_ns
         if not n_scans:
             raise PointsError(f"topic {chosen} has no message; expected point clouds")
+
+
+def _unpacked_files(folder: Path, bag: Any, alive: Callable[[], None]) -> Path:
+    """A ROS 2 bag's folder whose files are not compressed: the folder itself, or a copy in a temporary one."""
+    if bag.compression_mode != "file":
+        return folder
+    target = Path(tempfile.mkdtemp())
+    left = min(most_bytes(sum(file.stat().st_size for file in bag.paths)), shutil.disk_usage(target).free // 2)
+    for file in bag.paths:
+        left -= inflate_file(file, target / file.stem, left, alive)
+    information = {
+        **bag.metadata,
+        "compression_mode": "",
+        "compression_format": "",
+        "relative_file_paths": [file.stem for file in bag.paths],
+    }
+    text = json.dumps({"rosbag2_bagfile_information": information}, default=str)  # JSON is YAML
+    (target / "metadata.yaml").write_text(text, encoding="utf-8")
+    return target
 
 
 def _mcap_files(bag: Any) -> list[Path]:

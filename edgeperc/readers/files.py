@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
 from ..points import as_points
-from .inflate import inflate
+from .inflate import inflate, most_bytes
 from .pcd import begins_like_pcd, parse_pcd
 from .ply import parse_ply
-from .tables import MAX_BYTES, MAX_HEADER_BYTES
+from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES
 
 __all__ = ["read_points"]
 
@@ -60,20 +60,20 @@ def read_points(
     Raises
     ------
     PointsError
-        The file cannot be read, is empty, larger than 2 GiB, cut short or not a scan. A scan of no points is valid if a
-        header says so; a file of 0 bytes is an error.
+        The file cannot be read, is empty, larger than 256 MiB, cut short or not a scan. A scan of no points is valid
+        if a header says so; a file of 0 bytes is an error.
     """
     if not isinstance(source, str | os.PathLike):
         return as_points(source, remission_field=remission_field)
     path = Path(source)
     try:
         size = path.stat().st_size if path.is_file() else 0
-        if size > MAX_BYTES:
-            raise PointsError(f"{path}: {size:,} bytes are too much for one scan; expected at most {MAX_BYTES:,}")
+        if size > MAX_SCAN_BYTES:
+            raise PointsError(f"{path}: {size:,} bytes are too much for one scan; expected at most {MAX_SCAN_BYTES:,}")
         data = np.fromfile(path, dtype=np.uint8) if path.is_file() else None
     except PointsError:
         raise
-    except (OSError, ValueError) as exc:  # ValueError: a NUL in the name
+    except (MemoryError, OSError, ValueError) as exc:  # ValueError: a NUL in the name
         raise PointsError(f"{path}: the file cannot be read ({exc})") from exc
     if data is None:
         raise PointsError(f"{path}: there is no such file; expected a scan as .bin, .npy, .npz, .pcd or .ply")
@@ -81,6 +81,8 @@ def read_points(
         return _parse(data, path.name.lower(), columns, remission_field)
     except PointsError as exc:
         raise PointsError(f"{path}: {exc}") from exc
+    except MemoryError as exc:
+        raise PointsError(f"{path}: reading {data.size:,} bytes takes more memory than there is") from exc
 
 
 def _parse(data: NDArray[np.uint8], name: str, columns: int | None, remission_field: str | None) -> NDArray[np.float32]:
@@ -183,8 +185,7 @@ def _parse_npz(data: NDArray[np.uint8]) -> NDArray[Any]:
                 (member,) = members.values()
             else:
                 raise PointsError(f"several arrays and none called points: {', '.join(members)}")
-            # Deflate packs at most 1,032 to 1; scans pack less than 20 to 1.
-            if member.file_size > max(100 * data.size, 1 << 24):
+            if member.file_size > most_bytes(data.size):
                 raise PointsError(
                     f"{data.size} bytes claim to unpack to {member.file_size}; no scan packs so well, so it is not "
                     "unpacked. Save it as .npy"
@@ -210,7 +211,7 @@ def _unpack_member(data: NDArray[np.uint8], member: zipfile.ZipInfo) -> bytes:
         raise PointsError(f"{member.filename!r} does not begin at the byte {at:,} that the archive names")
     at += 30 + int(data[at + 26 : at + 30].view("<u2").sum())
     packed = data[at : at + member.compress_size].tobytes()
-    content = inflate(packed, methods[member.compress_type], min(member.file_size, MAX_BYTES))
+    content = inflate(packed, methods[member.compress_type], min(member.file_size, MAX_SCAN_BYTES))
     if len(content) != member.file_size or zlib.crc32(content) != member.CRC:
         raise PointsError(f"{member.filename!r} in the archive is damaged: its length or CRC-32 is wrong")
     return content

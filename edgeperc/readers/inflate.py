@@ -6,16 +6,25 @@ import bz2
 import io
 import zlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from ..errors import PointsError
 from ..extras import require
 from .tables import MAX_BYTES
 
-__all__ = ["inflate"]
+__all__ = ["inflate", "inflate_file", "most_bytes"]
+
+# Scans pack less than 20 to 1. Clouds without a return pack better, but are smaller than 64 MiB.
+_MOST_RATIO, _ALWAYS_BYTES = 100, 1 << 26
 
 
-def inflate(packed: bytes, method: str, limit: int = MAX_BYTES) -> bytes:
+def most_bytes(n_packed: int) -> int:
+    """Most bytes that so many compressed bytes may unpack to."""
+    return max(_MOST_RATIO * n_packed, _ALWAYS_BYTES)
+
+
+def inflate(packed: bytes, method: str, limit: int | None = None) -> bytes:
     """Decompress bytes, but no more than a limit.
 
     Parameters
@@ -23,20 +32,21 @@ def inflate(packed: bytes, method: str, limit: int = MAX_BYTES) -> bytes:
     packed : bytes
     method : {"", "deflate", "bz2", "lz4", "zstd"}
         ``""``: not compressed. ``"lz4"`` is LZ4's frame format.
-    limit : int
-        Most bytes of the result.
+    limit : int, optional
+        Most bytes of the result; by default 2 GiB, and never more than `most_bytes`.
 
     Raises
     ------
     PointsError
         The data holds more than ``limit`` bytes, is damaged or cut short, or the method is unknown.
     """
+    limit = min(MAX_BYTES if limit is None else limit, most_bytes(len(packed)) if method else MAX_BYTES)
     if method == "":
         content = packed
     elif method in ("deflate", "bz2", "lz4", "zstd"):
         try:
             content = _decompressor(method)(packed, limit + 1)
-        except (PointsError, ImportError):
+        except (PointsError, ImportError, MemoryError):
             raise
         except Exception as exc:  # each library has its own errors
             raise PointsError(f"the {method} data is damaged: {exc}") from exc
@@ -45,6 +55,32 @@ def inflate(packed: bytes, method: str, limit: int = MAX_BYTES) -> bytes:
     if len(content) > limit:
         raise PointsError(f"{len(packed):,} compressed bytes unpack to more than {limit:,}, so they are not unpacked")
     return content
+
+
+def inflate_file(packed: Path, target: Path, limit: int, alive: Callable[[], None]) -> int:
+    """Decompress a zstd file into another one, but no more bytes than a limit; their number.
+
+    Raises
+    ------
+    PointsError
+        As `inflate`.
+    """
+    zstd = require("zstandard", "io", "Reading zstd data")
+    n = 0
+    with packed.open("rb") as source, target.open("wb") as out:
+        reader = zstd.ZstdDecompressor().stream_reader(source, read_across_frames=True)
+        try:
+            while piece := reader.read(1 << 20):
+                n += len(piece)
+                if n > limit:
+                    size = packed.stat().st_size
+                    raise PointsError(f"{size:,} compressed bytes unpack to more than {limit:,}, which is not done")
+                out.write(piece)
+                if n % (1 << 28) < len(piece):
+                    alive()
+        except zstd.ZstdError as exc:
+            raise PointsError(f"the zstd data is damaged: {exc}") from exc
+    return n
 
 
 def _decompressor(method: str) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import struct
 import tempfile
 import zlib
@@ -49,6 +50,8 @@ def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], No
             "than the metadata says"
         )
     if found.bad:
+        if shutil.disk_usage(tempfile.gettempdir()).free < path.stat().st_size:
+            raise PointsError("the temporary folder has no room for a copy without the damaged packets")
         source = Path(tempfile.mkdtemp()) / "whole.pcap"
         copy_without(path, found.bad, source, alive)
     else:

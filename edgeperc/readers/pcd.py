@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..kernel_cache import njit
 from ..points import assemble, plain_name
-from .tables import MAX_BYTES, MAX_HEADER_BYTES, column, cut_short, parse_table, whole_number
+from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES, column, cut_short, parse_table, whole_number
 
 __all__ = ["begins_like_pcd", "fill_unpacked_lzf", "parse_pcd"]
 
@@ -141,8 +141,8 @@ def _unpack_pcd(body: NDArray[np.uint8], n_bytes: int) -> NDArray[np.uint8]:
     # The longest LZF reference takes 3 bytes and gives 264, so a larger claim is false; check before allocating.
     if size != n_bytes or size > 88 * packed_size:
         raise PointsError(f"{packed_size} compressed bytes claim to unpack to {size}; the fields need {n_bytes}")
-    if size > MAX_BYTES:
-        raise PointsError(f"the compressed data unpacks to {size:,} bytes; expected at most {MAX_BYTES:,}")
+    if size > MAX_SCAN_BYTES:
+        raise PointsError(f"the compressed data unpacks to {size:,} bytes; expected at most {MAX_SCAN_BYTES:,}")
     unpacked = np.empty(size, dtype=np.uint8)
     if fill_unpacked_lzf(body[8 : 8 + packed_size], unpacked) != size:
         raise PointsError("the compressed data is damaged")

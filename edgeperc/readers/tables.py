@@ -12,13 +12,24 @@ from numpy.typing import NDArray
 from ..errors import PointsError
 from ..points import assemble, remission_name
 
-__all__ = ["MAX_BYTES", "MAX_HEADER_BYTES", "column", "cut_short", "parse_table", "whole_number"]
+__all__ = [
+    "MAX_BYTES",
+    "MAX_HEADER_BYTES",
+    "MAX_SCAN_BYTES",
+    "column",
+    "cut_short",
+    "parse_table",
+    "whole_number",
+]
 
 MAX_HEADER_BYTES = 65536
 
-# Limit for a scan file, for what a compressed file or chunk unpacks to, and for the memory that decoding a capture
-# takes: 2 GiB, over 100 million points.
+# Limit for the memory that decoding a capture takes, and for what one of its chunks unpacks to: 2 GiB.
 MAX_BYTES = 1 << 31
+
+# Limit for a scan: 16 million points of KITTI's files, where a turn of the densest sensors has half a million. Reading
+# so much text takes 2 GiB of memory.
+MAX_SCAN_BYTES = 1 << 28
 
 
 def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int) -> NDArray[Any]:

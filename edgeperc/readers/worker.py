@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import MissingExtraError, PointsError
 from .decoders import decode, describe
-from .tables import MAX_BYTES
+from .tables import MAX_BYTES, MAX_SCAN_BYTES
 
 __all__ = ["ALIVE", "END", "ERROR", "FOUND", "HEADER", "MISSING", "READY", "SCAN", "WARNING", "main"]
 
@@ -44,7 +44,7 @@ def main() -> None:
         capture = Path(request["path"]), request["kind"], request["topic"]
         try:
             if "remission_field" not in request:
-                reply(FOUND, json.dumps(describe(*capture)).encode())
+                reply(FOUND, json.dumps(describe(*capture, lambda: reply(ALIVE))).encode())
                 return
             for stamp_s, points in decode(
                 *capture,
@@ -52,6 +52,11 @@ def main() -> None:
                 lambda text: reply(WARNING, text.encode("utf-8", "replace")),
                 lambda: reply(ALIVE),
             ):
+                if points.nbytes > MAX_SCAN_BYTES:
+                    raise PointsError(
+                        f"{request['path']}: a scan of {len(points):,} points is too large; expected at most "
+                        f"{MAX_SCAN_BYTES // 16:,}"
+                    )
                 content = np.ascontiguousarray(points, "<f4").data.cast("B") if points.size else b""
                 reply(SCAN, content, np.nan if stamp_s is None else stamp_s)
         except MissingExtraError as exc:
