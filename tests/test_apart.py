@@ -341,6 +341,23 @@ def test_real_captures_that_are_damaged(data_root: Callable[[str], Path], tmp_pa
         read_whole(tmp_path / "copy.pcap")
 
 
+def test_packets_of_the_right_size_with_damaged_headers(ouster: Path, tmp_path: Path) -> None:
+    """Packet type, frame, measurement and status are anything; the process that decodes may end, this one does not."""
+    content = (ouster / "sphere.pcap").read_bytes()
+    (tmp_path / "sphere.json").write_bytes((ouster / "sphere.json").read_bytes())
+    chance = random.Random(8)
+    for _ in range(10):
+        records = [bytearray(each) for each in records_of(content)]
+        for each in chance.sample(records, chance.choice((1, 8, len(records)))):
+            packet = 16 + 42
+            column = packet + 32 + chance.randrange(16) * ((len(each) - packet - 64) // 16)
+            for _ in range(chance.choice((1, 6))):
+                place = chance.choice((packet + chance.randrange(32), column + chance.randrange(12)))
+                each[place] = chance.choice((0, 255, chance.randrange(256)))
+        (tmp_path / "sphere.pcap").write_bytes(content[:24] + b"".join(records))
+        read_whole(tmp_path / "sphere.pcap")
+
+
 def test_osf_files_with_damage_and_right_checksums(ouster: Path, tmp_path: Path) -> None:
     content = (ouster / "sphere.osf").read_bytes()
     blocks, at = [], 0

@@ -277,6 +277,50 @@ def test_folders_are_opened_and_sorted(tmp_path: Path, capsys: pytest.CaptureFix
     assert answers[1]["n_points"] == 40
 
 
+def test_huge_scans_fail_and_the_others_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def perceive(self: FakePerceiver, points: np.ndarray, stamp_s: float | None = None) -> Perception:
+        if len(points) == 41:
+            raise MemoryError
+        return real(self, points, stamp_s)
+
+    real = FakePerceiver.__call__
+    monkeypatch.setattr(FakePerceiver, "__call__", perceive)
+    with (tmp_path / "a.bin").open("wb") as file:
+        file.truncate(100 << 30)  # sparse
+    write_scan(tmp_path / "b.bin", 41)
+    write_scan(tmp_path / "c.bin")
+    assert run("run", tmp_path) == 1
+    captured = capsys.readouterr()
+    assert "c.bin" in captured.out
+    assert "3 scans, 2 failed" in captured.err
+    assert "a.bin: 107,374,182,400 bytes are too much for one scan; expected at most 268,435,456" in captured.err
+    assert "b.bin: 41 points take more memory than there is" in captured.err
+
+
+@pytest.mark.skipif(os.name == "nt", reason="file names cannot have these characters")
+@pytest.mark.parametrize("command", [("run",), ("run", "--json"), ("info",), ("info", "--json")])
+def test_names_of_files_do_not_reach_the_terminal_raw(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
+) -> None:
+    good = write_scan(tmp_path / "a\x1b]0;title\x07\n\u202eb.bin")
+    bad, capture = tmp_path / "c\x1b[2J\r.bin", tmp_path / "d\x9b1m.pcap"
+    bad.write_bytes(b"no scan")
+    capture.write_bytes(b"no capture")
+    assert run(*command, good, bad, capture) == 1
+    captured = capsys.readouterr()
+    shown = captured.out + captured.err
+    assert all(name in shown for name in ("\\u001b]0;title", "\\u001b[2J", "1m.pcap"))
+    assert all(line.isprintable() for line in shown.split("\n"))
+
+
+@pytest.mark.parametrize(("option", "passed"), [((), "refuse"), (("--anyway",), "warn")])
+def test_anyway(tmp_path: Path, fake: type[FakePerceiver], option: tuple[str, ...], passed: str) -> None:
+    assert run("run", write_scan(tmp_path / "a.bin"), *option) == 0
+    assert fake.made[0].given[-1] == passed
+
+
 @pytest.fixture
 def capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A capture of three scans, cut short; the second of them makes the perceiver choke."""

@@ -378,6 +378,8 @@ def _each(
                 _write(points, perception, {kind: _file_of(file, kind) for kind in kinds}, title=str(name))
             except (EdgepercError, OSError) as exc:
                 yield name, exc, None, None
+            except MemoryError:
+                yield name, PointsError(f"{len(points):,} points take more memory than there is"), None, None
             else:
                 yield name, perception, tracks, _under(points, perception) if arguments.gif else None
     except (EdgepercError, OSError) as exc:
