@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import mmap
 import os
 import sys
@@ -19,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the tests' he
 
 from edgeperc.atomic import write_atomic
 
-from .running import Kind, State, attempt, new_case, run_job, supervise
+from .running import Kind, State, attempt, new_case, run_job, summary_of, supervise
 
 KINDS = ("scans", "captures", "models", "trackers", "commands")
 
@@ -41,10 +42,15 @@ def main() -> int:
         "--out", type=Path, default=Path("build/fuzz"), help="counts and failed cases; continued if there"
     )
     parser.add_argument("--case", type=int, default=None, help="run this case alone, in this process")
+    parser.add_argument("--table", action="store_true", help="print the counts in --out as Markdown, and run nothing")
     parser.add_argument("--here", action="store_true", help="run the cases in this process, which may end with them")
     parser.add_argument("--worker", nargs=4, default=None, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
+    if arguments.table:
+        print(table(arguments.out))
+        return 0
     kinds = arguments.kinds or [*KINDS]
+    logging.disable(logging.WARNING)  # what is told of damaged settings, a thousand times
     seed = int(time.time()) if arguments.seed is None else arguments.seed
     cache = arguments.out.absolute() / "cache"  # nothing of this computer's user is read or changed
     os.environ.setdefault("EDGEPERC_CACHE_DIR", str(cache))
@@ -102,6 +108,20 @@ def main() -> int:
         write_atomic(arguments.out / f"{name}-{seed}.json", whole.to_json())
         n_failures += whole.n_failures
     return int(n_failures > 0)
+
+
+def table(out: Path) -> str:
+    """The runs of every kind in a folder, added up, as rows of a Markdown table; then how processes died."""
+    rows, died = [], []
+    for kind in KINDS:
+        states = [State.read(file) for file in sorted(out.glob(f"{kind}-*of*.json"))]
+        if not states:
+            continue
+        whole = summary_of(states)
+        slowest, highest = whole.slowest["ms"] / 1e3, whole.highest["mb"]
+        rows.append(f"| `{kind}` | {whole.cases:,} | {whole.n_failures} | {slowest:.1f} s | {highest:.0f} MB |")
+        died += [f"{how} {count:,}" for how, count in sorted(whole.died.items())]
+    return "\n".join([*rows, f"died: {', '.join(died)}"])
 
 
 def line(state: State) -> str:

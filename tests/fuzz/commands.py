@@ -53,6 +53,11 @@ OPTIONS = [
     "--precision", "--threads", "--topic", "--on-mismatch", "--adapt", "--boxes-from", "--full-turn", "--rate",
     "--trusted", "--anyway", "--mount-height", "--turn",
 ]  # fmt: skip
+USUAL = {
+    "--sensor": [*SENSORS], "--model": ["lodnn"], "--on-mismatch": ["warn", "ignore"], "--provider": ["cpu", "auto"],
+    "--precision": ["auto", "fp32"], "--threads": ["1"], "--adapt": ["none", "both"], "--boxes-from": ["network"],
+    "--rate": ["10"], "--mount-height": ["1.5"], "--turn": ["90"],
+}  # fmt: skip
 TAKE_NONE = {"--json", "--png", "--html", "--labels", "--ply", "--track", "--full-turn", "--trusted", "--anyway"}
 
 
@@ -109,14 +114,15 @@ class Commands:
             given += files
         if command == "run" and case.chance(0.9):
             given += ["--model", "lodnn:int8", "--provider", "cpu", *(["--anyway"] if case.chance(0.7) else [])]
-        for _ in range(int(case.rng.integers(0, 4))):
+        most = 4 if command == "run" or case.chance(0.1) else 1
+        for _ in range(int(case.rng.integers(0, most))):
             option = case.pick(OPTIONS)
             given.append(option)
             if option == "--out":
                 given.append(str(case.folder / "out") if case.chance(0.7) else case.pick(["/proc/x", "\udcff", ""]))
             elif option not in TAKE_NONE or case.chance(0.02):
-                known = {"--sensor": [*SENSORS], "--model": files, "--on-mismatch": ["warn", "ignore"]}.get(option)
-                given.append(case.pick(known) if known and case.chance(0.5) else case.pick(STRANGE))
+                known = USUAL.get(option)
+                given.append(case.pick(known) if known and case.chance(0.6) else case.pick([*STRANGE, *files]))
         if case.chance(0.1):
             given.insert(int(case.rng.integers(len(given) + 1)), case.pick(STRANGE))
         return given

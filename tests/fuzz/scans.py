@@ -27,7 +27,7 @@ __all__ = ["LIMIT_MB", "LIMIT_S", "check_perception", "check_tracks", "make"]
 
 LIMIT_S, LIMIT_MB = 10.0, 1500.0
 BLOCK = 100  # cases with one perceiver
-HONEST_EVERY = 400  # every such block has real networks, and fewer cases use them
+HONEST_EVERY, HONEST_CASES = 50, 10  # in every 50th block, ten cases have real networks, which are slow
 DRAWN, PAGES, FILES = 0.0005, 0.01, 0.02  # shares of the cases that are drawn, written as a page, written as files
 
 VIEWS = {
@@ -157,11 +157,14 @@ class Scans:
     def __init__(self, seed: int) -> None:
         self.seed = seed
         self.cards = cards()
-        self.block, self.perceive, self.made_up = -1, None, []  # type: ignore[var-annotated]
+        self.made: tuple[int, bool] | None = None
+        self.perceive: Any = None
+        self.made_up: list[MadeUp] = []
 
     def perceiver(self, case: Case) -> tuple[Perceiver, list[MadeUp]]:
         block = case.index // BLOCK
-        if self.block == block and self.perceive is not None:
+        is_honest = block % HONEST_EVERY == 3 and case.index % BLOCK < HONEST_CASES
+        if self.made == (block, is_honest):
             return self.perceive, self.made_up
         rng = np.random.default_rng([self.seed, 1, block])
         made = Case(case.kind, case.seed, case.index, case.folder, rng)
@@ -173,7 +176,7 @@ class Scans:
             "score_threshold": made.pick([None, None, 0.0, 1.0, 0.5]),
             "full_turn": bool(rng.random() < 0.1),
         }
-        if block % HONEST_EVERY == HONEST_EVERY - 1:
+        if is_honest:
             self.made_up = []
             self.perceive = Perceiver(provider="cpu", n_threads=1, **options)
         else:
@@ -183,15 +186,13 @@ class Scans:
             with mock.patch.object(perceiver_module, "Session", side_effect=chosen):
                 self.perceive = Perceiver([m.card.name for m in chosen], **options)
             self.made_up = chosen
-        self.block = block
+        self.made = block, is_honest
         return self.perceive, self.made_up
 
     def run(self, case: Case) -> str:
         scan = hostile_scan(case)
         case.evidence["scan.npy"] = lambda: save(case.folder / "evidence.npy", scan)
         perceive, made_up = self.perceiver(case)
-        if not made_up and case.index % BLOCK >= 8:
-            return "skipped, real networks are slow"
         hostile = case.chance(0.2)
         for each in made_up:
             each.case, each.hostile = case, hostile
@@ -236,7 +237,9 @@ class Scans:
         if case.chance(DRAWN):
             picture = draw(perception, points)
             check(picture[:4] == b"\x89PNG", "not a picture")
-        return "answer"
+        return (
+            "answer" if any("made-up" in each for each in perception.providers.values()) else "answer of real networks"
+        )
 
 
 def check_perception(p: Perception, points: NDArray[np.float32]) -> None:
