@@ -64,10 +64,11 @@ def fill_scan_sums(
     rows : (8, 1024) float64, overwritten
         Elevation [deg] of the points in the eight directions ahead, left, behind, right and halfway between.
     n_rows : (8,) int64, overwritten
-    sums : (8,) float64, overwritten
+    sums : (9,) float64, overwritten
         0: finite points; 1: finite points in the view; 2: sectors of 1/64 turn with points; 3: share of the sectors in
         the view that have points; 4: logarithm of the ratio of obstacles at the sides to those ahead and behind;
-        5, 6: lowest and highest remission; 7: points 3 to 25 m away.
+        5, 6: lowest and highest remission; 7: points 3 to 25 m away; 8: points of the fullest sector over the mean of
+        the sectors that have points, of the points farther than 3 m.
     """
     n = points.shape[0]
     remissions[:] = 0
@@ -77,6 +78,7 @@ def fill_scan_sums(
     n_rows[:] = 0
     sums[:] = 0.0
     seen = np.zeros(64, dtype=np.bool_)
+    far = np.zeros(64)
     lowest = math.inf
     highest = -math.inf
     for i in range(0, n, step):
@@ -101,13 +103,15 @@ def fill_scan_sums(
         azimuth = y / across
         if x < 0.0:
             azimuth = 2.0 - azimuth if y >= 0.0 else -2.0 - azimuth
-        seen[min(int((azimuth + 2.0) * 16.0), 63)] = True
+        sector = min(int((azimuth + 2.0) * 16.0), 63)
+        seen[sector] = True
         if view_right <= azimuth <= view_left:
             sums[1] += 1.0
         horizontal = math.sqrt(x * x + y * y)
         ranges[min(max(int((math.log10(horizontal) + 3.0) * 20.0), 0), 199)] += 1
         square = x * x + y * y + z * z
         if square > 9.0:
+            far[sector] += 1.0
             elevations[min(int((math.atan(z / horizontal) * (180.0 / math.pi) + 90.0) * 2.0), 359)] += 1
         if 9.0 < square < 625.0:
             sums[7] += 1.0
@@ -126,6 +130,14 @@ def fill_scan_sums(
             in_view += 1
             in_view_seen += seen[sector]
     sums[3] = in_view_seen / max(in_view, 1)
+    n_far = 0.0
+    n_sectors = 0.0
+    fullest = 0.0
+    for sector in range(64):
+        n_far += far[sector]
+        n_sectors += far[sector] > 0.0
+        fullest = max(fullest, far[sector])
+    sums[8] = fullest * n_sectors / max(n_far, 1.0)
 
     # Points above the ground in corridors 4 m wide to the four sides, and how well they align with the axes.
     ground = np.argmax(heights[2]) * 0.2 - 9.9
@@ -192,6 +204,8 @@ class _Measures:
     remission_alike: float
     flat_axis: int | None
     flat_m: float
+    unevenness: float
+    nearest_m: float
 
 
 def _pseudo_azimuth(azimuth_deg: float) -> float:
@@ -213,7 +227,7 @@ def _measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> _
     points = read_only(points)
     remissions, elevations, ranges = (np.empty(size, dtype=np.int64) for size in (258, 360, 200))
     heights = np.empty((3, 100), dtype=np.int64)
-    rows, n_rows, sums = np.empty((8, 1024)), np.empty(8, dtype=np.int64), np.empty(8)
+    rows, n_rows, sums = np.empty((8, 1024)), np.empty(8, dtype=np.int64), np.empty(9)
     step = int(_STEPS[np.searchsorted(_STEPS[:-1], len(points) // _SAMPLE)])
     left, right = (_pseudo_azimuth(angle) for angle in azimuth_deg)
     fill_scan_sums(
@@ -256,6 +270,8 @@ def _measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> _
         # Facades are flat along y too, but only ground along a camera's axis gives such a wide range of elevations.
         flat_axis=flattest if peaks[flattest] >= max(_GROUND_SHARE, 1.5 * peaks[2]) and high - low > 60.0 else None,
         flat_m=round(int(heights[flattest].argmax()) * 0.2 - 9.9, 1),
+        unevenness=float(sums[8]),
+        nearest_m=10.0 ** (_quantile(ranges, 0.01) / 20.0 - 3.0),
     )
 
 
@@ -474,6 +490,10 @@ _GROUND_OFF_M = 1.3
 # Points this far above the sensor's field of view and that of training. At most 2 deg in KITTI and PandaSet; 16 deg if
 # PandaSet's origin is on the road.
 _TOO_HIGH_DEG = 12.0
+# A spinning sensor has as many returns in all directions: the fullest of 64 sectors has at most 2 times the mean in KITTI,
+# PandaSet, Argoverse 2, Lyft, DDAD, nuScenes and View of Delft; 6 and more if the origin is 45 m from the sensor.
+_MOST_UNEVEN = 4.0
+_NEAREST_M = 25.0  # of 99 % of the points; at most 10 m in these data
 # Fewer rows than a sensor of 16 beams has (12 to 13 are counted).
 _FEWEST_ROWS = 8.0
 
@@ -497,6 +517,16 @@ def _geometry_findings(scan: _Measures, profile: FitnessProfile, sensor: SensorP
             Finding(
                 f"The ground seems to lie towards {towards}, where the model expects it towards -z: the axes are not "
                 f"x forward, y left, z up.{advice}",
+                True,
+            )
+        ]
+
+    if scan.unevenness > _MOST_UNEVEN or scan.nearest_m > _NEAREST_M:
+        return [
+            Finding(
+                f"One direction holds {scan.unevenness:.1f} times as many points as the mean one, and the nearest "
+                f"points are {scan.nearest_m:.0f} m away: the sensor is not at the origin, as in the frame of a map; "
+                "subtract the sensor's position from the points.",
                 True,
             )
         ]
@@ -620,21 +650,22 @@ def _remission_findings(scan: _Measures, profile: FitnessProfile, sensor: Sensor
                 True,
             )
         ]
-    # Data in 0..1 has 0.004 of a full scale of 255.
+    # Data in 0..1 has 0.004 of a full scale of 255, which is one bin too.
+    in_one_bin = scan.remission_p99 < 0.02 and scan.remission_low < scan.remission_high
+    if scan.remission_alike > useless and not in_one_bin:
+        return [
+            Finding(
+                f"Remission is the same for {scan.remission_alike:.0%} of the points ({raw_high:g}): the field holds "
+                "something else; the model needs it.",
+                True,
+            )
+        ]
     if scan.remission_p99 < 0.2 * profile.remission_p99[0]:
         return [
             Finding(
                 f"Remission hardly exceeds {raw_p99:.2g}, but {stated}: pass sensor= a profile with the "
                 "remission_range of this data, (0, 1) if it is scaled already.",
                 scan.remission_p99 < 0.02,
-            )
-        ]
-    if scan.remission_alike > useless:
-        return [
-            Finding(
-                f"Remission is the same for {scan.remission_alike:.0%} of the points ({raw_high:g}): the field holds "
-                "something else; the model needs it.",
-                True,
             )
         ]
     darkest, brightest = profile.remission_median

@@ -193,3 +193,10 @@ def test_no_real_scan_of_the_training_sensor_is_refused(kitti_root: Path, semant
 def test_spoilt_real_scans_are_refused(kitti_root: Path, fault: str) -> None:
     files = sorted(kitti_root.glob("training/velodyne/*.bin"))[::16]
     assert [file.name for file in files if not gross(FAULTS[fault](read_points(file)))] == []
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.sampled_from(SEEDS), st.floats(0.0, 360.0), st.floats(60.0, 200.0))
+def test_the_frame_of_a_map(seed: int, direction_deg: float, distance_m: float) -> None:
+    away = distance_m * np.array([np.cos(np.radians(direction_deg)), np.sin(np.radians(direction_deg)), 0.0, 0.0])
+    assert any("is not at the" in sentence for sentence in gross(street(seed) + away))

@@ -263,7 +263,7 @@ def test_the_view_holds_its_share_of_the_points(azimuth_deg):
 
 def check_against_twin(points, step, beam_step, view):
     out = [np.full(size, 99, np.int64) for size in (258, 360, 200, (3, 100))]
-    rows, n_rows, sums = np.full((8, 1024), 99.0), np.full(8, 99, np.int64), np.full(8, 99.0)
+    rows, n_rows, sums = np.full((8, 1024), 99.0), np.full(8, 99, np.int64), np.full(9, 99.0)
     fill_scan_sums(points, step, beam_step, *view, *out, rows, n_rows, sums)
     *expected, expected_rows, expected_sums = twins.fitness.scan_sums(points, step, beam_step, *view)
     for got, wanted in zip(out, expected, strict=True):

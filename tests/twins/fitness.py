@@ -15,6 +15,7 @@ def scan_sums(points, step, beam_step, view_right, view_left):
 
     remissions, elevations, ranges = np.zeros(258, int), np.zeros(360, int), np.zeros(200, int)
     heights, seen, n_near, n_view = np.zeros((3, 100), int), np.zeros(64, bool), 0, 0
+    far = np.zeros(64, int)
     sample = finite(points[::step])
     for x, y, z, remission in sample:
         remissions[0 if remission <= 0 else 257 if remission > 1 else 1 + min(int(remission * 256), 255)] += 1
@@ -27,6 +28,7 @@ def scan_sums(points, step, beam_step, view_right, view_left):
         n_view += view_right <= azimuth <= view_left
         horizontal = math.sqrt(x * x + y * y)
         if x * x + y * y + z * z > 9:
+            far[min(int((azimuth + 2) * 16), 63)] += 1
             elevations[min(int((math.atan(z / horizontal) * (180 / math.pi) + 90) * 2), 359)] += 1
         ranges[min(max(int((math.log10(horizontal) + 3) * 20), 0), 199)] += 1
         if 9 < x * x + y * y + z * z < 625:
@@ -54,6 +56,7 @@ def scan_sums(points, step, beam_step, view_right, view_left):
             direction = round(math.degrees(math.atan2(y, x)) / 45) % 8
             if len(rows[direction]) < 1024:
                 rows[direction].append(math.degrees(math.atan(z / math.sqrt(x * x + y * y))))
+    unevenness = far.max() * np.count_nonzero(far) / max(far.sum(), 1)
     lowest, highest = (remission.min(), remission.max()) if len(sample) else (np.inf, -np.inf)
     sums = [len(sample), n_view, seen.sum(), seen[viewed].sum() / max(viewed.sum(), 1)]
-    return remissions, elevations, ranges, heights, rows, [*sums, alignment, lowest, highest, n_near]
+    return remissions, elevations, ranges, heights, rows, [*sums, alignment, lowest, highest, n_near, unevenness]
