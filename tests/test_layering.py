@@ -86,7 +86,7 @@ FLOORS = {
     """,
     "edgeperc_bench": """
         __init__ samples scenarios context
-        document inputs loadgen render
+        application document inputs loadgen render
         plots report worker options
         accuracy start
         measure
