@@ -490,8 +490,8 @@ _GROUND_OFF_M = 1.3
 # Points this far above the sensor's field of view and that of training. At most 2 deg in KITTI and PandaSet; 16 deg if
 # PandaSet's origin is on the road.
 _TOO_HIGH_DEG = 12.0
-# A spinning sensor has as many returns in all directions: the fullest of 64 sectors has at most 2 times the mean in KITTI,
-# PandaSet, Argoverse 2, Lyft, DDAD, nuScenes and View of Delft; 6 and more if the origin is 45 m from the sensor.
+# A spinning sensor has as many returns in all directions: the fullest of 64 sectors has at most 2.6 times the mean in
+# KITTI, PandaSet, Argoverse 2, Lyft, DDAD, nuScenes and View of Delft; 6 and more if the origin is 45 m off.
 _MOST_UNEVEN = 4.0
 _NEAREST_M = 25.0  # of 99 % of the points; at most 10 m in these data
 # Fewer rows than a sensor of 16 beams has (12 to 13 are counted).
