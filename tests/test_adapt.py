@@ -19,6 +19,7 @@ from edgeperc.adapt import Interpolator, condition, render
 from edgeperc.card import InputSpec, RangeImageGeometry
 from edgeperc.errors import PointsError, SensorError
 from edgeperc.evaluation.transfer import compare
+from edgeperc.mounting import MODEL_MOUNTING
 from edgeperc.projection import RangeImageProjector
 from edgeperc.sensor import SENSORS, RemissionFunction, SensorProfile, get_sensor
 from edgeperc.sensor_fit import (

@@ -293,10 +293,11 @@ def test_wrong_cards_are_refused():
     for view in (
         RangeImageGeometry((1.0, 1.0 - 1e-9, -1.0)),
         RangeImageGeometry((1.0, -1.0), 60000, 46.0, 45.0),
-        RangeImageGeometry((1.0, -1.0), 4, 45.0 + 1e-9, 45.0),
     ):
         with pytest.raises(CardError, match="closer than"):
             make_projector(view, spec)
+    with pytest.raises(CardError, match="at least 1 degree apart"):
+        RangeImageGeometry((1.0, -1.0), 4, 45.0 + 1e-9, 45.0)
 
 
 @pytest.mark.kernel

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 import twins.simulation
 from edgeperc.card import TopViewGeometry
 from edgeperc.errors import PointsError
+from edgeperc.mounting import Mounting
 from edgeperc.perception import Box
 from edgeperc.sensor import SensorProfile
 from edgeperc.simulation import raycast
@@ -404,7 +405,7 @@ def test_noise_drop_out_and_shadow_take_points_away() -> None:
 
 @pytest.mark.parametrize("height_m", [0.4, 1.73, 3.5])
 def test_mounting_height(height_m: float) -> None:
-    scan = simulate(flat(street()), replace(SMALL, mount_height_m=height_m), 0, noise=False)
+    scan = simulate(flat(street()), replace(SMALL, mounting=Mounting(height_m=height_m)), 0, noise=False)
     np.testing.assert_allclose(scan.points[:, 2], -height_m, atol=3e-3)
 
 

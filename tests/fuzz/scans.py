@@ -14,6 +14,7 @@ import edgeperc.perceiver as perceiver_module
 from edgeperc import Box, Perceiver, Perception, SensorProfile, Tracker, Tracks, road_ahead
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.errors import EdgepercError, FitnessError
+from edgeperc.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.points import as_points
 from edgeperc.records import scan_record
 from edgeperc.sensor import SENSORS
@@ -28,6 +29,7 @@ __all__ = ["LIMIT_MB", "LIMIT_S", "check_perception", "check_tracks", "make"]
 LIMIT_S, LIMIT_MB = 10.0, 1500.0
 BLOCK = 100  # cases with one perceiver
 HONEST_EVERY, HONEST_CASES = 50, 10  # in every 50th block, ten cases have real networks, which are slow
+AFTER = 0.3  # share of the cases whose road and tracks are computed
 DRAWN, PAGES, FILES = 0.0005, 0.01, 0.02  # shares of the cases that are drawn, written as a page, written as files
 
 VIEWS = {
@@ -149,6 +151,14 @@ def any_sensor(case: Case) -> SensorProfile | str:
         return "vlp-16"
 
 
+def any_mounting(case: Case) -> Mounting:
+    """A possible mounting, of which some values are to be estimated."""
+    rng = case.rng
+    limits = {"height_m": 20.0, "roll_deg": 90.0, "pitch_deg": 90.0, "yaw_deg": 360.0}
+    values = {name: case.pick([None, 0.0, limit, -limit, rng.uniform(-limit, limit)]) for name, limit in limits.items()}
+    return Mounting(**values, origin_m=case.pick([(0.0, 0.0), (1e5, -1e5), (1.5, 0.0)]))
+
+
 class Scans:
     """The kind ``scans``."""
 
@@ -175,6 +185,7 @@ class Scans:
             "adapt": made.pick(["both", "none", "remission", "interpolation"]),
             "score_threshold": made.pick([None, None, 0.0, 1.0, 0.5]),
             "full_turn": bool(rng.random() < 0.1),
+            "mounting": made.pick([MODEL_MOUNTING, MODEL_MOUNTING, any_mounting(made), Mounting()]),
         }
         if is_honest:
             self.made_up = []
@@ -196,9 +207,11 @@ class Scans:
         hostile = case.chance(0.2)
         for each in made_up:
             each.case, each.hostile = case, hostile
-        # The first scans are checked; as the state of a perceiver is not part of a case, every one is, or none.
+        # The first scans are checked and show the mounting. The state of a perceiver is not part of a case, so every
+        # scan is checked, or none, and every scan is the first to show the mounting.
         if perceive.on_mismatch != "ignore":
             perceive._to_check = int(case.index % 3 == 0)
+        perceive.reset_mounting()
         # The padding of a longdouble is not copied reliably.
         is_plain = isinstance(scan, np.ndarray) and not isinstance(scan, np.ma.MaskedArray) and scan.dtype.char != "g"
         before = scan.tobytes() if is_plain and scan.nbytes < 1 << 20 else None
@@ -217,17 +230,17 @@ class Scans:
             perceive._to_check = 0
             perception = perceive(scan, stamp_s)
         check_perception(perception, points)
-        road = None if perception.top_view is None else road_ahead(perception.top_view, perception.boxes)
-        if road is not None:
+        if perception.top_view is not None and case.chance(AFTER):
+            road = road_ahead(perception.top_view, perception.boxes)
             check(np.isfinite(road.outline).all(), "a corner of the road is not finite")
-            low, high = perception.top_view.x_range_m  # type: ignore[union-attr]
+            low, high = perception.top_view.x_range_m
             check(((road.free_m >= low - 1e-6) & (road.free_m <= high + 1e-6)).all(), "free distance out of the view")
-        tracker = Tracker()
-        tracks: Tracks | None = None
-        for k in range(2):
-            tracks = tracker.update(perception.boxes, 0.1 * k)
-            check_tracks(tracks)
-        json.dumps(scan_record(perception, tracks), allow_nan=False)
+        if case.chance(AFTER):
+            tracker = Tracker()
+            for k in range(2):
+                tracks = tracker.update(perception.boxes, 0.1 * k)
+                check_tracks(tracks)
+            json.dumps(scan_record(perception, tracks), allow_nan=False)
         if case.chance(FILES) and perception.points is not None:
             write_labels(perception, case.folder / "scan.label")
             write_ply(perception, points, case.folder / "scan.ply")
