@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from .mounting import Mounting
     from .perceiver import Perceiver
     from .perception import Box, Perception, PointLabels, TopView
-    from .readers.captures import read_scans
+    from .readers.captures import read_scans, sensor_of
     from .readers.files import read_points
     from .sensor import SensorProfile
     from .tracking import Track, Tracker, Tracks
@@ -101,6 +101,7 @@ __all__ = [
     "read_points",
     "read_scans",
     "road_ahead",
+    "sensor_of",
     "sensors",
     "stream",
 ]
@@ -132,6 +133,7 @@ _MODULES = {
     "read_points": "readers.files",
     "read_scans": "readers.captures",
     "road_ahead": "drivable",
+    "sensor_of": "readers.captures",
     "sensors": "listing",
     "stream": "live",
 }

@@ -139,7 +139,7 @@ def _warn_of_another_sensor(source: str | os.PathLike[str], perceiver: object, t
     if profile is not None and recorded_by is not None and contradicts(profile, recorded_by):
         warnings.warn(
             f"{os.fspath(source)}: the perceiver's sensor is {profile.name}, the capture names {recorded_by.name}; "
-            "pass sensor=edgeperc.readers.captures.sensor_of(source) to the Perceiver",
+            "pass sensor=edgeperc.sensor_of(source) to the Perceiver",
             stacklevel=3,
         )
 
