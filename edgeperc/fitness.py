@@ -548,7 +548,8 @@ def _geometry_findings(scan: _Measures, profile: FitnessProfile, sensor: SensorP
             findings.append(
                 Finding(
                     f"The ground lies at z = {scan.ground_m:.1f} m, in training it lay at {low:.1f} to {high:.1f} m: "
-                    "the origin is not the sensor, or the sensor is mounted at another height; shift z to match.",
+                    "the sensor is mounted at another height: pass the right mounting (--mount-height), or none, so that "
+                    "it is found.",
                     not low - _GROUND_OFF_M <= scan.ground_m <= high + _GROUND_OFF_M,
                 )
             )
@@ -583,7 +584,7 @@ def _geometry_findings(scan: _Measures, profile: FitnessProfile, sensor: SensorP
         findings.append(
             Finding(
                 "There are more obstacles ahead and behind than to the sides, as if the road ran along y: if x does "
-                "not point forward, turn the points (from x right, y forward: pass y, -x, z). "
+                "not point forward, pass its direction: Mounting(yaw_deg=-90), --turn -90, for x right, y forward. "
                 "If the vehicle stands across the road, ignore this."
             )
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,9 @@ from .points import read_only
 
 __all__ = ["FROZEN_AFTER", "MountingEstimate", "MountingEstimator"]
 
-# What differs from the training vehicle by less is taken for the street's own slope and camber, and scans stay as they
-# are. In single KITTI scans the estimates of one mounting scatter by 0.03 m, 1.0 deg of roll and 0.3 deg of pitch. An
-# error of 0.2 m, 2 deg of roll or 0.75 deg of pitch costs about one, one and three points of IoU of cars.
+# What differs from the training vehicle by less, or by less than two standard deviations, is taken for the street's own
+# slope and camber: scans stay as they are. An error of 0.2 m, 2 deg of roll or 0.75 deg of pitch costs about one, one
+# and three points of IoU of cars.
 SAME_HEIGHT_M, SAME_ROLL_DEG, SAME_PITCH_DEG = 0.15, 2.5, 0.75
 
 
@@ -63,8 +63,13 @@ class MountingEstimate:
         return ", ".join(parts)
 
 
-# Standard deviation over streets of what single scans of one mounting show: 103 KITTI scans of 26 drives.
-STREET_SD = (0.04, 1.0, 0.3)  # height [m], roll [deg], pitch [deg]
+# Standard deviation of what single scans of one mounting show, by their support (cells on the plane less those below
+# it): streets differ in slope and camber, and a plane with few cells may be a pavement or a bank. 151 KITTI scans of 26
+# drives.
+_SUPPORT = (150.0, 275.0, 475.0, 700.0)
+_HEIGHT_SD_M = (0.23, 0.14, 0.11, 0.03)
+_ROLL_SD_DEG = (1.8, 1.1, 1.0, 0.8)
+_PITCH_SD_DEG = (0.6, 0.3, 0.3, 0.3)
 
 # Heights of the origin above the road to start from [m]; the ground is found within 0.5 m of each.
 _STARTS_M = (1.7, 0.9, 2.5, 0.1, 3.3, 4.1, -0.7)
@@ -72,12 +77,12 @@ _VOTING_M = 12.0  # farther out, the land beside a road is often lower
 _MIN_CELLS = 60  # of half a meter, on the plane
 _MAX_BELOW = 0.8  # cells below the plane, as a share of the cells on it
 _CORRIDOR_M = (3.0, 15.0)  # half its width, and its length ahead and behind: the road that the vehicle stands on
-_BAND_M, _TRIM_M = 0.2, 0.06
+_BAND_M, _TRIM_M = 0.2, 0.1
 
 _STREET_M = (0.3, 3.0, 40.0)  # lowest and highest point above the road, and the farthest, that show the street's axis
 _STREET_BIN_M = 0.25
 _MIN_CONTRAST = 1.15  # of the best axis to the best one that differs by more than 20 deg
-_STREET_YAW_SD = 3.0
+_STREET_YAW_SD = 5.0
 
 FROZEN_AFTER = 5  # scans
 
@@ -92,16 +97,16 @@ class MountingEstimator:
 
     Notes
     -----
-    RANSAC finds the plane of the ground in the lowest returns of half-meter cells within 12 m, from several heights;
-    the plane with most cells on it, less those below it, counts. It is refined by least squares in the corridor that
-    the vehicle stands on, 6 m wide and 30 m long. Its height below the origin and its slopes give height, roll and
-    pitch; the median over the scans is the estimate. The yaw, if it is to be estimated, is the axis along which returns
-    0.3 to 3 m above the road line up best.
+    RANSAC finds the plane of the ground in the lowest returns of half-meter cells within 12 m, from several heights.
+    The plane with most support counts: the cells on it less those below it. It is refined by least squares in the
+    corridor that the vehicle stands on, 6 m wide and 30 m long. Its height below the origin and its slopes give height,
+    roll and pitch. The estimate is the median over the scans whose plane has at least half of the best one's support.
+    The yaw, if it is to be estimated, is the axis along which returns 0.3 to 3 m above the road line up best.
     """
 
     def __init__(self, known: Mounting) -> None:
         self.known = known
-        self._found: tuple[tuple[float, float, float, float], ...] = ()
+        self._found: tuple[tuple[float, ...], ...] = ()  # height, roll, pitch, yaw and support by each scan
 
     @property
     def n_scans(self) -> int:
@@ -131,14 +136,11 @@ class MountingEstimator:
         scan = points
         if self.known.origin_m != (0.0, 0.0):
             scan = points - np.array([*self.known.origin_m, 0.0, 0.0], np.float32)
-        a, b, c = _ground_plane(read_only(scan), self.known.yaw_deg or 0.0).tolist()
-        norm = math.sqrt(1.0 + a * a + b * b)
-        height_m, roll_deg, pitch_deg = -c / norm, math.degrees(math.atan(-b)), math.degrees(math.asin(a / norm))
-        yaw_deg = self.known.yaw_deg
-        if yaw_deg is None:
-            yaw_deg = _street_axis(ModelFrame(Mounting(height_m, roll_deg, pitch_deg)).move(scan))
+        found = replace(MODEL_MOUNTING, yaw_deg=self.known.yaw_deg or 0.0)
+        found, support = _leveled(scan, found)
+        yaw_deg = _street_axis(ModelFrame(found).move(scan)) if self.known.yaw_deg is None else self.known.yaw_deg
         more = MountingEstimator(self.known)
-        more._found = (*self._found, (height_m, roll_deg, pitch_deg, yaw_deg))
+        more._found = (*self._found, (*_values(replace(found, yaw_deg=yaw_deg)).tolist(), support))
         return more
 
     def estimate(self) -> MountingEstimate:
@@ -155,10 +157,14 @@ class MountingEstimator:
         if not self._found:
             raise MountingError("no scan shows the ground around the vehicle")
         found = np.array(self._found)
+        support = found[:, 4].max()
+        found = found[found[:, 4] >= 0.5 * support, :4]
         spread = found.std(axis=0, ddof=1) if len(found) > 1 else np.zeros(4)
-        sd = np.hypot([*STREET_SD, _STREET_YAW_SD], spread / math.sqrt(len(found)))
+        of_one = [np.interp(support, _SUPPORT, sd) for sd in (_HEIGHT_SD_M, _ROLL_SD_DEG, _PITCH_SD_DEG)]
+        sd = np.hypot([*of_one, _STREET_YAW_SD], spread / math.sqrt(len(found)))
         height, roll, pitch, yaw = np.where(np.isnan(_values(known)), sd, 0.0).tolist()
-        return MountingEstimate(_filled(known, np.median(found, axis=0)), height, roll, pitch, yaw, len(found))
+        middle = _filled(known, np.median(found, axis=0))
+        return MountingEstimate(middle, height, roll, pitch, yaw, len(self._found))
 
     def mounting(self) -> Mounting:
         """The mounting to use: the estimate, or the training vehicle's where that differs by no more than streets do.
@@ -168,9 +174,11 @@ class MountingEstimator:
         usual = _filled(self.known, _values(MODEL_MOUNTING))
         if self.known.is_known or not self._found:
             return usual
-        found = self.estimate().mounting
-        same = np.abs(_values(found) - _values(usual)) <= [SAME_HEIGHT_M, SAME_ROLL_DEG, SAME_PITCH_DEG, 0.0]
-        return usual if same.all() else found
+        found = self.estimate()
+        uncertain = 2.0 * np.array([found.height_sd_m, found.roll_sd_deg, found.pitch_sd_deg, 0.0])
+        least = np.maximum([SAME_HEIGHT_M, SAME_ROLL_DEG, SAME_PITCH_DEG, 0.0], uncertain)
+        same = np.abs(_values(found.mounting) - _values(usual)) <= least
+        return usual if same.all() else found.mounting
 
 
 def _values(mounting: Mounting) -> NDArray[np.float64]:
@@ -186,8 +194,20 @@ def _filled(mounting: Mounting, values: NDArray[np.float64]) -> Mounting:
     return Mounting(height_m, roll_deg, pitch_deg, yaw_deg, mounting.origin_m)
 
 
-def _ground_plane(scan: NDArray[np.float32], yaw_deg: float) -> NDArray[np.float64]:
-    """a, b, c of the ground z = a x + b y + c [m] around the vehicle."""
+def _leveled(scan: NDArray[np.float32], guess: Mounting) -> tuple[Mounting, float]:
+    """The mounting by the ground in a scan, from a first guess, and its support."""
+    frame = ModelFrame(guess)
+    (a, b, c), support = _ground_plane(read_only(frame.move(scan)))
+    norm = math.sqrt(1.0 + a * a + b * b)
+    rest = Mounting(-c / norm, math.degrees(math.atan(-b)), math.degrees(math.asin(a / norm)), 0.0)
+    T_vehicle_sensor = np.eye(4)
+    T_vehicle_sensor[:3, :3] = rest.rotation() @ frame.R
+    T_vehicle_sensor[:3, 3] = rest.rotation() @ frame.t + [0.0, 0.0, -c / norm]
+    return replace(Mounting.from_matrix(T_vehicle_sensor), yaw_deg=guess.yaw_deg), support
+
+
+def _ground_plane(scan: NDArray[np.float32]) -> tuple[tuple[float, float, float], float]:
+    """a, b, c of the ground z = a x + b y + c [m] around the vehicle, and how many more cells lie on it than below."""
     cell = np.empty(len(scan), np.int32)
     lowest = np.empty((N_CELLS, N_CELLS), np.int32)
     fill_lowest(scan, cell, lowest)
@@ -208,23 +228,21 @@ def _ground_plane(scan: NDArray[np.float32], yaw_deg: float) -> NDArray[np.float
             f"expected at least {_MIN_CELLS}"
         )
     across, along = _CORRIDOR_M
-    cos, sin = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
     x, y = scan[:, 0], scan[:, 1]
     with np.errstate(invalid="ignore", over="ignore"):
-        near = (np.abs(sin * x + cos * y) < across) & (np.hypot(x, y) < along)
+        near = (np.abs(y) < across) & (np.hypot(x, y) < along)
         near &= np.abs(scan[:, 2] - x * plane[0] - y * plane[1] - plane[2]) < _BAND_M
     rows = np.flatnonzero(near)
     rows = rows[np.unique(cell[rows], return_index=True)[1]]
     xyz = scan[rows, :3].astype(np.float64)
     design = np.column_stack([xyz[:, :2], np.ones(len(xyz))])
-    if len(rows) < _MIN_CELLS // 2:
-        return plane
     for _ in range(4):
         on_plane = np.abs(xyz[:, 2] - design @ plane) < _TRIM_M
         if np.count_nonzero(on_plane) < _MIN_CELLS // 2:
             break
         plane = np.linalg.lstsq(design[on_plane], xyz[on_plane, 2], rcond=None)[0]
-    return plane
+    a, b, c = plane.tolist()
+    return (a, b, c), float(best)
 
 
 def _street_axis(scan: NDArray[np.float32]) -> float:

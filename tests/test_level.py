@@ -231,6 +231,35 @@ def test_height_and_tilt_are_found(scans: list[NDArray[np.float32]], mounting: M
     assert "height" in str(found)
 
 
+def test_real_scans_give_the_applied_mounting_and_an_honest_uncertainty(kitti_root: Path) -> None:
+    """Single scans of 26 drives, as recorded, and as a tilted and raised sensor would have recorded them."""
+    files = sorted((kitti_root / "training" / "velodyne").glob("*.bin"))[254:374:2]
+    rng = np.random.default_rng(0)
+    errors, changes = [], []
+    for file in files:
+        scan = np.fromfile(file, np.float32).reshape(-1, 4)
+        own = MountingEstimator(Mounting()).add(scan).estimate()
+        m = own.mounting
+        assert m.height_m is not None
+        assert m.roll_deg is not None
+        assert m.pitch_deg is not None
+        sds = np.array([own.height_sd_m, own.roll_sd_deg, own.pitch_sd_deg])
+        errors.append((np.array([m.height_m, m.roll_deg, m.pitch_deg]) - [1.75, -0.2, 0.66]) / sds)
+        applied = Mounting(rng.uniform(0.8, 3.0), rng.uniform(-8.0, 8.0), rng.uniform(-8.0, 8.0), 0.0)
+        moved = MountingEstimator(Mounting()).add(seen_by(applied, scan)).estimate().mounting
+        whole = Mounting.from_matrix(np.block([[m.rotation() @ applied.rotation(), np.zeros((3, 1))], [np.eye(4)[3:]]]))
+        assert applied.height_m is not None
+        raised = m.height_m + applied.height_m - 1.73
+        changes.append(
+            [(moved.height_m or 0.0) - raised, (moved.roll_deg or 0.0) - (whole.roll_deg or 0.0),
+             (moved.pitch_deg or 0.0) - (whole.pitch_deg or 0.0)]
+        )  # fmt: skip
+    near = np.abs(np.array(changes)) < [0.05, 0.5, 0.5]
+    assert (near.mean(axis=0) >= 0.9).all(), near.mean(axis=0)
+    within = np.abs(np.array(errors)) < 2.0
+    assert (within.mean(axis=0) >= 0.9).all(), within.mean(axis=0)
+
+
 def test_given_values_are_kept(scans: list[NDArray[np.float32]]) -> None:
     known = Mounting(height_m=2.0, yaw_deg=0.0)
     found = MountingEstimator(known).add(seen_by(Mounting(2.6, 3.0, 0.0, 0.0), scans[0])).estimate()
