@@ -548,8 +548,8 @@ def _geometry_findings(scan: _Measures, profile: FitnessProfile, sensor: SensorP
             findings.append(
                 Finding(
                     f"The ground lies at z = {scan.ground_m:.1f} m, in training it lay at {low:.1f} to {high:.1f} m: "
-                    "the sensor is mounted at another height: pass the right mounting (--mount-height), or none, so that "
-                    "it is found.",
+                    "the sensor is mounted at another height: pass the right mounting (--mount-height), or none, "
+                    "so that it is found.",
                     not low - _GROUND_OFF_M <= scan.ground_m <= high + _GROUND_OFF_M,
                 )
             )
