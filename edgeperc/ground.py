@@ -131,7 +131,7 @@ def find_ground(
     lowest = np.empty((N_CELLS, N_CELLS), dtype=np.int32)
     fill_lowest(rows, cell, lowest)
     plane = np.array([0.0, 0.0, -mount_height_m])
-    found = fit_first_plane(rows, lowest, plane)
+    found = fit_first_plane(rows, lowest, FIRST_REACH_M, plane)
     height = np.empty(len(rows), dtype=np.float32)
     mask = np.empty(len(rows), dtype=np.bool_)
     if found and regions:
@@ -181,9 +181,11 @@ def fill_lowest(points: NDArray[np.float32], cell: NDArray[np.int32], lowest: ND
 
 
 @njit(cache=True, nogil=True)
-def fit_first_plane(points: NDArray[np.float32], lowest: NDArray[np.int32], plane: NDArray[np.float64]) -> bool:
-    """Replace ``plane`` (3,), the expected a, b, c, by the plane around the vehicle; False if there is none."""
-    size = 2 * int(FIRST_REACH_M / CELL_M)
+def fit_first_plane(
+    points: NDArray[np.float32], lowest: NDArray[np.int32], reach_m: float, plane: NDArray[np.float64]
+) -> bool:
+    """Replace ``plane`` (3,), the expected a, b, c, by the plane within ``reach_m``; False if there is none."""
+    size = 2 * int(reach_m / CELL_M)
     start = (N_CELLS - size) // 2
     residuals = np.empty((size * size, 3))
     fitted = np.empty(3)

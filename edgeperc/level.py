@@ -66,10 +66,10 @@ class MountingEstimate:
 # Standard deviation of what single scans of one mounting show, by their support (cells on the plane less those below
 # it): streets differ in slope and camber, and a plane with few cells may be a pavement or a bank. 151 KITTI scans of 26
 # drives.
-_SUPPORT = (150.0, 275.0, 475.0, 700.0)
-_HEIGHT_SD_M = (0.23, 0.14, 0.11, 0.03)
-_ROLL_SD_DEG = (1.8, 1.1, 1.0, 0.8)
-_PITCH_SD_DEG = (0.6, 0.3, 0.3, 0.3)
+_SUPPORT = (150.0, 275.0, 700.0)
+_HEIGHT_SD_M = (0.10, 0.06, 0.03)
+_ROLL_SD_DEG = (2.5, 1.2, 1.0)
+_PITCH_SD_DEG = (1.0, 0.35, 0.3)
 
 # Heights of the origin above the road to start from [m]; the ground is found within 0.5 m of each.
 _STARTS_M = (1.7, 0.9, 2.5, 0.1, 3.3, 4.1, -0.7)
@@ -216,7 +216,7 @@ def _ground_plane(scan: NDArray[np.float32]) -> tuple[tuple[float, float, float]
     best, most, plane = 0, 0, np.zeros(3)
     for start in _STARTS_M:
         trial = np.array([0.0, 0.0, -start])
-        if not fit_first_plane(scan, lowest, trial):
+        if not fit_first_plane(scan, lowest, _VOTING_M, trial):
             continue
         above = low[:, 2] - low[:, :2] @ trial[:2] - trial[2]
         on, below = int((np.abs(above) <= TOLERANCE_M).sum()), int((above < -TOLERANCE_M).sum())
