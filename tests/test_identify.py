@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from test_captures import POINTS, TYPES, vlp16_packets, write_bag1, write_bag2, write_mcap, write_pcap
 from test_captures import ouster as ouster
@@ -185,6 +185,7 @@ KEYS = ("sensor_info", "prod_line", "beam_intrinsics", "beam_altitude_angles", "
 
 @settings(deadline=None, max_examples=300)
 @given(st.dictionaries(st.sampled_from([*KEYS, "config_params", "pixels_per_column"]), JSON) | JSON)
+@example({"beam_altitude_angles": [-(2**63) - 1]})
 def test_any_metadata_is_known_or_a_typed_error(content: Any) -> None:
     with suppress(EdgepercError):
         assert isinstance(of_metadata(content, "x").profile, SensorProfile)

@@ -146,8 +146,8 @@ def _checked_beams(name: str, values: Any, n: int | None) -> int:
         )
     for value in values:  # early firmware has a list of numbers for each beam
         numbers = value if isinstance(value, list) else [value]
-        if not all(isinstance(v, int | float) and not isinstance(v, bool) and np.isfinite(v) for v in numbers):
-            raise PointsError(f"{name}: expected finite numbers, got {value!r:.80}")
+        if not all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= _MOST_COLUMNS for v in numbers):
+            raise PointsError(f"{name}: expected numbers up to {_MOST_COLUMNS}, got {value!r:.80}")
     return len(values)
 
 
