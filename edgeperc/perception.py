@@ -212,8 +212,8 @@ class Perception:
         -------
         dict
             ``stamp_s``, ``n_points``, ``n_dropped``, ``stage_ms``, ``providers``, ``boxes`` (`Box.to_dict`),
-            ``drivable_area_m2``, ``point_counts`` and ``fitness``. Every key is always present; its value is None if no
-            model of that kind ran.
+            ``drivable_area_m2``, ``point_counts``, ``fitness`` and ``mounting``. Every key is always present; its value
+            is None if no model of that kind ran.
         """
         return {
             "stamp_s": self.stamp_s,

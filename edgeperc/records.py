@@ -28,6 +28,7 @@ SCAN_KEYS = (
     "point_counts",
     "tracks",
     "fitness",
+    "mounting",
 )
 """Keys of a record, in their written order; every record has all of them."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import shutil
@@ -18,7 +19,9 @@ from edgeperc import listing, session, tuning, zoo
 from edgeperc.card import ModelCard
 from edgeperc.errors import ModelFileError
 from edgeperc.fitness import FitnessProfile
-from edgeperc.sensor import SENSORS
+from edgeperc.sensor import SENSORS, get_sensor
+from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.scene import simulate
 from edgeperc.zoo import Variant
 
 
@@ -237,3 +240,93 @@ def test_completion_names_its_extra(capsys: pytest.CaptureFixture[str], monkeypa
     monkeypatch.setitem(sys.modules, "shtab", None)
     assert run("completion", "bash") == 2
     assert "pip install 'edgeperc[completion]'" in capsys.readouterr().err
+
+
+# --- how a sensor is mounted -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    """Three simulated scans of a sensor 2.4 m above the road; the second shows nothing near the vehicle."""
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    for k in range(3):
+        scan = simulate(random_scene(k, "urban"), "hdl-64e", seed=k).points - np.float32([0.0, 0.0, 0.67, 0.0])
+        kept = np.hypot(scan[:, 0], scan[:, 1]) > (13.0 if k == 1 else 0.0)
+        scan[kept].tofile(folder / f"{k}.bin")
+    return folder
+
+
+def test_info_prints_the_mounting_and_writes_a_profile(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written = tmp_path / "mine.json"
+    assert run("info", *sorted(drive.iterdir()), "--write", written) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("cannot be estimated: the scan shows no ground") == 1
+    assert "hdl-64e, by 2 scans" in printed
+    mounting = get_sensor(written).mounting
+    assert mounting.is_known
+    assert mounting.height_m == pytest.approx(2.4, abs=0.1)
+    assert replace(get_sensor(written), mounting=get_sensor("hdl-64e").mounting) == get_sensor("hdl-64e")
+
+    assert run("info", drive / "0.bin", "--json", "--mount-height", "2.0") == 0
+    estimate = json.loads(capsys.readouterr().out)["mounting"]
+    assert (estimate["mounting"]["height_m"], estimate["height_sd_m"]) == (2.0, 0.0)
+    assert estimate["roll_sd_deg"] > 0.0
+
+
+def test_scans_of_a_recording_that_show_no_ground_are_left_out(drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info", drive, "--json") == 0
+    estimate = json.loads(capsys.readouterr().out)["mounting"]
+    assert estimate["n_scans"] == 2
+    assert estimate["mounting"]["height_m"] == pytest.approx(2.4, abs=0.1)
+
+
+def test_no_profile_is_written_without_ground_or_of_two_sensors(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written = tmp_path / "mine.json"
+    assert run("info", drive / "1.bin", "--write", written) == 1
+    assert "no scan shows the ground" in capsys.readouterr().err
+    assert run("info", "pointseg", "--write", written) == 1
+    assert "the scans are of 0 sensors" in capsys.readouterr().err
+    assert not written.exists()
+    with pytest.raises(SystemExit):
+        run("info", drive / "0.bin", "--write", tmp_path / "mine.txt")
+    assert "ends in .json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "mounting"),
+    [
+        (["--mount-height", "2.1"], {"height_m": 2.1}),
+        (["--turn", "-90"], {"yaw_deg": -90.0}),
+        (["--extrinsic", "T.json"], {"height_m": 1.9, "roll_deg": 0.0, "pitch_deg": 0.0, "yaw_deg": -90.0}),
+        (["--extrinsic", "T.json", "--mount-height", "3"], {"height_m": 3.0, "yaw_deg": -90.0}),
+    ],
+)
+def test_run_uses_the_given_mounting(
+    options: list[str],
+    mounting: dict[str, float],
+    drive: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(drive)
+    (drive / "T.json").write_text("[[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 1.9], [0, 0, 0, 1]]")
+    arguments = ["0.bin", "--json", "--model", "pointseg", "--provider", "cpu", "--on-mismatch", "ignore"]
+    assert run("run", *arguments, *options) == 0
+    used = json.loads(capsys.readouterr().out)["mounting"]
+    assert {name: round(used[name], 6) for name in mounting} == mounting
+
+
+@pytest.mark.parametrize(
+    "options", [["--mount-height", "nan"], ["--turn", "left"], ["--mount-height", "1e9"], ["--extrinsic", "absent"]]
+)
+def test_impossible_mountings_are_refused(options: list[str], drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with contextlib.suppress(SystemExit):  # argparse
+        assert run("run", drive / "0.bin", *options) != 0
+    error = capsys.readouterr().err
+    assert options[0] in error or "mounting" in error or "extrinsic" in error
+    assert "Traceback" not in error

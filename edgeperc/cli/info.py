@@ -223,6 +223,19 @@ def _megabytes(path: Path) -> str:
     return f"{path.stat().st_size / 1e6:.1f} MB"
 
 
+def _estimated(
+    estimator: MountingEstimator, scans: Sequence[NDArray[np.float32]]
+) -> tuple[MountingEstimator, MountingError | None]:
+    """The estimator after these scans, and why one was left out: a `Perceiver` too skips those without ground."""
+    reason = None
+    for scan in scans:
+        try:
+            estimator = estimator.add(scan)
+        except MountingError as exc:
+            reason = exc
+    return estimator, reason
+
+
 def _scan_rows(
     path: Path, arguments: argparse.Namespace, estimators: dict[SensorProfile, MountingEstimator]
 ) -> tuple[list[tuple[str, str]], dict[str, Any]]:
@@ -283,22 +296,18 @@ def _scan_rows(
     ]
     if sensor.remission is not None:
         rows.append(("", f"mapped to that of the {sensor.remission.to} by a {sensor.remission.kind}"))
-    scan, _ = condition(points, sensor)
-    own = MountingEstimator(sensor.mounting)
-    shared = estimators.setdefault(sensor, own)
+    conditioned = [condition(each, sensor)[0] for each in first]
+    own, reason = _estimated(MountingEstimator(sensor.mounting), conditioned)
+    estimators[sensor] = _estimated(estimators[sensor], conditioned)[0] if sensor in estimators else own
     try:
-        for each in first:
-            conditioned, _ = condition(each, sensor)
-            own, shared = own.add(conditioned), shared.add(conditioned)
         estimate = own.estimate()
-    except MountingError as exc:
-        rows.append(("mounting", f"cannot be estimated: {exc}"))
+    except MountingError:
+        rows.append(("mounting", f"cannot be estimated: {reason}"))
         document["mounting"] = None
     else:
         rows.append(("mounting", str(estimate)))
         document["mounting"] = estimate.to_dict()
-    estimators[sensor] = shared
-    scan = ModelFrame(own.mounting()).move(scan)
+    scan = ModelFrame(own.mounting()).move(conditioned[0])
     profile = FitnessProfile.from_scans([scan])
     rows.append(("beams", f"about {profile.beams[0]:.0f} rows of points ({sensor.name}: {sensor.n_beams})"))
     findings: dict[str, list[str] | None] = {}
