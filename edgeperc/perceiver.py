@@ -261,16 +261,16 @@ class Perceiver:
         self.cards = tuple(n.session.card for n in self._networks)
         self.providers = MappingProxyType({n.session.card.name: n.session.description for n in self._networks})
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
-        # A lock for each process: after a fork, the one that held the lock may be missing.
         self._locks = {os.getpid(): threading.Lock()}
         # Compile every kernel here, not in the first call, with a scan of two points. The networks have already run on
         # their golden inputs, and those outputs are decoded.
         warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
         self._perceive(warm_up, None, check=self._to_check > 0, infer=False)
+        floor, labels = self._warm_up_objects()
         if boxes_from != "network" and "range_image" in views:
-            self._find_objects(*self._warm_up_objects())
-        with suppress(MountingError):  # it has a floor, but no street
-            self._estimator.add(self._warm_up_objects()[0])
+            self._find_objects(floor, labels)
+        with suppress(MountingError):  # the floor has no street
+            self._estimator.add(floor)
         if "top_view" in views:
             compile_kernels()  # of `edgeperc.road_ahead`
 
@@ -290,9 +290,14 @@ class Perceiver:
         except MountingError:
             return None
 
+    @property
+    def _lock(self) -> threading.Lock:
+        """That of this process: after a fork, the one that held the parent's lock may be missing."""
+        return self._locks.setdefault(os.getpid(), threading.Lock())
+
     def reset_mounting(self) -> None:
         """Estimate the mounting anew, for scans of another vehicle; the next five scans settle it."""
-        with self._locks.setdefault(os.getpid(), threading.Lock()):
+        with self._lock:
             self._set_mounting(MountingEstimator(self._estimator.known))
 
     def _set_mounting(self, estimator: MountingEstimator) -> None:
@@ -335,7 +340,7 @@ class Perceiver:
             The scan differs from the training scans, grossly if ``on_mismatch`` is ``"refuse"``.
         """
         scan = as_points(points)
-        with self._locks.setdefault(os.getpid(), threading.Lock()):
+        with self._lock:
             check = self._to_check > 0 and len(scan) > 0
             perception = self._perceive(scan, stamp_s, check)
             self._to_check -= check
