@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tiny_model import entry, field, varint
 
 from edgeperc.card import CARD_KEY, Golden, InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.errors import CardError, ModelFileError
@@ -178,23 +179,6 @@ def test_positions_and_cells_agree() -> None:
 
 
 # --- a card in its file ----------------------------------------------------------------------------------------------
-
-
-def varint(value: int) -> bytes:
-    groups = []
-    while True:
-        value, group = value >> 7, value & 0x7F
-        groups.append(group | (0x80 if value else 0))
-        if not value:
-            return bytes(groups)
-
-
-def field(number: int, content: bytes) -> bytes:
-    return varint(number << 3 | 2) + varint(len(content)) + content
-
-
-def entry(key: str, value: bytes) -> bytes:
-    return field(14, field(1, key.encode()) + field(2, value))
 
 
 CARD = entry(CARD_KEY, TOP_VIEW_CARD.to_json().encode())

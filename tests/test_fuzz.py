@@ -21,7 +21,8 @@ if not hasattr(os, "fork"):
 
 from fuzz.running import Case, State, attempt, new_case, run_job
 from fuzz.scans import DENSE, ELEVATIONS, SLOTS, MadeUp, card_of
-from fuzz.tiny import GRAPH, field, model
+from fuzz.tiny import GRAPH, model
+from tiny_model import field
 
 import edgeperc.perceiver as perceiver_module
 from edgeperc import Box, Perceiver, SensorProfile, Tracker

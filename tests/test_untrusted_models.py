@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import hashlib
 import json
 import logging
 import os
@@ -19,76 +18,33 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_card import TOP_VIEW_CARD, entry, field, varint
+from test_card import TOP_VIEW_CARD
+from tiny_model import (
+    CONVOLUTION,
+    INITIALIZER,
+    SHAPE,
+    WEIGHTS,
+    field,
+    graph,
+    model,
+    node,
+    number,
+    shaped,
+    tensor,
+    tiny_card,
+    varint,
+)
 
 import edgeperc.onnx_file as onnx_file
 import edgeperc.session as session_module
 from edgeperc import Perceiver
-from edgeperc.card import CARD_KEY, Golden, InputSpec, ModelCard, OutputSpec, TopViewGeometry
+from edgeperc.card import Golden, ModelCard
 from edgeperc.errors import CardError, CardMismatchError, InferenceError, ModelError, ModelFileError
 from edgeperc.onnx_file import check_graph, read_model
-from edgeperc.session import Session, golden_input
+from edgeperc.session import Session
 from edgeperc.zoo import digest, model_path, resolve
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-SHAPE = (1, 2, 16, 16)
-WEIGHTS = np.array([[1.0, 2.0], [-1.0, 0.5]], np.float32)
-
-
-def tiny_card() -> ModelCard:
-    """Of a network with one convolution of 1x1, whose answers numpy computes."""
-    x = golden_input(3, SHAPE)
-    answers = np.einsum("kc,ncij->nkij", WEIGHTS, x)
-    record = {
-        "sha256": "",
-        "std": float(answers.std()),
-        "positions": [*range(0, 512, 16)],
-        "values": [float(v) for v in answers.ravel()[::16]],
-    }
-    return ModelCard(
-        name="tiny",
-        version="1",
-        view=TopViewGeometry((0.0, 16.0), (-8.0, 8.0), (-3.0, 3.0), 1.0),
-        input=InputSpec("x", ("distance", "height"), (0.0, 0.0), (10.0, 1.0)),
-        outputs=(OutputSpec("y", "class_logits"),),
-        classes=("background", "drivable"),
-        golden=Golden(3, hashlib.sha256(x.tobytes()).hexdigest(), {"y": record}),
-    )
-
-
-def number(key: int, value: int) -> bytes:
-    return varint(key << 3) + varint(value)
-
-
-def tensor(name: str, shape: tuple[int, ...], content: bytes, kind: int = 1, more: bytes = b"") -> bytes:
-    dims = b"".join(number(1, n) for n in shape)
-    return dims + number(2, kind) + field(8, name.encode()) + field(9, content) + more
-
-
-def node(operator: str, inputs: str, outputs: str, more: bytes = b"") -> bytes:
-    names = b"".join(field(1, name.encode()) for name in inputs.split())
-    names += b"".join(field(2, name.encode()) for name in outputs.split())
-    return field(1, names + field(4, operator.encode()) + more)
-
-
-def shaped(name: str, shape: tuple[int, ...]) -> bytes:
-    dims = b"".join(field(1, number(1, n)) for n in shape)
-    return field(1, name.encode()) + field(2, field(1, number(1, 1) + field(2, dims)))
-
-
-CONVOLUTION = node("Conv", "x w", "y")
-INITIALIZER = field(5, tensor("w", (2, 2, 1, 1), WEIGHTS.tobytes()))
-
-
-def graph(*parts: bytes) -> bytes:
-    return b"".join(parts) + field(2, b"g") + field(11, shaped("x", SHAPE)) + field(12, shaped("y", SHAPE))
-
-
-def model(graph: bytes, more: bytes = b"", card: ModelCard | bytes | None = None) -> bytes:
-    text = card if isinstance(card, bytes) else (card or tiny_card()).to_json().encode()
-    return number(1, 8) + field(8, number(2, 17)) + field(7, graph) + more + entry(CARD_KEY, text)
-
-
 TINY = model(graph(CONVOLUTION, INITIALIZER))
 
 

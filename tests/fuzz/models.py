@@ -11,6 +11,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+from tiny_model import field, node, number, tensor
 
 import edgeperc.perceiver as perceiver_module
 from edgeperc import Perceiver, SensorProfile
@@ -26,7 +27,7 @@ from edgeperc.zoo import digest, model_path, resolve
 from .mutate import mutated_bytes, mutated_document, mutated_json, mutated_message, noise, parse
 from .running import Case, check
 from .scans import MadeUp, check_perception
-from .tiny import CARD, GRAPH, boxed_card, field, image_card, model, node, number, tensor
+from .tiny import CARD, GRAPH, boxed_card, image_card, model
 
 __all__ = ["LIMIT_MB", "LIMIT_S", "Models", "make"]
 

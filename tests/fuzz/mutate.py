@@ -6,6 +6,8 @@ import copy
 import json
 from typing import Any
 
+from tiny_model import varint
+
 from .running import Case
 
 __all__ = [
@@ -16,7 +18,6 @@ __all__ = [
     "noise",
     "parse",
     "unparse",
-    "varint",
 ]
 
 MAGIC_BYTES = [0x00, 0xFF, 0x7F, 0x80, 0x01, 0x20, 0x0A]
@@ -60,16 +61,6 @@ def mutated_bytes(content: bytes, case: Case, most: int = 8, near: int = 0) -> b
 
 Field = list[Any]
 """Number, wire type, value: an int, bytes, or a list of fields of the message that the bytes are."""
-
-
-def varint(value: int) -> bytes:
-    value &= (1 << 64) - 1
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    out.append(value)
-    return bytes(out)
 
 
 def parse(content: bytes, depth: int = 0) -> list[Field] | None:
