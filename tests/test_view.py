@@ -5,11 +5,12 @@ import io
 import itertools
 import json
 import re
-import shutil
 import subprocess
 import sys
 import threading
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -498,42 +499,34 @@ def test_ground_is_a_plane_through_the_road() -> None:
 # --- the page in a browser -------------------------------------------------------------------------------------------
 
 
-def test_page_shows_and_hides(scan: np.ndarray, perception: Perception, tmp_path) -> None:
-    playwright = pytest.importorskip("playwright.sync_api")
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if chromium is None:
-        pytest.skip("no chromium, chromium-browser or google-chrome on the path")
+def test_page_shows_and_hides(scan: np.ndarray, perception: Perception, browser: Any, tmp_path: Path) -> None:
     write_html(perception, scan, tmp_path / "page.html", title="a <b>scan</b>")
     wrong: list[str] = []
-    with playwright.sync_playwright() as play:
-        browser = play.chromium.launch(
-            executable_path=chromium, args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        )
-        page = browser.new_page(viewport={"width": 1000, "height": 700})
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda message: wrong.append(message.text))
-        page.on("request", lambda request: request.url.startswith("file:") or wrong.append(request.url))
-        page.goto((tmp_path / "page.html").as_uri())
-        if not page.evaluate("!!document.createElement('canvas').getContext('webgl')"):
-            pytest.skip("this browser offers no WebGL")
-        assert page.inner_text("h1") == "a <b>scan</b>"
+    page = browser.new_page(viewport={"width": 1000, "height": 700})
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("console", lambda message: wrong.append(message.text))
+    page.on("request", lambda request: request.url.startswith("file:") or wrong.append(request.url))
+    page.goto((tmp_path / "page.html").as_uri())
+    if not page.evaluate("!!document.createElement('canvas').getContext('webgl')"):
+        pytest.skip("this browser offers no WebGL")
+    assert page.inner_text("h1") == "a <b>scan</b>"
 
-        def shown(name: str) -> int:
-            page.wait_for_timeout(300)
-            return int(near(pixels(page.screenshot()), name)[:, 340:].sum())
+    def shown(name: str) -> int:
+        page.wait_for_timeout(300)
+        return int(near(pixels(page.screenshot()), name)[:, 340:].sum())
 
-        assert shown("pedestrian") > 20
-        page.get_by_label(re.compile("^pedestrian")).uncheck()
-        assert shown("pedestrian") == 0
-        assert shown("van") > 20
-        page.keyboard.press("b")
-        assert shown("van") == 0
-        assert not page.get_by_label("boxes", exact=True).is_checked()
-        page.get_by_label("road surface").uncheck()
-        page.keyboard.press("a")
-        page.get_by_role("button", name="height").click()
-        assert shown("drivable") == 0
-        browser.close()
+    assert shown("pedestrian") > 20
+    page.get_by_label(re.compile("^pedestrian")).uncheck()
+    assert shown("pedestrian") == 0
+    assert shown("van") > 20
+    page.keyboard.press("b")
+    assert shown("van") == 0
+    assert not page.get_by_label("boxes", exact=True).is_checked()
+    page.get_by_label("road surface").uncheck()
+    page.keyboard.press("a")
+    page.get_by_role("button", name="height").click()
+    assert shown("drivable") == 0
+    page.close()
     assert not wrong
 
 
