@@ -271,6 +271,7 @@ class Perceiver:
             self._find_objects(floor, labels)
         with suppress(MountingError):  # the floor has no street
             self._estimator.add(floor)
+        ModelFrame(Mounting(0.0, 0.0, 0.0, 0.0)).move(floor)
         if "top_view" in views:
             compile_kernels()  # of `edgeperc.road_ahead`
 

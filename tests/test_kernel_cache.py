@@ -492,8 +492,10 @@ def perceptions(options):
         points.astype(np.int16), fields, points[:1], points[:0], points[:1].tolist(),
         np.where(np.arange(len(points))[:, None] % 7, points, np.nan).astype(np.float32),
         np.frombuffer(b"x" + points.tobytes(), np.float32, offset=1).reshape(-1, 4), points * np.float32(1e6),
+        points - np.float32([0, 0, 1, 0]),
     ]
     for k, scan in enumerate(shapes):
+        perceive.reset_mounting()  # each scan alone shows how its sensor is mounted
         try:
             found = perceive(scan, stamp_s=k)
         except edgeperc.FitnessError:
