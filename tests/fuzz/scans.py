@@ -170,6 +170,8 @@ class Scans:
         self.made: tuple[int, bool] | None = None
         self.perceive: Any = None
         self.made_up: list[MadeUp] = []
+        Perceiver(provider="cpu", n_threads=1)  # compiles the kernels, which no case should count
+        Tracker()
 
     def perceiver(self, case: Case) -> tuple[Perceiver, list[MadeUp]]:
         block = case.index // BLOCK
