@@ -36,8 +36,9 @@ MIN_GOLDEN_VALUES, MAX_GOLDEN_VALUES = 16, 100_000
 OUTPUT_KINDS = ("class_logits", "class_probabilities", "box_slots", "box_dense")
 CHANNELS = {
     "top_view": ("distance", "remission", "height"),
-    "range_image": ("x", "y", "z", "remission", "range"),
+    "range_image": ("x", "y", "z", "remission", "range", "height_above_ground"),
 }
+N_DENSE_CHANNELS = 9
 
 
 def _check(field: str, value: float, low: float, high: float) -> None:
@@ -202,6 +203,11 @@ class InputSpec:
     mean: tuple[float, ...]
     std: tuple[float, ...]
 
+    @property
+    def needs_ground(self) -> bool:
+        """Whether a channel is the height above the ground, which must be found before the input can be made."""
+        return "height_above_ground" in self.channels
+
     def __post_init__(self) -> None:
         if not len(self.channels) == len(self.mean) == len(self.std) or not self.channels:
             raise CardError(
@@ -216,10 +222,21 @@ class InputSpec:
 
 @dataclass(frozen=True, slots=True)
 class OutputSpec:
-    """One output of the graph; ``kind`` picks the function in ``decode.py`` that reads it."""
+    """One output of the graph; ``kind`` picks the function in ``decode.py`` that reads it.
+
+    Attributes
+    ----------
+    name : str
+        Name of the output in the graph.
+    kind : str
+        One of ``OUTPUT_KINDS``.
+    front : bool
+        Of kind ``"box_dense"``: it has a tenth channel, the logit that a box's yaw points to its front.
+    """
 
     name: str
     kind: str
+    front: bool = False
 
     def __post_init__(self) -> None:
         if self.kind not in OUTPUT_KINDS:
@@ -227,6 +244,8 @@ class OutputSpec:
                 f"output {reprlib.repr(self.name)} is of kind {reprlib.repr(self.kind)}; "
                 f"expected one of {', '.join(OUTPUT_KINDS)}"
             )
+        if self.front and self.kind != "box_dense":
+            raise CardError(f"output {reprlib.repr(self.name)} of kind {self.kind} has a front; only box_dense may")
         _check_name("output.name", self.name)
 
 
@@ -403,7 +422,8 @@ class ModelCard:
         if kind == "box_slots":
             return (1, None, 4)
         if kind == "box_dense":
-            return (1, 9, self.view.height // 4, self.view.width // 4)
+            n_channels = N_DENSE_CHANNELS + any(output.front for output in self.outputs)
+            return (1, n_channels, self.view.height // 4, self.view.width // 4)
         return (1, len(self.classes), self.view.height, self.view.width)
 
     def to_json(self) -> str:
@@ -415,7 +435,7 @@ class ModelCard:
             "schema": SCHEMA,
             "view": view,
             "input": {name: getattr(self.input, name) for name in InputSpec.__dataclass_fields__},
-            "outputs": [{"name": o.name, "kind": o.kind} for o in self.outputs],
+            "outputs": [{n: getattr(o, n) for n in OutputSpec.__dataclass_fields__} for o in self.outputs],
             "golden": self.golden and {n: getattr(self.golden, n) for n in Golden.__dataclass_fields__},
         }
         return json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
@@ -510,7 +530,11 @@ def _card(document: dict[str, Any]) -> ModelCard:
             std=_floats("input.std", document["input"]["std"]),
         ),
         outputs=tuple(
-            OutputSpec(name=_text("output.name", o["name"]), kind=_text("output.kind", o["kind"]))
+            OutputSpec(
+                name=_text("output.name", o["name"]),
+                kind=_text("output.kind", o["kind"]),
+                front=_bool("output.front", o.get("front", False)),  # earlier cards lack it
+            )
             for o in document["outputs"]
         ),
         classes=_texts("classes", document["classes"]),
@@ -574,6 +598,12 @@ def _float(field: str, value: Any) -> float:
 def _int(field: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise CardError(f"{field} is {reprlib.repr(value)}; expected a whole number")
+    return value
+
+
+def _bool(field: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise CardError(f"{field} is {reprlib.repr(value)}; expected true or false")
     return value
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .card import ModelCard, TopViewGeometry
+from .card import N_DENSE_CHANNELS, ModelCard, TopViewGeometry
 from .errors import CardMismatchError, InferenceError
 from .geometry import draw_footprints, suppress_overlaps
 from .kernel_cache import njit
@@ -171,9 +171,10 @@ def decode_dense(
 
     Parameters
     ----------
-    dense : (1, 9, H / 4, W / 4) or (9, H / 4, W / 4) float32
-        Heat-map logit; center's offset from the cell's center in rows and columns [cells of this map]; logarithms of
-        length and width [m]; sine and cosine of twice the yaw; center's z [m]; logarithm of the height [m].
+    dense : (1, C, H / 4, W / 4) or (C, H / 4, W / 4) float32
+        C is 9 or 10. Heat-map logit; center's offset from the cell's center in rows and columns [cells of this map];
+        logarithms of length and width [m]; sine and cosine of twice the yaw; center's z [m]; logarithm of the height
+        [m]. The tenth is the logit that the yaw in -pi/2..pi/2 points to the front.
     class_output : (1, C, H, W) or (C, H, W) float32
     class_kind : {"class_logits", "class_probabilities"}
     geometry : TopViewGeometry
@@ -197,7 +198,9 @@ def decode_dense(
     -------
     list of Box
         Best score first; on ties the box farther ahead, then the box farther left. The score is the probability in the
-        heat map. The yaw is in -pi/2..pi/2: the network, like the paper's, does not distinguish front and rear.
+        heat map. With nine channels the yaw is in -pi/2..pi/2 and ``front`` is None: the network, like the paper's,
+        does not distinguish front and rear. With ten the yaw points to the likelier front, and ``front`` is 0.5 or
+        more.
 
     Raises
     ------
@@ -215,9 +218,10 @@ def decode_dense(
     """
     maps = dense[0] if dense.ndim == 4 and dense.shape[0] == 1 else dense
     height, width = geometry.height, geometry.width
-    if maps.shape != (9, height // STRIDE, width // STRIDE):
+    expected = [(n, height // STRIDE, width // STRIDE) for n in (N_DENSE_CHANNELS, N_DENSE_CHANNELS + 1)]
+    if maps.shape not in expected:
         raise CardMismatchError(
-            f"{model}: box_dense has shape {dense.shape}; expected {(1, 9, height // STRIDE, width // STRIDE)} "
+            f"{model}: box_dense has shape {dense.shape}; expected {(1, *expected[0])} or {(1, *expected[1])} "
             f"for a view of {(height, width)}; check the card"
         )
     values = _class_values(class_output, class_kind, model)
@@ -237,7 +241,7 @@ def decode_dense(
     rows, cols = np.nonzero(peak)
     best = np.argsort(-maps[0, rows, cols], kind="stable")[:max_boxes]
     rows, cols = rows[best], cols[best]
-    heat, d_row, d_col, log_l, log_w, sin, cos, z, log_h = maps[:, rows, cols].astype(np.float64)
+    heat, d_row, d_col, log_l, log_w, sin, cos, z, log_h, *front = maps[:, rows, cols].astype(np.float64)
     with np.errstate(over="ignore"):  # a score of 0
         scores = 1.0 / (1.0 + np.exp(-heat))
     shrink = STRIDE * geometry.cell_m
@@ -253,6 +257,7 @@ def decode_dense(
         axis=1,
     )
     tall = np.exp(np.clip(log_h, low, high))
+    yaws, fronts = _facing(rectangles[:, 4], front[0]) if front else (rectangles[:, 4], None)
     keep = suppress_overlaps(rectangles, scores, iou_threshold)
     sums = np.empty((len(keep), len(classes)))
     fill_footprint_sums(
@@ -280,10 +285,17 @@ def decode_dense(
             score=float(scores[i]),
             center=(float(rectangles[i, 0]), float(rectangles[i, 1]), float(z[i])),
             size=(float(rectangles[i, 2]), float(rectangles[i, 3]), float(tall[i])),
-            yaw=float(rectangles[i, 4]),
+            yaw=float(yaws[i]),
+            front=None if fronts is None else float(fronts[i]),
         )
         for k, i in enumerate(keep)
     ]
+
+
+def _facing(yaws: NDArray[np.float64], logits: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Yaws in -pi..pi towards the likelier fronts, and their probabilities; a logit of 0 keeps the yaw."""
+    opposite = np.where(yaws > 0.0, yaws - math.pi, yaws + math.pi)
+    return np.where(logits >= 0.0, yaws, opposite), 1.0 / (1.0 + np.exp(-np.abs(logits)))
 
 
 def _class_values(output: NDArray[np.float32], kind: str, model: str) -> NDArray[np.float32]:

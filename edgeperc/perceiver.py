@@ -27,9 +27,10 @@ from .drivable import compile_kernels
 from .errors import EdgepercError, FitnessError, MountingError, OptionError
 from .fitness import Finding, FitnessProfile, check_fitness
 from .frame import ModelFrame
-from .ground import find_ground
+from .ground import Ground, find_ground
 from .level import MountingEstimate, MountingEstimator
 from .mounting import MODEL_HEIGHT_M, Mounting
+from .network_input import input_heights
 from .observed import Observer
 from .perception import Box, Perception, PointLabels, TopView
 from .points import as_points
@@ -260,6 +261,9 @@ class Perceiver:
         self.sessions = tuple(n.session for n in self._networks)
         self.cards = tuple(n.session.card for n in self._networks)
         self.providers = MappingProxyType({n.session.card.name: n.session.description for n in self._networks})
+        self._needs_ground = any(n.projector.needs_ground for n in self._networks) or (
+            boxes_from != "network" and "range_image" in views
+        )
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
         self._locks = {os.getpid(): threading.Lock()}
         # Compile every kernel here, not in the first call, with a scan of two points. The networks have already run on
@@ -267,8 +271,9 @@ class Perceiver:
         warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
         self._perceive(warm_up, None, check=self._to_check > 0, infer=False)
         floor, labels = self._warm_up_objects()
-        if boxes_from != "network" and "range_image" in views:
-            self._find_objects(floor, labels)
+        ground = self._find_ground(floor)
+        if ground is not None and boxes_from != "network":
+            self._find_objects(floor, labels, ground)
         with suppress(MountingError):  # the floor has no street
             self._estimator.add(floor)
         ModelFrame(Mounting(0.0, 0.0, 0.0, 0.0)).move(floor)
@@ -379,14 +384,16 @@ class Perceiver:
         points: PointLabels | None = None
         top_view: TopView | None = None
         boxes: tuple[Box, ...] = ()
+        ground = self._find_ground(scan)
+        watch.lap("cluster")
         for network in self._networks:
             if isinstance(network.session.card.view, TopViewGeometry):
                 top_view, boxes = self._label_cells(network, scan, watch, infer)
             else:
                 label = self._label_full_turn if self.full_turn else self._label_sector
-                points = label(network, scan, watch, infer)
-        if points is not None and self.boxes_from != "network":
-            clustered = self._find_objects(scan, points)
+                points = label(network, scan, None if ground is None else ground.height_m, watch, infer)
+        if points is not None and ground is not None and self.boxes_from != "network":
+            clustered = self._find_objects(scan, points, ground)
             boxes = join_boxes(boxes, self._new_to_networks(clustered)) if self.boxes_from == "both" else clustered
             watch.lap("cluster")
         return Perception(
@@ -431,9 +438,11 @@ class Perceiver:
                 'on_mismatch="warn" (on the command line --anyway).'
             )
 
-    def _project(self, network: _Network, scan: NDArray[np.float32]) -> NDArray[np.int32]:
+    def _project(
+        self, network: _Network, scan: NDArray[np.float32], height_m: NDArray[np.float32] | None = None
+    ) -> NDArray[np.int32]:
         pixel = np.empty(len(scan), np.int32)
-        network.projector.fill(scan, network.session.input, network.index, pixel)
+        network.projector.fill(scan, network.session.input, network.index, pixel, height_m)
         return pixel
 
     def _label_cells(
@@ -457,18 +466,24 @@ class Perceiver:
         return view, tuple(found)
 
     def _label_sector(
-        self, network: _Network, scan: NDArray[np.float32], watch: _Stopwatch, infer: bool
+        self,
+        network: _Network,
+        scan: NDArray[np.float32],
+        height_m: NDArray[np.float32] | None,
+        watch: _Stopwatch,
+        infer: bool,
     ) -> PointLabels:
         """Class of every point in the range image: decode pixels, remove outliers, label points (PointSeg 5.2)."""
         card = network.session.card
         assert isinstance(card.view, RangeImageGeometry)
-        pixel = self._project(network, scan)
+        pixel = self._project(network, scan, height_m)
         watch.lap("project")
         if network.interpolator is not None:
             assert isinstance(network.projector, RangeImageProjector)
             # Interpolated points are in the image only; refinement uses the points of the scan.
             dense, filled = network.interpolator.fill(scan, network.index)
-            network.projector.fill_image(dense, filled, network.session.input)
+            height_m = input_heights(network.projector, dense)
+            network.projector.fill_image(dense, filled, network.session.input, height_m)
             watch.lap("adapt")
         outputs = network.session.run() if infer else network.session.outputs
         watch.lap("infer")
@@ -482,13 +497,18 @@ class Perceiver:
         return PointLabels(labeled, pixel >= 0, card.classes)
 
     def _label_full_turn(
-        self, network: _Network, scan: NDArray[np.float32], watch: _Stopwatch, infer: bool
+        self,
+        network: _Network,
+        scan: NDArray[np.float32],
+        height_m: NDArray[np.float32] | None,
+        watch: _Stopwatch,
+        infer: bool,
     ) -> PointLabels:
         """Run the network once for each sector, on a turned scan; a point in two sectors keeps its first label."""
         view = network.session.card.view
         assert isinstance(view, RangeImageGeometry)
         width_deg = view.azimuth_left_deg - view.azimuth_right_deg
-        ahead = self._label_sector(network, scan, watch, infer)
+        ahead = self._label_sector(network, scan, height_m, watch, infer)
         labels, in_view = ahead.labels, ahead.in_view
         for k in range(1, math.ceil(360.0 / width_deg)):
             cos, sin = math.cos(math.radians(k * width_deg)), math.sin(math.radians(k * width_deg))
@@ -496,7 +516,7 @@ class Perceiver:
             with np.errstate(over="ignore"):  # what float32 cannot hold is not in view
                 turned[:, 0] = cos * scan[:, 0] + sin * scan[:, 1]
                 turned[:, 1] = cos * scan[:, 1] - sin * scan[:, 0]
-            aside = self._label_sector(network, turned, watch, infer)
+            aside = self._label_sector(network, turned, height_m, watch, infer)
             labels = np.where(in_view, labels, aside.labels)
             in_view = in_view | aside.in_view
         return PointLabels(labels, in_view, ahead.classes)
@@ -510,13 +530,16 @@ class Perceiver:
         labels = (np.arange(len(scan)) >= x.size).astype(np.uint8)
         return scan, PointLabels(labels, np.ones(len(scan), np.bool_), ("background", "car"))
 
-    def _find_objects(self, scan: NDArray[np.float32], points: PointLabels) -> tuple[Box, ...]:
+    def _find_ground(self, scan: NDArray[np.float32]) -> Ground | None:
+        """The ground, once for all that needs it: the input of a network, and the clusters; None if nothing does."""
+        return find_ground(scan, mount_height_m=MODEL_HEIGHT_M) if self._needs_ground else None
+
+    def _find_objects(self, scan: NDArray[np.float32], points: PointLabels, ground: Ground) -> tuple[Box, ...]:
         """Boxes around clusters of points above the ground that have one dominant class (KUL-Seg 5.2).
 
         Points out of the network's view count as background. An object cut by the view's edge therefore gets either a
         box of the whole object or none.
         """
-        ground = find_ground(scan, mount_height_m=MODEL_HEIGHT_M)
         return objects_from_points(
             scan,
             points.labels,

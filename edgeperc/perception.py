@@ -32,6 +32,9 @@ class Box:
         Length (along the heading), width, height [m].
     yaw : float
         Heading about +z from +x [rad], in -pi..pi.
+    front : float or None
+        Probability in 0..1 that ``yaw`` points to the object's front and not to its rear. None: the heading is known
+        only up to half a turn.
     """
 
     label: str
@@ -39,6 +42,7 @@ class Box:
     center: tuple[float, float, float]
     size: tuple[float, float, float]
     yaw: float
+    front: float | None = None
 
     def corners(self) -> NDArray[np.float64]:
         """Corners of the footprint, (4, 2) x, y [m]: front-left, rear-left, rear-right, front-right."""
@@ -55,11 +59,14 @@ class Box:
             "center": [round(float(v), 4) for v in self.center],
             "size": [round(float(v), 4) for v in self.size],
             "yaw": round(float(self.yaw), 5),
+            "front": None if self.front is None else round(float(self.front), 4),
         }
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Box:
         """Read what `to_dict` wrote. Other keys are ignored, so the record of a track is read as its box.
+
+        Without ``front``, as in records of earlier versions, it is None.
 
         Raises
         ------
@@ -69,16 +76,17 @@ class Box:
         try:
             (x, y, z), (length, width, height) = document["center"], document["size"]
             numbers = [float(v) for v in (document["score"], x, y, z, length, width, height, document["yaw"])]
-            label = document["label"]
+            label, front = document["label"], document.get("front")
+            front = None if front is None else float(front)
         except (KeyError, OverflowError, TypeError, ValueError) as exc:
             raise PointsError(
                 f"got a box that cannot be read ({type(exc).__name__}: {exc}); expected label, score, yaw, center "
-                "(x, y, z) and size (length, width, height)"
+                "(x, y, z), size (length, width, height) and front, a number or null"
             ) from exc
         if not isinstance(label, str):
             raise PointsError(f"got a box with label {label!r}; expected a str")
         score, x, y, z, length, width, height, yaw = numbers
-        return cls(label, score, (x, y, z), (length, width, height), yaw)
+        return cls(label, score, (x, y, z), (length, width, height), yaw, front)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

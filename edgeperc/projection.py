@@ -32,6 +32,8 @@ __all__ = [
 
 # Number of each channel in the kernels. "height" is z; "distance" is the range in the x-y plane.
 CHANNEL_CODES = {"x": 0, "y": 1, "z": 2, "height": 2, "remission": 3, "distance": 4, "range": 5}
+CHANNEL_CODES["height_above_ground"] = 6
+HEIGHT_RANGE_M = (-1.0, 5.0)  # heights above the ground are clipped to it; what is farther off is seldom an object
 
 # The nearest point of a pixel is the smallest of `rank << 32 | row of points`: the better rank wins, then the earlier
 # point. Ranks are the bits of floats, so those of finite points lie below infinity's.
@@ -42,6 +44,7 @@ LOW_WORD = np.int64(0xFFFF_FFFF)
 ZERO = np.float32(0.0)
 TWO = np.float32(2.0)
 INFINITY = np.float32(math.inf)
+LOWEST, HIGHEST = np.float32(HEIGHT_RANGE_M[0]), np.float32(HEIGHT_RANGE_M[1])
 
 # Points and pixels per block: the intermediate values of a block fit into the first-level cache.
 BLOCK = 256
@@ -264,6 +267,7 @@ def mark_range_image(
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_image(
     points: NDArray[np.float32],
+    heights: NDArray[np.float32],
     index: NDArray[np.int32],
     channels: NDArray[np.int32],
     mean: NDArray[np.float32],
@@ -275,6 +279,8 @@ def fill_image(
     Parameters
     ----------
     points : (n, 4) float32, C-contiguous
+    heights : (n,) or (0,) float32, C-contiguous
+        Height of each point above the ground [m]; empty if no channel needs it.
     index : (pixels,) int32
         Row of points; -1 without a return.
     channels : (C,) int32
@@ -284,7 +290,7 @@ def fill_image(
     """
     values = points.reshape(-1)
     rows = np.empty(4 * PIXEL_BLOCK, np.float32)
-    planes = np.empty((6, PIXEL_BLOCK), np.float32)
+    planes = np.empty((7, PIXEL_BLOCK), np.float32)
     for start in range(0, index.shape[0], PIXEL_BLOCK):
         row_of = index[start : start + PIXEL_BLOCK]
         size = row_of.shape[0]
@@ -309,6 +315,11 @@ def fill_image(
             planes[3, p] = remission
             planes[4, p] = np.sqrt(squared_distance)
             planes[5, p] = np.sqrt(squared_distance + z * z)
+        if heights.shape[0] > 0:
+            for p in range(size):  # NaN is the lower bound
+                height = heights[max(row_of[p], np.int32(0))]
+                height = height if height > LOWEST else LOWEST
+                planes[6, p] = height if height < HIGHEST else HIGHEST
         for c in range(channels.shape[0]):
             raw = planes[channels[c]]
             channel_mean = mean[c]
@@ -341,6 +352,7 @@ class TopViewProjector:
     def __init__(self, view: TopViewGeometry, input: InputSpec) -> None:
         self.view = view
         self.shape = (len(input.channels), view.height, view.width)
+        self.needs_ground = input.needs_ground
         self._channels, self._mean, self._std = _channels(input, ("distance", "remission", "height"))
         self._ranges = tuple(np.array(r, dtype=np.float32) for r in (view.x_range_m, view.y_range_m, view.z_range_m))
         self._cells_per_m = np.float32(1.0 / view.cell_m)
@@ -351,6 +363,7 @@ class TopViewProjector:
         image: NDArray[np.float32],
         index: NDArray[np.int32],
         pixel: NDArray[np.int32],
+        height_m: NDArray[np.float32] | None = None,
     ) -> None:
         """Project into the caller's buffers.
 
@@ -362,11 +375,14 @@ class TopViewProjector:
         index : (H, W) int32, C-contiguous, overwritten
         pixel : (n,) int32, C-contiguous, overwritten
             As in `Projection`.
+        height_m : (n,) float32, optional
+            Height of each point above the ground [m] (`edgeperc.ground.Ground.height_m`), for the channel
+            ``"height_above_ground"``; without this channel it is ignored.
 
         Raises
         ------
         PointsError
-            An array has another shape, dtype or layout.
+            An array has another shape, dtype or layout, or ``height_m`` is needed and missing.
         """
         points = _checked(self.shape, points, image, index, pixel)
         _, height, width = self.shape
@@ -375,11 +391,13 @@ class TopViewProjector:
         mark_top_view(
             points, x_range, y_range, z_range, self._cells_per_m, np.int32(height), np.int32(width), flat_index, pixel
         )
-        fill_image(points, flat_index, self._channels, self._mean, self._std, image.reshape(self.shape[0], -1))
+        heights = _heights(self.needs_ground, len(points), height_m)
+        flat_image = image.reshape(self.shape[0], -1)
+        fill_image(points, heights, flat_index, self._channels, self._mean, self._std, flat_image)
 
-    def project(self, points: NDArray[np.float32]) -> Projection:
+    def project(self, points: NDArray[np.float32], height_m: NDArray[np.float32] | None = None) -> Projection:
         """Project into fresh buffers; arguments and errors as in `fill`."""
-        return _project(self, points)
+        return _project(self, points, height_m)
 
 
 class RangeImageProjector:
@@ -397,7 +415,13 @@ class RangeImageProjector:
     ----------
     view : RangeImageGeometry
     input : InputSpec
-        Channels, any of ``"x"``, ``"y"``, ``"z"``, ``"remission"``, ``"range"`` in any order, meters.
+        Channels, any of ``"x"``, ``"y"``, ``"z"``, ``"remission"``, ``"range"`` and ``"height_above_ground"`` in any
+        order, meters. Heights above the ground are clipped to -1..5 m.
+
+    Attributes
+    ----------
+    needs_ground : bool
+        Whether a channel is the height above the ground.
 
     Raises
     ------
@@ -419,7 +443,9 @@ class RangeImageProjector:
     def __init__(self, view: RangeImageGeometry, input: InputSpec) -> None:
         self.view = view
         self.shape = (len(input.channels), view.height, view.width)
-        self._channels, self._mean, self._std = _channels(input, ("x", "y", "z", "remission", "range"))
+        self.needs_ground = input.needs_ground
+        known = ("x", "y", "z", "remission", "range", "height_above_ground")
+        self._channels, self._mean, self._std = _channels(input, known)
         self._wedge = wedge(view)
         self._rows = tabulate(row_edges(view), "rows")
         self._cols = tabulate(column_edges(view), "columns")
@@ -431,6 +457,7 @@ class RangeImageProjector:
         image: NDArray[np.float32],
         index: NDArray[np.int32],
         pixel: NDArray[np.int32],
+        height_m: NDArray[np.float32] | None = None,
     ) -> None:
         """Project into the caller's buffers; arguments and errors as in `TopViewProjector.fill`."""
         points = _checked(self.shape, points, image, index, pixel)
@@ -438,21 +465,24 @@ class RangeImageProjector:
         mark_range_image(
             points, self._wedge, *self._rows, *self._cols, np.int32(self.shape[2]), self._winner, flat_index, pixel
         )
-        self.fill_image(points, index, image)
+        self.fill_image(points, index, image, height_m)
 
     def fill_image(
         self,
         points: NDArray[np.float32],
         index: NDArray[np.int32],
         image: NDArray[np.float32],
+        height_m: NDArray[np.float32] | None = None,
     ) -> None:
         """Write the image for a given ``index``; arguments and errors as in `TopViewProjector.fill`."""
         points = _checked(self.shape, points, image, index)
-        fill_image(points, index.reshape(-1), self._channels, self._mean, self._std, image.reshape(self.shape[0], -1))
+        heights = _heights(self.needs_ground, len(points), height_m)
+        flat_image = image.reshape(self.shape[0], -1)
+        fill_image(points, heights, index.reshape(-1), self._channels, self._mean, self._std, flat_image)
 
-    def project(self, points: NDArray[np.float32]) -> Projection:
+    def project(self, points: NDArray[np.float32], height_m: NDArray[np.float32] | None = None) -> Projection:
         """Project into fresh buffers; arguments and errors as in `TopViewProjector.fill`."""
-        return _project(self, points)
+        return _project(self, points, height_m)
 
 
 def make_projector(
@@ -579,6 +609,20 @@ def _checked(
     return read_only(points)
 
 
+def _heights(needed: bool, n: int, height_m: NDArray[np.float32] | None) -> NDArray[np.float32]:
+    """The heights as the kernel takes them; raises PointsError."""
+    if not needed:
+        return read_only(np.empty(0, np.float32))
+    if height_m is None:
+        raise PointsError(
+            "the input has the channel height_above_ground and height_m is missing; pass height_m of "
+            "edgeperc.ground.find_ground, or use edgeperc.network_input.project"
+        )
+    if height_m.shape != (n,) or height_m.dtype != np.float32:
+        raise PointsError(f"height_m is {height_m.shape} {height_m.dtype} for {n} points; expected ({n},) float32")
+    return read_only(np.ascontiguousarray(height_m))
+
+
 def _check_points(points: NDArray[np.float32]) -> None:
     if not isinstance(points, np.ndarray):
         raise PointsError(f"points are a {type(points).__name__}; expected a numpy array (n, 4) float32")
@@ -592,6 +636,7 @@ def _check_points(points: NDArray[np.float32]) -> None:
 def _project(
     projector: TopViewProjector | RangeImageProjector,
     points: NDArray[np.float32],
+    height_m: NDArray[np.float32] | None,
 ) -> Projection:
     _check_points(points)
     projection = Projection(
@@ -599,5 +644,5 @@ def _project(
         index=np.empty(projector.shape[1:], dtype=np.int32),
         pixel=np.empty(points.shape[0], dtype=np.int32),
     )
-    projector.fill(points, projection.image, projection.index, projection.pixel)
+    projector.fill(points, projection.image, projection.index, projection.pixel, height_m)
     return projection

@@ -537,9 +537,10 @@ def test_car_cut_by_the_views_edge_gets_a_full_box_or_none(seen: float, n_boxes:
     scan[:, :3] = np.concatenate([floor, flank])
     labels = np.zeros(len(scan), np.uint8)
     labels[len(floor) :] = along >= 4.0 * (1.0 - seen) - 0.01
-    boxes = perceive._find_objects(
-        scan, PointLabels(labels, labels > 0, ("background", "car", "pedestrian", "cyclist"))
-    )
+    ground = perceive._find_ground(scan)
+    assert ground is not None
+    points = PointLabels(labels, labels > 0, ("background", "car", "pedestrian", "cyclist"))
+    boxes = perceive._find_objects(scan, points, ground)
     assert len(boxes) == n_boxes
     for box in boxes:
         np.testing.assert_allclose(box.center[0], 6.0, atol=0.05)
