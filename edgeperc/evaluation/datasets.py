@@ -125,6 +125,15 @@ class Calibration:
         pixel, depth = self.to_image(points)
         return (depth > 0.1) & (pixel >= 0).all(axis=1) & (pixel[:, 0] < IMAGE_SIZE[0]) & (pixel[:, 1] < IMAGE_SIZE[1])
 
+    def labeled_at(self, places: NDArray[Any], unlabeled: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which places (n, 3+) in the sensor frame are in the image and in no ``unlabeled`` (k, 4) rectangle [px]."""
+        labeled = self.in_image(places)
+        pixel, _ = self.to_image(places)
+        for left, top, right, bottom in unlabeled:
+            within = (pixel[:, 0] >= left) & (pixel[:, 0] <= right) & (pixel[:, 1] >= top) & (pixel[:, 1] <= bottom)
+            labeled &= ~within
+        return labeled
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -159,11 +168,7 @@ class Frame:
 
     def known_at(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """Whether objects are labeled at places (n, 3+) in the sensor frame, (n,) bool."""
-        known = self.calibration.in_image(points)
-        pixel, _ = self.calibration.to_image(points)
-        for left, top, right, bottom in self.unlabeled:
-            known &= ~((pixel[:, 0] >= left) & (pixel[:, 0] <= right) & (pixel[:, 1] >= top) & (pixel[:, 1] <= bottom))
-        return known
+        return self.calibration.labeled_at(points, self.unlabeled)
 
     def point_labels(self) -> NDArray[np.uint8]:
         """True class of each point, (n,) uint8: the class of the box around it, `IGNORE` where the truth is unknown."""
