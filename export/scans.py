@@ -14,6 +14,7 @@ from edgeperc.card import TopViewGeometry
 from edgeperc.evaluation.datasets import Frame
 from edgeperc.geometry import draw_footprints, inside
 from edgeperc.perception import Box
+from edgeperc.sensor import SensorProfile
 from edgeperc.simulation.samples import IGNORE, labels_by_boxes
 from edgeperc.simulation.scene import TOP_VIEW_CLASSES, SimulatedScan
 
@@ -31,9 +32,9 @@ class LabeledScan:
     Attributes
     ----------
     points : (n, 4) float32
-        x, y, z [m] in the sensor frame, remission.
+        x, y, z [m] in the frame of the models, remission in 0..1.
     labels : (n,) uint8
-        PointSeg's classes, `IGNORE` where unknown.
+        The network's classes (PointSeg's, unless others are asked for), `IGNORE` where unknown.
     boxes : tuple of Box
     counts : tuple of int
         Number of returns from each box.
@@ -45,6 +46,8 @@ class LabeledScan:
         Angle by which the points were turned about +z [rad].
     mirrored : bool
         Whether left and right were swapped after that turn.
+    sensor : SensorProfile or None
+        The sensor of the scan; None: the one that the models are trained for.
     """
 
     points: NDArray[np.float32]
@@ -55,6 +58,7 @@ class LabeledScan:
     azimuths: tuple[float, float] = (-np.pi, np.pi)
     turn: float = 0.0
     mirrored: bool = False
+    sensor: SensorProfile | None = None
 
     @classmethod
     def from_frame(
@@ -77,7 +81,7 @@ class LabeledScan:
     def save(self, path: Path) -> None:
         """Write an .npz file, without pickles."""
         boxes = np.array([[*b.center, *b.size, b.yaw] for b in self.boxes], np.float32).reshape(-1, 7)
-        names = np.array([b.label for b in self.boxes], dtype="U16")
+        names = np.array([b.label for b in self.boxes], dtype="U32")
         with open_atomic(path) as file:
             np.savez(
                 file,
@@ -88,6 +92,7 @@ class LabeledScan:
                 counts=np.array(self.counts, np.int64),
                 surface=self.surface,
                 azimuths=np.array(self.azimuths),
+                sensor=np.array("" if self.sensor is None else self.sensor.to_json()),
             )
 
     @classmethod
@@ -100,8 +105,15 @@ class LabeledScan:
                 for name, (x, y, z, length, width, height, yaw) in numbers
             )
             low, high = (float(a) for a in data["azimuths"])
+            profile = str(data["sensor"]) if "sensor" in data else ""  # files of earlier versions have none
             return cls(
-                data["points"], data["labels"], boxes, tuple(map(int, data["counts"])), data["surface"], (low, high)
+                data["points"],
+                data["labels"],
+                boxes,
+                tuple(map(int, data["counts"])),
+                data["surface"],
+                (low, high),
+                sensor=SensorProfile.from_json(profile) if profile else None,
             )
 
     def labeled(self, geometry: TopViewGeometry) -> NDArray[np.bool_]:

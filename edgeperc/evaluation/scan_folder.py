@@ -38,7 +38,7 @@ from ..readers.files import read_points
 from ..sensor import SensorProfile, get_sensor
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
-from .datasets import Calibration, read_objects
+from .datasets import IMAGE_SIZE, Calibration, read_objects
 from .splits import in_split
 
 __all__ = ["SCHEMA", "ScanFolder", "ScanFrame", "ScanLayout", "class_number", "known_layouts", "read_layout"]
@@ -250,6 +250,15 @@ class ScanFrame:
         counts = [int(np.count_nonzero(inside(box, self.points, 0.1))) for box in self.boxes or ()]
         return tuple(n if n >= self.layout.min_points else 0 for n in counts)
 
+    @property
+    def azimuths(self) -> tuple[float, float]:
+        """Right and left end of the sector in which all objects have boxes [rad], counter-clockwise from x."""
+        if self.calibration is None:
+            low, high = self.layout.labeled_deg
+            return math.radians(low), math.radians(high)
+        focal, middle = self.calibration.P2[0, 0], self.calibration.P2[0, 2]
+        return -math.atan2(IMAGE_SIZE[0] - middle, focal), math.atan2(middle, focal)
+
     def known_at(self, places: NDArray[Any]) -> NDArray[np.bool_]:
         """Whether all objects at places (n, 3+) [m] have boxes, (n,) bool."""
         if self.boxes is None:
@@ -271,13 +280,16 @@ class ScanFrame:
         classes : sequence of str
             As in `class_number`.
         by : {"points", "boxes"} or None
-            Labels of points, or the class of the box around a point. None: of points if the scan has them.
+            Labels of points, or the class of the box around a point. None: of points if the scan has them, else by
+            boxes; all unknown if it has neither.
 
         Raises
         ------
         PointsError
             The scan has no such labels.
         """
+        if by is None and self.point_classes is None and self.boxes is None:
+            return np.full(len(self.points), IGNORE, np.uint8)
         by = by or ("boxes" if self.point_classes is None else "points")
         if by == "points" and self.point_classes is not None:
             numbers = np.array([class_number(name, classes) for name in self.class_names], np.uint8)

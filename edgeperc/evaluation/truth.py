@@ -1,22 +1,35 @@
-"""Ground truth of one scan, from KITTI's labels, SemanticKITTI's labels or the simulator."""
+"""Ground truth of one scan, from KITTI's or SemanticKITTI's labels, a folder of labeled scans or the simulator."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..card import TopViewGeometry
+from ..frame import ModelFrame
 from ..geometry import draw_footprints, inside
+from ..mounting import Mounting
+from ..observed import Observer
 from ..perception import Box
+from ..points import read_only
 from ..simulation.samples import IGNORE, labels_by_boxes, simulated_scan
-from ..simulation.scene import TOP_VIEW_CLASSES
+from ..simulation.scene import POINT_CLASS_OF, TOP_VIEW_CLASSES
 from .datasets import ROAD_CLASSES, Frame, RoadFrame
+from .scan_folder import ScanFrame
 from .tables import VEHICLES
 
-__all__ = ["Truth", "kitti_truth", "semantickitti_truth", "simulated_truth"]
+__all__ = [
+    "Truth",
+    "cells_inside",
+    "folder_truth",
+    "kitti_truth",
+    "road_cells",
+    "semantickitti_truth",
+    "simulated_truth",
+]
 
 GROUND_Z_M = -1.5  # height at which a cell is looked up in the camera image
 
@@ -72,12 +85,8 @@ def kitti_truth(frame: Frame, view: TopViewGeometry | None, road: tuple[str, NDA
     """
     cells: Cells = {}
     if view is not None:
-        vehicles, unclear = np.zeros((2, view.height, view.width), np.uint8)
-        draw_footprints(vehicles, frame.boxes, view, TOP_VIEW_CLASSES)
-        # Cells of trams and "misc" objects are ignored: they belong to no class, but are not background.
-        strange = [replace(box, label="car") for box in frame.boxes if box.label in ("tram", "misc")]
-        draw_footprints(unclear, strange, view, TOP_VIEW_CLASSES)
-        known = frame.known_at(_cell_places(view)).reshape(vehicles.shape) & (unclear == 0)
+        vehicles, known = _drawn(frame.boxes, view)
+        known &= frame.known_at(_cell_places(view)).reshape(known.shape)
         by_boxes = np.where(vehicles > 0, vehicles - 1, 0)
         cells[BY_BOXES] = ("background", *VEHICLES), np.where(known, by_boxes, IGNORE).astype(np.uint8)
         if road is not None:
@@ -95,12 +104,109 @@ def semantickitti_truth(frame: RoadFrame, view: TopViewGeometry | None) -> Truth
     return Truth(frame.name, frame.drive, frame.points, None, (), (), _everywhere, cells, (OBSERVED, "road"))
 
 
+def folder_truth(frame: ScanFrame, mounting: Mounting, view: TopViewGeometry | None) -> Truth:
+    """Ground truth of a scan of a `ScanFolder`, moved into the frame of the models.
+
+    Parameters
+    ----------
+    frame : ScanFrame
+    mounting : Mounting
+        The mounting that the runtime used for this scan: its results are compared in the frame that it had.
+    view : TopViewGeometry or None
+        Grid of the cells; None: no cells.
+    """
+    model = ModelFrame(mounting)
+    boxes = model.move_boxes(frame.boxes or ())
+    labels = None if frame.boxes is None and frame.point_classes is None else frame.labels()
+
+    def known(places: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return frame.known_at((places[:, :3] - model.t) @ model.R)
+
+    cells: Cells = {}
+    road = None
+    if view is not None:
+        if frame.boxes is not None:
+            vehicles, clear = _drawn(boxes, view)
+            clear &= known(_cell_places(view)).reshape(clear.shape)
+            by_boxes = np.where(vehicles > 0, vehicles - 1, 0)
+            cells[BY_BOXES] = ("background", *VEHICLES), np.where(clear, by_boxes, IGNORE).astype(np.uint8)
+        surface = road_cells(frame, mounting, view)
+        if surface is not None:
+            cells[OBSERVED], road = (ROAD_CLASSES, surface), (OBSERVED, "road")
+    points = model.move(frame.points)
+    return Truth(frame.name, frame.drive, points, labels, boxes, frame.returns, known, cells, road)
+
+
+def road_cells(frame: ScanFrame, mounting: Mounting, view: TopViewGeometry) -> NDArray[np.uint8] | None:
+    """True surface of each cell by the labels of points, or else by the polygons of a scan.
+
+    Parameters
+    ----------
+    frame : ScanFrame
+    mounting : Mounting
+        A known one.
+    view : TopViewGeometry
+        Grid in the frame of the models.
+
+    Returns
+    -------
+    (rows, columns) uint8 or None
+        Index into `ROAD_CLASSES`; `IGNORE` for cells that the scan did not observe. None: the scan has no such labels.
+    """
+    model = ModelFrame(mounting)
+    points, labels = model.move(frame.points), frame.road_labels()
+    if labels is not None:
+        return RoadFrame(frame.name, frame.drive, points, labels).top_view(view)
+    if frame.drivable is None:
+        return None
+    height_m = mounting.height_m or 0.0
+    polygons = []
+    for ring in frame.drivable:
+        corners = ring if ring.shape[1] == 3 else np.column_stack([ring, np.full(len(ring), -height_m)])
+        polygons.append((corners @ model.R.T + model.t)[:, :2])
+    vehicles, clear = _drawn(model.move_boxes(frame.boxes or ()), view)
+    surface = np.where(vehicles > 0, 2, cells_inside(polygons, view)).astype(np.uint8)
+    row, col, in_view = view.cells(points[:, 0], points[:, 1])
+    in_view &= np.isfinite(points).all(axis=1)
+    index = np.full(surface.shape, -1, np.int32)
+    rising = np.flatnonzero(in_view)[np.argsort(points[in_view, 2], kind="stable")]
+    index[row[rising], col[rising]] = rising
+    observed = Observer(view, frame.layout.sensor).observe(read_only(points), index, height_m)
+    surface[~(observed & clear)] = IGNORE
+    return surface
+
+
+def cells_inside(polygons: Iterable[NDArray[np.float64]], view: TopViewGeometry) -> NDArray[np.bool_]:
+    """Cells whose center lies in a polygon (k, 2) of x, y [m], by the even-odd rule; (rows, columns) bool."""
+    x, y = (centers.ravel() for centers in view.cell_centers())
+    inside_any = np.zeros((len(x), len(y)), np.bool_)
+    for ring in polygons:
+        odd = np.zeros_like(inside_any)
+        for (x0, y0), (x1, y1) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+            rows = np.flatnonzero((x0 > x) != (x1 > x))  # rows that the edge crosses
+            if len(rows):
+                crossing = y0 + (x[rows] - x0) / (x1 - x0) * (y1 - y0)
+                odd[rows] ^= y[None, :] < crossing[:, None]
+        inside_any |= odd
+    return inside_any
+
+
 def simulated_truth(seed: int, view: TopViewGeometry | None) -> Truth:
     """Ground truth of a simulated scene, where everything is known. Each scene counts as a drive of its own."""
     name, scan = f"scene {seed}", simulated_scan(seed)
     cells: Cells = {} if view is None else {EVERY_CELL: (TOP_VIEW_CLASSES, scan.top_view_labels(view))}
     labels, road = labels_by_boxes(scan), (EVERY_CELL, "drivable")
     return Truth(name, name, scan.points, labels, scan.boxes, scan.box_points, _everywhere, cells, road)
+
+
+def _drawn(boxes: Sequence[Box], view: TopViewGeometry) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Vehicle in each cell, index into `TOP_VIEW_CLASSES` or 0, and the cells without an object of unknown class."""
+    vehicles, unclear = np.zeros((2, view.height, view.width), np.uint8)
+    draw_footprints(vehicles, boxes, view, TOP_VIEW_CLASSES)
+    # Cells of trams and "misc" objects are ignored: they belong to no class, but are not background.
+    strange = [replace(box, label="car") for box in boxes if box.label not in POINT_CLASS_OF]
+    draw_footprints(unclear, strange, view, TOP_VIEW_CLASSES)
+    return vehicles, unclear == 0
 
 
 def _cell_places(view: TopViewGeometry) -> NDArray[np.float64]:
