@@ -21,7 +21,7 @@ def add_parser(commands: Commands) -> None:
         "adaptation, with the remission mapped, with interpolation between beams, and with both.",
         examples=[
             "edgeperc eval-sensors os1-64=simulation:24",
-            "edgeperc eval-sensors pandar64=PandaSet/ vlp-16=simulation:8 --json out.json",
+            "edgeperc eval-sensors PandaSet/:pandaset vlp-16=simulation:8 --json out.json",
         ],
     )
     reading = parser.add_argument_group("input")
@@ -29,8 +29,8 @@ def add_parser(commands: Commands) -> None:
         "datasets",
         nargs="+",
         metavar="SENSOR=SOURCE",
-        help="a sensor's name or .json profile, and simulation:N, or a folder with velodyne/NAME.bin and "
-        "label/NAME.txt, or a folder of labeled range images NAME.npy",
+        help="a sensor's name or .json profile, and simulation:N or a folder of labeled range images NAME.npy; or "
+        "labeled scans, without SENSOR=: a folder with scans.json, or FOLDER:LAYOUT with the name of a public set",
     )
     models = parser.add_argument_group("models")
     models.add_argument(

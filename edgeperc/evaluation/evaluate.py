@@ -8,11 +8,10 @@ over resampled drives.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..errors import PointsError
+from ..errors import OptionError, PointsError
 from ..mounting import Mounting
 from ..perceiver import BoxesFrom
 from ..simulation.samples import FIRST_SEED
@@ -20,12 +19,16 @@ from ..zoo import DEFAULT
 from .datasets import KittiObjects, SemanticKitti
 from .judge import Judge
 from .mistakes import Mistakes
+from .scan_folder import ScanFolder, known_layouts
 from .tables import Record, figures
-from .truth import Truth
 
 __all__ = ["evaluate"]
 
 N_WORST = 20
+KINDS, OF_FOLDER = ("real", "semantickitti", "simulated"), "folder "
+
+_Figures = tuple[Record, Mistakes | None]
+_Scan = tuple[str, Callable[[], _Figures]]
 
 
 def evaluate(
@@ -47,7 +50,10 @@ def evaluate(
     Parameters
     ----------
     datasets : sequence of str or Path
-        Roots of a KITTI object set or of SemanticKITTI, or ``"simulation:N"`` for N simulated scans (default 24).
+        Roots of a KITTI object set or of SemanticKITTI, ``"simulation:N"`` for N simulated scans (default 24), or
+        labeled scans of any sensor: a folder with ``scans.json``, or ``"FOLDER:LAYOUT"``
+        (`scan_folder.ScanFolder.parse`). Those are perceived with the profile of their sensor, all round; the mounting
+        is found from the scans.
     models, road_by, provider, precision, boxes_from, mounted
         As in `Judge`.
     split : str or None
@@ -64,7 +70,8 @@ def evaluate(
     -------
     figures : dict
         ``"models"``, ``"providers"`` (as `Perceiver` has them), ``"split"``, ``"fold"``, and the `figures` of each kind
-        of scans in the datasets: ``"real"``, ``"semantickitti"``, ``"simulated"``.
+        of scans in the datasets: ``"real"``, ``"semantickitti"``, ``"simulated"``; and in ``"folders"`` those of
+        labeled scans of other sensors, by the name of the set.
     mistakes : list of Mistakes
         The twenty scans with most mistakes, worst first: real scans if there are any, else simulated ones.
 
@@ -72,60 +79,91 @@ def evaluate(
     ------
     PointsError
         A dataset is of an unknown kind, or has no scans of the split.
+    OptionError
+        ``mounted`` with scans of another sensor.
     SplitError
         A model was trained on a scan, and ``split`` is not ``"train"``.
     """
     split = split or ("test" if fold is None else "validation")
-    judge = Judge(
-        models,
-        provider=provider,
-        precision=precision,
-        road_by=road_by,
-        training_scans=split == "train",
-        boxes_from=boxes_from,
-        mounted=mounted,
-    )
-    scans = [scan for dataset in datasets for scan in _scans(judge, dataset, split, fold)]
+    options: dict[str, Any] = {"provider": provider, "precision": precision, "boxes_from": boxes_from}
+    options["training_scans"] = split == "train"
+    folders = {str(dataset): folder for dataset in datasets if (folder := _folder(dataset)) is not None}
+    if folders and (mounted is not None or road_by is not None):
+        raise OptionError(f"{next(iter(folders))} is of another sensor; mounted and road_by are for KITTI's scans")
+    judges: list[Judge] = []
+    scans: list[_Scan] = []
+    for folder in folders.values():
+        judges.append(Judge(models, sensor=folder.layout.sensor, **options))
+        scans += _folder_scans(judges[-1], folder, split, fold)
+    if len(folders) < len(datasets):
+        judges.append(Judge(models, road_by=road_by, mounted=mounted, **options))
+        scans += [s for d in datasets if str(d) not in folders for s in _scans(judges[-1], d, split, fold)]
     records: dict[str, list[Record]] = {}
     worst: dict[str, list[Mistakes]] = {}
-    for done, (block, read) in enumerate(scans, start=1):
-        record, mistakes = judge.record(read())
+    for done, (block, evaluated) in enumerate(scans, start=1):
+        record, mistakes = evaluated()
         records.setdefault(block, []).append(record)
         if mistakes is not None:
             ranked = sorted([*worst.get(block, ()), mistakes], key=lambda each: -each.n_errors)
             worst[block] = ranked[:N_WORST]
         on_scan(done, len(scans))
-    result: dict[str, Any] = {"models": {card.name: card.version for card in judge.perceive.cards}}
-    result |= {"providers": dict(judge.perceive.providers), "split": split, "fold": fold}
-    result |= {block: figures(of_block, n_resamples) for block, of_block in records.items()}
-    return result, worst.get("real") or worst.get("simulated", [])
+    perceive = judges[-1].perceive
+    result: dict[str, Any] = {"models": {card.name: card.version for card in perceive.cards}}
+    result |= {"providers": dict(perceive.providers), "split": split, "fold": fold}
+    blocks = {block: figures(of_block, n_resamples) for block, of_block in records.items()}
+    result |= {block: blocks.pop(block) for block in KINDS if block in blocks}
+    if blocks:
+        result["folders"] = {block.removeprefix(OF_FOLDER): of_block for block, of_block in blocks.items()}
+    in_order = ("real", *(block for block in worst if block.startswith(OF_FOLDER)), "simulated")
+    return result, next((worst[block] for block in in_order if block in worst), [])
 
 
-def _scans(judge: Judge, dataset: str | Path, split: str, fold: int | None) -> list[tuple[str, Callable[[], Truth]]]:
-    """For each scan of a dataset: its block of figures, and a function that reads the scan."""
+def _folder(dataset: str | Path) -> ScanFolder | None:
+    """The labeled scans of any sensor of a dataset; None if it is of another kind."""
+    root, (kind, colon, _) = Path(dataset), str(dataset).partition(":")
+    if kind == "simulation" or (root / "training" / "label_2").is_dir() or any(root.glob("sequences/*/labels")):
+        return None
+    if not colon and not (root / "scans.json").is_file():
+        raise PointsError(
+            f"{dataset} has no labeled scans; expected the root of a KITTI object set (training/label_2 below it), of "
+            "SemanticKITTI (sequences/*/labels below it), a folder with scans.json (docs/howto/train.md), "
+            f"FOLDER:LAYOUT with a layout of {', '.join(known_layouts())}, or the word simulation"
+        )
+    return ScanFolder.parse(dataset)
+
+
+def _folder_scans(judge: Judge, folder: ScanFolder, split: str, fold: int | None) -> list[_Scan]:
+    names = folder.names(split, fold=fold)
+    if not names:
+        raise PointsError(
+            f"{folder.root} has no scans of the {split} drives (fold: {fold}); pass another split, or 'all'"
+        )
+    return [(f"{OF_FOLDER}{folder.layout.name}", _later(judge.record_scan, folder.frame, name)) for name in names]
+
+
+def _scans(judge: Judge, dataset: str | Path, split: str, fold: int | None) -> list[_Scan]:
+    """For each scan of the other kinds: its block of figures, and a function that evaluates it."""
     kind, _, number = str(dataset).partition(":")
     if kind == "simulation":
         if not (number or "24").isdecimal() or number == "0":
             raise PointsError(f"got {dataset!r}; expected simulation, or simulation:N with a number of scans from 1")
-        return [("simulated", partial(judge.simulated, FIRST_SEED + k)) for k in range(int(number or 24))]
+        seeds = range(FIRST_SEED, FIRST_SEED + int(number or 24))
+        return [("simulated", _later(judge.record, judge.simulated, seed)) for seed in seeds]
     root = Path(dataset)
     if (root / "training" / "label_2").is_dir():
         objects = KittiObjects(root)
         names = objects.names(split, fold=fold)
-        scans = [("real", _later(judge.kitti, objects.frame, name)) for name in names]
-    elif any(root.glob("sequences/*/labels")):
+        read = objects.frame
+        scans = [("real", _later(judge.record, lambda n: judge.kitti(read(n)), name)) for name in names]
+    else:
         sequences = SemanticKitti(root)
         names = sequences.names(split, fold=fold)
-        scans = [("semantickitti", _later(judge.semantickitti, sequences.frame, name)) for name in names]
-    else:
-        raise PointsError(
-            f"{dataset} has no labeled scans; expected the root of a KITTI object set (training/label_2 below it), "
-            "of SemanticKITTI (sequences/*/labels below it), or the word simulation"
-        )
+        of = sequences.frame
+        scans = [("semantickitti", _later(judge.record, lambda n: judge.semantickitti(of(n)), name)) for name in names]
     if not scans:
         raise PointsError(f"{dataset} has no scans of the {split} drives (fold: {fold}); pass another split, or 'all'")
     return scans
 
 
-def _later(judge: Callable[[Any], Truth], read: Callable[[str], Any], name: str) -> Callable[[], Truth]:
-    return lambda: judge(read(name))
+def _later(evaluate: Callable[[Any], _Figures], read: Callable[[Any], Any], name: object) -> Callable[[], _Figures]:
+    return lambda: evaluate(read(name))

@@ -246,9 +246,9 @@ class ScanFrame:
 
     @cached_property
     def returns(self) -> tuple[int, ...]:
-        """Number of points in each box; 0 if it has fewer than the description's ``min_points``."""
-        counts = [int(np.count_nonzero(inside(box, self.points, 0.1))) for box in self.boxes or ()]
-        return tuple(n if n >= self.layout.min_points else 0 for n in counts)
+        """Number of points in each box; 0 if it has fewer than the description's ``min_points``, or is ignored."""
+        counts = [(box.label, int(np.count_nonzero(inside(box, self.points, 0.1)))) for box in self.boxes or ()]
+        return tuple(n if n >= self.layout.min_points and label != IGNORED else 0 for label, n in counts)
 
     @property
     def azimuths(self) -> tuple[float, float]:

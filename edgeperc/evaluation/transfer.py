@@ -11,30 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ModelError, PointsError
-from ..geometry import inside
 from ..perceiver import ADAPTATIONS, Perceiver
-from ..perception import Box
-from ..readers.files import read_points
 from ..sensor import SensorProfile, get_sensor
 from ..sensor_fit import fit_sensor
 from ..simulation.samples import FIRST_SEED, IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASSES
 from .metrics import Confusion
+from .scan_folder import ScanFolder, ScanFrame
 
 __all__ = ["Scan", "compare"]
 
 N_FITTED = 8  # scenes for a remission function, from seeds before the evaluated ones
 FARTHEST_M = 50.0
-
-# Point class -> names in label files. Other names, except those of `BACKGROUND`, count as unlabeled.
-CLASSES = {
-    1: ("car", "pickup_truck", "medium-sized_truck", "semi-truck", "truck", "van", "bus", "emergency_vehicle",
-        "type_vehicle", "regular_vehicle", "large_vehicle", "box_truck", "truck_cab", "bus/rv/caravan"),
-    2: ("pedestrian", "pedestrian_with_object", "person", "type_pedestrian"),
-    3: ("cyclist", "type_cyclist"),
-}  # fmt: skip
-BACKGROUND = ("cones", "pylons", "signs", "temporary_construction_barriers")
-RIDDEN_M = 1.4  # a bicycle box at least this high holds a rider
 
 # Train ids of PCLSegmentation's range images: Road to Vegetation, Person, Two-wheeler, Car, Truck, Bus, None.
 IMAGE_LABELS = np.array([0, 0, 0, 0, 0, 2, IGNORE, 1, 1, 1, IGNORE], np.uint8)
@@ -82,11 +70,11 @@ def compare(
     ----------
     datasets : sequence of str
         ``SENSOR=SOURCE``. The sensor is a built-in name or the file of a profile. The source is ``simulation:N``, a
-        folder with ``velodyne/NAME.bin`` and ``label/NAME.txt`` (class, x, y, z, length, width, height, yaw; a column
-        of zeros after the class is skipped), or a folder with range images ``NAME.npy`` (H, W, 6). Scans go through a
-        `Perceiver` as a user's do, with ``full_turn=True``: it finds the mounting, and nothing from the labels helps
-        it. The remission function of a simulated sensor is fitted to eight other scenes. That of a real sensor comes
-        from its profile.
+        folder of labeled scans (`scan_folder.ScanFolder.parse`), or one with range images ``NAME.npy`` (H, W, 6).
+        Labeled scans need no ``SENSOR=``, because their description names it. Their points are labeled by boxes, as
+        KITTI's are. Scans go through a `Perceiver` as a user's do, with ``full_turn=True``: it finds the mounting, and
+        nothing from the labels helps it. The remission function of a simulated sensor is fitted to eight other scenes.
+        That of a real sensor comes from its profile.
     model : str or Path
         A range-image model.
     provider, precision : str
@@ -163,7 +151,8 @@ def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]
     """Sensor and number of scans of a dataset, and a function that reads them."""
     sensor_name, equals, source = name.partition("=")
     if not equals:
-        raise PointsError(f"got {name!r}; expected SENSOR=SOURCE, such as os1-64=simulation:24 or pandar64=FOLDER")
+        folder = _folder(name)
+        return folder.layout.sensor, len(folder.drives), lambda: map(_of_frame, _frames(folder))
     sensor = get_sensor(sensor_name)
     kind, _, number = source.partition(":")
     if kind == "simulation":
@@ -173,21 +162,29 @@ def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]
         sensor = replace(sensor, remission_range=(0.0, _raw_model(sensor)[0]), remission=None)
         fitted, _ = fit_sensor([_simulated(sensor, FIRST_SEED - 1 - k).points for k in range(N_FITTED)], sensor)
         return fitted, n, lambda: (_simulated(sensor, FIRST_SEED + k) for k in range(n))
-    root = Path(source)
-    images = sorted(root.glob("*.npy"))
-    boxed = sorted(file for file in root.glob("label/*.txt") if (root / "velodyne" / f"{file.stem}.bin").exists())
-    if not images and not boxed:
+    images = sorted(Path(source).glob("*.npy"))
+    if images:
+        return sensor, len(images), lambda: map(_from_image, images)
+    folder = _folder(source)
+    return sensor, len(folder.drives), lambda: map(_of_frame, _frames(folder))
+
+
+def _folder(source: str) -> ScanFolder:
+    try:
+        return ScanFolder.parse(source)
+    except PointsError as exc:
         raise PointsError(
-            f"{root} has neither velodyne/NAME.bin with label/NAME.txt, nor range images NAME.npy; expected one of them"
-        )
+            f"{exc}. Expected SENSOR=simulation:N, SENSOR=FOLDER of range images NAME.npy, or labeled scans: a folder "
+            "with scans.json, or FOLDER:LAYOUT"
+        ) from exc
 
-    def read() -> Iterator[Scan]:
-        for file in images:
-            yield _from_image(file)
-        for file in boxed:
-            yield _from_boxes(root / "velodyne" / f"{file.stem}.bin", file)
 
-    return sensor, len(images) + len(boxed), read
+def _frames(folder: ScanFolder) -> Iterator[ScanFrame]:
+    return map(folder.frame, folder.names("all"))
+
+
+def _of_frame(frame: ScanFrame) -> Scan:
+    return Scan(frame.name, frame.points, frame.labels(by=None if frame.boxes is None else "boxes"))
 
 
 def _raw_model(sensor: SensorProfile) -> tuple[float, tuple[float, ...], tuple[float, ...]]:
@@ -219,18 +216,3 @@ def _from_image(path: Path) -> Scan:
             f"{path}: labels from {labels.min()} to {labels.max()}; expected 0 to {len(IMAGE_LABELS) - 1}"
         )
     return Scan(path.stem, np.ascontiguousarray(pixels[:, :4], np.float32), IMAGE_LABELS[labels])
-
-
-def _from_boxes(scan: Path, label: Path) -> Scan:
-    points = read_points(scan)
-    labels = np.zeros(len(points), np.uint8)
-    lines = [line.split() for line in label.read_text().splitlines() if line.strip()]
-    first = 2 if all(columns[1] == "0" for columns in lines) else 1  # some files have a column that is always 0
-    for columns in lines:
-        x, y, z, length, width, height, yaw = (float(v) for v in columns[first : first + 7])
-        name = columns[0].lower()
-        kind = next((k for k, names in CLASSES.items() if name in names), 0 if name in BACKGROUND else IGNORE)
-        if name == "bicycle" and height >= RIDDEN_M:
-            kind = 3
-        labels[inside(Box(name, 1.0, (x, y, z), (length, width, height), yaw), points, 0.05)] = kind
-    return Scan(scan.stem, points, labels)
