@@ -11,6 +11,7 @@ from edgeperc.simulation.samples import IGNORE
 from .targets import REGRESSED_FROM
 
 __all__ = [
+    "FRONT_WEIGHT",
     "GEOMETRY_WEIGHTS",
     "box_distillation_loss",
     "cross_entropy",
@@ -26,6 +27,9 @@ __all__ = [
 # Offsets, log sizes and the doubled angle have errors of similar size in an untrained head. z and height count half,
 # because no metric uses them.
 GEOMETRY_WEIGHTS = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.5, 0.5)
+FRONT_WEIGHT = 0.5
+"""Weight of the front's cross-entropy among the errors of a box, which it is as large as before training."""
+N_GEOMETRY = 1 + len(GEOMETRY_WEIGHTS)
 
 
 def cross_entropy(
@@ -110,17 +114,17 @@ def distillation_loss(logits: Tensor, probabilities: Tensor) -> Tensor:
 
 
 def box_distillation_loss(predicted: Tensor, teacher: Tensor) -> Tensor:
-    """Difference of dense boxes (B, 9, H, W) from a teacher's: cross-entropy of the heat maps plus L1 of the geometry.
+    """Difference of dense boxes (B, 9 or 10, H, W) from a teacher's: cross-entropy of the heat maps, and box errors.
 
-    Both are divided by the sum of the teacher's heat, which also weights the L1.
+    Both are divided by the sum of the teacher's heat, which also weights the errors (`dense_loss`). Fronts count if
+    both networks predict them.
     """
     predicted, teacher = predicted.float(), teacher.float()
     heat = teacher[:, 0].sigmoid()
     heat_loss = F.binary_cross_entropy_with_logits(predicted[:, 0], heat, reduction="sum")
     share = heat * (heat >= REGRESSED_FROM)
-    error = (predicted[:, 1:] - teacher[:, 1:]).abs() * predicted.new_tensor(GEOMETRY_WEIGHTS).view(1, -1, 1, 1)
-    total = share.sum().clamp(min=1.0)
-    return (heat_loss + (error.sum(1) * share).sum()) / total
+    error = _box_error(predicted, torch.cat([teacher[:, :N_GEOMETRY], teacher[:, N_GEOMETRY:].sigmoid()], dim=1))
+    return (heat_loss + (error * share).sum()) / share.sum().clamp(min=1.0)
 
 
 def slots_loss(predicted: Tensor, target: Tensor) -> Tensor:
@@ -137,9 +141,10 @@ def slots_loss(predicted: Tensor, target: Tensor) -> Tensor:
 def dense_loss(predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """Loss of the heat map (penalty-reduced focal loss; Zhou et al., 2019) and of the geometry (L1).
 
-    Both arguments are (B, 9, H, W), the target from `dense_targets`. The heat map's loss is a sum divided by the number
-    of boxes. An error of the geometry is the sum of a cell's absolute errors, weighted by `GEOMETRY_WEIGHTS`. The
-    geometry's loss is the mean error of the cells with a heat of at least `REGRESSED_FROM`, weighted by the heat.
+    The prediction is (B, 9 or 10, H, W), the target (B, 10, H, W) from `dense_targets`. The heat map's loss is a sum
+    divided by the number of boxes. An error of the geometry is the sum of a cell's absolute errors, weighted by
+    `GEOMETRY_WEIGHTS`, plus `FRONT_WEIGHT` times the cross-entropy of the front if it is predicted. The geometry's loss
+    is the mean error of the cells with a heat of at least `REGRESSED_FROM`, weighted by the heat.
     """
     predicted = predicted.float()
     logit, heat = predicted[:, 0], target[:, 0]
@@ -150,9 +155,17 @@ def dense_loss(predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     heat_loss = -(torch.where(center, hit, miss) * known).sum() / center.sum().clamp(min=1)
 
     share = heat * (heat >= REGRESSED_FROM)
-    error = (predicted[:, 1:] - target[:, 1:]).abs() * predicted.new_tensor(GEOMETRY_WEIGHTS).view(1, -1, 1, 1)
-    geometry_loss = (error.sum(1) * share).sum() / share.sum().clamp(min=1.0)
+    geometry_loss = (_box_error(predicted, target) * share).sum() / share.sum().clamp(min=1.0)
     return heat_loss, geometry_loss
+
+
+def _box_error(predicted: Tensor, target: Tensor) -> Tensor:
+    """Error of each cell's box, (B, H, W); the target's front is a probability."""
+    apart = (predicted[:, 1:N_GEOMETRY] - target[:, 1:N_GEOMETRY]).abs()
+    error = (apart * predicted.new_tensor(GEOMETRY_WEIGHTS).view(1, -1, 1, 1)).sum(1)
+    for logit, front in zip(predicted[:, N_GEOMETRY:].unbind(1), target[:, N_GEOMETRY:].unbind(1), strict=False):
+        error = error + FRONT_WEIGHT * F.binary_cross_entropy_with_logits(logit, front, reduction="none")
+    return error
 
 
 def ssadnet_loss(
@@ -175,7 +188,7 @@ def ssadnet_loss(
     labels : (B, H, W) integer
         As for `cross_entropy`.
     box_targets : Tensor
-        Shaped like ``boxes``: (B, n_slots, 4) from `slot_targets`, or (B, 9, H/4, W/4) from `dense_targets`.
+        As ``boxes``: (B, n_slots, 4) from `slot_targets`, or (B, 10, H/4, W/4) from `dense_targets`.
     lw_seg, lw_det : float
         Weights of the two losses (Table 2).
     class_weights : (C,) float, optional

@@ -34,6 +34,7 @@ from edgeperc.evaluation.datasets import SEQUENCE_DRIVES, KittiObjects, scan_has
 from edgeperc.evaluation.evaluate import evaluate
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
 from edgeperc.evaluation.splits import in_split
+from edgeperc.network_input import project
 from edgeperc.projection import make_projector
 from edgeperc.readers.files import read_points
 from edgeperc.session import Session
@@ -164,7 +165,7 @@ class _Calibrated:
     ) -> _Calibrated:
         """Calibrate the model of a file on scans."""
         model, projector = _folded(path), make_projector(card.view, card.input)
-        views = [projector.project(np.ascontiguousarray(points)) for points in scans]
+        views = [project(projector, np.ascontiguousarray(points, np.float32)) for points in scans]
         images = [view.image[None] for view in views]
         with tempfile.TemporaryDirectory() as folder:
             onnx.save(model, f"{folder}/folded.onnx")
@@ -482,7 +483,7 @@ def _parity(path: Path, rounded: Path) -> dict[str, float]:
     card = sessions[0].card
     projector = make_projector(card.view, card.input)
     for points in scans:
-        image = projector.project(points).image
+        image = project(projector, points).image
         labels = []
         for session in sessions:
             session.input[:] = image

@@ -62,6 +62,15 @@ class Recipe:
         edge=False,
         choices=("dense", "slots"),
     )
+    front: bool = _option(
+        False, "the box head also predicts which end of a vehicle is its front; only with head dense", TASKS["vehicles"]
+    )
+    height_above_ground: bool = _option(
+        False, "the input has a channel with the height of each point above the ground", TASKS["points"]
+    )
+    classes: tuple[str, ...] = _option(
+        (), "classes of points, the background first, separated by commas; empty: those of edgeperc", TASKS["points"]
+    )
     steps: int = _option(2000, "training steps")
     batch: int = _option(8, "scans in each step")
     optimizer: str = _option("adamw", "optimizer", choices=("adamw", "adam", "adagrad"))

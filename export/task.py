@@ -38,7 +38,8 @@ Targets: TypeAlias = "tuple[NDArray[Any], ...]"
 """Labels (H, W) uint8, and box targets if the network has boxes; in a batch, stacked along a new first axis."""
 
 # Vehicles are 4 % of the labeled pixels, pedestrians and cyclists 0.2 %.
-POINT_WEIGHTS = (1.0, 2.0, 4.0, 4.0)
+POINT_WEIGHTS = {"background": 1.0, "car": 2.0, "pedestrian": 4.0, "cyclist": 4.0}
+OWN_WEIGHT = 2.0  # of a class that is not among these
 TOP_VIEW_WEIGHTS = (1.0, 1.0, 2.0, 4.0, 4.0)
 
 # Slots: the paper's weight (Table 2). Dense: this head's loss, a sum for each box, is about ten times as large as the
@@ -147,7 +148,9 @@ class Points(Task):
     def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
         """`pointseg_loss`; with deep supervision, plus that of the early logits."""
         recipe, (labels,) = self.recipe, targets
-        weights = torch.tensor(POINT_WEIGHTS, device=labels.device) if recipe.class_weights else None
+        weights = None
+        if recipe.class_weights:
+            weights = torch.tensor([POINT_WEIGHTS.get(c, OWN_WEIGHT) for c in self.classes], device=labels.device)
 
         def one(logits: Tensor, labels: Tensor) -> Tensor:
             gamma, lovasz = recipe.focal_gamma, recipe.lovasz_weight
@@ -193,7 +196,7 @@ class Vehicles(Task):
         """Towards the teacher's classes, and towards its boxes if the head is dense."""
         loss = super().distillation(outputs, probabilities, boxes)
         if self.recipe.head == "dense":
-            if boxes is None or boxes.shape != outputs[1].shape:
+            if boxes is None or boxes.ndim != 4 or boxes.shape[2:] != outputs[1].shape[2:]:
                 raise ValueError('the teacher has no dense boxes; give --teacher a network with head "dense"')
             loss = loss + BOX_WEIGHT["dense"] * box_distillation_loss(outputs[1], boxes)
         return loss
@@ -245,7 +248,7 @@ class Road(Task):
 def task_of(recipe: Recipe) -> Task:
     """The task of a recipe's network."""
     tasks: dict[str, Callable[[Recipe, ModelCard], Task]] = {"points": Points, "vehicles": Vehicles, "road": Road}
-    return tasks[recipe.task](recipe, card_of(recipe.network, recipe.head, version="0"))
+    return tasks[recipe.task](recipe, card_of(recipe, version="0"))
 
 
 def _logits(outputs: Outputs) -> Tensor:

@@ -24,6 +24,7 @@ from edgeperc.card import CARD_KEY, Golden, ModelCard
 from edgeperc.decode import decode_classes, decode_top_view
 from edgeperc.errors import EdgepercError
 from edgeperc.fitness import FitnessProfile
+from edgeperc.network_input import project
 from edgeperc.projection import make_projector
 from edgeperc.session import Session, golden_input
 
@@ -195,7 +196,7 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
     projector = make_projector(card.view, card.input)
     worst, agreement, box_deviation = 0.0, 1.0, 0.0
     for points in scans:
-        projected = projector.project(np.ascontiguousarray(points))
+        projected = project(projector, np.ascontiguousarray(points, np.float32))
         with torch.no_grad():
             outputs = network.eval()(torch.from_numpy(projected.image[None]))
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
@@ -213,7 +214,7 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
             if kinds != expected_kinds:
                 raise ParityError(f"{path}: onnxruntime finds the boxes {kinds}, torch {expected_kinds}")
             for box, other in zip(boxes, expected_boxes, strict=True):
-                difference = np.abs(np.array([*box.center, *box.size]) - np.array([*other.center, *other.size]))
+                difference = np.abs(np.subtract([*box.center, *box.size], [*other.center, *other.size]))
                 box_deviation = max(box_deviation, float(difference.max()))
         else:
             ((kind, logits),) = expected.items()
@@ -274,8 +275,7 @@ def export(
     """
     network, recipe, notes = load(checkpoint)
     card = card_of(
-        recipe.network,
-        recipe.head,
+        recipe,
         name=name or recipe.network,
         version=version,
         fitness=None if fitness is None else fitness.to_dict(),

@@ -13,6 +13,7 @@ from edgeperc.decode import decode_classes, decode_dense, decode_slots, decode_t
 from edgeperc.errors import CardMismatchError, InferenceError
 from edgeperc.geometry import draw_footprints
 from edgeperc_export.cards import card_of
+from edgeperc_export.recipe import Recipe
 
 CLASSES = ("background", "drivable", "car", "van", "truck")
 VEHICLES = CLASSES[2:]
@@ -328,7 +329,7 @@ def test_only_the_best_slots_become_boxes():
 
 
 def test_boxes_are_drawn_into_the_map():
-    card = card_of("ssadnet", version="1")
+    card = card_of(Recipe("ssadnet"), version="1")
     drivable, stray = CLASSES.index("drivable"), CLASSES.index("van")
     logits = class_logits((slice(0, 10), slice(None), drivable, 9.0), (slice(350, 360), slice(0, 20), stray, 9.0))[0]
     dense = dense_of((26.0, 0.0, -1.0, 4.0, 1.6, 1.5, 0.0, 2.0), (38.0, 5.0, -1.0, 10.0, 2.6, 3.2, 0.4, 2.0))[0]
@@ -345,7 +346,7 @@ def test_boxes_are_drawn_into_the_map():
 
 
 def test_slot_boxes_do_not_change_the_map():
-    card = card_of("ssadnet", "slots", version="1")
+    card = card_of(Recipe("ssadnet", head="slots"), version="1")
     logits = class_logits((slice(100, 140), slice(50, 66), CLASSES.index("van"), 9.0))[0]
     slots = np.zeros((2, 4), np.float32)
     slots[0] = 58 / 200, 120 / 400, 20 / 200, 44 / 400

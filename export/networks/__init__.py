@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import nn
 
+from ..cards import card_of
 from ..recipe import Recipe, task_name
 from .edge import PointSegEdge, SSADNetEdge
 from .kulseg import KULSeg
@@ -27,18 +30,23 @@ def build(recipe: Recipe) -> nn.Module:
         The network or its head is unknown, or the network has no version for small computers.
     """
     task_name(recipe.network)  # raises ValueError for an unknown network
+    card = card_of(recipe, version="0")
+    sizes: dict[str, Any] = {"n_channels": len(card.input.channels), "n_classes": len(card.classes)}
+    if recipe.network == "ssadnet":
+        sizes["front"] = recipe.front
     torch.manual_seed(recipe.seed)
     if recipe.edge:
         if recipe.network not in EDGE:
             raise ValueError(f"{recipe.network} has no network for small computers; expected {' or '.join(EDGE)}")
-        return EDGE[recipe.network]()
+        return EDGE[recipe.network](**sizes)
+    sizes["dropout"] = recipe.dropout
     if recipe.network == "pointseg":
-        return PointSeg(dropout=recipe.dropout, deep_supervision=recipe.deep_supervision > 0.0)
+        return PointSeg(**sizes, deep_supervision=recipe.deep_supervision > 0.0)
     if recipe.network == "squeezesegv2":
-        return SqueezeSegV2(dropout=recipe.dropout)
+        return SqueezeSegV2(**sizes)
     if recipe.network == "kulseg":
-        return KULSeg(dropout=recipe.dropout)
+        return KULSeg(**sizes)
+    sizes |= {"context_width": recipe.context_width, "batch_norm": recipe.batch_norm}
     if recipe.network == "lodnn":
-        return LoDNN(context_width=recipe.context_width, batch_norm=recipe.batch_norm, dropout=recipe.dropout)
-    width, norm = recipe.context_width, recipe.batch_norm
-    return SSADNet(head=recipe.head, context_width=width, batch_norm=norm, dropout=recipe.dropout)
+        return LoDNN(**sizes)
+    return SSADNet(head=recipe.head, **sizes)

@@ -25,6 +25,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from edgeperc.card import N_DENSE_CHANNELS
+
 __all__ = [
     "CONTEXT_DILATIONS",
     "ELU_GAIN",
@@ -217,11 +219,12 @@ class SlotsHead(nn.Module):
 class DenseHead(nn.Module):
     """An anchor-free regressor on F.E. blocks 1 to 3: one prediction every four cells.
 
-    Out: (B, 9, H/4, W/4): heat-map logit; offset of the center from the output cell's center in rows, columns [output
-    cells]; log length, log width [m]; sin and cos of twice the yaw; center z [m]; log height [m].
+    Out: (B, 9 or 10, H/4, W/4): heat-map logit; offset of the center from the output cell's center in rows, columns
+    [output cells]; log length, log width [m]; sin and cos of twice the yaw; center z [m]; log height [m]; with
+    ``front``, the logit that the yaw in -pi/2..pi/2 points to the front.
     """
 
-    def __init__(self, c_in: int) -> None:
+    def __init__(self, c_in: int, front: bool = False) -> None:
         super().__init__()
         self.fine = nn.Sequential(
             FeatureBlock(c_in, 16, extra=False),  # -> (B, 16, 200, 100)
@@ -234,12 +237,12 @@ class DenseHead(nn.Module):
             conv_bn_elu(64, 64),
         )
         self.merge = nn.Sequential(conv_bn_elu(32 + 64, 64), conv_bn_elu(64, 64))  # -> (B, 64, 100, 50)
-        self.predict = nn.Conv2d(64, 9, 1)
+        self.predict = nn.Conv2d(64, N_DENSE_CHANNELS + front, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         fine = self.fine(x)
         coarse = _double(self.coarse(fine))
-        return self.predict(self.merge(torch.cat([fine, coarse], dim=1)))  # (B, 9, 100, 50)
+        return self.predict(self.merge(torch.cat([fine, coarse], dim=1)))  # (B, 9 or 10, 100, 50)
 
 
 class SSADNet(nn.Module):
@@ -259,16 +262,18 @@ class SSADNet(nn.Module):
         Probability of the spatial dropout in the context module and of the dropout in the B.B.R. blocks.
     batch_norm : bool
         Use batch norm in the segmentation branch too.
+    front : bool
+        Head "dense" also predicts which end of a vehicle is its front.
 
     Raises
     ------
     ValueError
-        The head is unknown.
+        The head is unknown, or head "slots" should predict fronts.
 
     Notes
     -----
     In: (B, 3, 400, 200) float32; any height and width divisible by 8 (head "slots": at least 32).
-    Out: segmentation logits (B, 5, 400, 200), and boxes (B, n_slots, 4) or (B, 9, 100, 50), float32.
+    Out: segmentation logits (B, 5, 400, 200), and boxes (B, n_slots, 4) or (B, 9 or 10, 100, 50), float32.
     """
 
     def __init__(
@@ -281,17 +286,18 @@ class SSADNet(nn.Module):
         context_width: int = 128,
         dropout: float = 0.25,
         batch_norm: bool = False,
+        front: bool = False,
     ) -> None:
         super().__init__()
         self.segmentation = SegmentationBranch(n_channels, n_classes, context_width, dropout, batch_norm)
         bridge = n_channels + 32
         self.detection: nn.Module
-        if head == "slots":
+        if head == "slots" and not front:
             self.detection = SlotsHead(bridge, n_slots, dropout)
         elif head == "dense":
-            self.detection = DenseHead(bridge)
+            self.detection = DenseHead(bridge, front)
         else:
-            raise ValueError(f'head is {head!r}; expected "slots" or "dense"')
+            raise ValueError(f'head is {head!r} with front={front}; expected "slots" without front, or "dense"')
         self._initialize(dropout)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
