@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import hypothesis
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,12 +21,15 @@ from hypothesis import strategies as st
 import edgeperc.zoo
 from edgeperc import cli
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.cli import eval
+from edgeperc.cli.output import print_line
 from edgeperc.errors import ModelError, PointsError, SplitError
 from edgeperc.evaluation import evaluate
+from edgeperc.evaluation.causes import count_causes
 from edgeperc.evaluation.datasets import Calibration, Frame, KittiObjects, RoadFrame, SemanticKitti, scan_hash
 from edgeperc.evaluation.judge import Judge
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
-from edgeperc.evaluation.tables import BANDS, Record, banded, figures
+from edgeperc.evaluation.tables import BANDS, FEWEST_OBJECTS, Record, banded, figures
 from edgeperc.evaluation.unseen import training_scans_of
 from edgeperc.perception import Box, Perception, PointLabels, TopView
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE
@@ -141,7 +146,8 @@ def test_points_by_hand(world: World) -> None:
     table = evaluated(Judge(["pointseg"]), frame(near, far, rider, van, points=points))["points"]
     assert set(table) == set(BANDS)
     car = table["all"]["car"]
-    assert (car["n_points"], car["n_objects"]) == (4 + 2 + 3, 2)
+    assert (car["n_points"], car["n_boxes"], car["n_objects"], car["n_drives"]) == (4 + 2 + 3, 2, 2, 1)
+    assert car["few"] is True
     assert car["precision"] == pytest.approx(8 / 11, abs=1e-4)
     assert car["recall"] == pytest.approx(8 / 9, abs=1e-4)
     assert car["iou"] == pytest.approx(8 / 12, abs=1e-4)
@@ -155,9 +161,8 @@ def test_points_by_hand(world: World) -> None:
         "precision": 0.5,
         "recall": 0.5,
         "iou": pytest.approx(1 / 3, abs=1e-4),
-        "iou_interval": None,
+        **dict.fromkeys(("precision_interval", "recall_interval", "iou_interval")),
         "n_points": 2,
-        "n_objects": 0,
     }
     assert table["all"]["pedestrian"]["iou"] is None
 
@@ -216,6 +221,198 @@ def test_boxes_of_clusters_by_hand(world: World) -> None:
     assert counts == {"car": [3, 3, 2], "van": [1, 0, 0], "pedestrian": [1, 1, 1]}
     assert [table["vehicle"][k] for k in ("n_truth", "n_predicted", "n_hits")] == [4, 3, 3]  # nobody on foot
     assert "boxes" not in evaluated(Judge(["pointseg"]), frame_of_all)
+
+
+def test_boxes_all_round_by_hand(world: World) -> None:
+    car, van, beside, hidden = box(10, 0), box(20, 4, "van"), box(30, -13), box(36, 0)
+    person, rider = (
+        replace(box(20, y, name), size=(0.8, 0.6, 1.7)) for y, name in ((-5, "pedestrian"), (-9, "cyclist"))
+    )
+    seated = replace(person, label="person_sitting", center=(24.0, -5.0, -1.0))
+    every = (car, van, beside, person, rider, seated)
+    one = frame(*every, hidden, points=[p for each in every for p in hits(each, 3)] + hits(hidden, 2))
+    world.boxes = (
+        replace(box(10, 0, score=0.9), yaw=math.pi),  # front for rear
+        box(20, 4, "car", score=0.8),  # a van, called a car
+        box(30, -13, score=0.7),  # beside the view of the network
+        box(36, 0, score=0.7),  # two returns: may be found
+        replace(person, score=0.6, center=(20.3, -5.0, -1.0), yaw=0.2),  # IoU 0.4
+        replace(rider, score=0.5, label="pedestrian"),  # another class: wrong
+        replace(seated, score=0.4, label="pedestrian"),  # may be found
+        replace(person, score=0.3, center=(9.0, -20.0, -1.0)),  # out of the camera's sight
+    )
+    for models in (["ssadnet"], ["pointseg", "ssadnet"]):
+        result = evaluated(Judge(models), one)
+        rows = result["all_round"]["all"]
+        counts = {name: [row[k] for k in ("n_truth", "n_predicted", "n_hits")] for name, row in rows.items()}
+        assert counts == {
+            "car": [2, 3, 2],
+            "van": [1, 0, 0],
+            "vehicle": [3, 3, 3],
+            "pedestrian": [1, 2, 1],
+            "cyclist": [1, 0, 0],
+            "person": [2, 2, 2],
+        }
+        assert rows["vehicle"]["ap"] == rows["pedestrian"]["ap"] == 1.0
+        assert (rows["cyclist"]["ap"], rows["cyclist"]["precision"], rows["cyclist"]["few"]) == (0.0, None, True)
+        assert "mean_ap" not in rows
+        heading = result["heading"]["all"]
+        assert heading["vehicle"] == {
+            **{"heading": pytest.approx(2 / 3, abs=1e-4), "heading_interval": None, "axis": 1.0, "axis_interval": None},
+            **{"n_hits": 3, "n_objects": 2, "few": True},  # the cars have one size
+        }
+        assert heading["pedestrian"]["heading"] == 1.0
+        assert heading["cyclist"]["heading"] is None
+        assert result["heading"]["0-15 m"]["car"]["heading"] == 0.0
+        # Labels are counted with those of other classes.
+        assert result["labeled"]["car"] == {"n_boxes": 2, "n_objects": 1, "n_drives": 1, "few": True}
+        assert set(result["labeled"]) == {"car", "van", "pedestrian", "cyclist", "person_sitting"}
+    assert not {"all_round", "heading"} & {*evaluated(Judge(["pointseg"]), one)}
+
+
+def test_unknown_places_are_not_all_round(world: World) -> None:
+    seen, dont_care = box(10, 0), box(20, 0)
+    points = [p for each in (seen, dont_care) for p in hits(each, 3)]
+    world.boxes = (seen, dont_care)
+    # The center of the second is at column 621, row 187 + 621 / 20 of the image.
+    one = frame(seen, dont_care, points=points, unlabeled=[[600, 210, 640, 225]])
+    row = evaluated(Judge(["ssadnet"]), one)["all_round"]["all"]["car"]
+    assert [row[k] for k in ("n_truth", "n_predicted", "n_hits")] == [1, 1, 1]
+
+
+def test_few_objects_are_marked() -> None:
+    boxes = [replace(box(10 + 5 * k, 0), size=(4.0 + 0.1 * k, 2.0, 1.6)) for k in range(FEWEST_OBJECTS)]
+    for n in (0, 1, FEWEST_OBJECTS - 1, FEWEST_OBJECTS):
+        evaluator = BoxEvaluator(together=("car",))
+        evaluator.update(boxes[:n], boxes[:n], drive="a")
+        evaluator.update(boxes[:n], boxes[:n], drive="a")
+        rows = figures([Record("", "a", {("all_round", "vehicle"): evaluator})])
+        assert rows["all_round"]["all"]["vehicle"].get("few", False) is (n < FEWEST_OBJECTS)
+        assert rows["heading"]["all"]["vehicle"].get("few", False) is (n < FEWEST_OBJECTS)
+        lines = [line for line in eval._box_lines(rows) if line.startswith("  all")]  # car, before vehicle
+        assert [f"car{eval._FEW}" in line for line in lines] == [n < FEWEST_OBJECTS] * (2 if n else 0)
+    assert f"n<{FEWEST_OBJECTS}" in eval._FEW
+
+
+# --- causes of errors ------------------------------------------------------------------------------------------------
+
+
+def street() -> np.ndarray:
+    """A floor 1.73 m below the sensor."""
+    x, y = np.meshgrid(np.arange(-20.0, 40.0, 0.25), np.arange(-15.0, 15.0, 0.25))
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.73), np.zeros(x.size)], axis=1).astype(np.float32)
+
+
+def counted(objects: list[tuple[list[float], int, int]], boxes: tuple[Box, ...] = ()) -> dict[str, Any]:
+    """Causes of objects of (x, y, z), predicted class, true class on a street."""
+    places = np.array([[*place, 0.0] for place, _, _ in objects], np.float32).reshape(-1, 4)
+    points = np.concatenate([places, street()])
+    labels, right = np.zeros((2, len(points)), np.uint8)
+    labels[: len(objects)], right[: len(objects)] = [o[1] for o in objects], [o[2] for o in objects]
+    seen = np.ones(len(points), bool)
+    tallies = count_causes(points, labels, right, right != IGNORE, seen, boxes, "a")
+    result = figures([Record("", "a", tallies)], 0)
+    return {**{what: {c: row["n_points"] for c, row in rows.items()} for what, rows in result["errors"].items()}} | {
+        "bumper": result["bumper"]["n_points"],
+        "rows": result["errors"],
+    }
+
+
+def test_causes_of_missed_points_by_hand() -> None:
+    car, far, truck = box(10, 0), box(35, 0), replace(box(34, 6, "truck"), size=(9.0, 2.6, 3.0))
+    rider = replace(box(12, -6, "cyclist"), size=(1.8, 0.6, 1.7))
+    objects = [([10.0, 0.1 * k, -1.0], 0, 1) for k in range(3)] + [([11.0, 0, -1.0], 1, 1)] * 2
+    objects += [([35.0, 0.1 * k, -1.0], 0, 1) for k in range(4)]
+    objects += [([33.0, 6.0, -1.0 + 0.1 * k], 2, 1) for k in range(5)] + [([28.0, 6.0, -1.0], 0, 1)]
+    objects += [([12.0, -6.0, -1.0], 2, 3)] * 2 + [([12.0, -6.1, -1.0], 0, 3)]
+    found = counted(objects, (car, far, truck, rider))
+    assert found["missed car"] == {"all": 3 + 4 + 5 + 1, "in vans and trucks": 5, "beyond 30 m": 4 + 5}
+    assert found["missed cyclist"] == {"all": 3, "of other objects": 2, "beyond 30 m": 0}
+    assert found["missed pedestrian"] == {"all": 0, "of other objects": 0, "beyond 30 m": 0}
+    rows = found["rows"]
+    assert (rows["missed car"]["all"]["share"], rows["missed car"]["all"]["n_of"]) == (
+        pytest.approx(13 / 15, abs=1e-4),
+        15,
+    )
+    assert rows["missed car"]["beyond 30 m"]["share"] == pytest.approx(9 / 13, abs=1e-4)
+    # Both cars have one size, so they are one object; the truck is another.
+    assert [rows["missed car"][c]["n_objects"] for c in ("all", "in vans and trucks", "beyond 30 m")] == [2, 1, 2]
+    assert rows["missed pedestrian"]["all"]["share"] is None
+    # What is called a pedestrian and is none, is false.
+    assert found["false pedestrian"] == {
+        **{"all": 7, "of other objects": 7, "within 0.4 m of an object": 0, "on poles": 0}
+    }
+
+
+def test_causes_of_false_points_by_hand() -> None:
+    car = box(10, 0)
+    wall = [([15.0 + 0.2 * k, 8.0, -1.0], 1, 0) for k in range(46)]  # 9 m
+    hedge = [([15.0 + 0.2 * k, -8.0, -1.0], 1, 0) for k in range(36)]  # 7 m
+    mast = [([25.0, 0.0, -1.5 + 0.2 * k], 1, 0) for k in range(25)]  # 4.8 m
+    beside = [([12.3, 0.0, -1.0], 1, 0), ([12.5, 0.0, -1.0], 1, 0)]  # 0.3 and 0.5 m off
+    found = counted([*wall, *hedge, *mast, *beside, ([20.0, 5.0, -1.73], 1, 0), ([22.0, 3.0, -1.0], 1, 2)], (car,))
+    assert found["false car"] == {
+        "all": 46 + 36 + 25 + 2 + 1 + 1,
+        "of other objects": 1,
+        "within 0.4 m of an object": 1,
+        "on large structures": 46 + 25,
+        "on the ground": 1,
+    }
+    person = [([20.0, 4.0, z], 2, 0) for z in (-1.0, -0.5, 0.0)]
+    sign = [([20.0, -4.0, z], 2, 0) for z in (-1.0, -0.5, 0.0)] + [
+        ([20.2, -4.1, 0.6], 0, 0)
+    ]  # 0.22 m aside, 2.3 m high
+    crown = [([24.0, -4.0, -1.0], 3, 0), ([24.4, -4.0, 2.0], 0, 0)]  # 0.4 m aside
+    found = counted([*person, *sign, *crown])
+    assert found["false pedestrian"]["all"] == 6
+    assert found["false pedestrian"]["on poles"] == 3
+    assert (found["false cyclist"]["all"], found["false cyclist"]["on poles"]) == (1, 0)
+
+
+def test_points_at_the_bumper_by_hand() -> None:
+    at = [3.0, 1.0, -1.6]
+    assert counted([(at, 1, 0), (at, 1, IGNORE), ([-3.0, 2.9, -1.6], 1, IGNORE)])["bumper"] == 3
+    beyond = [[4.6, 1.0, -1.6], [3.0, 3.1, -1.6], [3.0, -3.1, -1.6], [3.0, 1.0, -1.4]]
+    assert counted([(place, 1, 0) for place in beyond])["bumper"] == 0
+    assert counted([(at, 2, 0), (at, 0, 0), (at, 1, 1), (at, 1, 3)])["bumper"] == 0  # no car; an object
+
+
+def test_bumper_has_an_interval_of_points(world: World) -> None:
+    at = [3.0, 1.0, -1.6, 1.0]
+    result = evaluated(Judge(["pointseg"]), frame(points=[at] * 4), frame(points=[[9.0, 0, 0, 0]], drive="b"))
+    assert result["bumper"] == {"n_points": 4, "n_scans": 1, "n_drives": 1, "n_points_interval": [0, 8]}
+    assert ["car", "at", "the", "own", "bumper", "all", "-", "-", "4", "0-8", "-", "1", "-", "1"] in [
+        line.split() for line in eval._error_lines(result)
+    ]
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_causes_of_a_scan_without_ground(n: int) -> None:
+    points = np.full((n, 4), np.nan, np.float32)
+    nothing = np.zeros(n, np.uint8)
+    tallies = count_causes(points, nothing, nothing, nothing > 0, nothing > 0, (), "a")
+    result = figures([Record("", "a", tallies)], 0)
+    assert result["bumper"]["n_points"] == 0
+    assert all(
+        row["n_points"] == 0 and row["share"] is None for rows in result["errors"].values() for row in rows.values()
+    )
+
+
+POINT = st.tuples(
+    *(st.sampled_from([v / 10 for v in range(-12, 13)]) for _ in range(2)), st.sampled_from([-1.0, 0.0, 1.0])
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(POINT, st.sampled_from([0, 2])), max_size=12))
+def test_poles_are_columns(objects: list[Any]) -> None:
+    objects = [([20.0 + x, y, z], label, 0) for (x, y, z), label in objects]
+    expected = 0
+    for (x, y, _), label, _ in objects:
+        tops = [math.dist((x, y), top[:2]) for top, *_ in objects if top[2] + 1.73 > 2.0]
+        expected += label == 2 and min(tops, default=1.0) <= 0.3 + 1e-4
+        hypothesis.assume(all(abs(d - 0.3) > 1e-4 for d in tops))  # float32 of the scan
+    assert counted(objects)["false pedestrian"]["on poles"] == expected
 
 
 def test_cells_under_boxes(world: World) -> None:
@@ -541,7 +738,20 @@ def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFi
     assert set(result["models"]) == {"ssadnet", "pointseg"}
     assert (result["split"], result["fold"]) == ("test", None)
     simulated = result["simulated"]
-    assert set(simulated) == {"points", "pixels", "boxes", "segmentation", "road", "n_frames", "n_drives"}
+    groups = {
+        "labeled",
+        "points",
+        "pixels",
+        "boxes",
+        "all_round",
+        "heading",
+        "errors",
+        "bumper",
+        "segmentation",
+        "road",
+    }
+    assert set(simulated) == groups | {"n_frames", "n_drives"}
+    assert simulated["all_round"]["all"]["car"]["n_truth"] >= simulated["boxes"]["oriented"]["all"]["car"]["n_truth"]
     assert simulated["segmentation"]["every cell"]["all"]["n_cells"] == 160_000
     assert 0.5 < simulated["points"]["all"]["car"]["iou"] <= 1.0
     assert 0.5 < simulated["road"]["all"]["f1"] <= simulated["road"]["all"]["max_f1"] + 0.05
@@ -549,6 +759,26 @@ def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFi
     assert low <= simulated["road"]["all"]["f1"] <= high
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert f"{100 * simulated['road']['all']['ap']:.1f}" in printed.out
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_figures_of_few_objects_are_gray_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    for stream, gray, expected in (
+        (Terminal(), True, "\x1b[90mcar \\u001b[0m\x1b[0m\n"),  # what the text holds itself is shown, not obeyed
+        (Terminal(), False, "car \\u001b[0m\n"),
+        (io.StringIO(), True, "car \\u001b[0m\n"),
+    ):
+        print_line("car \x1b[0m", stream, gray=gray)
+        assert stream.getvalue() == expected
+    monkeypatch.setenv("NO_COLOR", "1")
+    plain = Terminal()
+    print_line("car", plain, gray=True)
+    assert plain.getvalue() == "car\n"
 
 
 def test_the_command_on_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -52,7 +52,8 @@ FLOORS = {
         simulation.__init__
         simulation.samples
         evaluation.__init__ evaluation.metrics evaluation.mistakes evaluation.splits evaluation.tracking_metrics
-        evaluation.datasets evaluation.tables
+        evaluation.causes evaluation.datasets
+        evaluation.scan_folder evaluation.tables
         evaluation.unseen evaluation.truth
         evaluation.judge evaluation.tracking evaluation.transfer
         evaluation.evaluate

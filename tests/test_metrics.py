@@ -8,7 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgeperc.errors import PointsError
-from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, ProbabilitySweep, average_precision
+from edgeperc.evaluation.metrics import (
+    BoxEvaluator,
+    Confusion,
+    ProbabilitySweep,
+    average_precision,
+    mean,
+    object_key,
+)
 from edgeperc.perception import Box
 
 
@@ -328,3 +335,70 @@ def test_axis_aligned_bounds_are_what_the_paper_compares():
 def test_thresholds_out_of_range_raise(threshold):
     with pytest.raises(PointsError, match="iou_threshold"):
         BoxEvaluator(threshold)
+
+
+# --- headings and distinct objects
+
+
+def test_headings_by_hand():
+    square = {"size": (2.0, 2.0)}
+    truth = [box(10.0 * k, 0.0, yaw=yaw, **square) for k, yaw in enumerate((0.0, 0.0, 0.0, 3.1, 0.0))]
+    predicted = [
+        box(0.0, 0.0, yaw=0.7, **square),  # 40 degrees
+        box(10.0, 0.0, yaw=math.pi, **square),  # front for rear
+        box(20.0, 0.0, yaw=-math.pi / 2, **square),  # across
+        box(30.0, 0.0, yaw=-3.1, **square),  # 5 degrees, beyond half a turn
+        box(99.0, 0.0, **square),  # no match
+        box(40.0, 0.0, yaw=math.nan, **square),  # overlaps nothing
+    ]
+    evaluator = BoxEvaluator()
+    evaluator.update(predicted, truth)
+    scores = evaluator.overall()
+    assert (scores.n_hits, scores.heading, scores.axis) == (4, 2 / 4, 3 / 4)
+    near = evaluator.per_class((0.0, 15.0))["car"]
+    assert (near.n_hits, near.heading, near.axis) == (2, 1 / 2, 1.0)
+    nobody = evaluator.overall((50.0, 60.0))
+    assert nobody.n_hits == nobody.n_found == 0
+    assert math.isnan(nobody.heading)
+    assert math.isnan(nobody.axis)
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.integers(-700, 700), st.integers(-700, 700)), max_size=5))
+def test_headings_are_those_of_unit_vectors(degrees):
+    side = {"size": (2.0, 2.0)}
+    degrees = [(a, b) for a, b in degrees if (a - b) % 90 != 45]  # exactly 45 degrees depends on rounding
+    truth = [box(10.0 * k, 0.0, yaw=math.radians(b), **side) for k, (_, b) in enumerate(degrees)]
+    evaluator = BoxEvaluator()
+    evaluator.update([box(10.0 * k, 0.0, yaw=math.radians(a), **side) for k, (a, _) in enumerate(degrees)], truth)
+    cosines = np.cos(np.radians([a - b for a, b in degrees]))
+    scores = evaluator.overall()
+    assert scores.n_hits == len(degrees)  # a turned square shares at least 2 (sqrt 2 - 1) of 4 - that with itself
+    if degrees:
+        assert scores.heading == pytest.approx(np.mean(cosines > math.sqrt(0.5)))
+        assert scores.axis == pytest.approx(np.mean(np.abs(cosines) > math.sqrt(0.5)))
+
+
+def test_an_object_counts_once_a_drive():
+    evaluator = BoxEvaluator()
+    one, other = box(10.0, 0.0, size=(4.123, 2.0)), box(30.0, 0.0, size=(4.13, 2.0))
+    moved = box(14.0, 3.0, size=(4.1249, 2.0), yaw=0.4)
+    assert object_key("a", one) == object_key("a", moved) == ("a", "car", 4.12, 2.0, 1.5)
+    assert object_key("a", one) != object_key("a", other)
+    assert object_key("a", one) != object_key("b", one)
+    evaluator.update([one], [one, other], drive="a")
+    evaluator.update([moved], [moved], drive="a")
+    evaluator.update([], [one], drive="b")
+    scores = evaluator.overall()
+    assert (scores.n_truth, scores.n_objects, scores.n_drives) == (4, 3, 2)
+    assert (scores.n_hits, scores.n_found) == (2, 1)
+    both = (evaluator + evaluator).per_class()["car"]
+    assert (both.n_truth, both.n_objects, both.n_drives, both.n_hits, both.n_found) == (8, 3, 2, 4, 1)
+    far = evaluator.overall((20.0, 40.0))
+    assert (far.n_truth, far.n_objects, far.n_drives, far.n_found) == (1, 1, 1, 0)
+
+
+def test_a_mean_leaves_nan_out():
+    assert mean([0.5, math.nan, 1.0]) == 0.75
+    assert math.isnan(mean([]))
+    assert math.isnan(mean([math.nan]))

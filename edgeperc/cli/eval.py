@@ -44,8 +44,9 @@ def add_parser(commands: Commands) -> None:
         "datasets",
         nargs="+",
         metavar="DATASET",
-        help="the root of a KITTI object set or of SemanticKITTI, or simulation:N for N simulated scans (simulation "
-        "alone: 24)",
+        help="the root of a KITTI object set or of SemanticKITTI, simulation:N for N simulated scans (simulation "
+        "alone: 24), or labeled scans of any sensor: a folder with scans.json, or FOLDER:LAYOUT with the name of a "
+        "public set (pandaset, av2, vod, ddad, lyft)",
     )
     reading.add_argument(
         "--split",
@@ -113,7 +114,7 @@ def eval_command(arguments: argparse.Namespace) -> int:
             on_scan=show,
         )
     for line in _figure_lines(figures):
-        print_line(line)
+        print_line(line, gray=_FEW in line)
     write_figures(arguments, figures)
     if arguments.worst is not None:
         from ..view.mistakes import draw_mistakes
@@ -123,19 +124,44 @@ def eval_command(arguments: argparse.Namespace) -> int:
     return 0
 
 
-# Columns of the tables: heading and key. Shares are printed in per cent.
+# Columns of the tables: heading and key. Shares are printed in per cent, each with its interval.
+def _with_intervals(*rates: tuple[str, str]) -> tuple[tuple[str, str], ...]:
+    return tuple(column for title, key in rates for column in ((title, key), ("95 %", f"{key}_interval")))
+
+
 _RATES = (("precision", "precision"), ("recall", "recall"))
-_POINT_COLUMNS = (*_RATES, ("IoU", "iou"), ("95 %", "iou_interval"), ("points", "n_points"), ("objects", "n_objects"))
+_OBJECT_COUNTS = (("objects", "n_objects"), ("drives", "n_drives"))
+_LABELED_COLUMNS = (("labels", "n_boxes"), *_OBJECT_COUNTS)
+_POINT_COLUMNS = (*_with_intervals(("IoU", "iou"), *_RATES), ("points", "n_points"), *_OBJECT_COUNTS)
+_HIT_COLUMNS = (("true", "n_truth"), ("predicted", "n_predicted"), ("hits", "n_hits"), *_OBJECT_COUNTS)
 _BOX_COLUMNS = (
-    *(("AP50", "ap"), ("95 %", "ap_interval"), *_RATES, ("mIoU@.5", "mean_iou_50"), ("mIoU@.7", "mean_iou_70")),
-    *(("true", "n_truth"), ("predicted", "n_predicted"), ("hits", "n_hits")),
+    *_with_intervals(("AP50", "ap"), *_RATES, ("mIoU@.5", "mean_iou_50"), ("mIoU@.7", "mean_iou_70")),
+    *_HIT_COLUMNS,
 )
-_MAP_COLUMNS = (("ACC", "accuracy"), ("mAP", "mean_ap"), ("mIoU", "mean_iou"), ("95 %", "mean_iou_interval"))
+_ALL_ROUND_COLUMNS = (*_with_intervals(("AP", "ap"), *_RATES), *_HIT_COLUMNS)
+_HEADING_COLUMNS = (
+    *_with_intervals(("heading", "heading"), ("modulo half a turn", "axis")),
+    *(("boxes", "n_hits"), ("objects", "n_objects")),
+)
+_ERROR_COLUMNS = (
+    *_with_intervals(("share", "share")),
+    *(("points", "n_points"), ("95 %", "n_points_interval"), ("of", "n_of"), ("scans", "n_scans")),
+    *_OBJECT_COUNTS,
+)
+_CELL_COLUMNS = (
+    *_with_intervals(("IoU", "iou"), ("ACC", "accuracy"), ("mAP", "mean_ap"), ("mIoU", "mean_iou")),
+    ("cells", "n_cells"),
+)
 _ROAD_COLUMNS = (
-    *(("F1", "f1"), ("95 %", "f1_interval"), ("AP", "ap"), ("ACC", "accuracy"), ("PRE", "precision")),
-    *(("REC", "recall"), ("IoU", "iou"), ("MaxF", "max_f1"), ("observed PRE", "drivable_precision")),
-    *(("observed REC", "drivable_recall"), ("cells", "n_cells")),
+    *_with_intervals(("F1", "f1"), ("AP", "ap"), ("ACC", "accuracy"), ("PRE", "precision"), ("REC", "recall")),
+    ("cells", "n_cells"),
 )
+_ROAD_COLUMNS_2 = (
+    *_with_intervals(("IoU", "iou"), ("MaxF", "max_f1")),
+    *_with_intervals(("observed PRE", "drivable_precision"), ("observed REC", "drivable_recall")),
+    ("cells", "n_cells"),
+)
+_FEW = " (n<10)"  # `edgeperc.evaluation.tables.FEWEST_OBJECTS`
 _BLOCKS = {"real": "real scans with boxes", "semantickitti": "SemanticKITTI", "simulated": "simulated scans"}
 
 
@@ -146,50 +172,106 @@ def _figure_lines(figures: Mapping[str, Any]) -> list[str]:
         f"{models}; {figures['split']} drives{fold}; shares in per cent, intervals over drives",
         f"ran as {'; '.join(figures['providers'].values())}",
     ]
-    for block, name in _BLOCKS.items():
-        if block not in figures:
-            continue
-        of_block = figures[block]
-        lines += ["", f"== {name}: {many(of_block['n_frames'], 'scan')}, {many(of_block['n_drives'], 'drive')} =="]
-        for kind, title in (
-            ("points", "points"),
-            ("pixels", "points with the class of their pixel, before refinement"),
-        ):
-            lines += table_lines(title, _POINT_COLUMNS, _class_rows(of_block.get(kind, {}), "n_points"))
-        for kind, of_kind in of_block.get("boxes", {}).items():
-            means = {
-                band: {"mean": {"ap": rows["mean_ap"], "ap_interval": rows.get("mean_ap_interval")}}
-                for band, rows in of_kind.items()
-                if rows["mean_ap"] is not None
-            }
-            rows = [*_class_rows(of_kind, "n_truth"), *_class_rows(means, "ap")]
-            lines += table_lines(
-                f"boxes, {kind}", _BOX_COLUMNS, sorted(rows, key=lambda row: [*of_kind].index(row[0][0]))
-            )
-        for kind, of_kind in of_block.get("segmentation", {}).items():
-            names = next(iter(of_kind.values()))["iou"]
-            columns = (*_MAP_COLUMNS, *((name, name) for name in names), ("cells", "n_cells"))
-            rows = [((band, ""), {**row, **row["iou"]}) for band, row in of_kind.items() if row["n_cells"]]
-            lines += table_lines(f"top view, {kind}; columns of classes are IoU", columns, rows)
-        rows = [((band, ""), row) for band, row in of_block.get("road", {}).items() if row["n_cells"]]
-        lines += table_lines("road", _ROAD_COLUMNS, rows)
-        for (band, _), row in rows[:1]:  # over all distances
-            titles = ("no road", "road")
-            shares = [
-                ((band, f"true {name}"), dict(zip(titles, part, strict=True)))
-                for name, part in zip(titles, row["confusion"], strict=True)
-            ]
-            lines += table_lines(
-                "road, confusion in shares of all cells", [(f"predicted {t}", t) for t in titles], shares
-            )
+    blocks = [(name, figures.get(block)) for block, name in _BLOCKS.items()]
+    for name, of_block in (*blocks, *figures.get("folders", {}).items()):
+        if of_block is not None:
+            lines += ["", f"== {name}: {many(of_block['n_frames'], 'scan')}, {many(of_block['n_drives'], 'drive')} =="]
+            lines += [*_labeled_lines(of_block), *_point_lines(of_block), *_box_lines(of_block)]
+            lines += [*_error_lines(of_block), *_cell_lines(of_block), *_road_lines(of_block)]
+    return lines
+
+
+def _labeled_lines(of_block: Mapping[str, Any]) -> list[str]:
+    rows = [((_marked(name, row), ""), row) for name, row in of_block.get("labeled", {}).items()]
+    return table_lines(
+        "labeled objects; each distinct object counts once, however often it is seen", _LABELED_COLUMNS, rows
+    )
+
+
+def _point_lines(of_block: Mapping[str, Any]) -> list[str]:
+    lines = []
+    for kind, title in (("points", "points"), ("pixels", "points with the class of their pixel, before refinement")):
+        lines += table_lines(title, _POINT_COLUMNS, _class_rows(of_block.get(kind, {}), "n_points"))
+    return lines
+
+
+def _box_lines(of_block: Mapping[str, Any]) -> list[str]:
+    lines = []
+    for kind, of_kind in of_block.get("boxes", {}).items():
+        means = {
+            band: {"mean": {"ap": rows["mean_ap"], "ap_interval": rows.get("mean_ap_interval")}}
+            for band, rows in of_kind.items()
+            if rows["mean_ap"] is not None
+        }
+        rows = [*_class_rows(of_kind, "n_truth"), *_class_rows(means, "ap")]
+        order = sorted(rows, key=lambda row: [*of_kind].index(row[0][0]))
+        lines += table_lines(f"boxes, {kind}", _BOX_COLUMNS, order)
+    lines += table_lines(
+        "boxes wherever the truth is known, oriented: AP50 of vehicles, AP25 of pedestrians and cyclists",
+        _ALL_ROUND_COLUMNS,
+        _class_rows(of_block.get("all_round", {}), "n_truth"),
+    )
+    lines += table_lines(
+        "heading of these boxes within 45 degrees of the true one",
+        _HEADING_COLUMNS,
+        _class_rows(of_block.get("heading", {}), "n_hits"),
+    )
+    return lines
+
+
+def _error_lines(of_block: Mapping[str, Any]) -> list[str]:
+    rows = [
+        ((error, _marked(cause, row)), row)
+        for error, causes in of_block.get("errors", {}).items()
+        for cause, row in causes.items()
+        if causes["all"]["n_points"]
+    ]
+    if "bumper" in of_block:
+        rows.append((("car at the own bumper", "all"), of_block["bumper"]))
+    return table_lines(
+        "errors: wrong points by cause; a cause is a share of its error, and a point may have several",
+        _ERROR_COLUMNS,
+        rows,
+    )
+
+
+def _cell_lines(of_block: Mapping[str, Any]) -> list[str]:
+    lines = []
+    for kind, of_kind in of_block.get("segmentation", {}).items():
+        rows = []
+        for band, row in of_kind.items():
+            if row["n_cells"]:
+                rows.append(((band, ""), row | {"iou": None, "iou_interval": None}))
+                for name, n_cells in row["n_cells_of"].items():
+                    own = {key: row[key][name] for key in ("iou", "iou_interval")}
+                    rows.append(((band, name), own | {"n_cells": n_cells}))
+        lines += table_lines(f"top view, {kind}", _CELL_COLUMNS, rows)
+    return lines
+
+
+def _road_lines(of_block: Mapping[str, Any]) -> list[str]:
+    rows = [((band, ""), row) for band, row in of_block.get("road", {}).items() if row["n_cells"]]
+    lines = table_lines("road", _ROAD_COLUMNS, rows)
+    lines += table_lines("road, over all thresholds and where it was observed", _ROAD_COLUMNS_2, rows)
+    for (band, _), row in rows[:1]:  # over all distances
+        titles = ("no road", "road")
+        shares = [
+            ((band, f"true {name}"), dict(zip(titles, part, strict=True)))
+            for name, part in zip(titles, row["confusion"], strict=True)
+        ]
+        lines += table_lines("road, confusion in shares of all cells", [(f"predicted {t}", t) for t in titles], shares)
     return lines
 
 
 def _class_rows(bands: Mapping[str, Any], count: str) -> list[tuple[tuple[str, str], Mapping[str, Any]]]:
     """A row for each class and band that has objects or predictions."""
     return [
-        ((band, name), row)
+        ((band, _marked(name, row)), row)
         for band, rows in bands.items()
         for name, row in rows.items()
         if isinstance(row, Mapping) and (row[count] or row.get("n_predicted"))
     ]
+
+
+def _marked(name: str, row: Mapping[str, Any]) -> str:
+    return f"{name}{_FEW}" if row.get("few") else name

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import json
 import math
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import import_module
@@ -35,11 +36,17 @@ def one_line(text: object) -> str:
     return " ".join(str(text).split())
 
 
-def print_line(text: str, file: TextIO | None = None) -> None:
-    """Print and flush a line, by default on stdout; a progress bar moves below it. See `printable`."""
+def print_line(text: str, file: TextIO | None = None, *, gray: bool = False) -> None:
+    """Print and flush a line, by default on stdout; a progress bar moves below it. See `printable`.
+
+    A gray line is gray on a terminal, unless the environment variable NO_COLOR is set.
+    """
     tqdm = getattr(sys.modules.get("tqdm"), "tqdm", None)  # imported only while a bar is drawn
+    shown = printable(text)
+    if gray and (file or sys.stdout).isatty() and not os.environ.get("NO_COLOR"):
+        shown = f"\x1b[90m{shown}\x1b[0m"
     with contextlib.nullcontext() if tqdm is None else tqdm.external_write_mode(sys.stdout):
-        print(printable(text), file=file, flush=True)
+        print(shown, file=file, flush=True)
 
 
 def print_error(text: object, program: str = "edgeperc") -> None:
@@ -151,5 +158,5 @@ def _cell(value: Any) -> str:
     if value is None:
         return "-"
     if isinstance(value, list):
-        return "-".join(f"{100.0 * bound:.1f}" for bound in value)
+        return "-".join(map(_cell, value))
     return f"{100.0 * value:.1f}" if isinstance(value, float) else f"{value:,}"

@@ -18,17 +18,21 @@ from ..errors import ModelError
 from ..frame import ModelFrame
 from ..geometry import inside
 from ..mounting import MODEL_MOUNTING, Mounting
+from ..network_input import project
 from ..perceiver import BoxesFrom, Perceiver
 from ..perception import Perception, PointLabels, TopView
 from ..projection import make_projector
+from ..sensor import SensorProfile
 from ..session import Session
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
+from .causes import count_causes
 from .datasets import Frame, RoadFrame
-from .metrics import FEWEST_RETURNS, BoxEvaluator, ProbabilitySweep, boxes_to_find
+from .metrics import FEWEST_RETURNS, BoxEvaluator, ProbabilitySweep, boxes_to_find, object_key
 from .mistakes import Mistakes
-from .tables import BANDS, VEHICLES, Record, banded, within
-from .truth import Truth, kitti_truth, semantickitti_truth, simulated_truth
+from .scan_folder import ScanFrame
+from .tables import ALL_ROUND, BANDS, VEHICLES, Record, banded, within
+from .truth import Truth, folder_truth, kitti_truth, semantickitti_truth, simulated_truth
 from .unseen import check_unseen, training_scans_of
 
 __all__ = ["Judge"]
@@ -57,6 +61,8 @@ class Judge:
     mounted : Mounting or None
         Perceive each scan as a sensor mounted so would have recorded it, with the mounting to be estimated from this
         scan alone. Points (not pixels) and boxes are evaluated. None: as recorded, on the training vehicle.
+    sensor : SensorProfile or None
+        The sensor of the scans for `record_scan`, with what is known of its mounting. None: the training vehicle's.
 
     Raises
     ------
@@ -74,11 +80,16 @@ class Judge:
         training_scans: bool = False,
         boxes_from: BoxesFrom = "network",
         mounted: Mounting | None = None,
+        sensor: SensorProfile | None = None,
     ) -> None:
-        self.perceive = _perceiver(
-            models, provider, precision, boxes_from, MODEL_MOUNTING if mounted is None else Mounting()
-        )
+        mounting = MODEL_MOUNTING if mounted is None else Mounting()
+        if sensor is None:
+            self.perceive = _perceiver(models, provider, precision, boxes_from, mounting)
+        else:
+            self.perceive = _perceiver(models, provider, precision, boxes_from, sensor.mounting, sensor)
         self.mounted = None if mounted is None else ModelFrame(mounted)
+        self.as_recorded = mounted is None and sensor is None
+        self.drive: str | None = None
         networks = [_Network(session) for session in self.perceive.sessions]
         self.from_sensor = next((n for n in networks if n.card.view.kind == "range_image"), None)
         self.from_above = next((n for n in networks if n.card.view.kind == "top_view"), None)
@@ -146,13 +157,34 @@ class Judge:
         mistakes : Mistakes or None
             None if the objects of the scan are not labeled.
         """
-        found = self._perceive(truth.points)
+        return self._compare(truth, self._perceive(truth.points))
+
+    def record_scan(self, frame: ScanFrame) -> tuple[Record, Mistakes | None]:
+        """Evaluate one scan of a `ScanFolder`, perceived as a user's: its mounting is found from scans of its drive.
+
+        Raises
+        ------
+        SplitError
+            A model was trained on this scan.
+        """
+        check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
+        if frame.drive != self.drive:
+            self.perceive.reset_mounting()
+            self.drive = frame.drive
+        found = self.perceive(frame.points)
+        boxes = ModelFrame(found.mounting).move_boxes(found.boxes)
+        return self._compare(folder_truth(frame, found.mounting, self.view), replace(found, boxes=boxes))
+
+    def _compare(self, truth: Truth, found: Perception) -> tuple[Record, Mistakes | None]:
         tallies: dict[tuple[str, ...], Any] = {}
         mistakes = None
         if truth.labels is not None:
             x, y = truth.points[:, 0], truth.points[:, 1]
             shown = (x > -2.0) & (x < 52.0) & (np.abs(y) < 27.0)
             mistakes = Mistakes(truth.name, truth.drive, truth.points[shown], np.zeros(int(shown.sum()), np.uint8))
+            if self.box_classes or found.points is not None:
+                seen = (box for box, n in zip(truth.boxes, truth.returns, strict=True) if n >= FEWEST_RETURNS)
+                tallies["labeled",] = Counter(object_key(truth.drive, box) for box in seen)
             if self.box_classes or self.cluster_classes:
                 mistakes = self._count_boxes(tallies, truth, found, mistakes)
             if found.points is not None:
@@ -173,14 +205,26 @@ class Judge:
     def _count_boxes(
         self, tallies: dict[tuple[str, ...], Any], truth: Truth, found: Perception, mistakes: Mistakes
     ) -> Mistakes:
-        """Match predicted boxes where the truth is known, once by axis-aligned and once by oriented footprints."""
+        """Match predicted boxes where the truth is known.
+
+        Boxes that the models detect are matched by axis-aligned and by oriented footprints, in the top-view model's
+        view. Vehicles, pedestrians and cyclists are matched all round, detected or not.
+        """
         centers = np.array([box.center for box in found.boxes], np.float64).reshape(-1, 3)
         predicted = [box for box, known in zip(found.boxes, truth.known(centers), strict=True) if known]
         returns = list(zip(truth.boxes, truth.returns, strict=True))
         to_find, ignored = boxes_to_find(returns, self.view, self.box_classes, classes_anywhere=self.cluster_classes)
         for kind in ("upright", "oriented"):
             evaluator = tallies["boxes", kind] = BoxEvaluator(oriented=kind == "oriented", together=VEHICLES)
-            pairs = evaluator.update(predicted, to_find, ignored=ignored)
+            pairs = evaluator.update(predicted, to_find, ignored=ignored, drive=truth.drive)
+        every = tuple(name for classes, _ in ALL_ROUND.values() for name in classes)
+        to_find, ignored = boxes_to_find(
+            returns, None, (), classes_anywhere=every, known=lambda box: bool(truth.known(np.array([box.center]))[0])
+        )
+        for group, (classes, least_iou) in ALL_ROUND.items():
+            evaluator = tallies["all_round", group] = BoxEvaluator(least_iou, together=classes)
+            guesses, rights = ([box for box in of if box.label in classes] for of in (predicted, to_find))
+            evaluator.update(guesses, rights, ignored=ignored, drive=truth.drive)
         returns_of = {id(box): n for box, n in returns}
         return replace(
             mistakes,
@@ -197,7 +241,7 @@ class Judge:
         mistakes: Mistakes,
         shown: NDArray[np.bool_],
     ) -> Mistakes:
-        """Count point labels after refinement, and pixel labels before it.
+        """Count point labels after refinement, pixel labels before it, and the causes of wrong labels.
 
         Objects of classes without evaluated boxes count as found if at least half of their points have their label.
         """
@@ -207,9 +251,11 @@ class Judge:
         range_m = np.hypot(truth.points[:, 0], truth.points[:, 1])
         labels = _renamed(found.labels, found.classes, POINT_CLASSES)
         tallies |= banded(("points",), POINT_CLASSES, labels, right, range_m)
-        if self.mounted is None:
+        if self.as_recorded:
             pixels = _renamed(self.from_sensor.point_labels(truth.points), found.classes, POINT_CLASSES)
             tallies |= banded(("pixels",), POINT_CLASSES, pixels, right, range_m)
+        counted = right != IGNORE
+        tallies |= count_causes(truth.points, labels, truth.labels, counted, found.in_view, truth.boxes, truth.drive)
         tallies |= {("objects", band): Counter() for band in BANDS}
         by_box = {id(box) for box in (*mistakes.found, *(box for box, _ in mistakes.missed))}
         hit, missed = [*mistakes.found], [*mistakes.missed]
@@ -220,14 +266,14 @@ class Judge:
             if kind is None or n_own < FEWEST_RETURNS:
                 continue
             for band, within_m in BANDS.items():
-                tallies["objects", band][POINT_CLASSES[kind]] += int(within(distance_m, within_m))
+                if within(distance_m, within_m):
+                    tallies["objects", band][POINT_CLASSES[kind], object_key(truth.drive, box)] += 1
             if id(box) in by_box or distance_m >= FARTHEST_M:
                 continue
             if 2 * int(np.count_nonzero(labels[own] == kind)) >= n_own:
                 hit.append(box)
             else:
                 missed.append((box, n_own))
-        counted = right != IGNORE
         wrong = np.where(counted & (labels != right), np.where(right > 0, 1, 2), 0).astype(np.uint8)
         n_objects = int(np.count_nonzero(counted & ((right > 0) | (labels > 0))))
         share = int(np.count_nonzero(wrong)) / max(n_objects, 1)
@@ -275,7 +321,7 @@ class _Network:
     def point_labels(self, points: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Label of the pixel of each point before PointSeg's refinement, (n,) uint8; 0 out of view."""
         labels, _ = decode_classes(self.session.outputs[self.kind], self.kind, model=self.card.name)
-        pixel = self.projector.project(points).pixel
+        pixel = project(self.projector, points).pixel
         return np.where(pixel >= 0, labels.ravel()[pixel], 0).astype(np.uint8)
 
 
@@ -285,9 +331,12 @@ def _perceiver(
     precision: str,
     boxes_from: BoxesFrom = "network",
     mounting: Mounting = MODEL_MOUNTING,  # the truth of cells is in the frame of the scan
+    sensor: SensorProfile | None = None,
 ) -> Perceiver:
     return Perceiver(
         list(models),
+        sensor=sensor or "hdl-64e",
+        full_turn=sensor is not None,
         mounting=mounting,
         provider=provider,
         precision=precision,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from functools import reduce
 from operator import add
 from typing import Any
@@ -17,11 +17,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .metrics import BoxEvaluator, Confusion, ProbabilitySweep
+from .causes import BUMPER, CAUSES
+from .metrics import BoxEvaluator, BoxScores, Confusion, ObjectKey, ProbabilitySweep, mean
 
-__all__ = ["BANDS", "VEHICLES", "Record", "banded", "figures", "within"]
+__all__ = ["ALL_ROUND", "BANDS", "FEWEST_OBJECTS", "VEHICLES", "Record", "banded", "figures", "within"]
 
 VEHICLES = ("car", "van", "truck")
+
+# Groups of classes whose boxes are evaluated wherever the truth is known: their classes, and the smallest IoU of a
+# match. A person's box is hardly larger than the spacing of the points on it, so it is matched at 0.25.
+ALL_ROUND = {"vehicle": (VEHICLES, 0.5), "person": (("pedestrian", "cyclist"), 0.25)}
+
+FEWEST_OBJECTS = 10  # figures of fewer distinct objects are marked: they say little
 
 # Ranges of the horizontal distance [m] of points, cell centers and box centers.
 BANDS = {
@@ -103,7 +110,19 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
     Returns
     -------
     dict
-        For JSON: numbers with four decimals, None for NaN.
+        For JSON: numbers with four decimals, None for NaN. Rows of objects have their number of labels in all scans
+        (``"n_boxes"`` or ``"n_truth"``), of distinct objects (``"n_objects"``, `metrics.object_key`) and of drives, and
+        ``"few": True`` if there are fewer than `FEWEST_OBJECTS`.
+
+        - ``"labeled"``: the labeled objects with at least three returns, by class.
+        - ``"points"``, ``"pixels"``: by band and class.
+        - ``"boxes"``: by kind (``"upright"``, ``"oriented"``), band and class, where the models detect the class.
+        - ``"all_round"``: by band and class, oriented boxes of vehicles (AP50) and people (AP25) wherever the truth is
+          known, detected or not. ``"heading"``: of those that were matched, whose heading is right within 45 degrees.
+        - ``"errors"``: by error and cause (`causes.CAUSES`). ``"all"`` is a share of the true (missed) or predicted
+          (false) points of the class, a cause a share of the error; ``"n_of"`` is the whole.
+        - ``"bumper"``: points at the own bumper that are labeled car.
+        - ``"segmentation"``: by table and band. ``"road"``: by band.
     """
     by_drive: dict[str, list[Tallies]] = {}
     for record in records:
@@ -127,11 +146,23 @@ def _figures(tallies: Tallies) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, tally in tallies.items():
         group, band = key[0], key[-1]
-        if group in ("points", "pixels"):
+        if group == "labeled":
+            found[group] = _labeled_rows(tally)
+        elif group in ("points", "pixels"):
             found.setdefault(group, {})[band] = _point_rows(tally, tallies["objects", band])
         elif group == "boxes":
             rows = {name: _box_rows(tally, within_m) for name, within_m in BANDS.items()}
             found.setdefault(group, {})[key[1]] = rows
+        elif group == "all_round":
+            for name, within_m in BANDS.items():
+                rows = {label: row for label, row in _box_rows(tally, within_m, key[1]).items() if label != "mean_ap"}
+                found.setdefault(group, {}).setdefault(name, {}).update(rows)
+                headings = {label: _heading_row(row) for label, row in rows.items()}
+                found.setdefault("heading", {}).setdefault(name, {}).update(headings)
+        elif key == ("errors", "points"):
+            scans, objects = tallies["errors", "scans"], tallies["errors", "objects"]
+            found["errors"] = {error: _error_rows(error, tally, scans, objects) for error in CAUSES}
+            found["bumper"] = _error_row(BUMPER, "all", tally, scans)
         elif group == "segmentation":
             found.setdefault(group, {}).setdefault(key[1], {})[band] = _map_row(tally)
         elif group == "road":
@@ -139,18 +170,70 @@ def _figures(tallies: Tallies) -> dict[str, Any]:
     return found
 
 
-def _point_rows(confusion: Confusion, n_objects: Counter[str]) -> dict[str, Any]:
+def _labeled_rows(labeled: Counter[ObjectKey]) -> dict[str, Any]:
+    n_boxes: Counter[str] = Counter()
+    for key, n in labeled.items():
+        n_boxes[key[1]] += n
+    return {
+        name: {"n_boxes": n} | _distinct(key for key in labeled if key[1] == name) for name, n in n_boxes.most_common()
+    }
+
+
+def _distinct(keys: Iterable[ObjectKey]) -> dict[str, Any]:
+    """Number of distinct objects, and of their drives."""
+    objects = {*keys}
+    return {"n_objects": len(objects), "n_drives": len({drive for drive, *_ in objects})} | _few(len(objects))
+
+
+def _few(n_objects: int) -> dict[str, bool]:
+    return {"few": True} if n_objects < FEWEST_OBJECTS else {}
+
+
+def _point_rows(confusion: Confusion, objects: Counter[tuple[str, ObjectKey]]) -> dict[str, Any]:
     rates = {"precision": confusion.precision(), "recall": confusion.recall(), "iou": confusion.iou()}
     rows = {}
     for k, name in enumerate(confusion.classes):
         row = {rate: float(values[k]) for rate, values in rates.items()}
-        rows[name] = row | {"n_points": int(confusion.counts[k].sum()), "n_objects": n_objects[name]}
+        row["n_points"] = int(confusion.counts[k].sum())
+        if k > 0:
+            row["n_boxes"] = sum(n for (label, _), n in objects.items() if label == name)
+            row |= _distinct(key for label, key in objects if label == name)
+        rows[name] = row
     return rows
 
 
-def _box_rows(evaluator: BoxEvaluator, within_m: tuple[float, float]) -> dict[str, Any]:
-    scores = {**evaluator.per_class(within_m), "vehicle": evaluator.overall(within_m)}
-    return {"mean_ap": evaluator.mean_ap(within_m)} | {name: asdict(row) for name, row in scores.items()}
+def _box_rows(evaluator: BoxEvaluator, within_m: tuple[float, float], together: str = "vehicle") -> dict[str, Any]:
+    per_class = evaluator.per_class(within_m)
+    scores = {**per_class, together: evaluator.overall(within_m)}
+    rows = {
+        name: {each.name: getattr(row, each.name) for each in fields(BoxScores)} | _few(row.n_objects)
+        for name, row in scores.items()
+    }
+    return {"mean_ap": mean([row.ap for row in per_class.values()])} | rows
+
+
+def _heading_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Of the boxes that were matched: the share whose heading is right, over the full turn and modulo half a turn."""
+    shares = {"heading": row["heading"], "axis": row["axis"]}
+    return shares | {"n_hits": row["n_hits"], "n_objects": row["n_found"]} | _few(row["n_found"])
+
+
+def _error_rows(
+    error: str, points: Counter[Any], scans: Counter[Any], objects: Counter[Any]
+) -> dict[str, dict[str, Any]]:
+    rows = {}
+    for cause in ("all", *CAUSES[error]):
+        n, whole = points[error, cause], points[error, "of" if cause == "all" else "all"]
+        row = {"share": n / whole if whole else math.nan, "n_of": whole} | _error_row(error, cause, points, scans)
+        if error.startswith("missed"):
+            row |= _distinct(key for *of, key in objects if of == [error, cause])
+        rows[cause] = row
+    return rows
+
+
+def _error_row(error: str, cause: str, points: Counter[Any], scans: Counter[Any]) -> dict[str, Any]:
+    n_scans = [n for (*of, _), n in scans.items() if of == [error, cause]]
+    return {"n_points": points[error, cause], "n_scans": sum(n_scans), "n_drives": len(n_scans)}
 
 
 def _map_row(confusion: Confusion) -> dict[str, Any]:
@@ -195,10 +278,15 @@ def _road_row(sweep: ProbabilitySweep, decision: Confusion, drivable: Confusion)
     }
 
 
+# The number of a row that says whether a drive has data for its figures.
+_COUNTS = ("n_of", "n_points", "n_truth", "n_hits", "n_road", "n_cells")
+
+
 def _add_intervals(
     whole: dict[str, Any], drives: Sequence[dict[str, Any]], samples: Sequence[dict[str, Any]], times: NDArray[Any]
 ) -> None:
     """Add the interval of each figure to ``whole``; ``drives`` holds the figures of single drives."""
+    count = next((name for name in _COUNTS if name in whole), None)
     for key, value in list(whole.items()):
         of_drives, of_samples = [each.get(key, {}) for each in drives], [each.get(key, {}) for each in samples]
         if key == "iou" and isinstance(value, dict):
@@ -208,26 +296,29 @@ def _add_intervals(
             }
         elif isinstance(value, dict):
             _add_intervals(value, of_drives, of_samples, times)
-        elif key in ("iou", "ap", "f1"):
-            count = next(name for name in ("n_points", "n_truth", "n_road") if name in whole)
+        elif count and isinstance(value, float):
             values = [each.get(key, math.nan) for each in samples]
             whole[f"{key}_interval"] = _interval([each.get(count, 0) for each in drives], values, times)
-    for mean in ("mean_iou", "mean_ap"):
+        if key == "bumper":
+            n_points = [each.get("n_points", 0) for each in of_samples]
+            bounds = _interval([1] * len(drives), n_points, times)
+            whole[key]["n_points_interval"] = bounds and [round(bound) for bound in bounds]
+    for mean_of in ("mean_iou", "mean_ap"):
         # Means over different classes are not comparable, so only drives and resamples with all classes count.
-        meant = [name for name, (value, _) in _parts(whole, mean).items() if not math.isnan(value)]
+        meant = [name for name, (value, _) in _parts(whole, mean_of).items() if not math.isnan(value)]
         if meant:
-            parts = [[_parts(each, mean).get(name, (math.nan, 0)) for name in meant] for each in (*drives, *samples)]
+            parts = [[_parts(each, mean_of).get(name, (math.nan, 0)) for name in meant] for each in (*drives, *samples)]
             fewest = [min(n for _, n in each) for each in parts[: len(drives)]]
             complete = [not any(math.isnan(value) for value, _ in each) for each in parts[len(drives) :]]
-            values = [each[mean] if same else math.nan for each, same in zip(samples, complete, strict=True)]
-            whole[f"{mean}_interval"] = _interval(fewest, values, times)
+            values = [each[mean_of] if same else math.nan for each, same in zip(samples, complete, strict=True)]
+            whole[f"{mean_of}_interval"] = _interval(fewest, values, times)
 
 
-def _parts(row: Mapping[str, Any], mean: str) -> dict[str, tuple[float, int]]:
+def _parts(row: Mapping[str, Any], mean_of: str) -> dict[str, tuple[float, int]]:
     """For a mean over classes: value of each class, and its number of cells or boxes."""
-    if mean == "mean_iou" and "iou" in row and "n_cells_of" in row:
+    if mean_of == "mean_iou" and "iou" in row and "n_cells_of" in row:
         return {name: (value, row["n_cells_of"][name]) for name, value in row["iou"].items() if name != "vehicle"}
-    if mean == "mean_ap" and mean in row:
+    if mean_of == "mean_ap" and mean_of in row:
         rows = {name: each for name, each in row.items() if isinstance(each, dict) and "ap" in each}
         return {name: (each["ap"], each["n_truth"]) for name, each in rows.items() if name != "vehicle"}
     return {}

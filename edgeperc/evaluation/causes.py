@@ -1,0 +1,158 @@
+"""Why points have wrong labels: missed and false points of each class, counted by cause."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cluster import find_clusters
+from ..geometry import inside
+from ..ground import Ground, find_ground
+from ..perception import Box
+from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
+from .metrics import object_key
+
+__all__ = ["BUMPER", "CAUSES", "count_causes"]
+
+BUMPER = "car at the own bumper"
+OTHER, VANS, FAR = "of other objects", "in vans and trucks", "beyond 30 m"
+NEAR, LARGE, FLOOR, POLE = "within 0.4 m of an object", "on large structures", "on the ground", "on poles"
+
+# The causes that are counted for each error. A point may have several of them, or none.
+CAUSES: dict[str, tuple[str, ...]] = {
+    "missed car": (VANS, FAR),
+    "missed pedestrian": (OTHER, FAR),
+    "missed cyclist": (OTHER, FAR),
+    "false car": (OTHER, NEAR, LARGE, FLOOR),
+    "false pedestrian": (OTHER, NEAR, POLE),
+    "false cyclist": (OTHER, NEAR, POLE),
+}
+
+FAR_M = 30.0
+NEAR_M = 0.4
+LARGE_LENGTH_M, LARGE_HEIGHT_M = 8.0, 4.0  # a longer or higher cluster is a wall, a hedge or a bank
+POLE_RADIUS_M, POLE_HEIGHT_M = 0.3, 2.0  # a column of points that goes on above this height is no person
+BUMPER_X_M, BUMPER_Y_M, BUMPER_Z_M = 4.5, 3.0, -1.5  # upper bounds of x, |y| and z; the road is at z = -1.73
+
+Counts = dict[tuple[str, ...], "Counter[Any]"]
+
+
+def count_causes(
+    points: NDArray[np.float32],
+    labels: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    known: NDArray[np.bool_],
+    in_view: NDArray[np.bool_],
+    boxes: Sequence[Box],
+    drive: str,
+) -> Counts:
+    """Count the wrong points of one scan by cause.
+
+    Parameters
+    ----------
+    points : (n, 3 or more) float32
+        x, y, z [m] in the frame of the models.
+    labels, right : (n,) uint8
+        Predicted and true class, indices into `POINT_CLASSES`. Values of ``right`` beyond them are unknown.
+    known, in_view : (n,) bool
+        Points that count, and points that have a prediction.
+    boxes : sequence of Box
+        The true boxes.
+    drive : str
+
+    Returns
+    -------
+    dict of tuple of str to Counter
+        ``("errors", "points")``: number of points by (error, cause). The cause ``"all"`` has all points of an error,
+        ``"of"`` the points that it is a share of: true points of the class if they are missed, predicted ones if they
+        are false. ``("errors", "scans")``: 1 by (error, cause, drive) with points. ``("errors", "objects")``: 1 by
+        (error, cause, `object_key`) with missed points.
+        The error `BUMPER` has all points in view that are labeled car at the bumper of the own vehicle, except those
+        of true objects.
+    """
+    scan = _Scan(points, boxes)
+    chosen = {(BUMPER, "all"): scan.at_bumper & in_view & (labels == 1) & ~((right > 0) & (right < len(POINT_CLASSES)))}
+    for number, name in enumerate(POINT_CLASSES[1:], start=1):
+        true, predicted = known & (right == number), known & (labels == number)
+        missed, false = true & ~predicted, predicted & ~true
+        background = false & (right == 0)
+        of_missed = {"of": true, "all": missed, FAR: missed & (np.hypot(points[:, 0], points[:, 1]) >= FAR_M)}
+        of_false = {"of": predicted, "all": false, OTHER: false & ~background, NEAR: scan.near_objects(background)}
+        if name == "car":
+            of_missed[VANS] = scan.within(missed, [box for box in boxes if box.label in ("van", "truck")])
+            of_false |= {LARGE: scan.on_large_structures(background), FLOOR: background & scan.ground.mask}
+        else:
+            of_missed[OTHER] = missed & (labels > 0)
+            of_false[POLE] = scan.on_poles(background)
+        chosen |= {(f"missed {name}", cause): mask for cause, mask in of_missed.items()}
+        chosen |= {(f"false {name}", cause): mask for cause, mask in of_false.items()}
+    counts: Counts = {("errors", name): Counter() for name in ("points", "scans", "objects")}
+    for (error, cause), mask in chosen.items():
+        n = int(np.count_nonzero(mask))
+        if n:
+            counts["errors", "points"][error, cause] = n
+            counts["errors", "scans"][error, cause, drive] = 1
+        if n and error.startswith("missed"):
+            own = [box for box in boxes if error == f"missed {POINT_CLASSES[POINT_CLASS_OF.get(box.label, 0)]}"]
+            keys = {object_key(drive, box) for box in own if inside(box, points[mask]).any()}
+            counts["errors", "objects"].update((error, cause, key) for key in keys)
+    return counts
+
+
+class _Scan:
+    """Where points lie: each method takes and returns a mask (n,) bool."""
+
+    def __init__(self, points: NDArray[np.float32], boxes: Sequence[Box]) -> None:
+        self.points, self.boxes = points, boxes
+
+    @cached_property
+    def ground(self) -> Ground:
+        return find_ground(self.points)
+
+    @property
+    def at_bumper(self) -> NDArray[np.bool_]:
+        x, y, z = self.points[:, :3].T
+        at: NDArray[np.bool_] = (x < BUMPER_X_M) & (np.abs(y) < BUMPER_Y_M) & (z < BUMPER_Z_M)
+        return at
+
+    def within(self, mask: NDArray[np.bool_], boxes: Sequence[Box], margin_m: float = 0.0) -> NDArray[np.bool_]:
+        """Points in one of the boxes."""
+        rows, found = np.flatnonzero(mask), np.zeros(len(mask), np.bool_)
+        for box in boxes:
+            found[rows] |= inside(box, self.points[rows], margin_m)
+        return found
+
+    def near_objects(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Points in a true box, or beside one."""
+        return self.within(mask, self.boxes, NEAR_M)
+
+    def on_large_structures(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Points above the ground, in a cluster that is too large for a car."""
+        above = ~self.ground.mask & np.isfinite(self.points).all(axis=1)
+        clusters = find_clusters(self.points, among=above, seeds=mask & above, min_points=1)
+        rows = np.flatnonzero(clusters >= 0)
+        rows = rows[np.argsort(clusters[rows], kind="stable")]
+        large = np.zeros(len(mask), np.bool_)
+        if rows.size:
+            first = np.flatnonzero(np.diff(clusters[rows], prepend=-1))
+            members = self.points[rows, :3]
+            size = np.maximum.reduceat(members, first) - np.minimum.reduceat(members, first)
+            is_large = (np.hypot(size[:, 0], size[:, 1]) > LARGE_LENGTH_M) | (size[:, 2] > LARGE_HEIGHT_M)
+            large[rows] = is_large[clusters[rows]]
+        return mask & large
+
+    def on_poles(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Points with a point higher than people above or below them, at most 0.3 m aside."""
+        found = np.zeros(len(mask), np.bool_)
+        tall = self.points[self.ground.height_m > POLE_HEIGHT_M, :2]
+        tall = tall[np.argsort(tall[:, 1])]
+        for row in np.flatnonzero(mask):
+            x, y = self.points[row, :2]
+            first, end = np.searchsorted(tall[:, 1], (y - POLE_RADIUS_M, y + POLE_RADIUS_M))
+            found[row] = (np.hypot(*(tall[first:end] - (x, y)).T) <= POLE_RADIUS_M).any()
+        return found
