@@ -21,6 +21,7 @@ from .kernel_cache import njit
 from .points import read_only
 
 __all__ = [
+    "HEIGHT_RANGE_M",
     "Projection",
     "RangeImageProjector",
     "TopViewProjector",

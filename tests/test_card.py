@@ -44,10 +44,40 @@ RANGE_CARD = replace(
 )
 
 
-@pytest.mark.parametrize("card", [TOP_VIEW_CARD, RANGE_CARD])
+FRONT_CARD = replace(TOP_VIEW_CARD, outputs=(TOP_VIEW_CARD.outputs[0], OutputSpec("boxes", "box_dense", front=True)))
+HEIGHT_CARD = replace(
+    RANGE_CARD, input=InputSpec("x", ("range", "height_above_ground"), (10.0, 0.4), (5.0, 0.7)), precision="int8"
+)
+
+
+@pytest.mark.parametrize("card", [TOP_VIEW_CARD, RANGE_CARD, FRONT_CARD, HEIGHT_CARD])
 def test_card_is_read_back_from_json(card: ModelCard) -> None:
     assert ModelCard.from_json(card.to_json()) == card
     assert ModelCard.from_json(card.to_json()).to_json() == card.to_json()
+
+
+def test_a_card_says_whether_boxes_have_a_front() -> None:
+    assert TOP_VIEW_CARD.output_shape("box_dense") == (1, 9, 100, 50)
+    assert FRONT_CARD.output_shape("box_dense") == (1, 10, 100, 50)
+    assert FRONT_CARD.output_shape("class_logits") == (1, 3, 400, 200)
+    document = json.loads(TOP_VIEW_CARD.to_json())
+    for output in document["outputs"]:  # as cards were before there was a front
+        del output["front"]
+    assert ModelCard.from_json(json.dumps(document)) == TOP_VIEW_CARD
+    for wrong in (1, "true", None):
+        document["outputs"][1]["front"] = wrong
+        with pytest.raises(CardError, match=r"output\.front is .*; expected true or false"):
+            ModelCard.from_json(json.dumps(document))
+    for kind in ("class_logits", "class_probabilities", "box_slots"):
+        with pytest.raises(CardError, match=f"'o' of kind {kind} has a front; only box_dense may"):
+            OutputSpec("o", kind, front=True)
+
+
+def test_only_range_images_have_a_height_above_the_ground() -> None:
+    assert HEIGHT_CARD.input.needs_ground
+    assert not RANGE_CARD.input.needs_ground
+    with pytest.raises(CardError, match="unknown to a top_view"):
+        replace(TOP_VIEW_CARD, input=HEIGHT_CARD.input)
 
 
 def test_geometries_know_their_shape() -> None:

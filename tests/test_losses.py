@@ -11,8 +11,11 @@ torch = pytest.importorskip("torch")
 
 from edgeperc.card import TopViewGeometry
 from edgeperc.decode import decode_dense, decode_slots
+from edgeperc.perception import Box
 from edgeperc.simulation.samples import IGNORE
+from edgeperc.simulation.scene import TOP_VIEW_CLASSES
 from edgeperc_export.losses import (
+    FRONT_WEIGHT,
     GEOMETRY_WEIGHTS,
     box_distillation_loss,
     cross_entropy,
@@ -23,6 +26,7 @@ from edgeperc_export.losses import (
     slots_loss,
     ssadnet_loss,
 )
+from edgeperc_export.scans import LabeledScan, mirrored, turned
 from edgeperc_export.targets import REGRESSED_FROM, dense_targets, slot_targets
 
 VIEW = TopViewGeometry()  # x 6..46 m, y -10..10 m, 0.1 m cells
@@ -103,12 +107,42 @@ def test_boxes_without_extent_are_refused(targets):
 def test_dense_target_of_one_box():
     yaw = 0.3
     target = dense_targets([(26.13, 2.27, -0.8, 4.1, 1.7, 1.5, yaw)], VIEW)
-    assert target.shape == (9, 100, 50)
+    assert target.shape == (10, 100, 50)
     assert target.dtype == np.float32
     ((row, col),) = np.argwhere(target[0] == 1.0)
     assert (row, col) == (49, 19)  # (46 - 26.13) / 0.4 = 49.675, (10 - 2.27) / 0.4 = 19.325
-    expected = [0.175, -0.175, np.log(4.1), np.log(1.7), np.sin(2 * yaw), np.cos(2 * yaw), -0.8, np.log(1.5)]
+    expected = [0.175, -0.175, np.log(4.1), np.log(1.7), np.sin(2 * yaw), np.cos(2 * yaw), -0.8, np.log(1.5), 1.0]
     np.testing.assert_allclose(target[1:, row, col], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "front"),
+    [(0, 1), (89, 1), (-89, 1), (91, 0), (-91, 0), (179, 0), (-179, 0), (180, 0), (271, 1), (361, 1), (-541, 0)],
+)
+def test_the_front_is_relative_to_the_decoded_yaw(degrees, front):
+    target = dense_targets([(26.13, 2.27, -0.8, 4.1, 1.7, 1.5, np.radians(degrees))], VIEW)
+    learned = target[0] >= REGRESSED_FROM
+    assert learned.sum() > 1
+    assert (target[9] == np.where(learned, front, 0)).all()
+    logits = np.where(target[9:], 9.0, -9.0)
+    dense = np.concatenate([np.where(target[:1] == 1.0, 5.0, -5.0), target[1:9], logits])[None].astype(np.float32)
+    classes = np.zeros((1, len(TOP_VIEW_CLASSES), VIEW.height, VIEW.width), np.float32)
+    (box,) = decode_dense(dense, classes, "class_logits", VIEW, TOP_VIEW_CLASSES, ("car",))
+    assert np.cos(box.yaw - np.radians(degrees)) == pytest.approx(1.0, abs=1e-6)
+    assert box.front == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    "change", [lambda scan: turned(scan, 2.5), mirrored, lambda scan: mirrored(turned(scan, -1.0))]
+)
+def test_the_front_stays_right_when_a_scan_is_turned_or_mirrored(change):
+    """A car's nose, a point 2 m ahead of its center, stays ahead of its yaw."""
+    box = Box("car", 1.0, (10.0, 3.0, -1.0), (4.0, 1.7, 1.5), 2.0)
+    nose = np.float32([[10.0 + 2.0 * np.cos(2.0), 3.0 + 2.0 * np.sin(2.0), -1.0, 0.0]])
+    scan = change(LabeledScan(nose, np.zeros(1, np.uint8), (box,), (1,), np.zeros((500, 500), np.uint8)))
+    (moved,) = scan.boxes
+    x, y = scan.points[0, :2] - moved.center[:2]
+    assert np.cos(moved.yaw - np.arctan2(y, x)) == pytest.approx(1.0, abs=1e-5)
 
 
 def test_every_learned_cell_points_to_the_same_center():
@@ -282,15 +316,18 @@ def test_distillation_is_lowest_at_the_teachers_probabilities(rng):
     assert distillation_loss(torch.from_numpy(np.log(teacher)), torch.from_numpy(teacher)) < loss
 
 
-def test_distillation_of_boxes_is_weighted_by_the_teachers_heat(rng):
-    taught = rng.normal(size=(2, 9, 3, 4)).astype(np.float32)
-    own = rng.normal(size=(2, 9, 3, 4)).astype(np.float32)
+@pytest.mark.parametrize(("n_taught", "n_own"), [(9, 9), (9, 10), (10, 9), (10, 10)])
+def test_distillation_of_boxes_is_weighted_by_the_teachers_heat(rng, n_taught, n_own):
+    taught = rng.normal(size=(2, n_taught, 3, 4)).astype(np.float32)
+    own = rng.normal(size=(2, n_own, 3, 4)).astype(np.float32)
     heat = 1.0 / (1.0 + np.exp(-taught[:, 0].astype(np.float64)))
     p = 1.0 / (1.0 + np.exp(-own[:, 0].astype(np.float64)))
     share = heat * (heat >= REGRESSED_FROM)
     assert share.sum() > 1.0
     cross = -(heat * np.log(p) + (1.0 - heat) * np.log(1.0 - p)).sum()
-    apart = (np.abs(own - taught)[:, 1:] * np.array(GEOMETRY_WEIGHTS).reshape(1, -1, 1, 1)).sum(1)
+    apart = (np.abs(own[:, :9] - taught[:, :9])[:, 1:] * np.array(GEOMETRY_WEIGHTS).reshape(1, -1, 1, 1)).sum(1)
+    if n_taught == n_own == 10:
+        apart += FRONT_WEIGHT * cross_of_logits(own[:, 9], 1.0 / (1.0 + np.exp(-taught[:, 9].astype(np.float64))))
     expected = (cross + (apart * share).sum()) / share.sum()
     loss = box_distillation_loss(torch.from_numpy(own), torch.from_numpy(taught))
     assert loss.item() == pytest.approx(expected, rel=1e-5)
@@ -356,6 +393,11 @@ def test_negative_slots_are_not_learned(rng):
     assert slots_loss(predicted[1:], target[1:]).item() == 0.0
 
 
+def cross_of_logits(logits, truth):
+    p = 1.0 / (1.0 + np.exp(-logits.astype(np.float64)))
+    return -(truth * np.log(p) + (1.0 - truth) * np.log(1.0 - p))
+
+
 def dense_case(rng):
     target = np.stack([dense_targets([CAR, (15.0, -3.0, 0.0, 6.0, 2.0, 2.0, 0.7)], VIEW), dense_targets([], VIEW)])
     target[:, 0, :20] = -1.0
@@ -369,10 +411,14 @@ def test_dense_loss(rng):
     miss = (1 - heat) ** 4 * p**2 * np.log(1 - p)
     expected_heat = -(hit[heat == 1].sum() + miss[(heat >= 0) & (heat < 1)].sum()) / 2
     share = np.where(heat >= REGRESSED_FROM, heat, 0.0)
-    error = (np.abs(predicted - target)[:, 1:] * np.reshape(GEOMETRY_WEIGHTS, (1, 8, 1, 1))).sum(1)
-    heat_loss, geometry_loss = dense_loss(torch.tensor(predicted), torch.tensor(target))
+    error = (np.abs(predicted - target)[:, 1:9] * np.reshape(GEOMETRY_WEIGHTS, (1, 8, 1, 1))).sum(1)
+    heat_loss, geometry_loss = dense_loss(torch.tensor(predicted[:, :9]), torch.tensor(target))
     assert heat_loss.item() == pytest.approx(expected_heat, rel=1e-4)
     assert geometry_loss.item() == pytest.approx((error * share).sum() / share.sum(), rel=1e-4)
+    error += FRONT_WEIGHT * cross_of_logits(predicted[:, 9], target[:, 9])
+    with_front = dense_loss(torch.tensor(predicted), torch.tensor(target))
+    assert with_front[0].item() == heat_loss.item()
+    assert with_front[1].item() == pytest.approx((error * share).sum() / share.sum(), rel=1e-4)
 
 
 def test_dense_loss_ignores_unlearned_cells(rng):
@@ -389,11 +435,12 @@ def test_dense_loss_of_the_truth_is_small_and_of_no_boxes_is_finite():
     target = torch.tensor(dense_targets([CAR], VIEW))[None]
     perfect = target.clone()
     perfect[:, 0] = torch.where(target[:, 0] == 1.0, 30.0, -30.0)
+    perfect[:, 9] = torch.where(target[:, 9] == 1.0, 30.0, -30.0)
     heat_loss, geometry_loss = dense_loss(perfect, target)
     assert heat_loss.item() < 1e-6
     assert geometry_loss.item() < 1e-6
-    extreme = torch.full((1, 9, 100, 50), 200.0, requires_grad=True)
-    heat_loss, geometry_loss = dense_loss(extreme, torch.zeros(1, 9, 100, 50))
+    extreme = torch.full((1, 10, 100, 50), 200.0, requires_grad=True)
+    heat_loss, geometry_loss = dense_loss(extreme, torch.zeros(1, 10, 100, 50))
     (heat_loss + geometry_loss).backward()
     assert torch.isfinite(heat_loss)
     assert geometry_loss.item() == 0.0
@@ -417,7 +464,7 @@ def test_ssadnet_loss_is_equation_3(rng, head):
     torch.testing.assert_close(total, 2.0 * segmentation + 0.5 * detection)
 
 
-@pytest.mark.parametrize("shape", [(2, 6, 4), (2, 9, 4, 3)])
+@pytest.mark.parametrize("shape", [(2, 6, 4), (2, 9, 4, 3), (2, 10, 4, 3)])
 def test_a_batch_without_ground_truth_is_not_learned(shape):
     logits, boxes = torch.randn(2, 5, 16, 12, requires_grad=True), torch.randn(shape, requires_grad=True)
     labels = torch.full((2, 16, 12), IGNORE, dtype=torch.uint8)

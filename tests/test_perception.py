@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,11 @@ def test_a_box_is_read_back_as_it_was_written() -> None:
     again = Box.from_dict(json.loads(json.dumps(CAR.to_dict())))
     assert again == Box("car", 0.8765, (12.3457, -1.5, -0.9), (4.1, 1.7, 1.5), 0.12346)
     assert Box.from_dict(again.to_dict()) == again
+    facing = replace(again, front=0.9)
+    assert Box.from_dict(json.loads(json.dumps(facing.to_dict()))) == facing
+    earlier = CAR.to_dict()
+    del earlier["front"]
+    assert Box.from_dict(earlier) == again
 
 
 @pytest.mark.parametrize(
@@ -51,6 +57,8 @@ def test_a_box_is_read_back_as_it_was_written() -> None:
         ({"center": 3.0}, "TypeError"),
         ({"size": [1.0, 2.0, 3.0, 4.0]}, "too many values"),
         ({"yaw": None}, "TypeError"),
+        ({"front": "rear"}, "rear"),
+        ({"front": []}, "TypeError"),
     ],
 )
 def test_a_wrong_box_is_refused(change: dict[str, Any], message: str) -> None:
@@ -67,7 +75,9 @@ def test_a_box_without_a_key_is_refused(key: str) -> None:
 
 
 @given(
-    st.dictionaries(st.sampled_from(["label", "score", "center", "size", "yaw"]), st.text() | st.floats() | st.none())
+    st.dictionaries(
+        st.sampled_from(["label", "score", "center", "size", "yaw", "front"]), st.text() | st.floats() | st.none()
+    )
 )
 def test_any_document_is_a_box_or_a_points_error(change: dict[str, Any]) -> None:
     try:

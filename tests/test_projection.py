@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import twins.projection
-from edgeperc import projection
-from edgeperc.card import InputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc import network_input, projection
+from edgeperc.card import CHANNELS, InputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.errors import CardError, PointsError
+from edgeperc.ground import find_ground
 from edgeperc.projection import column_edges, make_projector, row_edges, tabulate
 from edgeperc.sensor import get_sensor
 from edgeperc_bench.peers.projection import contenders, fill_copy
@@ -35,8 +36,7 @@ SMALL = [name for name, view in VIEWS.items() if view.height * view.width < 2000
 
 
 def spec_of(view, order=1):
-    names = ("distance", "remission", "height") if view.kind == "top_view" else ("x", "y", "z", "remission", "range")
-    names = names[::order]
+    names = CHANNELS[view.kind][::order]
     return InputSpec(
         "input", names, tuple(0.5 * k for k in range(len(names))), tuple(1.0 + k for k in range(len(names)))
     )
@@ -52,25 +52,40 @@ def random_points(rng, n):
     return points.astype(np.float32)
 
 
+def edges_of(name):
+    return row_edges(VIEWS[name]), column_edges(VIEWS[name])
+
+
 def assert_same(got, expected):
     for name, expected_array in zip(("image", "index", "pixel"), expected, strict=True):
         np.testing.assert_array_equal(getattr(got, name), expected_array, err_msg=name)
+
+
+def heights_of(points):
+    """Heights above an uneven ground, some beyond the limits, some not finite."""
+    rng = np.random.default_rng(len(points))
+    height_m = (points[:, 2] + rng.normal(1.7, 0.1, len(points))).astype(np.float32)
+    height_m[::11] = rng.choice([math.nan, math.inf, -math.inf, 4.9999, 5.0001, -1.0], len(height_m[::11]))
+    return height_m
 
 
 def check(points, view, spec=None):
     """Compiled, interpreted and slow runs agree to the last bit; returns the projection."""
     spec = spec or spec_of(view)
     projector = make_projector(view, spec)
-    projector.project(np.full((3, 4), 7.0, np.float32))  # leftovers must not shine through
-    compiled = projector.project(points)
+    # Leftovers must not shine through.
+    projector.project(np.full((3, 4), 7.0, np.float32), np.full(3, 7.0, np.float32))
+    with np.errstate(all="ignore"):
+        height_m = heights_of(points)
+    compiled = projector.project(points, height_m)
     edges = (row_edges(view), column_edges(view)) if view.kind == "range_image" else ()
-    assert_same(compiled, twins.projection.project(points, view, edges, spec))
+    assert_same(compiled, twins.projection.project(points, view, edges, spec, height_m))
     with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
         for name in KERNELS:
             kernel = getattr(projection, name)
             patch.setattr(projection, name, getattr(kernel, "py_func", kernel))
         if view.height * view.width < 2000:  # an interpreted run visits every pixel
-            assert_same(projector.project(points), (compiled.image, compiled.index, compiled.pixel))
+            assert_same(projector.project(points, height_m), (compiled.image, compiled.index, compiled.pixel))
     return compiled
 
 
@@ -106,7 +121,7 @@ def test_any_numbers(rows, name):
 def test_pixels_are_those_of_true_angles(name):
     view = VIEWS[name]
     points = random_points(np.random.default_rng(5), 20000)
-    seen = make_projector(view, spec_of(view)).project(points)
+    seen = make_projector(view, spec_of(view)).project(points, heights_of(points))
     with np.errstate(all="ignore"):
         x, y, z, _ = points.astype(np.float64).T
         azimuth, elevation = np.degrees(np.arctan2(y, x)), np.degrees(np.arctan2(z, np.hypot(x, y)))
@@ -235,7 +250,7 @@ def test_points_may_be_read_only():
 def test_every_pixel_leads_back_to_its_point():
     points = random_points(np.random.default_rng(1), 5000)
     for view in VIEWS.values():
-        seen = make_projector(view, spec_of(view)).project(points)
+        seen = make_projector(view, spec_of(view)).project(points, heights_of(points))
         flat = np.flatnonzero(seen.index >= 0)
         np.testing.assert_array_equal(seen.pixel[seen.index.reshape(-1)[flat]], flat)
         np.testing.assert_array_equal(np.unique(seen.pixel[seen.pixel >= 0]), flat)
@@ -276,6 +291,64 @@ def test_wrong_arrays_are_refused():
     ):
         with pytest.raises(PointsError, match=f"^{name} buffer"):
             projector.fill(good, **(buffers | {name: bad}))
+
+
+def test_heights_above_the_ground_are_clipped_and_normalized():
+    spec = InputSpec("input", ("height_above_ground", "z"), (1.0, 0.0), (2.0, 1.0))
+    points = np.zeros((7, 4), np.float32)
+    points[:, 0], points[:, 1] = 10.0, np.linspace(-9.0, 9.0, 7)  # seven columns of one row
+    height_m = np.float32([0.0, 3.0, -1.0, -2.0, 5.0, 80.0, math.nan])
+    projector = make_projector(VIEWS["front"], spec)
+    assert projector.needs_ground
+    assert not make_projector(VIEWS["top view"], spec_of(VIEWS["top view"])).needs_ground
+    seen = projector.project(points, height_m)
+    got = seen.image[0].reshape(-1)[seen.pixel]
+    np.testing.assert_array_equal(got, [-0.5, 1.0, -1.0, -1.0, 2.0, 2.0, -1.0])
+    assert not seen.image[:, seen.index < 0].any()
+
+
+def test_missing_or_wrong_heights_are_refused():
+    projector = make_projector(VIEWS["front"], spec_of(VIEWS["front"]))
+    points = np.ones((5, 4), np.float32)
+    with pytest.raises(PointsError, match=r"height_m is missing.*find_ground"):
+        projector.project(points)
+    for bad in (np.zeros(4, np.float32), np.zeros(5), np.zeros((5, 1), np.float32)):
+        with pytest.raises(PointsError, match=r"height_m is \(.*for 5 points; expected \(5,\) float32"):
+            projector.project(points, bad)
+    strided = np.zeros(10, np.float32)[::2]
+    strided.flags.writeable = False
+    assert (projector.project(points, strided).pixel >= -1).all()
+
+
+def test_five_channels_do_not_depend_on_heights():
+    points = random_points(np.random.default_rng(4), 3000)
+    names = CHANNELS["range_image"][:5]
+    without = make_projector(VIEWS["front"], InputSpec("input", names, (0.5,) * 5, (2.0,) * 5)).project(points)
+    six = InputSpec("input", CHANNELS["range_image"], (0.5,) * 6, (2.0,) * 6)
+    seen = make_projector(VIEWS["front"], six).project(points, heights_of(points))
+    np.testing.assert_array_equal(seen.image[:5], without.image)
+
+
+@pytest.mark.parametrize("n", [0, 1, 4000])
+def test_a_scan_is_projected_with_its_ground(n):
+    rng = np.random.default_rng(n)
+    points = np.zeros((n, 4), np.float32)
+    points[:, :2] = rng.uniform(-30.0, 30.0, (n, 2))
+    points[:, 2] = 0.05 * points[:, 0] - 1.73  # a slope
+    points[::9, 2] += 1.2
+    points[3::50] = math.nan
+    projector = make_projector(VIEWS["front"], spec_of(VIEWS["front"]))
+    seen = network_input.project(projector, points)
+    height_m = find_ground(points, mount_height_m=1.73).height_m
+    assert_same(
+        seen, twins.projection.project(points, VIEWS["front"], edges_of("front"), spec_of(VIEWS["front"]), height_m)
+    )
+    assert n < 4000 or abs(np.nanmedian(height_m)) < 0.05
+    plain = make_projector(VIEWS["top view"], spec_of(VIEWS["top view"]))
+    assert network_input.input_heights(plain, points) is None
+    assert_same(
+        network_input.project(plain, points), [getattr(plain.project(points), k) for k in ("image", "index", "pixel")]
+    )
 
 
 def test_the_benchmark_compares_equal_answers():

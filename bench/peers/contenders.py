@@ -17,6 +17,7 @@ import numpy as np
 
 from edgeperc.adapt import condition
 from edgeperc.card import ModelCard
+from edgeperc.network_input import project
 from edgeperc.projection import make_projector
 from edgeperc.sensor import get_sensor
 from edgeperc.session import available_providers
@@ -128,7 +129,7 @@ def groups(
     for variant in (*views["range_image"], *views["top_view"]):
         card, paths = variant.card, (variant.path,)
         image = folder / f"{variant.path.stem}-input.npy"
-        np.save(image, make_projector(card.view, card.input).project(points).image)
+        np.save(image, project(make_projector(card.view, card.input), points).image)
         alone = [
             Contender(f"onnxruntime {own}, network alone", "session", own, "auto", paths, image=image)
             for own in dict.fromkeys(("cpu", provider))

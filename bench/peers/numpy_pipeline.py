@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from edgeperc import Box, PointLabels, TopView
 from edgeperc.card import ModelCard, TopViewGeometry
 from edgeperc.geometry import draw_footprints
+from edgeperc.ground import find_ground
+from edgeperc.mounting import MODEL_HEIGHT_M
 from edgeperc.sensor import SensorProfile
 
 from ..worker import Prediction
@@ -64,7 +66,7 @@ class NumpyPipeline:
         boxes: tuple[Box, ...] = ()
         for card, engine, projector, index in self.networks:
             pixel = np.empty(len(points), np.int32)
-            projector.fill(points, engine.input, index, pixel)
+            projector.fill(points, engine.input, index, pixel, _heights(projector, points))
             by_name = engine.run()
             outputs = {o.kind: by_name[o.name] for o in card.outputs}
             logits = next(v for kind, v in outputs.items() if kind.startswith("class_"))
@@ -109,6 +111,11 @@ def vote(
     return found
 
 
+def _heights(projector: NumpyTopView | NumpyRangeImage, points: NDArray[np.float32]) -> NDArray[np.float32] | None:
+    """Heights above the ground, by edgeperc's kernels: numpy would take seconds."""
+    return find_ground(points, mount_height_m=MODEL_HEIGHT_M).height_m if projector.needs_ground else None
+
+
 def dense_boxes(card: ModelCard, logits: NDArray[np.float32], dense: NDArray[np.float32]) -> list[Box]:
     """`edgeperc.decode.decode_dense` in numpy."""
     view = card.view
@@ -121,7 +128,7 @@ def dense_boxes(card: ModelCard, logits: NDArray[np.float32], dense: NDArray[np.
     rows, cols = np.nonzero((heat == highest) & (heat >= threshold))
     best = np.argsort(-heat[rows, cols], kind="stable")[:MAX_BOXES]
     rows, cols = rows[best], cols[best]
-    score, d_row, d_col, log_l, log_w, sin, cos, z, log_h = dense[:, rows, cols].astype(np.float64)
+    score, d_row, d_col, log_l, log_w, sin, cos, z, log_h, *front = dense[:, rows, cols].astype(np.float64)
     cell_m = STRIDE * view.cell_m
     x, y = view.x_range_m[1] - (rows + 0.5 + d_row) * cell_m, view.y_range_m[1] - (cols + 0.5 + d_col) * cell_m
     sizes, yaw = np.exp([log_l, log_w, log_h]).T, 0.5 * np.arctan2(sin, cos)
@@ -141,7 +148,10 @@ def dense_boxes(card: ModelCard, logits: NDArray[np.float32], dense: NDArray[np.
         sums = (shares / shares.sum(axis=0))[:, inside].sum(axis=1)
         evidence = [_evidence(card, name, sums[card.classes.index(name)], size) for name in card.box_classes]
         label = card.box_classes[int(np.argmax(evidence))]
-        boxes.append(Box(label, box.score, place, size, box.yaw))
+        p_front = float(1.0 / (1.0 + np.exp(-front[0][k]))) if front else None
+        if p_front is not None and p_front < 0.5:
+            p_front, yaw[k] = 1.0 - p_front, yaw[k] + (-math.pi if yaw[k] > 0.0 else math.pi)
+        boxes.append(Box(label, box.score, place, size, float(yaw[k]), p_front))
     return boxes
 
 

@@ -26,7 +26,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from edgeperc.card import InputSpec, RangeImageGeometry, TopViewGeometry
-from edgeperc.projection import RangeImageProjector, TopViewProjector, column_edges, row_edges, tabulate
+from edgeperc.projection import HEIGHT_RANGE_M, RangeImageProjector, TopViewProjector, column_edges, row_edges, tabulate
 from edgeperc.readers.files import read_points
 from edgeperc.sensor import get_sensor
 from edgeperc.simulation.drawn import random_scene
@@ -66,6 +66,7 @@ class _NumpyProjector:
 
     def __init__(self, view: TopViewGeometry | RangeImageGeometry, input: InputSpec) -> None:
         self.shape = (len(input.channels), view.height, view.width)
+        self.needs_ground = input.needs_ground
         self.mean, self.std = (np.array(of, np.float32)[:, None] for of in (input.mean, input.std))
 
     def fill(
@@ -74,14 +75,18 @@ class _NumpyProjector:
         image: NDArray[np.float32],
         index: NDArray[np.int32],
         pixel: NDArray[np.int32],
+        height_m: NDArray[np.float32] | None = None,
     ) -> None:
-        """Project into the caller's buffers, as `TopViewProjector.fill`."""
+        """Project into the caller's buffers, as `TopViewProjector.fill`; a height above the ground comes last."""
         rows, flat, rank = self.select(points)
         pixel[:] = -1
         pixel[rows] = flat
         seen, winner = winners(flat, rank, index.reshape(-1), rows)
         image[:] = 0.0
-        image.reshape(len(image), -1)[:, seen] = (self.planes(*points[winner].T) - self.mean) / self.std
+        raw = self.planes(*points[winner].T)
+        if height_m is not None:
+            raw = np.vstack((raw, np.clip(height_m[winner], *HEIGHT_RANGE_M)))
+        image.reshape(len(image), -1)[:, seen] = (raw - self.mean) / self.std
 
     def select(self, points: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32]]:
         """Rows in view, the flat pixel of each, and its rank: the smallest rank wins the pixel."""
@@ -136,7 +141,7 @@ class NumpyRangeImage(_NumpyProjector):
     ----------
     view : RangeImageGeometry
     input : InputSpec
-        Channels x, y, z, remission, range.
+        Channels x, y, z, remission, range and, if wanted, height_above_ground.
     """
 
     def __init__(self, view: RangeImageGeometry, input: InputSpec) -> None:

@@ -39,9 +39,10 @@ VIEWS = {
 VEHICLES = {"car": (4.0, 1.8, 1.6), "van": (5.0, 2.0, 2.2)}
 
 
-def card_of(view: TopViewGeometry | RangeImageGeometry, *outputs: OutputSpec) -> ModelCard:
+def card_of(view: TopViewGeometry | RangeImageGeometry, *outputs: OutputSpec, above: bool = False) -> ModelCard:
+    """A card; ``above``: with the height above the ground as an input channel."""
     top = isinstance(view, TopViewGeometry)
-    channels = VIEWS[view.kind]
+    channels = (*VIEWS[view.kind], *(["height_above_ground"] if above else []))
     return ModelCard(
         name=f"made-up-{view.kind}",
         version="1",
@@ -56,6 +57,7 @@ def card_of(view: TopViewGeometry | RangeImageGeometry, *outputs: OutputSpec) ->
 
 
 DENSE = OutputSpec("d", "box_dense"), OutputSpec("c", "class_logits")
+FRONT = OutputSpec("d", "box_dense", front=True), DENSE[1]
 SLOTS = OutputSpec("c", "class_probabilities"), OutputSpec("s", "box_slots")
 ELEVATIONS = tuple(2.0 - 1.7 * k for k in range(16))
 
@@ -67,10 +69,14 @@ def cards() -> list[tuple[ModelCard, ...]]:
     image = card_of(RangeImageGeometry(ELEVATIONS, 64), DENSE[1])
     turn = card_of(RangeImageGeometry(ELEVATIONS, 128, 180.0, -180.0), DENSE[1])
     narrow = card_of(RangeImageGeometry((1.0, -1.0), 3, 10.0, -10.0), SLOTS[0])
+    front = card_of(ahead, *FRONT)
+    above = card_of(image.view, DENSE[1], above=True)
+    above_turn = card_of(turn.view, DENSE[1], above=True)
     shipped = [resolve(name)[0].card for name in ("ssadnet", "pointseg", "lodnn")]
     small = [
         (dense, image),
-        (dense, image),
+        (front, above),
+        (front, above_turn),
         (slots, image),
         (plain, turn),
         (dense, turn),
@@ -89,7 +95,7 @@ class MadeUp:
         view, n = card.view, len(card.classes)
         self.input = np.zeros((len(card.input.channels), view.height, view.width), np.float32)
         shapes: dict[str, tuple[int, ...]] = {
-            "box_dense": (9, view.height // 4, view.width // 4), "box_slots": (20, 4),
+            "box_dense": card.output_shape("box_dense")[1:], "box_slots": (20, 4),
             **dict.fromkeys(("class_logits", "class_probabilities"), (n, view.height, view.width)),
         }  # fmt: skip
         self.outputs = {o.kind: np.zeros(shapes[o.kind], np.float32) for o in card.outputs}
@@ -295,6 +301,7 @@ def check_box(box: Box) -> None:
     check(min(box.size) > 0.0, f"a box without extent: {box}")
     check(0.0 <= box.score <= 1.0, f"a score of {box.score}")
     check(abs(box.yaw) <= math.pi + 1e-6, f"a yaw of {box.yaw}")
+    check(box.front is None or 0.0 <= box.front <= 1.0, f"a front of {box.front}")
 
 
 def check_tracks(tracks: Tracks) -> None:

@@ -95,6 +95,15 @@ def peaks(heat, threshold):
     return peak
 
 
+def facing(yaw, logit):
+    """Twin of `edgeperc.decode._facing` for one box: the yaw of the likelier front, and its probability."""
+    with np.errstate(over="ignore"):
+        front = 1.0 / (1.0 + np.exp(-np.float64(logit)))
+    if front >= 0.5:
+        return yaw, front
+    return (yaw - np.pi if yaw > 0.0 else yaw + np.pi), 1.0 - front
+
+
 def footprint_sums(values, are_logits, rectangles, x_far, y_left, cell, max_summed=2**18):
     """Twin of `edgeperc.decode.fill_footprint_sums`."""
     probabilities = softmax(values) if are_logits else values.astype(np.float64)

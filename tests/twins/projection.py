@@ -39,7 +39,7 @@ def range_image_pixel(point, view, row_edges, col_edges):
     return row * view.width + col, squared_range
 
 
-def project(points, view, edges, spec):
+def project(points, view, edges, spec, height_m=None):
     """Twin of `edgeperc.projection`'s kernels: image, index, pixel. ``edges``: a range image's, of rows and columns."""
     image = np.zeros((len(spec.channels), view.height * view.width), np.float32)
     index = np.full(view.height * view.width, -1, np.int32)
@@ -58,9 +58,10 @@ def project(points, view, edges, spec):
             index[flat] = i
             x, y, z, remission = point
             distance = np.sqrt(x * x + y * y)
+            above = -1.0 if height_m is None or np.isnan(height_m[i]) else min(max(height_m[i], -1.0), 5.0)
             raw = {
                 "x": x, "y": y, "z": z, "height": z, "distance": distance, "range": np.sqrt(x * x + y * y + z * z),
-                "remission": remission,
+                "remission": remission, "height_above_ground": above,
             }  # fmt: skip
             image[:, flat] = (np.array([raw[name] for name in spec.channels], np.float32) - mean) / std
     return image.reshape(-1, view.height, view.width), index.reshape(view.height, view.width), pixel
