@@ -516,6 +516,10 @@ def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         for box in scan.boxes:
             x, y, z = np.add(box.center, (3.0, -2.0, 0.5))
             print(box.label.title(), 0, x, y, z, *box.size, box.yaw, file=file)
+    columns = ["class", "-", "x", "y", "z", "l", "w", "h", "yaw"]
+    names = {name: name for name in ("car", "van", "truck", "pedestrian", "cyclist")} | {"*": "ignore"}
+    description = {"schema": 1, "sensor": "hdl-64e", "boxes": names, "box_columns": columns}
+    (boxes / "scans.json").write_text(json.dumps(description))
     index = project(scan.points)
     image = np.zeros((64, 512, 6), np.float32)
     seen = index >= 0
