@@ -25,12 +25,12 @@ from ..projection import make_projector
 from ..sensor import SensorProfile
 from ..session import Session
 from ..simulation.samples import IGNORE
-from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
+from ..simulation.scene import POINT_CLASSES
 from .causes import count_causes
 from .datasets import Frame, RoadFrame
 from .metrics import FEWEST_RETURNS, BoxEvaluator, ProbabilitySweep, boxes_to_find, object_key
 from .mistakes import Mistakes
-from .scan_folder import ScanFrame
+from .scan_folder import ScanFrame, class_number
 from .tables import ALL_ROUND, BANDS, VEHICLES, Record, banded, within
 from .truth import Truth, folder_truth, kitti_truth, semantickitti_truth, simulated_truth
 from .unseen import check_unseen, training_scans_of
@@ -62,7 +62,8 @@ class Judge:
         Perceive each scan as a sensor mounted so would have recorded it, with the mounting to be estimated from this
         scan alone. Points (not pixels) and boxes are evaluated. None: as recorded, on the training vehicle.
     sensor : SensorProfile or None
-        The sensor of the scans for `record_scan`, with what is known of its mounting. None: the training vehicle's.
+        The sensor of the scans for `record_scan`, with what is known of its mounting; their points are evaluated by the
+        classes of the model. None: the training vehicle's, and `POINT_CLASSES`.
 
     Raises
     ------
@@ -89,10 +90,13 @@ class Judge:
             self.perceive = _perceiver(models, provider, precision, boxes_from, sensor.mounting, sensor)
         self.mounted = None if mounted is None else ModelFrame(mounted)
         self.as_recorded = mounted is None and sensor is None
+        self.point_classes: tuple[str, ...] = POINT_CLASSES
         self.drive: str | None = None
         networks = [_Network(session) for session in self.perceive.sessions]
         self.from_sensor = next((n for n in networks if n.card.view.kind == "range_image"), None)
         self.from_above = next((n for n in networks if n.card.view.kind == "top_view"), None)
+        if sensor is not None and self.from_sensor is not None:
+            self.point_classes = self.from_sensor.card.classes
         self.box_classes = self.from_above.card.box_classes if self.from_above and boxes_from != "clusters" else ()
         self.cluster_classes = self.from_sensor.card.classes[1:] if self.from_sensor and boxes_from != "network" else ()
         self.view: TopViewGeometry | None = None
@@ -173,7 +177,8 @@ class Judge:
             self.drive = frame.drive
         found = self.perceive(frame.points)
         boxes = ModelFrame(found.mounting).move_boxes(found.boxes)
-        return self._compare(folder_truth(frame, found.mounting, self.view), replace(found, boxes=boxes))
+        truth = folder_truth(frame, found.mounting, self.view, self.point_classes)
+        return self._compare(truth, replace(found, boxes=boxes))
 
     def _compare(self, truth: Truth, found: Perception) -> tuple[Record, Mistakes | None]:
         tallies: dict[tuple[str, ...], Any] = {}
@@ -249,25 +254,28 @@ class Judge:
         assert truth.labels is not None
         right = np.where(found.in_view, truth.labels, IGNORE).astype(np.uint8)
         range_m = np.hypot(truth.points[:, 0], truth.points[:, 1])
-        labels = _renamed(found.labels, found.classes, POINT_CLASSES)
-        tallies |= banded(("points",), POINT_CLASSES, labels, right, range_m)
+        labels = _renamed(found.labels, found.classes, self.point_classes)
+        tallies |= banded(("points",), self.point_classes, labels, right, range_m)
         if self.as_recorded:
             pixels = _renamed(self.from_sensor.point_labels(truth.points), found.classes, POINT_CLASSES)
             tallies |= banded(("pixels",), POINT_CLASSES, pixels, right, range_m)
         counted = right != IGNORE
-        tallies |= count_causes(truth.points, labels, truth.labels, counted, found.in_view, truth.boxes, truth.drive)
+        if self.point_classes == POINT_CLASSES:
+            tallies |= count_causes(
+                truth.points, labels, truth.labels, counted, found.in_view, truth.boxes, truth.drive
+            )
         tallies |= {("objects", band): Counter() for band in BANDS}
         by_box = {id(box) for box in (*mistakes.found, *(box for box, _ in mistakes.missed))}
         hit, missed = [*mistakes.found], [*mistakes.missed]
         for box in truth.boxes:
-            kind, distance_m = POINT_CLASS_OF.get(box.label), math.hypot(*box.center[:2])
+            kind, distance_m = class_number(box.label, self.point_classes), math.hypot(*box.center[:2])
             own = inside(box, truth.points) & (right == kind)
             n_own = int(np.count_nonzero(own))
-            if kind is None or n_own < FEWEST_RETURNS:
+            if kind in (0, IGNORE) or n_own < FEWEST_RETURNS:
                 continue
             for band, within_m in BANDS.items():
                 if within(distance_m, within_m):
-                    tallies["objects", band][POINT_CLASSES[kind], object_key(truth.drive, box)] += 1
+                    tallies["objects", band][self.point_classes[kind], object_key(truth.drive, box)] += 1
             if id(box) in by_box or distance_m >= FARTHEST_M:
                 continue
             if 2 * int(np.count_nonzero(labels[own] == kind)) >= n_own:

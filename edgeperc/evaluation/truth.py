@@ -16,7 +16,7 @@ from ..observed import Observer
 from ..perception import Box
 from ..points import read_only
 from ..simulation.samples import IGNORE, labels_by_boxes, simulated_scan
-from ..simulation.scene import POINT_CLASS_OF, TOP_VIEW_CLASSES
+from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES, TOP_VIEW_CLASSES
 from .datasets import ROAD_CLASSES, Frame, RoadFrame
 from .scan_folder import ScanFrame
 from .tables import VEHICLES
@@ -48,7 +48,8 @@ class Truth:
     points : (n, 4) float32
         x, y, z [m] in the sensor frame, remission.
     labels : (n,) uint8 or None
-        Index into `POINT_CLASSES`, `IGNORE` where unknown; None if points and objects are not labeled.
+        Index into `POINT_CLASSES`, or into the classes that `folder_truth` is given; `IGNORE` where unknown. None if
+        points and objects are not labeled.
     boxes : tuple of Box
         In the sensor frame.
     returns : tuple of int
@@ -104,7 +105,12 @@ def semantickitti_truth(frame: RoadFrame, view: TopViewGeometry | None) -> Truth
     return Truth(frame.name, frame.drive, frame.points, None, (), (), _everywhere, cells, (OBSERVED, "road"))
 
 
-def folder_truth(frame: ScanFrame, mounting: Mounting, view: TopViewGeometry | None) -> Truth:
+def folder_truth(
+    frame: ScanFrame,
+    mounting: Mounting,
+    view: TopViewGeometry | None,
+    classes: Sequence[str] = POINT_CLASSES,
+) -> Truth:
     """Ground truth of a scan of a `ScanFolder`, moved into the frame of the models.
 
     Parameters
@@ -114,10 +120,12 @@ def folder_truth(frame: ScanFrame, mounting: Mounting, view: TopViewGeometry | N
         The mounting that the runtime used for this scan: its results are compared in the frame that it had.
     view : TopViewGeometry or None
         Grid of the cells; None: no cells.
+    classes : sequence of str
+        Classes of points, the background first.
     """
     model = ModelFrame(mounting)
     boxes = model.move_boxes(frame.boxes or ())
-    labels = None if frame.boxes is None and frame.point_classes is None else frame.labels()
+    labels = None if frame.boxes is None and frame.point_classes is None else frame.labels(classes)
 
     def known(places: NDArray[np.float64]) -> NDArray[np.bool_]:
         return frame.known_at((places[:, :3] - model.t) @ model.R)
