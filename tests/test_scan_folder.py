@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from edgeperc.card import TopViewGeometry
 from edgeperc.errors import MountingError, OptionError, PointsError, SensorError
 from edgeperc.evaluation.datasets import scan_hash
 from edgeperc.evaluation.evaluate import evaluate
-from edgeperc.evaluation.scan_folder import ScanFolder, ScanLayout, class_number, known_layouts, read_layout
+from edgeperc.evaluation.scan_folder import _KEYS, ScanFolder, ScanLayout, class_number, known_layouts, read_layout
 from edgeperc.evaluation.truth import cells_inside, folder_truth, road_cells
 from edgeperc.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.perception import Box
@@ -350,6 +351,17 @@ def test_a_sensor_of_its_own_and_what_is_known_of_its_mounting(tmp_path: Path) -
     assert sensor == replace(get_sensor("hdl-64e"), name="byte", remission_range=(0.0, 255.0))
     own = {"name": "own", "elevations_deg": [2, 0, -2], "columns": 900}
     assert ScanLayout.from_json(json.dumps({**DESCRIPTION, "sensor": own})).sensor.n_beams == 3
+
+
+def test_the_description_in_the_documentation() -> None:
+    page = (Path(__file__).parent.parent / "docs/howto/train.md").read_text("utf-8")
+    (block,) = re.findall(r"^```json\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE)
+    layout = ScanLayout.from_json(block)
+    assert layout.sensor.mounting == Mounting(1.9)
+    assert layout.boxes["forklift"] == layout.points["forklift"] == "forklift"
+    entries = re.findall(r"^\| (`.*?) \|", page, flags=re.MULTILINE)
+    named = {name for entry in entries for name in re.findall(r"`(\w+)`", entry)}
+    assert named | {"name", "about"} == _KEYS
 
 
 JSON = st.recursive(
