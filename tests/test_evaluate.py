@@ -161,7 +161,8 @@ def test_points_by_hand(world: World) -> None:
         "precision": 0.5,
         "recall": 0.5,
         "iou": pytest.approx(1 / 3, abs=1e-4),
-        **dict.fromkeys(("precision_interval", "recall_interval", "iou_interval")),
+        "iou_by_drive": pytest.approx(1 / 3, abs=1e-4),
+        **dict.fromkeys(("precision_interval", "recall_interval", "iou_interval", "iou_by_drive_interval")),
         "n_points": 2,
     }
     assert table["all"]["pedestrian"]["iou"] is None
@@ -541,6 +542,10 @@ def test_intervals_are_over_drives(world: World) -> None:
     assert car["iou_interval"] == [0.5, 1.0]
     assert cyclist["iou"] == 1.0
     assert cyclist["iou_interval"] is None  # in one drive only
+    # With equal weights the first drive has 5 of 10 points, the second 10 of 10.
+    assert car["iou_by_drive"] == 0.75
+    assert car["iou_by_drive_interval"] == [0.5, 1.0]
+    assert "iou_by_drive" not in result["pixels"]["all"]["car"]
     assert evaluated(Judge(["pointseg"]), half, right, n_resamples=1000) == evaluated(
         Judge(["pointseg"]), half, right, n_resamples=1000
     )

@@ -132,7 +132,10 @@ def _with_intervals(*rates: tuple[str, str]) -> tuple[tuple[str, str], ...]:
 _RATES = (("precision", "precision"), ("recall", "recall"))
 _OBJECT_COUNTS = (("objects", "n_objects"), ("drives", "n_drives"))
 _LABELED_COLUMNS = (("labels", "n_boxes"), *_OBJECT_COUNTS)
-_POINT_COLUMNS = (*_with_intervals(("IoU", "iou"), *_RATES), ("points", "n_points"), *_OBJECT_COUNTS)
+_POINT_COLUMNS = (
+    *_with_intervals(("IoU", "iou"), ("IoU by drive", "iou_by_drive"), *_RATES),
+    *(("points", "n_points"), *_OBJECT_COUNTS),
+)
 _HIT_COLUMNS = (("true", "n_truth"), ("predicted", "n_predicted"), ("hits", "n_hits"), *_OBJECT_COUNTS)
 _BOX_COLUMNS = (
     *_with_intervals(("AP50", "ap"), *_RATES, ("mIoU@.5", "mean_iou_50"), ("mIoU@.7", "mean_iou_70")),
@@ -190,8 +193,12 @@ def _labeled_lines(of_block: Mapping[str, Any]) -> list[str]:
 
 def _point_lines(of_block: Mapping[str, Any]) -> list[str]:
     lines = []
-    for kind, title in (("points", "points"), ("pixels", "points with the class of their pixel, before refinement")):
-        lines += table_lines(title, _POINT_COLUMNS, _class_rows(of_block.get(kind, {}), "n_points"))
+    for kind, title in (
+        ("points", "points; IoU by drive: each drive counts as one scan"),
+        ("pixels", "points with the class of their pixel, before refinement"),
+    ):
+        columns = [column for column in _POINT_COLUMNS if kind == "points" or "iou_by_drive" not in column[1]]
+        lines += table_lines(title, columns, _class_rows(of_block.get(kind, {}), "n_points"))
     return lines
 
 

@@ -115,7 +115,8 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
         ``"few": True`` if there are fewer than `FEWEST_OBJECTS`.
 
         - ``"labeled"``: the labeled objects with at least three returns, by class.
-        - ``"points"``, ``"pixels"``: by band and class.
+        - ``"points"``, ``"pixels"``: by band and class. ``"iou_by_drive"``: the IoU if each drive counts as one scan,
+          its mean scan, so that a long drive does not count for more than a single scan of another street.
         - ``"boxes"``: by kind (``"upright"``, ``"oriented"``), band and class, where the models detect the class.
         - ``"all_round"``: by band and class, oriented boxes of vehicles (AP50) and people (AP25) wherever the truth is
           known, detected or not. ``"heading"``: of those that were matched, whose heading is right within 45 degrees.
@@ -127,7 +128,7 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
     by_drive: dict[str, list[Tallies]] = {}
     for record in records:
         by_drive.setdefault(record.drive, []).append(record.tallies)
-    drives = [_summed(tallies) for tallies in by_drive.values()]
+    drives = [_one_drive(tallies) for tallies in by_drive.values()]
     whole = _figures(_summed(drives))
     draws = np.random.default_rng(0).integers(len(drives), size=(n_resamples if len(drives) > 1 else 0, len(drives)))
     # Few drives have few different resamples (three drives have ten), so each is computed once.
@@ -135,6 +136,17 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
     samples = [_figures(_summed([drives[k] for k in draw])) for draw in different]
     _add_intervals(whole, [_figures(drive) for drive in drives], samples, times)
     return _plain(whole) | {"n_frames": sum(map(len, by_drive.values())), "n_drives": len(drives)}
+
+
+def _one_drive(scans: Sequence[Tallies]) -> Tallies:
+    """Sum the counts of a drive's scans, and add the confusion of its mean scan."""
+    tallies = _summed(scans)
+    means: dict[tuple[str, ...], Any] = {}
+    for key, tally in tallies.items():
+        if key[0] == "points":
+            mean_scan = means["mean_scan", key[1]] = Confusion(tally.classes, ignore=tally.ignore)
+            mean_scan.counts = tally.counts / len(scans)
+    return {**tallies, **means}
 
 
 def _summed(parts: Sequence[Tallies]) -> Tallies:
@@ -150,6 +162,9 @@ def _figures(tallies: Tallies) -> dict[str, Any]:
             found[group] = _labeled_rows(tally)
         elif group in ("points", "pixels"):
             found.setdefault(group, {})[band] = _point_rows(tally, tallies["objects", band])
+        elif group == "mean_scan":
+            for name, iou in zip(tally.classes, tally.iou().tolist(), strict=True):
+                found["points"][band][name]["iou_by_drive"] = iou
         elif group == "boxes":
             rows = {name: _box_rows(tally, within_m) for name, within_m in BANDS.items()}
             found.setdefault(group, {})[key[1]] = rows
