@@ -448,7 +448,8 @@ def check_fitness(points: NDArray[np.float32], profile: FitnessProfile, sensor: 
         x, y, z [m], remission scaled to 0..1 by ``sensor``. Points that are not finite are skipped.
     profile : FitnessProfile
     sensor : SensorProfile
-        The sensor that the caller says recorded the scan.
+        The sensor that the caller says recorded the scan. If its remission function is constant, because the scan has
+        no remission, remission is not checked.
 
     Returns
     -------
@@ -469,7 +470,10 @@ def check_fitness(points: NDArray[np.float32], profile: FitnessProfile, sensor: 
         return (Finding("The scan holds no finite point: is the sensor connected and its driver running?", True),)
     if scan.n_sampled < 300.0 and scan.points_in_view < 0.2 * profile.points_in_view[0]:
         return (_too_few(scan, profile),)  # too few points for the other checks
-    return (*_geometry_findings(scan, profile, sensor), *_remission_findings(scan, profile, sensor))
+    findings = _geometry_findings(scan, profile, sensor)
+    if sensor.remission is None or any(sensor.remission.coefficients[1:]):
+        findings += _remission_findings(scan, profile, sensor)
+    return tuple(findings)
 
 
 def _too_few(scan: _Measures, profile: FitnessProfile) -> Finding:

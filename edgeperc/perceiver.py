@@ -10,7 +10,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from numbers import Integral, Real
 from types import MappingProxyType
@@ -19,7 +19,7 @@ from typing import Literal, NoReturn, ParamSpec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .adapt import Interpolator, condition
+from .adapt import Interpolator, condition, render
 from .card import ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, join_boxes, objects_from_points
 from .decode import decode_classes, decode_top_view
@@ -36,6 +36,7 @@ from .perception import Box, Perception, PointLabels, TopView
 from .points import as_points
 from .projection import RangeImageProjector, TopViewProjector, make_projector
 from .refine import label_points, remove_outliers
+from .remission import NO_REMISSION, RemissionMatcher
 from .sensor import SensorProfile, get_sensor
 from .session import Session
 from .zoo import DEFAULT
@@ -150,7 +151,8 @@ class Perceiver:
         clusters.
     adapt : {"both", "remission", "interpolation", "none"}
         How to adapt scans of a sensor that the models were not trained on. ``"remission"``: convert its remission to
-        that of the training sensor, if its profile has a function for it. ``"interpolation"``: fill the range image
+        that of the training sensor, by the function of its profile or one that is matched to the first five scans
+        (`edgeperc.remission.RemissionMatcher`). ``"interpolation"``: fill the range image
         between its beams and columns, if they are fewer. Scans of the training sensor are not changed.
     boxes_from : {"both", "network", "clusters"}
         ``"network"``: boxes of a top-view model, vehicles ahead. ``"clusters"``: boxes around clusters of labeled
@@ -237,11 +239,12 @@ class Perceiver:
             raise OptionError(f"mounting is {mounting!r:.80}; expected a Mounting, or None")
         self.sensor = get_sensor(sensor)
         self._set_mounting(MountingEstimator(self.sensor.mounting if mounting is None else mounting))
+        self._remission = RemissionMatcher(self.sensor)
         self.on_mismatch = on_mismatch
         self.score_threshold = score_threshold
         self.adapt = adapt
         self._interpolates = adapt in ("both", "interpolation")
-        self._renders = self.sensor.remission is not None and adapt in ("both", "remission")
+        self._renders = adapt in ("both", "remission")
         self.boxes_from = boxes_from
         self.full_turn = full_turn
         gaps_deg = [upper - lower for upper, lower in pairwise(self.sensor.elevations_deg)]
@@ -269,6 +272,7 @@ class Perceiver:
         # Compile every kernel here, not in the first call, with a scan of two points. The networks have already run on
         # their golden inputs, and those outputs are decoded.
         warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
+        render(warm_up, replace(self.sensor, remission=NO_REMISSION))
         self._perceive(warm_up, None, check=self._to_check > 0, infer=False)
         floor, labels = self._warm_up_objects()
         ground = self._find_ground(floor)
@@ -302,8 +306,9 @@ class Perceiver:
         return self._locks.setdefault(os.getpid(), threading.Lock())
 
     def reset_mounting(self) -> None:
-        """Estimate the mounting anew, for scans of another vehicle; the next five scans settle it."""
+        """Estimate mounting and remission anew, for scans of another vehicle; the next five scans settle both."""
         with self._lock:
+            self._remission = RemissionMatcher(self.sensor)
             self._set_mounting(MountingEstimator(self._estimator.known))
 
     def _set_mounting(self, estimator: MountingEstimator) -> None:
@@ -358,10 +363,13 @@ class Perceiver:
         self, scan: NDArray[np.float32], stamp_s: float | None, check: bool, infer: bool = True
     ) -> Perception:
         watch = _Stopwatch()
-        scan, n_dropped = condition(scan, self.sensor, rendered=self._renders)
-        watch.lap("adapt" if self._renders else "check")
-        before = self._estimator
+        before, matcher, profile = self._estimator, self._remission, self.sensor
         hidden: tuple[Finding, ...] = ()
+        matched: tuple[Finding, ...] = ()
+        if self._renders:
+            self._remission, profile, matched = matcher.add(scan)
+        scan, n_dropped = condition(scan, profile, rendered=self._renders)
+        watch.lap("adapt" if self._renders and profile.remission is not None else "check")
         if infer and not before.is_complete and len(scan):
             try:
                 self._set_mounting(before.add(scan))
@@ -371,14 +379,17 @@ class Perceiver:
         if not self._frame.is_identity:
             scan = self._frame.move(scan)
             watch.lap("adapt")
-        fitness = self._check(scan) if check else ()
+        fitness = self._check(scan, profile) if check else ()
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *hidden)
-        if infer:
+        if self.on_mismatch != "ignore":
+            fitness = (*fitness, *matched)
+        if infer and check:
             try:
                 self._refuse(fitness)
             except FitnessError:
                 self._set_mounting(before)  # nothing is learnt from a refused scan
+                self._remission = matcher
                 raise
         watch.lap("check")
         points: PointLabels | None = None
@@ -407,6 +418,7 @@ class Perceiver:
             fitness=fitness,
             stamp_s=stamp_s,
             mounting=self._mounting,
+            remission=profile.remission if self._renders else None,
         )
 
     def _without_ground(self, reason: MountingError) -> tuple[Finding, ...]:
@@ -421,11 +433,11 @@ class Perceiver:
             ),
         )
 
-    def _check(self, scan: NDArray[np.float32]) -> tuple[Finding, ...]:
+    def _check(self, scan: NDArray[np.float32], sensor: SensorProfile) -> tuple[Finding, ...]:
         found: dict[Finding, None] = {}
         for network in self._networks:
             if network.fitness is not None:
-                found |= dict.fromkeys(check_fitness(scan, network.fitness, self.sensor))
+                found |= dict.fromkeys(check_fitness(scan, network.fitness, sensor))
         return tuple(found)
 
     def _refuse(self, fitness: tuple[Finding, ...]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from .card import TopViewGeometry
 from .errors import PointsError
 from .mounting import MODEL_MOUNTING, Mounting
+from .sensor import RemissionFunction
 
 __all__ = ["Box", "Perception", "PointLabels", "TopView"]
 
@@ -200,6 +201,9 @@ class Perception:
     mounting : Mounting
         The mounting with which the scan was moved into the frame of the models: as given, or as estimated from the
         scans so far. ``MODEL_MOUNTING``: the scan was not moved.
+    remission : RemissionFunction or None
+        The function that converted the remission: that of the sensor's profile, one that is matched to the scans so
+        far, or a constant if the scan has no remission; its ``source`` says which. None: remission was only scaled.
     """
 
     n_points: int
@@ -212,6 +216,7 @@ class Perception:
     fitness: tuple[str, ...]
     stamp_s: float | None
     mounting: Mounting = MODEL_MOUNTING
+    remission: RemissionFunction | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to a dict for JSON, with the number of points of each class in place of their labels.
@@ -220,8 +225,8 @@ class Perception:
         -------
         dict
             ``stamp_s``, ``n_points``, ``n_dropped``, ``stage_ms``, ``providers``, ``boxes`` (`Box.to_dict`),
-            ``drivable_area_m2``, ``point_counts``, ``fitness`` and ``mounting``. Every key is always present; its value
-            is None if no model of that kind ran.
+            ``drivable_area_m2``, ``point_counts``, ``fitness``, ``mounting`` and ``remission``. Every key is always
+            present; its value is None if no model of that kind ran, or if remission was only scaled.
         """
         return {
             "stamp_s": self.stamp_s,
@@ -234,4 +239,5 @@ class Perception:
             "point_counts": None if self.points is None else self.points.counts(),
             "fitness": list(self.fitness),
             "mounting": self.mounting.to_dict(),
+            "remission": None if self.remission is None else asdict(self.remission),
         }

@@ -29,6 +29,7 @@ SCAN_KEYS = (
     "tracks",
     "fitness",
     "mounting",
+    "remission",
 )
 """Keys of a record, in their written order; every record has all of them."""
 

@@ -20,8 +20,11 @@ __all__ = [
     "fit_functions",
     "fit_sensor",
     "incidences",
+    "increasing",
     "match_quantiles",
+    "quantiles_by_stratum",
     "remission_strata",
+    "stratify",
 ]
 
 # --- remission -------------------------------------------------------------------------------------------------------
@@ -163,14 +166,59 @@ def incidences(points: NDArray[np.float32], cell_m: float = 0.8) -> NDArray[np.f
     for i in range(3):
         for j in range(3):
             spread[:, i, j] = np.bincount(cell, off[:, i] * off[:, j]) / count
-    values, vectors = np.linalg.eigh(spread)
+    flat = count >= 6
+    values, vectors = np.linalg.eigh(spread[flat])
     # The middle eigenvalue separates surfaces from the line of one beam, the smallest one separates them from leaves.
-    flat = (count >= 6) & (values[:, 1] > 0.0025) & (values[:, 0] < 0.1 * values[:, 1])
-    range_m = np.linalg.norm(p, axis=1)
+    normals = np.full((len(count), 3), np.nan)
+    on_surface = (values[:, 1] > 0.0025) & (values[:, 0] < 0.1 * values[:, 1])
+    normals[flat] = np.where(on_surface[:, None], vectors[:, :, 0], np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
-        cosine = np.abs((p * vectors[cell, :, 0]).sum(axis=1)) / range_m
-    cosines[finite] = np.where(flat[cell], cosine, np.nan)
+        cosines[finite] = np.abs((p * normals[cell]).sum(axis=1)) / np.linalg.norm(p, axis=1)
     return cosines
+
+
+def stratify(
+    scan: NDArray[np.float32], n_points: int | None = None, cell_m: float = 0.8
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Find the stratum of each point, by range and incidence.
+
+    Parameters
+    ----------
+    scan : (n, 4) float32
+        x, y, z [m] in the sensor frame, remission. Points that are not finite or out of `RANGE_EDGES_M` are left out.
+    n_points : int or None
+        Use about so many points: all returns in some of the cells in which `incidences` fits surfaces. None: use all.
+    cell_m : float
+        Edge of the cells [m].
+
+    Returns
+    -------
+    strata : (k,) int64
+        0 to `N_STRATA` - 1.
+    remissions : (k,) float64
+
+    Raises
+    ------
+    PointsError
+        The array is not a scan.
+    """
+    if scan.ndim != 2 or scan.shape[1] != 4:
+        raise PointsError(f"got an array of shape {scan.shape}; expected (n, 4): x, y, z, remission")
+    with np.errstate(over="ignore", invalid="ignore"):
+        square = np.square(scan[:, :3]).sum(axis=1)
+        known = (square >= RANGE_EDGES_M[0] ** 2) & (square < RANGE_EDGES_M[-1] ** 2) & np.isfinite(scan[:, 3])
+    kept = scan[known]
+    every = 1 if n_points is None else len(kept) // max(n_points, 1)
+    if every > 1:
+        # Consecutive products of odd numbers, in int32 with overflow, spread neighboring cells evenly.
+        cells = np.floor(kept[:, :3] / np.float32(cell_m)).astype(np.int32)
+        spread = cells @ np.array([73856093, 19349663, 83492791], np.int32)
+        kept = kept[(spread >> 8) % every == 0]
+    range_m = np.sqrt(np.square(kept[:, :3].astype(np.float64)).sum(axis=1))
+    cosine = np.nan_to_num(incidences(kept, cell_m), nan=np.inf)
+    by_range = np.clip(np.searchsorted(RANGE_EDGES_M, range_m, side="right") - 1, 0, len(RANGE_EDGES_M) - 2)
+    by_cosine = np.searchsorted(COSINE_EDGES[1:], cosine, side="left")
+    return by_range * len(COSINE_EDGES) + by_cosine, kept[:, 3].astype(np.float64)
 
 
 def remission_strata(scans: Iterable[NDArray[np.float32]]) -> list[tuple[float, tuple[float, ...]]]:
@@ -193,18 +241,15 @@ def remission_strata(scans: Iterable[NDArray[np.float32]]) -> list[tuple[float, 
     PointsError
         An array is not a scan.
     """
-    strata, remissions = [np.empty(0, np.int64)], [np.empty(0)]
-    for scan in scans:
-        if scan.ndim != 2 or scan.shape[1] != 4:
-            raise PointsError(f"got an array of shape {scan.shape}; expected (n, 4): x, y, z, remission")
-        range_m = np.linalg.norm(scan[:, :3].astype(np.float64), axis=1)
-        known = (range_m >= RANGE_EDGES_M[0]) & (range_m < RANGE_EDGES_M[-1]) & np.isfinite(scan[:, 3])
-        cosine = np.nan_to_num(incidences(scan), nan=np.inf)
-        by_range = np.searchsorted(RANGE_EDGES_M, range_m, side="right") - 1
-        by_cosine = np.searchsorted(COSINE_EDGES[1:], cosine, side="left")
-        strata.append((by_range * len(COSINE_EDGES) + by_cosine)[known])
-        remissions.append(scan[known, 3].astype(np.float64))
-    stratum, remission = np.concatenate(strata), np.concatenate(remissions)
+    return quantiles_by_stratum([stratify(scan) for scan in scans])
+
+
+def quantiles_by_stratum(
+    samples: Sequence[tuple[NDArray[np.int64], NDArray[np.float64]]],
+) -> list[tuple[float, tuple[float, ...]]]:
+    """Compute what `remission_strata` does, from what `stratify` returned for each scan."""
+    stratum = np.concatenate([np.empty(0, np.int64), *(strata for strata, _ in samples)])
+    remission = np.concatenate([np.empty(0), *(remissions for _, remissions in samples)])
     shares = (np.arange(N_SHARES) + 0.5) / N_SHARES
     found: list[tuple[float, tuple[float, ...]]] = []
     for k in range(N_STRATA):
@@ -290,8 +335,12 @@ def fit_sensor(
     raw, wanted = match_quantiles(remission_strata(scans), REFERENCES[to])
     described = source or f"quantiles by range and incidence of {len(scans)} scans"
     functions = fit_functions(raw - low, wanted, full_scale=high - low, to=to, source=described)
-    best = next(f for f in functions if f.kind != "polynomial" or _increases(f))  # a line increases
-    return replace(sensor, remission=best), functions
+    return replace(sensor, remission=increasing(functions)), functions
+
+
+def increasing(functions: Sequence[RemissionFunction]) -> RemissionFunction:
+    """The first function that does not decrease up to full scale; a line and a logarithm fitted to quantiles do not."""
+    return next(f for f in functions if f.kind != "polynomial" or _increases(f))
 
 
 def _increases(parabola: RemissionFunction) -> bool:

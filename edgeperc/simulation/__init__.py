@@ -1,6 +1,7 @@
 """A spinning-LiDAR simulator for the demo, the benchmark, tests and training.
 
-`drawn` makes random scenes, and `layouts` makes scenes around real boxes, from the parts in `street` and `shapes`.
+`drawn` makes random scenes, and `layouts` makes scenes around real boxes, from the parts in
+`street`, `roadside`, `vehicles` and `people`, which consist of the primitives in `shapes`.
 `scene` turns a scene into a labeled scan with the ray-casting kernels of `raycast`. `samples` makes the scans for
 training and evaluation, with point labels from boxes as in KITTI.
 """

@@ -9,9 +9,10 @@ import numpy as np
 
 from ..errors import PointsError
 from .raycast import LANE, PAVEMENT
+from .roadside import add_beside_people, add_islands_poles, add_parked_bicycles, add_roadside
 from .scene import Scene
-from .shapes import SIZES, Row, bicycle
-from .street import IN_BAYS, ROW_RANGE_M, ROW_WIDTH_M, Street, add_roadside, any_vehicle, random_terrain, strip_row
+from .shapes import Row
+from .street import IN_BAYS, ROW_RANGE_M, ROW_WIDTH_M, SIZES, Street, any_vehicle, random_terrain, strip_row
 
 __all__ = ["ENVIRONMENTS", "random_scene"]
 
@@ -57,15 +58,15 @@ def random_scene(seed: int, environment: str | None = None) -> Scene:
     heading = float(rng.normal(0.0, 0.03))
     strips = [strip_row(0, 0, heading, curvature, right, left)]
     crossings: list[float] = []
-    if place == "junction" or (place != "highway" and rng.random() < 0.3):
-        for _ in range(int(rng.integers(1, 3))):
+    if place == "junction" or (place != "highway" and rng.random() < 0.45):
+        for _ in range(int(rng.integers(1, 4))):
             s = float(rng.uniform(8.0, 60.0) * rng.choice([1.0, 1.0, -1.0]))
             if any(abs(s - other) < 20.0 for other in crossings):
                 continue
             crossings.append(s)
             x, y, turn = math.cos(heading) * s, math.sin(heading) * s + curvature * s * s / 2, heading + curvature * s
-            across = turn + math.pi / 2 + float(rng.normal(0.0, 0.2))
-            width = float(rng.uniform(2.6, 5.5))
+            across = turn + math.pi / 2 + float(rng.normal(0.0, 0.25))
+            width = float(rng.uniform(2.0, 5.5))
             ends = ((-200.0, 200.0), (0.0, 200.0), (-200.0, 0.0))[int(rng.integers(0, 3))]
             strips.append(strip_row(x, y, across, float(rng.normal(0, 0.004)), -width, width, ends))
     if in_bays:
@@ -82,13 +83,50 @@ def random_scene(seed: int, environment: str | None = None) -> Scene:
         deep = float(rng.choice([2.3, 5.0]))
         bay = (edge, edge + deep) if side > 0 else (-edge - deep, -edge)
         strips.append(strip_row(0, 0, heading, curvature, *bay, (start, start + float(rng.uniform(10.0, 45.0))), True))
+    if place in ("urban", "residential", "junction") and rng.random() < 0.4:
+        between = sway + (same - ego_lane - 0.5) * lane if oncoming else None  # where the two directions meet
+        strips += _islands(rng, strips, crossings, right, left, between)
     street = Street(rng, strips, terrain)
     street.take(-0.3, 0.0, 4.8, 2.2, 0.0)  # the sensor's own vehicle
+    for k in np.flatnonzero(street.strips[:, 9] < 0.0).tolist():
+        u0, u1, s0, s1 = street.strips[k, 5:9].tolist()
+        x, y, yaw = street.on_strip((s0 + s1) / 2, (u0 + u1) / 2, k)
+        street.take(x, y, s1 - s0, u1 - u0, yaw)
+    add_islands_poles(street)
     _add_traffic(street, place, lane, same, oncoming, ego_lane, sway, crossings)
     _add_parked(street, park_right > 0.0, park_left > 0.0, crossings, place)
     _add_people(street, place)
     add_roadside(street, place)
     return street.scene()
+
+
+def _islands(
+    rng: np.random.Generator,
+    strips: Sequence[Row],
+    crossings: Sequence[float],
+    right: float,
+    left: float,
+    between: float | None,
+) -> list[Row]:
+    """Draw islands in the mouths of side streets, and between the directions of the first road."""
+    islands = []
+    for k in range(1, 1 + len(crossings)):
+        for first in (left + float(rng.uniform(1.0, 3.0)), right - float(rng.uniform(1.0, 3.0))):
+            half, length = float(rng.uniform(0.4, 1.0)), float(rng.uniform(2.0, 8.0)) * (1.0 if first > 0.0 else -1.0)
+            ends = sorted((first, first + length))
+            if strips[k][6] > 3.0 and strips[k][7] < ends[0] and ends[1] < strips[k][8] and rng.random() < 0.6:
+                islands.append(strip_row(*_pose(strips[k]), strips[k][4], -half, half, (ends[0], ends[1]), island=True))
+    if between is not None and rng.random() < 0.6:
+        half, first = float(rng.uniform(0.3, 0.8)), float(rng.uniform(6.0, 45.0) * rng.choice([1.0, 1.0, -1.0]))
+        islands.append(
+            strip_row(*_pose(strips[0]), strips[0][4], between - half, between + half,
+                      (first, first + float(rng.uniform(2.5, 12.0))), island=True)
+        )  # fmt: skip
+    return islands
+
+
+def _pose(strip: Row) -> tuple[float, float, float]:
+    return strip[0], strip[1], math.atan2(strip[3], strip[2])
 
 
 def _add_traffic(
@@ -115,9 +153,15 @@ def _add_traffic(
             speed = pace * rng.uniform(0.3, 1.2) if rng.random() < 0.8 else 0.0
             turn = float(street.strips[0, 4]) * speed * (-1.0 if against else 1.0)
             yaw += math.pi * against + float(rng.normal(0.0, 0.03))
-            street.add_object(label, x, y, yaw, None, speed, turn)
+            if place == "urban" and rng.random() < 0.02:
+                label = "tram"
+            placed = street.add_object(label, x, y, yaw, None, speed, turn)
+            if placed and label in ("car", "van") and rng.random() < 0.03:
+                away = street.objects[-1].size[0] / 2 + 2.2
+                x, y = x - away * math.cos(yaw), y - away * math.sin(yaw)
+                street.add_object("misc", x, y, yaw, (3.4, 1.7, float(rng.uniform(1.1, 2.4))), speed, turn)
     for k in range(1, len(street.strips)):
-        if street.strips[k, 9] > 0.0:
+        if street.strips[k, 9] != 0.0:
             continue
         for _ in range(int(rng.poisson(2.5))):
             s = float(rng.uniform(street.strips[k, 7], street.strips[k, 8])) * 0.2
@@ -128,13 +172,17 @@ def _add_traffic(
                 label = any_vehicle(rng, 0.05)
                 street.add_object(label, x, y, yaw + math.pi * against, None, float(rng.choice([0.0, 5.0])))
     if place != "highway":
-        for _ in range(int(rng.poisson(1.6))):
+        for _ in range(int(rng.poisson(1.9))):
             left = bool(rng.random() < 0.35)
             edge = street.strips[0, 6] if left else street.strips[0, 5]
             s = float(rng.uniform(-30.0, 45.0))
             x, y, yaw = street.on_strip(s, edge + float(rng.uniform(0.4, 2.6)) * (-1 if left else 1))
             yaw += math.pi * left + float(rng.normal(0, 0.15))
             street.add_object("cyclist", x, y, yaw, None, float(rng.uniform(1.0, 7.0)))
+            if rng.random() < 0.15:  # two of them, one behind or beside the other
+                a, b = (float(rng.uniform(2.0, 4.0)), 0.2) if rng.random() < 0.6 else (0.3, 1.0)
+                x, y = x - a * math.cos(yaw) + b * math.sin(yaw), y - a * math.sin(yaw) - b * math.cos(yaw)
+                street.add_object("cyclist", x, y, yaw, None, float(rng.uniform(1.0, 7.0)))
 
 
 def _add_parked(street: Street, right: bool, left: bool, crossings: Sequence[float], place: str) -> None:
@@ -157,7 +205,7 @@ def _add_parked(street: Street, right: bool, left: bool, crossings: Sequence[flo
             s += length / 2 + rng.uniform(0.5, 1.6)
     for k in range(1, len(street.strips)):
         u0, u1, s0, s1, bay = street.strips[k, 5:10]
-        if bay == 0.0:
+        if bay <= 0.0:
             continue
         deep, fill = u1 - u0 > 4.0, rng.uniform(0.1, 0.95)
         for s in np.arange(s0 + 1.3, s1 - 1.0, 2.6 if deep else 5.6):
@@ -179,7 +227,7 @@ def _add_parked(street: Street, right: bool, left: bool, crossings: Sequence[flo
 
 def _add_people(street: Street, place: str) -> None:
     rng = street.rng
-    mean = {"urban": 7.0, "residential": 3.0, "junction": 7.0, "rural": 0.4, "highway": 0.0}[place]
+    mean = {"urban": 7.5, "residential": 4.0, "junction": 7.5, "rural": 0.6, "highway": 0.0}[place]
     for _ in range(int(rng.poisson(mean))):
         side = float(rng.choice([-1.0, 1.0]))
         edge = street.edge(0, side)
@@ -190,16 +238,32 @@ def _add_people(street: Street, place: str) -> None:
         x, y, yaw = street.on_strip(s, u)
         yaw += float(rng.choice([0.0, math.pi])) if rng.random() < 0.75 else float(rng.uniform(-math.pi, math.pi))
         speed = float(rng.uniform(0.6, 1.8)) if rng.random() < 0.75 else 0.0
-        for _ in range(1 + int(rng.integers(1, 4)) * bool(rng.random() < 0.3)):  # alone, or in a group
-            px, py = x + float(rng.normal(0, 0.5)), y + float(rng.normal(0, 0.5))
-            street.add_object("pedestrian", px, py, yaw + float(rng.normal(0, 0.2)), None, speed)
-    for _ in range(int(rng.poisson(1.0 if place in ("urban", "junction") else 0.2))):  # bicycles without a rider
+        if rng.random() < 0.06:
+            street.add_object("person_sitting", x, y, yaw)
+            continue
+        # Alone, in a group, or in a crowd.
+        others = int(rng.integers(1, 4)) if rng.random() < 0.3 else int(rng.integers(4, 9)) * bool(rng.random() < 0.04)
+        for _ in range(1 + others):
+            spread = 0.5 if others < 4 else 1.2
+            px, py = x + float(rng.normal(0, spread)), y + float(rng.normal(0, spread))
+            size = None
+            if rng.random() < 0.08:  # a child
+                size = (float(rng.uniform(0.35, 0.7)), float(rng.uniform(0.35, 0.5)), float(rng.uniform(0.95, 1.45)))
+            street.add_object("pedestrian", px, py, yaw + float(rng.normal(0, 0.2)), size, speed)
+        if rng.random() < 0.4:
+            add_beside_people(street, px, py, yaw)
+    standing = [each for each in street.objects if each.label in ("car", "van") and each.speed_mps == 0.0]
+    for _ in range(int(rng.poisson(1.2)) if standing and mean > 1.0 else 0):  # beside a vehicle that stands
+        car = standing[int(rng.integers(0, len(standing)))]
+        a = float(rng.uniform(-0.6, 0.6)) * car.size[0]
+        b = float(rng.choice([-1.0, 1.0])) * (car.size[1] / 2 + float(rng.uniform(0.65, 0.9)))
+        x, y = car.center[0] + a * math.cos(car.yaw) - b * math.sin(car.yaw), car.center[1]
+        street.add_object("pedestrian", x, y + a * math.sin(car.yaw) + b * math.cos(car.yaw), car.yaw)
+    for _ in range(int(rng.poisson(0.5 if mean > 1.0 else 0.1))):  # motorcycles without a rider
         side = float(rng.choice([-1.0, 1.0]))
-        edge = street.edge(0, side)
-        x, y, yaw = street.on_strip(float(rng.uniform(-20, 40)), side * (edge + float(rng.uniform(0.6, 3.0))))
-        yaw += float(rng.choice([0.0, math.pi / 2])) + float(rng.normal(0, 0.1))
-        rows: list[Row] = []
-        n = int(rng.integers(1, 6))
-        for k in range(n):
-            rows += bicycle(1.75, 0.27, rng, (k - (n - 1) / 2) * 0.5)
-        street.add_static(rows, x, y, 1.8, 0.5 * n, yaw)
+        x, y, yaw = street.on_strip(
+            float(rng.uniform(-20, 40)), side * (street.edge(0, side) + float(rng.normal(0, 1.0)))
+        )
+        size = (float(rng.uniform(1.75, 2.2)), float(rng.uniform(0.6, 0.85)), float(rng.uniform(1.0, 1.3)))
+        street.add_object("misc", x, y, yaw + float(rng.choice([0.0, math.pi / 2])), size)
+    add_parked_bicycles(street, 1.3 if place in ("urban", "junction") else 0.3)

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..perception import Box
-from .raycast import GLASS, LANE, MATTE, PAINT, SLOPE_X, SLOPE_Y
+from .raycast import LANE, SLOPE_X, SLOPE_Y
+from .roadside import add_beside_people, add_parked_bicycles, add_roadside
 from .scene import Scene, wrapped
-from .shapes import SHAPES, Row, block
-from .street import IN_BAYS, ROW_RANGE_M, Street, add_roadside, any_vehicle, random_terrain, strip_row
+from .shapes import Row
+from .street import IN_BAYS, ROW_RANGE_M, SHAPES, Street, any_vehicle, random_terrain, strip_row
 
 __all__ = ["scene_from_boxes"]
 
@@ -25,8 +26,8 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
     Parameters
     ----------
     boxes : sequence of Box
-        In a sensor frame with its origin ``mount_height_m`` above the road. Boxes with labels other than car, van,
-        truck, pedestrian and cyclist become background obstacles.
+        In a sensor frame with its origin ``mount_height_m`` above the road. Boxes with labels other than KITTI's are
+        left out.
     seed : int
         Seed of everything else: road edges, roadside, and objects outside the labeled view.
     mount_height_m : float
@@ -35,7 +36,7 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
     Returns
     -------
     Scene
-        Its first objects are the ``boxes`` of the five labels, in order. They stand on the ground of the scene, so z
+        Its first objects are the ``boxes``, in order. They stand on the ground of the scene, so z
         differs slightly from the boxes.
     """
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 15485863))
@@ -66,12 +67,14 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
         right, left, bays = _parking_rows(beside, lane, right, left, heading, curvature)
     strips = [strip_row(0, 0, heading, curvature, right, left)]
     crossings: list[float] = []
-    if across or rng.random() < 0.2:
+    if across or rng.random() < 0.4:
         s = float(np.median(across)) if across else float(rng.uniform(10.0, 55.0))
         crossings.append(s)
         x, y = s * math.cos(heading), s * math.sin(heading) + curvature * s * s / 2
-        width = float(rng.uniform(3.0, 5.5))
-        strips.append(strip_row(x, y, heading + curvature * s + math.pi / 2, 0.0, -width, width))
+        width = float(rng.uniform(2.4, 5.5))
+        ends = ((-200.0, 200.0), (0.0, 200.0), (-200.0, 0.0))[int(rng.integers(0, 3)) if not across else 0]
+        turn = heading + curvature * s + math.pi / 2 + float(rng.normal(0.0, 0.2)) * (not across)
+        strips.append(strip_row(x, y, turn, 0.0, -width, width, ends))
     strips += bays
     terrain = random_terrain(rng, place)
     terrain[LANE] = lane
@@ -91,19 +94,6 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
             pace = {"pedestrian": 1.3, "cyclist": 4.0}.get(box.label, 9.0)
             speed = float(pace * rng.uniform(0.5, 1.2)) if moving and rng.random() < 0.6 else 0.0
             street.add_object(box.label, *box.center[:2], box.yaw, box.size, speed, force=True)
-        else:
-            length, width, height = box.size
-            rows = [
-                block(PAINT, 0.4, (0, 0, 0.25 + height * 0.3), (length, width, height * 0.5), density=0.1),
-                block(GLASS if height > 2.2 else MATTE, 0.2, (0, 0, height * 0.75),
-                       (length, width * 0.96, height * 0.5), density=0.6),
-            ]  # fmt: skip
-            street.take(*box.center[:2], length, width, box.yaw)
-            z, _ = street.ground(*box.center[:2])
-            for row in rows:
-                turned = block(int(row[1]), row[2], (box.center[0], box.center[1], z + row[6]),
-                                (2 / row[7], 2 / row[11], 2 / row[15]), yaw=box.yaw, density=row[3])  # fmt: skip
-                street.rows.append(turned)
     # Labeled objects are visible, so mostly keep the line of sight to them free.
     for box in boxes:
         away = math.hypot(box.center[0], box.center[1])
@@ -118,6 +108,10 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
             yaw += math.pi * (ahead < 0.0)
             street.add_object(any_vehicle(rng, 0.03), x, y, yaw)
     _add_unlabeled_people(street, boxes)
+    for box in boxes:
+        if box.label in ("pedestrian", "person_sitting") and rng.random() < 0.3:
+            add_beside_people(street, *box.center[:2], box.yaw)
+    add_parked_bicycles(street, 0.6 if not fast else 0.0)
     add_roadside(street, place)
     return street.scene()
 

@@ -12,7 +12,9 @@ from ..kernel_cache import njit
 __all__ = [
     "ASPHALT",
     "BANK_RISE",
+    "BANK_RISE_LEFT",
     "BANK_SLOPE",
+    "BANK_SLOPE_LEFT",
     "BAY",
     "BOX",
     "CROWN",
@@ -65,15 +67,16 @@ BOX, CYLINDER, ELLIPSOID = 0, 1, 2
 MATTE, PAINT, GLASS, RETRO, LEAVES, POROUS, FACADE = 0, 1, 2, 3, 4, 5, 6
 ROW = 20
 
-# Columns of Scene.strips: origin x, y, cos and sin of the direction, curvature, u range, s range, 1 for a parking bay.
+# Columns of Scene.strips: origin x, y, cos and sin of the direction, curvature, u range, s range, and the kind: 0 for a
+# road, 1 for a parking bay, -1 for a raised island in a road.
 STRIP = 10
 
 # Entries of Scene.terrain.
 (
     SLOPE_X, SLOPE_Y, WAVE_X, WAVE_X_K, WAVE_X_0, WAVE_Y, WAVE_Y_K, WAVE_Y_0, KERB, PAVEMENT, CROWN,
     BANK_SLOPE, BANK_RISE, ROUGH, DITCH, ROUNDING, ASPHALT, PAVING, GRASS, MARKING, LANE, DROPPED, WEAR,
-    LIP, BAY, TERRAIN,
-) = range(26)  # fmt: skip
+    LIP, BAY, BANK_SLOPE_LEFT, BANK_RISE_LEFT, TERRAIN,
+) = range(28)  # fmt: skip
 TILE = 256  # cells along each side of the noise tile; 0.3 m each
 _GROUND, _NOTHING = -1, -2  # hits that are not rows of primitives
 
@@ -121,10 +124,10 @@ def ground_at(
 ) -> tuple[float, float, float, float, float]:
     """Evaluate the ground at x, y [m], world frame.
 
-    Returns height, distance outside the roads, distance outside the bays, and u and s in the first road's frame [m].
+    Returns height, distance outside the roads (an island is outside), distance outside the bays, and u and s in the first road's frame [m].
     Both distances are negative inside. s is along the axis of the road, u to its left.
     """
-    outside, outside_bays, u_first, s_first = 1e9, 1e9, 0.0, 0.0
+    outside, outside_bays, outside_islands, u_first, s_first = 1e9, 1e9, 1e9, 0.0, 0.0
     for k in range(strips.shape[0]):
         dx, dy = x - strips[k, 0], y - strips[k, 1]
         s = strips[k, 2] * dx + strips[k, 3] * dy
@@ -133,6 +136,8 @@ def ground_at(
         d = max(max(u - strips[k, 6], strips[k, 5] - u), max(strips[k, 7] - s, s - strips[k, 8]))
         if strips[k, 9] > 0.0:
             outside_bays = min(outside_bays, d)
+        elif strips[k, 9] < 0.0:
+            outside_islands = min(outside_islands, d)
         elif k == 0:
             outside, u_first, s_first = d, u, s
         else:
@@ -147,19 +152,20 @@ def ground_at(
         z += terrain[CROWN] * min(-d, 4.0)
         if outside > 0.0:
             z += terrain[LIP]
-        return z, outside, outside_bays, u_first, s_first
+        if outside_islands < 0.0:
+            z += max(terrain[KERB], 0.08) * min(-outside_islands / 0.05, 1.0)
+        return z, max(outside, -outside_islands), outside_bays, u_first, s_first
     kerb = terrain[KERB]
     along = (s_first + terrain[DROPPED]) / 23.0
     if along - np.floor(along) < 0.15:
-        kerb *= 0.25  # dropped for a driveway
+        kerb *= 0.25 + 0.75 * min(max((d - 0.6) / 0.9, 0.0), 1.0)  # dropped for a driveway
     z += kerb * min(d / 0.05, 1.0) + 0.02 * min(d, terrain[PAVEMENT])
     e = d - terrain[PAVEMENT]
     if e > 0.0:
-        z += (
-            min(terrain[BANK_SLOPE] * e, terrain[BANK_RISE])
-            if terrain[BANK_RISE] > 0.0
-            else (max(-terrain[BANK_SLOPE] * e, terrain[BANK_RISE]))
-        )
+        slope, rise = terrain[BANK_SLOPE], terrain[BANK_RISE]
+        if u_first > 0.0:
+            slope, rise = terrain[BANK_SLOPE_LEFT], terrain[BANK_RISE_LEFT]
+        z += min(slope * e, rise) if rise > 0.0 else max(-slope * e, rise)
         basin = (e - 1.6) / 1.2
         z -= terrain[DITCH] * max(1.0 - basin * basin, 0.0)
         z += min(e / 0.3, 1.0) * terrain[ROUGH] * (1.0 + _tile_at(tile, x, y, 0.3))

@@ -40,7 +40,8 @@ __all__ = [
 
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
 TOP_VIEW_CLASSES = ("background", "drivable", "car", "van", "truck")
-# Point class of an object: PointSeg's car includes all vehicles. KITTI also labels sitting people.
+# Point class of an object: PointSeg's car includes all vehicles. KITTI also labels sitting people. Trams and "misc"
+# objects (trailers, parked motorcycles) belong to no class: real labels ignore their points.
 POINT_CLASS_OF = {"car": 1, "van": 1, "truck": 1, "pedestrian": 2, "person_sitting": 2, "cyclist": 3}
 
 
@@ -51,7 +52,8 @@ class SceneObject:
     Attributes
     ----------
     label : str
-        ``"car"``, ``"van"``, ``"truck"``, ``"pedestrian"`` or ``"cyclist"``.
+        ``"car"``, ``"van"``, ``"truck"``, ``"pedestrian"``, ``"person_sitting"``, ``"cyclist"``, ``"tram"`` or
+        ``"misc"``.
     center : tuple of 3 float
         Center of the box [m], world frame.
     size : tuple of 3 float
@@ -84,8 +86,8 @@ class Scene:
         Shapes; columns as in `raycast`. Shapes of an object are in its frame: origin at the center of the footprint, on
         the ground.
     strips : (k, 10) float64
-        Road surfaces and parking bays; columns as in `raycast`. The first is the sensor's road.
-    terrain : (26,) float64
+        Road surfaces, parking bays and islands; columns as in `raycast`. The first is the sensor's road.
+    terrain : (27,) float64
         Parameters of the ground, by the constants of `raycast`.
     tile : (256, 256) float64
         Periodic noise in -1..1, for roughness and stains.
@@ -128,7 +130,7 @@ class SimulatedScan:
     points : (n, 4) float32
         x, y, z [m], remission 0..0.99 in steps of 0.01. Beam by beam from the top, counter-clockwise from +x.
     labels : (n,) uint8
-        Index into `POINT_CLASSES`.
+        Index into `POINT_CLASSES`; trams and ``"misc"`` objects are background.
     objects : (n,) int32
         Index into ``boxes``; -1 for the background.
     boxes : tuple of Box
@@ -162,14 +164,15 @@ class SimulatedScan:
         -------
         (rows, columns) uint8
             Index into `TOP_VIEW_CLASSES` at the center of the cell: the footprint of the nearest vehicle, else the road
-            surface.
+            surface. Below trams and ``"misc"`` objects is background.
         """
         view = TopViewGeometry() if geometry is None else geometry
         x, y = view.cell_centers()
         labels = np.zeros((view.height, view.width), dtype=np.uint8)
         strips, terrain, tile = self.scene.strips, self.scene.terrain, self.scene.tile
         fill_drivable(strips, terrain, tile, self.T_world_sensor, x.ravel(), y.ravel(), labels)
-        draw_footprints(labels, self.boxes, view, TOP_VIEW_CLASSES)
+        others = [replace(box, label="background") for box in self.boxes if box.label in ("tram", "misc")]
+        draw_footprints(labels, [*others, *self.boxes], view, TOP_VIEW_CLASSES)
         return labels
 
 
@@ -287,7 +290,7 @@ def simulate(
     )  # fmt: skip
     points, objects = points[:n].copy(), objects[:n].copy()
     boxes = tuple(_box_in_sensor(each, pose) for each in scene.objects)
-    lookup = np.array([*(POINT_CLASS_OF[each.label] for each in scene.objects), 0], dtype=np.uint8)
+    lookup = np.array([*(POINT_CLASS_OF.get(each.label, 0) for each in scene.objects), 0], dtype=np.uint8)
     counts = np.bincount(objects[objects >= 0], minlength=len(boxes))
     return SimulatedScan(
         points=points,

@@ -132,7 +132,8 @@ def drivable(scene, pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarra
     """Twin of `fill_drivable`; a place that is not finite is no road."""
     with np.errstate(invalid="ignore"):
         places = np.stack(np.broadcast_arrays(x[:, None], y[None, :], -pose[2, 3]), axis=-1) @ pose[:3, :3].T
-        return (road_places(scene, *(places + pose[:3, 3])[..., :2].transpose(2, 0, 1))[0] < 0).astype(np.uint8)
+        outside, _, islands, *_ = road_places(scene, *(places + pose[:3, 3])[..., :2].transpose(2, 0, 1))
+        return (np.maximum(outside, -islands) < 0).astype(np.uint8)
 
 
 def tile_at(tile: np.ndarray, x: np.ndarray, y: np.ndarray, cell_m: float) -> np.ndarray:
@@ -148,37 +149,45 @@ def tile_at(tile: np.ndarray, x: np.ndarray, y: np.ndarray, cell_m: float) -> np
 
 
 def road_places(scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Distance outside the roads and outside the bays, and u, s along the first road, for arrays of x and y."""
+    """Distance outside roads, bays and islands, and u, s along the first road, for arrays of x and y."""
     rounding = scene.terrain[15]
-    outside, bays = np.full(np.shape(x), np.inf), np.full(np.shape(x), np.inf)
-    for k, (x0, y0, cos, sin, curvature, right, left, first, last, is_bay) in enumerate(scene.strips):
+    outside, bays, islands = (np.full(np.shape(x), 1e9) for _ in range(3))
+    for k, (x0, y0, cos, sin, curvature, right, left, first, last, kind) in enumerate(scene.strips):
         s, across = cos * (x - x0) + sin * (y - y0), cos * (y - y0) - sin * (x - x0)
         u = (across - curvature * s * s / 2) / np.sqrt(1 + (curvature * s) ** 2)
         d = np.max([u - left, right - u, first - s, s - last], axis=0)
-        if is_bay:
+        if kind > 0:
             bays = np.minimum(bays, d)
+        elif kind < 0:
+            islands = np.minimum(islands, d)
         elif k == 0:
             outside, u_first, s_first = d, u, s
         else:
             outside = np.minimum(outside, d) - np.maximum(rounding - abs(outside - d), 0) ** 2 / (4 * rounding)
-    return outside, bays, u_first, s_first
+    return outside, bays, islands, u_first, s_first
 
 
 def ground(scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Twin of `ground_at`, its height and its distance outside the roads, for arrays of x and y."""
     slope_x, slope_y, ax, kx, px, ay, ky, py = scene.terrain[:8]
     kerb, pavement, crown, bank, rise, rough, ditch, _ = scene.terrain[8:16]
-    outside, bays, _, along = road_places(scene, x, y)
+    outside, bays, islands, across, along = road_places(scene, x, y)
     z = slope_x * x + slope_y * y + ax * np.sin(kx * x + px) + ay * np.sin(ky * y + py)
     d = np.minimum(outside, bays)
     inside = crown * np.minimum(-d, 4.0) + scene.terrain[23] * (outside > 0)
+    inside = inside + np.where(islands < 0, max(kerb, 0.08) * np.minimum(-islands / 0.05, 1.0), 0.0)
     dropped = ((along + scene.terrain[21]) / 23.0) % 1.0 < 0.15
-    verge = kerb * np.where(dropped, 0.25, 1.0) * np.minimum(d / 0.05, 1.0) + 0.02 * np.minimum(d, pavement)
+    driveway = 0.25 + 0.75 * np.clip((d - 0.6) / 0.9, 0.0, 1.0)
+    verge = kerb * np.where(dropped, driveway, 1.0) * np.minimum(d / 0.05, 1.0) + 0.02 * np.minimum(d, pavement)
     e = d - pavement
-    slope = np.minimum(bank * e, rise) if rise > 0 else np.maximum(-bank * e, rise)
+    sides = [
+        np.minimum(grade * e, height) if height > 0 else np.maximum(-grade * e, height)
+        for grade, height in ((bank, rise), scene.terrain[25:27])
+    ]
+    slope = np.where(across > 0, sides[1], sides[0])
     noise = tile_at(scene.tile, x, y, 0.3)
     grass = slope - ditch * np.maximum(1 - ((e - 1.6) / 1.2) ** 2, 0) + np.minimum(e / 0.3, 1) * rough * (1 + noise)
-    return z + np.where(d <= 0, inside, verge + np.where(e > 0, grass, 0.0)), outside
+    return z + np.where(d <= 0, inside, verge + np.where(e > 0, grass, 0.0)), np.where(d <= 0, np.maximum(outside, -islands), outside)
 
 
 def cast(primitives, scene, pose, elevations, azimuths, reach, key):
@@ -224,7 +233,8 @@ def ground_remission(scene, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     terrain = scene.terrain
     pavement, asphalt, paving, grass, marking, lane = terrain[[9, 16, 17, 18, 19, 20]]
     wear, bay = terrain[[22, 24]]
-    outside, bays, u, s = road_places(scene, x, y)
+    outside, bays, islands, u, s = road_places(scene, x, y)
+    outside = np.where(np.minimum(outside, bays) <= 0, np.maximum(outside, -islands), outside)
     stain, patch = tile_at(scene.tile, x, y, 0.11), tile_at(scene.tile, x + 31.0, y + 17.0, 1.7)
     right, left = scene.strips[0, 5], scene.strips[0, 6]
     to_line = abs(u / lane - np.floor(u / lane + 0.5)) * lane
