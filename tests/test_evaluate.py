@@ -621,7 +621,12 @@ def kitti_set(root: Path, drives: dict[str, str] | None = None) -> Path:
 def test_scans_of_a_split(world: World, tmp_path: Path) -> None:
     root = kitti_set(
         tmp_path,
-        {"000000": "2011_09_26_drive_0011", "000001": "2011_09_26_drive_0005", "000002": "2011_09_26_drive_0059"},
+        {
+            "000000": "2011_09_26_drive_0011",
+            "000001": "2011_09_26_drive_0005",
+            "000002": "2011_09_26_drive_0059",
+            "000003": "2011_09_26_drive_0001",
+        },
     )
     for asked, n_frames in (
         ({}, 1),
@@ -630,7 +635,9 @@ def test_scans_of_a_split(world: World, tmp_path: Path) -> None:
         ({"fold": 2}, 1),
         ({"fold": 0, "split": "train"}, 1),
         ({"split": "train"}, 2),
-        ({"split": "all"}, 3),
+        ({"split": "all"}, 4),
+        ({"split": "validation"}, 1),
+        ({"split": "held-back"}, 2),
     ):
         done: list[int] = []
         result, worst = evaluate.evaluate(

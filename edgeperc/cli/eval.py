@@ -50,8 +50,9 @@ def add_parser(commands: Commands) -> None:
     )
     reading.add_argument(
         "--split",
-        choices=("test", "validation", "train", "all"),
-        help="which drives (default: test, or those of --fold); nothing is trained on test and validation drives",
+        choices=("test", "validation", "held-back", "train", "all"),
+        help="which drives (default: test, or those of --fold); nothing is trained on test and validation drives, "
+        "which are the held-back ones",
     )
     reading.add_argument(
         "--fold",

@@ -57,8 +57,9 @@ def evaluate(
     models, road_by, provider, precision, boxes_from, mounted
         As in `Judge`.
     split : str or None
-        Drives of the real scans: ``"test"``, ``"train"``, ``"validation"`` or ``"all"`` (`splits.in_split`). None: the
-        validation drives if there is a ``fold``, else the test drives.
+        Drives of the real scans: ``"test"``, ``"train"``, ``"validation"`` or ``"all"`` (`splits.in_split`), or
+        ``"held-back"``: validation and test drives. None: the validation drives if there is a ``fold``, else the test
+        drives.
     fold : int or None
         Fold of the training drives, 0 to 2 (`splits.in_split`).
     n_resamples : int
@@ -133,12 +134,17 @@ def _folder(dataset: str | Path) -> ScanFolder | None:
 
 
 def _folder_scans(judge: Judge, folder: ScanFolder, split: str, fold: int | None) -> list[_Scan]:
-    names = folder.names(split, fold=fold)
+    names = _names(folder, split, fold)
     if not names:
         raise PointsError(
             f"{folder.root} has no scans of the {split} drives (fold: {fold}); pass another split, or 'all'"
         )
     return [(f"{OF_FOLDER}{folder.layout.name}", _later(judge.record_scan, folder.frame, name)) for name in names]
+
+
+def _names(scans: ScanFolder | KittiObjects | SemanticKitti, split: str, fold: int | None) -> list[str]:
+    parts = ("validation", "test") if split == "held-back" else (split,)
+    return [name for part in parts for name in scans.names(part, fold=fold)]
 
 
 def _scans(judge: Judge, dataset: str | Path, split: str, fold: int | None) -> list[_Scan]:
@@ -152,12 +158,12 @@ def _scans(judge: Judge, dataset: str | Path, split: str, fold: int | None) -> l
     root = Path(dataset)
     if (root / "training" / "label_2").is_dir():
         objects = KittiObjects(root)
-        names = objects.names(split, fold=fold)
+        names = _names(objects, split, fold)
         read = objects.frame
         scans = [("real", _later(judge.record, lambda n: judge.kitti(read(n)), name)) for name in names]
     else:
         sequences = SemanticKitti(root)
-        names = sequences.names(split, fold=fold)
+        names = _names(sequences, split, fold)
         of = sequences.frame
         scans = [("semantickitti", _later(judge.record, lambda n: judge.semantickitti(of(n)), name)) for name in names]
     if not scans:
