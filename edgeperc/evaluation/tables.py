@@ -170,9 +170,10 @@ def _figures(tallies: Tallies) -> dict[str, Any]:
             found.setdefault(group, {})[key[1]] = rows
         elif group == "all_round":
             for name, within_m in BANDS.items():
-                rows = {label: row for label, row in _box_rows(tally, within_m, key[1]).items() if label != "mean_ap"}
+                scores = {**tally.per_class(within_m), key[1]: tally.overall(within_m)}
+                rows = {label: _box_row(row) for label, row in scores.items()}
                 found.setdefault(group, {}).setdefault(name, {}).update(rows)
-                headings = {label: _heading_row(row) for label, row in rows.items()}
+                headings = {label: _heading_row(row) for label, row in scores.items()}
                 found.setdefault("heading", {}).setdefault(name, {}).update(headings)
         elif key == ("errors", "points"):
             scans, objects = tallies["errors", "scans"], tallies["errors", "objects"]
@@ -217,20 +218,24 @@ def _point_rows(confusion: Confusion, objects: Counter[tuple[str, ObjectKey]]) -
     return rows
 
 
-def _box_rows(evaluator: BoxEvaluator, within_m: tuple[float, float], together: str = "vehicle") -> dict[str, Any]:
+def _box_rows(evaluator: BoxEvaluator, within_m: tuple[float, float]) -> dict[str, Any]:
     per_class = evaluator.per_class(within_m)
-    scores = {**per_class, together: evaluator.overall(within_m)}
-    rows = {
-        name: {each.name: getattr(row, each.name) for each in fields(BoxScores)} | _few(row.n_objects)
-        for name, row in scores.items()
-    }
+    rows = {name: _box_row(row) for name, row in (per_class | {"vehicle": evaluator.overall(within_m)}).items()}
     return {"mean_ap": mean([row.ap for row in per_class.values()])} | rows
 
 
-def _heading_row(row: Mapping[str, Any]) -> dict[str, Any]:
+def _box_row(scores: BoxScores) -> dict[str, Any]:
+    row = {each.name: getattr(scores, each.name) for each in fields(BoxScores) if each.name not in _HEADING}
+    return row | _few(scores.n_objects)
+
+
+_HEADING = ("heading", "axis", "n_found")
+
+
+def _heading_row(scores: BoxScores) -> dict[str, Any]:
     """Of the boxes that were matched: the share whose heading is right, over the full turn and modulo half a turn."""
-    shares = {"heading": row["heading"], "axis": row["axis"]}
-    return shares | {"n_hits": row["n_hits"], "n_objects": row["n_found"]} | _few(row["n_found"])
+    shares = {"heading": scores.heading, "axis": scores.axis}
+    return shares | {"n_hits": scores.n_hits, "n_objects": scores.n_found} | _few(scores.n_found)
 
 
 def _error_rows(
