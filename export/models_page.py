@@ -231,7 +231,7 @@ def _figures(figures: Mapping[str, Any], scans: str, bands: Sequence[str]) -> It
         for band, rows in _by_band(figures["points"], bands):
             for name, row in rows.items():
                 rates = [_percent(row, key) for key in ("precision", "recall", "iou")]
-                yield _row(name, band, *rates, f"{row['n_points']:,}", row["n_objects"] or "-")
+                yield _row(name, band, *rates, f"{row['n_points']:,}", row.get("n_objects") or "-")
     for kind, of_kind in figures.get("boxes", {}).items():
         head = ["range", "AP50", "precision", "recall", "mIoU@0.5", "mIoU@0.7", "boxes"]
         yield from _head(f"{kind} boxes, {scans}", head)
