@@ -84,7 +84,9 @@ def build_network(state: Mapping[str, Any], path: Path) -> nn.Module:
 
 def _recipe(text: str) -> Recipe:
     given = json.loads(text)
-    recipe = Recipe(**given)
+    recipe = Recipe(**{**given, "classes": tuple(given.get("classes", ()))})
+    if not all(isinstance(name, str) for name in recipe.classes):
+        raise ValueError(f"its recipe has classes {str(recipe.classes)[:60]}")
     for field in fields(Recipe):
         value, usual = getattr(recipe, field.name), getattr(Recipe, field.name, "")
         kinds: Any = (int, float) if isinstance(usual, float) else type(usual)

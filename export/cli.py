@@ -14,6 +14,7 @@ from edgeperc import __version__
 from edgeperc.cli.output import print_error, print_line
 from edgeperc.cli.program import Parser, run_program
 from edgeperc.errors import EdgepercError, MissingExtraError, ModelError
+from edgeperc.evaluation.scan_folder import ScanFolder
 
 from .database.cli import add_database_commands
 from .recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe
@@ -26,6 +27,8 @@ SEMANTICKITTI = "root folder of SemanticKITTI, to evaluate the drivable area"
 FOLD = "fold of the training drives (0, 1 or 2) to validate on instead of training on it"
 THREADS = "number of CPU threads (default: one for each core)"
 COMPILE = "run the network through torch.compile, which needs a C++ compiler and a minute to start"
+SCANS = "more real scans: FOLDER with a scans.json, or FOLDER:LAYOUT; may be repeated"
+WORKERS = "number of processes that make the training samples (default 1)"
 VERSION = "version to write into the card (default 1.0.0)"
 PROOF = "scan files on which torch and onnxruntime must agree, in addition to four simulated scans"
 
@@ -76,6 +79,7 @@ def build_parser() -> argparse.ArgumentParser:
     train.add_argument("network", choices=NETWORKS, help="network to train")
     train.add_argument("out", type=Path, help="folder for checkpoint.pt and log.jsonl; a checkpoint in it is resumed")
     train.add_argument("--kitti", type=Path, help=KITTI)
+    train.add_argument("--scans", action="append", default=[], metavar="FOLDER[:LAYOUT]", help=SCANS)
     train.add_argument("--simulated", type=Path, help="folder of scans written by edgeperc-export simulate")
     train.add_argument("--fold", type=int, help=FOLD)
     train.add_argument(
@@ -84,16 +88,32 @@ def build_parser() -> argparse.ArgumentParser:
         default="ours",
         help=f"source of the options not given below: the defaults shown, or the network's paper ({', '.join(PAPER)})",
     )
-    train.add_argument("--start-from", type=Path, help="checkpoint.pt whose weights the run starts from")
+    train.add_argument(
+        "--start-from", type=Path, help="checkpoint.pt, or fp32 model.onnx, whose weights the run starts from"
+    )
     train.add_argument(
         "--teacher",
         type=Path,
-        help="checkpoint.pt of the network to distil from; with --distil 0, of one that labels the unlabeled points",
+        help="checkpoint.pt or model.onnx of the network to distil from; with --distil 0, checkpoint.pt of one that "
+        "labels the unlabeled points",
     )
     train.add_argument("--threads", type=int, help=THREADS)
+    train.add_argument("--workers", type=int, default=1, help=WORKERS)
+    train.add_argument(
+        "--checkpoint-every",
+        type=int,
+        default=100,
+        metavar="STEPS",
+        help="steps between checkpoints, and between lines of log.jsonl (default 100)",
+    )
     train.add_argument("--compile", action="store_true", help=COMPILE)
     _add_recipe_options(train)
     train.set_defaults(run=_train)
+
+    curve = commands.add_parser("curve", help="show the validation figures of training runs over the samples seen")
+    curve.add_argument("runs", type=Path, nargs="+", metavar="OUT", help="folder of a training run, with its log.jsonl")
+    curve.add_argument("--lines", type=int, default=12, help="at most this many lines for each run (default 12)")
+    curve.set_defaults(run=_curve)
 
     export = commands.add_parser("export", help="write a checkpoint as an .onnx model with a card")
     export.add_argument("checkpoint", type=Path, help="checkpoint.pt of a training run")
@@ -178,8 +198,10 @@ def build_parser() -> argparse.ArgumentParser:
     make.add_argument("--layouts", type=Path, help=LAYOUTS)
     make.add_argument("--semantickitti", type=Path, help=SEMANTICKITTI)
     make.add_argument("--fold", type=int, help=FOLD)
+    make.add_argument("--scans", action="append", default=[], metavar="FOLDER[:LAYOUT]", help=SCANS)
     make.add_argument("--steps", type=int, help="training steps (default: as many as for the shipped model)")
     make.add_argument("--threads", type=int, help=THREADS)
+    make.add_argument("--workers", type=int, default=1, help=WORKERS)
     make.add_argument("--compile", action="store_true", help=COMPILE)
     make.add_argument("--model-version", default="1.0.0", help=VERSION)
     make.set_defaults(run=_make)
@@ -211,7 +233,12 @@ def build_parser() -> argparse.ArgumentParser:
 
 # --- recipes ----------------------------------------------------------------------------------------------------------
 
-TYPES = {"bool": bool, "float": float, "int": int, "str": str}
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+TYPES = {"bool": bool, "float": float, "int": int, "str": str, "tuple[str, ...]": _names}
 
 
 def _recipe_fields() -> dict[str, Field[Any]]:
@@ -229,7 +256,8 @@ def _add_recipe_options(parser: argparse.ArgumentParser) -> None:
         settings: dict[str, Any] = {"type": TYPES[str(field.type)], "choices": field.metadata["choices"] or None}
         if field.type == "bool":
             settings = {"action": argparse.BooleanOptionalAction}
-        groups[networks].add_argument(option, help=f"{field.metadata['help']} (default: {field.default})", **settings)
+        default = field.default if field.default != () else "empty"
+        groups[networks].add_argument(option, help=f"{field.metadata['help']} (default: {default})", **settings)
 
 
 def _title(networks: tuple[str, ...]) -> str:
@@ -282,14 +310,26 @@ def _train(args: argparse.Namespace) -> int:
         recipe,
         args.out,
         kitti=args.kitti,
+        scan_sets=[ScanFolder.parse(text) for text in args.scans],
         simulated=args.simulated,
         fold=args.fold,
         start_from=args.start_from,
         teacher=args.teacher,
         n_threads=args.threads,
+        n_workers=args.workers,
         compiled=args.compile,
+        checkpoint_every=args.checkpoint_every,
     )
     print_line(str(checkpoint))
+    return 0
+
+
+def _curve(args: argparse.Namespace) -> int:
+    from .curve import curve_table
+
+    for run in args.runs:
+        for line in curve_table(run, args.lines):
+            print_line(line)
     return 0
 
 
@@ -386,9 +426,11 @@ def _make(args: argparse.Namespace) -> int:
         kitti=args.kitti,
         layouts=args.layouts,
         semantickitti=args.semantickitti,
+        scan_sets=[ScanFolder.parse(text) for text in args.scans],
         fold=args.fold,
         steps=args.steps,
         n_threads=args.threads,
+        n_workers=args.workers,
         compiled=args.compile,
         version=args.model_version,
     )

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import onnx
 
 from edgeperc.evaluation.evaluate import evaluate
+from edgeperc.evaluation.scan_folder import ScanFolder
 
 from .recipe import MODELS
 from .simulate import fitness_of, parity_scans, simulate
@@ -29,9 +31,11 @@ def make(
     kitti: Path | None,
     layouts: Path | None,
     semantickitti: Path | None = None,
+    scan_sets: Sequence[ScanFolder] = (),
     fold: int | None = None,
     steps: int | None = None,
     n_threads: int | None = None,
+    n_workers: int = 0,
     compiled: bool = False,
     version: str = "1.0.0",
 ) -> Path:
@@ -46,11 +50,14 @@ def make(
     kitti, layouts, semantickitti : Path or None
         Folders of a KITTI object set, of its labels and calibrations alone, and of SemanticKITTI. Models whose name
         ends in ``-sim`` need none of them; ``kitti`` then serves for evaluation only.
+    scan_sets : sequence of ScanFolder
+        More real scans to train on.
     fold : int, optional
         Validate on this fold of the training drives, and do not train on it.
     steps : int, optional
         Number of training steps; by default the shipped model's.
     n_threads : int or None
+    n_workers : int
     compiled : bool
         As for `edgeperc_export.train.train`; the shipped PointSegs were compiled, the SSADNets not.
     version : str
@@ -84,8 +91,10 @@ def make(
                 out,
                 kitti=kitti,
                 layouts=layouts,
+                scan_sets=scan_sets,
                 fold=own_fold,
                 n_threads=n_threads,
+                n_workers=n_workers,
                 compiled=compiled,
                 version=version,
             )
@@ -96,10 +105,12 @@ def make(
         out / f"{name}{_suffix(fold)}",
         kitti=kitti,
         simulated=scans,
+        scan_sets=scan_sets,
         fold=fold,
         start_from=None if stage.after is None else checkpoint_of(stage.after),
         teacher=None if stage.teacher is None else checkpoint_of(stage.teacher),
         n_threads=n_threads,
+        n_workers=n_workers,
         compiled=compiled,
     )
     path = out / f"{name}{_suffix(fold)}.onnx"

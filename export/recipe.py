@@ -93,11 +93,24 @@ class Recipe:
     paste_cars: float = _option(
         0.0, "share of cars among pasted objects; 0: cars are not pasted into range images", TASKS["points"]
     )
+    n_negatives: float = _option(
+        2.0, "mean number of poles, trunks and pieces of walls that are cut from other scans and pasted into each scan"
+    )
     turn_to_rare: float = _option(0.3, "share of simulated scans turned so that a pedestrian or cyclist is ahead")
     turn_anywhere: float = _option(
         0.0, "share of simulated scans turned by any angle, so that vehicles appear away from the street ahead"
     )
     weather: float = _option(0.1, "share of scans with rain, snow or fog added")
+    half_beams: float = _option(
+        0.1, "share of scans of which every second beam is dropped, as for a sensor with 32 beams"
+    )
+    tilt_deg: float = _option(
+        0.25, "standard deviation of the roll and pitch by which scans are tilted [deg]: errors of the leveling"
+    )
+    redraw_every: int = _option(
+        1000,
+        "after this many steps, label some training scans and draw those with false objects more often; 0: never",
+    )
     class_weights: bool = _option(
         True, "weight rare classes more in the cross-entropy", (*TASKS["points"], *TASKS["vehicles"])
     )
@@ -147,8 +160,12 @@ PLAIN: Mapping[str, Any] = {
     "augment": False,
     "n_pasted": 0.0,
     "swap": 0.0,
+    "n_negatives": 0.0,
     "turn_to_rare": 0.0,
     "weather": 0.0,
+    "half_beams": 0.0,
+    "tilt_deg": 0.0,
+    "redraw_every": 0,
     "class_weights": False,
     "lovasz_weight": 0.0,
     "weight_decay": 0.0,

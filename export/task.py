@@ -122,7 +122,7 @@ class Task(ABC):
     def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
         """The loss of a batch: a network's outputs compared with the stacked targets of `target`."""
 
-    def distillation(self, outputs: Outputs, probabilities: Tensor, boxes: Tensor | None) -> Tensor:
+    def distillation(self, outputs: Outputs, probabilities: Tensor, boxes: Tensor | None = None) -> Tensor:
         """The distillation loss of a batch towards a teacher's class probabilities (B, C, H, W) and boxes."""
         return distillation_loss(_logits(outputs), probabilities)
 
@@ -192,7 +192,7 @@ class Vehicles(Task):
             logits, boxes, labels, box_targets, lw_det=lw_det, class_weights=weights, lovasz_weight=lovasz_weight
         )[0]
 
-    def distillation(self, outputs: Outputs, probabilities: Tensor, boxes: Tensor | None) -> Tensor:
+    def distillation(self, outputs: Outputs, probabilities: Tensor, boxes: Tensor | None = None) -> Tensor:
         """Towards the teacher's classes, and towards its boxes if the head is dense."""
         loss = super().distillation(outputs, probabilities, boxes)
         if self.recipe.head == "dense":
@@ -239,7 +239,7 @@ class Road(Task):
         """`road_loss`."""
         return road_loss(_logits(outputs), targets[0], self.recipe.lovasz_weight)
 
-    def distillation(self, outputs: Outputs, probabilities: Tensor, boxes: Tensor | None) -> Tensor:
+    def distillation(self, outputs: Outputs, probabilities: Tensor, boxes: Tensor | None = None) -> Tensor:
         """Towards the teacher's drivable class; all its other classes, vehicles included, count as one."""
         drivable = probabilities[:, 1]
         return distillation_loss(_logits(outputs), torch.stack([1.0 - drivable, drivable], dim=1))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,16 +16,19 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from edgeperc.card import InputSpec
+from edgeperc.card import InputSpec, ModelCard
 from edgeperc.evaluation.datasets import KittiObjects
+from edgeperc.network_input import project
 from edgeperc.projection import make_projector
 from edgeperc.readers.files import read_points
+from edgeperc.session import Session
 from edgeperc.simulation.samples import IGNORE
 
-from .scans import SURFACE, LabeledScan, turned
+from .scan_sets import seen_by_network
+from .scans import SURFACE, LabeledScan, mirrored, turned
 from .task import Task
 
-__all__ = ["pseudo_labeled", "teach", "unlabeled_scans"]
+__all__ = ["OnnxTeacher", "pseudo_labeled", "teach", "unlabeled_scans"]
 
 SURE = 0.9
 """Smallest probability of a pseudo-label."""
@@ -66,7 +70,7 @@ def pseudo_labeled(
     for scan in tqdm(list(scans), desc="labeling", leave=False):
         labels = scan.labels.copy()
         for angle in DIRECTIONS:
-            projected = projector.project(np.ascontiguousarray(turned(scan, float(angle)).points))
+            projected = project(projector, np.ascontiguousarray(turned(scan, float(angle)).points))
             with torch.no_grad():
                 p = network(torch.from_numpy(projected.image[None])).float().softmax(1)[0].numpy()
             best: NDArray[np.uint8] = p.argmax(0).astype(np.uint8)
@@ -75,6 +79,56 @@ def pseudo_labeled(
             labels[at] = np.where(labels[at] == IGNORE, best[trusted], labels[at])
         labeled.append(replace(scan, labels=labels, azimuths=(-np.pi, np.pi)))
     return labeled
+
+
+class OnnxTeacher:
+    """An exported network as the teacher: it answers for each sample, in the process that makes the sample.
+
+    Parameters
+    ----------
+    path : Path
+        The .onnx file. Its own channels are projected from the same scan as the input of the network to train.
+    task : Task
+        That of the network to train.
+
+    Raises
+    ------
+    ValueError
+        The teacher has another view, or other classes.
+    """
+
+    def __init__(self, path: Path, task: Task) -> None:
+        self.path, self.card = path, ModelCard.read(path)
+        if self.card.view != task.view:
+            raise ValueError(f"{path} sees another view than {task.recipe.network}")
+        if task.recipe.task != "road" and self.card.classes != task.classes:
+            raise ValueError(
+                f"{path} has the classes {', '.join(self.card.classes)}; expected {', '.join(task.classes)}"
+            )
+        self.mirror = task.recipe.seen_twice
+        self.has_boxes = task.recipe.task == "vehicles" and task.recipe.head == "dense"
+        if self.has_boxes and "box_dense" not in [output.kind for output in self.card.outputs]:
+            raise ValueError(f'{path} has no dense boxes; give --teacher a network with head "dense"')
+        self.projector = make_projector(self.card.view, self.card.input)
+        self._session: Session | None = None
+
+    def __call__(self, scan: LabeledScan) -> tuple[NDArray[np.float32], ...]:
+        """Class probabilities (C, H, W) float32, and dense boxes if the network to train has them."""
+        if self._session is None:  # made in the process that uses it
+            self._session = Session(self.path, "cpu", n_threads=1)
+        p, boxes = self._answer(self._session, scan)
+        if self.mirror:
+            p = 0.5 * (p + self._answer(self._session, mirrored(scan))[0][:, :, ::-1])
+        return (p, boxes) if boxes is not None else (p,)
+
+    def _answer(self, session: Session, scan: LabeledScan) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        session.input[:] = seen_by_network(self.projector, scan)[1].image
+        raw = session.run()
+        p = np.array(raw["class_logits"] if "class_logits" in raw else raw["class_probabilities"])
+        if "class_logits" in raw:
+            p = np.exp(p - p.max(axis=0))
+            p /= p.sum(axis=0)
+        return p, np.array(raw["box_dense"]) if self.has_boxes else None
 
 
 @torch.no_grad()

@@ -9,8 +9,8 @@ from __future__ import annotations
 import copy
 import json
 import math
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -22,23 +22,29 @@ from tqdm import tqdm
 
 from edgeperc.atomic import open_atomic
 from edgeperc.evaluation.datasets import KittiObjects
+from edgeperc.evaluation.scan_folder import ScanFolder
+from edgeperc.simulation.scene import POINT_CLASSES
 
 from .checkpoint import build_network, read_checkpoint
 from .networks import build
 from .recipe import Recipe
-from .roads import sure_surface
-from .samples import RealScans, Samples, real_scans
+from .samples import RealScans, Samples, loaded, real_scans
+from .scan_sets import read_scan_set
 from .scans import LabeledScan
-from .task import Targets, Task, task_of
-from .teacher import pseudo_labeled, teach, unlabeled_scans
+from .start import start
+from .task import Task, task_of
+from .teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
 from .watch import Watch
 
 __all__ = ["train"]
 
 WARM_UP_STEPS = 100
 
-# Every sixth frame is enough to validate on, because neighboring frames look alike.
+# Of a drive with more frames than this, every sixth is enough to validate on, because neighboring frames look alike.
+FEW_FRAMES = 6
 VALIDATION_STRIDE = 6
+# Batches that the statistics of batch norm are computed from, if a run starts from an exported model.
+STATISTICS_BATCHES = 8
 
 
 def train(
@@ -47,11 +53,13 @@ def train(
     *,
     kitti: Path | None,
     simulated: Path | None,
+    scan_sets: Sequence[ScanFolder] = (),
     given: RealScans | None = None,
     fold: int | None = None,
     start_from: Path | None = None,
     teacher: Path | None = None,
     n_threads: int | None = None,
+    n_workers: int = 0,
     compiled: bool = False,
     checkpoint_every: int = 100,
 ) -> Path:
@@ -63,26 +71,31 @@ def train(
     out : Path
         Folder for ``checkpoint.pt`` and ``log.jsonl``. A checkpoint of the same recipe in it is resumed.
     kitti : Path or None
-        Folder of a KITTI object set. Frames of test drives are not used. With a ``simulated_share`` of 1, all training
-        drives are for validation only.
+        Folder of a KITTI object set. Frames of test drives are not used; validation drives are for the curve only. With
+        a ``simulated_share`` of 1, all training drives are for validation only.
     simulated : Path or None
         Folder of scans written by ``edgeperc-export simulate``.
+    scan_sets : sequence of ScanFolder
+        More real scans, of any sensor; their drives for training are trained on, those for validation are watched.
     given : RealScans, optional
         Real scans in place of those of ``kitti``.
     fold : int, optional
         Fold of the training drives to validate on instead of training on it. Every ``checkpoint_every`` steps the
         averaged network is evaluated on it, and the best weights are kept (early stopping).
     start_from : Path or None
-        A checkpoint whose weights a new run starts from. Weights that the networks do not share are ignored.
+        A checkpoint or an exported model (.onnx) whose weights a new run starts from. Weights that the networks do not
+        share are ignored.
     teacher : Path or None
-        A checkpoint of the network to distil from. If the recipe does not distil: a checkpoint of a network that labels
-        the unlabeled points of real scans.
+        A checkpoint or an exported model (.onnx) of the network to distil from. If the recipe does not distil: a
+        checkpoint of a network that labels the unlabeled points of real scans.
     n_threads : int or None
         Number of CPU threads; None leaves it to torch.
+    n_workers : int
+        Number of processes that make the samples; 0: this one makes them between the steps. Each has one thread.
     compiled : bool
         Use `torch.compile`, which takes a minute and a C++ compiler; PointSeg then trains a third faster.
     checkpoint_every : int
-        Steps between checkpoints.
+        Steps between checkpoints, and between points of the curve.
 
     Returns
     -------
@@ -100,38 +113,40 @@ def train(
     if n_threads is not None:
         torch.set_num_threads(n_threads)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    task = task_of(recipe)
     objects = KittiObjects(kitti) if kitti else None
-    real, hashes, watched = given or RealScans([], {}, [])
-    weights = [1.0] * len(real)
-    if objects:
-        only_simulated = recipe.simulated_share == 1.0
-        names = objects.names("train") if only_simulated else []
-        if fold is not None and not only_simulated:
-            names = objects.names("validation", fold=fold)
-        watched = [LabeledScan.from_frame(objects.frame(n), sure_surface) for n in names[::VALIDATION_STRIDE]]
-        names = [] if only_simulated else objects.names("train", fold=fold)
-        real, weights, hashes = real_scans(objects, names, drawn=recipe.drawn_roads)
+    only_simulated = recipe.simulated_share == 1.0
+    real, weights, hashes, watched = (
+        _real(recipe, objects, scan_sets, fold)
+        if given is None
+        else (given.scans, [1.0] * len(given.scans), given.hashes, given.watched)
+    )
     if recipe.distil > 0.0 and teacher is None:
         raise ValueError(f"the recipe distils ({recipe.distil:g}) but there is no teacher; give --teacher")
-    task = task_of(recipe)
     if teacher is not None and recipe.distil == 0.0 and (objects is None or recipe.task != "points"):
         raise ValueError("the teacher is not used; give --distil, or train a network that labels points on --kitti")
-    teacher_network = None if teacher is None else _teacher(teacher, task).to(device)
+    onnx_teacher = OnnxTeacher(teacher, task) if teacher is not None and teacher.suffix == ".onnx" else None
+    if onnx_teacher is not None and recipe.distil == 0.0:
+        raise ValueError(f"{teacher}: an exported teacher does not label scans; give its checkpoint.pt, or --distil")
+    teacher_network = None if teacher is None or onnx_teacher else _teacher(teacher, task).to(device)
     if teacher_network is not None and objects is not None and recipe.distil == 0.0:
         extra = unlabeled_scans(objects, fold)
         real = pseudo_labeled(teacher_network.cpu(), task, [*real, *extra])
         weights += [len(extra) ** -0.5] * len(extra)
-    samples = Samples(recipe, real, weights, sorted(simulated.glob("*.npz")) if simulated else [])
+    paths = sorted(simulated.glob("*.npz")) if simulated else []
+    samples = Samples(recipe, real, weights, paths, onnx_teacher)
     watch = Watch(samples, watched) if watched else None
 
     network = build(recipe)
-    before: list[dict[str, object]] = []
-    if start_from is not None:
-        before = _start(network, start_from)
+    before: list[dict[str, Any]] = []
+    checkpoint, step = out / "checkpoint.pt", 0
+    if start_from is not None and not checkpoint.exists():
+        images = [torch.from_numpy(samples.batch(k)[0]) for k in range(STATISTICS_BATCHES)]
+        before, frames = start(network, recipe, start_from, images)
+        hashes = frames | hashes
     network = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in its stubs
     averaged = copy.deepcopy(network).eval()
     optimizer = _optimizer(recipe, network)
-    checkpoint, step = out / "checkpoint.pt", 0
     best, since_best, halvings = None, 0, 0
     best_figure, lowest_loss = -1.0, math.inf
     curve: list[dict[str, Any]] = []
@@ -139,12 +154,13 @@ def train(
         state = read_checkpoint(checkpoint, device)
         if state["recipe"] != recipe:
             raise ValueError(f"{checkpoint} is of another recipe: {state['recipe']}; give an empty folder")
-        before, curve = state["before"], state["curve"]
+        before, curve, hashes = state["before"], state["curve"], state["frames"]
         network.load_state_dict(state["network"])
         averaged.load_state_dict(state["averaged"])
         optimizer.load_state_dict(state["optimizer"])
         step, best = state["step"], state["best"]
         best_figure, lowest_loss, since_best, halvings = state["watched"]
+        samples.odds = {name: odds.cpu().numpy() for name, odds in state["odds"].items()}
 
     def save() -> None:
         with open_atomic(checkpoint) as file:
@@ -162,6 +178,7 @@ def train(
                     "frames": json.dumps(hashes),
                     "fold": -1 if fold is None else fold,
                     "n_simulated": len(samples.simulated),
+                    "odds": {name: torch.from_numpy(odds) for name, odds in samples.odds.items()},
                 },
                 file,
             )
@@ -171,12 +188,14 @@ def train(
     progress = tqdm(total=recipe.steps, initial=step, desc=recipe.network, unit="step")
     losses: list[float] = []
     with (out / "log.jsonl").open("a") as log, progress:
-        for inputs, *targets in _ahead(samples, step, recipe.steps):
+        for inputs, *others in loaded(samples, step, recipe.steps, n_workers):
             for group in optimizer.param_groups:
                 group["lr"] = recipe.learning_rate * _schedule(recipe, step) * 0.5**halvings
             torch.manual_seed((recipe.seed << 32) + step)
-            x = torch.from_numpy(inputs).to(device, memory_format=torch.channels_last)
-            y = [torch.from_numpy(t).to(device) for t in targets]
+            x = inputs.to(device, memory_format=torch.channels_last)
+            others = [other.to(device) for other in others]
+            y = others[: samples.n_targets]
+            taught: tuple[Any, ...] = tuple(others[samples.n_targets :])
             network.train()
             if recipe.head_only:
                 network.segmentation.requires_grad_(False).eval()
@@ -184,8 +203,9 @@ def train(
                 outputs = forward(x)
             loss = task.loss(outputs, y)
             if teacher_network is not None and recipe.distil > 0.0:
-                distilled = teach(teacher_network, x, task.input, mirror=recipe.seen_twice)
-                loss = loss + recipe.distil * task.distillation(outputs, *distilled)
+                taught = teach(teacher_network, x, task.input, mirror=recipe.seen_twice)
+            if taught:
+                loss = loss + recipe.distil * task.distillation(outputs, *taught)
             if not torch.isfinite(loss):
                 raise FloatingPointError(f"the loss is {loss.item()} at step {step}; lower --learning-rate")
             optimizer.zero_grad(set_to_none=True)
@@ -197,13 +217,16 @@ def train(
             losses.append(loss.item())
             progress.update()
             progress.set_postfix(loss=f"{losses[-1]:.3f}")
+            if recipe.redraw_every and step % recipe.redraw_every == 0:
+                samples.redraw(averaged, step)
             if step % checkpoint_every == 0 or step == recipe.steps:
-                line: dict[str, Any] = {"step": step, "loss": round(float(np.mean(losses)), 5)}
+                line: dict[str, Any] = {"step": step, "samples": step * recipe.batch}
+                line["loss"] = round(float(np.mean(losses)), 5)
                 losses.clear()
                 if watch is not None:
                     figure, watched_loss, figures = watch.validate(averaged)
                     line |= {"validation_loss": round(watched_loss, 5), "validation": figures}
-                    if figure > best_figure:
+                    if figure > best_figure and (fold is not None or only_simulated or given is not None):
                         best_figure, best = figure, copy.deepcopy(averaged.state_dict())
                     since_best = 0 if watched_loss < lowest_loss else since_best + checkpoint_every
                     lowest_loss = min(lowest_loss, watched_loss)
@@ -217,15 +240,40 @@ def train(
     return checkpoint
 
 
-def _ahead(samples: Samples, start: int, stop: int) -> Iterator[Targets]:
-    """The batches of the steps. Each is made during the training step before it."""
-    with ThreadPoolExecutor(1) as pool:
-        pending = pool.submit(samples.batch, start) if start < stop else None
-        for step in range(start, stop):
-            assert pending is not None
-            batch = pending.result()
-            pending = pool.submit(samples.batch, step + 1) if step + 1 < stop else None
-            yield batch
+def _real(
+    recipe: Recipe, kitti: KittiObjects | None, scan_sets: Sequence[ScanFolder], fold: int | None
+) -> tuple[list[LabeledScan], list[float], dict[str, str], list[LabeledScan]]:
+    """The real scans to train on, their weights and hashes, and the scans to watch."""
+    scans: list[LabeledScan] = []
+    weights: list[float] = []
+    hashes: dict[str, str] = {}
+    watched: list[LabeledScan] = []
+    only_simulated = recipe.simulated_share == 1.0
+    if kitti is not None:
+        names = kitti.names("train") if only_simulated else kitti.names("validation", fold=fold)
+        chosen = _few_of_each_drive(names, [kitti.drives[name] for name in names])
+        watched += real_scans(kitti, chosen, classes=recipe.classes)[0]
+        if not only_simulated:
+            names = kitti.names("train", fold=fold)
+            scans, weights, hashes = real_scans(kitti, names, drawn=recipe.drawn_roads, classes=recipe.classes)
+    classes = recipe.classes or POINT_CLASSES
+    for folder in scan_sets:
+        if not only_simulated:
+            more, more_weights, more_hashes = read_scan_set(folder, "train", fold, classes=classes)
+            scans, weights, hashes = scans + more, weights + more_weights, hashes | more_hashes
+        watched += read_scan_set(folder, "validation", fold, classes=classes)[0]
+    return scans, weights, hashes, watched
+
+
+def _few_of_each_drive(names: Sequence[str], drives: Sequence[str]) -> list[str]:
+    """The names without most frames of long drives."""
+    chosen, seen = [], Counter[str]()
+    n_frames = Counter(drives)
+    for name, drive in zip(names, drives, strict=True):
+        if n_frames[drive] <= FEW_FRAMES or seen[drive] % VALIDATION_STRIDE == 0:
+            chosen.append(name)
+        seen[drive] += 1
+    return chosen
 
 
 def _schedule(recipe: Recipe, step: int) -> float:
@@ -249,17 +297,6 @@ def _optimizer(recipe: Recipe, network: nn.Module) -> torch.optim.Optimizer:
         [{"params": decayed, "weight_decay": recipe.weight_decay}, {"params": kept, "weight_decay": 0.0}],
         lr=recipe.learning_rate,
     )
-
-
-def _start(network: nn.Module, checkpoint: Path) -> list[dict[str, object]]:
-    """Copy the weights that a checkpoint shares with the network; returns the recipes of its training runs in order."""
-    state = read_checkpoint(checkpoint)
-    own, saved = network.state_dict(), state["best"] or state["averaged"]
-    common = {name: value for name, value in saved.items() if name in own and own[name].shape == value.shape}
-    if not common:
-        raise ValueError(f"{checkpoint} has no weight in common with the network to train")
-    network.load_state_dict(common, strict=False)
-    return [*state["before"], asdict(state["recipe"])]
 
 
 def _teacher(checkpoint: Path, task: Task) -> nn.Module:

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from .samples import Samples
+from .scan_sets import seen_by_network
 from .scans import LabeledScan
 
 __all__ = ["Watch"]
@@ -27,10 +28,9 @@ class Watch:
 
     def __init__(self, samples: Samples, scans: Sequence[LabeledScan]) -> None:
         self.task, self.scans = samples.task, scans
-        self.projected = [samples.project(scan) for scan in scans]
-        self.targets = [
-            self.task.target(scan, projected) for scan, projected in zip(scans, self.projected, strict=True)
-        ]
+        seen = [seen_by_network(samples.projector, scan) for scan in scans]
+        self.projected = [projected for _, projected in seen]
+        self.targets = [self.task.target(scan, projected) for scan, projected in seen]
 
     def validate(self, network: nn.Module) -> tuple[float, float, dict[str, float | None]]:
         """Validate a network: the decisive figure (`Tally.decisive`), the mean loss, and all figures by name."""

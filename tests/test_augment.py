@@ -56,6 +56,7 @@ def test_a_bank_holds_each_object_with_its_points() -> None:
     held = replace(
         street,
         points=np.concatenate([street.points, points]),
+        labels=np.append(street.labels, np.full(len(points), 2, np.uint8)),
         boxes=(box, replace(box, center=(20.0, 5.0, -0.88)), replace(box, label="tram")),
         counts=(len(points), 3, 50),  # enough returns, too few returns, an unknown class
     )
@@ -68,16 +69,16 @@ def test_a_bank_holds_each_object_with_its_points() -> None:
 
 
 def test_a_pasted_object_hides_only_what_is_behind_it() -> None:
-    box, points = post(10.0, 0.0)
+    box, points = post(10.0, 0.0, "car")
     street = flat_street()
-    bank = ObjectBank({"pedestrian": [(box, points)]})
-    out = pasted(street, bank, np.random.default_rng(0), 1, {"pedestrian": 1.0})
+    bank = ObjectBank({"car": [(box, points)]})
+    out = pasted(street, bank, np.random.default_rng(0), 1, {"car": 1.0})
     (there,) = out.boxes
     (count,) = out.counts
-    assert count == np.count_nonzero(out.labels == 2) == len(points)
+    assert count == np.count_nonzero(out.labels == 1) == len(points)
     assert np.hypot(*there.center[:2]) == pytest.approx(10.0)  # as far away as it was
     assert there.center[2] - there.size[2] / 2 == pytest.approx(GROUND_M, abs=0.01)
-    assert inside(there, out.points[out.labels == 2], 0.01).all()
+    assert inside(there, out.points[out.labels == 1], 0.01).all()
     azimuth = np.arctan2(there.center[1], there.center[0])
 
     left = {tuple(p) for p in out.points[out.labels == 0].tolist()}

@@ -41,10 +41,11 @@ from edgeperc_export.roads import DRAWN, drawn_roads
 from edgeperc_export.samples import Samples, real_scans
 from edgeperc_export.scans import LabeledScan
 from edgeperc_export.simulate import parity_scans, simulate
+from edgeperc_export.start import start
 from edgeperc_export.task import Task, task_of
 from edgeperc_export.teacher import pseudo_labeled, teach, unlabeled_scans
 from edgeperc_export.to_onnx import ParityError, export, load, to_graph, verify, write_card
-from edgeperc_export.train import _optimizer, _schedule, _start, train
+from edgeperc_export.train import _optimizer, _schedule, train
 from edgeperc_export.watch import Watch
 
 
@@ -171,14 +172,15 @@ def test_a_run_starts_from_the_weights_it_shares_with_a_checkpoint(tmp_path: Pat
     dense = untrained("ssadnet", tmp_path)
     slots = build(small("ssadnet", head="slots", seed=5))
     before = {name: value.clone() for name, value in slots.state_dict().items()}
-    recipes = _start(slots, dense)
+    recipes, frames = start(slots, small("ssadnet", head="slots", seed=5), dense, [])
     assert recipes[-1]["head"] == "dense"
+    assert frames == {}
     given = weights(dense)
     for name, value in slots.state_dict().items():
         origin = given.get(name) if name.startswith("segmentation") else before[name]
         assert torch.equal(value, origin), name
     with pytest.raises(ValueError, match="no weight in common"):
-        _start(build(small("pointseg")), dense)
+        start(build(small("pointseg")), small("pointseg"), dense, [])
 
 
 @pytest.mark.usefixtures("small_views")
@@ -536,7 +538,11 @@ def test_an_empty_scan_is_a_sample_without_ground_truth(simulated: Path) -> None
     assert not image.any()
     assert (truth == IGNORE).all()
     full_image, full_truth = Samples(small("pointseg"), [], [], files).sample(scan)
-    assert ((full_truth == IGNORE) == (full_image == 0.0).all(axis=0)).all()
+    empty = (full_image == 0.0).all(axis=0)
+    assert (full_truth[empty] == IGNORE).all()
+    # Without a point of unknown class, such as those of a tram, every other pixel is labeled.
+    known = replace(scan, labels=np.where(scan.labels == IGNORE, 0, scan.labels).astype(np.uint8))
+    assert ((Samples(small("pointseg"), [], [], files).sample(known)[1] == IGNORE) == empty).all()
 
 
 def test_a_stopped_simulation_resumes(tmp_path: Path) -> None:

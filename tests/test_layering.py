@@ -71,10 +71,11 @@ FLOORS = {
     """,
     "edgeperc_export": """
         __init__ networks.pointseg networks.ssadnet recipe scans targets
-        augment cards losses networks.edge networks.lodnn networks.squeezesegv2 roads simulate
+        augment cards losses networks.edge networks.lodnn networks.squeezesegv2 roads scan_sets simulate
         models_page networks.kulseg task
-        networks.__init__ samples teacher
-        checkpoint watch
+        networks.__init__ teacher
+        checkpoint samples
+        start watch curve
         to_onnx train
         agree quantize ablation make
         database.__init__ database.files
