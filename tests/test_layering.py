@@ -46,8 +46,10 @@ FLOORS = {
         live
         simulation.raycast
         simulation.shapes
-        simulation.scene
+        simulation.scene simulation.vehicles
+        simulation.people
         simulation.street
+        simulation.roadside
         simulation.drawn simulation.layouts
         simulation.__init__
         simulation.samples

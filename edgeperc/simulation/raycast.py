@@ -124,8 +124,8 @@ def ground_at(
 ) -> tuple[float, float, float, float, float]:
     """Evaluate the ground at x, y [m], world frame.
 
-    Returns height, distance outside the roads (an island is outside), distance outside the bays, and u and s in the first road's frame [m].
-    Both distances are negative inside. s is along the axis of the road, u to its left.
+    Returns height, distance outside the roads, distance outside the bays, and u and s in the first road's frame [m].
+    Both distances are negative inside; an island is outside. s is along the axis of the road, u to its left.
     """
     outside, outside_bays, outside_islands, u_first, s_first = 1e9, 1e9, 1e9, 0.0, 0.0
     for k in range(strips.shape[0]):

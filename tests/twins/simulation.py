@@ -187,7 +187,9 @@ def ground(scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     slope = np.where(across > 0, sides[1], sides[0])
     noise = tile_at(scene.tile, x, y, 0.3)
     grass = slope - ditch * np.maximum(1 - ((e - 1.6) / 1.2) ** 2, 0) + np.minimum(e / 0.3, 1) * rough * (1 + noise)
-    return z + np.where(d <= 0, inside, verge + np.where(e > 0, grass, 0.0)), np.where(d <= 0, np.maximum(outside, -islands), outside)
+    return z + np.where(d <= 0, inside, verge + np.where(e > 0, grass, 0.0)), np.where(
+        d <= 0, np.maximum(outside, -islands), outside
+    )
 
 
 def cast(primitives, scene, pose, elevations, azimuths, reach, key):
