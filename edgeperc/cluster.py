@@ -220,6 +220,7 @@ def objects_from_points(
     *,
     among: NDArray[np.bool_] | None = None,
     height_m: NDArray[np.float32] | None = None,
+    clusters: NDArray[np.int32] | None = None,
     min_share: float = 0.7,
     min_distance_m: float = 0.5,
     distance_per_m: float = 0.015,
@@ -241,6 +242,9 @@ def objects_from_points(
     height_m : (n,) float32, optional
         Height of every point above the ground (`Ground.height_m`). A box then reaches down to the ground, otherwise
         to its lowest point.
+    clusters : (n,) int32, optional
+        Cluster of every point, -1 for none, if they are known (`find_clusters` with labeled points as seeds). Otherwise
+        they are found among ``among``.
     min_share : float
         A cluster is kept if more than this share of its points has one class (KUL-Seg 5.2). Pedestrian points count as
         cyclist if at least a quarter of the pedestrian and cyclist points are cyclist.
@@ -285,21 +289,24 @@ def objects_from_points(
         raise PointsError(
             f"got height_m of shape {height_m.shape} for {len(points)} points; expected one value a point"
         )
-    clusters = find_clusters(
-        points,
-        among=among,
-        seeds=labels > 0,
-        min_share=min_share,
-        min_distance_m=min_distance_m,
-        distance_per_m=distance_per_m,
-        min_points=min_points,
-    )
+    if clusters is None:
+        clusters = find_clusters(
+            points,
+            among=among,
+            seeds=labels > 0,
+            min_share=min_share,
+            min_distance_m=min_distance_m,
+            distance_per_m=distance_per_m,
+            min_points=min_points,
+        )
     number = {name: k for k, name in enumerate(classes)}
     part_of = {number[part]: number[whole] for part, whole in PART_OF.items() if part in number and whole in number}
     found, shares = cluster_labels(clusters, labels, min_share=min_share, part_of=part_of)
     rows = np.flatnonzero(clusters >= 0)
     sizes = np.bincount(clusters[rows], minlength=len(found))
-    highest = np.where(found > 0, shares * sizes / (sizes + EVIDENCE), -math.inf)  # the box may reduce this score
+    highest = np.where(
+        (found > 0) & (sizes >= min_points), shares * sizes / (sizes + EVIDENCE), -math.inf
+    )  # the box may reduce this score
     kept = np.argsort(-highest, kind="stable")[:MAX_OBJECTS]
     kept = np.sort(kept[(found[kept] > 0) & (highest[kept] >= min_score)])
     rows = rows[np.isin(clusters[rows], kept)]

@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .adapt import Interpolator, condition, render
+from .agreement import RULES, agree_on_boxes, agree_on_cells, agree_on_points
 from .card import ModelCard, RangeImageGeometry, TopViewGeometry
-from .cluster import MIN_SCORE, join_boxes, objects_from_points
+from .cluster import MIN_SCORE, find_clusters, join_boxes, objects_from_points
 from .decode import decode_classes, decode_top_view
 from .drivable import compile_kernels
 from .errors import EdgepercError, FitnessError, MountingError, OptionError
@@ -43,7 +44,7 @@ from .zoo import DEFAULT
 
 __all__ = ["ADAPTATIONS", "BoxesFrom", "Perceiver"]
 
-STAGES = ("check", "project", "infer", "decode", "refine", "cluster")
+STAGES = ("check", "project", "infer", "decode", "refine", "cluster", "agree")
 Adaptation = Literal["both", "remission", "interpolation", "none"]
 BoxesFrom = Literal["both", "network", "clusters"]
 OnMismatch = Literal["refuse", "warn", "raise", "ignore"]
@@ -162,6 +163,10 @@ class Perceiver:
     full_turn : bool
         Run a range-image model once for each sector, four times for the shipped models. Every point then has a class,
         and there are boxes beside and behind the vehicle.
+    agree : bool
+        Correct the parts of the result by one another (`edgeperc.agreement`): the clusters of points above the ground
+        vote on their class, boxes support or complete labels, and no cell below an object is drivable. Boxes below
+        ``score_threshold`` take no part. False, for comparisons: labels and cells are those of the networks.
     trusted : bool
         Open model files whose graphs are otherwise refused: with unusual operators, functions, subgraphs or sizes
         (`edgeperc.session.Session`). Only for files whose origin you know.
@@ -171,7 +176,7 @@ class Perceiver:
     sensor : SensorProfile
     mounting : MountingEstimate or None
         The mounting by the scans so far; None if it is to be estimated and no scan has shown the ground.
-    on_mismatch, score_threshold, adapt, boxes_from, full_turn
+    on_mismatch, score_threshold, adapt, boxes_from, full_turn, agree
         As given; read-only.
     cards : tuple of ModelCard
     sessions : tuple of Session
@@ -202,6 +207,7 @@ class Perceiver:
     adapt: Adaptation
     boxes_from: BoxesFrom
     full_turn: bool
+    agree: bool
     cards: tuple[ModelCard, ...]
     sessions: tuple[Session, ...]
     providers: Mapping[str, str]
@@ -221,12 +227,14 @@ class Perceiver:
         adapt: Adaptation = "both",
         boxes_from: BoxesFrom = "both",
         full_turn: bool = False,
+        agree: bool = True,
         trusted: bool = False,
     ) -> None:
         _check_choice("adapt", adapt, ADAPTATIONS, {"neither": "none"})
         _check_choice("on_mismatch", on_mismatch, ("refuse", "warn", "raise", "ignore"))
         _check_choice("boxes_from", boxes_from, ("both", "network", "clusters"))
         _check_choice("full_turn", full_turn, (True, False))
+        _check_choice("agree", agree, (True, False))
         if score_threshold is not None and not (isinstance(score_threshold, Real) and 0.0 <= score_threshold <= 1.0):
             raise OptionError(f"score_threshold is {score_threshold!r}; expected a number in 0..1, or None")
         if n_threads is not None and not (isinstance(n_threads, Integral) and n_threads >= 1):
@@ -247,6 +255,8 @@ class Perceiver:
         self._renders = adapt in ("both", "remission")
         self.boxes_from = boxes_from
         self.full_turn = full_turn
+        self.agree = agree
+        self._rules = RULES if agree else frozenset()  # an ablation leaves some of them out
         gaps_deg = [upper - lower for upper, lower in pairwise(self.sensor.elevations_deg)]
         # Twice the spacing of beams or columns: points of one object are linked even if a return between is missing.
         self._distance_per_m = 2.0 * math.radians(max(np.median(gaps_deg or [0.0]), 360.0 / self.sensor.columns))
@@ -264,8 +274,10 @@ class Perceiver:
         self.sessions = tuple(n.session for n in self._networks)
         self.cards = tuple(n.session.card for n in self._networks)
         self.providers = MappingProxyType({n.session.card.name: n.session.description for n in self._networks})
-        self._needs_ground = any(n.projector.needs_ground for n in self._networks) or (
-            boxes_from != "network" and "range_image" in views
+        self._needs_ground = (
+            agree
+            or any(n.projector.needs_ground for n in self._networks)
+            or (boxes_from != "network" and "range_image" in views)
         )
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
         self._locks = {os.getpid(): threading.Lock()}
@@ -273,11 +285,13 @@ class Perceiver:
         # their golden inputs, and those outputs are decoded.
         warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
         render(warm_up, replace(self.sensor, remission=NO_REMISSION))
-        self._perceive(warm_up, None, check=self._to_check > 0, infer=False)
+        perception = self._perceive(warm_up, None, check=self._to_check > 0, infer=False)
         floor, labels = self._warm_up_objects()
         ground = self._find_ground(floor)
-        if ground is not None and boxes_from != "network":
-            self._find_objects(floor, labels, ground)
+        if ground is not None:
+            unsure = (Box("car", 0.4, (5.0, 0.0, -1.0), (4.0, 1.6, 1.5), 0.0),)
+            seen = None if perception.points is None else labels
+            self._combine(floor, ground, seen, perception.top_view, unsure, _Stopwatch())
         with suppress(MountingError):  # the floor has no street
             self._estimator.add(floor)
         ModelFrame(Mounting(0.0, 0.0, 0.0, 0.0)).move(floor)
@@ -403,10 +417,8 @@ class Perceiver:
             else:
                 label = self._label_full_turn if self.full_turn else self._label_sector
                 points = label(network, scan, None if ground is None else ground.height_m, watch, infer)
-        if points is not None and ground is not None and self.boxes_from != "network":
-            clustered = self._find_objects(scan, points, ground)
-            boxes = join_boxes(boxes, self._new_to_networks(clustered)) if self.boxes_from == "both" else clustered
-            watch.lap("cluster")
+        if ground is not None:
+            points, top_view, boxes = self._combine(scan, ground, points, top_view, boxes, watch)
         return Perception(
             n_points=len(scan),
             n_dropped=n_dropped,
@@ -534,7 +546,7 @@ class Perceiver:
         return PointLabels(labels, in_view, ahead.classes)
 
     def _warm_up_objects(self) -> tuple[NDArray[np.float32], PointLabels]:
-        """Nine points of a car on a floor: enough to compile every kernel of `_find_objects`."""
+        """Nine points of a car on a floor: enough to compile every kernel of `_combine`."""
         x, y = np.meshgrid(np.arange(-8.0, 8.0), np.arange(-8.0, 8.0))
         scan = np.zeros((x.size + 9, 4), np.float32)
         scan[:-9, 0], scan[:-9, 1], scan[:-9, 2] = x.ravel(), y.ravel(), -MODEL_HEIGHT_M
@@ -546,21 +558,53 @@ class Perceiver:
         """The ground, once for all that needs it: the input of a network, and the clusters; None if nothing does."""
         return find_ground(scan, mount_height_m=MODEL_HEIGHT_M) if self._needs_ground else None
 
-    def _find_objects(self, scan: NDArray[np.float32], points: PointLabels, ground: Ground) -> tuple[Box, ...]:
-        """Boxes around clusters of points above the ground that have one dominant class (KUL-Seg 5.2).
+    def _combine(
+        self,
+        scan: NDArray[np.float32],
+        ground: Ground,
+        points: PointLabels | None,
+        top_view: TopView | None,
+        boxes: tuple[Box, ...],
+        watch: _Stopwatch,
+    ) -> tuple[PointLabels | None, TopView | None, tuple[Box, ...]]:
+        """What the parts agree on, and boxes around clusters of points above the ground (KUL-Seg 5.2).
 
-        Points out of the network's view count as background. An object cut by the view's edge therefore gets either a
-        box of the whole object or none.
+        Points out of the network's view count as background for these boxes. An object cut by the view's edge
+        therefore gets either a box of the whole object or none.
         """
-        return objects_from_points(
-            scan,
-            points.labels,
-            points.classes,
-            among=~ground.mask,
-            height_m=ground.height_m,
-            distance_per_m=self._distance_per_m,
-            min_score=MIN_SCORE if self.score_threshold is None else self.score_threshold,
-        )
+        clusters = None
+        dropped: list[Box] = []
+        if points is not None and self._rules:
+            clusters = find_clusters(
+                scan,
+                among=~ground.mask,
+                seeds=points.labels > 0,
+                distance_per_m=self._distance_per_m,
+                min_points=1,
+            )
+            watch.lap("cluster")
+            points = agree_on_points(scan, points, ground, clusters, boxes, rules=self._rules)
+            kept = agree_on_boxes(boxes, scan, points, ground, rules=self._rules)
+            dropped = [box for box in boxes if box not in kept]
+            boxes = kept
+            watch.lap("agree")
+        if points is not None and self.boxes_from != "network":
+            clustered = objects_from_points(
+                scan,
+                points.labels,
+                points.classes,
+                among=~ground.mask,
+                height_m=ground.height_m,
+                clusters=clusters,
+                distance_per_m=self._distance_per_m,
+                min_score=MIN_SCORE if self.score_threshold is None else self.score_threshold,
+            )
+            boxes = join_boxes(boxes, self._new_to_networks(clustered)) if self.boxes_from == "both" else clustered
+            watch.lap("cluster")
+        if top_view is not None and self._rules:
+            top_view = agree_on_cells(top_view, scan, points, ground, boxes, dropped, rules=self._rules)
+            watch.lap("agree")
+        return points, top_view, boxes
 
     def _new_to_networks(self, boxes: tuple[Box, ...]) -> list[Box]:
         """Boxes that no network can detect, because of their class or because they are out of its view."""

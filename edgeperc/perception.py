@@ -190,8 +190,8 @@ class Perception:
     boxes : tuple of Box
         Best score first.
     stage_ms : mapping
-        Wall time [ms] of ``check``, ``project``, ``infer``, ``decode``, ``refine`` and ``cluster``, and of ``adapt``
-        for sensors whose scans are adapted.
+        Wall time [ms] of ``check``, ``project``, ``infer``, ``decode``, ``refine``, ``cluster`` and ``agree``, and of
+        ``adapt`` for sensors whose scans are adapted.
     providers : mapping
         What ran, by model name, e.g. ``"pointseg int8, CPUExecutionProvider"``.
     fitness : tuple of str

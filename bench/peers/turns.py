@@ -51,6 +51,7 @@ def make_perceiver(contender: Contender, scans: Sequence[NDArray[np.float32]], s
         n_threads=n_threads,
         on_mismatch="ignore",
         boxes_from="network",  # as the numpy pipelines
+        agree=False,
     )
     return [partial(perceive, scan) for scan in scans]
 

@@ -14,9 +14,11 @@ __all__ = [
     "DEFAULT_SENSOR",
     "PRECISIONS",
     "PROVIDERS",
+    "RULES",
     "Commands",
     "Renamed",
     "add_adapt",
+    "add_agreement",
     "add_boxes_from",
     "add_command",
     "add_figures_file",
@@ -34,10 +36,12 @@ __all__ = [
 Commands = Any  # what ArgumentParser.add_subparsers returns; argparse keeps its class private
 _WIDTH = 78
 
-# Copies of the values in `edgeperc.zoo` and `edgeperc.session`. Those modules import numpy, which would delay --help.
+# Copies of the values in `edgeperc.zoo`, `edgeperc.session` and `edgeperc.agreement`. Those modules import numpy, which
+# would delay --help.
 DEFAULT = ("ssadnet", "pointseg")
 DEFAULT_SENSOR = "hdl-64e"
 PROVIDERS = ("auto", "cpu", "openvino", "cuda", "tensorrt", "tensorrt-rtx", "coreml", "directml")
+RULES = ("boxes", "column", "fill", "ground", "height", "road", "share", "support")
 PRECISIONS = ("auto", "fp32", "bf16", "int8")
 
 
@@ -191,6 +195,7 @@ def add_network(group: Any) -> None:
         "origin you know (default: refuse them)",
     )
     add_boxes_from(group, "both")
+    add_agreement(group)
     group.add_argument(
         "--full-turn",
         action="store_true",
@@ -211,6 +216,16 @@ def add_boxes_from(group: Any, default: str) -> None:
         help="network: boxes of the top-view model (vehicles ahead); clusters: boxes around clusters of labeled "
         "points (every class, where points have a class); both: network boxes, and cluster boxes where there are no "
         "network boxes (default: %(default)s)",
+    )
+
+
+def add_agreement(group: Any) -> None:
+    """Add ``--no-agreement``."""
+    group.add_argument(
+        "--no-agreement",
+        action="store_true",
+        help="return the labels, boxes and cells of the networks as they are (default: correct them by one another, by "
+        "the ground and by clusters)",
     )
 
 

@@ -29,6 +29,7 @@ _RENAMED = {
 }
 # Arguments of the library and the options that set them.
 _OPTIONS = {
+    "agree": "--no-agreement",
     "adapt": "--adapt",
     "boxes_from": "--boxes-from",
     "fold": "--fold",

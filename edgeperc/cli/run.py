@@ -152,6 +152,7 @@ def make_perceiver(
         adapt=adapt,
         boxes_from=arguments.boxes_from,
         full_turn=arguments.full_turn,
+        agree=not arguments.no_agreement,
         trusted=arguments.trusted,
     )
 

@@ -133,6 +133,7 @@ class RoadModel:
             provider=plan.provider,
             n_threads=1,
             on_mismatch=on_mismatch,
+            agree=False,
         )
         (card,) = self.perceive.cards
         view = card.view
