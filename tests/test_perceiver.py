@@ -106,7 +106,7 @@ def test_other_fields_of_the_perception(perception: Perception, perceive: Percei
     assert perception.top_view.labels.shape == (400, 200)
     assert perception.top_view.classes == ("background", "drivable", "car", "van", "truck")
     assert perception.top_view.to_meters(399, 0) == pytest.approx((6.05, 9.95))
-    assert set(perception.stage_ms) == {"check", "project", "infer", "decode", "refine", "cluster"}
+    assert set(perception.stage_ms) == {"check", "project", "infer", "decode", "refine", "cluster", "agree"}
     assert min(perception.stage_ms.values()) > 0.0
     assert [*perception.providers] == ["ssadnet", "pointseg"]
     for name, text in perception.providers.items():

@@ -7,10 +7,11 @@ over resampled drives.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..agreement import RULES
 from ..errors import OptionError, PointsError
 from ..mounting import Mounting
 from ..perceiver import BoxesFrom
@@ -41,6 +42,7 @@ def evaluate(
     provider: str = "cpu",
     precision: str = "auto",
     boxes_from: BoxesFrom = "network",
+    rules: Collection[str] = RULES,
     mounted: Mounting | None = None,
     n_resamples: int = 1000,
     on_scan: Callable[[int, int], None] = lambda done, total: None,
@@ -54,7 +56,7 @@ def evaluate(
         labeled scans of any sensor: a folder with ``scans.json``, or ``"FOLDER:LAYOUT"``
         (`scan_folder.ScanFolder.parse`). Those are perceived with the profile of their sensor, all round; the mounting
         is found from the scans.
-    models, road_by, provider, precision, boxes_from, mounted
+    models, road_by, provider, precision, boxes_from, rules, mounted
         As in `Judge`.
     split : str or None
         Drives of the real scans: ``"test"``, ``"train"``, ``"validation"`` or ``"all"`` (`splits.in_split`), or
@@ -87,6 +89,7 @@ def evaluate(
     """
     split = split or ("test" if fold is None else "validation")
     options: dict[str, Any] = {"provider": provider, "precision": precision, "boxes_from": boxes_from}
+    options["rules"] = rules
     options["training_scans"] = split == "train"
     folders = {str(dataset): folder for dataset in datasets if (folder := _folder(dataset)) is not None}
     if folders and (mounted is not None or road_by is not None):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..agreement import RULES
 from ..card import TopViewGeometry
 from ..decode import decode_classes
-from ..errors import ModelError
+from ..errors import ModelError, OptionError
 from ..frame import ModelFrame
 from ..geometry import inside
 from ..mounting import MODEL_MOUNTING, Mounting
@@ -58,6 +59,8 @@ class Judge:
     boxes_from : {"network", "clusters", "both"}
         As in `Perceiver`. Cluster boxes are evaluated wherever the truth is known, boxes of a top-view model only in
         its view.
+    rules : collection of str
+        Rules of the agreement of labels, boxes and cells; a part of `edgeperc.agreement.RULES` for an ablation.
     mounted : Mounting or None
         Perceive each scan as a sensor mounted so would have recorded it, with the mounting to be estimated from this
         scan alone. Points (not pixels) and boxes are evaluated. None: as recorded, on the training vehicle.
@@ -69,6 +72,8 @@ class Judge:
     ------
     ModelError
         ``road_by`` is one of the models, or has another top view.
+    OptionError
+        A rule is unknown.
     """
 
     def __init__(
@@ -80,14 +85,15 @@ class Judge:
         road_by: str | Path | None = None,
         training_scans: bool = False,
         boxes_from: BoxesFrom = "network",
+        rules: Collection[str] = RULES,
         mounted: Mounting | None = None,
         sensor: SensorProfile | None = None,
     ) -> None:
         mounting = MODEL_MOUNTING if mounted is None else Mounting()
         if sensor is None:
-            self.perceive = _perceiver(models, provider, precision, boxes_from, mounting)
+            self.perceive = _perceiver(models, provider, precision, boxes_from, rules, mounting)
         else:
-            self.perceive = _perceiver(models, provider, precision, boxes_from, sensor.mounting, sensor)
+            self.perceive = _perceiver(models, provider, precision, boxes_from, rules, sensor.mounting, sensor)
         self.mounted = None if mounted is None else ModelFrame(mounted)
         self.as_recorded = mounted is None and sensor is None
         self.point_classes: tuple[str, ...] = POINT_CLASSES
@@ -338,10 +344,13 @@ def _perceiver(
     provider: str,
     precision: str,
     boxes_from: BoxesFrom = "network",
+    rules: Collection[str] = (),
     mounting: Mounting = MODEL_MOUNTING,  # the truth of cells is in the frame of the scan
     sensor: SensorProfile | None = None,
 ) -> Perceiver:
-    return Perceiver(
+    if not {*rules} <= RULES:
+        raise OptionError(f"rules are {sorted(rules)}; expected some of {', '.join(sorted(RULES))}")
+    perceiver = Perceiver(
         list(models),
         sensor=sensor or "hdl-64e",
         full_turn=sensor is not None,
@@ -350,7 +359,10 @@ def _perceiver(
         precision=precision,
         on_mismatch="ignore",
         boxes_from=boxes_from,
+        agree=bool(rules),
     )
+    perceiver._rules = frozenset(rules)
+    return perceiver
 
 
 def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
