@@ -260,6 +260,7 @@ def test_boxes_all_round_by_hand(world: World) -> None:
         heading = result["heading"]["all"]
         assert heading["vehicle"] == {
             **{"heading": pytest.approx(2 / 3, abs=1e-4), "heading_interval": None, "axis": 1.0, "axis_interval": None},
+            **{"front_known": 0.0, "front_known_interval": None},
             **{"n_hits": 3, "n_objects": 2, "few": True},  # the cars have one size
         }
         assert heading["pedestrian"]["heading"] == 1.0

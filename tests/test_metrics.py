@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -354,7 +355,10 @@ def test_headings_by_hand():
     evaluator = BoxEvaluator()
     evaluator.update(predicted, truth)
     scores = evaluator.overall()
-    assert (scores.n_hits, scores.heading, scores.axis) == (4, 2 / 4, 3 / 4)
+    assert (scores.n_hits, scores.heading, scores.axis, scores.front_known) == (4, 2 / 4, 3 / 4, 0.0)
+    known = BoxEvaluator()
+    known.update([replace(predicted[0], front=0.9), predicted[1], replace(predicted[4], front=0.9)], truth)
+    assert known.overall().front_known == 1 / 2
     near = evaluator.per_class((0.0, 15.0))["car"]
     assert (near.n_hits, near.heading, near.axis) == (2, 1 / 2, 1.0)
     nobody = evaluator.overall((50.0, 60.0))

@@ -10,7 +10,9 @@ from typing import Any
 from ..extras import require
 from .arguments import (
     DEFAULT,
+    RULES,
     Commands,
+    add_agreement,
     add_boxes_from,
     add_command,
     add_figures_file,
@@ -71,6 +73,14 @@ def add_parser(commands: Commands) -> None:
     add_model(models)
     add_provider(models, provider="cpu")
     add_boxes_from(models, "network")
+    add_agreement(models)
+    models.add_argument(
+        "--without-rule",
+        action="append",
+        choices=RULES,
+        default=[],
+        help="leave out one rule of the agreement, to measure what it is worth; may be repeated (default: none)",
+    )
     models.add_argument(
         "--road-by",
         metavar="MODEL",
@@ -109,6 +119,7 @@ def eval_command(arguments: argparse.Namespace) -> int:
             fold=arguments.fold,
             road_by=arguments.road_by,
             boxes_from=arguments.boxes_from,
+            rules=() if arguments.no_agreement else {*RULES} - {*arguments.without_rule},
             mounted=None if arguments.mounted is None else Mounting(*arguments.mounted),
             provider=arguments.provider,
             precision=arguments.precision,
@@ -144,7 +155,7 @@ _BOX_COLUMNS = (
 )
 _ALL_ROUND_COLUMNS = (*_with_intervals(("AP", "ap"), *_RATES), *_HIT_COLUMNS)
 _HEADING_COLUMNS = (
-    *_with_intervals(("heading", "heading"), ("modulo half a turn", "axis")),
+    *_with_intervals(("heading", "heading"), ("modulo half a turn", "axis"), ("front known", "front_known")),
     *(("boxes", "n_hits"), ("objects", "n_objects")),
 )
 _ERROR_COLUMNS = (

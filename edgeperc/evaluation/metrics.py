@@ -237,6 +237,8 @@ class BoxScores:
     heading, axis : float
         Share of the hits whose yaw is within 45 degrees of the true one: over the full turn, where front for rear is
         wrong, and modulo half a turn. NaN without hits; a yaw that is not finite is wrong.
+    front_known : float
+        Share of the hits with a known front (`Box.front`); the yaw of the others counts as it is.
     n_truth, n_predicted, n_hits : int
         Ignored boxes are not counted.
     n_objects, n_found : int
@@ -252,6 +254,7 @@ class BoxScores:
     mean_iou_70: float
     heading: float
     axis: float
+    front_known: float
     n_truth: int
     n_predicted: int
     n_hits: int
@@ -266,6 +269,7 @@ class _Matches:
     overlaps: list[float] = field(default_factory=list)  # IoU with the matched true box; 0 without a match
     ranges_m: list[float] = field(default_factory=list)  # distance of the matched true box, else of the prediction
     turns: list[float] = field(default_factory=list)  # error of the yaw, 0..pi; NaN without a match
+    fronts: list[bool] = field(default_factory=list)  # the prediction knows its front
     matched: list[ObjectKey | None] = field(default_factory=list)  # object of the matched true box
     truth_m: list[float] = field(default_factory=list)  # distance of every box to find
     objects: list[ObjectKey] = field(default_factory=list)  # object of every box to find
@@ -416,6 +420,7 @@ class BoxEvaluator:
             matches.scores.append(box.score)
             matches.ranges_m.append(_range_m(right or box))
             matches.turns.append(math.nan if right is None else _turn(box.yaw - right.yaw))
+            matches.fronts.append(box.front is not None)
             matches.matched.append(None if right is None else object_key(drive, right))
         return [*pairs, *((None, box) for box in missed.values())]
 
@@ -429,6 +434,7 @@ class BoxEvaluator:
         hits = overlaps >= self.iou_threshold
         n_hits = int(np.count_nonzero(hits))
         turns = np.array(matches.turns)[kept][hits]
+        fronts = np.array(matches.fronts, dtype=np.bool_)[kept][hits]
         objects = {matches.objects[k] for k in to_find}
         return BoxScores(
             ap=average_precision(scores, hits, n_truth),
@@ -438,6 +444,7 @@ class BoxEvaluator:
             mean_iou_70=mean(overlaps[overlaps >= max(0.7, self.iou_threshold)]),
             heading=float(_share(np.count_nonzero(turns <= HEADING_RAD), n_hits)),
             axis=float(_share(np.count_nonzero(np.minimum(turns, math.pi - turns) <= HEADING_RAD), n_hits)),
+            front_known=float(_share(np.count_nonzero(fronts), n_hits)),
             n_truth=n_truth,
             n_predicted=len(hits),
             n_hits=n_hits,

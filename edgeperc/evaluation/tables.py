@@ -229,12 +229,12 @@ def _box_row(scores: BoxScores) -> dict[str, Any]:
     return row | _few(scores.n_objects)
 
 
-_HEADING = ("heading", "axis", "n_found")
+_HEADING = ("heading", "axis", "front_known", "n_found")
 
 
 def _heading_row(scores: BoxScores) -> dict[str, Any]:
     """Of the boxes that were matched: the share whose heading is right, over the full turn and modulo half a turn."""
-    shares = {"heading": scores.heading, "axis": scores.axis}
+    shares = {"heading": scores.heading, "axis": scores.axis, "front_known": scores.front_known}
     return shares | {"n_hits": scores.n_hits, "n_objects": scores.n_found} | _few(scores.n_found)
 
 
