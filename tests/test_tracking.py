@@ -423,13 +423,13 @@ def test_any_boxes_at_any_times_make_finite_tracks(seed: int) -> None:
 @pytest.mark.parametrize(("n", "m"), [(0, 0), (1, 0), (0, 2), (5, 4), (20, 3)])
 def test_shapes_hiding_and_rivals_are_those_of_the_twins(n: int, m: int) -> None:
     rng = np.random.default_rng(n + m)
-    state, detections = rng.normal(0.0, 1.0, (n, 5)), rng.normal(0.0, 1.0, (m, 3))
+    state = rng.normal(0.0, 1.0, (n, 5))
     beta, shapes, sigmas = rng.dirichlet(np.ones(m + 1), n), rng.uniform(1, 3, (m, 4)), rng.uniform(0.1, 1, (n, 4))
-    shape, variance, front = rng.uniform(1, 3, (n, 4)), rng.uniform(0.1, 1, (n, 4)), rng.uniform(-10, 10, n)
+    shape, variance = rng.uniform(1, 3, (n, 4)), rng.uniform(0.1, 1, (n, 4))
     walk = np.array([0.1, 0.2, 0.3, 0.4])
-    wanted = twins.tracking.updated_shapes(state, beta, detections, shapes, sigmas, walk, shape, variance, front)
-    update_shapes(state, beta, detections, shapes, sigmas, walk, shape, variance, front)
-    for got, want in zip((shape, variance, front), wanted, strict=True):
+    wanted = twins.tracking.updated_shapes(beta, shapes, sigmas, walk, shape, variance)
+    update_shapes(beta, shapes, sigmas, walk, shape, variance)
+    for got, want in zip((shape, variance), wanted, strict=True):
         np.testing.assert_allclose(got, want)
     seen, sensor, shares = rng.random(n) < 0.7, np.array([3.0, -8.0]), np.empty(n)
     fill_hidden(10.0 * state, shape, seen, sensor, shares)
@@ -447,7 +447,8 @@ def test_births_lives_and_views_are_those_of_the_twins(n: int, m: int) -> None:
     kinds = tracker._kinds(["car", "pedestrian", "cyclist"])[rng.integers(0, 3, n)]
     of = tracker._classes[kinds]
     detections, shapes = rng.normal(0.0, 9.0, (n, 3)), rng.uniform(0.5, 4.0, (n, 4))
-    born = kinds, of, detections, shapes, rng.normal(0.0, 3.0, n), rng.uniform(0.0, 60.0, n)
+    evidence = rng.normal(0.0, 3.0, n), rng.normal(0.0, 3.0, n), np.arange(n)
+    born = kinds, of, detections, shapes, *evidence, rng.uniform(0.0, 60.0, n)
     wanted = twins.tracking.newborn(5, *born, MOST_EXISTENCE, TRACK)
     tracks = np.zeros(n, TRACK)
     fill_newborn(5, *born, tracks)

@@ -6,7 +6,8 @@ ROOT holds KITTI's tracking sequences with detections (``label_02``, ``calib``, 
 it, a street of parked and moving cars is drawn from a seed. Only `Tracker.update` is measured, in one thread, boxes in
 and tracks out, over whole sequences:
 
-- each class alone, and all classes together; the kernels compile before the first scan that counts
+- each class alone, and all classes together. Trackers are made before the clocks start, and their construction
+  compiles the kernels
 - one sequence of cars (``--sequence``) by the tracker and by Stone Soup, with the same boxes, those with a score above
   ``--score``. Stone Soup runs a JPDA over unscented filters with one motion model, constant velocity, in x and y, for
   at most ``--seconds``; the scans that it did by then count
@@ -122,8 +123,7 @@ def endurance(n_scans: int, n_targets: int) -> str:
     """The time of a scan of crossing targets, and the growth of memory after a tenth of the scans."""
     from ..context import rss_mb  # needs the extra 'bench'
 
-    follow([drawn_street(30)])  # the kernels load before the first scan that counts
-    tracker, ms, early_mb = Tracker(), np.empty(n_scans), 0.0
+    tracker, ms, early_mb = Tracker(), np.empty(n_scans), 0.0  # its construction compiles the kernels
     for k, (boxes, _) in enumerate(crossing(n_scans, n_targets, n_targets // 2)):
         ms[k] = elapsed_ms(partial(tracker.update, boxes, k * FRAME_S, np.eye(4)))
         if k == n_scans // 10:
@@ -136,13 +136,26 @@ def endurance(n_scans: int, n_targets: int) -> str:
     )
 
 
-def follow(sequences: Sequence[Scans]) -> int:
-    """Track every sequence from its beginning; return the number of scans."""
-    for scans in sequences:
-        tracker = Tracker()
+def follow(sequences: Sequence[Scans], trackers: Iterator[Tracker]) -> int:
+    """Track every sequence from its beginning, each with a tracker of its own; return the number of scans."""
+    for scans, tracker in zip(sequences, trackers, strict=False):
         for k, boxes in enumerate(scans):
             tracker.update(boxes, k * FRAME_S)
     return sum(map(len, sequences))
+
+
+def timed(run: Callable[[], int]) -> tuple[int, float, float]:
+    """Number of scans of a run, its wall time and its processor time [s]."""
+    wall_s, cpu_s = time.perf_counter(), time.process_time()
+    done = run()
+    return done, time.perf_counter() - wall_s, time.process_time() - cpu_s
+
+
+def time_tracker(sequences: Sequence[Scans]) -> tuple[int, float, float]:
+    """As `timed`, for `follow`. The trackers are made, and the kernels compiled, before the clocks start."""
+    trackers = [Tracker() for _ in sequences]
+    follow([drawn_street(3)], iter([Tracker()]))
+    return timed(partial(follow, sequences, iter(trackers)))
 
 
 def stone_soup(scans: Scans, seconds: float) -> int:
@@ -241,26 +254,23 @@ def main() -> None:
         cars = [[box for box in scan if box.label == "car"] for scan in read[arguments.sequence]]
     shared = [[box for box in scan if box.score > arguments.score] for scan in cars]
 
-    follow([drawn_street(30)])
     rows = [["", "scans", "boxes/scan", "scans/s", "by processor time"]]
 
-    def add(name: str, run: Callable[[], int], boxes_per_scan: float) -> float:
-        """Time a run, which returns its number of scans; return the processor time of a scan [s]."""
-        wall_s, cpu_s = time.perf_counter(), time.process_time()
-        done = run()
-        wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
+    def add(name: str, measured: tuple[int, float, float], boxes_per_scan: float) -> float:
+        """Add a row; return the processor time of a scan [s]."""
+        done, wall_s, cpu_s = measured
         rows.append([name, f"{done:,}", number(boxes_per_scan, 1), number(done / wall_s, 0), number(done / cpu_s, 0)])
         return cpu_s / max(done, 1)
 
     for name, sequences in of_class.items():
         n_boxes, n_scans = sum(len(scan) for scans in sequences for scan in scans), sum(map(len, sequences))
-        add(name, partial(follow, sequences), n_boxes / n_scans)
+        add(name, time_tracker(sequences), n_boxes / n_scans)
     each = sum(map(len, shared)) / len(shared)
-    own_s = add(f"one sequence, score > {arguments.score}", partial(follow, [shared] * 5), each)
+    own_s = add(f"one sequence, score > {arguments.score}", time_tracker([shared] * 5), each)
     sentences = [f"one thread; {versions()}"]
     if importlib.util.find_spec("stonesoup"):
         name = f"Stone Soup {importlib.metadata.version('stonesoup')} JPDA"
-        theirs_s = add(name, partial(stone_soup, shared, arguments.seconds), each)
+        theirs_s = add(name, timed(partial(stone_soup, shared, arguments.seconds)), each)
         sentences.append(f"Stone Soup takes {theirs_s / own_s:,.0f} times as long for a scan")
     else:
         sentences.append("Stone Soup's JPDA is not installed. Run: pip install 'edgeperc[peers]'")

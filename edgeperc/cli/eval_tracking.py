@@ -37,11 +37,13 @@ def add_parser(commands: Commands) -> None:
         eval_tracking_command,
         help="tracking figures on KITTI's sequences",
         description="Track KITTI's sequences without ego poses and compare the tracks with the labels: CLEAR-MOT at "
-        "the score with the best MOTA, its averages over forty recalls, and HOTA.\n\nThe boxes come from "
+        "the score with the best MOTA, its averages over forty recalls, and HOTA; and how often the heading of a track "
+        "points to its front. Kernels are compiled before the time is measured.\n\nThe boxes come from "
         "--boxes; without --boxes, from ROOT/detections; with --model, or if ROOT has no detections, from the models, "
         "which run on the scans in ROOT/velodyne.",
         examples=[
             "edgeperc eval-tracking tracking/",
+            "edgeperc eval-tracking tracking/ --rules ab3dmot --rival ab3dmot",
             "edgeperc eval-tracking tracking/ --sequences 0000 0002 --gif 0000.gif",
             "edgeperc eval-tracking KITTI/ --model pointseg --json figures.json",
         ],
@@ -80,6 +82,20 @@ def add_parser(commands: Commands) -> None:
         default=0.25,
         metavar="X",
         help="smallest 3-D overlap (intersection over union) of a match, 0..1 (default: %(default)s)",
+    )
+    rules.add_argument(
+        "--rules",
+        choices=("edgeperc", "ab3dmot"),
+        default="edgeperc",
+        metavar="RULES",
+        help="ab3dmot: as AB3DMOT's program, with the image height of the detection instead of the track, sitting "
+        "people not excused, and rounded scores; edgeperc: thresholds are compared exactly (default: %(default)s)",
+    )
+    rules.add_argument(
+        "--rival",
+        choices=("ab3dmot",),
+        metavar="METHOD",
+        help="evaluate AB3DMOT's method, implemented again, on the same boxes by the same rules (default: none)",
     )
     models = parser.add_argument_group("models, if the boxes come from scans")
     add_model(models)
@@ -120,6 +136,8 @@ def eval_tracking_command(arguments: argparse.Namespace) -> int:
             classes=arguments.classes,
             boxes=boxes,
             iou_threshold=arguments.iou,
+            rules=arguments.rules,
+            rival=arguments.rival is not None,
             on_sequence=show,
         )
     for line in _tracking_lines(figures):
@@ -170,13 +188,40 @@ _COUNT_COLUMNS = (
 )
 
 
+_HEADING_COLUMNS = (
+    *(("boxes", "n_boxes"), ("tracks", "n_tracks"), ("known front", "n_resolved"), ("right of known", "right")),
+    ("right of all", "right_of_all"),
+)
+
+
 def _tracking_lines(figures: Mapping[str, Any]) -> list[str]:
-    rows = [(("", name), without_nan({**of, **of["best"], **of["hota"]})) for name, of in figures["classes"].items()]
-    every = [(("", name), without_nan({**of, **of["all_tracks"]})) for name, of in figures["classes"].items()]
+    methods = {"": figures["classes"], "AB3DMOT's method": figures.get("rival", {})}
+    every = [((method, name), of) for method, by in methods.items() for name, of in by.items()]
+    rows = [(name, without_nan({**of, **of["best"], **of["hota"]})) for name, of in every]
+    headings = [
+        (
+            (kind, name),
+            counts
+            | {"right": _share(counts, "n_right", "n_resolved")}
+            | {"right_of_all": _share(counts, "n_right_of_all", "n_boxes")},
+        )
+        for kind in ("moving", "stopped", "parked")
+        for name, of in figures["headings"].items()
+        if (counts := of[kind])["n_boxes"]
+    ]
     return [
-        f"{many(len(figures['sequences']), 'sequence')}, {figures['of']}, 3-D IoU {figures['iou_threshold']}; "
-        f"{figures['frames_per_s']:,.0f} scans a second in the tracker; shares in per cent",
+        f"{many(len(figures['sequences']), 'sequence')}, {figures['of']}, 3-D IoU {figures['iou_threshold']}, rules "
+        f"{figures['rules']}; {figures['frames_per_s']:,.0f} scans a second in the tracker; shares in per cent",
         *table_lines("over forty recalls; at the best MOTA", _AVERAGE_COLUMNS, rows),
         *table_lines("counts at the best MOTA", _COUNT_COLUMNS, rows),
-        *table_lines("counts of all tracks, with any score", _COUNT_COLUMNS, every),
+        *table_lines(
+            "counts of all tracks, with any score",
+            _COUNT_COLUMNS,
+            [(name, without_nan({**of, **of["all_tracks"]})) for name, of in every],
+        ),
+        *(table_lines("headings within a quarter turn of the label's", _HEADING_COLUMNS, headings) if headings else ()),
     ]
+
+
+def _share(counts: Mapping[str, int], part: str, whole: str) -> float | None:
+    return counts[part] / counts[whole] if counts[whole] else None

@@ -1,4 +1,7 @@
-"""Evaluate the tracker on KITTI's tracking sequences, by AB3DMOT's protocol and as in KUL-Seg's Table 7."""
+"""Evaluate trackers on KITTI's tracking sequences, by AB3DMOT's protocol and as in KUL-Seg's Table 7.
+
+There are two sets of rules (`RULES`). Every tracker that is compared is evaluated by the same set.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,9 @@ from ..perception import Box
 from ..readers.files import read_points
 from ..tracking.tracker import Tracker
 from ..tracking.tracks import ClassParameters, Tracks
+from .ab3dmot import SETTINGS, Ab3dmot
 from .datasets import IMAGE_SIZE, Calibration, KittiObjects
+from .headings import Headings, count_headings
 from .tracking_metrics import FrameTracks, FrameTruth, evaluate_tracks
 from .unseen import check_unseen, training_scans_of
 
@@ -26,7 +31,10 @@ __all__ = [
     "CLASSES",
     "FRAME_S",
     "KINDS",
+    "RULES",
+    "FrameResult",
     "TrackingSequence",
+    "ab3dmot_sequence",
     "evaluate_kitti",
     "perceive_drive",
     "read_sequence",
@@ -45,6 +53,11 @@ NEIGHBORS = {"car": ("van",), "pedestrian": ("person", "person_sitting"), "cycli
 MAX_OCCLUSION, MAX_TRUNCATION, MIN_HEIGHT_PX, MIN_UNLABELED = 2, 0, 25.0, 0.5
 FRAME_S = 0.1
 
+# "edgeperc": a track's image box is the projection of its 3-D box, and scores are compared exactly.
+# "ab3dmot": as AB3DMOT's program. A track's image box is that of its last detection, sitting people are labeled as
+# nothing, and scores are rounded (`edgeperc.evaluation.tracking_metrics.evaluate_tracks`).
+RULES = ("edgeperc", "ab3dmot")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackingSequence:
@@ -55,6 +68,8 @@ class TrackingSequence:
     name : str
     detections : tuple of tuple of Box
         By frame, of all classes, in the sensor frame. Scores are in 0..1.
+    image_boxes : tuple of (k, 4) float64
+        By frame: image rectangle (left, top, right, bottom) of each detection [px].
     truth : mapping of str to tuple of FrameTruth
         By class and frame.
     unlabeled : tuple of (k, 4) float64
@@ -64,9 +79,40 @@ class TrackingSequence:
 
     name: str
     detections: tuple[tuple[Box, ...], ...]
+    image_boxes: tuple[NDArray[np.float64], ...]
     truth: Mapping[str, tuple[FrameTruth, ...]]
     unlabeled: tuple[NDArray[np.float64], ...]
     calibration: Calibration
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameResult:
+    """What a tracker reports for one frame.
+
+    Attributes
+    ----------
+    ids : (n,) int64
+    labels : list of str
+    boxes : (n, 7) float64
+        In the sensor frame.
+    scores : (n,) float64
+        Log odds, or any other scores: only their order and their mean over the frames of a track matter.
+    sources : (n,) int64
+        Index of the detection of this frame; -1 for none.
+    """
+
+    ids: NDArray[np.int64]
+    labels: Sequence[str]
+    boxes: NDArray[np.float64]
+    scores: NDArray[np.float64]
+    sources: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, tracks: Tracks) -> FrameResult:
+        """Convert the tracks of `edgeperc.Tracker`."""
+        with np.errstate(divide="ignore"):  # log odds, because float64 probabilities near 1 cannot be distinguished
+            scores = np.log(tracks.scores) - np.log1p(-tracks.scores)
+        return cls(tracks.ids, tracks.labels, tracks.boxes, np.clip(scores, -36.0, 36.0), tracks.sources)
 
 
 def sequence_names(root: Path | str) -> list[str]:
@@ -143,7 +189,12 @@ def _labels(root: Path, name: str) -> tuple[Path, list[list[str]], Calibration]:
 
 
 def read_sequence(
-    root: Path | str, name: str, classes: Sequence[str] = CLASSES, boxes: Sequence[Sequence[Box]] | None = None
+    root: Path | str,
+    name: str,
+    classes: Sequence[str] = CLASSES,
+    boxes: Sequence[Sequence[Box]] | None = None,
+    *,
+    rules: str = RULES[0],
 ) -> TrackingSequence:
     """Read labels, calibration and detections (``detections/DETECTOR_CLASS/NAME.txt``) of a sequence below ``root``.
 
@@ -157,6 +208,8 @@ def read_sequence(
         Keys of `KINDS`.
     boxes : sequence of sequence of Box, optional
         Detections by frame, instead of the files.
+    rules : str
+        Of `RULES`.
 
     Returns
     -------
@@ -179,19 +232,21 @@ def read_sequence(
     kinds = np.array([columns[2].lower() for columns in labels], np.str_)
     n_frames = 1 + int(values[:, 0].max(initial=-1.0))
     if boxes is None:
-        detections = _read_detections(root, name, classes, calibration, n_frames)
+        detections, image_boxes = _read_detections(root, name, classes, calibration, n_frames)
     elif len(boxes) < n_frames:
         raise TrackingError(
             f"got boxes of {len(boxes)} frames for {n_frames} of {label_path}; pass one line for each frame"
         )
     else:
         detections = [list(of_frame) for of_frame in boxes]
+        image_boxes = [_image_rectangles(_rows(of_frame), calibration) for of_frame in detections]
     n_frames = len(detections)
     placed = calibration.sensor_boxes(values[:, 9:16])
     ignored = (values[:, 2] > MAX_TRUNCATION) | (values[:, 3] > MAX_OCCLUSION)
     truth: dict[str, tuple[FrameTruth, ...]] = {}
     for of in classes:
-        mine = np.isin(kinds, [*KINDS[of], *NEIGHBORS[of]])
+        neighbors = [kind for kind in NEIGHBORS[of] if (rules, kind) != ("ab3dmot", "person")]
+        mine = np.isin(kinds, [*KINDS[of], *neighbors])
         excused = ignored | ~np.isin(kinds, KINDS[of])
         in_frame = [np.flatnonzero(mine & (values[:, 0] == k)) for k in range(n_frames)]
         truth[of] = tuple(
@@ -201,6 +256,7 @@ def read_sequence(
     return TrackingSequence(
         name=name,
         detections=tuple(tuple(of_frame) for of_frame in detections),
+        image_boxes=tuple(image_boxes),
         truth=truth,
         unlabeled=tuple(values[unlabeled & (values[:, 0] == k), 5:9] for k in range(n_frames)),
         calibration=calibration,
@@ -209,12 +265,13 @@ def read_sequence(
 
 def _read_detections(
     root: Path, name: str, classes: Sequence[str], calibration: Calibration, n_frames: int
-) -> list[list[Box]]:
-    """Read detections by frame.
+) -> tuple[list[list[Box]], list[NDArray[np.float64]]]:
+    """Read detections and their image rectangles by frame.
 
     Columns: frame, type, left, top, right, bottom, logit, height, width, length, x, y, z, turn, alpha.
     """
     detections: list[list[Box]] = [[] for _ in range(n_frames)]
+    image_boxes: list[list[NDArray[np.float64]]] = [[] for _ in range(n_frames)]
     for of in classes:
         folders = sorted((root / "detections").glob(f"*_{of.capitalize()}"))
         if not folders:
@@ -225,12 +282,21 @@ def _read_detections(
             rows = np.array(lines, np.float64).reshape(-1, 15)
         except ValueError as exc:
             raise TrackingError(f"{path} is not a file of detections; expected 15 comma-separated columns") from exc
-        detections += [[] for _ in range(len(detections), 1 + int(rows[:, 0].max(initial=-1.0)))]
+        n_more = 1 + int(rows[:, 0].max(initial=-1.0)) - len(detections)
+        detections += [[] for _ in range(n_more)]
+        image_boxes += [[] for _ in range(n_more)]
         scores = 1.0 / (1.0 + np.exp(-rows[:, 6]))
         placed = calibration.sensor_boxes(rows[:, 7:14])
-        for frame, score, row in zip(rows[:, 0].astype(np.int64), scores.tolist(), placed.tolist(), strict=True):
+        for frame, score, seen, row in zip(
+            rows[:, 0].astype(np.int64), scores.tolist(), rows[:, 2:6], placed.tolist(), strict=True
+        ):
             detections[frame].append(Box(of, score, (row[0], row[1], row[2]), (row[3], row[4], row[5]), row[6]))
-    return detections
+            image_boxes[frame].append(seen)
+    return detections, [np.array(of_frame).reshape(-1, 4) for of_frame in image_boxes]
+
+
+def _rows(boxes: Sequence[Box]) -> NDArray[np.float64]:
+    return np.array([(*box.center, *box.size, box.yaw) for box in boxes], np.float64).reshape(-1, 7)
 
 
 def track_sequence(
@@ -253,7 +319,7 @@ def track_sequence(
     # Labels and detections cover the field of view of the left color camera.
     (fx, _, cx), width_px = sequence.calibration.P2[0, :3], IMAGE_SIZE[0]
     edges = math.degrees(math.atan(cx / fx)), -math.degrees(math.atan((width_px - cx) / fx))
-    tracker = Tracker(parameters, field_of_view_deg=edges)
+    tracker = Tracker(parameters, field_of_view_deg=edges)  # its construction compiles the kernels
     tracks = []
     start = time.perf_counter()
     for k, boxes in enumerate(sequence.detections):
@@ -261,21 +327,56 @@ def track_sequence(
     return tracks, time.perf_counter() - start
 
 
-def _frame_tracks(sequence: TrackingSequence, tracks: Sequence[Tracks], of: str) -> list[FrameTracks]:
+def ab3dmot_sequence(sequence: TrackingSequence, classes: Sequence[str] = CLASSES) -> list[FrameResult]:
+    """Run AB3DMOT's method (`edgeperc.evaluation.ab3dmot`) over a sequence, with one tracker for each class.
+
+    Parameters
+    ----------
+    sequence : TrackingSequence
+    classes : sequence of str
+
+    Returns
+    -------
+    list of FrameResult
+        One for each frame. Classes without settings of AB3DMOT's have no tracks.
+    """
+    trackers = {of: Ab3dmot(SETTINGS[of]) for of in classes if of in SETTINGS}
+    results = []
+    for boxes in sequence.detections:
+        parts, labels = [], []
+        for number, (of, tracker) in enumerate(trackers.items()):
+            mine = [k for k, box in enumerate(boxes) if box.label == of]
+            scores = np.clip([boxes[k].score for k in mine], 1e-15, 1.0 - 1e-15)
+            ids, rows, logits, at = tracker.update(
+                [boxes[k] for k in mine], (np.log(scores) - np.log1p(-scores)).tolist()
+            )
+            sources = np.where(at >= 0, np.append(mine, -1).astype(np.int64)[at], -1)
+            parts.append((len(trackers) * ids + number, rows, logits, sources))
+            labels += [of] * len(ids)
+        ids, rows, logits, sources = (np.concatenate(part) for part in zip(*parts, strict=True))
+        results.append(FrameResult(ids, labels, rows, logits, sources))
+    return results
+
+
+def _frame_tracks(sequence: TrackingSequence, results: Sequence[FrameResult], of: str, rules: str) -> list[FrameTracks]:
     """Convert the tracks of one class for the metrics, by frame."""
     frames = []
-    for in_frame, unlabeled in zip(tracks, sequence.unlabeled, strict=True):
-        mine = np.flatnonzero([label in KINDS[of] for label in in_frame.labels])
-        boxes = in_frame.boxes[mine]
-        excused = _excused(boxes, unlabeled, sequence.calibration)
-        with np.errstate(divide="ignore"):  # log odds, because float64 probabilities near 1 cannot be distinguished
-            scores = np.log(in_frame.scores[mine]) - np.log1p(-in_frame.scores[mine])
-        frames.append(FrameTracks(in_frame.ids[mine], boxes, np.clip(scores, -36.0, 36.0), excused))
+    last: dict[int, NDArray[np.float64]] = {}
+    for result, seen, unlabeled in zip(results, sequence.image_boxes, sequence.unlabeled, strict=True):
+        mine = np.flatnonzero([label in KINDS[of] for label in result.labels])
+        ids, boxes = result.ids[mine], result.boxes[mine]
+        shown = _image_rectangles(boxes, sequence.calibration)
+        if rules == "ab3dmot":
+            for k, (one, source) in enumerate(zip(ids.tolist(), result.sources[mine].tolist(), strict=True)):
+                if source >= 0:
+                    last[one] = seen[source]
+                shown[k] = last.get(one, shown[k])
+        frames.append(FrameTracks(ids, boxes, result.scores[mine], _excused(shown, unlabeled)))
     return frames
 
 
-def _excused(boxes: NDArray[np.float64], unlabeled: NDArray[np.float64], calibration: Calibration) -> NDArray[np.bool_]:
-    """Which boxes (n, 7) are at most 25 pixels high in the image, or have over half of their image area in DontCare."""
+def _image_rectangles(boxes: NDArray[np.float64], calibration: Calibration) -> NDArray[np.float64]:
+    """Project boxes (n, 7): left, top, right, bottom [px] within the image; without area if a box is not in it."""
     signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
     local = signs[None] * boxes[:, None, 3:6]
     cos, sin = np.cos(boxes[:, 6])[:, None], np.sin(boxes[:, 6])[:, None]
@@ -287,13 +388,19 @@ def _excused(boxes: NDArray[np.float64], unlabeled: NDArray[np.float64], calibra
     ahead = depth > 0.1  # a corner behind the camera has no pixel
     low = np.where(ahead[..., None], pixel, np.inf).min(axis=1).clip(0.0, IMAGE_SIZE)
     high = np.where(ahead[..., None], pixel, -np.inf).max(axis=1).clip(0.0, IMAGE_SIZE)
-    size = np.maximum(high - low, 0.0)
+    return np.hstack([low, np.maximum(high, low)])
+
+
+def _excused(shown: NDArray[np.float64], unlabeled: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which image rectangles (n, 4) are at most 25 pixels high, or have over half of their area in DontCare."""
+    low, high = shown[:, :2], shown[:, 2:]
+    size = high - low
     hidden = (size[:, 1] <= MIN_HEIGHT_PX) | (size[:, 0] <= 0.0)
     for left, top, right, bottom in unlabeled:
         shared = np.minimum(high, [right, bottom]) - np.maximum(low, [left, top])
         overlap = np.where((shared > 0.0).all(axis=1), shared.prod(axis=1), 0.0)
         hidden |= overlap > MIN_UNLABELED * np.maximum(size.prod(axis=1), 1e-9)
-    return hidden
+    return np.asarray(hidden)
 
 
 def evaluate_kitti(
@@ -304,6 +411,8 @@ def evaluate_kitti(
     parameters: Mapping[str, ClassParameters] | None = None,
     boxes: Mapping[str, Sequence[Sequence[Box]]] | None = None,
     iou_threshold: float = 0.25,
+    rules: str = RULES[0],
+    rival: bool = False,
     on_sequence: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Run the tracker over KITTI's sequences and evaluate the tracks.
@@ -322,37 +431,62 @@ def evaluate_kitti(
         Detections by sequence and frame, instead of the files.
     iou_threshold : float
         Smallest 3-D IoU of a match.
+    rules : str
+        Of `RULES`.
+    rival : bool
+        Whether to evaluate AB3DMOT's method too, with the same boxes and rules.
     on_sequence : callable, optional
         Called with the number of sequences done and the number of all sequences.
 
     Returns
     -------
     dict
-        For JSON: ``sequences``, ``iou_threshold``, ``frames_per_s``, and in ``classes`` the `TrackingScores` of each.
+        For JSON: ``sequences``, ``iou_threshold``, ``rules``, ``frames_per_s``; in ``classes`` the `TrackingScores` of
+        each; in ``headings`` the counts of `edgeperc.evaluation.headings` of each; with ``rival``, in ``rival`` the
+        `TrackingScores` of AB3DMOT's method.
 
     Raises
     ------
     TrackingError
-        There is no such data, or a file is malformed.
+        There is no such data, or a file is malformed, or there are no such rules.
     """
+    if rules not in RULES:
+        raise TrackingError(f"got rules {rules!r}; expected one of {', '.join(RULES)}")
     root = Path(root)
     names = list(sequences or sequence_names(root))
-    pairs: dict[str, list[tuple[Sequence[FrameTruth], Sequence[FrameTracks]]]] = {of: [] for of in classes}
+    # By tracker, class and sequence.
+    pairs: dict[str, dict[str, list[tuple[Sequence[FrameTruth], Sequence[FrameTracks]]]]] = {
+        name: {of: [] for of in classes} for name in ("edgeperc", *(("ab3dmot",) if rival else ()))
+    }
+    headings = {of: Headings() for of in classes}
     n_frames, seconds = 0, 0.0
-    Tracker(parameters).update([Box("car", 0.5, (9.0, 0.0, 0.0), (4.0, 2.0, 1.5), 0.0)], 0.0)  # loads the kernels
     for done, name in enumerate(names, start=1):
-        sequence = read_sequence(root, name, classes, (boxes or {}).get(name))
+        sequence = read_sequence(root, name, classes, (boxes or {}).get(name), rules=rules)
         tracks, took = track_sequence(sequence, parameters)
         n_frames, seconds = n_frames + len(tracks), seconds + took
+        results = {"edgeperc": [FrameResult.of(in_frame) for in_frame in tracks]}
+        if rival:
+            results["ab3dmot"] = ab3dmot_sequence(sequence, classes)
         for of in classes:
-            pairs[of].append((sequence.truth[of], _frame_tracks(sequence, tracks, of)))
+            for method, reported in results.items():
+                pairs[method][of].append((sequence.truth[of], _frame_tracks(sequence, reported, of, rules)))
+            headings[of] += count_headings(sequence.truth[of], tracks, KINDS[of], iou_threshold)
         if on_sequence is not None:
             on_sequence(done, len(names))
+    scores = {
+        method: {
+            of: asdict(evaluate_tracks(each, iou_threshold, as_ab3dmot=rules == "ab3dmot")) for of, each in by.items()
+        }
+        for method, by in pairs.items()
+    }
     return {
         "sequences": names,
         "iou_threshold": iou_threshold,
+        "rules": rules,
         "frames_per_s": n_frames / seconds,
-        "classes": {of: asdict(evaluate_tracks(pairs[of], iou_threshold)) for of in classes},
+        "classes": scores["edgeperc"],
+        "headings": {of: asdict(each) for of, each in headings.items()},
+        **({"rival": scores["ab3dmot"]} if rival else {}),
     }
 
 

@@ -20,6 +20,7 @@ __all__ = [
     "fill_newborn",
     "mark_out_of_view",
     "mark_rivals",
+    "update_fronts",
     "update_lives",
     "update_shapes",
 ]
@@ -38,7 +39,9 @@ TRACK = np.dtype(
         ("covariance", np.float64, (5, 5)),
         ("shape", np.float64, 4),
         ("shape_variance", np.float64, 4),
-        ("front", np.float64),
+        ("fronts", np.float64, 3),
+        ("source", np.int64),
+        ("score", np.float64),
         ("logit_sum", np.float64),
         ("chances", np.float64),
         ("age_s", np.float64),
@@ -68,6 +71,9 @@ CLASS = np.dtype(
                 "gate",
                 "birth_logit",
                 "sure_logit",
+                "moving_mps",
+                "far_logit",
+                "coasting_logit",
             )
         ),
         ("memory_s", np.float64),
@@ -78,6 +84,12 @@ CLASS = np.dtype(
 # detection adds its score, and EXPECTED because it lies in the gate. Without the maximum, an object that was tracked
 # for a long time would be reported for a long time after it left.
 EXPECTED, MOST_EXISTENCE, LEAST_EXISTENCE = 1.0, 5.0, -6.0
+
+# Log odds that the heading of a track points to its front. A scan in which it moves adds MOVED, so after eight such
+# scans motion has all its weight, 0.98. Detections with a known front have more weight in the end than motion, because
+# vehicles also reverse. One detection counts up to TOLD, because the same error recurs from scan to scan.
+MOVED, MOST_MOVED = 0.5, 4.0
+TOLD, MOST_TOLD = 2.0, 8.0
 
 # A box may be larger than its object, so no track counts as completely hidden.
 MOST_HIDDEN = 0.9
@@ -91,6 +103,8 @@ def fill_newborn(
     detections: NDArray[np.float64],
     shapes: NDArray[np.float64],
     logits: NDArray[np.float64],
+    told: NDArray[np.float64],
+    sources: NDArray[np.int64],
     ranges: NDArray[np.float64],
     tracks: NDArray[np.void],
 ) -> None:
@@ -110,6 +124,10 @@ def fill_newborn(
         Height of the center, length, width, height [m].
     logits : (n,) float64
         Log odds of the scores.
+    told : (n,) float64
+        Log odds that the heading points to the front.
+    sources : (n,) int64
+        Index of each detection in the scan.
     ranges : (n,) float64
         Distances from the sensor [m].
     tracks : (n,) record, overwritten
@@ -122,7 +140,8 @@ def fill_newborn(
         cos, sin = math.cos(heading), math.sin(heading)
         along, across, turn = of["sigmas"][0] * farther, of["sigmas"][1] * farther, of["sigmas"][2] * farther
         track["id"], track["label"], track["group"] = first_id + i, kinds[i], of["group"]
-        track["hits"], track["chances"], track["front"], track["label_weight"] = 1, 1.0, 1.0, 1.0
+        track["hits"], track["chances"], track["label_weight"], track["source"] = 1, 1.0, 1.0, sources[i]
+        track["fronts"][1], track["fronts"][2] = min(max(told[i], -TOLD), TOLD), 1.0
         track["logit_sum"] = logits[i]
         track["existence"] = min(logits[i] - of["sure_logit"], MOST_EXISTENCE)
         for a in range(4):
@@ -261,26 +280,19 @@ def mark_rivals(
 
 @njit(cache=True, nogil=True)
 def update_shapes(
-    state: NDArray[np.float64],
     beta: NDArray[np.float64],
-    detections: NDArray[np.float64],
     shapes: NDArray[np.float64],
     sigmas: NDArray[np.float64],
     walk: NDArray[np.float64],
     shape: NDArray[np.float64],
     variance: NDArray[np.float64],
-    front: NDArray[np.float64],
 ) -> None:
-    """Smooth the height of the center and the size by Kalman filters, and vote for the front end; in place.
+    """Smooth the height of the center and the size by Kalman filters; in place.
 
     Parameters
     ----------
-    state : (n, 5) float64
-        x, y, v, heading, turn rate after the update.
     beta : (n, m + 1) float64
         As in `edgeperc.tracking.jpda.fill_association`.
-    detections : (m, 3) float64
-        x, y [m], heading [rad].
     shapes : (m, 4) float64
         Height of the center, length, width, height [m].
     sigmas : (n, 4) float64
@@ -289,26 +301,65 @@ def update_shapes(
         Standard deviations of their random walks between the scans [m].
     shape, variance : (n, 4) float64
         Estimates of ``shapes`` and their variances [m, m2].
-    front : (n,) float64
-        Votes, in -10..10: of the detections' headings, and of the speed, because most objects move forward. Below 0,
-        the heading points to the rear.
     """
-    for i in range(len(front)):
-        vote = 0.5 * math.tanh(state[i, 2] / 3.0)
+    for i in range(len(shape)):
         seen = np.zeros(4)
-        for j in range(len(detections)):
+        for j in range(len(shapes)):
             if beta[i, j + 1] == 0.0:
                 continue
-            vote += beta[i, j + 1] * math.cos(detections[j, 2] - state[i, 3])
             for a in range(4):
                 seen[a] += beta[i, j + 1] * shapes[j, a]
-        front[i] = min(max(front[i] + vote, -10.0), 10.0)
         detected = 1.0 - beta[i, 0]
         for a in range(4):
             variance[i, a] += walk[a] * walk[a]
             gain = variance[i, a] / (variance[i, a] + sigmas[i, a] * sigmas[i, a])
             shape[i, a] += gain * (seen[a] - detected * shape[i, a])
             variance[i, a] *= 1.0 - gain * detected
+
+
+@njit(cache=True, nogil=True)
+def update_fronts(
+    state: NDArray[np.float64],
+    speed_sigma: NDArray[np.float64],
+    moving_mps: NDArray[np.float64],
+    beta: NDArray[np.float64],
+    detections: NDArray[np.float64],
+    told: NDArray[np.float64],
+    fronts: NDArray[np.float64],
+) -> None:
+    """Collect evidence that the heading of each track points to its front and not to its rear; in place.
+
+    Parameters
+    ----------
+    state : (n, 5) float64
+        x, y, v, heading, turn rate after the update.
+    speed_sigma : (n,) float64
+        Standard deviation of v [m/s].
+    moving_mps : (n,) float64
+        A track moves if its speed is higher than this, and than three standard deviations.
+    beta : (n, m + 1) float64
+        As in `edgeperc.tracking.jpda.fill_association`.
+    detections : (m, 3) float64
+        x, y [m], heading [rad].
+    told : (m,) float64
+        Log odds that the heading of the detection points to the front; 0 if that is unknown.
+    fronts : (n, 3) float64
+        Log odds from motion, in -4..4: objects move forward. Log odds from the detections, in -8..8. Balance of the
+        detections' headings, in -10..10, for detections that do not say whether they know the front.
+    """
+    for i in range(len(fronts)):
+        speed = abs(state[i, 2])
+        if speed > moving_mps[i] and speed > 3.0 * speed_sigma[i]:
+            step = MOVED if state[i, 2] > 0.0 else -MOVED
+            fronts[i, 0] = min(max(fronts[i, 0] + step, -MOST_MOVED), MOST_MOVED)
+        for j in range(len(detections)):
+            if beta[i, j + 1] == 0.0:
+                continue
+            along = math.cos(detections[j, 2] - state[i, 3])
+            fronts[i, 1] += beta[i, j + 1] * min(max(told[j], -TOLD), TOLD) * (1.0 if along > 0.0 else -1.0)
+            fronts[i, 2] += beta[i, j + 1] * along
+        fronts[i, 1] = min(max(fronts[i, 1], -MOST_TOLD), MOST_TOLD)
+        fronts[i, 2] = min(max(fronts[i, 2], -10.0), 10.0)
 
 
 @njit(cache=True, nogil=True)
@@ -321,7 +372,7 @@ def update_lives(
     kinds: NDArray[np.int64],
     dt: float,
 ) -> None:
-    """Update hits and misses, the label by majority, and the existence of each track; in place.
+    """Update hits, misses and detection of each track, its label by majority, and its existence; in place.
 
     Parameters
     ----------
@@ -345,12 +396,13 @@ def update_lives(
         if beta[i, 0] >= 0.5:
             track["chances"] += 1.0 - MOST_HIDDEN * hidden[i]
             track["misses"] += 1
+            track["source"] = -1
             track["missed_s"] += dt
             # Likelihood ratio of a miss: the numerator assumes that the object exists; without an object it is 1.
             track["existence"] += math.log(1.0 - of["detection"] * (1.0 - MOST_HIDDEN * hidden[i]))
             continue
         best = np.argmax(beta[i, 1:])
-        track["misses"], track["missed_s"] = 0, 0.0
+        track["misses"], track["missed_s"], track["source"] = 0, 0.0, best
         track["hits"] += 1
         track["chances"] += 1.0
         track["logit_sum"] += logits[best]

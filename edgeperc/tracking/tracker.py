@@ -26,6 +26,7 @@ from .lives import (
     fill_newborn,
     mark_out_of_view,
     mark_rivals,
+    update_fronts,
     update_lives,
     update_shapes,
 )
@@ -44,6 +45,12 @@ FIRST_TWIST = np.array([15.0, 1.0, 0.3])
 TWIST_WALK = np.array([4.0, 0.5, 0.5])
 TURN_MEMORY_S = 2.0  # without evidence, the estimated turn rate decays with this time constant
 MAX_LANDMARKS = 48
+
+# Fields that ClassParameters and CLASS have in common.
+_SCALARS = (
+    *("still_mps", "keep_motion_s", "range_m", "detection", "gate", "memory_s"),
+    *("moving_mps", "far_logit", "coasting_logit"),
+)
 
 # Beyond these limits squares and differences of numbers lose their meaning, or overflow.
 FARTHEST_M = 1e8  # coordinates of boxes and poses; projected map coordinates are up to 1e7
@@ -177,7 +184,7 @@ class Tracker:
                 f"got a scan {'with' if posed else 'without'} T_world_sensor, unlike those before it; pass it with all "
                 "scans or with none, or call reset() before a new recording"
             )
-        given, names = _checked_boxes(boxes)
+        given, told, names = _checked_boxes(boxes)
         pose = None if T_world_sensor is None else _checked_pose(T_world_sensor)
         kinds = self._kinds(names)
         classes = self._classes[kinds]
@@ -234,23 +241,22 @@ class Tracker:
 
         # Combination.
         fill_combined(states, covariances, modes, state, covariance)
-        shape, shape_variance, front = (tracks[field].copy() for field in ("shape", "shape_variance", "front"))
+        shape, shape_variance, fronts = (tracks[field].copy() for field in ("shape", "shape_variance", "fronts"))
         update_shapes(
-            state,
             beta,
-            detections,
             shapes,
             of["shape"] * farther[:, None],
             SHAPE_WALK_M * math.sqrt(dt),
             shape,
             shape_variance,
-            front,
         )
+        speed_sigma = np.sqrt(np.maximum(covariance[:, 2, 2], 0.0))
+        update_fronts(state, speed_sigma, of["moving_mps"].copy(), beta, detections, told, fronts)
         hidden = np.zeros(n)
         fill_hidden(state, shape, beta[:, 0] < 0.5, pose[:2, 3].copy(), hidden)
         tracks["states"], tracks["covariances"], tracks["modes"] = states, covariances, modes
         tracks["state"], tracks["covariance"] = state, covariance
-        tracks["shape"], tracks["shape_variance"], tracks["front"] = shape, shape_variance, front
+        tracks["shape"], tracks["shape_variance"], tracks["fronts"] = shape, shape_variance, fronts
         logits = _logit(given[:, 7])
         update_lives(tracks, of, beta, hidden, logits, kinds, dt)
 
@@ -261,17 +267,29 @@ class Tracker:
             joined = np.zeros(n + len(own), TRACK)  # np.concatenate takes ten times as long with named fields
             joined[:n] = tracks
             fill_newborn(
-                self._next_id, kinds[own], classes[own], detections[own], shapes[own], logits[own], ranges, joined[n:]
+                self._next_id,
+                kinds[own],
+                classes[own],
+                detections[own],
+                shapes[own],
+                logits[own],
+                told[own],
+                own,
+                ranges,
+                joined[n:],
             )
             tracks = joined
         tracks = self._living(tracks)
+        of, strength = self._classes[tracks["label"]], strength_of(tracks)
+        away = np.hypot(tracks["state"][:, 0] - pose[0, 3], tracks["state"][:, 1] - pose[1, 3]) / of["range_m"]
+        tracks["score"] = strength + of["far_logit"] * away - of["coasting_logit"] * tracks["misses"]
 
         self._posed, self._stamp_s, self._tracks, self._T_world_sensor = posed, stamp_s, tracks, pose
         self._next_id += len(own)
         self._twist, self._twist_variances = twist, twist_variances
         reported = tracks["existence"] > 0.0
         mark_out_of_view(tracks, pose, self._left, self._right, reported)
-        mark_rivals(tracks["state"].copy(), tracks["shape"].copy(), strength_of(tracks), reported)
+        mark_rivals(tracks["state"].copy(), tracks["shape"].copy(), strength, reported)
         n_tentative = int(len(tracks) - np.count_nonzero(reported))
         return Tracks(tracks[reported], self._labels, stamp_s, pose.copy(), n_tentative, n_approximated)
 
@@ -285,7 +303,7 @@ class Tracker:
                 self._groups.append(of.group)
             row = np.zeros(1, CLASS)
             row["group"] = self._groups.index(of.group)
-            for field in ("still_mps", "keep_motion_s", "range_m", "detection", "gate", "memory_s"):
+            for field in _SCALARS:
                 row[field] = getattr(of, field)
             row["noise"] = of.acceleration_mps2, of.turn_acceleration_rps2, of.walk_m, of.wander_rad, of.still_mps
             row["sigmas"] = of.along_m, of.across_m, of.heading_rad
@@ -341,11 +359,12 @@ class Tracker:
         return tracks
 
 
-def _checked_boxes(boxes: Iterable[Box]) -> tuple[NDArray[np.float64], list[str]]:
-    """Check boxes; return rows (m, 8) of x, y, z, length, width, height, yaw, score, and the labels."""
+def _checked_boxes(boxes: Iterable[Box]) -> tuple[NDArray[np.float64], NDArray[np.float64], list[str]]:
+    """Check boxes; return rows (m, 8) of x, y, z, length, width, height, yaw, score, log odds of fronts, and labels."""
     given = list(boxes)
     try:
         rows = np.array([(*box.center, *box.size, box.yaw, box.score) for box in given], np.float64).reshape(-1, 8)
+        fronts = np.array([0.5 if box.front is None else box.front for box in given], np.float64)
         names = [box.label for box in given]
     except (AttributeError, OverflowError, TypeError, ValueError) as exc:
         raise TrackingError(f"got boxes that are not edgeperc.Box objects ({exc}); pass edgeperc.Box objects") from exc
@@ -353,14 +372,15 @@ def _checked_boxes(boxes: Iterable[Box]) -> tuple[NDArray[np.float64], list[str]
     right = np.isfinite(rows).all(axis=1) & (rows[:, 7] >= 0.0) & (rows[:, 7] <= 1.0)
     right &= (np.abs(rows[:, :3]) <= FARTHEST_M).all(axis=1)
     right &= ((sizes >= SIZES_M[0]) & (sizes <= SIZES_M[1])).all(axis=1)
+    right &= (fronts >= 0.0) & (fronts <= 1.0)
     right &= np.array([isinstance(name, str) for name in names], np.bool_)
     if not right.all():
         wrong = given[int(np.argmin(right))]
         raise TrackingError(
             f"got {wrong}; expected finite numbers, coordinates up to {FARTHEST_M:g} m, sizes from {SIZES_M[0]:g} to "
-            f"{SIZES_M[1]:g} m and a score in 0..1: drop such boxes before tracking"
+            f"{SIZES_M[1]:g} m, a score and a front in 0..1: drop such boxes before tracking"
         )
-    return rows, names
+    return rows, _logit(fronts), names
 
 
 def _checked_pose(given: ArrayLike) -> NDArray[np.float64]:

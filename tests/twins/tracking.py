@@ -214,14 +214,22 @@ def hidden(state, shape, seen, sensor):
     return shares
 
 
-def updated_shapes(state, beta, detections, shapes, sigmas, walk, shape, variance, front):
-    """Twin of `edgeperc.tracking.lives.update_shapes`: the new shape, variance and front."""
+def updated_shapes(beta, shapes, sigmas, walk, shape, variance):
+    """Twin of `edgeperc.tracking.lives.update_shapes`: the new shape and variance."""
     variance = variance + walk**2
     detected = 1 - beta[:, :1]
     gain = variance / (variance + sigmas**2)
-    votes = beta[:, 1:] * np.cos(detections[None, :, 2] - state[:, 3:4])
-    front = np.clip(front + votes.sum(axis=1) + 0.5 * np.tanh(state[:, 2] / 3), -10, 10)
-    return shape + gain * (beta[:, 1:] @ shapes - detected * shape), variance * (1 - gain * detected), front
+    return shape + gain * (beta[:, 1:] @ shapes - detected * shape), variance * (1 - gain * detected)
+
+
+def updated_fronts(state, speed_sigma, moving_mps, beta, detections, told, fronts):
+    """Twin of `edgeperc.tracking.lives.update_fronts`: the new evidence."""
+    speed = np.abs(state[:, 2])
+    step = 0.5 * np.sign(state[:, 2]) * ((speed > moving_mps) & (speed > 3 * speed_sigma))
+    along = np.cos(detections[None, :, 2] - state[:, 3:4])
+    headings = (beta[:, 1:] * along).sum(axis=1)
+    knew = (beta[:, 1:] * np.where(along > 0, 1, -1) * np.clip(told, -2, 2)).sum(axis=1)
+    return np.clip(fronts + np.stack([step, knew, headings], axis=1), [-4, -8, -10], [4, 8, 10])
 
 
 def lives(tracks, classes, beta, hidden, logits, kinds, dt, most_hidden, expected, most):
@@ -239,17 +247,19 @@ def lives(tracks, classes, beta, hidden, logits, kinds, dt, most_hidden, expecte
     tracks["misses"] = np.where(hit, 0, tracks["misses"] + 1)
     tracks["missed_s"] = np.where(hit, 0, tracks["missed_s"] + dt)
     tracks["logit_sum"][hit] += logits[best]
+    tracks["source"] = -1
+    tracks["source"][hit] = best
     weight = tracks["label_weight"][hit] + np.where(tracks["label"][hit] == kinds[best], 1, -1)
     tracks["label"][hit] = np.where(weight < 0, kinds[best], tracks["label"][hit])
     tracks["label_weight"][hit] = np.minimum(np.abs(weight), 20)
     return tracks
 
 
-def newborn(first_id, kinds, classes, detections, shapes, logits, ranges, most, dtype):
+def newborn(first_id, kinds, classes, detections, shapes, logits, told, sources, ranges, most, dtype):
     """Twin of `edgeperc.tracking.lives.fill_newborn`."""
     tracks = np.zeros(len(kinds), dtype)
-    for track, kind, of, detection, shape, logit, distance in zip(
-        tracks, kinds, classes, detections, shapes, logits, ranges, strict=True
+    for track, kind, of, detection, shape, logit, front, distance in zip(
+        tracks, kinds, classes, detections, shapes, logits, told, ranges, strict=True
     ):
         farther = 1 + distance / of["range_m"]
         turned = np.array(
@@ -258,7 +268,8 @@ def newborn(first_id, kinds, classes, detections, shapes, logits, ranges, most, 
         spread = np.zeros((5, 5))
         spread[:2, :2] = turned @ np.diag((of["sigmas"][:2] * farther) ** 2) @ turned.T
         spread[[2, 3, 4], [2, 3, 4]] = of["birth"][0] ** 2, (of["sigmas"][2] * farther) ** 2, of["birth"][1] ** 2
-        track["label"], track["group"], track["label_weight"], track["front"] = kind, of["group"], 1, 1
+        track["label"], track["group"], track["label_weight"] = kind, of["group"], 1
+        track["fronts"] = 0, np.clip(front, -2, 2), 1
         track["states"][:, [0, 1, 3]] = detection
         track["covariances"] = spread
         track["covariances"][2, 2, 2] = of["still_mps"] ** 2
@@ -267,7 +278,7 @@ def newborn(first_id, kinds, classes, detections, shapes, logits, ranges, most, 
         track["shape"], track["shape_variance"] = shape, (of["shape"] * farther) ** 2
         track["logit_sum"], track["chances"], track["hits"] = logit, 1, 1
         track["existence"] = min(logit - of["sure_logit"], most)
-    tracks["id"] = first_id + np.arange(len(tracks))
+    tracks["id"], tracks["source"] = first_id + np.arange(len(tracks)), sources
     return tracks
 
 
@@ -300,7 +311,7 @@ def rivals(state, shape, strength, reported):
     return sorted(kept)
 
 
-def breaks(truth, ids, ignored):
+def breaks(truth, ids, ignored, late):
     """Twin of `edgeperc.evaluation.tracking_metrics.count_breaks`: ID switches and fragments, as KITTI counts them."""
     switches = fragments = 0
     for one in {*truth.tolist()}:
@@ -315,6 +326,7 @@ def breaks(truth, ids, ignored):
             following = own[f + 1] if f + 1 < len(own) else own[f]
             switches += last != own[f] and -1 not in (last, own[f], own[f - 1])
             fragments += own[f - 1] != own[f] and -1 not in (last, own[f], following)
+            fragments += late and f == len(own) - 1 and last == -1 and own[f] != -1 and own[f - 1] != own[f]
             last = own[f] if own[f] != -1 else last
     return switches, fragments
 

@@ -1,0 +1,134 @@
+"""How often the heading of a track points to the front of its object, and not to its rear.
+
+The sequences hold no poses, so an object's own motion is that of its labels in the frame of `Tracks.T_world_sensor`,
+which the tracker estimates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import astuple, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..tracking.tracks import Tracks
+from .tracking_metrics import FrameTruth, box_iou
+
+__all__ = ["MOVING_MPS", "Headings", "Standing", "count_headings", "speeds"]
+
+MOVING_MPS = 1.5  # objects with a lower speed stand
+WINDOW = 5  # frames before and after, over which an object's speed is measured
+FRAME_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """Counts of boxes of tracks that match a label, without ignored ones.
+
+    Attributes
+    ----------
+    n_boxes, n_tracks : int
+        Boxes, and tracks with at least one of them.
+    n_resolved : int
+        Boxes with a front (`edgeperc.Box.front`); for the others the heading is known up to half a turn.
+    n_right : int
+        Boxes with a front, whose heading is less than a quarter turn from the label's.
+    n_right_of_all : int
+        All boxes whose heading is less than a quarter turn from the label's.
+    """
+
+    n_boxes: int = 0
+    n_tracks: int = 0
+    n_resolved: int = 0
+    n_right: int = 0
+    n_right_of_all: int = 0
+
+    def __add__(self, other: Standing) -> Standing:
+        return Standing(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
+
+
+@dataclass(frozen=True, slots=True)
+class Headings:
+    """Counts of objects that move (`MOVING_MPS`), that stand after they moved, and that never moved so far."""
+
+    moving: Standing = Standing()
+    stopped: Standing = Standing()
+    parked: Standing = Standing()
+
+    def __add__(self, other: Headings) -> Headings:
+        return Headings(self.moving + other.moving, self.stopped + other.stopped, self.parked + other.parked)
+
+
+def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[NDArray[np.float64]]:
+    """Speed over ground of each true box, from its places up to `WINDOW` frames before and after.
+
+    Parameters
+    ----------
+    truth : sequence of FrameTruth
+    tracks : sequence of Tracks
+        One for each frame; their ``T_world_sensor`` is used.
+
+    Returns
+    -------
+    list of (n,) float64
+        By frame [m/s]; NaN for an object without other frames nearby.
+    """
+    places: list[dict[int, NDArray[np.float64]]] = []
+    for frame, of in zip(truth, tracks, strict=True):
+        world = frame.boxes[:, :3] @ of.T_world_sensor[:3, :3].T + of.T_world_sensor[:3, 3]
+        places.append(dict(zip(frame.ids.tolist(), world[:, :2], strict=True)))
+    found = []
+    for k, here in enumerate(places):
+        speed = np.full(len(truth[k].ids), np.nan)
+        for i, one in enumerate(here):
+            near = [j for j in range(max(k - WINDOW, 0), min(k + WINDOW + 1, len(places))) if one in places[j]]
+            if near[-1] > near[0]:
+                way = places[near[-1]][one] - places[near[0]][one]
+                speed[i] = np.hypot(*way) / (FRAME_S * (near[-1] - near[0]))
+        found.append(speed)
+    return found
+
+
+def count_headings(
+    truth: Sequence[FrameTruth], tracks: Sequence[Tracks], labels: Collection[str], iou_threshold: float
+) -> Headings:
+    """Count right headings in one sequence.
+
+    Parameters
+    ----------
+    truth : sequence of FrameTruth
+    tracks : sequence of Tracks
+        One for each frame.
+    labels : collection of str
+        Labels of the tracks that count.
+    iou_threshold : float
+        Smallest 3-D IoU of a track and its label.
+
+    Returns
+    -------
+    Headings
+    """
+    rows: list[tuple[int, int, bool, bool]] = []  # kind, track, resolved, right
+    moved: set[int] = set()
+    for frame, of, speed in zip(truth, tracks, speeds(truth, tracks), strict=True):
+        mine = np.flatnonzero([label in labels for label in of.labels])
+        iou = box_iou(frame.boxes, of.boxes[mine])
+        moves = speed > MOVING_MPS
+        moved |= {*frame.ids[moves].tolist()}
+        for i in np.flatnonzero(~frame.ignored & ~np.isnan(speed)).tolist():
+            if iou[i].max(initial=0.0) < iou_threshold:
+                continue
+            at = mine[int(iou[i].argmax())]
+            right = bool(np.cos(of.boxes[at, 6] - frame.boxes[i, 6]) > 0.0)
+            kind = 0 if moves[i] else 1 if int(frame.ids[i]) in moved else 2
+            rows.append((kind, int(of.ids[at]), bool(of.fronts[at] >= 0.5), right))
+    counted = []
+    for kind in range(3):
+        own = [row for row in rows if row[0] == kind]
+        resolved = [row for row in own if row[2]]
+        n_right = sum(row[3] for row in resolved)
+        counted.append(
+            Standing(len(own), len({row[1] for row in own}), len(resolved), n_right, sum(row[3] for row in own))
+        )
+    return Headings(*counted)
