@@ -29,6 +29,7 @@ from edgeperc.level import MountingEstimator
 from edgeperc.mounting import Mounting
 from edgeperc.network_input import input_heights, project
 from edgeperc.projection import Projection, RangeImageProjector, TopViewProjector
+from edgeperc.remission import NO_REMISSION, RemissionMatcher, is_missing
 from edgeperc.sensor import SensorProfile
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES
@@ -45,8 +46,8 @@ def read_scan_set(
 ) -> tuple[list[LabeledScan], list[float], dict[str, str]]:
     """Read the labeled scans of a split.
 
-    What the description does not say of the mounting is estimated from the first scans of each drive, as a `Perceiver`
-    does.
+    As in a `Perceiver`, what the description does not say of the mounting is estimated from the first scans of each
+    drive, and the remission is matched to that of the training sensor.
 
     Parameters
     ----------
@@ -74,25 +75,30 @@ def read_scan_set(
     layout, names = folder.layout, folder.names(split, fold=fold)
     n_scans = Counter(folder.drives[name] for name in names)
     estimators: dict[str, MountingEstimator] = {}
-    frames: list[tuple[ScanFrame, NDArray[np.float32]]] = []
-    for name in tqdm(names, desc=f"reading {layout.name}", leave=False):
-        frame = folder.frame(name)
-        points, _ = condition(frame.points, layout.sensor)
+    matchers: dict[str, RemissionMatcher] = {}
+    sensors: dict[str, SensorProfile] = {}  # of each drive, with the function that all its scans have led to
+    frames = [folder.frame(name) for name in tqdm(names, desc=f"reading {layout.name}", leave=False)]
+    for frame in frames:
         estimator = estimators.setdefault(frame.drive, MountingEstimator(layout.sensor.mounting))
         with suppress(MountingError):  # perhaps another scan of the drive shows the ground
-            estimators[frame.drive] = estimator.add(points)
-        frames.append((frame, points))
+            estimators[frame.drive] = estimator.add(frame.points)
+        if not is_missing(frame.points):
+            matcher = matchers.get(frame.drive, RemissionMatcher(layout.sensor))
+            matchers[frame.drive], sensors[frame.drive], _ = matcher.add(frame.points)
     scans: list[LabeledScan] = []
-    for frame, points in frames:
+    for frame in frames:
         estimator = estimators[frame.drive]
         if not estimator.known.is_known and not estimator.n_scans:
             raise MountingError(
                 f"{folder.root}: no scan of drive {frame.drive} shows the ground; give height_m, roll_deg and "
                 "pitch_deg as mounting in the description"
             )
+        missing = is_missing(frame.points)
+        sensor = replace(layout.sensor, remission=NO_REMISSION) if missing else sensors[frame.drive]
+        points, _ = condition(frame.points, sensor)
         scans.append(labeled_scan(frame, points, estimator.mounting(), classes))
-    weights = [n_scans[frame.drive] ** -0.5 for frame, _ in frames]
-    return scans, weights, {f"{layout.name}/{frame.name}": scan_hash(frame.points) for frame, _ in frames}
+    weights = [n_scans[frame.drive] ** -0.5 for frame in frames]
+    return scans, weights, {f"{layout.name}/{frame.name}": scan_hash(frame.points) for frame in frames}
 
 
 def labeled_scan(
@@ -133,6 +139,7 @@ def labeled_scan(
         surface,
         (-math.pi, math.pi) if full else (low + yaw, high + yaw),
         sensor=frame.layout.sensor,
+        boxes_known=frame.boxes is not None,
     )
 
 

@@ -48,6 +48,8 @@ class LabeledScan:
         Whether left and right were swapped after that turn.
     sensor : SensorProfile or None
         The sensor of the scan; None: the one that the models are trained for.
+    boxes_known : bool
+        Whether the objects in the labeled sector have boxes; False if only points are labeled.
     """
 
     points: NDArray[np.float32]
@@ -59,6 +61,7 @@ class LabeledScan:
     turn: float = 0.0
     mirrored: bool = False
     sensor: SensorProfile | None = None
+    boxes_known: bool = True
 
     @classmethod
     def from_frame(
@@ -93,6 +96,7 @@ class LabeledScan:
                 surface=self.surface,
                 azimuths=np.array(self.azimuths),
                 sensor=np.array("" if self.sensor is None else self.sensor.to_json()),
+                boxes_known=np.array(self.boxes_known),
             )
 
     @classmethod
@@ -114,6 +118,7 @@ class LabeledScan:
                 data["surface"],
                 (low, high),
                 sensor=SensorProfile.from_json(profile) if profile else None,
+                boxes_known=bool(data["boxes_known"]) if "boxes_known" in data else True,
             )
 
     def labeled(self, geometry: TopViewGeometry) -> NDArray[np.bool_]:
@@ -121,6 +126,10 @@ class LabeledScan:
         x, y = geometry.cell_centers()
         azimuth = np.arctan2(y, x)
         return (azimuth >= self.azimuths[0]) & (azimuth <= self.azimuths[1])
+
+    def boxed(self, geometry: TopViewGeometry) -> NDArray[np.bool_]:
+        """Whether all objects of each cell have boxes, (rows, cols) bool."""
+        return self.labeled(geometry) & self.boxes_known
 
     def top_view_truth(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
         """SSADNet's segmentation truth (3.1.2), (rows, cols) uint8: the surface with the vehicles drawn over it.

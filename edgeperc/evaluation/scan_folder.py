@@ -11,7 +11,8 @@
     FOLDER/frames.csv             columns name and drive
 
 A scan is labeled if it has at least one of the three label files. ``layouts/`` beside this module has descriptions of
-public sets.
+public sets. With ``"files": "semantickitti"`` in the description, the folder is SemanticKITTI's root instead:
+``sequences/SEQ/velodyne/NAME.bin`` and ``sequences/SEQ/labels/NAME.label``.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from ..readers.files import read_points
 from ..sensor import SensorProfile, get_sensor
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
-from .datasets import IMAGE_SIZE, Calibration, read_objects
+from .datasets import IMAGE_SIZE, SEQUENCE_DRIVES, Calibration, read_objects
 from .splits import in_split
 
 __all__ = ["SCHEMA", "ScanFolder", "ScanFrame", "ScanLayout", "class_number", "known_layouts", "read_layout"]
@@ -55,7 +56,7 @@ _COARSE = {"van": "car", "truck": "car", "person_sitting": "pedestrian"}
 _SENSOR_KEYS = {"like", "name", "elevations_deg", "columns", "remission_range", "min_range_m", "max_range_m"}
 _CLASS_NAME = re.compile(r"[a-z][a-z0-9 _-]{0,30}")
 _KEYS = {
-    *("schema", "name", "about", "sensor", "mounting", "boxes", "box_format", "box_columns"),
+    *("schema", "name", "about", "files", "sensor", "mounting", "boxes", "box_format", "box_columns"),
     *("points", "point_names", "labeled_deg", "labeled_m", "min_points", "drives", "splits"),
 }
 
@@ -92,6 +93,9 @@ class ScanLayout:
     ----------
     name : str
         Name of the set, in tables and in cards.
+    files : str
+        ``"plain"``, or ``"semantickitti"``: the tree of that set; a scan is called ``SEQ/NAME``, and its drive is that
+        of its sequence (`datasets.SEQUENCE_DRIVES`).
     sensor : SensorProfile
         Its ``mounting`` is what is known of the mounting.
     boxes, points : mapping of str to str
@@ -123,6 +127,7 @@ class ScanLayout:
     sensor: SensorProfile
     boxes: Mapping[str, str]
     points: Mapping[str, str]
+    files: str = "plain"
     box_format: str = "plain"
     box_columns: tuple[str, ...] = BOX_COLUMNS
     point_names: Mapping[int, str] | None = None
@@ -168,7 +173,8 @@ class ScanLayout:
         if not isinstance(name, str) or not re.fullmatch(r"[\w.-]{1,40}", name):
             raise PointsError(f"name is {name!r:.60}; expected 1 to 40 letters, digits, '.', '_' or '-'")
         own: dict[str, Any] = {"name": name, "sensor": _sensor(given, folder), "boxes": boxes, "points": points}
-        for key, choices in (("box_format", ("plain", "kitti")), ("drives", ("table", "scan", "one"))):
+        allowed = {"files": ("plain", "semantickitti"), "box_format": ("plain", "kitti")}
+        for key, choices in {**allowed, "drives": ("table", "scan", "one")}.items():
             if key in given and given[key] not in choices:
                 raise PointsError(f"{key} is {given[key]!r:.60}; expected {' or '.join(choices)}")
             own |= {key: given[key]} if key in given else {}
@@ -404,6 +410,10 @@ class ScanFolder:
     def _path(self, kind: str, name: str) -> Path | None:
         """The label file of a scan: boxes, points or drivable; None if the scan has none."""
         boxes = f"label_2/{name}.txt" if self.layout.box_format == "kitti" else f"label/{name}.txt"
+        sequence, _, stem = name.rpartition("/")
+        if sequence:
+            path = self.root / "sequences" / sequence / "labels" / f"{stem}.label"
+            return path if kind == "points" and path.is_file() else None
         candidates = {
             "boxes": (boxes,),
             "points": (f"semseg/{name}.u8", f"semseg/{name}.label"),
@@ -413,19 +423,22 @@ class ScanFolder:
 
     def _scans(self) -> dict[str, Path]:
         scans: dict[str, Path] = {}
-        folder = self.root / "velodyne"
-        for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        nested = self.layout.files == "semantickitti"
+        found = self.root.glob("sequences/*/velodyne/*" if nested else "velodyne/*")
+        for path in sorted(found):
             if path.name.startswith("."):
                 continue
             suffix = next((end for end in SUFFIXES if path.name.lower().endswith(end)), None)
             if suffix is None:
                 raise PointsError(f"{path}: no scan by its name; expected {', '.join(SUFFIXES)} in velodyne/")
             name = path.name[: -len(suffix)]
+            name = f"{path.parts[-3]}/{name}" if nested else name
             if name in scans:
                 raise PointsError(f"{path} and {scans[name].name} have one name; give each scan a name of its own")
             scans[name] = path
         if not scans:
-            raise PointsError(f"{self.root} has no scans in velodyne/; expected velodyne/NAME.bin")
+            expected = "sequences/SEQ/velodyne/NAME.bin" if nested else "velodyne/NAME.bin"
+            raise PointsError(f"{self.root} has no scans; expected {expected}")
         return scans
 
     def _drives(self) -> dict[str, str]:
@@ -441,6 +454,9 @@ class ScanFolder:
                 f"{self.root} has no labels for its scans ({next(iter(self.scans))}, ...); expected label/NAME.txt, "
                 "semseg/NAME.u8 or drivable/NAME.json (with box_format kitti: label_2/NAME.txt and calib/NAME.txt)"
             )
+        if self.layout.files == "semantickitti":
+            sequences = {name: name.partition("/")[0] for name in labeled}
+            return {name: SEQUENCE_DRIVES.get(sequence, sequence) for name, sequence in sequences.items()}
         if self.layout.drives == "one":
             return dict.fromkeys(labeled, self.layout.name)
         table = self.root / "frames.csv"
