@@ -180,7 +180,7 @@ class Vehicles(Task):
         if self.recipe.head == "slots":
             boxes = slot_targets(to_find, view, N_SLOTS)
         else:
-            boxes = dense_targets(to_find, view, labeled=scan.labeled(view), unsure=unclear)
+            boxes = dense_targets(to_find, view, labeled=scan.boxed(view), unsure=unclear)
         return scan.top_view_truth(view), boxes
 
     def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
@@ -212,7 +212,7 @@ class Vehicles(Task):
         raw = {kind: output[0].cpu().numpy() for kind, output in zip(kinds, outputs, strict=True)}
         labels, found = decode_top_view(self.card, projected.index >= 0, raw, self.card.score_threshold)
         tally.pixels.update(labels, targets[0])
-        labeled = scan.labeled(view)
+        labeled = scan.boxed(view)
 
         def known(box: Box) -> bool:
             x, y = box.center[:2]
