@@ -157,8 +157,8 @@ def seen_by_network(
     -------
     scan : LabeledScan
         If the range image of a coarser sensor was filled: with the interpolated points. Each is labeled as the nearest
-        of the next measured points in its row and its column, and `IGNORE` if that is more than 0.5 m away and the
-        others differ. Else the given one.
+        of the next measured points in its row and its column, and `IGNORE` if that is more than 0.5 m away and one of
+        them is no background. Else the given one.
     projected : Projection
         Its ``index`` refers to the points of the returned scan; ``pixel`` to the given ones.
     """
@@ -189,12 +189,12 @@ def _nearest_labels(
 ) -> NDArray[np.uint8]:
     """Label of the nearest of the next measured points left, right, above and below, (H, W) uint8.
 
-    `IGNORE` without such a point, and where it is farther away than `NEAR_M` and the others have other labels: on the
-    road, points between two rings are interpolated over meters.
+    `IGNORE` without such a point, and where it is farther away than `NEAR_M` unless all are background: on the road,
+    points between two rings are interpolated over meters.
     """
     place = points[filled, :3]
     best, nearest = np.full(index.shape, np.inf, np.float32), np.full(index.shape, IGNORE, np.uint8)
-    lowest, highest = np.full_like(nearest, 255), np.zeros_like(nearest)
+    highest = np.zeros_like(nearest)
     for axis in (0, 1):
         for step in (1, -1):
             way = (slice(None), slice(None, None, step)) if axis else (slice(None, None, step), slice(None))
@@ -205,7 +205,6 @@ def _nearest_labels(
             apart = np.where(row >= 0, np.linalg.norm(points[row, :3] - place, axis=2), np.inf)
             closer = apart < best
             best[closer], nearest[closer] = apart[closer], labels[row][closer]
-            lowest = np.where(row >= 0, np.minimum(lowest, labels[row]), lowest)
             highest = np.where(row >= 0, np.maximum(highest, labels[row]), highest)
-    nearest[(best > NEAR_M) & (lowest != highest)] = IGNORE
+    nearest[(best > NEAR_M) & (highest > 0)] = IGNORE
     return nearest
