@@ -52,6 +52,9 @@ MAX_STRETCH = 1.6
 MAX_PERSON_RANGE_M = 45.0
 MAX_TILT_SIGMAS = 2.0
 
+# |y| < slope * x + margin: 55 degrees to both sides. Range images reach 45 degrees, top views 10 m at 6 m ahead.
+AHEAD_SLOPE, AHEAD_MARGIN_M = 1.43, 2.0
+
 
 @dataclass(frozen=True)
 class ObjectBank:
@@ -379,14 +382,17 @@ def augmented(
     scan = turned(scan, float(angle))
     if rng.random() < 0.5:
         scan = mirrored(scan)
-    # Points behind the sensor are in neither view and would only cost time.
-    ahead = scan.points[:, 0] > 0.0
+    # Points outside this sector are in neither view and would only cost time.
+    x, y = scan.points[:, 0], scan.points[:, 1]
+    ahead = np.abs(y) < AHEAD_SLOPE * x + AHEAD_MARGIN_M
     scan = replace(scan, points=scan.points[ahead], labels=scan.labels[ahead])
-    if bank is not None and n_pasted > 0.0:
+    if bank is not None and n_pasted + n_negatives > 0.0:
         kinds = odds or {name: 1.0 for name in bank.objects if name not in NEGATIVES}
-        scan = pasted(scan, bank, rng, int(rng.poisson(n_pasted)), kinds)
-    if bank is not None and n_negatives > 0.0:
-        scan = pasted(scan, bank, rng, int(rng.poisson(n_negatives)), negatives)
+        shares: dict[str, float] = {}
+        for n, group in ((n_pasted, kinds), (n_negatives, negatives)):
+            total = sum(group.values())
+            shares |= {name: n * share / total for name, share in group.items()}
+        scan = pasted(scan, bank, rng, int(rng.poisson(n_pasted + n_negatives)), shares)
     if rng.random() < weather:
         scan = weathered(scan, rng)
     if rng.random() < half_beams:

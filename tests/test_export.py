@@ -26,6 +26,8 @@ from edgeperc.evaluation.datasets import KittiObjects, scan_hash
 from edgeperc.evaluation.evaluate import evaluate
 from edgeperc.evaluation.splits import fold_of
 from edgeperc.fitness import FitnessProfile
+from edgeperc.network_input import project
+from edgeperc.projection import make_projector
 from edgeperc.session import Session
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
@@ -34,16 +36,17 @@ from edgeperc_export import make as make_module
 from edgeperc_export.ablation import PAPERS, SHIPPED, VARIANTS, ablate, plot
 from edgeperc_export.cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT
 from edgeperc_export.cli import main
+from edgeperc_export.curve import curve_table
 from edgeperc_export.models_page import models_page
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe, Stage
 from edgeperc_export.roads import DRAWN, drawn_roads
 from edgeperc_export.samples import Samples, real_scans
-from edgeperc_export.scans import LabeledScan
+from edgeperc_export.scans import LabeledScan, mirrored
 from edgeperc_export.simulate import parity_scans, simulate
 from edgeperc_export.start import start
 from edgeperc_export.task import Task, task_of
-from edgeperc_export.teacher import pseudo_labeled, teach, unlabeled_scans
+from edgeperc_export.teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
 from edgeperc_export.to_onnx import ParityError, export, load, to_graph, verify, write_card
 from edgeperc_export.train import _optimizer, _schedule, train
 from edgeperc_export.watch import Watch
@@ -107,14 +110,22 @@ def weights(path: Path) -> dict[str, Tensor]:
 
 @pytest.mark.usefixtures("small_views")
 @pytest.mark.parametrize(
-    ("network", "head"), [("lodnn", "dense"), ("pointseg", "dense"), ("ssadnet", "dense"), ("ssadnet", "slots")]
+    ("network", "head", "n_workers"),
+    [
+        ("lodnn", "dense", 0),
+        ("pointseg", "dense", 0),
+        ("pointseg", "dense", 1),
+        ("ssadnet", "dense", 2),
+        ("ssadnet", "slots", 0),
+    ],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(
-    tmp_path: Path, simulated: Path, network: str, head: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, simulated: Path, network: str, head: str, n_workers: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recipe = small(network, head=head)
+    recipe = small(network, head=head, redraw_every=1)
     arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "checkpoint_every": 2}
-    whole = train(recipe, tmp_path / "whole", **arguments)
+    whole = train(recipe, tmp_path / "whole", **arguments)  # without workers: they change nothing
+    arguments["n_workers"] = n_workers
 
     # Killed in the third step, when there is a checkpoint of the second.
     kind = type(task_of(recipe))
@@ -181,6 +192,66 @@ def test_a_run_starts_from_the_weights_it_shares_with_a_checkpoint(tmp_path: Pat
         assert torch.equal(value, origin), name
     with pytest.raises(ValueError, match="no weight in common"):
         start(build(small("pointseg")), small("pointseg"), dense, [])
+
+
+SHIPPED_MODELS = Path(__file__).resolve().parent.parent / "models"
+
+
+@pytest.mark.parametrize(
+    ("model", "recipe"),
+    [
+        ("pointseg", Recipe("pointseg", edge=True, height_above_ground=True, batch=1)),
+        ("ssadnet", Recipe("ssadnet", edge=True, front=True, batch=1)),
+        ("lodnn", Recipe("lodnn", edge=True, batch=1)),
+    ],
+)
+def test_a_run_that_starts_from_a_model_starts_with_its_outputs(
+    simulated: Path, scans: list[np.ndarray], model: str, recipe: Recipe
+) -> None:
+    path, network = SHIPPED_MODELS / f"{model}.onnx", build(recipe)
+    task = task_of(recipe)
+    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    image = torch.from_numpy(samples.batch(0)[0])
+    before, frames = start(network, recipe, path, [image])
+    session = Session(path, "cpu", n_threads=1)
+    assert frames == session.card.training["frames"]
+    assert before[-1] == session.card.training["recipe"]
+    theirs, ours = (make_projector(card.view, card.input) for card in (session.card, task.card))
+    for points in scans:
+        session.input[:] = project(theirs, np.ascontiguousarray(points)).image
+        with torch.no_grad():
+            outputs = network.eval()(torch.from_numpy(project(ours, np.ascontiguousarray(points)).image[None]))
+        for output, expected in zip(as_tuple(outputs), session.run().values(), strict=True):
+            value = output[0].numpy()
+            assert np.abs(value[: len(expected)] - expected).max() < 1e-4 * expected.std()
+            assert not value[len(expected) :].any()  # the logit of the front
+    # In training, batch norm uses the statistics of the batch, here those of the one that it started with.
+    for module in network.train().modules():
+        if isinstance(module, nn.Dropout2d):
+            module.eval()
+    with torch.no_grad():
+        trained = as_tuple(network(image))[0]
+        expected = as_tuple(network.eval()(image))[0]
+    assert (trained - expected).abs().max() < 1e-2 * expected.std()
+
+
+def as_tuple(outputs: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    return outputs if isinstance(outputs, tuple) else (outputs,)
+
+
+def test_classes_of_a_start_keep_their_weights(simulated: Path) -> None:
+    path = SHIPPED_MODELS / "pointseg.onnx"
+    recipe = Recipe("pointseg", edge=True, batch=1, classes=("background", "cone", "pedestrian"))
+    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    assert set(np.unique(samples.batch(0)[1])) <= {0, 2, IGNORE}  # cars are of no class of this network
+    image = torch.from_numpy(samples.batch(0)[0])
+    own, shipped = build(recipe), build(replace(recipe, classes=()))
+    start(own, recipe, path, [image])
+    start(shipped, replace(recipe, classes=()), path, [image])
+    with torch.no_grad():
+        ours, theirs = own.eval()(image), shipped.eval()(image)
+    assert torch.equal(ours[:, [0, 2]], theirs[:, [0, 2]])
+    assert not ours[:, 1].any()
 
 
 @pytest.mark.usefixtures("small_views")
@@ -430,6 +501,85 @@ def test_an_unused_or_unsuitable_teacher_is_refused(tmp_path: Path, simulated: P
     slots = untrained("ssadnet", tmp_path, head="slots")
     with pytest.raises(ValueError, match="the teacher has no dense boxes"):
         train(small("ssadnet", edge=True, distil=1.0, n_pasted=0.0), tmp_path, **arguments | {"teacher": slots})
+
+
+@pytest.mark.parametrize("network", ["pointseg", "ssadnet", "lodnn"])
+def test_an_exported_teacher_answers_with_each_sample(simulated: Path, network: str) -> None:
+    path = SHIPPED_MODELS / ("pointseg.onnx" if network == "pointseg" else "ssadnet.onnx")
+    recipe = small(network, edge=True, distil=1.0, seen_twice=False)
+    task = task_of(recipe)
+    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")), OnnxTeacher(path, task))
+    arrays = [torch.from_numpy(array) for array in samples.batch(0)]
+    image, taught = arrays[0], arrays[1 + samples.n_targets :]
+    assert len(taught) == (2 if network == "ssadnet" else 1)
+    assert float((taught[0].sum(1) - 1.0).abs().max()) < 1e-5
+    # The teacher reads the same channels of the same scan.
+    session = Session(path, "cpu", n_threads=1)
+    session.input[:] = image[0].numpy()
+    raw = session.run()
+    assert torch.allclose(torch.from_numpy(raw["class_logits"]).softmax(0), taught[0][0], atol=1e-6)
+    outputs = build(recipe).eval()(image)
+    assert torch.isfinite(task.distillation(outputs, *taught))
+    twice = OnnxTeacher(path, task_of(replace(recipe, seen_twice=True)))
+    scan = LabeledScan.load(samples.simulated[0])
+    np.testing.assert_allclose(twice(scan)[0], twice(mirrored(scan))[0][:, :, ::-1], atol=0.02)
+
+
+@pytest.mark.usefixtures("small_views")
+def test_a_run_with_an_exported_teacher_equals_one_with_workers(
+    tmp_path: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint = train(small("pointseg", edge=True, steps=1), tmp_path / "teacher", kitti=None, simulated=simulated)
+    monkeypatch.setattr(to_onnx, "MIN_AGREEMENT", 0.9)
+    teacher = tmp_path / "teacher.onnx"
+    export(checkpoint, teacher, scans=parity_scans([])[:1], fitness=None)
+    recipe = small("pointseg", edge=True, distil=1.0, steps=2)
+    arguments = {"kitti": None, "simulated": simulated, "teacher": teacher, "n_threads": 1}
+    one, other = (weights(train(recipe, tmp_path / f"with-{n}", n_workers=n, **arguments)) for n in (0, 1))
+    assert all(torch.equal(value, other[name]) for name, value in one.items())
+    with pytest.raises(ValueError, match="sees another view than lodnn"):
+        OnnxTeacher(teacher, task_of(small("lodnn")))
+
+
+def test_scans_with_false_objects_are_drawn_more_often(kitti: Path, simulated: Path) -> None:
+    scans, scan_weights, _ = real_scans(KittiObjects(kitti), ["000000", "000001"])
+    samples = Samples(small("pointseg", n_pasted=0.0), scans, scan_weights, sorted(simulated.glob("*.npz")))
+
+    class Blind(nn.Module):
+        """Calls everything farther away than a distance a pedestrian."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.weight = nn.Parameter(torch.zeros(1))
+
+        def forward(self, x: Tensor) -> Tensor:
+            far = (x[:, 4] > self.weight + 1.0).float()
+            return torch.stack([1.0 - far, 0.0 * far, far, 0.0 * far], dim=1)
+
+    samples.redraw(Blind(), 1000)
+    for name in ("real", "simulated"):
+        odds = samples.odds[name]
+        loads = [samples.real[k] if name == "real" else samples._load(k) for k in range(2)]
+        false = [int(((far := samples.sample(s))[0][4] > 1.0)[far[1] == 0].sum()) for s in loads]
+        assert odds[int(np.argmax(false))] > odds[int(np.argmin(false))]
+    again = Samples(small("pointseg", n_pasted=0.0), scans, scan_weights, sorted(simulated.glob("*.npz")))
+    again.redraw(Blind(), 1000)
+    for name in ("real", "simulated"):
+        np.testing.assert_array_equal(samples.odds[name], again.odds[name])
+
+
+@pytest.mark.usefixtures("small_views")
+def test_the_curve_of_a_run_is_a_table(tmp_path: Path, kitti: Path, simulated: Path) -> None:
+    train(small("pointseg"), tmp_path, kitti=kitti, simulated=simulated, fold=1, n_threads=1, checkpoint_every=1)
+    with (tmp_path / "log.jsonl").open("a") as log:  # as after a stop
+        log.write((tmp_path / "log.jsonl").read_text().splitlines()[-1] + "\n")
+    head, names, *rows, gain = curve_table(tmp_path, 2)
+    assert head == f"{tmp_path}: 4 lines of the log, means of 2"
+    assert names.split() == ["samples", "loss", "car", "pedestrian", "cyclist"]
+    assert [row.split()[0] for row in rows] == ["2", "4"]
+    assert gain.split()[:2] == ["last", "quarter"]
+    with pytest.raises(ValueError, match="has no line"):
+        list(curve_table(tmp_path / "nothing"))
 
 
 @pytest.mark.usefixtures("small_views")
