@@ -16,7 +16,21 @@ from edgeperc.geometry import inside
 from edgeperc.perception import Box
 from edgeperc.simulation.samples import IGNORE, simulated_scan
 from edgeperc.simulation.scene import POINT_CLASS_OF
-from edgeperc_export.augment import ObjectBank, augmented, facing, pasted, swapped, weathered
+from edgeperc_export.augment import (
+    MAX_PERSON_RANGE_M,
+    NEGATIVES,
+    ObjectBank,
+    augmented,
+    background_pieces,
+    facing,
+    halved,
+    pasted,
+    resized,
+    swapped,
+    tilted,
+    weathered,
+    with_ground_ahead,
+)
 from edgeperc_export.scans import SURFACE, LabeledScan, turned
 
 GROUND_M = -1.73
@@ -193,3 +207,109 @@ def test_saved_scans_read_back(tmp_path: Path, scan: LabeledScan) -> None:
     back = LabeledScan.load(tmp_path / "scan.npz")
     np.testing.assert_array_equal(back.labels, scan.labels)
     assert back.counts == scan.counts
+
+
+def pole_and_wall() -> LabeledScan:
+    """A street with a pole of 3 m, a pedestrian as tall as a pedestrian, and a wall of 8 m."""
+    up, side = np.meshgrid(np.arange(0.05, 3.0, 0.05), np.arange(-0.06, 0.06, 0.03))
+    pole = np.stack([np.full(up.size, 12.0), 4.0 + side.ravel(), GROUND_M + up.ravel()], 1)
+    up, along = np.meshgrid(np.arange(0.05, 2.5, 0.1), np.arange(0.0, 8.0, 0.1))
+    wall = np.stack([15.0 + along.ravel(), np.full(up.size, -6.0), GROUND_M + up.ravel()], 1)
+    box, person = post(20.0, 2.0)
+    street = flat_street((box,))
+    parts = [np.column_stack([part, np.full(len(part), 0.3)]).astype(np.float32) for part in (pole, wall)]
+    labels = [np.zeros(len(parts[0]) + len(parts[1]), np.uint8), np.full(len(person), 2, np.uint8)]
+    return replace(
+        street,
+        points=np.concatenate([street.points, *parts, person]),
+        labels=np.concatenate([street.labels, *labels]),
+        counts=(len(person),),
+    )
+
+
+def test_poles_and_walls_are_cut_out_of_the_background() -> None:
+    scan = pole_and_wall()
+    pieces = list(background_pieces(scan))
+    assert sorted({box.label for box, _ in pieces}) == ["pole", "wall"]
+    for box, points in pieces:
+        assert inside(box, points, 0.05).all()
+        foot = box.center[2] - box.size[2] / 2.0
+        assert foot == pytest.approx(GROUND_M, abs=0.05)
+        assert points[:, 2].min() > foot + 0.05  # without the ground
+        assert len(points) > 50
+    ((pole, _),) = [piece for piece in pieces if piece[0].label == "pole"]
+    assert pole.center[:2] == pytest.approx((12.0, 4.0), abs=0.1)
+    # A pole of unknown class, or beside a labeled object, is not known to be background.
+    assert not list(background_pieces(replace(scan, labels=np.full_like(scan.labels, IGNORE))))
+    nothing = replace(scan, points=scan.points[:0], labels=scan.labels[:0])
+    assert not list(background_pieces(nothing))
+
+
+def test_pasted_background_is_background() -> None:
+    bank = ObjectBank.of([pole_and_wall()])
+    assert set(bank.objects) == {"pedestrian", "pole", "wall"}
+    street = flat_street()
+    out = pasted(street, bank, np.random.default_rng(0), 8, NEGATIVES)
+    assert not out.boxes
+    assert not out.counts
+    assert not out.labels.any()
+    assert np.count_nonzero(out.points[:, 2] > GROUND_M + 1.0) > 30
+
+
+def test_pasted_objects_get_the_number_of_their_class() -> None:
+    bank = ObjectBank({"cone": [post(10.0, 0.0, "cone")]}, ("background", "car", "cone"))
+    out = pasted(flat_street(), bank, np.random.default_rng(0), 1, {"cone": 1.0})
+    assert set(np.unique(out.labels)) == {0, 2}
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), distance=st.floats(4.0, 44.0))
+def test_a_resized_person_stands_on_the_same_ground(seed: int, distance: float) -> None:
+    box, points = post(distance, 0.0)
+    other, moved = resized(box, points, np.random.default_rng(seed))
+    assert distance - 1e-6 <= np.hypot(*other.center[:2]) <= min(1.6 * distance, MAX_PERSON_RANGE_M) + 1e-6
+    assert other.center[2] - other.size[2] / 2 == pytest.approx(GROUND_M, abs=1e-6)
+    assert 0.87 <= other.size[2] / box.size[2] <= 1.15
+    assert inside(other, moved, 0.01).all()
+    assert 0 < len(moved) <= len(points)
+
+
+def test_the_ground_at_the_bumper_is_background() -> None:
+    box, points = post(4.0, 1.0)
+    street = flat_street((box,))
+    unknown = np.full(len(street.points) + len(points), IGNORE, np.uint8)
+    scan = replace(street, points=np.concatenate([street.points, points]), labels=unknown, counts=(len(points),))
+    out = with_ground_ahead(scan)
+    known = out.labels == 0
+    near = (scan.points[:, 0] < 6.0) & (np.abs(scan.points[:, 1]) < 3.0) & (scan.points[:, 2] < GROUND_M + 0.2)
+    assert (near | ~known).all()
+    assert np.count_nonzero(known) > 500
+    assert not (known & inside(box, scan.points)).any()
+    assert with_ground_ahead(street) is street
+
+
+def test_every_second_beam_is_dropped(scan: LabeledScan) -> None:
+    out = halved(scan)
+    assert out.sensor is not None
+    assert len(out.sensor.elevations_deg) == 32
+    assert 0.4 < len(out.points) / len(scan.points) < 0.6
+    flat = np.hypot(out.points[:, 0], out.points[:, 1])
+    elevations = np.degrees(np.arctan2(out.points[:, 2], flat))
+    apart = np.abs(elevations[:, None] - np.array(out.sensor.elevations_deg)).min(1)
+    assert np.quantile(apart, 0.99) < 0.3
+    assert halved(out) is out
+
+
+def test_a_tilted_scan_keeps_its_objects(scan: LabeledScan) -> None:
+    out = tilted(scan, np.radians(0.5), np.radians(-0.5), 0.05)
+    for box, other in zip(scan.boxes, out.boxes, strict=True):
+        shift = np.subtract(other.center, box.center)
+        assert abs(shift[2]) < 0.05 + np.radians(0.75) * np.hypot(*box.center[:2])
+        core = replace(box, size=(box.size[0], box.size[1], box.size[2] - 0.2))
+        own = inside(core, scan.points)
+        assert inside(replace(other, size=box.size), out.points[own], 0.2).all()
+    np.testing.assert_allclose(
+        np.linalg.norm(out.points[:, :3] - np.float32([0, 0, 0.05]), axis=1),
+        np.linalg.norm(scan.points[:, :3], axis=1),
+        rtol=1e-3,
+    )
