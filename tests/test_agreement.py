@@ -1,0 +1,413 @@
+"""Agreement of labels, boxes and cells: kernels against twins, invariants on any input, scenes with known answers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import twins.agreement
+from edgeperc import Box, Perceiver, PointLabels, PointsError, TopView
+from edgeperc.agreement import (
+    COMPLETING_SCORE,
+    MAX_LENGTH_M,
+    MAX_TOP_M,
+    MIN_LARGE_SHARE,
+    MIN_SUPPORTED_SHARE,
+    MIN_VEHICLE_SHARE,
+    RULES,
+    _as_rows,
+    agree_on_boxes,
+    agree_on_cells,
+    agree_on_points,
+    apply_verdicts,
+    clear_columns,
+    clear_ground,
+    clear_road,
+    count_inside,
+    fill_support,
+    fill_tallies,
+)
+from edgeperc.card import TopViewGeometry
+from edgeperc.cli import arguments
+from edgeperc.cluster import find_clusters
+from edgeperc.geometry import inside
+from edgeperc.ground import Ground, find_ground
+from edgeperc.points import read_only
+from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.scene import simulate
+
+CLASSES = ("background", "car", "pedestrian", "cyclist")
+ROLES = np.array([0, 1, 2, 2], np.uint8)
+VIEW = TopViewGeometry((0.0, 20.0), (-8.0, 8.0), cell_m=0.5)
+GROUND_Z = -1.73
+patient = settings(deadline=None, max_examples=60)  # the first example compiles a kernel
+
+coordinates = st.floats(-9.0, 19.0, width=32) | st.sampled_from([0.0, -0.0, 60.0, 3e38, math.nan, math.inf, -math.inf])
+heights = st.floats(-1.0, 7.0, width=32) | st.sampled_from([0.0, 0.3, 2.0, math.nan, math.inf, -math.inf])
+rows = st.tuples(coordinates, coordinates, heights, st.booleans(), st.booleans(), st.integers(0, 3), st.integers(-1, 5))
+scenes = st.lists(rows, max_size=60)
+boxes_of = st.lists(
+    st.builds(
+        lambda x, y, length, width, yaw, score, label: Box(label, score, (x, y, -1.0), (length, width, 1.5), yaw),
+        *(st.floats(-5.0, 15.0), st.floats(-6.0, 6.0), st.floats(0.3, 12.0), st.floats(0.3, 4.0)),
+        *(st.floats(-3.2, 3.2), st.sampled_from([0.1, 0.3, 0.4, 0.5, 0.9]), st.sampled_from(["car", "van", "truck"])),
+    ),
+    max_size=4,
+)
+
+
+class Scene:
+    """Arrays of a random scene, as the kernels take them."""
+
+    def __init__(self, given: list[tuple[float, float, float, bool, bool, int, int]]) -> None:
+        n = len(given)
+        columns = list(zip(*given, strict=True)) if given else [()] * 7
+        self.points = np.zeros((n, 4), np.float32)
+        for k in range(2):
+            self.points[:, k] = columns[k]
+        self.height = np.array(columns[2], np.float32)
+        self.points[:, 2] = self.height + np.float32(GROUND_Z)
+        self.on_ground = np.array(columns[3], np.bool_) & (np.abs(self.height) < 0.2)
+        self.in_view = np.array(columns[4], np.bool_) & np.isfinite(self.points).all(axis=1)
+        self.labels = np.where(self.in_view, np.array(columns[5], np.uint8), 0).astype(np.uint8)
+        self.clusters = np.where(self.on_ground | ~np.isfinite(self.points).all(axis=1), -1, columns[6]).astype(
+            np.int32
+        )
+        self.points.flags.writeable = False
+
+    @property
+    def ground(self) -> Ground:
+        return Ground(self.on_ground, self.height, (0.0, 0.0, GROUND_Z))
+
+    @property
+    def found(self) -> PointLabels:
+        return PointLabels(self.labels, self.in_view, CLASSES)
+
+
+def top_view(seed: int = 0, view: TopViewGeometry = VIEW) -> TopView:
+    labels = np.random.default_rng(seed).integers(0, 5, (view.height, view.width)).astype(np.uint8)
+    labels[::2] = 1
+    names = ("background", "drivable", "car", "van", "truck")
+    return TopView(labels, names, view.cell_m, view.x_range_m, view.y_range_m, np.ones(labels.shape, np.bool_))
+
+
+# --- kernels
+
+
+@patient
+@given(scenes)
+def test_columns_match_the_twin(given: list) -> None:
+    scene, limits = Scene(given), np.array([0.0, 0.0, 2.0, 2.2])
+    found = scene.labels.copy()
+    clear_columns(scene.points, read_only(scene.height), limits, found)
+    np.testing.assert_array_equal(found, twins.agreement.columns(scene.points, scene.height, limits, scene.labels))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_dense_columns_match_the_twin(seed: int) -> None:
+    """Poles, people and foliage, so that columns end at gaps of every size."""
+    rng = np.random.default_rng(seed)
+    n = 1500
+    points = np.zeros((n, 4), np.float32)
+    place = rng.integers(0, 30, n)
+    points[:, :2] = place[:, None] * 0.7 - 5 + rng.normal(0, 0.1, (n, 2))
+    height = (rng.random(n) * rng.uniform(1.0, 6.6, 30)[place]).astype(np.float32)
+    labels, limits = rng.integers(0, 4, n).astype(np.uint8), np.array([0.0, 0.0, 2.0, 2.2])
+    found = labels.copy()
+    clear_columns(read_only(points), read_only(height), limits, found)
+    right = twins.agreement.columns(points, height, limits, labels)
+    np.testing.assert_array_equal(found, right)
+    assert np.count_nonzero(found != labels) > 0
+
+
+@patient
+@given(scenes)
+def test_tallies_match_the_twin(given: list) -> None:
+    scene = Scene(given)
+    counts, bounds = np.empty((6, 5), np.int32), np.empty((6, 5), np.float32)
+    args = scene.points, scene.height, scene.in_view, scene.labels, scene.clusters
+    fill_tallies(*map_read_only(args), counts, bounds)
+    right_counts, right_bounds = twins.agreement.tallies(*args, 6, 4)
+    np.testing.assert_array_equal(counts, right_counts)
+    np.testing.assert_array_equal(bounds, right_bounds)
+
+
+def map_read_only(arrays: tuple[NDArray, ...]) -> list[NDArray]:
+    return [read_only(array, array.dtype) for array in arrays]
+
+
+@patient
+@given(scenes, boxes_of)
+def test_boxes_around_points_match_the_twin(given: list, boxes: list[Box]) -> None:
+    scene, as_rows = Scene(given), _as_rows(boxes)
+    of_box = (np.arange(len(boxes)) % 3 + 1).astype(np.uint8)
+    scores, names = np.empty(len(scene.points), np.float32), np.empty(len(scene.points), np.uint8)
+    arrays = map_read_only((scene.points, scene.height, scene.on_ground))
+    fill_support(*arrays, as_rows, of_box, scores, names)
+    right_scores, right_names = twins.agreement.support(*arrays, as_rows, of_box)
+    np.testing.assert_array_equal(scores, right_scores)
+    np.testing.assert_array_equal(names, right_names)
+    counts = np.empty((len(boxes), 3), np.int64)
+    more = *arrays, *map_read_only((scene.in_view, scene.labels))
+    count_inside(*more, ROLES, as_rows, counts)
+    np.testing.assert_array_equal(counts, twins.agreement.inside_counts(*more, ROLES, as_rows))
+
+
+@patient
+@given(scenes, st.integers(0, 99))
+def test_verdicts_match_the_twin(given: list, seed: int) -> None:
+    scene, rng = Scene(given), np.random.default_rng(seed)
+    n = len(scene.points)
+    table, shares = rng.integers(0, 4, (6, 4)).astype(np.uint8), rng.random(6).astype(np.float32)
+    scores, names = rng.random(n).astype(np.float32), rng.integers(0, 4, n).astype(np.uint8)
+    in_view, clusters = map_read_only((scene.in_view, scene.clusters))
+    found = scene.labels.copy()
+    apply_verdicts(in_view, clusters, table, shares, ROLES, scores, names, found)
+    right = twins.agreement.verdicts(in_view, clusters, table, shares, ROLES, scores, names, scene.labels)
+    np.testing.assert_array_equal(found, right)
+
+
+@patient
+@given(scenes)
+def test_cleared_ground_matches_the_twin(given: list) -> None:
+    scene = Scene([(round(x) if abs(x) < 99 else x, 0.1, *rest) for x, _, *rest in given])  # many in one cell
+    found = scene.labels.copy()
+    clear_ground(scene.points, read_only(scene.on_ground, np.bool_), ROLES, found)
+    np.testing.assert_array_equal(found, twins.agreement.ground(scene.points, scene.on_ground, ROLES, scene.labels))
+
+
+@patient
+@given(scenes, st.booleans())
+def test_cleared_road_matches_the_twin(given: list, by_height: bool) -> None:
+    scene, cells = Scene(given), top_view().labels
+    found, grid = cells.copy(), np.array([VIEW.x_range_m[1], VIEW.y_range_m[1], VIEW.cell_m])
+    arrays = map_read_only((scene.points, scene.height, scene.labels))
+    clear_road(*arrays, ROLES, by_height, grid, 1, np.zeros(cells.shape, np.uint8), found)
+    np.testing.assert_array_equal(found, twins.agreement.road(*arrays, ROLES, by_height, grid, 1, cells))
+
+
+# --- what always holds
+
+
+@patient
+@given(scenes, boxes_of)
+def test_points_keep_their_view_and_meet_the_rules(given: list, boxes: list[Box]) -> None:
+    scene = Scene(given)
+    agreed = agree_on_points(scene.points, scene.found, scene.ground, scene.clusters, boxes)
+    np.testing.assert_array_equal(scene.labels, scene.found.labels)  # the input is not modified
+    assert agreed.classes == CLASSES
+    assert agreed.labels.dtype == np.uint8
+    np.testing.assert_array_equal(agreed.in_view, scene.in_view)
+    assert not agreed.labels[~scene.in_view].any()
+    boxed = np.zeros(len(scene.points), np.bool_)
+    for box in boxes:
+        own = twins.agreement.inside(scene.points, scene.height, scene.on_ground, _as_rows([box])[0])
+        boxed |= own & (box.score >= 0.3)
+    for k in range(6):
+        own = scene.clusters == k
+        if not own.any():
+            continue
+        share = np.mean(scene.labels[own & scene.in_view] == 1) if (own & scene.in_view).any() else 0.0
+        length = np.hypot(*(np.ptp(scene.points[own, c]) for c in range(2)))
+        is_large = length > MAX_LENGTH_M + 1e-3 or np.max(scene.height[own], initial=-np.inf) > MAX_TOP_M
+        if share < (MIN_LARGE_SHARE if is_large else MIN_VEHICLE_SHARE):
+            assert not (agreed.labels[own & ~boxed] == 1).any()
+        if share < MIN_SUPPORTED_SHARE and all(box.score < COMPLETING_SCORE for box in boxes):
+            assert not (agreed.labels[own] == 1).any()
+    again = agree_on_points(scene.points, scene.found, scene.ground, scene.clusters, boxes)
+    np.testing.assert_array_equal(agreed.labels, again.labels)
+
+
+@patient
+@given(scenes, boxes_of)
+def test_no_cell_below_an_object_is_drivable(given: list, boxes: list[Box]) -> None:
+    scene, view = Scene(given), top_view()
+    agreed = agree_on_cells(view, scene.points, scene.found, scene.ground, boxes)
+    x, y = np.broadcast_arrays(*VIEW.cell_centers())
+    centers = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
+    for box in boxes:
+        flat = replace(box, center=(*box.center[:2], 0.0), size=(box.size[0] - 1e-6, box.size[1] - 1e-6, 1.0))
+        assert not agreed.road.ravel()[inside(flat, centers)].any()
+    row, col, known = VIEW.cells(*scene.points[:, :2].T.astype(np.float64))
+    assert not agreed.road[row[known & (scene.labels > 0)], col[known & (scene.labels > 0)]].any()
+    assert not (agreed.road & ~view.road).any()
+    np.testing.assert_array_equal(agreed.labels[~view.road], view.labels[~view.road])
+    np.testing.assert_array_equal(agreed.observed, view.observed)
+
+
+@patient
+@given(scenes, boxes_of)
+def test_only_uncertain_boxes_without_labels_are_dropped(given: list, boxes: list[Box]) -> None:
+    scene = Scene(given)
+    kept = agree_on_boxes(boxes, scene.points, scene.found, scene.ground)
+    assert [box for box in boxes if box in kept] == [*kept]
+    for box in boxes:
+        own = twins.agreement.inside(scene.points, scene.height, scene.on_ground, _as_rows([box])[0])
+        is_right = np.count_nonzero(own & (scene.labels == 1)) >= 0.1 * np.count_nonzero(own & scene.in_view)
+        assert (box in kept) == (box.score >= 0.5 or (own.any() and (is_right or not (own & scene.in_view).any())))
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_no_points_and_one_point(n: int) -> None:
+    scene = Scene([(5.0, 0.0, 1.0, False, True, 1, 0)][:n])
+    box = Box("car", 0.9, (5.0, 0.0, -1.0), (4.0, 1.6, 1.5), 0.0)
+    agreed = agree_on_points(scene.points, scene.found, scene.ground, scene.clusters, [box])
+    assert agreed.labels.tolist() == [1] * n
+    assert agree_on_boxes([box], scene.points, agreed, scene.ground) == (box,)
+    unsure = replace(box, score=0.4)
+    assert agree_on_boxes([unsure], scene.points, agreed, scene.ground) == (unsure,) * n
+    assert agree_on_cells(top_view(), scene.points, agreed, scene.ground, [box]).drivable.any()
+
+
+def test_arrays_must_agree() -> None:
+    scene = Scene([(5.0, 0.0, 1.0, False, True, 1, 0)] * 3)
+    with pytest.raises(PointsError, match=r"clusters of shape \(2,\) for 3 points"):
+        agree_on_points(scene.points, scene.found, scene.ground, scene.clusters[:2])
+    with pytest.raises(PointsError, match=r"labels.in_view of shape \(3,\) for 2 points|ground.height_m of shape"):
+        agree_on_points(scene.points[:2], scene.found, scene.ground, scene.clusters[:2])
+    with pytest.raises(PointsError, match=r"got points of shape \(3,\)"):
+        agree_on_points(scene.points[:, 0], scene.found, scene.ground, scene.clusters)
+    few = PointLabels(scene.labels, scene.in_view, ("background",))
+    with pytest.raises(PointsError, match="got label 1 for 1 classes"):
+        agree_on_boxes([], scene.points, few, scene.ground)
+
+
+def test_rules_are_those_of_the_command_line() -> None:
+    assert tuple(sorted(RULES)) == arguments.RULES
+
+
+# --- scenes with known answers
+
+
+def block(
+    x: float, y: float, size: tuple[float, float, float], label: int, spacing: float = 0.15
+) -> NDArray[np.float64]:
+    """Points x, y, height, label on the sides of a block that stands on the ground."""
+    length, width, height = size
+    rows = []
+    for z in np.arange(0.2, height, spacing):
+        for u in np.arange(-length / 2, length / 2 + 1e-9, spacing):
+            rows += [(x + u, y - width / 2, z, label), (x + u, y + width / 2, z, label)]
+        for v in np.arange(-width / 2, width / 2, spacing):
+            rows += [(x - length / 2, y + v, z, label)]
+    return np.array(rows)
+
+
+def agreed_scene(
+    *parts: NDArray[np.float64], boxes: tuple[Box, ...] = (), rules: frozenset[str] = RULES
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Rows x, y, height, label of parts on a floor, and their labels after the agreement."""
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(0.0, 30.0, 0.35), np.arange(-15.0, 15.0, 0.35)))
+    rows = np.concatenate([np.column_stack([x, y, np.zeros((x.size, 2))]), *parts])
+    points = np.column_stack([rows[:, :2], rows[:, 2] + GROUND_Z, np.zeros(len(rows))]).astype(np.float32)
+    labels = PointLabels(rows[:, 3].astype(np.uint8), np.ones(len(rows), np.bool_), CLASSES)
+    ground = find_ground(points)
+    clusters = find_clusters(points, among=~ground.mask, seeds=labels.labels > 0, min_points=1)
+    return rows, agree_on_points(points, labels, ground, clusters, boxes, rules=rules).labels
+
+
+CAR = (4.0, 1.7, 1.5)
+
+
+def test_car_is_completed() -> None:
+    car = block(12.0, 3.0, CAR, 1)
+    car[: len(car) // 4, 3] = 0
+    rows, labels = agreed_scene(car)
+    own = rows[:, 2] > 0.0
+    assert (labels[own] == 1).all()
+    assert not labels[~own].any()
+
+
+def test_wall_is_no_car() -> None:
+    wall = block(12.0, 6.0, (14.0, 0.3, 2.5), 0)
+    wall[wall[:, 0] > 11.0, 3] = 1
+    assert not agreed_scene(wall)[1].any()
+    assert agreed_scene(wall, rules=RULES - {"share"})[1].any()
+
+
+def test_truck_with_trailer_is_kept() -> None:
+    truck = block(14.0, 5.0, (16.0, 2.5, 3.9), 1)
+    assert (agreed_scene(truck)[1] == 1).sum() == len(truck)
+
+
+def test_car_beside_a_hedge_is_kept_where_a_box_is() -> None:
+    car, hedge = block(12.0, 3.0, CAR, 1), block(12.0, 4.3, (9.0, 0.4, 1.6), 0)
+    rows, labels = agreed_scene(car, hedge)
+    assert not labels.any()
+    box = Box("car", 0.6, (12.0, 3.0, -1.0), CAR, 0.0)
+    rows, labels = agreed_scene(car, hedge, boxes=(box,))
+    is_car = rows[:, 3] == 1
+    assert (labels[is_car] == 1).all()
+    assert not (labels[~is_car & (np.abs(rows[:, 1] - 4.3) < 0.21)]).any()
+
+
+def test_pole_is_no_person_and_a_person_under_foliage_is_one() -> None:
+    person, pole = block(8.0, 2.0, (0.4, 0.4, 1.75), 2, 0.1), block(8.0, -4.0, (0.2, 0.2, 1.8), 2, 0.1)
+    above = block(8.0, -4.0, (0.2, 0.2, 3.5), 0, 0.1)
+    foliage = block(8.0, 2.0, (3.0, 3.0, 4.0), 0, 0.2)
+    rows, labels = agreed_scene(person, pole, above[above[:, 2] > 1.8], foliage[foliage[:, 2] > 2.4])
+    own = (rows[:, 3] == 2) & (rows[:, 1] > 0.0)
+    assert (labels[own] == 2).all()
+    assert not labels[~own].any()
+
+
+def test_kerb_is_no_car_and_ground_is_car_only_below_cars() -> None:
+    kerb, car = block(3.5, 0.0, (1.0, 4.0, 0.3), 1), block(12.0, 3.0, CAR, 1)
+    below = np.array([(12.0, 2.15, 0.0, 1), (3.0, -2.0, 0.0, 1), (20.0, 2.0, 0.0, 1)])
+    rows, labels = agreed_scene(kerb, car, below)
+    assert labels[-3:].tolist() == [1, 0, 0]
+    assert not labels[rows[:, 0] < 5.0].any()
+
+
+def test_cyclist_is_one_object() -> None:
+    rider = block(9.0, 1.0, (1.7, 0.5, 1.7), 2, 0.1)
+    rider[::3, 3] = 3
+    rows, labels = agreed_scene(rider)
+    assert (labels[rows[:, 3] > 0] == 3).all()
+
+
+def test_other_classes_are_not_changed() -> None:
+    scene = Scene([(5.0, 0.0, 1.0, False, True, 2, 0)] * 9 + [(5.0, 0.0, 0.0, True, True, 2, -1)])
+    found = PointLabels(scene.labels, scene.in_view, ("background", "sign", "road", "tree"))
+    agreed = agree_on_points(scene.points, found, scene.ground, scene.clusters)
+    np.testing.assert_array_equal(agreed.labels, scene.labels)
+
+
+def test_cells_of_dropped_boxes_are_no_vehicles() -> None:
+    view = top_view()
+    view.labels[:] = 2
+    nothing = np.zeros((0, 4), np.float32)
+    ground = Ground(np.zeros(0, np.bool_), np.zeros(0, np.float32), (0.0, 0.0, GROUND_Z))
+    kept = Box("car", 0.9, (5.0, 0.0, -1.0), (4.0, 2.0, 1.5), 0.0)
+    dropped = replace(kept, center=(7.0, 0.0, -1.0))
+    cells = agree_on_cells(view, nothing, None, ground, [kept], [dropped]).labels
+    assert cells[VIEW.cells(5.1, 0.1)[:2]] == 2
+    assert cells[VIEW.cells(6.6, 0.1)[:2]] == 2  # in both
+    assert cells[VIEW.cells(8.1, 0.1)[:2]] == 0
+
+
+@pytest.mark.parametrize("models", ["pointseg", "lodnn", ["ssadnet", "pointseg"]])
+def test_perceivers_of_one_view_agree_too(models: str | list[str]) -> None:
+    scan = simulate(random_scene(6, "urban"), "hdl-64e", seed=6).points
+    options = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore"}
+    alone, agreed = Perceiver(models, agree=False, **options), Perceiver(models, **options)
+    found = agreed(scan)
+    again = agreed(scan)
+    assert found.boxes == again.boxes
+    assert alone(scan).stage_ms["agree"] == 0.0
+    if found.points is not None:
+        np.testing.assert_array_equal(found.points.labels, again.points.labels)
+        assert (found.points.labels != alone(scan).points.labels).any()
+    if found.top_view is not None:
+        np.testing.assert_array_equal(found.top_view.labels, again.top_view.labels)
+        assert (alone(scan).top_view.drivable & ~found.top_view.drivable).any()
+    assert agreed(scan[:0]).boxes == agreed(scan[:0]).boxes
+    broken = scan.copy()
+    broken[::7] = np.nan
+    assert agreed(broken).n_dropped == len(scan[::7])

@@ -1,0 +1,126 @@
+"""Slow twins of the agreement of labels, boxes and cells."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def cells_of(points, cell_m, n):
+    """Row and column of each point in a square grid around the sensor, and whether it is in the grid."""
+    x, y = (points[:, k].astype(np.float64) + 0.5 * n * cell_m for k in range(2))
+    known = (x >= 0.0) & (x < n * cell_m) & (y >= 0.0) & (y < n * cell_m)
+    row, col = (np.minimum(np.where(known, v, 0.0) / cell_m, n - 1).astype(int) for v in (x, y))
+    return row, col, known
+
+
+def columns(points, height, limits, labels):
+    """Twin of `edgeperc.agreement.clear_columns`."""
+    row, col, known = cells_of(points, 0.2, 512)
+    h = height.astype(np.float64)
+    known = known & (h >= 0.0) & (h < 64 * 0.1)
+    level = np.minimum(np.where(known, h, 0.0) / 0.1, 63).astype(int)
+    cleared = labels.copy()
+    for i in np.flatnonzero(known & (limits[labels] > 0.0)):
+        near = known & (np.abs(row - row[i]) <= 1) & (np.abs(col - col[i]) <= 1)
+        top = level[i]
+        for at in np.unique(level[near]):
+            if top < at <= top + 4:  # three empty levels of 0.1 m at most
+                top = at
+        if (top + 1) * 0.1 > limits[labels[i]] + 0.05:
+            cleared[i] = 0
+    return cleared
+
+
+def tallies(points, height, in_view, labels, clusters, n, n_classes):
+    """Twin of `edgeperc.agreement.fill_tallies`."""
+    counts = np.zeros((n, n_classes + 1), np.int32)
+    bounds = np.empty((n, 5), np.float32)
+    for k in range(n):
+        own = clusters == k
+        counts[k, :-1] = np.bincount(labels[own & in_view], minlength=n_classes)
+        counts[k, -1] = np.count_nonzero(own & in_view)
+        xy = points[own, :2]
+        bounds[k, :2] = xy.min(axis=0, initial=np.inf)
+        bounds[k, 2:4] = xy.max(axis=0, initial=-np.inf)
+        bounds[k, 4] = height[own].max(initial=-np.inf)
+    return counts, bounds
+
+
+def inside(points, height, on_ground, box):
+    """Points above the ground in a box of `edgeperc.agreement.fill_support`, (n,) bool."""
+    x, y, half_l, half_w, cos, sin, highest, _ = box
+    dx, dy = points[:, 0].astype(np.float64) - x, points[:, 1].astype(np.float64) - y
+    with np.errstate(invalid="ignore"):
+        return (
+            ~on_ground
+            & (np.abs(cos * dx + sin * dy) <= half_l)
+            & (np.abs(cos * dy - sin * dx) <= half_w)
+            & (height <= highest)
+        )
+
+
+def support(points, height, on_ground, boxes, of_box):
+    """Twin of `edgeperc.agreement.fill_support`."""
+    scores, names = np.zeros(len(points), np.float32), np.zeros(len(points), np.uint8)
+    for box, name in zip(boxes, of_box, strict=True):
+        better = inside(points, height, on_ground, box) & (box[7] > scores)
+        scores[better], names[better] = box[7], name
+    return scores, names
+
+
+def inside_counts(points, height, on_ground, in_view, labels, roles, boxes):
+    """Twin of `edgeperc.agreement.count_inside`."""
+    own = [inside(points, height, on_ground, box) for box in boxes]
+    is_vehicle = roles[labels] == 1
+    rows = [
+        (np.count_nonzero(o), np.count_nonzero(o & in_view), np.count_nonzero(o & in_view & is_vehicle)) for o in own
+    ]
+    return np.array(rows, np.int64).reshape(-1, 3)
+
+
+def verdicts(in_view, clusters, table, shares, roles, scores, names, labels):
+    """Twin of `edgeperc.agreement.apply_verdicts`."""
+    agreed = labels.copy()
+    for i in np.flatnonzero(in_view):
+        old, k = labels[i], clusters[i]
+        new = old if k < 0 else table[k, old]
+        if k >= 0 and roles[old] == 1 and roles[new] == 0 and scores[i] >= 0.3 and shares[k] >= 0.4:
+            new = old
+        if scores[i] >= 0.5 and (new == 0 or roles[new] == 1):
+            new = names[i]
+        agreed[i] = new
+    return agreed
+
+
+def ground(points, on_ground, roles, labels):
+    """Twin of `edgeperc.agreement.clear_ground`."""
+    row, col, known = cells_of(points, 0.2, 1024)
+    cleared = labels.copy()
+    for role in (1, 2):
+        own = roles[labels] == role
+        standing = {*zip(row[own & ~on_ground & known], col[own & ~on_ground & known], strict=True)}
+        for i in np.flatnonzero(own & on_ground):
+            if not known[i] or (row[i], col[i]) not in standing:
+                cleared[i] = 0
+    return cleared
+
+
+def road(points, height, labels, roles, by_height, grid, drivable, cells):
+    """Twin of `edgeperc.agreement.clear_road`."""
+    far, left, cell_m = grid
+    returns = np.zeros(cells.shape, int)
+    with np.errstate(invalid="ignore", over="ignore"):
+        row = (far - points[:, 0].astype(np.float64)) / cell_m
+        col = (left - points[:, 1].astype(np.float64)) / cell_m
+        known = (row >= 0) & (row < cells.shape[0]) & (col >= 0) & (col < cells.shape[1])
+        is_object = known & (roles[labels] != 0)
+        is_obstacle = known & ~is_object & (height >= 0.3) & (height <= 2.0) & by_height
+    for i in np.flatnonzero(is_obstacle):
+        returns[int(row[i]), int(col[i])] += 1
+    for i in np.flatnonzero(is_object):
+        returns[int(row[i]), int(col[i])] = 2
+    cleared = cells.copy()
+    for r, c in np.argwhere((returns > 0) & (cells == drivable)):
+        if np.minimum(returns[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2], 2).sum() >= 2:
+            cleared[r, c] = 0
+    return cleared
