@@ -14,7 +14,6 @@ from edgeperc import __version__
 from edgeperc.cli.output import print_error, print_line
 from edgeperc.cli.program import Parser, run_program
 from edgeperc.errors import EdgepercError, MissingExtraError, ModelError
-from edgeperc.evaluation.scan_folder import ScanFolder
 
 from .database.cli import add_database_commands
 from .recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe
@@ -304,6 +303,8 @@ def _simulate(args: argparse.Namespace) -> int:
 
 def _train(args: argparse.Namespace) -> int:
     recipe = _recipe(args)
+    from edgeperc.evaluation.scan_folder import ScanFolder
+
     from .train import train
 
     checkpoint = train(
@@ -418,6 +419,8 @@ def _agree(args: argparse.Namespace) -> int:
 
 
 def _make(args: argparse.Namespace) -> int:
+    from edgeperc.evaluation.scan_folder import ScanFolder
+
     from .make import make
 
     path = make(

@@ -90,7 +90,7 @@ def test_every_field_of_a_recipe_is_an_option() -> None:
                 if isinstance(field.default, bool):
                     arguments += [option if field.default else option.replace("--", "--no-", 1)]
                 else:
-                    arguments += [option, str(field.default)]
+                    arguments += [option, "" if field.default == () else str(field.default)]
         assert _recipe(build_parser().parse_args(arguments)) == Recipe(network)
 
 
