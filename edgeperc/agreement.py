@@ -340,7 +340,7 @@ def _verdicts(
     seen = np.maximum(counts[:, -1], 1)
     vehicle_share = counts[:, vehicles].sum(axis=1) / seen
     person_share = counts[:, persons].sum(axis=1) / seen
-    length = np.hypot(bounds[:, 2] - bounds[:, 0], bounds[:, 3] - bounds[:, 1])
+    length = np.hypot(*(bounds[:, 2:4].astype(np.float64) - bounds[:, :2]).T)
     top = bounds[:, 4]
     large = (length > MAX_LENGTH_M) | (top > MAX_TOP_M)
 

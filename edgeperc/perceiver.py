@@ -546,13 +546,14 @@ class Perceiver:
         return PointLabels(labels, in_view, ahead.classes)
 
     def _warm_up_objects(self) -> tuple[NDArray[np.float32], PointLabels]:
-        """Nine points of a car on a floor: enough to compile every kernel of `_combine`."""
+        """Nine points of a car and a person on a floor: enough to compile every kernel of `_combine`."""
         x, y = np.meshgrid(np.arange(-8.0, 8.0), np.arange(-8.0, 8.0))
         scan = np.zeros((x.size + 9, 4), np.float32)
         scan[:-9, 0], scan[:-9, 1], scan[:-9, 2] = x.ravel(), y.ravel(), -MODEL_HEIGHT_M
         scan[-9:, 0], scan[-9:, 1] = 5.0, np.linspace(-0.2, 0.2, 9)
         labels = (np.arange(len(scan)) >= x.size).astype(np.uint8)
-        return scan, PointLabels(labels, np.ones(len(scan), np.bool_), ("background", "car"))
+        labels[-1] = 2
+        return scan, PointLabels(labels, np.ones(len(scan), np.bool_), ("background", "car", "pedestrian"))
 
     def _find_ground(self, scan: NDArray[np.float32]) -> Ground | None:
         """The ground, once for all that needs it: the input of a network, and the clusters; None if nothing does."""

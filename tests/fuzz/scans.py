@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from typing import Any
 from unittest import mock
 
@@ -14,6 +15,8 @@ import edgeperc.perceiver as perceiver_module
 from edgeperc import Box, Perceiver, Perception, SensorProfile, Tracker, Tracks, road_ahead
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.errors import EdgepercError, FitnessError
+from edgeperc.frame import ModelFrame
+from edgeperc.geometry import draw_footprints
 from edgeperc.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.points import as_points
 from edgeperc.records import scan_record
@@ -194,6 +197,7 @@ class Scans:
             "score_threshold": made.pick([None, None, 0.0, 1.0, 0.5]),
             "full_turn": bool(rng.random() < 0.1),
             "mounting": made.pick([MODEL_MOUNTING, MODEL_MOUNTING, any_mounting(made), Mounting()]),
+            "agree": bool(rng.random() < 0.9),
         }
         if is_honest:
             self.made_up = []
@@ -238,6 +242,8 @@ class Scans:
             perceive._to_check = 0
             perception = perceive(scan, stamp_s)
         check_perception(perception, points)
+        if perceive.agree:
+            check_agreement(perception)
         if perception.top_view is not None and case.chance(AFTER):
             road = road_ahead(perception.top_view, perception.boxes)
             check(np.isfinite(road.outline).all(), "a corner of the road is not finite")
@@ -293,6 +299,17 @@ def check_perception(p: Perception, points: NDArray[np.float32]) -> None:
     check(scores == sorted(scores, reverse=True), "boxes are not in the order of their scores")
     check(all(math.isfinite(ms) and ms >= 0.0 for ms in p.stage_ms.values()), "stage_ms")
     json.dumps(p.to_dict(), allow_nan=False)
+
+
+def check_agreement(p: Perception) -> None:
+    """Raise `Failure` if a cell below a box is drivable."""
+    if p.top_view is None:
+        return
+    names = tuple({box.label for box in p.boxes})
+    boxes = [replace(b, size=(0.9 * b.size[0], 0.9 * b.size[1], b.size[2])) for b in p.boxes]  # moved, with rounding
+    covered = np.full(p.top_view.labels.shape, 255, np.uint8)
+    draw_footprints(covered, ModelFrame(p.mounting).move_boxes(boxes), p.top_view.geometry, names)
+    check(not (p.top_view.road & (covered < 255)).any(), "a drivable cell below a box")
 
 
 def check_box(box: Box) -> None:
