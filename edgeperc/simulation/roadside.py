@@ -197,11 +197,13 @@ def _add_furniture(street: Street, x: float, y: float, yaw: float, place: str) -
 def _add_tree(street: Street, x: float, y: float, clear_m: float = 0.0) -> bool:
     """Place a tree, if its ground is free. Its foliage starts above ``clear_m``."""
     rng = street.rng
-    height, radius, spread = float(rng.uniform(4, 13)), float(rng.uniform(0.07, 0.3)), float(rng.uniform(1.2, 3.4))
+    height, radius, spread = float(rng.uniform(4, 13)), float(rng.uniform(0.07, 0.36)), float(rng.uniform(1.2, 3.4))
     bole = max(clear_m, float(rng.uniform(1.2, 3.2)))
     height = max(height, bole + 1.5)
     wood = float(rng.uniform(0.2, 0.42))
     rows = [rod(wood, (0, 0, -0.3), (rng.normal(0, 0.12), rng.normal(0, 0.12), bole + 1), radius)]
+    if rng.random() < 0.5:  # coarse bark: returns scatter by some centimeters
+        rows[0] = (*rows[0][:1], LEAVES, wood, float(rng.uniform(8.0, 25.0)), *rows[0][4:])
     kind = rng.random()
     if kind < 0.12 and clear_m == 0.0:  # a conifer
         for level in np.linspace(0.6, height, 6).tolist():
@@ -372,7 +374,7 @@ def add_roadside(street: Street, place: str) -> None:
                     s += float(rng.uniform(5.0, 15.0))
             _add_street_trees(street, k, side, pavement, low, high, 0.0 if open_land else green)
             near, far = max(low, -60.0), min(high, 75.0)
-            for _ in range(int(rng.poisson(12 if not open_land else 5))):
+            for _ in range(int(rng.poisson(11 if not open_land else 5))):
                 u = side * (edge + float(rng.uniform(0.35, max(pavement, 1.0))))
                 x, y, yaw = street.on_strip(float(rng.uniform(near, far)), u, k)
                 _add_furniture(street, x, y, yaw + (0.0 if side < 0 else math.pi), place)
@@ -383,7 +385,7 @@ def add_roadside(street: Street, place: str) -> None:
                 _add_tree(street, x, y)
             for _ in range(int(rng.poisson(30 * green))):
                 away = pavement * float(rng.uniform(0.7, 1.0)) + abs(float(rng.normal(0.0, 4.0)))
-                size = float(rng.uniform(0.25, 0.9) if rng.random() < 0.5 else rng.uniform(0.9, 3.2))
+                size = float(rng.uniform(0.25, 0.9) if rng.random() < 0.6 else rng.uniform(0.9, 3.2))
                 x, y, _ = street.on_strip(float(rng.uniform(near, far)), side * (edge + away + 0.5), k)
                 _add_bush(street, x, y, size)
     _add_retaining_walls(street, pavement)

@@ -58,7 +58,7 @@ def simulated_scan(
     else:
         scene, x, y, yaw = scene_from_boxes(boxes, seed), 0.0, 0.0, 0.0
     # Measured: the road is pitched by 0.4 and rolled by 0.75 degrees (medians) against the sensor.
-    pitch, roll = float(rng.normal(0.0, 0.006)), float(rng.normal(0.0, 0.01))
+    pitch, roll = float(rng.normal(0.0, 0.006)), float(rng.normal(0.0, 0.013))
     pose = sensor_pose(scene, sensor, x, y, yaw=yaw, pitch=pitch, roll=roll)
     if mounting is not None:
         pose[:3, :3] = pose[:3, :3] @ mounting.rotation()
