@@ -378,7 +378,8 @@ def test_the_description_in_the_documentation() -> None:
     layout = ScanLayout.from_json(block)
     assert layout.sensor.mounting == Mounting(1.9)
     assert layout.boxes["forklift"] == layout.points["forklift"] == "forklift"
-    entries = re.findall(r"^\| (`.*?) \|", page, flags=re.MULTILINE)
+    table = page.partition("| entry |")[2].partition("\n\n")[0]
+    entries = re.findall(r"^\| (`.*?) \|", table, flags=re.MULTILINE)
     named = {name for entry in entries for name in re.findall(r"`(\w+)`", entry)}
     assert named | {"name", "about"} == _KEYS
 
