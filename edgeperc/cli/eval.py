@@ -48,7 +48,7 @@ def add_parser(commands: Commands) -> None:
         metavar="DATASET",
         help="the root of a KITTI object set or of SemanticKITTI, simulation:N for N simulated scans (simulation "
         "alone: 24), or labeled scans of any sensor: a folder with scans.json, or FOLDER:LAYOUT with the name of a "
-        "public set (pandaset, av2, vod, ddad, lyft)",
+        "public set (pandaset, av2, vod, ddad, lyft, semantickitti)",
     )
     reading.add_argument(
         "--split",
