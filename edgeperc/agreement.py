@@ -51,7 +51,6 @@ MIN_VEHICLE_SHARE = 0.6
 # Of clusters larger than vehicles; trucks with trailers are kept if nearly all of their points are labeled.
 MIN_LARGE_SHARE = 0.75
 MAX_LENGTH_M, MAX_TOP_M = 10.0, 4.0
-MIN_SUPPORTED_SHARE = 0.4  # if a box of the top view confirms the points
 MIN_PERSON_SHARE = 0.1  # persons stand near walls and cars: a larger share loses people
 MIN_VEHICLE_TOP_M, MIN_PERSON_TOP_M = 0.5, 1.0
 # A cluster is completed if this share of its points is labeled, and if it is not too large for a group of persons.
@@ -118,8 +117,8 @@ def agree_on_points(
     -----
     First, a person's point becomes background if the points within about 0.3 m around go on to above 2.0 m (cyclist:
     2.2 m) without a gap of more than 0.3 m. Each cluster then votes, by the shares of its points in view. It loses its
-    vehicle labels if less than 0.6 of its points have them (0.75 if it is longer than 10 m or higher than 4 m; 0.4 for
-    points in a box with a score of 0.3), or if it is lower than 0.5 m. It loses its person labels below a share of 0.1
+    vehicle labels if less than 0.6 of its points have them (0.75 if it is longer than 10 m or higher than 4 m), or if
+    it is lower than 0.5 m; labels in a box with a score of 0.3 stay. It loses its person labels below a share of 0.1
     or a height of 1.0 m. A share of 0.6 gives the class to all of its points in view; persons are cyclists if a quarter
     of them is labeled so. A box with a score of 0.5 makes the points above the ground in it vehicle points, except
     persons. Last, points on the ground keep a label only in cells of 0.2 m in which an object of their kind stands.
@@ -139,10 +138,10 @@ def agree_on_points(
     counts = np.empty((n, len(labels.classes) + 1), np.int32)
     bounds = np.empty((n, 5), np.float32)
     fill_tallies(rows, height, in_view, read_only(agreed, np.uint8), of, counts, bounds)
-    verdicts, shares = _verdicts(labels.classes, counts, bounds, rules)
+    verdicts = _verdicts(labels.classes, counts, bounds, rules)
     support = boxes if "support" in rules else ()
     scores, names = _supported(points, ground, support, labels.classes)
-    apply_verdicts(in_view, of, verdicts, shares, roles, scores, names, agreed)
+    apply_verdicts(in_view, of, verdicts, roles, scores, names, agreed)
     if "ground" in rules:
         clear_ground(rows, on_ground, roles, agreed)
     return PointLabels(agreed, labels.in_view, labels.classes)
@@ -333,8 +332,8 @@ def _supported(
 
 def _verdicts(
     classes: Sequence[str], counts: NDArray[np.int32], bounds: NDArray[np.float32], rules: Collection[str]
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """What becomes of each label in each cluster, (k, classes), and the share of vehicle points, (k,)."""
+) -> NDArray[np.uint8]:
+    """What becomes of each label in each cluster, (k, classes)."""
     roles = _roles(classes)
     vehicles, persons = np.flatnonzero(roles == _VEHICLE), np.flatnonzero(roles == _PERSON)
     seen = np.maximum(counts[:, -1], 1)
@@ -369,8 +368,7 @@ def _verdicts(
                     is_whole = counts[:, all_k] >= MIN_OF_WHOLE * (counts[:, k] + counts[:, all_k])
                     most = np.where(is_whole, all_k, most).astype(np.uint8)
             verdicts[np.ix_(filled, np.array([0, *persons]))] = most[filled, None]
-    too_low = (top < MIN_VEHICLE_TOP_M) & ("height" in rules)
-    return verdicts, np.where(too_low, 0.0, vehicle_share).astype(np.float32)
+    return verdicts
 
 
 @njit(cache=True, nogil=True)
@@ -525,7 +523,6 @@ def apply_verdicts(
     in_view: NDArray[np.bool_],
     clusters: NDArray[np.int32],
     verdicts: NDArray[np.uint8],
-    shares: NDArray[np.float32],
     roles: NDArray[np.uint8],
     scores: NDArray[np.float32],
     names: NDArray[np.uint8],
@@ -539,8 +536,6 @@ def apply_verdicts(
     clusters : (n,) int32
     verdicts : (k, classes) uint8
         New label by cluster and label.
-    shares : (k,) float32
-        Share of vehicle points in each cluster.
     roles : (classes,) uint8
         1 for vehicles, 2 for persons, 0 for others.
     scores, names : (n,) float32, (n,) uint8
@@ -554,8 +549,7 @@ def apply_verdicts(
         new = old
         if k >= 0:
             new = verdicts[k, old]
-            is_supported = scores[i] >= SUPPORTING_SCORE and shares[k] >= MIN_SUPPORTED_SHARE
-            if roles[old] == _VEHICLE and roles[new] == 0 and is_supported:
+            if roles[old] == _VEHICLE and roles[new] == 0 and scores[i] >= SUPPORTING_SCORE:
                 new = old
         if scores[i] >= COMPLETING_SCORE and (new == 0 or roles[new] == _VEHICLE):
             new = names[i]

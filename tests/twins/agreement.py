@@ -78,13 +78,13 @@ def inside_counts(points, height, on_ground, in_view, labels, roles, boxes):
     return np.array(rows, np.int64).reshape(-1, 3)
 
 
-def verdicts(in_view, clusters, table, shares, roles, scores, names, labels):
+def verdicts(in_view, clusters, table, roles, scores, names, labels):
     """Twin of `edgeperc.agreement.apply_verdicts`."""
     agreed = labels.copy()
     for i in np.flatnonzero(in_view):
         old, k = labels[i], clusters[i]
         new = old if k < 0 else table[k, old]
-        if k >= 0 and roles[old] == 1 and roles[new] == 0 and scores[i] >= 0.3 and shares[k] >= 0.4:
+        if k >= 0 and roles[old] == 1 and roles[new] == 0 and scores[i] >= 0.3:
             new = old
         if scores[i] >= 0.5 and (new == 0 or roles[new] == 1):
             new = names[i]
