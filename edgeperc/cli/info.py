@@ -247,6 +247,7 @@ def _scan_rows(
     from ..frame import ModelFrame
     from ..level import FROZEN_AFTER, MountingEstimator
     from ..readers.captures import read_scans
+    from ..remission import RemissionMatcher
     from ..sensor import get_sensor
     from ..zoo import listed
 
@@ -294,9 +295,14 @@ def _scan_rows(
         ("elevation", "{:.1f} .. {:.1f} deg (99 % of the points)".format(*measured["elevation_deg"])),
         ("remission", "min {:g}, 5 % {:g}, median {:g}, 95 % {:g}, max {:g}".format(*measured["remission"])),
     ]
-    if sensor.remission is not None:
-        rows.append(("", f"mapped to that of the {sensor.remission.to} by a {sensor.remission.kind}"))
-    conditioned = [condition(each, sensor)[0] for each in first]
+    matcher, used, said = RemissionMatcher(sensor), sensor, list[str]()
+    for each in first:
+        matcher, used, more = matcher.add(each)
+        said += more
+    if used.remission is not None:
+        how = "" if used is sensor else f", {used.remission.source}"
+        rows.append(("", f"mapped to that of the {used.remission.to} by a {used.remission.kind}{how}"))
+    conditioned = [condition(each, used)[0] for each in first]
     own, reason = _estimated(MountingEstimator(sensor.mounting), conditioned)
     estimators[sensor] = _estimated(estimators[sensor], conditioned)[0] if sensor in estimators else own
     try:
@@ -316,7 +322,7 @@ def _scan_rows(
             findings[card.name] = None
             rows.append((card.name, "its card does not describe its training scans"))
             continue
-        found = check_fitness(scan, FitnessProfile.from_dict(card.fitness), sensor)
+        found = (*check_fitness(scan, FitnessProfile.from_dict(card.fitness), used), *said)
         findings[card.name] = list(found)
         rows += [(card.name, f"as a scan of {sensor.name}: {sentence}") for sentence in found]
         if not found:
