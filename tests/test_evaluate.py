@@ -315,7 +315,8 @@ def counted(objects: list[tuple[list[float], int, int]], boxes: tuple[Box, ...] 
     tallies = count_causes(points, labels, right, right != IGNORE, seen, boxes, "a")
     result = figures([Record("", "a", tallies)], 0)
     return {**{what: {c: row["n_points"] for c, row in rows.items()} for what, rows in result["errors"].items()}} | {
-        "bumper": result["bumper"]["n_points"],
+        "bumper": result["bumper"]["all"]["n_points"],
+        "bumper_ground": result["bumper"]["on the ground"]["n_points"],
         "rows": result["errors"],
     }
 
@@ -372,8 +373,10 @@ def test_causes_of_false_points_by_hand() -> None:
 
 
 def test_points_at_the_bumper_by_hand() -> None:
-    at = [3.0, 1.0, -1.6]
-    assert counted([(at, 1, 0), (at, 1, IGNORE), ([-3.0, 2.9, -1.6], 1, IGNORE)])["bumper"] == 3
+    at = [3.0, 1.0, -1.65]
+    wheel = [3.0, 1.0, -1.52]  # 0.21 m above the ground
+    found = counted([(at, 1, 0), (at, 1, IGNORE), ([-3.0, 2.9, -1.65], 1, IGNORE), (wheel, 1, IGNORE)])
+    assert (found["bumper"], found["bumper_ground"]) == (4, 3)
     beyond = [[4.6, 1.0, -1.6], [3.0, 3.1, -1.6], [3.0, -3.1, -1.6], [3.0, 1.0, -1.4]]
     assert counted([(place, 1, 0) for place in beyond])["bumper"] == 0
     assert counted([(at, 2, 0), (at, 0, 0), (at, 1, 1), (at, 1, 3)])["bumper"] == 0  # no car; an object
@@ -382,7 +385,8 @@ def test_points_at_the_bumper_by_hand() -> None:
 def test_bumper_has_an_interval_of_points(world: World) -> None:
     at = [3.0, 1.0, -1.6, 1.0]
     result = evaluated(Judge(["pointseg"]), frame(points=[at] * 4), frame(points=[[9.0, 0, 0, 0]], drive="b"))
-    assert result["bumper"] == {"n_points": 4, "n_scans": 1, "n_drives": 1, "n_points_interval": [0, 8]}
+    assert result["bumper"]["all"] == {"n_points": 4, "n_scans": 1, "n_drives": 1, "n_points_interval": [0, 8]}
+    assert set(result["bumper"]) == {"all", "on the ground"}
     assert ["car", "at", "the", "own", "bumper", "all", "-", "-", "4", "0-8", "-", "1", "-", "1"] in [
         line.split() for line in eval._error_lines(result)
     ]
@@ -394,7 +398,7 @@ def test_causes_of_a_scan_without_ground(n: int) -> None:
     nothing = np.zeros(n, np.uint8)
     tallies = count_causes(points, nothing, nothing, nothing > 0, nothing > 0, (), "a")
     result = figures([Record("", "a", tallies)], 0)
-    assert result["bumper"]["n_points"] == 0
+    assert result["bumper"]["all"]["n_points"] == result["bumper"]["on the ground"]["n_points"] == 0
     assert all(
         row["n_points"] == 0 and row["share"] is None for rows in result["errors"].values() for row in rows.values()
     )

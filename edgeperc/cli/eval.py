@@ -245,8 +245,7 @@ def _error_lines(of_block: Mapping[str, Any]) -> list[str]:
         for cause, row in causes.items()
         if causes["all"]["n_points"]
     ]
-    if "bumper" in of_block:
-        rows.append((("car at the own bumper", "all"), of_block["bumper"]))
+    rows += [(("car at the own bumper", cause), row) for cause, row in of_block.get("bumper", {}).items()]
     return table_lines(
         "errors: wrong points by cause; a cause is a share of its error, and a point may have several",
         _ERROR_COLUMNS,

@@ -17,7 +17,7 @@ from ..perception import Box
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
 from .metrics import object_key
 
-__all__ = ["BUMPER", "CAUSES", "count_causes"]
+__all__ = ["BUMPER", "CAUSES", "FLOOR", "count_causes"]
 
 BUMPER = "car at the own bumper"
 OTHER, VANS, FAR = "of other objects", "in vans and trucks", "beyond 30 m"
@@ -73,10 +73,12 @@ def count_causes(
         are false. ``("errors", "scans")``: 1 by (error, cause, drive) with points. ``("errors", "objects")``: 1 by
         (error, cause, `object_key`) with missed points.
         The error `BUMPER` has all points in view that are labeled car at the bumper of the own vehicle, except those
-        of true objects.
+        of true objects. Where the truth is unknown, there may be a car beside the own one; the cause `FLOOR` counts the
+        points on the ground alone.
     """
     scan = _Scan(points, boxes)
-    chosen = {(BUMPER, "all"): scan.at_bumper & in_view & (labels == 1) & ~((right > 0) & (right < len(POINT_CLASSES)))}
+    at_bumper = scan.at_bumper & in_view & (labels == 1) & ~((right > 0) & (right < len(POINT_CLASSES)))
+    chosen = {(BUMPER, "all"): at_bumper, (BUMPER, FLOOR): at_bumper & scan.ground.mask}
     for number, name in enumerate(POINT_CLASSES[1:], start=1):
         true, predicted = known & (right == number), known & (labels == number)
         missed, false = true & ~predicted, predicted & ~true

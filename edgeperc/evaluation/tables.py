@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .causes import BUMPER, CAUSES
+from .causes import BUMPER, CAUSES, FLOOR
 from .metrics import BoxEvaluator, BoxScores, Confusion, ObjectKey, ProbabilitySweep, mean
 
 __all__ = ["ALL_ROUND", "BANDS", "FEWEST_OBJECTS", "VEHICLES", "Record", "banded", "figures", "within"]
@@ -122,7 +122,8 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
           known, detected or not. ``"heading"``: of those that were matched, whose heading is right within 45 degrees.
         - ``"errors"``: by error and cause (`causes.CAUSES`). ``"all"`` is a share of the true (missed) or predicted
           (false) points of the class, a cause a share of the error; ``"n_of"`` is the whole.
-        - ``"bumper"``: points at the own bumper that are labeled car.
+        - ``"bumper"``: points at the own bumper that are labeled car: all, and those on the ground. Where the truth is
+          unknown they may be of a real car beside the own one.
         - ``"segmentation"``: by table and band. ``"road"``: by band.
     """
     by_drive: dict[str, list[Tallies]] = {}
@@ -178,7 +179,7 @@ def _figures(tallies: Tallies) -> dict[str, Any]:
         elif key == ("errors", "points"):
             scans, objects = tallies["errors", "scans"], tallies["errors", "objects"]
             found["errors"] = {error: _error_rows(error, tally, scans, objects) for error in CAUSES}
-            found["bumper"] = _error_row(BUMPER, "all", tally, scans)
+            found["bumper"] = {cause: _error_row(BUMPER, cause, tally, scans) for cause in ("all", FLOOR)}
         elif group == "segmentation":
             found.setdefault(group, {}).setdefault(key[1], {})[band] = _map_row(tally)
         elif group == "road":
@@ -319,10 +320,10 @@ def _add_intervals(
         elif count and isinstance(value, float):
             values = [each.get(key, math.nan) for each in samples]
             whole[f"{key}_interval"] = _interval([each.get(count, 0) for each in drives], values, times)
-        if key == "bumper":
-            n_points = [each.get("n_points", 0) for each in of_samples]
+        for cause in value if key == "bumper" else ():
+            n_points = [each[cause]["n_points"] if each else 0 for each in of_samples]
             bounds = _interval([1] * len(drives), n_points, times)
-            whole[key]["n_points_interval"] = bounds and [round(bound) for bound in bounds]
+            value[cause]["n_points_interval"] = bounds and [round(bound) for bound in bounds]
     for mean_of in ("mean_iou", "mean_ap"):
         # Means over different classes are not comparable, so only drives and resamples with all classes count.
         meant = [name for name, (value, _) in _parts(whole, mean_of).items() if not math.isnan(value)]
