@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numba
 import numpy as np
 import pytest
 
 from edgeperc import TrackingError, cli
 from edgeperc.evaluation.datasets import scan_hash
-from edgeperc.evaluation.tracking import evaluate_kitti, read_sequence, sequence_names, sequence_scans, track_sequence
+from edgeperc.evaluation.tracking import (
+    RULES,
+    evaluate_kitti,
+    read_sequence,
+    sequence_names,
+    sequence_scans,
+    track_sequence,
+)
 from edgeperc.sensor import get_sensor
 from edgeperc_bench.peers.tracking import every_second_beam
 
@@ -74,6 +84,83 @@ def test_kitti_is_evaluated_by_its_rules(kitti: Path) -> None:
     assert (seen, figures["sequences"]) == ([(1, 1)], ["0000"])
 
 
+def test_the_rules_decide_which_box_is_small_and_who_sits(kitti: Path) -> None:
+    """A false car whose detection is 20 pixels high in the image, although its box is higher; a person who sits."""
+    detections = kitti / "detections/pointrcnn_Car/0000.txt"
+    small = [f"{k},2,500,100,550,120,4.0,1.5,1.8,4.2,-9.0,1.7,30.0,-1.57,0.0" for k in range(20)]
+    detections.write_text(detections.read_text() + "\n" + "\n".join(small))
+    sitting = [f"{k} 3 Person 0 0 0.0 100 100 300 200 1.2 0.6 0.8 10.0 1.7 14.0 0.0" for k in range(20)]
+    labels = kitti / "label_02/0000.txt"
+    labels.write_text(labels.read_text() + "\n".join(sitting) + "\n")
+    person = [f"{k},1,900,100,950,200,3.0,1.2,0.6,0.8,10.0,1.7,14.0,0.0,0.0" for k in range(20)]
+    pedestrians = kitti / "detections/pointrcnn_Pedestrian/0000.txt"
+    pedestrians.write_text(pedestrians.read_text() + "\n" + "\n".join(person))
+    n_false = {}
+    for rules in RULES:
+        figures = evaluate_kitti(kitti, rules=rules, rival=True)
+        assert figures["rules"] == rules
+        n_false[rules] = [
+            figures[method][of]["all_tracks"]["n_false"]
+            for method in ("classes", "rival")
+            for of in ("car", "pedestrian")
+        ]
+    # Cars and pedestrians of each method. The pedestrian in DontCare has half of its detection's rectangle in it, and
+    # more of its box.
+    assert n_false["edgeperc"] == [20, 0, 20, 0]
+    assert n_false["ab3dmot"] == [0, 40, 0, 40]
+    with pytest.raises(TrackingError, match="rules 'kitti'"):
+        evaluate_kitti(kitti, rules="kitti")
+
+
+def test_headings_and_the_rival_are_printed(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["eval-tracking", str(kitti), "--rules", "ab3dmot", "--rival", "ab3dmot"]) == 0
+    text = capsys.readouterr().out
+    assert "rules ab3dmot" in text
+    assert text.count("AB3DMOT's method") == 3
+    assert "headings within a quarter turn" in text
+    rows = [line.split() for line in text.splitlines()]
+    (moving,) = [row for row in rows if row[:2] == ["moving", "car"]]
+    assert moving[2:4] == ["20", "1"]
+    assert int(moving[4]) > 15
+    assert moving[5:] == ["100.0", "100.0"]
+
+
+COUNT = """
+import sys, time
+from importlib import import_module
+from pathlib import Path
+
+names = ("tracking.egomotion", "tracking.imm", "tracking.jpda", "tracking.lives", "tracking.ukf")
+modules = [import_module(f"edgeperc.{name}") for name in names]
+kernels = [kernel for module in modules for kernel in vars(module).values() if hasattr(kernel, "signatures")]
+clock, counted = time.perf_counter, []
+
+def stop():
+    counted.append(sum(len(kernel.signatures) for kernel in kernels))
+    return clock()
+
+if sys.argv[1] == "bench":
+    from edgeperc_bench.peers import tracking
+    run = lambda: tracking.time_tracker([tracking.drawn_street(30)])
+else:
+    from edgeperc.evaluation import tracking
+    run = lambda: tracking.evaluate_kitti(Path(sys.argv[1]), rival=True)
+time.perf_counter = stop
+run()
+assert len(kernels) > 20 and len(counted) == 2, (len(kernels), counted)
+print(*counted)
+"""
+
+
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled with the JIT off")
+@pytest.mark.parametrize("what", ["eval-tracking", "bench"])
+def test_nothing_is_compiled_while_the_clock_runs(kitti: Path, what: str) -> None:
+    """A new process counts the compiled kernels when the clock starts, and when it stops."""
+    command = [sys.executable, "-c", COUNT, "bench" if what == "bench" else str(kitti)]
+    before, after = map(int, subprocess.run(command, check=True, capture_output=True, text=True).stdout.split())
+    assert after == before > 10
+
+
 def test_kitti_errors(kitti: Path, tmp_path: Path) -> None:
     with pytest.raises(TrackingError, match="no label_02"):
         evaluate_kitti(tmp_path / "elsewhere")
@@ -89,7 +176,7 @@ def test_eval_tracking_prints_the_tables(kitti: Path, capsys: pytest.CaptureFixt
     arguments = ["eval-tracking", str(kitti), "--json", str(kitti / "out/figures.json")]
     assert cli.main(arguments) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("1 sequence, given detections, 3-D IoU 0.25;")
+    assert lines[0].startswith("1 sequence, given detections, 3-D IoU 0.25, rules edgeperc;")
     words = [line.split() for line in lines]
     assert ["car", "100.0"] in [line[:1] + line[4:5] for line in words if len(line) > 8]
     assert any(line[:7] == ["sAMOTA", "AMOTA", "AMOTP", "MOTA", "MOTP", "HOTA", "DetA"] for line in words)
@@ -225,6 +312,15 @@ def test_real_sequences_are_tracked_well(data_root) -> None:
     assert figures["best"]["mota"] > 0.85
     assert figures["best"]["n_switches"] == 0
     assert figures["hota"]["hota"] > 0.6
+
+
+def test_real_vehicles_that_move_point_to_where_they_drive(data_root) -> None:
+    """Motion alone: PointRCNN's boxes do not say that they know the front."""
+    figures = evaluate_kitti(data_root("tracking"), sequences=["0011"], classes=["car"])["headings"]["car"]
+    moving = figures["moving"]
+    assert moving["n_boxes"] > 500
+    assert moving["n_resolved"] > 0.9 * moving["n_boxes"]
+    assert moving["n_right"] > 0.95 * moving["n_resolved"]
 
 
 # --- pictures and the command line -----------------------------------------------------------------------------------

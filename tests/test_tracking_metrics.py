@@ -16,6 +16,7 @@ from edgeperc import TrackingError
 from edgeperc.evaluation.tracking_metrics import (
     FrameTracks,
     FrameTruth,
+    TrackingScores,
     box_iou,
     count_breaks,
     evaluate_tracks,
@@ -106,13 +107,14 @@ def test_matches_are_as_many_as_can_be() -> None:
 def test_breaks_are_counted_as_the_twin_does(frames: list[tuple[int, int, bool]]) -> None:
     truth, ids = (np.array([frame[k] for frame in frames], np.int64) for k in (0, 1))
     ignored = np.array([frame[2] for frame in frames], bool)
-    assert count_breaks(truth, ids, ignored) == twins.tracking.breaks(truth, ids, ignored)
+    for late in (False, True):
+        assert count_breaks(truth, ids, ignored, late) == twins.tracking.breaks(truth, ids, ignored, late)
 
 
 def test_breaks_by_hand() -> None:
-    def count(ids: list[int], ignored: tuple[int, ...] = ()) -> tuple[int, int]:
+    def count(ids: list[int], ignored: tuple[int, ...] = (), late: bool = False) -> tuple[int, int]:
         hidden = np.isin(np.arange(len(ids)), ignored)
-        return count_breaks(np.zeros(len(ids), np.int64), np.array(ids), hidden)
+        return count_breaks(np.zeros(len(ids), np.int64), np.array(ids), hidden, late)
 
     assert count([1, 1, 1, 1]) == (0, 0)
     assert count([1, 1, 2, 2]) == (1, 1)
@@ -120,6 +122,10 @@ def test_breaks_by_hand() -> None:
     assert count([1, 1, -1, 2, 2]) == (0, 1)
     assert count([1, 1, -1, -1]) == (0, 0)
     assert count([1, 1, 2, 2], ignored=(1,)) == (0, 0)  # an ignored box makes a new beginning
+    assert count([-1, -1, 1]) == (0, 0)
+    assert count([-1, -1, 1], late=True) == (0, 1)  # first found in the last frame
+    assert count([-1, 1, 1], late=True) == (0, 0)
+    assert count([1, 1, 2], late=True) == count([1, 1, 2]) == (1, 1)
 
 
 @settings(max_examples=100, deadline=None)
@@ -180,11 +186,52 @@ def test_nothing_at_all_has_no_marks() -> None:
     scores = evaluate_tracks([empty])
     assert math.isnan(scores.best.mota)
     assert math.isnan(scores.hota.hota)
-    assert scores.samota == 0.0
+    assert np.isnan([scores.samota, scores.amota, scores.amotp]).all()
+    ignored = [truth_of((1, 0.0), ignored=(1,))] * 9, [tracks_of((5, 0.0))] * 9
+    for as_ab3dmot in (False, True):
+        scores = evaluate_tracks([ignored], as_ab3dmot=as_ab3dmot)  # matches, but nothing to find
+        assert np.isnan([scores.samota, scores.amota, scores.amotp, scores.best.mota]).all()
     missed = evaluate_tracks([([truth_of((1, 0.0))] * 3, [tracks_of()] * 3)])
     assert (missed.best.mota, missed.best.n_missed, missed.hota.hota) == (0.0, 3, 0.0)
     with pytest.raises(TrackingError, match="got 2 frames"):
         evaluate_tracks([([truth_of()] * 3, [tracks_of()] * 2)])
+
+
+def test_ab3dmots_program_loses_a_track_at_its_own_threshold() -> None:
+    """Ten times 0.3 is less than 3 in float64, and ten times the mean of that is less than it again."""
+    mean = sum([0.3] * 10) / 10
+    assert sum([mean] * 10) / 10 < mean < 0.3
+    truth = [truth_of((1, 0.0))] * 10
+
+    def evaluated(score: float, as_ab3dmot: bool) -> TrackingScores:
+        return evaluate_tracks([(truth, [tracks_of((5, 0.0), score=score)] * 10)], as_ab3dmot=as_ab3dmot)
+
+    # Ten matches make nine thresholds after recall 0, and all boxes are found at each.
+    assert evaluated(0.3, False).samota == pytest.approx(9 / 40)
+    assert evaluated(0.5, True).samota == pytest.approx(9 / 40)  # sums of 0.5 are exact
+    lost = evaluated(0.3, True)
+    assert (lost.samota, lost.amota, lost.amotp) == (0.0, 0.0, 0.0)
+    assert lost.best.mota == 1.0  # no threshold is better than all tracks
+    assert evaluated(0.3000001, True).samota == lost.samota  # six digits of each score
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.booleans())
+def test_any_tracks_have_finite_figures_or_none(seed: int, as_ab3dmot: bool) -> None:
+    rng = np.random.default_rng(seed)
+    truth, tracks = [], []
+    for _ in range(int(rng.integers(1, 12))):
+        there = [(j, 9.0 * j) for j in range(int(rng.integers(0, 4)))]
+        found = [(j, 9.0 * j + rng.normal(0.0, 2.0)) for j in range(int(rng.integers(0, 4)))]
+        truth.append(truth_of(*there, ignored=(2,)))
+        tracks.append(tracks_of(*found, score=float(rng.normal()), excused=(1,)))
+    scores = evaluate_tracks([(truth, tracks)], as_ab3dmot=as_ab3dmot)
+    averages = [scores.samota, scores.amota, scores.amotp]
+    assert np.isfinite(averages).all() if scores.all_tracks.n_truth else np.isnan(averages).all()
+    if scores.all_tracks.n_truth:
+        assert 0.0 <= scores.samota <= 1.0
+        assert scores.best.n_missed >= scores.all_tracks.n_missed
+        assert scores.amota <= max(scores.best.mota, 0.0) + 1e-9  # recalls that are not reached count as 0
 
 
 def test_clear_agrees_with_motmetrics() -> None:

@@ -195,7 +195,9 @@ _HEADING_COLUMNS = (
 
 
 def _tracking_lines(figures: Mapping[str, Any]) -> list[str]:
-    methods = {"": figures["classes"], "AB3DMOT's method": figures.get("rival", {})}
+    methods = {"": figures["classes"]}
+    if "rival" in figures:
+        methods = {"edgeperc": figures["classes"], "AB3DMOT's method": figures["rival"]}
     every = [((method, name), of) for method, by in methods.items() for name, of in by.items()]
     rows = [(name, without_nan({**of, **of["best"], **of["hota"]})) for name, of in every]
     headings = [

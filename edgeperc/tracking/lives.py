@@ -43,6 +43,7 @@ TRACK = np.dtype(
         ("source", np.int64),
         ("score", np.float64),
         ("logit_sum", np.float64),
+        ("last_logit", np.float64),
         ("chances", np.float64),
         ("age_s", np.float64),
         ("missed_s", np.float64),
@@ -72,6 +73,7 @@ CLASS = np.dtype(
                 "birth_logit",
                 "sure_logit",
                 "moving_mps",
+                "latest",
                 "far_logit",
                 "coasting_logit",
             )
@@ -142,7 +144,7 @@ def fill_newborn(
         track["id"], track["label"], track["group"] = first_id + i, kinds[i], of["group"]
         track["hits"], track["chances"], track["label_weight"], track["source"] = 1, 1.0, 1.0, sources[i]
         track["fronts"][1], track["fronts"][2] = min(max(told[i], -TOLD), TOLD), 1.0
-        track["logit_sum"] = logits[i]
+        track["logit_sum"] = track["last_logit"] = logits[i]
         track["existence"] = min(logits[i] - of["sure_logit"], MOST_EXISTENCE)
         for a in range(4):
             track["shape"][a] = shapes[i, a]
@@ -406,6 +408,7 @@ def update_lives(
         track["hits"] += 1
         track["chances"] += 1.0
         track["logit_sum"] += logits[best]
+        track["last_logit"] = logits[best]
         # Boyer-Moore majority vote: other labels count down, and replace the label below 0.
         weight = track["label_weight"] + (1.0 if track["label"] == kinds[best] else -1.0)
         if weight < 0.0:

@@ -49,7 +49,7 @@ MAX_LANDMARKS = 48
 # Fields that ClassParameters and CLASS have in common.
 _SCALARS = (
     *("still_mps", "keep_motion_s", "range_m", "detection", "gate", "memory_s"),
-    *("moving_mps", "far_logit", "coasting_logit"),
+    *("moving_mps", "latest", "far_logit", "coasting_logit"),
 )
 
 # Beyond these limits squares and differences of numbers lose their meaning, or overflow.
@@ -282,7 +282,8 @@ class Tracker:
         tracks = self._living(tracks)
         of, strength = self._classes[tracks["label"]], strength_of(tracks)
         away = np.hypot(tracks["state"][:, 0] - pose[0, 3], tracks["state"][:, 1] - pose[1, 3]) / of["range_m"]
-        tracks["score"] = strength + of["far_logit"] * away - of["coasting_logit"] * tracks["misses"]
+        tracks["score"] = strength + of["latest"] * (tracks["last_logit"] - strength)
+        tracks["score"] += of["far_logit"] * away - of["coasting_logit"] * tracks["misses"]
 
         self._posed, self._stamp_s, self._tracks, self._T_world_sensor = posed, stamp_s, tracks, pose
         self._next_id += len(own)

@@ -247,6 +247,7 @@ def lives(tracks, classes, beta, hidden, logits, kinds, dt, most_hidden, expecte
     tracks["misses"] = np.where(hit, 0, tracks["misses"] + 1)
     tracks["missed_s"] = np.where(hit, 0, tracks["missed_s"] + dt)
     tracks["logit_sum"][hit] += logits[best]
+    tracks["last_logit"][hit] = logits[best]
     tracks["source"] = -1
     tracks["source"][hit] = best
     weight = tracks["label_weight"][hit] + np.where(tracks["label"][hit] == kinds[best], 1, -1)
@@ -276,7 +277,7 @@ def newborn(first_id, kinds, classes, detections, shapes, logits, told, sources,
         track["modes"] = 1 / 3
         track["state"], track["covariance"] = combination(track["states"], track["covariances"], track["modes"])
         track["shape"], track["shape_variance"] = shape, (of["shape"] * farther) ** 2
-        track["logit_sum"], track["chances"], track["hits"] = logit, 1, 1
+        track["logit_sum"], track["last_logit"], track["chances"], track["hits"] = logit, logit, 1, 1
         track["existence"] = min(logit - of["sure_logit"], most)
     tracks["id"], tracks["source"] = first_id + np.arange(len(tracks)), sources
     return tracks
