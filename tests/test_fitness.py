@@ -136,7 +136,7 @@ def test_a_room() -> None:
         (lambda p: p + np.float32([0, 0, 1.73, 0]), "another height"),
         (lambda p: p - np.float32([0, 0, 3.0, 0]), "another height"),
         (lambda p: np.full((5, 4), np.nan, np.float32), "no finite point"),
-        (lambda p: rows_of(p, 4), "about 4 rows"),
+        (lambda p: rows_of(p, 4), "rows of points"),
     ],
 )
 def test_other_gross_differences(change: Callable[[Points], Points], sentence: str) -> None:

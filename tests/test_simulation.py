@@ -21,6 +21,7 @@ from edgeperc.simulation import raycast
 from edgeperc.simulation.drawn import ENVIRONMENTS, random_scene
 from edgeperc.simulation.layouts import scene_from_boxes
 from edgeperc.simulation.raycast import BANK_SLOPE_LEFT, FACADE, GLASS, LEAVES, MATTE, PAINT, POROUS, ROUGH, ground_at
+from edgeperc.simulation.samples import IGNORE, labels_by_boxes, simulated_scan
 from edgeperc.simulation.scene import (
     POINT_CLASS_OF,
     TOP_VIEW_CLASSES,
@@ -484,6 +485,85 @@ def test_bays_are_not_drivable() -> None:
     x, y, _ = Street(np.random.default_rng(0), list(scene.strips), scene.terrain).on_strip(15.0, 22.0)
     assert not scene.on_road(x, y)
     assert scene.on_road(5.0, 0.0)
+
+
+def test_islands_are_raised_and_not_drivable() -> None:
+    scene = flat(street())
+    scene.strips[0, :5] = 0.0, 0.0, 1.0, 0.0, 0.0
+    scene.strips[0, 5:9] = -4.0, 8.0, -200.0, 200.0
+    island = (0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 3.0, 10.0, 16.0, -1.0)
+    scene = replace(scene, strips=np.vstack([scene.strips[:1], island]))
+    assert not scene.on_road(13.0, 2.0)
+    assert scene.on_road(13.0, 0.5)
+    assert scene.on_road(20.0, 2.0)
+    assert scene.ground_height(13.0, 2.0) >= 0.08
+    assert scene.ground_height(13.0, 0.5) == pytest.approx(0.0, abs=1e-9)
+    labels = simulate(scene, SMALL, 0, noise=False).top_view_labels()
+    view = TopViewGeometry()
+    x, y = np.broadcast_arrays(*view.cell_centers())
+    on_island = (x > 10.0) & (x < 16.0) & (y > 1.0) & (y < 3.0)
+    assert (labels[on_island] == 0).all()
+    assert (labels[(y > -3.9) & (y < 0.9)] == 1).all()
+
+
+def test_islands_have_poles_and_no_traffic() -> None:
+    scenes = [scene for scene in map(random_scene, range(40)) if (scene.strips[:, 9] < 0.0).any()]
+    assert len(scenes) > 4
+    for scene in scenes:
+        for each in scene.objects:
+            if each.label in ("car", "van", "truck", "tram", "cyclist"):
+                x, y = np.array([each.center[0]]), np.array([each.center[1]])
+                assert twins.simulation.road_places(scene, x, y)[2][0] > 0.0
+
+
+def test_trams_and_trailers_belong_to_no_class() -> None:
+    tram, trailer = box("tram", 20.0, 4.0), Box("misc", 1.0, (12.0, -3.0, -0.83), (3.0, 1.6, 1.8), 0.0)
+    tram = replace(tram, size=(14.0, 2.5, 3.4))
+    scan = simulate(flat(street(tram, trailer, box("person_sitting", 9.0, 1.0))), SMALL, 0)
+    labels, view = labels_by_boxes(scan), scan.top_view_labels()
+    for k in (0, 1):
+        assert scan.box_points[k] > 20
+        assert (scan.labels[scan.objects == k] == 0).all()
+        assert (labels[scan.objects == k] == IGNORE).mean() > 0.95
+    assert (labels[scan.objects == 2] == 2).all()
+    geometry = TopViewGeometry()
+    x, y = np.broadcast_arrays(*geometry.cell_centers())
+    assert (view[(np.abs(x - 20.0) < 6.5) & (np.abs(y - 4.0) < 1.0)] == 0).all()
+
+
+@pytest.mark.parametrize(("height_m", "pitch_deg", "roll_deg"), [(1.4, 3.0, 0.0), (2.2, -3.0, 2.0)])
+def test_scans_of_other_mountings(height_m: float, pitch_deg: float, roll_deg: float) -> None:
+    mounting = Mounting(height_m=height_m, pitch_deg=pitch_deg, roll_deg=roll_deg)
+    upright, scan = simulated_scan(6, SMALL), simulated_scan(6, SMALL, mounting=mounting)
+    turn = upright.T_world_sensor[:3, :3].T @ scan.T_world_sensor[:3, :3]
+    np.testing.assert_allclose(turn, mounting.rotation(), atol=1e-12)
+    assert scan.T_world_sensor[2, 3] - upright.T_world_sensor[2, 3] == pytest.approx(height_m - SMALL.mount_height_m)
+    assert scan.scene.objects == upright.scene.objects
+    world = scan.points[:, :3] @ scan.T_world_sensor[:3, :3].T + scan.T_world_sensor[:3, 3]
+    above = world[:, 2] - twins.simulation.ground(scan.scene, world[:, 0], world[:, 1])[0]
+    assert (np.abs(above) < 0.05).mean() > 0.4  # most returns are from the ground
+
+
+def test_the_own_vehicle_stands_clear_of_objects() -> None:
+    for seed in range(30):
+        scan = simulated_scan(seed, SMALL)
+        for each in scan.boxes:
+            dx, dy = -each.center[0], -each.center[1]
+            cos, sin = math.cos(each.yaw), math.sin(each.yaw)
+            away = max(abs(cos * dx + sin * dy) - each.size[0] / 2, abs(cos * dy - sin * dx) - each.size[1] / 2)
+            assert away > 0.9 or abs(each.center[2]) > 4.0, (seed, each)
+
+
+def test_posts_stand_beside_the_roads() -> None:
+    for seed, environment in enumerate(ENVIRONMENTS * 2):
+        scene = random_scene(100 + seed, environment)
+        static = scene.primitives[scene.primitives[:, 19] < 0]
+        assert np.isfinite(static).all()
+        upright = static[(static[:, 0] == 1) & (np.abs(static[:, 13:15]).sum(axis=1) < 1e-9)]
+        feet = [row[6] - 1.0 / abs(row[15]) - scene.ground_height(*row[4:6]) for row in upright]
+        standing = upright[np.array(feet) < -0.1]
+        assert len(standing) > 3
+        assert not any(scene.on_road(*row[4:6]) for row in standing)
 
 
 def test_rows_of_a_layout_stand_in_bays_where_they_look_parked() -> None:

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "demo_command"]
 
-# A junction with cars, a truck, pedestrians and a cyclist, most of which the models detect. Training scenes have other
+# A junction with cars, a van, pedestrians and a cyclist, most of which the models detect. Training scenes have other
 # seeds.
-DEMO_SCENE = (2_000_000_110, "junction")
+DEMO_SCENE = (2_000_000_218, "junction")
 
 
 def add_parser(commands: Commands) -> None:
