@@ -54,7 +54,7 @@ FLOORS = {
         simulation.__init__
         simulation.samples
         evaluation.__init__ evaluation.metrics evaluation.mistakes evaluation.splits evaluation.tracking_metrics
-        evaluation.causes evaluation.datasets
+        evaluation.ab3dmot evaluation.causes evaluation.datasets evaluation.headings
         evaluation.scan_folder evaluation.tables
         evaluation.unseen evaluation.truth
         evaluation.judge evaluation.tracking evaluation.transfer
