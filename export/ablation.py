@@ -36,6 +36,7 @@ VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "focal loss (gamma 2)": {"focal_gamma": 2.0},
         "classes weighed alike": {"class_weights": False},
         "deep supervision (0.4)": {"deep_supervision": 0.4},
+        "with the height above the ground": {"height_above_ground": True},
         "weights not averaged": {"ema": 0.0},
         "self-training on unlabelled scans": {"teacher": True},
         "distilled from where it starts, mirrored too": {"teacher": True, "distil": 1.0},
@@ -51,6 +52,7 @@ VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "spatial dropout (0.25)": {"dropout": 0.25},
         "batches of eight": {"batch": 8},
         "weights not averaged": {"ema": 0.0},
+        "the front of boxes too": {"front": True},
         "the paper's slots": {"head": "slots"},
     },
     # The settings that the paper of LoDNN-I varies (Electronics 12, 3165, Figure 16).

@@ -227,7 +227,17 @@ KULSEG = Recipe("kulseg", steps=3600, batch=4, focal_gamma=2.0, distil=1.0, seen
 # so few training scans the network does not need it, and it disturbs batch norm.
 SSADNET = Recipe("ssadnet", batch=4, learning_rate=1.5e-3, context_width=64, n_pasted=3.0, dropout=0.0)
 
-EDGE = Recipe("ssadnet", edge=True, steps=6000, batch=4, learning_rate=3e-3, cooldown=0.2, n_pasted=3.0)
+EDGE = Recipe(
+    "ssadnet",
+    edge=True,
+    front=True,
+    height_above_ground=True,
+    steps=6000,
+    batch=4,
+    learning_rate=3e-3,
+    cooldown=0.2,
+    n_pasted=3.0,
+)
 
 DISTILLED = replace(EDGE, steps=1000, learning_rate=1e-3, cooldown=0.4, distil=1.0, seen_twice=False)
 

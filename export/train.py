@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from edgeperc.atomic import open_atomic
@@ -299,13 +299,27 @@ def _optimizer(recipe: Recipe, network: nn.Module) -> torch.optim.Optimizer:
     )
 
 
+class _Teacher(nn.Module):
+    """A network that sees some channels of another network's input."""
+
+    def __init__(self, network: nn.Module, channels: Sequence[int]) -> None:
+        super().__init__()
+        self.network, self.channels = network, list(channels)
+
+    def forward(self, x: Tensor) -> Any:
+        return self.network(x[:, self.channels])
+
+
 def _teacher(checkpoint: Path, task: Task) -> nn.Module:
-    """The network of a checkpoint with the same view and input as the task."""
+    """The network of a checkpoint with the same view as the task, and with the same channels or fewer."""
     state = read_checkpoint(checkpoint)
     recipe = state["recipe"]
-    if (task_of(recipe).view, task_of(recipe).input) != (task.view, task.input):
+    seen, own = (
+        list(zip(spec.channels, spec.mean, spec.std, strict=True)) for spec in (task.input, task_of(recipe).input)
+    )
+    if task_of(recipe).view != task.view or not set(own) <= set(seen):
         raise ValueError(f"{checkpoint} is of {recipe.network}, which sees another view than {task.recipe.network}")
-    return build_network(state, checkpoint).eval()
+    return _Teacher(build_network(state, checkpoint), [seen.index(channel) for channel in own]).eval()
 
 
 @torch.no_grad()

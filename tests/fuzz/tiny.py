@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import tiny_model
 
-from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry
+from edgeperc.card import CHANNELS, InputSpec, ModelCard, OutputSpec, RangeImageGeometry
 from edgeperc.zoo import resolve
 
 __all__ = ["CARD", "GRAPH", "boxed_card", "image_card", "model"]
@@ -21,12 +21,12 @@ def model(graph: bytes, card: bytes | None = None) -> bytes:
 
 
 def boxed_card() -> ModelCard:
-    """With oriented boxes."""
+    """With oriented boxes that know their fronts."""
     sizes = {"car": (4.0, 1.8, 1.6), "van": (5.0, 2.0, 2.2)}
     return replace(
         CARD,
         golden=None,
-        outputs=(OutputSpec("d", "box_dense"), OutputSpec("y", "class_logits")),
+        outputs=(OutputSpec("d", "box_dense", front=True), OutputSpec("y", "class_logits")),
         classes=("background", "drivable", "car", "van"),
         box_classes=("car", "van"),
         box_size_priors=sizes,
@@ -35,12 +35,12 @@ def boxed_card() -> ModelCard:
 
 
 def image_card() -> ModelCard:
-    """Of a range image."""
+    """Of a range image with heights above the ground."""
     return replace(
         CARD,
         golden=None,
         view=RangeImageGeometry(tuple(2.0 - 1.7 * k for k in range(16)), 64),
-        input=InputSpec("x", ("x", "y", "z", "remission", "range"), (0.0,) * 5, (10.0,) * 5),
+        input=InputSpec("x", CHANNELS["range_image"], (0.0,) * 6, (10.0,) * 6),
         classes=("background", "car", "pedestrian", "cyclist"),
         fitness=resolve("pointseg")[0].card.fitness,
     )
