@@ -44,6 +44,7 @@ VEHICLES = frozenset({"car", "van", "truck"})
 # Height [m] above the ground up to which the column of points at a person may reach. At 2.2 and 2.4 m instead of 2.0 m,
 # 24 and 38 % fewer of the false pedestrian points are removed; no pedestrian is lost at any of them.
 PERSON_TOP_M: Mapping[str, float] = MappingProxyType({"pedestrian": 2.0, "cyclist": 2.2})
+MIN_COLUMN_M = 0.2  # lower points are no part of a column
 COLUMN_GAP_M = 0.3  # a larger gap ends a column: a head and the foliage above it
 
 # Shares are of a cluster's points in the network's view. Car IoU is 80.8, 81.2, 81.6 and 81.6 for 0.4, 0.5, 0.6, 0.7.
@@ -391,8 +392,10 @@ def clear_columns(
     half = 0.5 * N_COLUMNS * CELL_M
     one = np.uint64(1)
     for i in range(points.shape[0]):
+        if not height[i] >= MIN_COLUMN_M:  # more than half of a scan's points, which saves a third of the time
+            continue
         x, y, z = np.float64(points[i, 0]) + half, np.float64(points[i, 1]) + half, np.float64(height[i])
-        if (x >= 0.0) & (x < 2.0 * half) & (y >= 0.0) & (y < 2.0 * half) & (z >= 0.0) & (z < N_BINS * BIN_M):
+        if (x >= 0.0) & (x < 2.0 * half) & (y >= 0.0) & (y < 2.0 * half) & (z < N_BINS * BIN_M):
             row, col = min(int(x / CELL_M), N_COLUMNS - 1), min(int(y / CELL_M), N_COLUMNS - 1)
             taken[row, col] |= one << np.uint64(min(int(z / BIN_M), N_BINS - 1))
     most_missing = int(COLUMN_GAP_M / BIN_M + 0.5)
@@ -660,7 +663,10 @@ def clear_road(
     """
     n_rows, n_cols = cells.shape
     lowest, highest = OBSTACLE_M
+    least = grid[0] - (n_rows + 1) * grid[2]
     for i in range(points.shape[0]):
+        if not points[i, 0] >= least:  # saves the divisions for most points
+            continue
         row = (grid[0] - np.float64(points[i, 0])) / grid[2]
         col = (grid[1] - np.float64(points[i, 1])) / grid[2]
         if not ((row >= 0.0) & (row < n_rows) & (col >= 0.0) & (col < n_cols)):

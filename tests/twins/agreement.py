@@ -21,7 +21,7 @@ def columns(points, height, limits, labels):
     level = np.minimum(np.where(known, h, 0.0) / 0.1, 63).astype(int)
     cleared = labels.copy()
     for i in np.flatnonzero(known & (limits[labels] > 0.0)):
-        near = known & (np.abs(row - row[i]) <= 1) & (np.abs(col - col[i]) <= 1)
+        near = known & (height >= np.float32(0.2)) & (np.abs(row - row[i]) <= 1) & (np.abs(col - col[i]) <= 1)
         top = level[i]
         for at in np.unique(level[near]):
             if top < at <= top + 4:  # three empty levels of 0.1 m at most
