@@ -132,7 +132,8 @@ class RemissionMatcher:
 
     def _is_in_range(self, points: NDArray[np.float32]) -> bool:
         """Whether the remission is in the profile's unit; `check_fitness` reports it if not."""
-        raw = points[:: max(1, len(points) // _SAMPLE), 3].astype(np.float64)
+        with np.errstate(invalid="ignore"):  # a signaling NaN
+            raw = points[:: max(1, len(points) // _SAMPLE), 3].astype(np.float64)
         low, high = self.sensor.remission_range
         share = (raw[np.isfinite(raw)] - low) / (high - low)
         return bool(
