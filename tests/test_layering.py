@@ -28,7 +28,7 @@ FLOORS = {
         kernel_cache perception zoo.__init__
         frame geometry linkage
         adapt cluster decode drivable fitness ground observed projection refine sensor_fit session
-        level network_input remission
+        agreement level network_input remission
         readers.__init__ readers.tables
         readers.inflate readers.packets
         readers.pcd readers.ply
