@@ -22,7 +22,7 @@ from .sensor import SensorProfile
 
 __all__ = ["Interpolator", "condition", "render"]
 
-KIND_CODES = {"linear": 0, "polynomial": 1, "logarithm": 2}
+KIND_CODES = {"linear": 0, "polynomial": 1, "logarithm": 2, "power": 3}
 
 
 def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True) -> tuple[NDArray[np.float32], int]:
@@ -129,7 +129,8 @@ def fill_rendered(
         A value of ``KIND_CODES``.
     coefficients : (3,) float64
     offset, scale : float
-        The argument x of `RemissionFunction` is ``(raw + offset) * scale``; the logarithm clips it to 0 from below.
+        The argument x of `RemissionFunction` is ``(raw + offset) * scale``; logarithm and power clip it to 0 from
+        below.
     rendered : (n, 4) float32, overwritten
         A remission that is not finite becomes NaN.
     """
@@ -154,7 +155,10 @@ def fill_rendered(
 def rendered_at(x: float, kind: int, coefficients: NDArray[np.float64]) -> float:
     """Value of a `RemissionFunction` at a finite x."""
     a, b, c = coefficients[0], coefficients[1], coefficients[2]
-    value = a + b * math.log1p(max(x, 0.0)) if kind == 2 else a + (b + c * x) * x
+    if kind == 3:
+        value = a * math.exp(min(b * math.log(x), 700.0)) if x > 0.0 else 0.0
+    else:
+        value = a + b * math.log1p(max(x, 0.0)) if kind == 2 else a + (b + c * x) * x
     return min(max(value, 0.0), 1.0)
 
 

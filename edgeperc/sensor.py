@@ -19,7 +19,7 @@ from .mounting import MODEL_HEIGHT_M, UNKNOWN_MOUNTING, Mounting
 __all__ = ["REMISSION_KINDS", "SENSORS", "RemissionFunction", "SensorProfile", "get_sensor"]
 
 SCHEMA = 2  # of a sensor profile's file
-REMISSION_KINDS = {"linear": 2, "polynomial": 3, "logarithm": 2}  # number of coefficients
+REMISSION_KINDS = {"linear": 2, "polynomial": 3, "logarithm": 2, "power": 2}  # number of coefficients
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,13 @@ class RemissionFunction:
     """Maps the remission of one sensor to that of another (KUL-Seg 5).
 
     With ``x = full_scale * remission``, where remission is scaled to 0..1 by the profile's ``remission_range``, the
-    other sensor's remission in 0..1 is a + b x (linear), a + b x + c x^2 (polynomial) or a + b ln(1 + x) (logarithm),
-    clipped to 0..1. `edgeperc.sensor_fit` fits it, `edgeperc.adapt` applies it.
+    other sensor's remission in 0..1 is a + b x (linear), a + b x + c x^2 (polynomial), a + b ln(1 + x) (logarithm) or
+    a x^b (power), clipped to 0..1. `edgeperc.sensor_fit` fits it, `edgeperc.adapt` applies it.
 
     Attributes
     ----------
     kind : str
-        ``"linear"``, ``"polynomial"`` or ``"logarithm"``.
+        ``"linear"``, ``"polynomial"``, ``"logarithm"`` or ``"power"``.
     coefficients : tuple of float
         a, b and, for a polynomial, c.
     full_scale : float
@@ -72,6 +72,8 @@ class RemissionFunction:
                 f"a {self.kind} remission function has {REMISSION_KINDS[self.kind]} finite coefficients up to 1e9, "
                 f"got {self.coefficients!r}"
             )
+        if self.kind == "power" and self.coefficients[1] <= 0.0:
+            raise SensorError(f"a power remission function has an exponent above 0, got {self.coefficients[1]!r}")
         if not 0.0 < self.full_scale <= 1e9 or not 0.0 <= self.rmse < math.inf:
             raise SensorError(
                 f"full_scale {self.full_scale!r} must be above 0 and at most 1e9, rmse {self.rmse!r} finite, from 0"
@@ -323,7 +325,7 @@ def _ouster(model: str, half_fov_deg: float, min_range_m: float, max_range_m: fl
 
 _BYTE = (0.0, 255.0)
 
-# `edgeperc fit-sensor`, from unlabeled scans. The logarithm was the best of three each time.
+# `edgeperc fit-sensor`, from unlabeled scans. The logarithm was the best of line, parabola and logarithm each time.
 _OF_NUSCENES = RemissionFunction(
     "logarithm", (-0.2949, 0.1832), 255.0, "hdl-64e", 0.0209, "13 nuScenes scans, quantiles by range and incidence"
 )

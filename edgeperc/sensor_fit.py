@@ -75,6 +75,28 @@ def _terms(kind: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([np.ones_like(x), np.log1p(np.maximum(x, 0.0))], axis=1)
 
 
+_EXPONENTS = np.exp(np.linspace(math.log(0.1), math.log(4.0), 60))
+
+
+def _best_power(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    size = max(float(x.max()), 1e-30)
+    terms = np.maximum(x[:, None] / size, 0.0) ** _EXPONENTS
+    factors = (terms * y[:, None]).sum(axis=0) / ((terms**2).sum(axis=0) + 1e-30)
+    best = int(((factors * terms - y[:, None]) ** 2).mean(axis=0).argmin())
+    return np.array([factors[best] / size ** _EXPONENTS[best], _EXPONENTS[best]])
+
+
+def _fitted(kind: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients of a function of this kind with the least squares."""
+    return _best_power(x, y) if kind == "power" else _least_squares(kind, x, y)
+
+
+def _values(kind: str, x: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+    if kind == "power":
+        return np.asarray(coefficients[0] * np.maximum(x, 0.0) ** coefficients[1], np.float64)
+    return np.asarray(_terms(kind, x) @ coefficients, np.float64)
+
+
 def _least_squares(kind: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     terms = _terms(kind, x)
     size = np.abs(terms).max(axis=0) + 1e-30  # columns of very different size would lose digits
@@ -89,7 +111,7 @@ def fit_functions(
     to: str,
     source: str,
 ) -> tuple[RemissionFunction, ...]:
-    """Fit a line, a parabola and a logarithm to pairs of remissions, the best first.
+    """Fit a line, a parabola, a logarithm and a power to pairs of remissions, the best first.
 
     Parameters
     ----------
@@ -128,9 +150,9 @@ def fit_functions(
     for kind in REMISSION_KINDS:
         errors = np.empty(len(x))
         for held in (fold == k for k in range(min(len(x), FOLDS))):
-            errors[held] = _terms(kind, x[held]) @ _least_squares(kind, x[~held], y[~held]) - y[held]
+            errors[held] = _values(kind, x[held], _fitted(kind, x[~held], y[~held])) - y[held]
         rmse = math.sqrt(float(np.mean(errors**2)))
-        best = tuple(float(c) for c in _least_squares(kind, x, y))
+        best = tuple(float(c) for c in _fitted(kind, x, y))
         found.append(RemissionFunction(kind, best, full_scale, to, rmse, source))
     return tuple(sorted(found, key=lambda function: function.rmse))
 
@@ -339,7 +361,7 @@ def fit_sensor(
 
 
 def increasing(functions: Sequence[RemissionFunction]) -> RemissionFunction:
-    """The first function that does not decrease up to full scale; a line and a logarithm fitted to quantiles do not."""
+    """The first function that does not decrease up to full scale; all but parabolas, fitted to quantiles, do not."""
     return next(f for f in functions if f.kind != "polynomial" or _increases(f))
 
 

@@ -29,6 +29,7 @@ from edgeperc.sensor_fit import (
     fit_functions,
     fit_sensor,
     incidences,
+    increasing,
     match_quantiles,
     remission_strata,
 )
@@ -44,6 +45,7 @@ FUNCTIONS = (
     replace(LOGARITHM, kind="linear", coefficients=(0.1, 0.004)),
     replace(LOGARITHM, kind="polynomial", coefficients=(0.2, 0.004, -2e-5)),
 )
+POWER = replace(LOGARITHM, kind="power", coefficients=(0.06, 0.4))
 
 # KUL-Seg, Table 4: Ouster's and Velodyne's intensity of vehicle, truck, ground and pillar.
 OUSTER, VELODYNE = np.array([45.91, 714.50, 113.28, 376.01]), np.array([3.78, 123.38, 5.60, 108.64])
@@ -54,8 +56,8 @@ OUSTER, VELODYNE = np.array([45.91, 714.50, 113.28, 376.01]), np.array([3.78, 12
 def test_ranking_of_functions_matches_the_papers_table() -> None:
     """The ranking of the paper's Table 5: logarithm 58.26, line 72.12, parabola 132.87."""
     best, *others = fit_functions(OUSTER, VELODYNE / 255.0, full_scale=9000.0, to="hdl-64e", source="KUL-Seg")
-    assert [f.kind for f in (best, *others)] == ["logarithm", "linear", "polynomial"]
-    assert [round(255.0 * f.rmse, 1) for f in (best, *others)] == [35.1, 56.1, 177.0]
+    assert [f.kind for f in (best, *others)] == ["logarithm", "linear", "polynomial", "power"]
+    assert [round(255.0 * f.rmse, 1) for f in (best, *others)] == [35.1, 56.1, 177.0, 199.5]
     np.testing.assert_allclose(np.multiply(best.coefficients, 255.0), np.polyfit(np.log1p(OUSTER), VELODYNE, 1)[::-1])
     np.testing.assert_allclose(np.multiply(others[0].coefficients, 255.0), np.polyfit(OUSTER, VELODYNE, 1)[::-1])
     np.testing.assert_allclose(np.multiply(others[1].coefficients, 255.0), np.polyfit(OUSTER, VELODYNE, 2)[::-1])
@@ -81,7 +83,21 @@ def test_exact_pairs_recover_the_function(shape: RemissionFunction, offset: floa
     np.testing.assert_allclose(_value(best, x), wanted, atol=1e-7)
 
 
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0.12, 3.8), st.floats(0.05, 1.0), st.integers(0, 2**32 - 1))
+def test_powers_are_recovered(exponent: float, top: float, seed: int) -> None:
+    """Exponents are tried in steps of 6 %."""
+    x = np.random.default_rng(seed).uniform(0.0, 255.0, 60)
+    functions = fit_functions(x, top * (x / 255.0) ** exponent, full_scale=255.0, to="hdl-64e", source="")
+    found = next(function for function in functions if function.kind == "power")
+    assert found.coefficients[1] == pytest.approx(exponent, rel=0.07)
+    np.testing.assert_allclose(_value(found, x), top * (x / 255.0) ** exponent, atol=0.03 * top)
+    assert found.rmse < 0.03 * top
+
+
 def _value(function: RemissionFunction, x: np.ndarray) -> np.ndarray:
+    if function.kind == "power":
+        return function.coefficients[0] * x ** function.coefficients[1]
     if function.kind == "logarithm":
         return function.coefficients[0] + function.coefficients[1] * np.log1p(x)
     return sum(c * x**k for k, c in enumerate(function.coefficients))
@@ -162,13 +178,12 @@ def test_function_is_recovered_from_other_streets() -> None:
 
 def test_parabola_that_turns_down_is_not_used() -> None:
     """The best fit is a parabola that turns down before full scale; the second best is used."""
-    bent = [street(k) for k in (11, 12)]
-    for scan in bent:
-        scan[:, 3] = 300.0 - np.sqrt(90000.0 - 90000.0 * np.minimum(scan[:, 3], 0.99))
-    wide = SensorProfile("wide", HDL.elevations_deg, 2083, (0.0, 4000.0))
-    profile, functions = fit_sensor(bent, wide)
-    assert functions[0].kind == "polynomial"
-    assert profile.remission is functions[1]
+    x = np.linspace(0.0, 100.0, 60)
+    wanted = 0.9 * x / 100.0 - 0.4 * (x / 100.0) ** 2
+    for full_scale, used in ((100.0, 0), (4000.0, 1)):
+        functions = fit_functions(x, wanted, full_scale=full_scale, to="hdl-64e", source="")
+        assert functions[0].kind == "polynomial"
+        assert increasing(functions) is functions[used]
 
 
 def test_strata_with_few_points_are_empty() -> None:
@@ -185,7 +200,7 @@ def test_strata_with_few_points_are_empty() -> None:
         remission_strata([np.zeros((3, 3), np.float32)])
 
 
-@pytest.mark.parametrize("function", FUNCTIONS, ids=lambda f: f.kind)
+@pytest.mark.parametrize("function", [*FUNCTIONS, POWER], ids=lambda f: f.kind)
 @settings(max_examples=60, deadline=None)
 @given(points=hnp.arrays(np.float32, st.tuples(st.integers(0, 20), st.just(4)), elements=st.floats(width=32)))
 def test_rendering_agrees_with_the_twin(function: RemissionFunction, points: np.ndarray) -> None:
@@ -250,6 +265,7 @@ def test_built_in_functions_match_their_source() -> None:
         (lambda d: d["remission"].update(kind="cubic"), "kind 'cubic'; expected one of linear"),
         (lambda d: d["remission"].update(coefficients=[1.0]), "2 finite coefficients"),
         (lambda d: d["remission"].update(coefficients=[1.0, float("nan")]), "2 finite coefficients"),
+        (lambda d: d["remission"].update(kind="power", coefficients=[1.0, 0.0]), "an exponent above 0, got 0.0"),
         (lambda d: d["remission"].update(full_scale=0), "above 0"),
         (lambda d: d["remission"].update(rmse=-1), "rmse -1.0 finite, from 0"),
         (lambda d: d["remission"].update(to=""), "expected two str"),
@@ -479,11 +495,9 @@ def test_adapt_fit_writes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureF
     fit = ["fit-sensor", str(scans), "--sensor", "vlp-16", "--to", "hdl-64e", "--out", str(out)]
     assert cli.main(fit) == 0
     found = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in found] == [
-        "logarithm",
-        *sorted(line.split()[0] for line in found[1:3]),
-        "written",
-    ]
+    kinds = [line.split()[0] for line in found]
+    assert kinds[0] == "logarithm"
+    assert sorted(kinds) == ["linear", "logarithm", "polynomial", "power", "written"]
     profile = get_sensor(out)
     assert profile == replace(get_sensor("vlp-16"), remission=profile.remission)
     assert profile.remission is not None

@@ -18,6 +18,9 @@ def rendered(points, function, remission_range):
         elif function.kind == "logarithm":
             a, b = function.coefficients
             out[i, 3] = np.clip(a + b * np.log1p(max(x, 0.0)), 0.0, 1.0)
+        elif function.kind == "power":
+            a, b = function.coefficients
+            out[i, 3] = np.clip(a * max(x, 0.0) ** b, 0.0, 1.0)
         else:
             out[i, 3] = np.clip(sum(c * x**k for k, c in enumerate(function.coefficients)), 0.0, 1.0)
     return out
