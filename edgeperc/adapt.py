@@ -134,7 +134,7 @@ def fill_rendered(
     rendered : (n, 4) float32, overwritten
         A remission that is not finite becomes NaN.
     """
-    # Most sensors report whole numbers up to 255. A table of their 256 results is seven times as fast.
+    # Most sensors report whole numbers up to 255. A table of their 256 results takes 0.3 instead of 2 ms.
     whole = np.empty(256)
     for k in range(len(whole)):
         whole[k] = rendered_at(float(k), kind, coefficients)
@@ -143,8 +143,9 @@ def fill_rendered(
         rendered[i, 1] = points[i, 1]
         rendered[i, 2] = points[i, 2]
         x = (np.float64(points[i, 3]) + offset) * scale
-        if 0.0 <= x < 256.0 and x == math.floor(x):
-            rendered[i, 3] = whole[int(x)]
+        nearest = math.floor(x + 0.5) if 0.0 <= x < 255.5 else -1.0
+        if x == nearest or (nearest >= 1.0 and abs(x - nearest) < 2e-5):  # 255ths as float32 are not quite whole
+            rendered[i, 3] = whole[int(nearest)]
         elif math.isfinite(x):
             rendered[i, 3] = rendered_at(x, kind, coefficients)
         else:
