@@ -38,7 +38,7 @@ CHANNELS = {
     "top_view": ("distance", "remission", "height"),
     "range_image": ("x", "y", "z", "remission", "range", "height_above_ground"),
 }
-N_DENSE_CHANNELS = 9
+N_DENSE_CHANNELS, N_FRONT_CHANNELS = 9, 2
 
 
 def _check(field: str, value: float, low: float, high: float) -> None:
@@ -231,7 +231,8 @@ class OutputSpec:
     kind : str
         One of ``OUTPUT_KINDS``.
     front : bool
-        Of kind ``"box_dense"``: it has a tenth channel, the logit that a box's yaw points to its front.
+        Of kind ``"box_dense"``: it has two more channels, a vector towards the front of a box. Its component along a
+        heading is the logit that the front is there.
     """
 
     name: str
@@ -422,7 +423,7 @@ class ModelCard:
         if kind == "box_slots":
             return (1, None, 4)
         if kind == "box_dense":
-            n_channels = N_DENSE_CHANNELS + any(output.front for output in self.outputs)
+            n_channels = N_DENSE_CHANNELS + N_FRONT_CHANNELS * any(output.front for output in self.outputs)
             return (1, n_channels, self.view.height // 4, self.view.width // 4)
         return (1, len(self.classes), self.view.height, self.view.width)
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .card import N_DENSE_CHANNELS, ModelCard, TopViewGeometry
+from .card import N_DENSE_CHANNELS, N_FRONT_CHANNELS, ModelCard, TopViewGeometry
 from .errors import CardMismatchError, InferenceError
 from .geometry import draw_footprints, suppress_overlaps
 from .kernel_cache import njit
@@ -172,9 +172,10 @@ def decode_dense(
     Parameters
     ----------
     dense : (1, C, H / 4, W / 4) or (C, H / 4, W / 4) float32
-        C is 9 or 10. Heat-map logit; center's offset from the cell's center in rows and columns [cells of this map];
+        C is 9 or 11. Heat-map logit; center's offset from the cell's center in rows and columns [cells of this map];
         logarithms of length and width [m]; sine and cosine of twice the yaw; center's z [m]; logarithm of the height
-        [m]. The tenth is the logit that the yaw in -pi/2..pi/2 points to the front.
+        [m]. The last two are a vector (x, y) towards the front, whose component along a heading is the logit that the
+        front is there.
     class_output : (1, C, H, W) or (C, H, W) float32
     class_kind : {"class_logits", "class_probabilities"}
     geometry : TopViewGeometry
@@ -199,7 +200,7 @@ def decode_dense(
     list of Box
         Best score first; on ties the box farther ahead, then the box farther left. The score is the probability in the
         heat map. With nine channels the yaw is in -pi/2..pi/2 and ``front`` is None: the network, like the paper's,
-        does not distinguish front and rear. With ten the yaw points to the likelier front, and ``front`` is 0.5 or
+        does not distinguish front and rear. With eleven the yaw points to the likelier front, and ``front`` is 0.5 or
         more.
 
     Raises
@@ -218,7 +219,7 @@ def decode_dense(
     """
     maps = dense[0] if dense.ndim == 4 and dense.shape[0] == 1 else dense
     height, width = geometry.height, geometry.width
-    expected = [(n, height // STRIDE, width // STRIDE) for n in (N_DENSE_CHANNELS, N_DENSE_CHANNELS + 1)]
+    expected = [(n, height // STRIDE, width // STRIDE) for n in (N_DENSE_CHANNELS, N_DENSE_CHANNELS + N_FRONT_CHANNELS)]
     if maps.shape not in expected:
         raise CardMismatchError(
             f"{model}: box_dense has shape {dense.shape}; expected {(1, *expected[0])} or {(1, *expected[1])} "
@@ -257,7 +258,7 @@ def decode_dense(
         axis=1,
     )
     tall = np.exp(np.clip(log_h, low, high))
-    yaws, fronts = _facing(rectangles[:, 4], front[0]) if front else (rectangles[:, 4], None)
+    yaws, fronts = _facing(rectangles[:, 4], *front) if front else (rectangles[:, 4], None)
     keep = suppress_overlaps(rectangles, scores, iou_threshold)
     sums = np.empty((len(keep), len(classes)))
     fill_footprint_sums(
@@ -292,8 +293,11 @@ def decode_dense(
     ]
 
 
-def _facing(yaws: NDArray[np.float64], logits: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _facing(
+    yaws: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Yaws in -pi..pi towards the likelier fronts, and their probabilities; a logit of 0 keeps the yaw."""
+    logits = np.cos(yaws) * x + np.sin(yaws) * y
     opposite = np.where(yaws > 0.0, yaws - math.pi, yaws + math.pi)
     return np.where(logits >= 0.0, yaws, opposite), 1.0 / (1.0 + np.exp(-np.abs(logits)))
 

@@ -119,7 +119,7 @@ def distillation_loss(logits: Tensor, probabilities: Tensor) -> Tensor:
 
 
 def box_distillation_loss(predicted: Tensor, teacher: Tensor) -> Tensor:
-    """Difference of dense boxes (B, 9 or 10, H, W) from a teacher's: cross-entropy of the heat maps, and box errors.
+    """Difference of dense boxes (B, 9 or 11, H, W) from a teacher's: cross-entropy of the heat maps, and box errors.
 
     Both are divided by the sum of the teacher's heat, which also weights the errors (`dense_loss`). Fronts count if
     both networks predict them.
@@ -128,7 +128,11 @@ def box_distillation_loss(predicted: Tensor, teacher: Tensor) -> Tensor:
     heat = teacher[:, 0].sigmoid()
     heat_loss = F.binary_cross_entropy_with_logits(predicted[:, 0], heat, reduction="sum")
     share = heat * (heat >= REGRESSED_FROM)
-    error = _box_error(predicted, torch.cat([teacher[:, :N_GEOMETRY], teacher[:, N_GEOMETRY:].sigmoid()], dim=1))
+    # The likelier of the two headings that the teacher's doubled angle allows, and its probability.
+    yaw = 0.5 * torch.atan2(teacher[:, 5], teacher[:, 6])
+    front, heading = teacher[:, N_GEOMETRY:], torch.stack([yaw.cos(), yaw.sin()], dim=1)
+    likely = (front * heading).sum(1, keepdim=True).sigmoid() if front.shape[1] else None
+    error = _box_error(predicted, teacher, heading, likely)
     return (heat_loss + (error * share).sum()) / share.sum().clamp(min=1.0)
 
 
@@ -146,7 +150,7 @@ def slots_loss(predicted: Tensor, target: Tensor) -> Tensor:
 def dense_loss(predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """Loss of the heat map (penalty-reduced focal loss; Zhou et al., 2019) and of the geometry (L1).
 
-    The prediction is (B, 9 or 10, H, W), the target (B, 10, H, W) from `dense_targets`. The heat map's loss is a sum
+    The prediction is (B, 9 or 11, H, W), the target (B, 11, H, W) from `dense_targets`. The heat map's loss is a sum
     divided by the number of boxes. An error of the geometry is the sum of a cell's absolute errors, weighted by
     `GEOMETRY_WEIGHTS`, plus `FRONT_WEIGHT` times the cross-entropy of the front if it is predicted. The geometry's loss
     is the mean error of the cells with a heat of at least `REGRESSED_FROM`, weighted by the heat.
@@ -160,16 +164,22 @@ def dense_loss(predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     heat_loss = -(torch.where(center, hit, miss) * known).sum() / center.sum().clamp(min=1)
 
     share = heat * (heat >= REGRESSED_FROM)
-    geometry_loss = (_box_error(predicted, target) * share).sum() / share.sum().clamp(min=1.0)
+    error = _box_error(predicted, target, target[:, N_GEOMETRY:], torch.ones_like(heat[:, None]))
+    geometry_loss = (error * share).sum() / share.sum().clamp(min=1.0)
     return heat_loss, geometry_loss
 
 
-def _box_error(predicted: Tensor, target: Tensor) -> Tensor:
-    """Error of each cell's box, (B, H, W); the target's front is a probability."""
+def _box_error(predicted: Tensor, target: Tensor, heading: Tensor, likely: Tensor | None) -> Tensor:
+    """Error of each cell's box, (B, H, W).
+
+    ``heading``: unit vectors (B, 2, H, W); ``likely``: probability (B, 1, H, W) that the front is there, if known.
+    """
     apart = (predicted[:, 1:N_GEOMETRY] - target[:, 1:N_GEOMETRY]).abs()
     error = (apart * predicted.new_tensor(GEOMETRY_WEIGHTS).view(1, -1, 1, 1)).sum(1)
-    for logit, front in zip(predicted[:, N_GEOMETRY:].unbind(1), target[:, N_GEOMETRY:].unbind(1), strict=False):
-        error = error + FRONT_WEIGHT * F.binary_cross_entropy_with_logits(logit, front, reduction="none")
+    front = predicted[:, N_GEOMETRY:]
+    if likely is not None and front.shape[1]:
+        logit = (front * heading).sum(1, keepdim=True)
+        error = error + FRONT_WEIGHT * F.binary_cross_entropy_with_logits(logit, likely, reduction="none")[:, 0]
     return error
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edgeperc.card import N_DENSE_CHANNELS, TopViewGeometry
+from edgeperc.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS, TopViewGeometry
 
 __all__ = ["REGRESSED_FROM", "dense_targets", "slot_targets"]
 
@@ -75,11 +75,11 @@ def dense_targets(
 
     Returns
     -------
-    (10, height/4, width/4) float32
+    (11, height/4, width/4) float32
         Channel 0, the heat: 1 in the output cell that holds a box's center; around it a Gaussian shaped like the box,
-        whose edges are three standard deviations away; -1 in cells that are not learned. Channels 1 to 9: the geometry
+        whose edges are three standard deviations away; -1 in cells that are not learned. Channels 1 to 8: the geometry
         of the box with the highest heat, in the format of box_dense, where that heat is at least `REGRESSED_FROM`; else
-        0. Of channel 9, the probability: 1 if the yaw that the doubled angle decodes to points to the front, else 0.
+        0. Channels 9 and 10: x and y of the unit vector towards its front.
 
     Raises
     ------
@@ -87,19 +87,18 @@ def dense_targets(
         A length, width or height is not positive.
     """
     height, width = view.height // STRIDE, view.width // STRIDE
-    target = np.zeros((N_DENSE_CHANNELS + 1, height, width), np.float32)
+    target = np.zeros((N_DENSE_CHANNELS + N_FRONT_CHANNELS, height, width), np.float32)
     heat = target[0]
 
     boxes, rows, cols = _boxes_in_view(boxes, view)
     for box, row, col in zip(boxes, rows / STRIDE, cols / STRIDE, strict=True):
         bump = _gaussian(box, row, col, (height, width), view.cell_m * STRIDE)
         cell_rows, cell_cols = np.nonzero((bump > heat) & (bump >= REGRESSED_FROM))
-        sin, cos = np.sin(2.0 * box[6]), np.cos(2.0 * box[6])
-        front = np.cos(box[6] - 0.5 * np.arctan2(sin, cos)) > 0.0
+        doubled, front = (np.sin(2.0 * box[6]), np.cos(2.0 * box[6])), (np.cos(box[6]), np.sin(box[6]))
         target[1, cell_rows, cell_cols] = row - (cell_rows + 0.5)
         target[2, cell_rows, cell_cols] = col - (cell_cols + 0.5)
         target[3:, cell_rows, cell_cols] = np.array(
-            [np.log(box[3]), np.log(box[4]), sin, cos, box[2], np.log(box[5]), front]
+            [np.log(box[3]), np.log(box[4]), *doubled, box[2], np.log(box[5]), *front]
         )[:, None]
         np.maximum(heat, bump, out=heat)
 

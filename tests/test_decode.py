@@ -197,37 +197,39 @@ def test_dense_boxes_are_decoded_exactly():
     assert decode_dense(dense_of(b, a), probabilities, "class_probabilities", VIEW, CLASSES, VEHICLES) == boxes
 
 
-def with_front(dense, logits):
-    """The dense maps with a tenth channel."""
-    return np.concatenate([dense, np.broadcast_to(np.float32(logits), dense[:, :1].shape)], axis=1)
+def with_front(dense, x, y):
+    """The dense maps with a vector towards the front."""
+    return np.concatenate([dense, *(np.broadcast_to(np.float32(v), dense[:, :1].shape) for v in (x, y))], axis=1)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.4, -1.2, 1.57, -1.57])
-@pytest.mark.parametrize("logit", [0.0, -0.0, 3.0, -3.0, 0.1, -0.1, 800.0, -800.0])
-def test_the_tenth_channel_turns_boxes_to_their_fronts(yaw, logit):
+@pytest.mark.parametrize("front", [(0, 0), (3, 0), (-3, 0), (0, 3), (0.1, -0.2), (-0.1, -0.1), (800, 1), (3e38, -3e38)])
+def test_boxes_turn_to_their_fronts(yaw, front):
     dense = dense_of((20.13, 3.37, -0.9, 4.2, 1.7, 1.5, yaw, 3.0), (38.8, -6.1, -0.5, 9.5, 2.5, 3.1, 0.7, 1.0))
     plain = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
-    boxes = decode_dense(with_front(dense, logit), class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
+    boxes = decode_dense(with_front(dense, *front), class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
     assert all(box.front is None for box in plain)
     for before, box in zip(plain, boxes, strict=True):
-        expected_yaw, front = twins.decode.facing(before.yaw, logit)
+        expected_yaw, likely = twins.decode.facing(before.yaw, *front)
         assert replace(before, yaw=box.yaw, front=box.front) == box
         assert box.yaw == pytest.approx(expected_yaw)
-        assert box.front == pytest.approx(front)
+        assert box.front == pytest.approx(likely)
         assert 0.5 <= box.front <= 1.0
         assert -math.pi <= box.yaw <= math.pi
 
 
 def test_each_box_has_its_own_front():
     ahead, away = (20.13, 3.37, -0.9, 4.2, 1.7, 1.5, 0.4, 3.0), (38.8, -6.1, -0.5, 9.5, 2.5, 3.1, 0.7, 1.0)
-    dense = with_front(dense_of(ahead, away), 2.0)
+    dense = with_front(dense_of(ahead, away), 2.0, 0.0)
     row, col = int((VIEW.x_range_m[1] - away[0]) / 0.4), int((VIEW.y_range_m[1] - away[1]) / 0.4)
-    dense[0, 9, row, col] = -1.0
+    dense[0, 9:, row, col] = -np.cos(0.7), -np.sin(0.7)
     boxes = decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
     assert [box.yaw for box in boxes] == pytest.approx([0.4, 0.7 - math.pi], abs=1e-5)
-    assert [box.front for box in boxes] == pytest.approx([1 / (1 + math.exp(-2.0)), 1 / (1 + math.exp(-1.0))])
+    assert [box.front for box in boxes] == pytest.approx(
+        [1 / (1 + math.exp(-2.0 * math.cos(0.4))), 1 / (1 + math.exp(-1.0))]
+    )
     dense[0, 9, 0, 0] = np.nan
-    with pytest.raises(InferenceError, match="1 of 50000 values of box_dense"):
+    with pytest.raises(InferenceError, match="1 of 55000 values of box_dense"):
         decode_dense(dense, class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
 
 
@@ -309,10 +311,10 @@ def test_dense_clips_extreme_sizes_and_refuses_non_finite_values():
     logits[0, 1, 2, 3] = np.inf
     with pytest.raises(InferenceError, match="1 of 400000 values of class_logits"):
         decode_dense(dense_of(), logits, "class_logits", VIEW, CLASSES, VEHICLES)
-    with pytest.raises(CardMismatchError, match=r"\(1, 8, 100, 50\).*\(1, 9, 100, 50\) or \(1, 10, 100, 50\)"):
+    with pytest.raises(CardMismatchError, match=r"\(1, 8, 100, 50\).*\(1, 9, 100, 50\) or \(1, 11, 100, 50\)"):
         decode_dense(dense[:, :8], class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
-    with pytest.raises(CardMismatchError, match=r"\(1, 11, 100, 50\)"):
-        decode_dense(with_front(with_front(dense, 0), 0), class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
+    with pytest.raises(CardMismatchError, match=r"\(1, 13, 100, 50\)"):
+        decode_dense(with_front(with_front(dense, 0, 0), 0, 0), class_logits(), "class_logits", VIEW, CLASSES, VEHICLES)
     with pytest.raises(CardMismatchError, match=r"\(1, 4, 400, 200\)"):
         decode_dense(dense_of(), class_logits()[:, :4], "class_logits", VIEW, CLASSES, VEHICLES)
 

@@ -107,27 +107,23 @@ def test_boxes_without_extent_are_refused(targets):
 def test_dense_target_of_one_box():
     yaw = 0.3
     target = dense_targets([(26.13, 2.27, -0.8, 4.1, 1.7, 1.5, yaw)], VIEW)
-    assert target.shape == (10, 100, 50)
+    assert target.shape == (11, 100, 50)
     assert target.dtype == np.float32
     ((row, col),) = np.argwhere(target[0] == 1.0)
     assert (row, col) == (49, 19)  # (46 - 26.13) / 0.4 = 49.675, (10 - 2.27) / 0.4 = 19.325
-    expected = [0.175, -0.175, np.log(4.1), np.log(1.7), np.sin(2 * yaw), np.cos(2 * yaw), -0.8, np.log(1.5), 1.0]
-    np.testing.assert_allclose(target[1:, row, col], expected, atol=1e-5)
+    expected = [0.175, -0.175, np.log(4.1), np.log(1.7), np.sin(2 * yaw), np.cos(2 * yaw), -0.8, np.log(1.5)]
+    np.testing.assert_allclose(target[1:, row, col], [*expected, np.cos(yaw), np.sin(yaw)], atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("degrees", "front"),
-    [(0, 1), (89, 1), (-89, 1), (91, 0), (-91, 0), (179, 0), (-179, 0), (180, 0), (271, 1), (361, 1), (-541, 0)],
-)
-def test_the_front_is_relative_to_the_decoded_yaw(degrees, front):
+@pytest.mark.parametrize("degrees", [0, 89, -89, 90, 91, -91, 179, -179, 180, 271, 361, -541])
+def test_the_front_that_is_learned_is_decoded(degrees):
     target = dense_targets([(26.13, 2.27, -0.8, 4.1, 1.7, 1.5, np.radians(degrees))], VIEW)
     learned = target[0] >= REGRESSED_FROM
     assert learned.sum() > 1
-    assert (target[9] == np.where(learned, front, 0)).all()
-    logits = np.where(target[9:], 9.0, -9.0)
-    dense = np.concatenate([np.where(target[:1] == 1.0, 5.0, -5.0), target[1:9], logits])[None].astype(np.float32)
+    np.testing.assert_allclose(target[9] ** 2 + target[10] ** 2, learned, atol=1e-6)
+    dense = np.concatenate([np.where(target[:1] == 1.0, 5.0, -5.0), target[1:9], 9.0 * target[9:]])[None]
     classes = np.zeros((1, len(TOP_VIEW_CLASSES), VIEW.height, VIEW.width), np.float32)
-    (box,) = decode_dense(dense, classes, "class_logits", VIEW, TOP_VIEW_CLASSES, ("car",))
+    (box,) = decode_dense(dense.astype(np.float32), classes, "class_logits", VIEW, TOP_VIEW_CLASSES, ("car",))
     assert np.cos(box.yaw - np.radians(degrees)) == pytest.approx(1.0, abs=1e-6)
     assert box.front == pytest.approx(1.0, abs=1e-3)
 
@@ -316,7 +312,7 @@ def test_distillation_is_lowest_at_the_teachers_probabilities(rng):
     assert distillation_loss(torch.from_numpy(np.log(teacher)), torch.from_numpy(teacher)) < loss
 
 
-@pytest.mark.parametrize(("n_taught", "n_own"), [(9, 9), (9, 10), (10, 9), (10, 10)])
+@pytest.mark.parametrize(("n_taught", "n_own"), [(9, 9), (9, 11), (11, 9), (11, 11)])
 def test_distillation_of_boxes_is_weighted_by_the_teachers_heat(rng, n_taught, n_own):
     taught = rng.normal(size=(2, n_taught, 3, 4)).astype(np.float32)
     own = rng.normal(size=(2, n_own, 3, 4)).astype(np.float32)
@@ -326,8 +322,10 @@ def test_distillation_of_boxes_is_weighted_by_the_teachers_heat(rng, n_taught, n
     assert share.sum() > 1.0
     cross = -(heat * np.log(p) + (1.0 - heat) * np.log(1.0 - p)).sum()
     apart = (np.abs(own[:, :9] - taught[:, :9])[:, 1:] * np.array(GEOMETRY_WEIGHTS).reshape(1, -1, 1, 1)).sum(1)
-    if n_taught == n_own == 10:
-        apart += FRONT_WEIGHT * cross_of_logits(own[:, 9], 1.0 / (1.0 + np.exp(-taught[:, 9].astype(np.float64))))
+    if n_taught == n_own == 11:
+        yaw = 0.5 * np.arctan2(taught[:, 5], taught[:, 6])
+        theirs, ours = (front[:, 9] * np.cos(yaw) + front[:, 10] * np.sin(yaw) for front in (taught, own))
+        apart += FRONT_WEIGHT * cross_of_logits(ours, 1.0 / (1.0 + np.exp(-theirs.astype(np.float64))))
     expected = (cross + (apart * share).sum()) / share.sum()
     loss = box_distillation_loss(torch.from_numpy(own), torch.from_numpy(taught))
     assert loss.item() == pytest.approx(expected, rel=1e-5)
@@ -415,7 +413,7 @@ def test_dense_loss(rng):
     heat_loss, geometry_loss = dense_loss(torch.tensor(predicted[:, :9]), torch.tensor(target))
     assert heat_loss.item() == pytest.approx(expected_heat, rel=1e-4)
     assert geometry_loss.item() == pytest.approx((error * share).sum() / share.sum(), rel=1e-4)
-    error += FRONT_WEIGHT * cross_of_logits(predicted[:, 9], target[:, 9])
+    error += FRONT_WEIGHT * cross_of_logits((predicted * target)[:, 9:].sum(1), 1.0)
     with_front = dense_loss(torch.tensor(predicted), torch.tensor(target))
     assert with_front[0].item() == heat_loss.item()
     assert with_front[1].item() == pytest.approx((error * share).sum() / share.sum(), rel=1e-4)

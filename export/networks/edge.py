@@ -14,7 +14,7 @@ import math
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from edgeperc.card import N_DENSE_CHANNELS
+from edgeperc.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
 
 from .pointseg import conv_bn_relu, initialize
 from .ssadnet import HEAT_PRIOR
@@ -127,14 +127,14 @@ class SSADNetEdge(nn.Module):
     Notes
     -----
     In: (B, 3, 400, 200) float32; any height and width divisible by 8.
-    Out: segmentation logits (B, 5, 400, 200) and boxes (B, 9 or 10, 100, 50), in the format of `DenseHead`, float32.
+    Out: segmentation logits (B, 5, 400, 200) and boxes (B, 9 or 11, 100, 50), in the format of `DenseHead`, float32.
     """
 
     def __init__(self, *, n_channels: int = 3, n_classes: int = 5, front: bool = False) -> None:
         super().__init__()
         self.trunk = Trunk(n_channels, n_classes, (2, 2), fine=16, middle=64, coarse=112)
         self.detection = nn.Sequential(conv_bn_relu(64, 64, 3), conv_bn_relu(64, 64, 3))
-        self.predict = nn.Conv2d(64, N_DENSE_CHANNELS + front, 1)
+        self.predict = nn.Conv2d(64, N_DENSE_CHANNELS + N_FRONT_CHANNELS * front, 1)
         initialize(self, self.trunk.classifier, self.predict)
         assert self.predict.bias is not None
         self.predict.bias.data[0] = -math.log(1.0 / HEAT_PRIOR - 1.0)

@@ -25,7 +25,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from edgeperc.card import N_DENSE_CHANNELS
+from edgeperc.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
 
 __all__ = [
     "CONTEXT_DILATIONS",
@@ -219,9 +219,9 @@ class SlotsHead(nn.Module):
 class DenseHead(nn.Module):
     """An anchor-free regressor on F.E. blocks 1 to 3: one prediction every four cells.
 
-    Out: (B, 9 or 10, H/4, W/4): heat-map logit; offset of the center from the output cell's center in rows, columns
+    Out: (B, 9 or 11, H/4, W/4): heat-map logit; offset of the center from the output cell's center in rows, columns
     [output cells]; log length, log width [m]; sin and cos of twice the yaw; center z [m]; log height [m]; with
-    ``front``, the logit that the yaw in -pi/2..pi/2 points to the front.
+    ``front``, a vector (x, y) towards the front, whose component along a heading is the logit that the front is there.
     """
 
     def __init__(self, c_in: int, front: bool = False) -> None:
@@ -237,12 +237,12 @@ class DenseHead(nn.Module):
             conv_bn_elu(64, 64),
         )
         self.merge = nn.Sequential(conv_bn_elu(32 + 64, 64), conv_bn_elu(64, 64))  # -> (B, 64, 100, 50)
-        self.predict = nn.Conv2d(64, N_DENSE_CHANNELS + front, 1)
+        self.predict = nn.Conv2d(64, N_DENSE_CHANNELS + N_FRONT_CHANNELS * front, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         fine = self.fine(x)
         coarse = _double(self.coarse(fine))
-        return self.predict(self.merge(torch.cat([fine, coarse], dim=1)))  # (B, 9 or 10, 100, 50)
+        return self.predict(self.merge(torch.cat([fine, coarse], dim=1)))  # (B, 9 or 11, 100, 50)
 
 
 class SSADNet(nn.Module):
@@ -273,7 +273,7 @@ class SSADNet(nn.Module):
     Notes
     -----
     In: (B, 3, 400, 200) float32; any height and width divisible by 8 (head "slots": at least 32).
-    Out: segmentation logits (B, 5, 400, 200), and boxes (B, n_slots, 4) or (B, 9 or 10, 100, 50), float32.
+    Out: segmentation logits (B, 5, 400, 200), and boxes (B, n_slots, 4) or (B, 9 or 11, 100, 50), float32.
     """
 
     def __init__(

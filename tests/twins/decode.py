@@ -95,8 +95,9 @@ def peaks(heat, threshold):
     return peak
 
 
-def facing(yaw, logit):
+def facing(yaw, x, y):
     """Twin of `edgeperc.decode._facing` for one box: the yaw of the likelier front, and its probability."""
+    logit = np.dot([np.cos(yaw), np.sin(yaw)], [x, y])
     with np.errstate(over="ignore"):
         front = 1.0 / (1.0 + np.exp(-np.float64(logit)))
     if front >= 0.5:
