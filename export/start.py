@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from edgeperc.card import ModelCard
+from edgeperc.session import golden_input
 
 from .cards import card_of
 from .checkpoint import read_checkpoint
@@ -67,12 +68,13 @@ def start(
         card, folded = card_of(state["recipe"], version="0"), False
         given = state["best"] or state["averaged"]
         before, frames = [*state["before"], asdict(state["recipe"])], dict(state["frames"])
-    pairs, first = _layers(network, images[0][:1] if folded else _example(own_card))
+    shape = (1, len(own_card.input.channels), own_card.view.height, own_card.view.width)
+    pairs, first = _layers(network, torch.from_numpy(golden_input(0, shape)))
     own = network.state_dict()
     common = {}
     for name, weight in given.items():
         value: Tensor | None = weight
-        if name in own and name.endswith("weight") and name == f"{first}.weight":
+        if name in own and name in first:
             value = _by_channel(weight, own[name], card, own_card, path)
         elif name in own and weight.shape != own[name].shape:
             value = _by_class(weight, own[name], card.classes, own_card.classes)
@@ -96,20 +98,17 @@ def folded_weights(path: Path) -> dict[str, Tensor]:
     return weights
 
 
-def _example(card: ModelCard) -> Tensor:
-    return torch.zeros(1, len(card.input.channels), card.view.height, card.view.width)
-
-
 @torch.no_grad()
-def _layers(network: nn.Module, image: Tensor) -> tuple[dict[str, str], str]:
-    """Each convolution that a batch norm follows -> the batch norm; and the first convolution."""
+def _layers(network: nn.Module, image: Tensor) -> tuple[dict[str, str], set[str]]:
+    """Each convolution that a batch norm follows -> the batch norm; and the weights of those that read the input."""
     made: dict[int, tuple[str, Tensor]] = {}
     pairs: dict[str, str] = {}
-    order: list[str] = []
+    first: set[str] = set()
 
     def convolved(name: str) -> Any:
         def hook(module: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-            order.append(name)
+            if torch.equal(inputs[0][:, : image.shape[1]], image):
+                first.add(f"{name}.weight")
             made[id(output)] = (name, output)  # held, so that no other tensor gets its number
 
         return hook
@@ -132,15 +131,17 @@ def _layers(network: nn.Module, image: Tensor) -> tuple[dict[str, str], str]:
     network.train(training)
     for hook in hooks:
         hook.remove()
-    return pairs, order[0]
+    return pairs, first
 
 
 def _by_channel(given: Tensor, own: Tensor, card: ModelCard, own_card: ModelCard, path: Path) -> Tensor | None:
-    """The weights of the first convolution, input channel by input channel."""
-    if given.shape[0] != own.shape[0] or given.shape[2:] != own.shape[2:]:
+    """The weights of a convolution that reads the input, channel by channel, and those of channels made from it."""
+    theirs, ours = card.input, own_card.input
+    n_made = own.shape[1] - len(ours.channels)
+    if given.shape[0] != own.shape[0] or given.shape[1] - len(theirs.channels) != n_made:
         return None
     value = torch.zeros_like(own)
-    theirs, ours = card.input, own_card.input
+    value[:, len(ours.channels) :] = given[:, len(theirs.channels) :]
     for k, name in enumerate(ours.channels):
         if name not in theirs.channels:
             continue

@@ -203,6 +203,7 @@ SHIPPED_MODELS = Path(__file__).resolve().parent.parent / "models"
         ("pointseg", Recipe("pointseg", edge=True, height_above_ground=True, batch=1)),
         ("ssadnet", Recipe("ssadnet", edge=True, front=True, batch=1)),
         ("lodnn", Recipe("lodnn", edge=True, batch=1)),
+        ("research/kulseg", Recipe("kulseg", height_above_ground=True, batch=1)),
     ],
 )
 def test_a_run_that_starts_from_a_model_starts_with_its_outputs(
@@ -224,7 +225,7 @@ def test_a_run_that_starts_from_a_model_starts_with_its_outputs(
         for output, expected in zip(as_tuple(outputs), session.run().values(), strict=True):
             value = output[0].numpy()
             assert np.abs(value[: len(expected)] - expected).max() < 1e-4 * expected.std()
-            assert not value[len(expected) :].any()  # the logit of the front
+            assert not value[len(expected) :].any()  # the vector to the front
     # In training, batch norm uses the statistics of the batch, here those of the one that it started with.
     for module in network.train().modules():
         if isinstance(module, nn.Dropout2d):
