@@ -17,11 +17,15 @@ from hypothesis.extra import numpy as hnp
 from edgeperc import Perceiver, remission
 from edgeperc.adapt import condition
 from edgeperc.errors import FitnessError, PointsError
+from edgeperc.evaluation.datasets import KittiObjects
+from edgeperc.evaluation.metrics import Confusion
+from edgeperc.evaluation.truth import kitti_truth
 from edgeperc.readers.files import read_points
 from edgeperc.remission import FROZEN_AFTER, NO_REMISSION, RemissionMatcher, is_missing
 from edgeperc.sensor import SENSORS, SensorProfile, get_sensor
 from edgeperc.sensor_fit import N_STRATA, incidences, quantiles_by_stratum, remission_strata, stratify
 from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import simulate
 
 HDL = get_sensor("hdl-64e")
@@ -381,3 +385,21 @@ def test_kitti_scans_are_not_converted(kitti_root: Path) -> None:
         assert used is HDL, name
         assert matcher.n_scans == 1
         assert findings == ()
+
+
+def test_kitti_scans_without_remission(kitti_root: Path) -> None:
+    """IoU of cars: the constant loses less than 25 points, and at least 20 points less than zeros."""
+    objects = KittiObjects(kitti_root)
+    perceivers = {adapt: perceiver(adapt=adapt, on_mismatch="ignore") for adapt in ("both", "none")}
+    counts = {name: Confusion(("background", "car", "pedestrian", "cyclist")) for name in ("recorded", *perceivers)}
+    for name in objects.names("validation")[::8]:
+        truth = kitti_truth(objects.frame(name), None)
+        assert truth.labels is not None
+        for kind, count in counts.items():
+            points = truth.points if kind == "recorded" else with_remission(truth.points, 0.0)
+            found = perceivers.get(kind, perceivers["both"])(points).points
+            counted = found.in_view & (truth.labels != IGNORE)
+            count.update(found.labels[counted], truth.labels[counted])
+    cars = {kind: count.iou()[1] for kind, count in counts.items()}
+    assert cars["both"] > cars["recorded"] - 0.25
+    assert cars["both"] > cars["none"] + 0.2
