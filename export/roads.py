@@ -28,6 +28,7 @@ __all__ = [
     "Y_RANGE_M",
     "Z_RANGE_M",
     "DatabaseError",
+    "box_sums",
     "drawn_roads",
     "ground_plane",
     "mask_of",
@@ -131,9 +132,9 @@ def sure_surface(points: NDArray[np.float32]) -> NDArray[np.uint8]:
         size = surface.size
         count = np.bincount(cell[low], minlength=size).reshape(surface.shape)
         total = np.bincount(cell[low], weights=points[low, 3], minlength=size).reshape(surface.shape)
-        around, bright = _boxed(count), _boxed(total)
+        around, bright = box_sums(count), box_sums(total)
         bright = (around >= 8) & (bright > (asphalt + BRIGHTER) * around) & (count > 0)
-        # Lane markings are bright too, but narrower than the 1.4 m of `_boxed`. The lane itself always stays road.
+        # Lane markings are bright too, but narrower than the 1.4 m of `box_sums`. The lane itself always stays road.
         surface[bright] = 0
         surface.reshape(-1)[cell[lane]] = 1
     surface.reshape(-1)[cell[risen]] = 0
@@ -180,7 +181,7 @@ def with_road(surface: NDArray[np.uint8], road: NDArray[np.uint8]) -> NDArray[np
     return np.where(drawn, road[row % VIEW.height, col % VIEW.width], surface).astype(np.uint8)
 
 
-def _boxed(values: NDArray[Any], reach: int = 3) -> NDArray[Any]:
+def box_sums(values: NDArray[Any], reach: int = 3) -> NDArray[Any]:
     """Sums over the (2 reach + 1)² cells around each cell."""
     for axis in (0, 1):
         padded = np.pad(values, [(reach + 1, reach) if a == axis else (0, 0) for a in (0, 1)])

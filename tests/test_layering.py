@@ -73,8 +73,8 @@ FLOORS = {
     """,
     "edgeperc_export": """
         __init__ networks.pointseg networks.ssadnet recipe scans targets
-        augment cards losses networks.edge networks.lodnn networks.squeezesegv2 roads scan_sets simulate
-        models_page networks.kulseg task
+        augment cards losses networks.edge networks.lodnn networks.squeezesegv2 roads simulate
+        models_page networks.kulseg scan_sets task
         networks.__init__ teacher
         checkpoint samples
         start watch curve

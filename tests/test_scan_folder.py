@@ -569,6 +569,17 @@ def test_scans_to_train_on(tmp_path: Path) -> None:
     assert read_scan_set(folder, "validation") == ([], [], {})
 
 
+def test_road_between_the_returns_is_road(tmp_path: Path) -> None:
+    root, scan = street(tmp_path, "hdl-64e")
+    folder = ScanFolder(root)
+    (labeled,), _, _ = read_scan_set(folder, "all")
+    measured = road_cells(folder.frame("3"), Mounting(0.4, 0.0, MODEL_MOUNTING.pitch_deg, 0.0), SURFACE)
+    assert measured is not None
+    truth = scan.top_view_labels(SURFACE)
+    assert np.count_nonzero(labeled.surface == 1) > 1.5 * np.count_nonzero(measured == 1)
+    assert np.mean(truth[labeled.surface == 1] == 1) > 0.95 * np.mean(truth[measured == 1] == 1)
+
+
 def test_a_drive_without_ground_needs_a_mounting(tmp_path: Path) -> None:
     root = folder_of(tmp_path, label__a_dot_txt=LINES)
     with pytest.raises(MountingError, match="give height_m, roll_deg and pitch_deg"):
