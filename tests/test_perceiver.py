@@ -49,7 +49,7 @@ from edgeperc.zoo import model_path, shipped_models
 
 @pytest.fixture(scope="module")
 def scan() -> SimulatedScan:
-    return simulate(random_scene(4, "urban"), "hdl-64e", seed=4)
+    return simulate(random_scene(8, "urban"), "hdl-64e", seed=8)
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def test_result_is_the_same_for_any_thread_count(perception: Perception, scan: S
 
 def test_result_does_not_depend_on_earlier_scans(perceive: Perceiver, perception: Perception) -> None:
     other = simulate(random_scene(9), "hdl-64e", seed=9).points
-    again = simulate(random_scene(4, "urban"), "hdl-64e", seed=4).points
+    again = simulate(random_scene(8, "urban"), "hdl-64e", seed=8).points
     perceive(other)
     assert_same(perception, perceive(again))
 
@@ -379,7 +379,7 @@ def test_the_road_alone(scan: SimulatedScan) -> None:
     assert (found.top_view.drivable & road).sum() > 0.7 * road.sum()  # cars hide the rest
     ahead = edgeperc.road_ahead(found.top_view)
     assert ahead.free_ahead_m() > 40.0
-    assert ahead.lane_width_m == pytest.approx(3.2, abs=0.5)
+    assert ahead.lane_width_m == pytest.approx(3.0, abs=0.5)
 
 
 def test_two_models_of_one_view_are_refused() -> None:
@@ -514,9 +514,10 @@ def test_boxes_of_labeled_points_are_around_them(scan: SimulatedScan) -> None:
     assert answer.boxes == perceive(scan.points).boxes
 
 
-def test_clusters_do_not_repeat_boxes_of_the_network(scan: SimulatedScan, perception: Perception) -> None:
+def test_clusters_do_not_repeat_boxes_of_the_network(scan: SimulatedScan) -> None:
     networks = Perceiver("ssadnet", provider="cpu")(scan.points).boxes
-    clusters = Perceiver("pointseg", provider="cpu")(scan.points).boxes
+    clusters = Perceiver("pointseg", provider="cpu", agree=False)(scan.points).boxes
+    perception = Perceiver(["ssadnet", "pointseg"], provider="cpu", agree=False)(scan.points)
     assert overlaps(clusters, networks).max() > 0.5  # both find some
     assert set(networks) < set(perception.boxes) <= {*networks, *clusters}
     others = tuple(box for box in perception.boxes if box not in networks)
