@@ -67,11 +67,11 @@ class Tally:
         return float(np.nanmean(self.pixels.iou()[1:])) if self.boxes is None else self.boxes.overall().ap
 
     def figures(self) -> dict[str, float | None]:
-        """IoU of each class; AP and recall of the boxes. None where a figure is not defined."""
+        """IoU of each class; AP, recall and share of right headings of the boxes. None where one is not defined."""
         found = dict(zip(self.pixels.classes, map(float, self.pixels.iou()), strict=True))
         if self.boxes is not None:
             scores = self.boxes.overall()
-            found |= {"ap": scores.ap, "recall": scores.recall}
+            found |= {"ap": scores.ap, "recall": scores.recall, "heading": scores.heading}
         return {name: None if math.isnan(value) else round(value, 4) for name, value in found.items()}
 
 

@@ -58,7 +58,7 @@ def test_card_is_read_back_from_json(card: ModelCard) -> None:
 
 def test_a_card_says_whether_boxes_have_a_front() -> None:
     assert TOP_VIEW_CARD.output_shape("box_dense") == (1, 9, 100, 50)
-    assert FRONT_CARD.output_shape("box_dense") == (1, 10, 100, 50)
+    assert FRONT_CARD.output_shape("box_dense") == (1, 11, 100, 50)
     assert FRONT_CARD.output_shape("class_logits") == (1, 3, 400, 200)
     document = json.loads(TOP_VIEW_CARD.to_json())
     for output in document["outputs"]:  # as cards were before there was a front

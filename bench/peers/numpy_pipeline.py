@@ -148,10 +148,13 @@ def dense_boxes(card: ModelCard, logits: NDArray[np.float32], dense: NDArray[np.
         sums = (shares / shares.sum(axis=0))[:, inside].sum(axis=1)
         evidence = [_evidence(card, name, sums[card.classes.index(name)], size) for name in card.box_classes]
         label = card.box_classes[int(np.argmax(evidence))]
-        p_front = float(1.0 / (1.0 + np.exp(-front[0][k]))) if front else None
-        if p_front is not None and p_front < 0.5:
-            p_front, yaw[k] = 1.0 - p_front, yaw[k] + (-math.pi if yaw[k] > 0.0 else math.pi)
-        boxes.append(Box(label, box.score, place, size, float(yaw[k]), p_front))
+        heading, p_front = float(yaw[k]), None
+        if front:
+            logit = float(front[0][k] * math.cos(heading) + front[1][k] * math.sin(heading))
+            p_front = 1.0 / (1.0 + math.exp(-abs(logit)))
+            if logit < 0.0:
+                heading += -math.pi if heading > 0.0 else math.pi
+        boxes.append(Box(label, box.score, place, size, heading, p_front))
     return boxes
 
 
