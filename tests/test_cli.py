@@ -202,11 +202,10 @@ def test_run_prints_a_line_a_scan(
     assert "car 600, pedestrian 0, cyclist 0" in lines[1]
     assert fake.made[0].given == (["ssadnet", "pointseg"], "os1-64", "cpu", 2, "ignore")
     options = ("--boxes-from", "clusters", "--full-turn", "--precision", "bf16", "--adapt", "none", "--trusted")
-    assert run("run", scans[0], *options) == 0
-    assert [one.more for one in fake.made] == [
-        {"precision": "auto", "adapt": "both", "boxes_from": "both", "full_turn": False, "trusted": False},
-        {"precision": "bf16", "adapt": "none", "boxes_from": "clusters", "full_turn": True, "trusted": True},
-    ]
+    assert run("run", scans[0], *options, "--no-agreement") == 0
+    usual = {"precision": "auto", "adapt": "both", "boxes_from": "both", "full_turn": False, "agree": True}
+    other = {"precision": "bf16", "adapt": "none", "boxes_from": "clusters", "full_turn": True, "agree": False}
+    assert [one.more for one in fake.made] == [{**usual, "trusted": False}, {**other, "trusted": True}]
 
 
 def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -79,7 +79,9 @@ def add_parser(commands: Commands) -> None:
         action="append",
         choices=RULES,
         default=[],
-        help="leave out one rule of the agreement, to measure what it is worth; may be repeated (default: none)",
+        metavar="RULE",
+        help="leave out one rule of the agreement, to measure what it is worth; may be repeated: "
+        f"{', '.join(RULES)} (default: none)",
     )
     models.add_argument(
         "--road-by",
