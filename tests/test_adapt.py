@@ -550,7 +550,7 @@ def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     figures = json.loads(out.read_text())
     simulated, boxed, pictured = (figures[name] for name in datasets)
     assert simulated["n_scans"] == 1
-    assert simulated["function"].startswith(("logarithm", "linear"))
+    assert simulated["function"].startswith(("logarithm", "linear", "power"))
     assert (boxed["n_scans"], pictured["n_scans"]) == (1, 1)
     for found in (boxed, pictured):
         assert found["function"] is None
