@@ -436,6 +436,10 @@ def test_wrong_arrays() -> None:
 # --- the whole runtime -----------------------------------------------------------------------------------------------
 
 
+# Nothing but the sensor adapts the scan; a tilted street does not move it.
+ALONE = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore", "mounting": MODEL_MOUNTING}
+
+
 @pytest.mark.parametrize("name", ["vlp-16", "os1-64"])
 def test_labels_are_only_of_input_points(name: str) -> None:
     points = simulate(random_scene(4, "urban"), name, seed=4).points
@@ -444,7 +448,7 @@ def test_labels_are_only_of_input_points(name: str) -> None:
     own = replace(get_sensor(name), remission_range=(0.0, 1.0), remission=None)  # the simulator's is the HDL-64E's
     answers = {}
     for adapt in ("none", "interpolation"):
-        perceive = Perceiver("pointseg", sensor=own, provider="cpu", n_threads=1, on_mismatch="ignore", adapt=adapt)
+        perceive = Perceiver("pointseg", sensor=own, adapt=adapt, **ALONE)
         answers[adapt] = perceive(points)
         assert ("adapt" in answers[adapt].stage_ms) == (adapt == "interpolation")
         assert perceive(points[:0]).points.labels.shape == (0,)
@@ -457,10 +461,7 @@ def test_labels_are_only_of_input_points(name: str) -> None:
 
 def test_scans_of_the_training_sensor_are_not_adapted() -> None:
     points = simulate(random_scene(4, "urban"), "hdl-64e", seed=4).points
-    answers = [
-        Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore", adapt=adapt)(points)
-        for adapt in ("both", "none")
-    ]
+    answers = [Perceiver("pointseg", adapt=adapt, **ALONE)(points) for adapt in ("both", "none")]
     np.testing.assert_array_equal(answers[0].points.labels, answers[1].points.labels)
     assert all("adapt" not in answer.stage_ms for answer in answers)
     with pytest.raises(ValueError, match="adapt is 'all'; expected none, remission"):
@@ -473,12 +474,11 @@ def test_rendered_scan_gives_the_reference_result() -> None:
     distorted = points.copy()
     distorted[:, 3] = np.expm1((points[:, 3].astype(np.float64) + 0.1) / 0.15)
     sensor = replace(HDL, remission_range=(0.0, 255.0), remission=LOGARITHM)
-    given = Perceiver("pointseg", provider="cpu", n_threads=1, on_mismatch="ignore")(points).points
-    settings = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore"}
-    rendered = Perceiver("pointseg", sensor=sensor, **settings)(distorted)
+    given = Perceiver("pointseg", **ALONE)(points).points
+    rendered = Perceiver("pointseg", sensor=sensor, **ALONE)(distorted)
     assert "adapt" in rendered.stage_ms
     assert (rendered.points.labels == given.labels).mean() > 0.999
-    plain = Perceiver("pointseg", sensor=sensor, adapt="none", **settings)(distorted)
+    plain = Perceiver("pointseg", sensor=sensor, adapt="none", **ALONE)(distorted)
     assert (plain.points.labels == given.labels).mean() < 0.999
 
 
