@@ -17,6 +17,7 @@ from edgeperc.ground import find_ground
 from edgeperc.mounting import MODEL_HEIGHT_M
 from edgeperc.perception import Box
 from edgeperc.projection import row_edges
+from edgeperc.remission import NO_REMISSION
 from edgeperc.sensor import SensorProfile, get_sensor
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES
@@ -341,6 +342,7 @@ def augmented(
     negatives: Mapping[str, float] = NEGATIVES,
     half_beams: float = 0.0,
     tilt_deg: float = 0.0,
+    no_remission: float = 0.0,
 ) -> LabeledScan:
     """The scan turned, mirrored, thinned, shifted in height and scaled in remission, all at random.
 
@@ -370,6 +372,8 @@ def augmented(
         Share of scans of which every second beam is left.
     tilt_deg : float
         Standard deviation of the errors of roll and pitch [deg]; the errors are at most twice as large.
+    no_remission : float
+        Share of scans whose remission is the constant that stands for a missing one.
     """
     full = scan.azimuths[1] - scan.azimuths[0] >= 2.0 * np.pi
     angle = rng.normal(0.0, np.radians(5.0))
@@ -405,4 +409,6 @@ def augmented(
     scan = tilted(replace(scan, points=points, labels=labels), roll, pitch, float(rng.normal(0.0, 0.04)))
     gain, offset = np.exp(rng.normal(0.0, 0.15)), rng.normal(0.0, 0.02)
     scan.points[:, 3] = np.clip(scan.points[:, 3] * np.float32(gain) + np.float32(offset), 0.0, 1.0)
+    if rng.random() < no_remission:
+        scan.points[:, 3] = NO_REMISSION.coefficients[0]
     return scan

@@ -107,6 +107,9 @@ class Recipe:
     tilt_deg: float = _option(
         0.25, "standard deviation of the roll and pitch by which scans are tilted [deg]: errors of the leveling"
     )
+    no_remission: float = _option(
+        0.05, "share of scans whose remission is the constant that stands for a missing one at run time"
+    )
     redraw_every: int = _option(
         1000,
         "after this many steps, label some training scans and draw those with false objects more often; 0: never",
@@ -165,6 +168,7 @@ PLAIN: Mapping[str, Any] = {
     "weather": 0.0,
     "half_beams": 0.0,
     "tilt_deg": 0.0,
+    "no_remission": 0.0,
     "redraw_every": 0,
     "class_weights": False,
     "lovasz_weight": 0.0,

@@ -168,6 +168,7 @@ class Samples:
             negatives=self.negatives,
             half_beams=recipe.half_beams,
             tilt_deg=recipe.tilt_deg,
+            no_remission=recipe.no_remission,
         )
         scan = change(scan)
         if self.task.swaps_sectors and rng.random() < recipe.swap:

@@ -14,6 +14,7 @@ pytest.importorskip("tqdm")
 
 from edgeperc.geometry import inside
 from edgeperc.perception import Box
+from edgeperc.remission import NO_REMISSION
 from edgeperc.simulation.samples import IGNORE, simulated_scan
 from edgeperc.simulation.scene import POINT_CLASS_OF
 from edgeperc_export.augment import (
@@ -313,3 +314,10 @@ def test_a_tilted_scan_keeps_its_objects(scan: LabeledScan) -> None:
         np.linalg.norm(scan.points[:, :3], axis=1),
         rtol=1e-3,
     )
+
+
+def test_scans_without_remission_have_the_constant_of_the_runtime(scan: LabeledScan) -> None:
+    rng = np.random.default_rng(0)
+    missing = augmented(scan, rng, no_remission=1.0)
+    assert (missing.points[:, 3] == np.float32(NO_REMISSION.coefficients[0])).all()
+    assert np.ptp(augmented(scan, rng).points[:, 3]) > 0.1
