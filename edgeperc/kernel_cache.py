@@ -89,6 +89,8 @@ class KernelCache:
         self._function = function
         # In a frozen application there are no source files.
         self._source = Path(sys.executable if getattr(sys, "frozen", False) else inspect.getfile(function)).absolute()
+        # Of the source that was imported; the file may change while the process runs.
+        self._stamp = _stamp(str(self._source))
         self._enabled = True
 
     @property
@@ -122,8 +124,8 @@ class KernelCache:
             None if there is none that can be used.
         """
         target_context.refresh()
-        stamp = _stamp(str(self._source)) if self._enabled else None
-        if stamp is None:
+        stamp = self._stamp
+        if stamp is None or not self._enabled:
             return None
         name, known = self._key(sig, target_context.codegen())
         for folder in self._folders():
@@ -148,8 +150,7 @@ class KernelCache:
         """
         if not self._enabled or result.library.has_dynamic_globals:  # addresses in this process
             return
-        stamp = _stamp(str(self._source))
-        reasons = []
+        stamp, reasons = self._stamp, []
         if stamp is None:
             reasons.append(f"{self._source} cannot be read")
         else:

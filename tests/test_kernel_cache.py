@@ -198,6 +198,17 @@ def test_an_edited_source_replaces_its_files(place: Place) -> None:
         assert [file.name for file in place.files] == names
 
 
+def test_what_is_compiled_after_an_edit_is_of_the_imported_source(place: Place) -> None:
+    place.start()
+    whole = VALUES.astype(np.int64)
+    place.source.write_text(SOURCE.replace("x * x", "2 * x * x"))
+    kernel_cache._stamp.cache_clear()
+    assert sys.modules["some_kernels"].total(whole) == ANSWER  # as imported
+    with pytest.raises(AssertionError, match=r"60\.0 == 30\.0"):
+        place.start()
+    assert sys.modules["some_kernels"].total(whole) == 2.0 * ANSWER
+
+
 def test_each_signature_has_its_file(place: Place) -> None:
     place.start()
     module = sys.modules["some_kernels"]
