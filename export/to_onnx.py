@@ -7,9 +7,10 @@ A file is written only if onnxruntime reproduces the torch network's outputs on 
 from __future__ import annotations
 
 import hashlib
+import json
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,10 +67,10 @@ def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:
     frames = notes["frames"]
     simulated = f"{notes['n_simulated']} simulated scans"
     return {
-        "data": f"{len(frames)} real frames (KITTI), {simulated}" if frames else f"{simulated}, no real frame",
+        "data": f"{len(frames)} real frames, {simulated}" if frames else f"{simulated}, no real frame",
         "frames": frames,
-        "licence": "CC BY-NC-SA 3.0, as KITTI's, on which it was trained" if frames else notes["licence"],
-        "recipe": {n: getattr(recipe, n) for n in Recipe.__dataclass_fields__},
+        "licence": "terms of the data sets of the real frames; KITTI: CC BY-NC-SA 3.0" if frames else notes["licence"],
+        "recipe": json.loads(json.dumps(asdict(recipe))),  # as a card is read again: without tuples
         "steps": notes["step"],
         "started_from": notes["before"],
         "curve": notes["curve"],

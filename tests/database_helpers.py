@@ -32,7 +32,7 @@ def simulated_kitti(root: Path) -> Path:
     T[:3, :3] = [[1, 0, 0], [0, 0.99995, -0.01], [0, 0.01, 0.99995]]
     T_cam_velo = T @ [[0, -1, 0, 0.1], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]
     for k, drive in enumerate(DRIVES):
-        scan = simulated_scan(10**9 + k)
+        scan = simulated_scan(10**9 + 10 + k)
         scan.points.tofile(root / "training/velodyne" / f"{k:06d}.bin")
         rows.append(f"{k:06d},2011_09_26_drive_{drive}")
         lines = ["DontCare -1 -1 -10 500 170 590 190 -1 -1 -1 -1000 -1000 -1000 -10"]

@@ -228,7 +228,16 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pyte
         "n_dropped": 0,
         "stage_ms": {"project": 1.0, "infer": 20.25},
         "providers": {"ssadnet": "CPUExecutionProvider (fp32)", "pointseg": "CPUExecutionProvider (fp32)"},
-        "boxes": [{"label": "car", "score": 0.9123, "center": [20.0, -3.0, -0.9], "size": [4.2, 1.8, 1.6], "yaw": 0.3}],
+        "boxes": [
+            {
+                "label": "car",
+                "score": 0.9123,
+                "center": [20.0, -3.0, -0.9],
+                "size": [4.2, 1.8, 1.6],
+                "yaw": 0.3,
+                "front": None,
+            }
+        ],
         "drivable_area_m2": 100.0,
         "road": {
             "outline": [[36.0, 0.0], [46.0, 0.0], [46.0, 10.0], [36.0, 10.0]],

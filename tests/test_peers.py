@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from edgeperc import ModelCard, Perceiver
+from edgeperc.mounting import MODEL_MOUNTING
 from edgeperc.perception import Box
 from edgeperc.sensor import get_sensor
 from edgeperc.session import Session, golden_input
@@ -38,7 +39,9 @@ def scan() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def right(scan: np.ndarray) -> Prediction:
-    found = Perceiver(NAMES, provider="cpu", on_mismatch="ignore", boxes_from="network")(scan)
+    found = Perceiver(
+        NAMES, provider="cpu", mounting=MODEL_MOUNTING, on_mismatch="ignore", boxes_from="network", agree=False
+    )(scan)
     return Prediction(found.points, found.top_view, found.boxes)
 
 

@@ -297,7 +297,7 @@ def faulty(points: NDArray[np.float32], how: str) -> NDArray[np.float32]:
 
 FAULTS = {
     "remission 0..255": "Remission runs from 0 to 25",
-    "no remission": "Remission is 0 for 100",
+    "no remission": "The scan has no remission",
     "upside down": "mounted upside down",
     "camera axes": "ground seems to lie towards",
     "millimeters": "convert them to meters",
@@ -318,7 +318,7 @@ def test_mismatch_can_be_an_error(scan: SimulatedScan, fault: str) -> None:
         Perceiver("pointseg", provider="cpu", on_mismatch="raise")(faulty(scan.points, fault))
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault != "no remission"])
 def test_gross_differences_are_refused_before_a_network_runs(
     scan: SimulatedScan, fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -349,7 +349,7 @@ def test_mismatch_can_be_ignored(scan: SimulatedScan) -> None:
 
 def test_only_the_first_scans_are_checked(scan: SimulatedScan) -> None:
     perceive = Perceiver("pointseg", provider="cpu", on_mismatch="warn")
-    bad = faulty(scan.points, "no remission")
+    bad = faulty(scan.points, "upside down")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         checked = [bool(perceive(bad).fitness) for _ in range(7)]

@@ -302,9 +302,9 @@ def check_perception(p: Perception, points: NDArray[np.float32]) -> None:
 
 
 def check_agreement(p: Perception) -> None:
-    """Raise `Failure` if a cell below a box is drivable. A strong tilt changes footprints when boxes are moved."""
+    """Raise `Failure` if a cell below a box is drivable. A tilt changes footprints when boxes are moved."""
     tilts = p.mounting.roll_deg or 0.0, p.mounting.pitch_deg or 0.0
-    if p.top_view is None or max(map(abs, tilts)) > 15.0:
+    if p.top_view is None or max(map(abs, tilts)) > 3.0:
         return
     names = tuple({box.label for box in p.boxes})
     boxes = [replace(b, size=(0.9 * b.size[0], 0.9 * b.size[1], b.size[2])) for b in p.boxes]  # moved, with rounding
