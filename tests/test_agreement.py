@@ -212,7 +212,7 @@ def test_points_keep_their_view_and_meet_the_rules(given: list, boxes: list[Box]
         if not own.any():
             continue
         share = np.mean(scene.labels[own & scene.in_view] == 1) if (own & scene.in_view).any() else 0.0
-        length = np.hypot(*(np.ptp(scene.points[own, c]) for c in range(2)))
+        length = np.hypot(*(np.ptp(scene.points[own, c].astype(np.float64)) for c in range(2)))
         is_large = length > MAX_LENGTH_M + 1e-3 or np.max(scene.height[own], initial=-np.inf) > MAX_TOP_M
         if share < (MIN_LARGE_SHARE if is_large else MIN_VEHICLE_SHARE):
             assert not (agreed.labels[own & ~boxed] == 1).any()
