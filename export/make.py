@@ -155,10 +155,12 @@ def finish(
     # SSADNet 3.1.2 takes another network's road as ground truth where no road is labeled.
     learned_road = "drivable" in card.classes and (stage.after or stage.teacher) is not None
     road_by = path.with_name(f"{ROAD_TRUTH}.onnx") if learned_road and kitti is not None else None
-    figures, _ = evaluate([*datasets.values()], [path], fold=fold, road_by=road_by)
+    # The figures of a card are of its network alone.
+    figures, _ = evaluate([*datasets.values()], [path], fold=fold, road_by=road_by, rules=())
     command = ["edgeperc eval", *datasets, f"--model {name}"]
     command += [f"--road-by {ROAD_TRUTH}"] if road_by else []
     command += [f"--fold {fold}"] if fold is not None else []
+    command += ["--no-agreement"]
     figures["command"] = " ".join(command)
     path.with_suffix(".json").write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
     write_card(onnx.load(path), replace(card, metrics=figures), path)

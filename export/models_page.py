@@ -18,6 +18,8 @@ from .recipe import Recipe
 
 __all__ = ["models_page"]
 
+NO_AGREEMENT = "--no-agreement"
+
 TASKS = {"range_image": "a class for every point", "top_view": "drivable area and vehicles ahead"}
 SOURCES = {"real": "real", "semantickitti": "SemanticKITTI", "simulated": "simulated"}
 ALL_RANGES = ("all",)
@@ -47,7 +49,9 @@ def models_page(folder: Path) -> str:
         *_prose(
             f"On the test drives ({', '.join(sorted(TEST_DRIVES))}), on which nothing was trained or chosen, and on "
             "simulated scans. All figures are percentages. In brackets: 95 % bootstrap intervals over drives (over "
-            "scenes for simulation), if two or more have the class. Do not average tables of real and simulated scans."
+            "scenes for simulation), if two or more have the class. Do not average tables of real and simulated scans. "
+            "The figures are of each network alone, before the agreement of points, boxes and cells. Simulated scans "
+            "are of the streets at the time of the model's export."
         ),
     ]
     for variant in shipped:
@@ -185,7 +189,7 @@ def _validation(path: Path) -> Iterable[str]:
             else:
                 cells = [_percent(row[key], name) for name in columns]
             yield _row(f"`{row['file']}`", *cells, f"{row['relative_time']:.1f}")
-    yield from ("", f"Made by `{table['command']}`.")
+    yield from ("", f"Made by `{_alone(table['command'])}`.")
 
 
 def _model(variant: Variant) -> Iterable[str]:
@@ -216,9 +220,14 @@ def _recipe(recipe: Mapping[str, Any]) -> str:
     return _flat({name: value for name, value in recipe.items() if name not in usual or value != usual[name]})
 
 
+def _alone(command: str) -> str:
+    """The command for a network alone; earlier exports were evaluated before there was an agreement."""
+    return command if NO_AGREEMENT in command else f"{command} {NO_AGREEMENT}"
+
+
 def _figures_of(card: ModelCard, bands: Sequence[str]) -> Iterable[str]:
     if "command" in card.metrics:
-        yield f"- Figures made by `{card.metrics['command']}`"
+        yield f"- Figures made by `{_alone(card.metrics['command'])}`"
     for source, title in SOURCES.items():
         if source in card.metrics:
             of = card.metrics[source]

@@ -643,8 +643,8 @@ def test_make_also_makes_the_models_that_it_starts_from(
     assert [card.training["recipe"]["steps"] for card in cards] == [1, 1]
     assert [bool(card.training["frames"]) for card in cards] == [False, True]
     assert [card.metrics["command"] for card in cards] == [
-        "edgeperc eval KITTI simulation --model pointseg-sim",
-        "edgeperc eval KITTI simulation --model pointseg-full --fold 0",
+        "edgeperc eval KITTI simulation --model pointseg-sim --no-agreement",
+        "edgeperc eval KITTI simulation --model pointseg-full --fold 0 --no-agreement",
     ]
     assert cards[1].training["started_from"] == [cards[0].training["recipe"]]
     assert json.loads(made.with_suffix(".json").read_text())["real"]["n_frames"] == 1
