@@ -373,6 +373,16 @@ def _verdicts(
 
 
 @njit(cache=True, nogil=True)
+def cell_of(points: NDArray[np.float32], i: int, n: int) -> tuple[int, int]:
+    """Row and column of a point in a grid of n x n cells of `CELL_M` around the sensor; -1, -1 outside of it."""
+    half = 0.5 * n * CELL_M
+    x, y = np.float64(points[i, 0]) + half, np.float64(points[i, 1]) + half
+    if not ((x >= 0.0) & (x < 2.0 * half) & (y >= 0.0) & (y < 2.0 * half)):
+        return -1, -1
+    return min(int(x / CELL_M), n - 1), min(int(y / CELL_M), n - 1)
+
+
+@njit(cache=True, nogil=True)
 def clear_columns(
     points: NDArray[np.float32], height: NDArray[np.float32], limits: NDArray[np.float64], labels: NDArray[np.uint8]
 ) -> None:
@@ -389,24 +399,23 @@ def clear_columns(
         Only points within 51.2 m along x and y are changed.
     """
     taken = np.zeros((N_COLUMNS, N_COLUMNS), dtype=np.uint64)
-    half = 0.5 * N_COLUMNS * CELL_M
     one = np.uint64(1)
     for i in range(points.shape[0]):
         if not height[i] >= MIN_COLUMN_M:  # more than half of a scan's points, which saves a third of the time
             continue
-        x, y, z = np.float64(points[i, 0]) + half, np.float64(points[i, 1]) + half, np.float64(height[i])
-        if (x >= 0.0) & (x < 2.0 * half) & (y >= 0.0) & (y < 2.0 * half) & (z < N_BINS * BIN_M):
-            row, col = min(int(x / CELL_M), N_COLUMNS - 1), min(int(y / CELL_M), N_COLUMNS - 1)
+        z = np.float64(height[i])
+        row, col = cell_of(points, i, N_COLUMNS)
+        if row >= 0 and z < N_BINS * BIN_M:
             taken[row, col] |= one << np.uint64(min(int(z / BIN_M), N_BINS - 1))
     most_missing = int(COLUMN_GAP_M / BIN_M + 0.5)
     for i in range(points.shape[0]):
         limit = limits[labels[i]]
         if limit <= 0.0:
             continue
-        x, y, z = np.float64(points[i, 0]) + half, np.float64(points[i, 1]) + half, np.float64(height[i])
-        if not ((x >= 0.0) & (x < 2.0 * half) & (y >= 0.0) & (y < 2.0 * half) & (z >= 0.0) & (z < N_BINS * BIN_M)):
+        z = np.float64(height[i])
+        row, col = cell_of(points, i, N_COLUMNS)
+        if row < 0 or not ((z >= 0.0) & (z < N_BINS * BIN_M)):
             continue
-        row, col = min(int(x / CELL_M), N_COLUMNS - 1), min(int(y / CELL_M), N_COLUMNS - 1)
         column = np.uint64(0)
         for r in range(max(row - 1, 0), min(row + 2, N_COLUMNS)):
             for c in range(max(col - 1, 0), min(col + 2, N_COLUMNS)):
@@ -574,20 +583,16 @@ def clear_ground(
     labels : (n,) uint8, modified
     """
     standing = np.zeros((N_FOOTPRINTS, N_FOOTPRINTS), dtype=np.uint8)
-    half = 0.5 * N_FOOTPRINTS * CELL_M
     for is_second in range(2):
         for i in range(points.shape[0]):
             role = roles[labels[i]]
             if role == 0 or on_ground[i] != (is_second == 1):
                 continue
-            x, y = np.float64(points[i, 0]) + half, np.float64(points[i, 1]) + half
-            known = (x >= 0.0) & (x < 2.0 * half) & (y >= 0.0) & (y < 2.0 * half)
-            row = min(int(x / CELL_M), N_FOOTPRINTS - 1) if known else 0
-            col = min(int(y / CELL_M), N_FOOTPRINTS - 1) if known else 0
+            row, col = cell_of(points, i, N_FOOTPRINTS)
             if is_second == 0:
-                if known:
+                if row >= 0:
                     standing[row, col] |= role
-            elif not known or standing[row, col] & role == 0:
+            elif row < 0 or standing[row, col] & role == 0:
                 labels[i] = 0
 
 

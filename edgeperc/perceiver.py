@@ -573,12 +573,13 @@ class Perceiver:
         Points out of the network's view count as background for these boxes. An object cut by the view's edge
         therefore gets either a box of the whole object or none.
         """
+        above = ~ground.mask
         clusters = None
         dropped: list[Box] = []
         if points is not None and self._rules:
             clusters = find_clusters(
                 scan,
-                among=~ground.mask,
+                among=above,
                 seeds=points.labels > 0,
                 distance_per_m=self._distance_per_m,
                 min_points=1,
@@ -594,7 +595,7 @@ class Perceiver:
                 scan,
                 points.labels,
                 points.classes,
-                among=~ground.mask,
+                among=above,
                 height_m=ground.height_m,
                 clusters=clusters,
                 distance_per_m=self._distance_per_m,
