@@ -20,7 +20,16 @@ from numpy.typing import ArrayLike, NDArray
 from .errors import CardError
 from .onnx_file import read_metadata
 
-__all__ = ["CARD_KEY", "Golden", "InputSpec", "ModelCard", "OutputSpec", "RangeImageGeometry", "TopViewGeometry"]
+__all__ = [
+    "CARD_KEY",
+    "CameraGeometry",
+    "Golden",
+    "InputSpec",
+    "ModelCard",
+    "OutputSpec",
+    "RangeImageGeometry",
+    "TopViewGeometry",
+]
 
 CARD_KEY = "edgeperc.card"
 Precision = Literal["fp32", "int8"]
@@ -33,8 +42,9 @@ MAX_ROWS, MAX_COLUMNS, MAX_PIXELS = 4096, 65_536, 16 * 10**6
 MAX_CHANNELS = 16
 MIN_SECTOR_DEG = 1.0
 MIN_GOLDEN_VALUES, MAX_GOLDEN_VALUES = 16, 100_000
-OUTPUT_KINDS = ("class_logits", "class_probabilities", "box_slots", "box_dense")
+OUTPUT_KINDS = ("class_logits", "class_probabilities", "box_slots", "box_dense", "camera_logits")
 CHANNELS = {
+    "camera": ("red", "green", "blue"),
     "top_view": ("distance", "remission", "height"),
     "range_image": ("x", "y", "z", "remission", "range", "height_above_ground"),
 }
@@ -186,8 +196,37 @@ class RangeImageGeometry:
 
 
 @dataclass(frozen=True, slots=True)
+class CameraGeometry:
+    """The image of a camera, scaled to the network's input. Row 0 is the top, column 0 leftmost.
+
+    Attributes
+    ----------
+    width, height : int
+        Columns and rows of the input.
+    fit : {"stretch"}
+        How an image of another size gets there: all of it is scaled to ``width`` and ``height``, bilinearly with
+        half-pixel centers (`edgeperc.image.fill_scaled`), whatever its aspect; nothing is cropped or padded.
+    """
+
+    width: int
+    height: int
+    fit: Literal["stretch"] = "stretch"
+
+    def __post_init__(self) -> None:
+        if self.fit != "stretch":
+            raise CardError(f"view.fit is {reprlib.repr(self.fit)}; expected stretch")
+        _check_size(self.height, self.width)
+
+    @property
+    def kind(self) -> str:
+        return "camera"
+
+
+@dataclass(frozen=True, slots=True)
 class InputSpec:
     """The network's input: ``(raw - mean) / std`` per channel; 0 in every channel of a pixel without a return.
+
+    The raw values of a camera are 0..255 in ``"red"``, ``"green"`` and ``"blue"``, in the order that the network takes.
 
     Attributes
     ----------
@@ -315,11 +354,13 @@ class ModelCard:
     name, version : str
     precision : {"fp32", "int8"}
         Precision of the stored weights. ``"int8"``: weights and activations are 8-bit integers.
-    view : TopViewGeometry or RangeImageGeometry
+    view : TopViewGeometry, RangeImageGeometry or CameraGeometry
     input : InputSpec
     outputs : tuple of OutputSpec
+        That of a camera is of kind ``"camera_logits"``, float32 of shape (1, classes, h, w): logits on a grid whose h
+        and w divide the height and the width of the view.
     classes : tuple of str
-        Index 0 is the background.
+        Index 0 is the background; those of a camera have none.
     box_classes : tuple of str
         Classes that boxes may have; a subset of ``classes``.
     box_size_priors : mapping
@@ -348,7 +389,7 @@ class ModelCard:
 
     name: str
     version: str
-    view: TopViewGeometry | RangeImageGeometry
+    view: TopViewGeometry | RangeImageGeometry | CameraGeometry
     input: InputSpec
     outputs: tuple[OutputSpec, ...]
     classes: tuple[str, ...]
@@ -384,7 +425,11 @@ class ModelCard:
                 f"expected some of {', '.join(CHANNELS[self.view.kind])}"
             )
         kinds = [o.kind for o in self.outputs]
-        if sum(k.startswith("class_") for k in kinds) != 1 or len(kinds) != len(set(kinds)):
+        if self.view.kind == "camera":
+            self._check_camera(kinds)
+        elif (
+            sum(k.startswith("class_") for k in kinds) != 1 or len(kinds) != len(set(kinds)) or "camera_logits" in kinds
+        ):
             raise CardError(f"output kinds {kinds}; expected one class output and at most one of each box kind")
         if any(k.startswith("box_") for k in kinds):
             if self.view.kind != "top_view":
@@ -418,10 +463,22 @@ class ModelCard:
                 if output.name in self.golden.outputs and None not in shape:
                     self.golden.check_output(output.name, math.prod(n for n in shape if n is not None))
 
+    def _check_camera(self, kinds: list[str]) -> None:
+        if kinds != ["camera_logits"]:
+            raise CardError(f"output kinds {kinds} of a camera; expected one, camera_logits")
+        if sorted(self.input.channels) != sorted(CHANNELS["camera"]):
+            raise CardError(
+                f"input channels {self.input.channels} of a camera; expected red, green and blue, each once"
+            )
+        if self.fitness is not None:
+            raise CardError("a camera with a fitness, which is of scans; expected null")
+
     def output_shape(self, kind: str) -> tuple[int | None, ...]:
         """Shape of the output of a kind, with the batch; None where any length is allowed."""
         if kind == "box_slots":
             return (1, None, 4)
+        if kind == "camera_logits":
+            return (1, len(self.classes), None, None)
         if kind == "box_dense":
             n_channels = N_DENSE_CHANNELS + N_FRONT_CHANNELS * any(output.front for output in self.outputs)
             return (1, n_channels, self.view.height // 4, self.view.width // 4)
@@ -497,7 +554,7 @@ class ModelCard:
 def _card(document: dict[str, Any]) -> ModelCard:
     view = dict(document["view"])
     kind = view.pop("kind")
-    geometry: TopViewGeometry | RangeImageGeometry
+    geometry: TopViewGeometry | RangeImageGeometry | CameraGeometry
     if kind == "top_view":
         geometry = TopViewGeometry(
             x_range_m=_pair("view.x_range_m", view["x_range_m"]),
@@ -512,8 +569,10 @@ def _card(document: dict[str, Any]) -> ModelCard:
             azimuth_left_deg=_float("view.azimuth_left_deg", view["azimuth_left_deg"]),
             azimuth_right_deg=_float("view.azimuth_right_deg", view["azimuth_right_deg"]),
         )
+    elif kind == "camera":
+        geometry = CameraGeometry(_int("view.width", view["width"]), _int("view.height", view["height"]), view["fit"])
     else:
-        raise CardError(f"view.kind is {reprlib.repr(kind)}; expected top_view or range_image")
+        raise CardError(f"view.kind is {reprlib.repr(kind)}; expected top_view, range_image or camera")
     fitness, golden = document["fitness"], document["golden"]
     if document["schema"] == 2:  # schema 2 has the precision in the free-form metadata, and no measured agreement
         precision, precisions = document["training"].get("precision", "fp32"), {}

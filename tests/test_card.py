@@ -15,7 +15,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_model import entry, field, varint
 
-from edgeperc.card import CARD_KEY, Golden, InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.card import (
+    CARD_KEY,
+    CameraGeometry,
+    Golden,
+    InputSpec,
+    ModelCard,
+    OutputSpec,
+    RangeImageGeometry,
+    TopViewGeometry,
+)
 from edgeperc.errors import CardError, ModelFileError
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -48,9 +57,17 @@ FRONT_CARD = replace(TOP_VIEW_CARD, outputs=(TOP_VIEW_CARD.outputs[0], OutputSpe
 HEIGHT_CARD = replace(
     RANGE_CARD, input=InputSpec("x", ("range", "height_above_ground"), (10.0, 0.4), (5.0, 0.7)), precision="int8"
 )
+CAMERA_CARD = replace(
+    RANGE_CARD,
+    view=CameraGeometry(480, 360),
+    input=InputSpec("image", ("red", "green", "blue"), (128.0,) * 3, (64.0,) * 3),
+    outputs=(OutputSpec("logits", "camera_logits"),),
+    classes=("Sky", "Road"),
+    fitness=None,
+)
 
 
-@pytest.mark.parametrize("card", [TOP_VIEW_CARD, RANGE_CARD, FRONT_CARD, HEIGHT_CARD])
+@pytest.mark.parametrize("card", [TOP_VIEW_CARD, RANGE_CARD, FRONT_CARD, HEIGHT_CARD, CAMERA_CARD])
 def test_card_is_read_back_from_json(card: ModelCard) -> None:
     assert ModelCard.from_json(card.to_json()) == card
     assert ModelCard.from_json(card.to_json()).to_json() == card.to_json()
@@ -71,6 +88,34 @@ def test_a_card_says_whether_boxes_have_a_front() -> None:
     for kind in ("class_logits", "class_probabilities", "box_slots"):
         with pytest.raises(CardError, match=f"'o' of kind {kind} has a front; only box_dense may"):
             OutputSpec("o", kind, front=True)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"outputs": (OutputSpec("p", "class_logits"),)}, "of a camera; expected one, camera_logits"),
+        ({"outputs": ()}, "of a camera; expected one, camera_logits"),
+        ({"input": InputSpec("x", ("red", "green"), (0.0,) * 2, (1.0,) * 2)}, "expected red, green and blue"),
+        ({"input": InputSpec("x", ("red", "red", "blue"), (0.0,) * 3, (1.0,) * 3)}, "expected red, green and blue"),
+        ({"input": InputSpec("x", ("range",), (0.0,), (1.0,))}, "unknown to a camera"),
+        ({"fitness": {"a": 1.0}}, "fitness"),
+    ],
+)
+def test_what_a_camera_may_not_have(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(CardError, match=message):
+        replace(CAMERA_CARD, **change)
+
+
+def test_cameras_say_how_an_image_is_scaled() -> None:
+    assert CAMERA_CARD.output_shape("camera_logits") == (1, 2, None, None)
+    assert (CAMERA_CARD.view.height, CAMERA_CARD.view.width) == (360, 480)
+    for view in ({"width": 0}, {"height": 5000}, {"width": 65_536, "height": 4096}, {"fit": "crop"}):
+        document = json.loads(CAMERA_CARD.to_json())
+        document["view"] |= view
+        with pytest.raises(CardError, match="expected"):
+            ModelCard.from_json(json.dumps(document))
+    with pytest.raises(CardError, match="one class output"):
+        replace(RANGE_CARD, outputs=(OutputSpec("p", "class_logits"), OutputSpec("c", "camera_logits")))
 
 
 def test_only_range_images_have_a_height_above_the_ground() -> None:
