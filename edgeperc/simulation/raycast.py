@@ -56,13 +56,15 @@ __all__ = [
     "fill_column_counts",
     "fill_column_rows",
     "fill_drivable",
+    "fill_ground_kinds",
     "fill_placed",
     "fill_points",
     "ground_at",
 ]
 
 # A primitive is a row of float64: kind, material, remission, density, center (3), rows of the matrix that maps an
-# offset from the center into the unit shape (9), taper of the front, rear and sides (3), object (-1: none).
+# offset from the center into the unit shape (9), taper of the front, rear and sides (3), object. Below 0, the last is a
+# static shape: -1 of no class, -2 - k of class k of `camera`.
 BOX, CYLINDER, ELLIPSOID = 0, 1, 2
 MATTE, PAINT, GLASS, RETRO, LEAVES, POROUS, FACADE = 0, 1, 2, 3, 4, 5, 6
 ROW = 20
@@ -591,6 +593,22 @@ def _ground_remission(
     if outside < terrain[PAVEMENT]:
         return terrain[PAVING] * (1.0 + 0.1 * stain + 0.1 * patch)
     return terrain[GRASS] * (1.0 + 0.25 * stain + 0.1 * patch)
+
+
+@njit(cache=True, nogil=True)
+def fill_ground_kinds(
+    strips: NDArray[np.float64],
+    terrain: NDArray[np.float64],
+    tile: NDArray[np.float64],
+    xy: NDArray[np.float64],
+    kinds: NDArray[np.uint8],
+    remissions: NDArray[np.float64],
+) -> None:
+    """Write the ground's kind (n,) at x, y [m], world frame, (n, 2): 0 road, 1 bay or pavement, 2 grass; remission."""
+    for i in range(xy.shape[0]):
+        _, outside, outside_bays, _, _ = ground_at(strips, terrain, tile, xy[i, 0], xy[i, 1])
+        kinds[i] = 0 if outside < 0.0 else 1 if outside_bays < 0.0 or outside < terrain[PAVEMENT] else 2
+        remissions[i] = _ground_remission(strips, terrain, tile, xy[i, 0], xy[i, 1])
 
 
 @njit(cache=True, nogil=True)

@@ -173,6 +173,7 @@ _FURNITURE = (
     (_box, 0.18), (_meter, 0.08), (_column, 0.05), (_bench, 0.03), (_shelter, 0.02),
 )  # fmt: skip
 _POLES = (_lamp, _sign, _traffic_light, _mast)
+_THIN = (*_POLES, _wide_sign, _bollard, _meter)  # poles to a camera
 
 
 def _add_furniture(street: Street, x: float, y: float, yaw: float, place: str) -> None:
@@ -182,13 +183,14 @@ def _add_furniture(street: Street, x: float, y: float, yaw: float, place: str) -
         shares *= np.array([0.3, 1.0, 1.0, 0.0, 1.0, 1.5, 0.2, 0.0, 0.1, 0.1, 0.1])
     make = _FURNITURE[int(rng.choice(len(shares), p=shares / shares.sum()))][0]
     rows, width = make(rng)
+    of = "Pole" if make in _THIN else ""
     if make is _bollard and rng.random() < 0.4:  # a row of equal ones
         gap = float(rng.uniform(1.2, 2.2))
         for k in range(int(rng.integers(3, 9))):
             a = k * gap
-            street.add_static(rows, x + a * math.cos(yaw), y + a * math.sin(yaw), width, width, yaw, 0.2)
+            street.add_static(rows, x + a * math.cos(yaw), y + a * math.sin(yaw), width, width, yaw, 0.2, of=of)
         return
-    street.add_static(rows, x, y, 1.3 if make is _shelter else min(width, 0.6), width, yaw, 0.2)
+    street.add_static(rows, x, y, 1.3 if make is _shelter else min(width, 0.6), width, yaw, 0.2, of=of)
 
 
 # --- plants -----------------------------------------------------------------------------------------------------------
@@ -226,7 +228,7 @@ def _add_tree(street: Street, x: float, y: float, clear_m: float = 0.0) -> bool:
             )
     if rng.random() < 0.15 and clear_m == 0.0:  # ivy, shoots
         rows.append(blob(LEAVES, 0.38, (0, 0, 0.5), (5 * radius, 5 * radius, float(rng.uniform(1.0, 3.0))), 4.0))
-    return street.add_static(rows, x, y, 2 * radius, 2 * radius, 0.0, 0.35)
+    return street.add_static(rows, x, y, 2 * radius, 2 * radius, 0.0, 0.35, of="Tree")
 
 
 def _add_bush(street: Street, x: float, y: float, size: float) -> bool:
@@ -237,13 +239,13 @@ def _add_bush(street: Street, x: float, y: float, size: float) -> bool:
     if size > 1.2 and rng.random() < 0.12:  # narrow and as high as a person or higher
         w, h = float(rng.uniform(0.4, 0.9)), float(rng.uniform(1.3, 2.6))
         rows.append(blob(LEAVES, leaf, (0, 0, h / 2), (w, w, h), float(rng.uniform(6.0, 14.0))))
-        return street.add_static(rows, x, y, w, w, 0.0, 0.3)
+        return street.add_static(rows, x, y, w, w, 0.0, 0.3, of="Tree")
     for _ in range(int(rng.integers(2, 4 + 2 * math.ceil(size)))):
         w, h = size * float(rng.uniform(0.3, 0.9)), size * float(rng.uniform(0.3, 0.9))
         a, b = (rng.normal(0, 0.25, 2) * size).tolist()
         center = (a, b, 0.4 * h + float(rng.uniform(0.0, 0.35)) * size)
         rows.append(blob(LEAVES, leaf, center, (w, w * float(rng.uniform(0.6, 1.4)), h), float(rng.uniform(1.5, 7))))
-    return street.add_static(rows, x, y, size * 0.8, size * 0.8, 0.0, 0.3)
+    return street.add_static(rows, x, y, size * 0.8, size * 0.8, 0.0, 0.3, of="Tree")
 
 
 # --- borders and buildings --------------------------------------------------------------------------------------------
@@ -264,7 +266,7 @@ def _add_building(street: Street, x: float, y: float, yaw: float, length: float,
             block(MATTE, wall, (rng.uniform(-0.4, 0.4) * length, -rng.choice([-1, 1]) * depth / 2, low + h / 2 - 0.05),
                    (w, rng.uniform(0.6, 1.6), h + 0.1))
         )  # fmt: skip
-    return street.add_static(rows, x, y, length + 0.4, depth + 1.4, yaw, 0.8)
+    return street.add_static(rows, x, y, length + 0.4, depth + 1.4, yaw, 0.8, of="Building")
 
 
 class _Border:
@@ -315,6 +317,8 @@ def _spread(length: float, step: float) -> list[float]:
     return np.arange(-length / 2, length / 2, step).tolist()
 
 
+# As in CamVid: walls count as buildings, hedges as trees.
+_BORDER_OF = {"hedge": "Tree", "thicket": "Tree", "wall": "Building", "fence": "Fence", "rail": "Fence"}
 _BORDERS = {
     "urban": (("hedge", 0.24), ("wall", 0.33), ("fence", 0.23), ("thicket", 0.1), ("none", 0.1)),
     "residential": (("hedge", 0.4), ("wall", 0.24), ("fence", 0.16), ("thicket", 0.15), ("none", 0.05)),
@@ -339,7 +343,8 @@ def _add_border(street: Street, road: int, side: float, away: float, low: float,
         while kind != "none" and s < end - 1.0:
             length = min(end - s, 6.0)
             x, y, yaw = street.on_strip(s + length / 2, side * (street.edge(road, side) + shift), road)
-            street.add_static(border.rows(length + 0.05, rng), x, y, length - 0.6, border.width, yaw, 0.1)
+            rows = border.rows(length + 0.05, rng)
+            street.add_static(rows, x, y, length - 0.6, border.width, yaw, 0.1, of=_BORDER_OF[kind])
             s += length
         s = end + (float(rng.uniform(1.0, 5.0)) if rng.random() < 0.7 else float(rng.uniform(5.0, 25.0)))
 
@@ -426,7 +431,7 @@ def _add_retaining_walls(street: Street, pavement: float) -> None:
         border.height = float(rng.uniform(0.4, 0.9)) * float(rise)
         for s in np.arange(low, low + float(rng.uniform(20.0, 80.0)), 6.0).tolist():
             x, y, yaw = street.on_strip(s, side * (street.edge(0, side) + pavement + 0.2))
-            street.add_static(border.rows(6.05, rng), x, y, 5.4, border.width, yaw, 0.1)
+            street.add_static(border.rows(6.05, rng), x, y, 5.4, border.width, yaw, 0.1, of="Building")
 
 
 def add_beside_people(street: Street, x: float, y: float, yaw: float) -> None:
@@ -437,15 +442,16 @@ def add_beside_people(street: Street, x: float, y: float, yaw: float) -> None:
     kind = rng.random()
     if kind < 0.55:
         rows, width = _POLES[int(rng.integers(0, len(_POLES)))](rng)
-        street.add_static(rows, px, py, 0.1, min(width, 0.2), yaw, 0.2)
+        street.add_static(rows, px, py, 0.1, min(width, 0.2), yaw, 0.2, of="Pole")
     elif kind < 0.7:
         _add_tree(street, px, py, 2.1)
     elif kind < 0.85:
         _add_furniture(street, px, py, yaw, "urban")
     elif kind < 0.95:
-        street.add_static(pram(rng), x + 0.95 * math.cos(yaw), y + 0.95 * math.sin(yaw), 0.8, 0.4, yaw, -20.0)
+        px, py = x + 0.95 * math.cos(yaw), y + 0.95 * math.sin(yaw)
+        street.add_static(pram(rng), px, py, 0.8, 0.4, yaw, -20.0, of="Pedestrian")
     else:
-        street.add_static(bicycle(1.75, 0.27, rng), px, py, 1.7, 0.4, yaw, 0.1)
+        street.add_static(bicycle(1.75, 0.27, rng), px, py, 1.7, 0.4, yaw, 0.1, of="Bicyclist")
 
 
 def add_parked_bicycles(street: Street, mean: float) -> None:
@@ -460,7 +466,7 @@ def add_parked_bicycles(street: Street, mean: float) -> None:
         n = int(rng.integers(1, 8))
         for k in range(n):
             rows += bicycle(float(rng.uniform(1.6, 1.85)), 0.27, rng, (k - (n - 1) / 2) * 0.5)
-        street.add_static(rows, x, y, 1.8, 0.5 * n, yaw)
+        street.add_static(rows, x, y, 1.8, 0.5 * n, yaw, of="Bicyclist")
 
 
 def add_islands_poles(street: Street) -> None:
@@ -472,4 +478,4 @@ def add_islands_poles(street: Street) -> None:
             x, y, yaw = street.on_strip(float(s), float(street.strips[k, 5:7].mean()), k)
             if rng.random() < 0.7:
                 rows, width = (_sign, _bollard, _traffic_light)[int(rng.choice(3, p=[0.5, 0.3, 0.2]))](rng)
-                street.add_static(rows, x, y, 0.2, min(width, 0.3), yaw, 0.1)
+                street.add_static(rows, x, y, 0.2, min(width, 0.3), yaw, 0.1, of="Pole")

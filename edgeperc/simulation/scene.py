@@ -32,6 +32,7 @@ __all__ = [
     "Scene",
     "SceneObject",
     "SimulatedScan",
+    "place_shapes",
     "sensor_pose",
     "simulate",
     "simulate_sequence",
@@ -133,6 +134,8 @@ class SimulatedScan:
         Index into `POINT_CLASSES`; trams and ``"misc"`` objects are background.
     objects : (n,) int32
         Index into ``boxes``; -1 for the background.
+    surfaces : (n,) int32
+        Row of ``scene.primitives`` that returned the point; -1 for the ground.
     boxes : tuple of Box
         All objects of the scene, including hidden ones.
     box_ids : tuple of int
@@ -147,6 +150,7 @@ class SimulatedScan:
     points: NDArray[np.float32]
     labels: NDArray[np.uint8]
     objects: NDArray[np.int32]
+    surfaces: NDArray[np.int32]
     boxes: tuple[Box, ...]
     box_ids: tuple[int, ...]
     box_points: tuple[int, ...]
@@ -261,18 +265,7 @@ def simulate(
     elevations = np.radians(np.asarray(profile.elevations_deg))
     reach = min(float(max_range_m), profile.max_range_m)
 
-    primitives = np.empty_like(scene.primitives)
-    poses = np.array([(*o.center[:2], o.center[2] - o.size[2] / 2.0, o.yaw) for o in scene.objects]).reshape(-1, 4)
-    fill_placed(scene.primitives, poses, pose, primitives)
-    bounds = np.empty((len(primitives), 5))
-    fill_bounds(primitives, bounds)
-    near_first = np.argsort(bounds[:, 4], kind="stable")
-    primitives, bounds = np.ascontiguousarray(primitives[near_first]), np.ascontiguousarray(bounds[near_first])
-    starts = np.zeros(n_columns + 1, dtype=np.int64)
-    fill_column_counts(bounds, n_columns, reach, starts)
-    rows = np.empty(starts[-1], dtype=np.int32)
-    fill_column_rows(bounds, n_columns, reach, starts, rows)
-
+    primitives, bounds, starts, rows = place_shapes(scene, pose, n_columns, reach)
     shape = (n_beams, n_columns)
     ranges, exits, cosines = np.empty(shape), np.empty(shape), np.empty(shape)
     hits = np.empty(shape, dtype=np.int32)
@@ -282,13 +275,15 @@ def simulate(
         elevations, azimuths, reach, key, ranges, hits, exits, cosines,
     )  # fmt: skip
     points = np.empty((n_beams * n_columns, 4), dtype=np.float32)
-    objects = np.empty(n_beams * n_columns, dtype=np.int32)
+    surfaces = np.empty(n_beams * n_columns, dtype=np.int32)
     n = fill_points(
         primitives, scene.strips, scene.terrain, scene.tile, pose, elevations, azimuths, range_offsets,
         remission_offsets, ranges, hits, exits, cosines, profile.min_range_m, reach, key, noise, noise and ego_shadow,
-        points, objects,
+        points, surfaces,
     )  # fmt: skip
-    points, objects = points[:n].copy(), objects[:n].copy()
+    points, surfaces = points[:n].copy(), surfaces[:n].copy()
+    # Shapes that are not part of an object have a negative number; -1 is the last entry, the ground.
+    objects = np.maximum([*scene.primitives[:, 19], -1.0], -1.0).astype(np.int32)[surfaces]
     boxes = tuple(_box_in_sensor(each, pose) for each in scene.objects)
     lookup = np.array([*(POINT_CLASS_OF.get(each.label, 0) for each in scene.objects), 0], dtype=np.uint8)
     counts = np.bincount(objects[objects >= 0], minlength=len(boxes))
@@ -296,12 +291,48 @@ def simulate(
         points=points,
         labels=lookup[objects],  # -1 is the last entry, the background
         objects=objects,
+        surfaces=surfaces,
         boxes=boxes,
         box_ids=tuple(each.track_id for each in scene.objects),
         box_points=tuple(int(c) for c in counts),
         T_world_sensor=pose,
         scene=scene,
     )
+
+
+def place_shapes(
+    scene: Scene, T_world_sensor: NDArray[np.float64], n_columns: int, reach_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.int32]]:
+    """Sort the shapes of a scene by the directions in which rays from a sensor may hit them.
+
+    Parameters
+    ----------
+    scene : Scene
+    T_world_sensor : (4, 4) float64
+    n_columns : int
+        Number of sectors of a turn, counter-clockwise from +x.
+    reach_m : float
+
+    Returns
+    -------
+    primitives : (n, 20) float64
+        In the sensor frame, nearest first; the last column is the row of ``scene.primitives``.
+    bounds, starts, rows
+        As `fill_cast` needs them.
+    """
+    primitives = np.empty_like(scene.primitives)
+    poses = np.array([(*o.center[:2], o.center[2] - o.size[2] / 2.0, o.yaw) for o in scene.objects]).reshape(-1, 4)
+    fill_placed(scene.primitives, poses, T_world_sensor, primitives)
+    bounds = np.empty((len(primitives), 5))
+    fill_bounds(primitives, bounds)
+    near_first = np.argsort(bounds[:, 4], kind="stable")
+    primitives, bounds = np.ascontiguousarray(primitives[near_first]), np.ascontiguousarray(bounds[near_first])
+    primitives[:, 19] = near_first
+    starts = np.zeros(n_columns + 1, dtype=np.int64)
+    fill_column_counts(bounds, n_columns, reach_m, starts)
+    rows = np.empty(starts[-1], dtype=np.int32)
+    fill_column_rows(bounds, n_columns, reach_m, starts, rows)
+    return primitives, bounds, starts, rows
 
 
 def simulate_sequence(

@@ -26,6 +26,7 @@ from .raycast import (
     MARKING,
     PAVEMENT,
     PAVING,
+    RETRO,
     ROUGH,
     ROUNDING,
     ROW,
@@ -48,6 +49,7 @@ from .shapes import Row, Vector
 from .vehicles import bus, car, misc, truck, van
 
 __all__ = [
+    "CAMERA_CLASSES",
     "IN_BAYS",
     "ROW_RANGE_M",
     "ROW_WIDTH_M",
@@ -81,6 +83,23 @@ SIZES: dict[str, tuple[Vector, Vector]] = {
     "person_sitting": ((0.72, 0.6, 1.26), (0.1, 0.06, 0.05)),
     "cyclist": ((1.76, 0.62, 1.74), (0.12, 0.1, 0.08)),
 }
+
+
+CAMERA_CLASSES = (
+    "Sky",
+    "Building",
+    "Pole",
+    "Road",
+    "Pavement",
+    "Tree",
+    "SignSymbol",
+    "Fence",
+    "Car",
+    "Pedestrian",
+    "Bicyclist",
+)
+"""CamVid's eleven classes of images, in their usual order."""
+_SIGN = -2.0 - CAMERA_CLASSES.index("SignSymbol")
 
 
 class Street:
@@ -175,13 +194,24 @@ class Street:
         return True
 
     def add_static(
-        self, rows: list[Row], x: float, y: float, length: float, width: float, yaw: float, off_road: float = 0.1
+        self,
+        rows: list[Row],
+        x: float,
+        y: float,
+        length: float,
+        width: float,
+        yaw: float,
+        off_road: float = 0.1,
+        *,
+        of: str = "",
     ) -> bool:
         """Place static shapes if the ground is free and off the roads. Return whether they were placed.
 
         ``rows`` are primitives in a frame at x, y on the ground, turned by ``yaw``. They stand on the lowest ground
-        below them.
+        below them. ``of`` is their class in a camera's image (`CAMERA_CLASSES`), empty for none; retroreflectors on
+        poles are signs.
         """
+        number = -2.0 - CAMERA_CLASSES.index(of) if of else -1.0
         cos, sin = math.cos(yaw), math.sin(yaw)
         z, outside = self.ground(x, y)
         if outside < off_road:
@@ -202,7 +232,9 @@ class Street:
             axes = []
             for i in (7, 10, 13):
                 axes += [cos * row[i] - sin * row[i + 1], sin * row[i] + cos * row[i + 1], row[i + 2]]
-            self.rows.append((*row[:4], x + cos * cx - sin * cy, y + sin * cx + cos * cy, z + cz, *axes, *row[16:]))
+            mine = _SIGN if of == "Pole" and row[1] == RETRO else number
+            where = (x + cos * cx - sin * cy, y + sin * cx + cos * cy, z + cz)
+            self.rows.append((*row[:4], *where, *axes, *row[16:19], mine))
         return True
 
 

@@ -1,0 +1,196 @@
+"""A camera in the simulated street: classes, depths and a drawn picture, by the ray casting of the LiDAR."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..calibration import Calibration
+from ..errors import CalibrationError
+from .raycast import FACADE, GLASS, LEAVES, PAINT, RETRO, fill_cast, fill_ground_kinds
+from .scene import Scene, place_shapes
+from .street import CAMERA_CLASSES
+
+__all__ = ["CAMERA_CLASSES", "VOID", "CameraImage", "forward_camera", "render", "surface_classes"]
+
+VOID = 255
+"""No class: benches, bins and other shapes that CamVid counts to none of its eleven classes."""
+
+MOST_TILT_DEG = 20.0  # the search for the ground needs a camera that is nearly upright
+_SECTORS = 1440
+# From the camera's frame (x right, y down, z ahead) to that of the rays (x ahead, y left, z up).
+_AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+_SKY, _ROAD, _PAVEMENT, _TREE = (CAMERA_CLASSES.index(name) for name in ("Sky", "Road", "Pavement", "Tree"))
+_OF_OBJECT = {
+    **dict.fromkeys(("car", "van", "truck", "tram", "misc"), CAMERA_CLASSES.index("Car")),
+    **dict.fromkeys(("pedestrian", "person_sitting"), CAMERA_CLASSES.index("Pedestrian")),
+    "cyclist": CAMERA_CLASSES.index("Bicyclist"),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraImage:
+    """What a camera sees of a simulated street, and the truth.
+
+    Attributes
+    ----------
+    rgb : (height, width, 3) uint8
+        A drawn picture: one color for each surface, shaded, with noise. It is no photograph.
+    labels : (height, width) uint8
+        True class of each pixel: index into `CAMERA_CLASSES`, `VOID` for none.
+    depth_m : (height, width) float32
+        Distance along the optical axis [m]; infinite for the sky.
+    """
+
+    rgb: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+
+
+def forward_camera(width: int = 960, height: int = 720, *, fov_deg: float = 60.0) -> Calibration:
+    """Make the calibration of a camera that looks ahead, mounted as KITTI's: 0.27 m ahead of the LiDAR, 0.08 m lower.
+
+    Parameters
+    ----------
+    width, height : int
+        Size of the image [px].
+    fov_deg : float
+        Horizontal field of view [deg].
+    """
+    focal = width / (2.0 * math.tan(math.radians(fov_deg) / 2.0))
+    K = np.array([[focal, 0.0, (width - 1) / 2.0], [0.0, focal, (height - 1) / 2.0], [0.0, 0.0, 1.0]])
+    T_camera_sensor = _AHEAD.T.copy()
+    T_camera_sensor[:3, 3] = 0.0, -0.08, -0.27
+    return Calibration(K, T_camera_sensor, width, height)
+
+
+def render(
+    scene: Scene,
+    calibration: Calibration,
+    T_world_sensor: ArrayLike,
+    seed: int,
+    *,
+    max_range_m: float = 250.0,
+) -> CameraImage:
+    """Render what the camera sees.
+
+    Parameters
+    ----------
+    scene : Scene
+    calibration : Calibration
+        Of the camera and the LiDAR whose pose is given.
+    T_world_sensor : (4, 4) array_like
+        Pose of the LiDAR (`SimulatedScan.T_world_sensor`).
+    seed : int
+        Seed of leaves, colors and noise. The result is the same bit for bit for the same seed.
+    max_range_m : float
+        Length of the rays [m]. Farther surfaces are sky.
+
+    Returns
+    -------
+    CameraImage
+
+    Raises
+    ------
+    CalibrationError
+        The camera is tilted by more than 20 degrees.
+    """
+    T_world_camera = np.asarray(T_world_sensor, np.float64) @ np.linalg.inv(calibration.T_camera_sensor)
+    pose = T_world_camera @ _AHEAD.T
+    if not pose[2, 2] >= math.cos(math.radians(MOST_TILT_DEG)):
+        raise CalibrationError(f"the camera is tilted by more than {MOST_TILT_DEG:g} degrees, which is not simulated")
+    rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 15485863))
+    key = int(rng.integers(0, 2**63))
+    width, height = calibration.width, calibration.height
+    (f_x, _, c_x), (_, f_y, c_y), _ = calibration.K.tolist()
+    azimuths = np.arctan((c_x - np.arange(width)) / f_x)
+    slopes = (c_y - np.arange(height)) / f_y
+    primitives, bounds, starts, rows = place_shapes(scene, pose, _SECTORS, max_range_m)
+    sectors = np.floor(azimuths / (2.0 * math.pi / _SECTORS)).astype(np.int64) % _SECTORS
+
+    # Transposed: a column of the image has one azimuth, and elevations of its own.
+    shape = (width, height, 1)
+    ranges, exits, cosines = np.empty(shape), np.empty(shape), np.empty(shape)
+    hits = np.empty(shape, dtype=np.int32)
+    elevations = np.arctan(slopes * np.cos(azimuths)[:, None])
+    for column, sector in enumerate(sectors.tolist()):
+        fill_cast(
+            primitives, bounds, starts[sector : sector + 2], rows, scene.strips, scene.terrain, scene.tile, pose,
+            elevations[column], azimuths[column : column + 1], max_range_m, np.uint64(key + column * height),
+            ranges[column], hits[column], exits[column], cosines[column],
+        )  # fmt: skip
+    ranges, cosines, hits = (np.ascontiguousarray(of[:, :, 0].T) for of in (ranges, cosines, hits))
+    elevations = elevations.T
+    depth = np.where(hits == -2, np.inf, ranges * np.cos(elevations) * np.cos(azimuths))
+
+    labels = np.full(hits.shape, _SKY, dtype=np.uint8)
+    solid, ground = hits >= 0, hits == -1
+    surfaces = np.full(hits.shape, -1, dtype=np.int64)
+    surfaces[solid] = primitives[hits[solid], 19].astype(np.int64)
+    labels[solid] = surface_classes(scene)[surfaces[solid]]
+    row, col = np.nonzero(ground)
+    camera = np.stack([-np.tan(azimuths[col]), -slopes[row], np.ones(len(row))]) * depth[ground]
+    world = T_world_camera[:3, :3] @ camera + T_world_camera[:3, 3:]
+    kinds = np.empty(len(row), np.uint8)
+    remissions = np.empty(len(row))
+    fill_ground_kinds(scene.strips, scene.terrain, scene.tile, np.ascontiguousarray(world[:2].T), kinds, remissions)
+    labels[ground] = np.array([_ROAD, _PAVEMENT, _TREE], np.uint8)[kinds]
+
+    color = np.empty((*hits.shape, 3))
+    color[:] = _mixed((236, 240, 245), (120, 165, 220), np.clip(4.0 * slopes, 0.0, 1.0))[:, None]
+    shade = 0.55 + 0.45 * cosines
+    color[solid] = _surface_colors(scene, rng)[surfaces[solid]] * shade[solid][:, None]
+    gray, green = np.array([1.0, 1.0, 1.02]), np.array([0.62, 0.85, 0.4])
+    tint = np.stack([370.0 * gray, 560.0 * gray, 330.0 * green])[kinds]
+    color[ground] = tint * remissions[:, None]
+    haze = 1.0 - np.exp(-np.where(np.isfinite(depth), depth, 0.0) / 300.0)
+    color = color * (1.0 - haze[..., None]) + np.array([225.0, 230.0, 236.0]) * haze[..., None]
+    color += rng.normal(0.0, 5.0, hits.shape)[..., None]
+    return CameraImage(np.clip(color, 0.0, 255.0).astype(np.uint8), labels, depth.astype(np.float32))
+
+
+def surface_classes(scene: Scene) -> NDArray[np.uint8]:
+    """Class of each of ``scene.primitives`` in an image: index into `CAMERA_CLASSES`, `VOID` for none, (n,) uint8."""
+    of_object = [
+        CAMERA_CLASSES.index("Bicyclist") if each.label == "misc" and each.size[0] < 2.7 else _OF_OBJECT[each.label]
+        for each in scene.objects
+    ]  # a short "misc" object is a motorcycle, which CamVid counts to the bicycles
+    number = scene.primitives[:, 19].astype(np.int64)
+    lookup = np.array([*of_object, 0], dtype=np.uint8)
+    static = np.where(number < -1, -2 - number, np.where(scene.primitives[:, 1] == LEAVES, _TREE, VOID))
+    return np.where(number >= 0, lookup[np.maximum(number, -1)], static).astype(np.uint8)
+
+
+def _surface_colors(scene: Scene, rng: np.random.Generator) -> NDArray[np.float64]:
+    """A color (n, 3) for each of ``scene.primitives``: of its material, and of its object where that is painted."""
+    primitives = scene.primitives
+    n = len(primitives)
+    material, number = primitives[:, 1].astype(np.int64), primitives[:, 19].astype(np.int64)
+    # Shapes of a person with the same remission are of one cloth.
+    _, cloth = np.unique(primitives[:, [19, 2]], axis=0, return_inverse=True)
+    own = (rng.uniform(40.0, 190.0, (n, 1)) + rng.normal(0.0, 22.0, (n, 3)))[cloth.reshape(-1)]
+    walls = np.array([190.0, 165.0, 140.0]) + rng.normal(0.0, 22.0, (n, 1)) + rng.normal(0.0, 8.0, (n, 3))
+    leaves = np.array([70.0, 105.0, 48.0]) + rng.normal(0.0, 12.0, (n, 1)) + rng.normal(0.0, 6.0, (n, 3))
+    paint = rng.uniform(20.0, 225.0, (len(scene.objects) + 1, 1)) + rng.normal(0.0, 25.0, (len(scene.objects) + 1, 3))
+    classes = surface_classes(scene)
+    colors = np.full((n, 3), 110.0)
+    building = (classes == CAMERA_CLASSES.index("Building")) | (material == FACADE)
+    colors[building] = walls[building]
+    colors[classes == CAMERA_CLASSES.index("Fence")] = (120.0, 108.0, 92.0)
+    people = (number >= 0) & np.isin(classes, [CAMERA_CLASSES.index("Pedestrian"), CAMERA_CLASSES.index("Bicyclist")])
+    colors[people] = own[people]
+    colors[(number >= 0) & ~people] = 45.0  # wheels and other parts of vehicles
+    colors[material == PAINT] = paint[number[material == PAINT]]
+    colors[material == LEAVES] = leaves[material == LEAVES]
+    colors[material == GLASS] = (48.0, 58.0, 68.0)
+    colors[material == RETRO] = np.where(rng.random((n, 1)) < 0.5, (225.0, 225.0, 225.0), (190.0, 45.0, 40.0))[
+        material == RETRO
+    ]
+    return np.asarray(np.clip(colors, 5.0, 250.0))
+
+
+def _mixed(low: tuple[int, ...], high: tuple[int, ...], share: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.array(low) + share[:, None] * (np.array(high) - np.array(low)))
