@@ -5,7 +5,9 @@
     EdgepercError
     ├── OptionError (ValueError)      an unknown option, or a value out of its range
     ├── PointsError (ValueError)      an array or a sensor file that is not a scan
+    ├── ImageError (ValueError)       an array or a file that is not a camera's image, or an image that is missing
     ├── SensorError (ValueError)      an unknown or impossible sensor profile
+    ├── CalibrationError (ValueError) values that describe no camera, or no pose of one
     ├── SettingsError (ValueError)    this computer's settings file cannot be read
     ├── SplitError (ValueError)       a model would be evaluated on a scan that it was trained on
     ├── TrackingError (ValueError)    boxes or a pose that cannot be tracked
@@ -26,10 +28,12 @@ Each message says what was given, what was expected and what to do.
 from __future__ import annotations
 
 __all__ = [
+    "CalibrationError",
     "CardError",
     "CardMismatchError",
     "EdgepercError",
     "FitnessError",
+    "ImageError",
     "InferenceError",
     "MissingExtraError",
     "ModelError",
@@ -58,8 +62,16 @@ class PointsError(EdgepercError, ValueError):
     """An array or a sensor file is not a scan: wrong shape, dtype, fields or length."""
 
 
+class ImageError(EdgepercError, ValueError):
+    """An array or a file is not a camera's image: wrong shape, dtype, format or size; or an image is missing."""
+
+
 class SensorError(EdgepercError, ValueError):
     """A sensor profile is unknown or describes no possible sensor."""
+
+
+class CalibrationError(EdgepercError, ValueError):
+    """A calibration describes no camera, or does not fit the image that it is used with."""
 
 
 class MountingError(EdgepercError, ValueError):
