@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,7 @@ from edgeperc.sensor import SensorProfile, get_sensor
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES
 
+from .processes import mapped
 from .scans import LabeledScan, mirrored, turned, turned_box
 
 __all__ = [
@@ -73,21 +76,38 @@ class ObjectBank:
     classes: tuple[str, ...] = POINT_CLASSES
 
     @classmethod
-    def of(cls, scans: Iterable[LabeledScan], fewest: int = 8, classes: tuple[str, ...] = POINT_CLASSES) -> ObjectBank:
-        """The objects of the scans within 60 m that have at least ``fewest`` returns, and pieces of the background."""
+    def of(
+        cls,
+        scans: Iterable[LabeledScan],
+        fewest: int = 8,
+        classes: tuple[str, ...] = POINT_CLASSES,
+        n_workers: int = 0,
+    ) -> ObjectBank:
+        """The objects of the scans within 60 m that have at least ``fewest`` returns, and pieces of the background.
+
+        ``n_workers`` processes look for them; 0: this one. The bank is the same.
+        """
         objects: dict[str, list[tuple[Box, NDArray[np.float32]]]] = {}
-        for scan in scans:
-            for box, count in zip(scan.boxes, scan.counts, strict=True):
-                name = "pedestrian" if box.label == "person_sitting" else box.label
-                known = class_number(name, classes) not in (0, IGNORE)
-                if not known or count < fewest or np.hypot(*box.center[:2]) > 60.0:
-                    continue
-                points = scan.points[inside(box, scan.points)]
-                if len(points) >= fewest:
-                    objects.setdefault(name, []).append((box, points))
-            for box, points in background_pieces(scan, fewest):
-                objects.setdefault(box.label, []).append((box, points))
+        with mapped(partial(_cut_out, fewest=fewest, classes=classes), scans, n_workers) as found:
+            for name, piece in chain.from_iterable(found):
+                objects.setdefault(name, []).append(piece)
         return cls(objects, classes)
+
+
+def _cut_out(
+    scan: LabeledScan, *, fewest: int, classes: tuple[str, ...]
+) -> list[tuple[str, tuple[Box, NDArray[np.float32]]]]:
+    """The objects of one scan and pieces of its background, each with its kind."""
+    found = []
+    for box, count in zip(scan.boxes, scan.counts, strict=True):
+        name = "pedestrian" if box.label == "person_sitting" else box.label
+        known = class_number(name, classes) not in (0, IGNORE)
+        if not known or count < fewest or np.hypot(*box.center[:2]) > 60.0:
+            continue
+        points = scan.points[inside(box, scan.points)]
+        if len(points) >= fewest:
+            found.append((name, (box, points)))
+    return found + [(box.label, (box, points)) for box, points in background_pieces(scan, fewest)]
 
 
 def background_pieces(scan: LabeledScan, fewest: int = 8) -> Iterator[tuple[Box, NDArray[np.float32]]]:

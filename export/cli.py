@@ -72,6 +72,9 @@ def build_parser() -> argparse.ArgumentParser:
     simulate.add_argument("--first", type=int, default=0, help="number of the first scan, and its seed (default 0)")
     simulate.add_argument("--layouts", type=Path, help=LAYOUTS)
     simulate.add_argument("--sensor", default="hdl-64e", help="sensor to simulate (default hdl-64e)")
+    simulate.add_argument(
+        "--workers", type=int, default=0, help="number of processes that simulate (default: this one)"
+    )
     simulate.set_defaults(run=_simulate)
 
     train = commands.add_parser("train", help="train a network, or resume a stopped training run")
@@ -297,7 +300,7 @@ def _recipe(args: argparse.Namespace) -> Recipe:
 def _simulate(args: argparse.Namespace) -> int:
     from .simulate import simulate
 
-    simulate(args.out, args.n, first=args.first, layouts_root=args.layouts, sensor=args.sensor)
+    simulate(args.out, args.n, first=args.first, layouts_root=args.layouts, sensor=args.sensor, n_workers=args.workers)
     return 0
 
 

@@ -79,7 +79,7 @@ def make(
     if not simulated_only and (kitti is None or layouts is None):
         raise ValueError(f"{name} is trained on real scans too; give --kitti and --layouts")
     scans = out / ("scans" if simulated_only else "scans-with-layouts")
-    simulate(scans, N_SIMULATED, layouts_root=None if simulated_only else layouts)
+    simulate(scans, N_SIMULATED, layouts_root=None if simulated_only else layouts, n_workers=n_workers)
 
     def checkpoint_of(other: str) -> Path:
         # The models that this one starts from or is distilled from must not be trained on the fold either.

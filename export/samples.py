@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -23,6 +22,7 @@ from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES
 
 from .augment import NEGATIVES, ObjectBank, augmented, swapped, with_ground_ahead
+from .processes import CONTEXT
 from .recipe import Recipe
 from .roads import drawn_roads, sure_surface, with_road
 from .scan_sets import seen_by_network
@@ -30,7 +30,7 @@ from .scans import LabeledScan
 from .task import Targets, task_of
 from .teacher import OnnxTeacher
 
-__all__ = ["RealScans", "Samples", "loaded", "real_scans"]
+__all__ = ["RealScans", "Recent", "Samples", "loaded", "real_scans"]
 
 # Scans whose objects are cut out for pasting; each holds about five.
 BANK_SCANS = 400
@@ -40,6 +40,8 @@ OWN_ODDS = 0.2
 # often one of them is drawn than by its weight alone.
 REDRAWN_SCANS = 64
 REDRAW_FACTORS = (0.5, 3.0)
+# Samples that are kept to be used again: 1 MB each.
+RECENT_SAMPLES = 2048
 
 
 class Samples:
@@ -55,6 +57,8 @@ class Samples:
         Files written by `LabeledScan.save`.
     teacher : OnnxTeacher, optional
         Its answers come with the samples.
+    n_workers : int
+        Number of processes that cut out the objects to paste; 0: this one.
 
     Attributes
     ----------
@@ -76,6 +80,7 @@ class Samples:
         real_weights: Sequence[float],
         simulated: Sequence[Path],
         teacher: OnnxTeacher | None = None,
+        n_workers: int = 0,
     ) -> None:
         if not real and not simulated:
             raise ValueError("no scans to train on; give --kitti, --scans, --simulated or several of them")
@@ -100,7 +105,7 @@ class Samples:
             stride = max(1, len(simulated) // BANK_SCANS)
             scans = [*self.real, *(self._load(k) for k in range(0, len(simulated), stride))]
             scans = tqdm(scans, desc="cutting out objects", leave=False)
-            self.bank = ObjectBank.of(scans, classes=recipe.classes or POINT_CLASSES)
+            self.bank = ObjectBank.of(scans, classes=recipe.classes or POINT_CLASSES, n_workers=n_workers)
 
     def batch(self, step: int) -> Targets:
         """The arrays of one step, always the same for the same step and `odds`.
@@ -187,26 +192,70 @@ class Samples:
         return replace(scan, labels=self._numbers[scan.labels])
 
 
-def loaded(samples: Samples, start: int, stop: int, n_workers: int) -> Iterator[list[Tensor]]:
+def loaded(
+    samples: Samples, start: int, stop: int, n_workers: int, device: torch.device | None = None
+) -> Iterator[list[Tensor]]:
     """The batches of the steps from ``start`` to ``stop``, made by ``n_workers`` processes ahead of their use.
 
     At multiples of the recipe's ``redraw_every``, the processes start anew, so that they see the new odds. With 0
     workers each batch is made when it is asked for; the batches are the same.
+
+    If the recipe has a ``reuse`` above 1, only one batch in so many is new. The others are drawn from the newest
+    samples, which stay on the device.
     """
-    every = samples.recipe.redraw_every or stop
-    # A forked process shares the scans; where it is not safe, each process gets a copy of them.
-    context = "fork" if sys.platform == "linux" else "spawn"
+    recipe = samples.recipe
+    every, device = recipe.redraw_every or stop, device or torch.device("cpu")
+    recent = Recent(RECENT_SAMPLES)
     while start < stop:
         end = min(stop, start - start % every + every)
-        yield from DataLoader(
+        new: DataLoader[list[Tensor]] = DataLoader(
             samples,  # type: ignore[arg-type]  # it has __getitem__, which is all that is needed
             batch_size=None,
-            sampler=range(start, end),
+            sampler=range(start, end, recipe.reuse),
             num_workers=n_workers,
             prefetch_factor=4 if n_workers else None,
-            multiprocessing_context=context if n_workers else None,
+            multiprocessing_context=CONTEXT if n_workers else None,
+            pin_memory=device.type == "cuda",
         )
+        for step, batch in zip(range(start, end, recipe.reuse), new, strict=True):
+            batch = [part.to(device, non_blocking=True) for part in batch]
+            yield batch
+            if recipe.reuse > 1:
+                recent.add(batch)
+            for again in range(step + 1, min(step + recipe.reuse, end)):
+                yield recent.draw(recipe.batch, torch.Generator().manual_seed((recipe.seed << 32) + again))
         start = end
+
+
+class Recent:
+    """The newest samples.
+
+    Parameters
+    ----------
+    size : int
+        At most this many samples are kept, rounded up to whole batches.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._size, self._n_added, self._n_kept = size, 0, 0
+        self._parts: list[Tensor] = []
+
+    def add(self, batch: Sequence[Tensor]) -> None:
+        """Keep a batch; the oldest one is dropped if there is no more room."""
+        n = len(batch[0])
+        n_batches = -(-self._size // n)
+        if not self._parts:
+            self._parts = [part.new_empty((n_batches * n, *part.shape[1:])) for part in batch]
+        at = self._n_added % n_batches * n
+        for kept, part in zip(self._parts, batch, strict=True):
+            kept[at : at + n] = part
+        self._n_added += 1
+        self._n_kept = min(self._n_added, n_batches) * n
+
+    def draw(self, n: int, generator: torch.Generator) -> list[Tensor]:
+        """``n`` different samples, drawn at random."""
+        chosen = torch.randperm(self._n_kept, generator=generator)[:n].to(self._parts[0].device)
+        return [part[chosen] for part in self._parts]
 
 
 def _numbers(classes: Sequence[str]) -> NDArray[np.uint8]:

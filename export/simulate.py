@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +12,25 @@ from tqdm import tqdm
 
 from edgeperc.evaluation.datasets import KittiObjects, layouts
 from edgeperc.fitness import FitnessProfile
+from edgeperc.perception import Box
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import simulated_scan
 
+from .processes import mapped
 from .scans import LabeledScan
 
 __all__ = ["fitness_of", "parity_scans", "simulate"]
 
 
-def simulate(out: Path, n: int, *, first: int = 0, layouts_root: Path | None = None, sensor: str = "hdl-64e") -> None:
+def simulate(
+    out: Path,
+    n: int,
+    *,
+    first: int = 0,
+    layouts_root: Path | None = None,
+    sensor: str = "hdl-64e",
+    n_workers: int = 0,
+) -> None:
     """Write ``n`` labeled scans into ``out``. Existing files are kept, so a stopped run resumes.
 
     Parameters
@@ -32,15 +43,25 @@ def simulate(out: Path, n: int, *, first: int = 0, layouts_root: Path | None = N
         Folder of KITTI's labels; every other scene gets the boxes of one of its scans.
     sensor : str
         Name of the sensor to simulate.
+    n_workers : int
+        Number of processes that simulate; 0: this one. The scans are the same.
     """
     out.mkdir(parents=True, exist_ok=True)
     real = list(layouts(layouts_root)) if layouts_root else []
-    for seed in tqdm(range(first, first + n), desc="simulating", unit="scan"):
-        path = out / f"{seed:06d}.npz"
-        if not path.exists():
-            # 4,973 is prime: neighboring seeds take layouts of different drives.
-            boxes = real[seed * 4973 % len(real)] if real and seed % 2 else None
-            LabeledScan.from_simulation(simulated_scan(seed, sensor, boxes)).save(path)
+    missing = [seed for seed in range(first, first + n) if not _path(out, seed).exists()]
+    with mapped(partial(_simulate, out=out, layouts=real, sensor=sensor), missing, n_workers) as done:
+        for _ in tqdm(done, desc="simulating", unit="scan", total=len(missing)):
+            pass
+
+
+def _path(out: Path, seed: int) -> Path:
+    return out / f"{seed:06d}.npz"
+
+
+def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: str) -> None:
+    # 4,973 is prime: neighboring seeds take layouts of different drives.
+    boxes = layouts[seed * 4973 % len(layouts)] if layouts and seed % 2 else None
+    LabeledScan.from_simulation(simulated_scan(seed, sensor, boxes)).save(_path(out, seed))
 
 
 def parity_scans(paths: Sequence[Path]) -> list[NDArray[np.float32]]:

@@ -113,6 +113,7 @@ def train(
     if n_threads is not None:
         torch.set_num_threads(n_threads)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    torch.backends.cudnn.benchmark = True  # inputs have one size
     task = task_of(recipe)
     objects = KittiObjects(kitti) if kitti else None
     only_simulated = recipe.simulated_share == 1.0
@@ -134,7 +135,7 @@ def train(
         real = pseudo_labeled(teacher_network.cpu(), task, [*real, *extra])
         weights += [len(extra) ** -0.5] * len(extra)
     paths = sorted(simulated.glob("*.npz")) if simulated else []
-    samples = Samples(recipe, real, weights, paths, onnx_teacher)
+    samples = Samples(recipe, real, weights, paths, onnx_teacher, n_workers)
     watch = Watch(samples, watched) if watched else None
 
     network = build(recipe)
@@ -188,12 +189,11 @@ def train(
     progress = tqdm(total=recipe.steps, initial=step, desc=recipe.network, unit="step")
     losses: list[float] = []
     with (out / "log.jsonl").open("a") as log, progress:
-        for inputs, *others in loaded(samples, step, recipe.steps, n_workers):
+        for inputs, *others in loaded(samples, step, recipe.steps, n_workers, device):
             for group in optimizer.param_groups:
                 group["lr"] = recipe.learning_rate * _schedule(recipe, step) * 0.5**halvings
             torch.manual_seed((recipe.seed << 32) + step)
-            x = inputs.to(device, memory_format=torch.channels_last)
-            others = [other.to(device) for other in others]
+            x = inputs.contiguous(memory_format=torch.channels_last)
             y = others[: samples.n_targets]
             taught: tuple[Any, ...] = tuple(others[samples.n_targets :])
             network.train()
@@ -325,8 +325,10 @@ def _teacher(checkpoint: Path, task: Task) -> nn.Module:
 @torch.no_grad()
 def _average(averaged: nn.Module, network: nn.Module, decay: float) -> None:
     """One step of the exponential moving average of weights; counters are copied."""
-    for slow, fast in zip(averaged.state_dict().values(), network.state_dict().values(), strict=True):
-        if slow.dtype.is_floating_point:
-            slow.lerp_(fast, 1.0 - decay)
-        else:
+    pairs = list(zip(averaged.state_dict().values(), network.state_dict().values(), strict=True))
+    floating = [(slow, fast) for slow, fast in pairs if slow.dtype.is_floating_point]
+    # All at once: on a GPU, a call for each tensor takes longer than the averaging.
+    torch._foreach_lerp_([slow for slow, _ in floating], [fast for _, fast in floating], 1.0 - decay)
+    for slow, fast in pairs:
+        if not slow.dtype.is_floating_point:
             slow.copy_(fast)

@@ -34,6 +34,7 @@ from edgeperc.simulation.scene import SimulatedScan
 from edgeperc_export import cards, to_onnx
 from edgeperc_export import make as make_module
 from edgeperc_export.ablation import PAPERS, SHIPPED, VARIANTS, ablate, plot
+from edgeperc_export.augment import ObjectBank
 from edgeperc_export.cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT
 from edgeperc_export.cli import main
 from edgeperc_export.curve import curve_table
@@ -41,7 +42,7 @@ from edgeperc_export.models_page import models_page
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe, Stage
 from edgeperc_export.roads import DRAWN, drawn_roads
-from edgeperc_export.samples import Samples, real_scans
+from edgeperc_export.samples import Recent, Samples, loaded, real_scans
 from edgeperc_export.scans import LabeledScan, mirrored
 from edgeperc_export.simulate import parity_scans, simulate
 from edgeperc_export.start import start
@@ -147,6 +148,48 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
         assert torch.equal(value, resumed[name]), name
     log = [json.loads(line) for line in (tmp_path / "whole/log.jsonl").read_text().splitlines()]
     assert all(np.isfinite(line["loss"]) for line in log)
+
+
+@pytest.mark.usefixtures("small_views")
+def test_reused_samples_are_drawn_from_the_newest(tmp_path: Path, simulated: Path) -> None:
+    recipe = small("pointseg", steps=7, batch=2, reuse=3, redraw_every=0)
+    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    batches = [[part.clone() for part in batch] for batch in loaded(samples, 0, recipe.steps, 0)]
+    assert len(batches) == recipe.steps
+    seen: list[Tensor] = []
+    for step, (image, *_) in enumerate(batches):
+        if step % recipe.reuse == 0:
+            np.testing.assert_array_equal(image, samples.batch(step)[0])
+            seen += list(image)
+        else:
+            numbers = [next(k for k, other in enumerate(seen) if torch.equal(one, other)) for one in image]
+            assert len(set(numbers)) == 2
+    assert train(recipe, tmp_path, kitti=None, simulated=simulated, n_threads=1).exists()
+
+
+def test_recent_samples_replace_the_oldest() -> None:
+    recent = Recent(4)
+    for number in range(5):
+        recent.add([torch.full((2, 1), float(number)), torch.full((2,), number)])
+        found, labels = recent.draw(4, torch.Generator().manual_seed(number))
+        expected = sorted([number, number, *([number - 1] * 2 if number else [])])
+        assert sorted(labels.tolist()) == expected
+        assert found[:, 0].tolist() == labels.tolist()
+
+
+def test_workers_simulate_the_same_scans_and_cut_out_the_same_objects(tmp_path: Path) -> None:
+    for n_workers in (0, 2):
+        simulate(tmp_path / str(n_workers), 3, n_workers=n_workers)
+    ours, theirs = (sorted((tmp_path / folder).glob("*.npz")) for folder in ("0", "2"))
+    assert [path.name for path in ours] == [path.name for path in theirs]
+    assert all(one.read_bytes() == other.read_bytes() for one, other in zip(ours, theirs, strict=True))
+    scans = [LabeledScan.load(path) for path in ours]
+    bank, other_bank = (ObjectBank.of(scans, n_workers=n_workers) for n_workers in (0, 2))
+    assert list(bank.objects) == list(other_bank.objects)
+    for name, objects in bank.objects.items():
+        for (box, points), (other_box, other_points) in zip(objects, other_bank.objects[name], strict=True):
+            assert box == other_box
+            np.testing.assert_array_equal(points, other_points)
 
 
 @pytest.mark.usefixtures("small_views")
@@ -273,7 +316,8 @@ def test_head_only_trains_only_the_head(tmp_path: Path, simulated: Path) -> None
 def test_the_papers_recipes_match_the_papers() -> None:
     """SSADNet 3.2, PointSeg 5 and LoDNN-I 3.3 to 3.6, without settings that they do not mention."""
     ssadnet, pointseg = PAPER["ssadnet"], PAPER["pointseg"]
-    assert (ssadnet.head, ssadnet.optimizer, ssadnet.learning_rate, ssadnet.batch) == ("slots", "adam", 1e-5, 8)
+    assert (ssadnet.head, ssadnet.optimizer, ssadnet.learning_rate) == ("slots-paper", "adam", 1e-5)
+    assert ssadnet.batch == 8
     assert ssadnet.halve_after == 100
     assert (pointseg.optimizer, pointseg.learning_rate, pointseg.batch, pointseg.steps) == ("adagrad", 1e-3, 32, 50_000)
     for recipe in (ssadnet, pointseg):
@@ -723,7 +767,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory, scans: Sequence[np.ndarra
 
 @pytest.mark.parametrize(
     ("network", "head"),
-    [("kulseg", "dense"), ("lodnn", "dense"), ("pointseg", "dense"), ("ssadnet", "dense"), ("ssadnet", "slots")],
+    [("kulseg", "dense"), ("lodnn", "dense"), ("pointseg", "dense"), ("ssadnet", "dense"), ("ssadnet", "slots"), ("ssadnet", "slots-paper")],
 )
 def test_an_export_is_verified(exported: Exported, scans: Sequence[np.ndarray], network: str, head: str) -> None:
     checkpoint, path, card = exported(network, head)

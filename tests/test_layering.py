@@ -26,13 +26,13 @@ FLOORS = {
         extras mounting onnx_file
         card points sensor tuning
         kernel_cache perception zoo.__init__
-        frame geometry linkage
-        adapt cluster decode drivable fitness ground observed projection refine sensor_fit session
-        agreement level network_input remission
+        calibration frame geometry linkage
+        adapt cluster decode drivable fitness ground image observed projection refine sensor_fit session
+        agreement level network_input paint remission
         readers.__init__ readers.tables
         readers.inflate readers.packets
         readers.pcd readers.ply
-        readers.files readers.mcap readers.ouster
+        readers.files readers.images readers.mcap readers.ouster
         readers.decoders
         readers.identify
         readers.worker
@@ -49,7 +49,7 @@ FLOORS = {
         simulation.scene simulation.vehicles
         simulation.people
         simulation.street
-        simulation.roadside
+        simulation.camera simulation.roadside
         simulation.drawn simulation.layouts
         simulation.__init__
         simulation.samples
@@ -72,7 +72,8 @@ FLOORS = {
         __init__ __main__
     """,
     "edgeperc_export": """
-        __init__ networks.pointseg networks.ssadnet recipe scans targets
+        __init__ processes targets
+        networks.pointseg networks.ssadnet recipe scans
         augment cards losses networks.edge networks.lodnn networks.squeezesegv2 roads simulate
         models_page networks.kulseg scan_sets task
         networks.__init__ teacher

@@ -1,0 +1,28 @@
+"""Work spread over processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
+
+__all__ = ["CONTEXT", "mapped"]
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+CONTEXT = "fork" if sys.platform == "linux" else "spawn"
+"""How processes start. A forked process shares the scans; where forking is not safe, each process gets a copy."""
+
+
+@contextmanager
+def mapped(function: Callable[[Item], Result], items: Iterable[Item], n_workers: int) -> Iterator[Iterator[Result]]:
+    """``map(function, items)`` in ``n_workers`` processes, in the order of the items; with 0 in this process."""
+    if not n_workers:
+        yield map(function, items)
+        return
+    with ProcessPoolExecutor(n_workers, multiprocessing.get_context(CONTEXT)) as pool:
+        yield pool.map(function, items, chunksize=4)
