@@ -24,10 +24,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from .errors import (
+    CalibrationError,
     CardError,
     CardMismatchError,
     EdgepercError,
     FitnessError,
+    ImageError,
     InferenceError,
     MissingExtraError,
     ModelError,
@@ -44,16 +46,19 @@ from .errors import (
 )
 
 if TYPE_CHECKING:
+    from .calibration import Calibration
     from .card import ModelCard
     from .drivable import RoadAhead, road_ahead
     from .frame import ModelFrame
     from .listing import ModelInfo, ProviderInfo, SensorInfo, models, providers, sensors
     from .live import Answer, Stream, stream
     from .mounting import Mounting
+    from .painting import camera_road, paint
     from .perceiver import Perceiver
-    from .perception import Box, Perception, PointLabels, TopView
+    from .perception import Box, ImageLabels, Perception, PointLabels, TopView
     from .readers.captures import read_scans, sensor_of
     from .readers.files import read_points
+    from .readers.images import read_image
     from .sensor import SensorProfile
     from .tracking import Track, Tracker, Tracks
     from .view import draw
@@ -61,10 +66,14 @@ if TYPE_CHECKING:
 __all__ = [
     "Answer",
     "Box",
+    "Calibration",
+    "CalibrationError",
     "CardError",
     "CardMismatchError",
     "EdgepercError",
     "FitnessError",
+    "ImageError",
+    "ImageLabels",
     "InferenceError",
     "MissingExtraError",
     "ModelCard",
@@ -95,9 +104,12 @@ __all__ = [
     "TrackingError",
     "Tracks",
     "__version__",
+    "camera_road",
     "draw",
     "models",
+    "paint",
     "providers",
+    "read_image",
     "read_points",
     "read_scans",
     "road_ahead",
@@ -111,6 +123,8 @@ __version__ = "0.1.0"
 _MODULES = {
     "Answer": "live",
     "Box": "perception",
+    "ImageLabels": "perception",
+    "Calibration": "calibration",
     "ModelCard": "card",
     "ModelFrame": "frame",
     "ModelInfo": "listing",
@@ -127,9 +141,12 @@ _MODULES = {
     "Track": "tracking",
     "Tracker": "tracking",
     "Tracks": "tracking",
+    "camera_road": "painting",
     "draw": "view",
     "models": "listing",
+    "paint": "painting",
     "providers": "listing",
+    "read_image": "readers.images",
     "read_points": "readers.files",
     "read_scans": "readers.captures",
     "road_ahead": "drivable",

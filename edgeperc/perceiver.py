@@ -21,19 +21,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from .adapt import Interpolator, condition, render
 from .agreement import RULES, agree_on_boxes, agree_on_cells, agree_on_points
-from .card import ModelCard, RangeImageGeometry, TopViewGeometry
+from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, find_clusters, join_boxes, objects_from_points
 from .decode import decode_classes, decode_top_view
 from .drivable import compile_kernels
-from .errors import EdgepercError, FitnessError, MountingError, OptionError
+from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
 from .fitness import Finding, FitnessProfile, check_fitness
 from .frame import ModelFrame
 from .ground import Ground, find_ground
+from .image import ImageScaler, as_image, label_pixels
 from .level import MountingEstimate, MountingEstimator
 from .mounting import MODEL_HEIGHT_M, Mounting
 from .network_input import input_heights
 from .observed import Observer
-from .perception import Box, Perception, PointLabels, TopView
+from .perception import Box, ImageLabels, Perception, PointLabels, TopView
 from .points import as_points
 from .projection import RangeImageProjector, TopViewProjector, make_projector
 from .refine import label_points, remove_outliers
@@ -80,6 +81,23 @@ class _Network:
     observer: Observer | None
 
 
+@dataclass(frozen=True)
+class _Camera:
+    session: Session
+    scaler: ImageScaler
+
+    def label(self, image: NDArray[np.uint8], watch: _Stopwatch, infer: bool = True) -> ImageLabels:
+        """Class of every pixel of an image, at its own size."""
+        card, (height, width, _) = self.session.card, image.shape
+        self.scaler.fill(image, self.session.input)
+        watch.lap("project")
+        outputs = self.session.run() if infer else self.session.outputs
+        watch.lap("infer")
+        labels = label_pixels(outputs["camera_logits"], height, width, model=card.name)
+        watch.lap("decode")
+        return ImageLabels(labels, card.classes)
+
+
 def _renamed(**names: str) -> Callable[[Callable[_P, None]], Callable[_P, None]]:
     """Refuse the old name of a keyword; the message gives the new name."""
 
@@ -117,7 +135,7 @@ def _listed(models: object) -> list[str | os.PathLike[str]]:
 
 
 class Perceiver:
-    """Turn a LiDAR scan into drivable area, boxes and a class for every point.
+    """Turn a LiDAR scan into drivable area, boxes and a class for every point, and a camera's image into its classes.
 
     Construction loads the models, checks them against their cards and compiles every kernel. Results own their
     arrays; internal buffers are reused between calls. One instance processes one call at a time, and other threads
@@ -127,7 +145,8 @@ class Perceiver:
     ----------
     models : str, Path, sequence of these, or None
         Names of shipped models (``"ssadnet"``, ``"pointseg:int8"``) or paths of .onnx files with a card; at most one
-        model per view. None takes the best pair, `edgeperc.zoo.DEFAULT`.
+        model per view: top view, range image and camera. None takes the best pair of LiDAR models,
+        `edgeperc.zoo.DEFAULT`. The options of scans have no effect on a camera.
     sensor : str, Path or SensorProfile
         The sensor that takes the scans: a built-in name (`edgeperc.sensors`), a file written by ``edgeperc
         fit-sensor``, or a profile.
@@ -190,7 +209,7 @@ class Perceiver:
         An option is unknown or out of range, or the models cannot be combined.
     ModelError, ProviderError, SensorError, MissingExtraError
         A model, a provider or a sensor is missing or does not fit. Only construction raises these and OptionError.
-    PointsError, InferenceError, FitnessError
+    PointsError, ImageError, InferenceError, FitnessError
         Only a call raises these.
 
     Examples
@@ -260,32 +279,44 @@ class Perceiver:
         gaps_deg = [upper - lower for upper, lower in pairwise(self.sensor.elevations_deg)]
         # Twice the spacing of beams or columns: points of one object are linked even if a return between is missing.
         self._distance_per_m = 2.0 * math.radians(max(np.median(gaps_deg or [0.0]), 360.0 / self.sensor.columns))
-        self._networks = [
-            self._load(Session(model, provider, precision=precision, n_threads=n_threads, trusted=trusted))
-            for model in wanted
-        ]
-        views = [n.session.card.view.kind for n in self._networks]
-        if not views or len(views) != len(set(views)):
-            raise OptionError(
-                f"models {[str(m) for m in wanted]} have views {views}; expected at least one model, at most one a view"
-            )
+        self.sessions = tuple(
+            Session(model, provider, precision=precision, n_threads=n_threads, trusted=trusted) for model in wanted
+        )
+        self.cards = tuple(session.card for session in self.sessions)
+        views = [card.view.kind for card in self.cards]
+        if len(views) != len(set(views)):
+            raise OptionError(f"models {[str(m) for m in wanted]} have views {views}; expected at most one a view")
+        self._networks = [self._load(s) for s in self.sessions if not isinstance(s.card.view, CameraGeometry)]
+        self._camera = next(
+            (
+                _Camera(s, ImageScaler(s.card.view, s.card.input))
+                for s in self.sessions
+                if isinstance(s.card.view, CameraGeometry)
+            ),
+            None,
+        )
         if boxes_from == "clusters" and "range_image" not in views:
             raise OptionError("boxes_from is 'clusters', which needs a class for every point; add a range-image model")
-        self.sessions = tuple(n.session for n in self._networks)
-        self.cards = tuple(n.session.card for n in self._networks)
-        self.providers = MappingProxyType({n.session.card.name: n.session.description for n in self._networks})
-        self._needs_ground = (
+        self.providers = MappingProxyType({s.card.name: s.description for s in self.sessions})
+        self._needs_ground = bool(self._networks) and (
             agree
             or any(n.projector.needs_ground for n in self._networks)
             or (boxes_from != "network" and "range_image" in views)
         )
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
         self._locks = {os.getpid(): threading.Lock()}
-        # Compile every kernel here, not in the first call, with a scan of two points. The networks have already run on
-        # their golden inputs, and those outputs are decoded.
+        # Compile every kernel here, not in the first call, with an image of one pixel and a scan of two points. The
+        # networks have already run on their golden inputs, and those outputs are decoded.
+        if self._camera is not None:
+            self._camera.label(as_image(np.zeros((1, 1, 3), np.uint8)), _Stopwatch(), infer=False)
+        if self._networks:
+            self._compile(views)
+
+    def _compile(self, views: Sequence[str]) -> None:
+        """Compile every kernel of scans."""
         warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
         render(warm_up, replace(self.sensor, remission=NO_REMISSION))
-        perception = self._perceive(warm_up, None, check=self._to_check > 0, infer=False)
+        perception = self._perceive(warm_up, None, _Stopwatch(), self._to_check > 0, infer=False)
         floor, labels = self._warm_up_objects()
         ground = self._find_ground(floor)
         if ground is not None:
@@ -332,6 +363,7 @@ class Perceiver:
 
     def _load(self, session: Session) -> _Network:
         card = session.card
+        assert not isinstance(card.view, CameraGeometry)
         interpolator = None
         if self._interpolates and isinstance(card.view, RangeImageGeometry):
             interpolator = Interpolator(card.view, self.sensor)
@@ -344,39 +376,76 @@ class Perceiver:
             observer=Observer(card.view, self.sensor) if isinstance(card.view, TopViewGeometry) else None,
         )
 
-    def __call__(self, points: ArrayLike, stamp_s: float | None = None) -> Perception:
-        """Perceive one scan.
+    def __call__(
+        self, points: ArrayLike | None = None, stamp_s: float | None = None, *, image: ArrayLike | None = None
+    ) -> Perception:
+        """Perceive one scan, one image, or a scan and an image of the same moment.
 
         Parameters
         ----------
-        points : (n, 4) or (n, 3) array_like, or a structured array
+        points : (n, 4) or (n, 3) array_like, or a structured array; None without a LiDAR model
             x, y, z [m] about the sensor, z up; remission in the sensor's raw unit. Not modified. Rows that are not
             finite are counted, labeled 0 and otherwise ignored; an empty scan gives an empty perception.
         stamp_s : float or None
             Time of the scan [s], for the tracker; returned in the perception.
+        image : (H, W, 3) uint8 array_like; None without a camera model
+            Red, green and blue, row 0 at the top (`edgeperc.read_image`), of any size up to 2**26 pixels. Not modified.
 
         Raises
         ------
         PointsError
-            ``points`` is not a scan.
+            ``points`` is not a scan, or is missing, or no LiDAR model is loaded for it.
+        ImageError
+            ``image`` is not an image, or is missing, or no camera model is loaded for it.
         InferenceError
             A network failed, or its output has values that are not finite.
         FitnessError
             The scan differs from the training scans, grossly if ``on_mismatch`` is ``"refuse"``.
         """
-        scan = as_points(points)
+        self._check_given(points, image)
+        scan = None if points is None else as_points(points)
+        pixels = None if image is None else as_image(image)
         with self._lock:
-            check = self._to_check > 0 and len(scan) > 0
-            perception = self._perceive(scan, stamp_s, check)
-            self._to_check -= check
+            watch = _Stopwatch()
+            if scan is None:
+                perception = self._nothing(stamp_s, watch)
+            else:
+                check = self._to_check > 0 and len(scan) > 0
+                perception = self._perceive(scan, stamp_s, watch, check)
+                self._to_check -= check
+            if pixels is not None and self._camera is not None:
+                perception = replace(perception, image=self._camera.label(pixels, watch))
         for sentence in perception.fitness:
             warnings.warn(sentence, stacklevel=2)
         return perception
 
+    def _check_given(self, points: ArrayLike | None, image: ArrayLike | None) -> None:
+        """Raise `PointsError` or `ImageError` if there is no input for a model, or no model for an input."""
+        loaded = ", ".join(card.name for card in self.cards)
+        if points is None and self._networks:
+            name = self._networks[0].session.card.name
+            raise PointsError(f"got no points, and {name} needs a scan; pass points, (n, 4), or leave out {name}")
+        if points is not None and not self._networks:
+            raise PointsError(
+                f"got points, and the only model is of a camera ({loaded}); pass image= alone, or add LiDAR models: "
+                f"Perceiver({[*DEFAULT, loaded]})"
+            )
+        if image is None and self._camera is not None:
+            name = self._camera.session.card.name
+            raise ImageError(f"got no image, and {name} needs one; pass image=, (H, W, 3) uint8, or leave out {name}")
+        if image is not None and self._camera is None:
+            raise ImageError(
+                f"got an image, and none of the models is of a camera ({loaded}); add one such as camseg to models="
+            )
+
+    def _nothing(self, stamp_s: float | None, watch: _Stopwatch) -> Perception:
+        """The perception of no scan."""
+        ms = MappingProxyType(watch.ms)
+        return Perception(0, 0, None, None, (), ms, self.providers, (), stamp_s)
+
     def _perceive(
-        self, scan: NDArray[np.float32], stamp_s: float | None, check: bool, infer: bool = True
+        self, scan: NDArray[np.float32], stamp_s: float | None, watch: _Stopwatch, check: bool, infer: bool = True
     ) -> Perception:
-        watch = _Stopwatch()
         before, matcher, profile = self._estimator, self._remission, self.sensor
         hidden: tuple[Finding, ...] = ()
         matched: tuple[Finding, ...] = ()

@@ -14,7 +14,9 @@ from .errors import PointsError
 from .mounting import MODEL_MOUNTING, Mounting
 from .sensor import RemissionFunction
 
-__all__ = ["Box", "Perception", "PointLabels", "TopView"]
+__all__ = ["Box", "ImageLabels", "Perception", "PointLabels", "TopView"]
+
+ROADS = ("drivable", "road")  # names of classes of an image on which a vehicle may drive, in lower case
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,13 +176,57 @@ class PointLabels:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ImageLabels:
+    """A class for every pixel of a camera's image, at the image's own size.
+
+    Attributes
+    ----------
+    labels : (H, W) uint8
+        Index into ``classes``. Row 0 is the top, column 0 leftmost.
+    classes : tuple of str
+    """
+
+    labels: NDArray[np.uint8]
+    classes: tuple[str, ...]
+
+    @property
+    def drivable(self) -> NDArray[np.bool_]:
+        """Pixels of the road, (H, W) bool: of a class called road or drivable; all False if there is none."""
+        roads = [k for k, name in enumerate(self.classes) if name.casefold() in ROADS]
+        found = np.zeros(self.labels.shape, np.bool_)
+        for k in roads:
+            found |= self.labels == k
+        return found
+
+    @property
+    def drivable_share(self) -> float:
+        """Share of the image's pixels that are road, in 0..1."""
+        return float(np.count_nonzero(self.drivable)) / self.labels.size
+
+    def counts(self) -> dict[str, int]:
+        """Number of pixels, by class."""
+        counted = np.bincount(self.labels.ravel(), minlength=len(self.classes))
+        return {name: int(counted[k]) for k, name in enumerate(self.classes)}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert to a dict for JSON: ``width``, ``height``, ``drivable_share`` and ``pixel_counts`` by class."""
+        height, width = self.labels.shape
+        return {
+            "width": width,
+            "height": height,
+            "drivable_share": round(self.drivable_share, 4),
+            "pixel_counts": self.counts(),
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Perception:
-    """Everything perceived in one scan.
+    """Everything perceived in one scan, in one image, or in both.
 
     Attributes
     ----------
     n_points : int
-        Points in the input.
+        Points in the input; 0 without a scan.
     n_dropped : int
         Input points that are not finite; they are labeled 0 and otherwise ignored.
     points : PointLabels or None
@@ -191,7 +237,7 @@ class Perception:
         Best score first.
     stage_ms : mapping
         Wall time [ms] of ``check``, ``project``, ``infer``, ``decode``, ``refine``, ``cluster`` and ``agree``, and of
-        ``adapt`` for sensors whose scans are adapted.
+        ``adapt`` for sensors whose scans are adapted. ``project``, ``infer`` and ``decode`` include a camera's.
     providers : mapping
         What ran, by model name, e.g. ``"pointseg int8, CPUExecutionProvider"``.
     fitness : tuple of str
@@ -204,6 +250,8 @@ class Perception:
     remission : RemissionFunction or None
         The function that converted the remission: that of the sensor's profile, one that is matched to the scans so
         far, or a constant if the scan has no remission; its ``source`` says which. None: remission was only scaled.
+    image : ImageLabels or None
+        From a camera model; None without one.
     """
 
     n_points: int
@@ -217,6 +265,7 @@ class Perception:
     stamp_s: float | None
     mounting: Mounting = MODEL_MOUNTING
     remission: RemissionFunction | None = None
+    image: ImageLabels | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to a dict for JSON, with the number of points of each class in place of their labels.
@@ -225,8 +274,9 @@ class Perception:
         -------
         dict
             ``stamp_s``, ``n_points``, ``n_dropped``, ``stage_ms``, ``providers``, ``boxes`` (`Box.to_dict`),
-            ``drivable_area_m2``, ``point_counts``, ``fitness``, ``mounting`` and ``remission``. Every key is always
-            present; its value is None if no model of that kind ran, or if remission was only scaled.
+            ``drivable_area_m2``, ``point_counts``, ``fitness``, ``mounting``, ``remission`` and ``image``
+            (`ImageLabels.to_dict`). Every key is always present; its value is None if no model of that kind ran, or if
+            remission was only scaled.
         """
         return {
             "stamp_s": self.stamp_s,
@@ -240,4 +290,5 @@ class Perception:
             "fitness": list(self.fitness),
             "mounting": self.mounting.to_dict(),
             "remission": None if self.remission is None else asdict(self.remission),
+            "image": None if self.image is None else self.image.to_dict(),
         }

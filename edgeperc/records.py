@@ -30,6 +30,7 @@ SCAN_KEYS = (
     "fitness",
     "mounting",
     "remission",
+    "image",
 )
 """Keys of a record, in their written order; every record has all of them."""
 

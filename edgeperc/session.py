@@ -369,6 +369,11 @@ class Session:
         self._binding = self._session.io_binding()
         self.outputs: dict[str, NDArray[np.float32]] = {}
         for output, shape in zip(card.outputs, self._shapes(batch, run_options), strict=True):
+            if output.kind == "camera_logits" and (card.view.height % shape[2] or card.view.width % shape[3]):
+                raise CardMismatchError(
+                    f"{self.path}: {output.name!r} has shape {shape}; expected rows and columns that divide the view's "
+                    f"{card.view.height} and {card.view.width}"
+                )
             buffer = np.zeros(shape, np.float32)
             self._binding.bind_output(output.name, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
             self.outputs[output.kind] = buffer[0]

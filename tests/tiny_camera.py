@@ -1,0 +1,70 @@
+"""A camera model made of bytes, without onnx: one convolution, whose answers numpy computes."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import tiny_model
+from tiny_model import field, node, number, shaped, tensor
+
+from edgeperc.card import CameraGeometry, Golden, InputSpec, ModelCard, OutputSpec
+from edgeperc.session import golden_input
+
+__all__ = ["CLASSES", "camera_card", "camera_model", "write_camera"]
+
+CLASSES = ("Sky", "Road", "Tree")
+# A pixel is road if it is red, a tree if it is green, sky if it is blue.
+WEIGHTS = np.array([[-1.0, -1.0, 2.0], [2.0, -1.0, -1.0], [-1.0, 2.0, -1.0]], np.float32)
+
+
+def _ints(name: str, values: tuple[int, ...]) -> bytes:
+    """An attribute of a node: a list of whole numbers."""
+    content = b"".join(number(8, value) for value in values)
+    return field(5, field(1, name.encode()) + content + number(20, 7))
+
+
+def camera_card(width: int = 32, height: int = 24, stride: int = 4) -> ModelCard:
+    """Of `camera_model`, named tinycam."""
+    x = golden_input(3, (1, 3, height, width))
+    blocks = x.reshape(1, 3, height // stride, stride, width // stride, stride).mean(axis=(3, 5))
+    answers = np.einsum("kc,ncij->nkij", WEIGHTS, blocks)
+    kept = range(0, answers.size, max(1, answers.size // 24))
+    record = {
+        "sha256": "",
+        "std": float(answers.std()),
+        "positions": [*kept],
+        "values": [float(answers.ravel()[k]) for k in kept],
+    }
+    return ModelCard(
+        name="tinycam",
+        version="1",
+        view=CameraGeometry(width, height),
+        input=InputSpec("x", ("red", "green", "blue"), (127.5,) * 3, (127.5,) * 3),
+        outputs=(OutputSpec("y", "camera_logits"),),
+        classes=CLASSES,
+        golden=Golden(3, hashlib.sha256(x.tobytes()).hexdigest(), {"y": record}),
+        training={"licence": "CC0-1.0"},
+    )
+
+
+def camera_model(card: ModelCard | None = None, stride: int = 4) -> bytes:
+    """The bytes of an .onnx file: a convolution whose stride and kernel are ``stride`` pixels."""
+    card = camera_card(stride=stride) if card is None else card
+    height, width = card.view.height, card.view.width
+    weights = np.repeat(np.repeat(WEIGHTS[:, :, None, None], stride, axis=2), stride, axis=3) / stride**2
+    strides = _ints("strides", (stride, stride))
+    graph = node("Conv", "x w", "y", strides) + field(
+        5, tensor("w", (3, 3, stride, stride), weights.astype("<f4").tobytes())
+    )
+    graph += field(2, b"g") + field(11, shaped("x", (1, 3, height, width)))
+    graph += field(12, shaped("y", (1, 3, height // stride, width // stride)))
+    return tiny_model.model(graph, card=card)
+
+
+def write_camera(folder: Path) -> Path:
+    """Write `camera_model` as tinycam.onnx; return its path."""
+    path = folder / "tinycam.onnx"
+    path.write_bytes(camera_model())
+    return path
