@@ -476,7 +476,7 @@ class ModelCard:
     def output_shape(self, kind: str) -> tuple[int | None, ...]:
         """Shape of the output of a kind, with the batch; None where any length is allowed."""
         if kind == "box_slots":
-            return (1, None, 4)
+            return (1, None, None)
         if kind == "camera_logits":
             return (1, len(self.classes), None, None)
         if kind == "box_dense":

@@ -14,7 +14,7 @@ from .geometry import draw_footprints, suppress_overlaps
 from .kernel_cache import njit
 from .perception import Box
 
-__all__ = ["decode_classes", "decode_dense", "decode_slots", "decode_top_view"]
+__all__ = ["decode_classes", "decode_dense", "decode_scored_slots", "decode_slots", "decode_top_view"]
 
 STRIDE = 4  # cells of the top view behind one cell of a box_dense output, along each axis
 MIN_EXTENT_M = 0.5  # smaller slots are empty
@@ -114,41 +114,133 @@ def decode_slots(
     CardMismatchError
         Shapes disagree, or a box class has no size prior.
     """
-    rows = slots[0] if slots.ndim == 3 and slots.shape[0] == 1 else slots
-    if rows.ndim != 2 or rows.shape[1] != 4:
-        raise CardMismatchError(f"{model}: box_slots has shape {slots.shape}; expected (1, K, 4); check the export")
+    values = _slot_rows(slots, 4, box_classes, box_size_priors, model)
     height, width = geometry.height, geometry.width
     if labels.shape != (height, width) or scores.shape != (height, width):
         raise CardMismatchError(
             f"{model}: labels {labels.shape} and scores {scores.shape} for a view of {(height, width)}; check the card"
         )
-    missing = [name for name in box_classes if name not in box_size_priors]
-    if missing:
-        raise CardMismatchError(f"{model}: no box_size_priors for {missing}; box_slots needs one for each box class")
-    _check_finite(rows, "box_slots", model)
-    values = rows.astype(np.float64)
     smaller = np.minimum(values[:, 3] * height * geometry.cell_m, values[:, 2] * width * geometry.cell_m)
     values = values[((values[:, :2] >= 0.0) & (values[:, :2] < 1.0)).all(axis=1) & (smaller >= MIN_EXTENT_M)]
     at_row, at_col = (values[:, 1] * height).astype(np.int64), (values[:, 0] * width).astype(np.int64)
     is_box = np.array([name in box_classes for name in classes])[labels[at_row, at_col]]
     values, score = values[is_box], np.minimum(scores[at_row, at_col][is_box], 1.0)
-    boxes = []
     best = np.argsort(-score, kind="stable")[:max_boxes]
-    for center_col, center_row, across_share, along_share in values[best].tolist():
-        along_m = along_share * height * geometry.cell_m
-        across_m = across_share * width * geometry.cell_m
-        at = (int(center_row * height), int(center_col * width))
-        label = classes[labels[at]]
-        tall = float(box_size_priors[label][2])
-        center = (
-            geometry.x_range_m[1] - center_row * height * geometry.cell_m,
-            geometry.y_range_m[1] - center_col * width * geometry.cell_m,
-            tall / 2.0 - mount_height_m,
+    names = [classes[k] for k in labels[at_row[is_box], at_col[is_box]][best]]
+    return _standing(_slot_rectangles(values[best], geometry), score[best], names, box_size_priors, mount_height_m)
+
+
+def decode_scored_slots(
+    slots: NDArray[np.float32],
+    class_output: NDArray[np.float32],
+    class_kind: str,
+    geometry: TopViewGeometry,
+    classes: Sequence[str],
+    box_classes: Sequence[str],
+    box_size_priors: Mapping[str, tuple[float, float, float]],
+    mount_height_m: float,
+    *,
+    score_threshold: float = 0.3,
+    iou_threshold: float = 0.2,
+    max_boxes: int = 100,
+    model: str = "the model",
+) -> list[Box]:
+    """Decode axis-aligned boxes with scores of their own.
+
+    Parameters
+    ----------
+    slots : (1, K, 5) or (K, 5) float32
+        Center column, center row, extents as for `decode_slots`, and the logit that there is an object.
+    class_output, class_kind, classes, box_classes
+        As for `decode_dense`; the class of a box is the one with the largest sum of probabilities in its footprint.
+    geometry, box_size_priors, mount_height_m
+        As for `decode_slots`.
+    score_threshold, iou_threshold, max_boxes, model
+        As for `decode_dense`: of the best slots, those that overlap a better one are dropped.
+
+    Returns
+    -------
+    list of Box
+        Best score first, the earlier slot on ties. The yaw is 0 if the longer side points ahead, else pi/2. Extents are
+        clipped to 0.2 to 40 m.
+
+    Raises
+    ------
+    InferenceError
+        An output holds values that are not finite.
+    CardMismatchError
+        Shapes disagree, or a box class has no size prior.
+    """
+    rows = _slot_rows(slots, 5, box_classes, box_size_priors, model)
+    values = _class_values(class_output, class_kind, model)
+    if values.shape != (len(classes), geometry.height, geometry.width):
+        raise CardMismatchError(
+            f"{model}: {class_kind} has shape {class_output.shape}; expected "
+            f"{(1, len(classes), geometry.height, geometry.width)}; check the card"
         )
-        size = (max(along_m, across_m), min(along_m, across_m), tall)
-        boxes.append(
-            Box(label, min(float(scores[at]), 1.0), center, size, 0.0 if along_m >= across_m else math.pi / 2.0)
+    _check_finite(values, class_kind, model)
+    if max_boxes < 1 or not box_classes:
+        return []
+    inside = ((rows[:, :2] >= 0.0) & (rows[:, :2] < 1.0)).all(axis=1)
+    rows = rows[inside & (rows[:, 4] >= _logit(score_threshold))]
+    rows = rows[np.argsort(-rows[:, 4], kind="stable")[:max_boxes]]
+    rectangles = _slot_rectangles(rows, geometry)
+    rectangles[:, 2:4] = np.clip(rectangles[:, 2:4], *SIZE_RANGE_M)
+    with np.errstate(over="ignore"):  # a score of 0
+        scores = 1.0 / (1.0 + np.exp(-rows[:, 4]))
+    keep = suppress_overlaps(rectangles, scores, iou_threshold)
+    evidence = _footprint_evidence(values, class_kind, rectangles[keep], geometry, classes, box_classes)
+    names = [box_classes[k] for k in np.argmax(evidence, axis=1)]
+    return _standing(rectangles[keep], scores[keep], names, box_size_priors, mount_height_m)
+
+
+def _slot_rows(
+    slots: NDArray[np.float32],
+    n_columns: int,
+    box_classes: Sequence[str],
+    box_size_priors: Mapping[str, tuple[float, float, float]],
+    model: str,
+) -> NDArray[np.float64]:
+    """The slots of one scan (K, n_columns), checked."""
+    rows = slots[0] if slots.ndim == 3 and slots.shape[0] == 1 else slots
+    if rows.ndim != 2 or rows.shape[1] != n_columns:
+        raise CardMismatchError(
+            f"{model}: box_slots has shape {slots.shape}; expected (1, K, 4) or (1, K, 5); check the export"
         )
+    missing = [name for name in box_classes if name not in box_size_priors]
+    if missing:
+        raise CardMismatchError(f"{model}: no box_size_priors for {missing}; box_slots needs one for each box class")
+    _check_finite(rows, "box_slots", model)
+    return rows.astype(np.float64)
+
+
+def _slot_rectangles(slots: NDArray[np.float64], geometry: TopViewGeometry) -> NDArray[np.float64]:
+    """x, y, length, width [m] and yaw [rad] of slots: the length is the longer side."""
+    along, across = slots[:, 3] * geometry.height * geometry.cell_m, slots[:, 2] * geometry.width * geometry.cell_m
+    return np.stack(
+        [
+            geometry.x_range_m[1] - slots[:, 1] * geometry.height * geometry.cell_m,
+            geometry.y_range_m[1] - slots[:, 0] * geometry.width * geometry.cell_m,
+            np.maximum(along, across),
+            np.minimum(along, across),
+            np.where(along >= across, 0.0, math.pi / 2.0),
+        ],
+        axis=1,
+    )
+
+
+def _standing(
+    rectangles: NDArray[np.float64],
+    scores: NDArray[np.floating],
+    names: Sequence[str],
+    box_size_priors: Mapping[str, tuple[float, float, float]],
+    mount_height_m: float,
+) -> list[Box]:
+    """Boxes that stand on the road, as tall as is usual for their class."""
+    boxes = []
+    for (x, y, length, width, yaw), score, name in zip(rectangles.tolist(), scores.tolist(), names, strict=True):
+        tall = float(box_size_priors[name][2])
+        boxes.append(Box(name, score, (x, y, tall / 2.0 - mount_height_m), (length, width, tall), yaw))
     return boxes
 
 
@@ -260,18 +352,7 @@ def decode_dense(
     tall = np.exp(np.clip(log_h, low, high))
     yaws, fronts = _facing(rectangles[:, 4], *front) if front else (rectangles[:, 4], None)
     keep = suppress_overlaps(rectangles, scores, iou_threshold)
-    sums = np.empty((len(keep), len(classes)))
-    fill_footprint_sums(
-        values,
-        class_kind == "class_logits",
-        rectangles[keep],
-        geometry.x_range_m[1],
-        geometry.y_range_m[1],
-        geometry.cell_m,
-        sums,
-    )
-    candidates = np.array([list(classes).index(name) for name in box_classes])
-    evidence = sums[:, candidates]
+    evidence = _footprint_evidence(values, class_kind, rectangles[keep], geometry, classes, box_classes)
     if box_size_spreads:
         assert box_size_priors is not None
         sizes = np.log(np.stack([rectangles[keep, 2], rectangles[keep, 3], tall[keep]], axis=1))
@@ -291,6 +372,21 @@ def decode_dense(
         )
         for k, i in enumerate(keep)
     ]
+
+
+def _footprint_evidence(
+    values: NDArray[np.float32],
+    class_kind: str,
+    rectangles: NDArray[np.float64],
+    geometry: TopViewGeometry,
+    classes: Sequence[str],
+    box_classes: Sequence[str],
+) -> NDArray[np.float64]:
+    """Sums of the probabilities of each box class in each rectangle, (n, box classes)."""
+    sums = np.empty((len(rectangles), len(classes)))
+    x_far, y_left = geometry.x_range_m[1], geometry.y_range_m[1]
+    fill_footprint_sums(values, class_kind == "class_logits", rectangles, x_far, y_left, geometry.cell_m, sums)
+    return sums[:, [list(classes).index(name) for name in box_classes]]
 
 
 def _facing(
@@ -552,6 +648,20 @@ def decode_top_view(
         boxed = np.flatnonzero(is_box[labels])  # indices, because these cells are few
         labels.reshape(-1)[boxed[~returned.reshape(-1)[boxed]]] = 0
         draw_footprints(labels, found, card.view, card.classes)
+    elif "box_slots" in outputs and outputs["box_slots"].shape[-1] == 5:
+        found = decode_scored_slots(
+            outputs["box_slots"],
+            outputs[kind],
+            kind,
+            card.view,
+            card.classes,
+            card.box_classes,
+            card.box_size_priors,
+            card.mount_height_m,
+            score_threshold=score_threshold,
+            iou_threshold=card.nms_iou,
+            model=card.name,
+        )
     elif "box_slots" in outputs:
         found = decode_slots(
             outputs["box_slots"],

@@ -58,10 +58,11 @@ def card_of(recipe: Recipe, **facts: Any) -> ModelCard:
     if task == "road":
         outputs = (OutputSpec("segmentation", "class_logits"),)
         return ModelCard(view=TOP_VIEW, input=TOP_VIEW_INPUT, outputs=outputs, classes=ROAD_CLASSES, **facts)
+    boxes = OutputSpec("boxes", "box_dense" if recipe.head == "dense" else "box_slots", recipe.front)
     return ModelCard(
         view=TOP_VIEW,
         input=TOP_VIEW_INPUT,
-        outputs=(OutputSpec("segmentation", "class_logits"), OutputSpec("boxes", f"box_{recipe.head}", recipe.front)),
+        outputs=(OutputSpec("segmentation", "class_logits"), boxes),
         classes=TOP_VIEW_CLASSES,
         box_classes=("car", "van", "truck"),
         # Length, width, height: geometric means, and standard deviations of the logarithms, of 28,963 labels of KITTI

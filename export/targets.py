@@ -1,4 +1,4 @@
-"""Targets of the box heads: slots and dense maps."""
+"""Targets of the box heads: slots by place, the paper's slots, and dense maps."""
 
 from __future__ import annotations
 
@@ -7,17 +7,71 @@ from numpy.typing import ArrayLike, NDArray
 
 from edgeperc.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS, TopViewGeometry
 
-__all__ = ["REGRESSED_FROM", "dense_targets", "slot_targets"]
+__all__ = ["REGRESSED_FROM", "SLOT_CELLS", "dense_targets", "paper_slot_targets", "slot_targets"]
 
 STRIDE = 4
 """Top-view cells along the edge of one output cell of head "dense"."""
+SLOT_CELLS = 32
+"""Top-view cells along the edge of the square that belongs to one slot: five poolings by two. The last row and column
+of squares also get the cells that are left over."""
 REGRESSED_FROM = 0.5
 """Cells with at least this heat learn the box's geometry, weighted by the heat. The detected peak may be a neighbor of
 the true one, so the neighbors' geometry must be correct too."""
 
 
-def slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> NDArray[np.float32]:
-    """Upright boxes around rotated footprints, nearest first (SSADNet 3.1.1).
+def slot_targets(
+    boxes: ArrayLike,
+    view: TopViewGeometry,
+    *,
+    labeled: NDArray[np.bool_] | None = None,
+    unsure: ArrayLike | None = None,
+) -> NDArray[np.float32]:
+    """Targets of head "slots": each slot has a square of the view, and the upright box of the object centered there.
+
+    Parameters
+    ----------
+    boxes, labeled, unsure
+        As for `dense_targets`.
+    view : TopViewGeometry
+        Height and width at least `SLOT_CELLS`.
+
+    Returns
+    -------
+    (rows * columns, 5) float32
+        By rows from the far left square: center column, center row, width and height as in `paper_slot_targets`, and
+        the presence: 1 with an object, 0 without one, -1 if it is not learned. A slot without an object has zeros. Of
+        several objects in one square, the slot gets the nearest.
+
+    Raises
+    ------
+    ValueError
+        A length, width or height is not positive.
+    """
+    n_rows, n_cols = view.height // SLOT_CELLS, view.width // SLOT_CELLS
+    target = np.zeros((n_rows, n_cols, 5), np.float32)
+    if labeled is not None:
+        every = (np.arange(n) * SLOT_CELLS for n in (n_rows, n_cols))
+        known = labeled
+        for axis, starts in enumerate(every):
+            known = np.logical_and.reduceat(known, starts, axis=axis)
+        target[~known, 4] = -1.0
+    for group, present in ((unsure, False), (boxes, True)):
+        if group is None:
+            continue
+        group, rows, cols = _boxes_in_view(group, view)
+        at_row = np.minimum(rows.astype(np.int64) // SLOT_CELLS, n_rows - 1)
+        at_col = np.minimum(cols.astype(np.int64) // SLOT_CELLS, n_cols - 1)
+        if not present:
+            target[at_row, at_col, 4] = -1.0
+            continue
+        nearest_last = np.argsort(rows, kind="stable")
+        target[at_row[nearest_last], at_col[nearest_last], :4] = _upright(group, rows, cols, view)[nearest_last]
+        target[at_row, at_col, 4] = 1.0
+    return target.reshape(-1, 5)
+
+
+def paper_slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> NDArray[np.float32]:
+    """Targets of head "slots-paper": upright boxes around rotated footprints, nearest first (SSADNet 3.1.1).
 
     Parameters
     ----------
@@ -39,13 +93,7 @@ def slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> NDArr
         A length, width or height is not positive.
     """
     boxes, rows, cols = _boxes_in_view(boxes, view)
-    length, width, yaw = boxes[:, 3], boxes[:, 4], boxes[:, 6]
-    across = np.abs(length * np.sin(yaw)) + np.abs(width * np.cos(yaw))
-    along = np.abs(length * np.cos(yaw)) + np.abs(width * np.sin(yaw))
-    found = np.stack(
-        [cols / view.width, rows / view.height, across / view.cell_m / view.width, along / view.cell_m / view.height],
-        axis=1,
-    )
+    found = _upright(boxes, rows, cols, view)
     nearest = np.argsort(-rows, kind="stable")[:n_slots]
     target = np.zeros((n_slots, 4), np.float32)
     target[: len(nearest)] = found[nearest]
@@ -124,6 +172,19 @@ def _boxes_in_view(
     cols = (view.y_range_m[1] - boxes[:, 1]) / view.cell_m
     inside = (rows >= 0) & (rows < view.height) & (cols >= 0) & (cols < view.width)
     return boxes[inside], rows[inside], cols[inside]
+
+
+def _upright(
+    boxes: NDArray[np.float64], rows: NDArray[np.float64], cols: NDArray[np.float64], view: TopViewGeometry
+) -> NDArray[np.float64]:
+    """Center column, center row, width and height of the upright boxes, (m, 4), as shares of the image's."""
+    length, width, yaw = boxes[:, 3], boxes[:, 4], boxes[:, 6]
+    across = np.abs(length * np.sin(yaw)) + np.abs(width * np.cos(yaw))
+    along = np.abs(length * np.cos(yaw)) + np.abs(width * np.sin(yaw))
+    return np.stack(
+        [cols / view.width, rows / view.height, across / view.cell_m / view.width, along / view.cell_m / view.height],
+        axis=1,
+    )
 
 
 def _gaussian(

@@ -28,7 +28,7 @@ from .cards import card_of
 from .losses import box_distillation_loss, distillation_loss, pointseg_loss, road_loss, ssadnet_loss
 from .recipe import Recipe
 from .scans import LabeledScan
-from .targets import dense_targets, slot_targets
+from .targets import dense_targets, paper_slot_targets, slot_targets
 
 __all__ = ["Outputs", "Points", "Road", "Tally", "Targets", "Task", "Vehicles", "task_of"]
 
@@ -42,9 +42,9 @@ POINT_WEIGHTS = {"background": 1.0, "car": 2.0, "pedestrian": 4.0, "cyclist": 4.
 OWN_WEIGHT = 2.0  # of a class that is not among these
 TOP_VIEW_WEIGHTS = (1.0, 1.0, 2.0, 4.0, 4.0)
 
-# Slots: the paper's weight (Table 2). Dense: this head's loss, a sum for each box, is about ten times as large as the
-# segmentation's, a mean over cells.
-BOX_WEIGHT = {"slots": 0.1, "dense": 0.2}
+# The paper's slots: its weight (Table 2). The others: their losses, sums for each box, are about ten times as large as
+# the segmentation's, a mean over cells.
+BOX_WEIGHT = {"slots-paper": 0.1, "slots": 0.2, "dense": 0.2}
 N_SLOTS = 16
 
 
@@ -177,10 +177,11 @@ class Vehicles(Task):
             np.array([[*b.center, *b.size, b.yaw] for b, n in vehicles if (n >= FEWEST_RETURNS) == wanted], np.float64)
             for wanted in (True, False)
         )
-        if self.recipe.head == "slots":
-            boxes = slot_targets(to_find, view, N_SLOTS)
+        if self.recipe.head == "slots-paper":
+            boxes = paper_slot_targets(to_find, view, N_SLOTS)
         else:
-            boxes = dense_targets(to_find, view, labeled=scan.boxed(view), unsure=unclear)
+            targets = slot_targets if self.recipe.head == "slots" else dense_targets
+            boxes = targets(to_find, view, labeled=scan.boxed(view), unsure=unclear)
         return scan.top_view_truth(view), boxes
 
     def loss(self, outputs: Outputs, targets: Sequence[Tensor]) -> Tensor:
@@ -202,8 +203,8 @@ class Vehicles(Task):
         return loss
 
     def tally(self) -> Tally:
-        """An empty tally of labels and boxes."""
-        return Tally(Confusion(self.classes), BoxEvaluator())
+        """An empty tally of labels and boxes. Slots are upright boxes, so they are compared with upright ones."""
+        return Tally(Confusion(self.classes), BoxEvaluator(oriented=self.recipe.head == "dense"))
 
     def count(self, outputs: Outputs, projected: Projection, targets: Targets, scan: LabeledScan, tally: Tally) -> None:
         """Labels and boxes as the runtime decodes them; boxes count where the scan is labeled."""

@@ -9,7 +9,7 @@ import pytest
 import twins.decode
 from edgeperc import decode
 from edgeperc.card import TopViewGeometry
-from edgeperc.decode import decode_classes, decode_dense, decode_slots, decode_top_view
+from edgeperc.decode import decode_classes, decode_dense, decode_scored_slots, decode_slots, decode_top_view
 from edgeperc.errors import CardMismatchError, InferenceError
 from edgeperc.geometry import draw_footprints
 from edgeperc_export.cards import card_of
@@ -142,6 +142,89 @@ def test_malformed_slots_are_refused():
             1.73,
         )
     assert slots_for(np.zeros((0, 4))) == []
+
+
+# --- slots with scores
+
+
+def scored_slots_for(slots, class_output=None, **options):
+    class_output = np.zeros((len(CLASSES), *SHAPE), np.float32) if class_output is None else class_output
+    return decode_scored_slots(
+        np.asarray(slots, np.float32), class_output, "class_logits", VIEW, CLASSES, VEHICLES, PRIORS, 1.73, **options
+    )
+
+
+def twin_of_scored_slots(slots, logits, score_threshold, iou_threshold, max_boxes):
+    """One slot after the other."""
+    found = []
+    for col, row, across, along, logit in np.asarray(slots, np.float64):
+        score = 1.0 / (1.0 + np.exp(-logit))
+        if not (0 <= col < 1 and 0 <= row < 1) or score < score_threshold:
+            continue
+        along, across = along * SHAPE[0] * 0.1, across * SHAPE[1] * 0.1
+        sides = np.clip([max(along, across), min(along, across)], 0.2, 40.0)
+        yaw = 0.0 if along >= across else math.pi / 2.0
+        found.append((score, np.array([46.0 - row * 40.0, 10.0 - col * 20.0, *sides, yaw])))
+    found = sorted(found, key=lambda each: -each[0])[:max_boxes]
+    rectangles = np.array([rectangle for _, rectangle in found]).reshape(-1, 5)
+    kept = twins.decode.nms(rectangles, iou_threshold)
+    sums = twins.decode.footprint_sums(logits, True, rectangles[kept], 46.0, 10.0, 0.1)
+    numbers = [CLASSES.index(name) for name in VEHICLES]
+    names = [VEHICLES[k] for k in sums[:, numbers].argmax(1)]
+    scores = [score for (score, _), each in zip(found, kept, strict=True) if each]
+    return list(zip(names, scores, rectangles[kept], strict=True))
+
+
+@pytest.mark.parametrize("n", [0, 1, 72, 400])
+def test_scored_slots_equal_their_twin(n):
+    rng = np.random.default_rng(n)
+    slots = np.column_stack([rng.uniform(-0.1, 1.1, (n, 2)), rng.uniform(-0.02, 0.2, (n, 2)), rng.normal(size=n)])
+    slots = slots.astype(np.float32)
+    logits = rng.normal(size=(len(CLASSES), *SHAPE)).astype(np.float32)
+    limits = {"score_threshold": 0.4, "iou_threshold": 0.2, "max_boxes": 50}
+    found = scored_slots_for(slots, logits, **limits)
+    expected = twin_of_scored_slots(slots, logits, **limits)
+    assert [box.label for box in found] == [name for name, *_ in expected]
+    for box, (label, score, (x, y, length, width, yaw)) in zip(found, expected, strict=True):
+        assert box.score == pytest.approx(score, abs=1e-6)
+        tall = PRIORS[label][2]
+        np.testing.assert_allclose(box.center, (x, y, tall / 2.0 - 1.73), atol=1e-5)
+        np.testing.assert_allclose(box.size, (length, width, tall), atol=1e-5)
+        assert box.yaw == yaw
+
+
+def test_of_two_slots_with_one_object_the_surer_remains():
+    car, same = [0.5, 0.5, 0.08, 0.1, 1.0], [0.5, 0.505, 0.08, 0.1, 2.0]
+    (box,) = scored_slots_for([car, same, [0.5, 0.9, 0.08, 0.1, -4.0]])
+    assert box.score == pytest.approx(1.0 / (1.0 + math.exp(-2.0)))
+    assert box.center[0] == pytest.approx(46.0 - 0.505 * 40.0)
+    assert len(scored_slots_for([car, same], iou_threshold=1.0)) == 2
+    assert len(scored_slots_for([car, same], iou_threshold=1.0, max_boxes=1)) == 1
+    assert scored_slots_for([car], max_boxes=0) == []
+    assert len(scored_slots_for([[0.5, 0.5, 0.1, 0.1, -1e4]], score_threshold=0.0)) == 1
+
+
+def test_malformed_scored_slots_are_refused():
+    with pytest.raises(InferenceError, match="1 of 5 values of box_slots"):
+        scored_slots_for([[0.5, 0.5, np.inf, 0.1, 1.0]])
+    with pytest.raises(CardMismatchError, match=r"\(1, 4\)"):
+        scored_slots_for([[0.5, 0.5, 0.1, 0.1]])
+    with pytest.raises(CardMismatchError, match="3, 3"):
+        scored_slots_for([[0.5, 0.5, 0.1, 0.1, 1.0]], np.zeros((len(CLASSES), 3, 3), np.float32))
+    broken = np.zeros((len(CLASSES), *SHAPE), np.float32)
+    broken[0, 0, 0] = np.nan
+    with pytest.raises(InferenceError, match="of class_logits"):
+        scored_slots_for([[0.5, 0.5, 0.1, 0.1, 1.0]], broken)
+
+
+def test_a_top_view_decodes_slots_with_and_without_scores():
+    card = card_of(Recipe("ssadnet", head="slots"), version="1")
+    outputs = {"class_logits": class_logits((slice(100, 140), slice(50, 66), CLASSES.index("van"), 9.0))[0]}
+    for slot, score in (([0.29, 0.3, 0.08, 0.1], 1.0), ([0.29, 0.3, 0.08, 0.1, 0.0], 0.5)):
+        outputs["box_slots"] = np.array([slot], np.float32)
+        _, (box,) = decode_top_view(card, np.zeros(SHAPE, np.bool_), outputs, 0.3)
+        assert box.label == "van"
+        assert box.score == pytest.approx(score, abs=2e-3)
 
 
 # --- dense
@@ -384,7 +467,7 @@ def test_boxes_are_drawn_into_the_map():
 
 
 def test_slot_boxes_do_not_change_the_map():
-    card = card_of(Recipe("ssadnet", head="slots"), version="1")
+    card = card_of(Recipe("ssadnet", head="slots-paper"), version="1")
     logits = class_logits((slice(100, 140), slice(50, 66), CLASSES.index("van"), 9.0))[0]
     slots = np.zeros((2, 4), np.float32)
     slots[0] = 58 / 200, 120 / 400, 20 / 200, 44 / 400

@@ -10,7 +10,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from edgeperc.card import TopViewGeometry
-from edgeperc.decode import decode_dense, decode_slots
+from edgeperc.decode import decode_dense, decode_scored_slots, decode_slots
 from edgeperc.perception import Box
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import TOP_VIEW_CLASSES
@@ -22,12 +22,13 @@ from edgeperc_export.losses import (
     dense_loss,
     distillation_loss,
     lovasz_softmax,
+    paper_slots_loss,
     pointseg_loss,
     slots_loss,
     ssadnet_loss,
 )
 from edgeperc_export.scans import LabeledScan, mirrored, turned
-from edgeperc_export.targets import REGRESSED_FROM, dense_targets, slot_targets
+from edgeperc_export.targets import REGRESSED_FROM, dense_targets, paper_slot_targets, slot_targets
 
 VIEW = TopViewGeometry()  # x 6..46 m, y -10..10 m, 0.1 m cells
 CAR = (26.0, 2.0, -1.0, 4.0, 1.6, 1.5, 0.0)
@@ -50,11 +51,11 @@ def random_maps(rng, n_classes=5, shape=(2, 6, 7), ignored=0.2):
     return logits, labels
 
 
-# --- slot_targets ---------------------------------------------------------------------------------------------------
+# --- paper_slot_targets ---------------------------------------------------------------------------------------------
 
 
 def test_slot_of_a_box_ahead():
-    (slot,) = slot_targets([CAR], VIEW, 1)
+    (slot,) = paper_slot_targets([CAR], VIEW, 1)
     # Row (46 - 26) / 0.1 = 200 of 400, column (10 - 2) / 0.1 = 80 of 200; 16 columns across, 40 rows along.
     np.testing.assert_allclose(slot, [80 / 200, 200 / 400, 16 / 200, 40 / 400], rtol=1e-6)
 
@@ -73,29 +74,68 @@ def test_slots_of_rotated_boxes_contain_the_footprint(rng):
             np.ptp(cols) / 200,
             np.ptp(rows) / 400,
         ]
-        np.testing.assert_allclose(slot_targets([box], VIEW, 1)[0], expected, rtol=1e-5)
+        np.testing.assert_allclose(paper_slot_targets([box], VIEW, 1)[0], expected, rtol=1e-5)
 
 
 def test_slots_are_nearest_first_and_the_farthest_are_dropped():
     boxes = [(x, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0) for x in (30.0, 10.0, 40.0, 20.0)]
-    target = slot_targets(boxes, VIEW, 3)
+    target = paper_slot_targets(boxes, VIEW, 3)
     np.testing.assert_allclose(target[:, 1], [0.9, 0.65, 0.4], rtol=1e-6)
 
 
 def test_empty_slots_are_zero():
-    assert slot_targets([CAR], VIEW, 4)[1:].tolist() == [[0.0] * 4] * 3
-    assert slot_targets([], VIEW, 2).tolist() == [[0.0] * 4] * 2
-    assert slot_targets(np.empty((0, 7)), VIEW, 2).dtype == np.float32
+    assert paper_slot_targets([CAR], VIEW, 4)[1:].tolist() == [[0.0] * 4] * 3
+    assert paper_slot_targets([], VIEW, 2).tolist() == [[0.0] * 4] * 2
+    assert paper_slot_targets(np.empty((0, 7)), VIEW, 2).dtype == np.float32
+
+
+# --- slot_targets ---------------------------------------------------------------------------------------------------
+
+
+def test_a_slot_has_the_box_centered_in_its_square():
+    target = slot_targets([CAR], VIEW).reshape(12, 6, 5)
+    # Row 200 is in the square of rows 192 to 223, column 80 in that of columns 64 to 95.
+    np.testing.assert_allclose(target[6, 2], [80 / 200, 200 / 400, 16 / 200, 40 / 400, 1.0], rtol=1e-6)
+    assert np.count_nonzero(target) == 5
+
+
+def test_the_last_squares_get_the_cells_left_over():
+    target = slot_targets([(6.05, -9.95, 0.0, 4.0, 2.0, 1.5, 0.0)], VIEW).reshape(12, 6, 5)
+    np.testing.assert_allclose(target[11, 5, :2], [199.5 / 200, 399.5 / 400], rtol=1e-6)
+    assert np.count_nonzero(target[..., 4]) == 1
+
+
+def test_of_two_objects_in_a_square_the_slot_gets_the_nearer():
+    near, far = (26.0, 1.0, 0.0, 2.0, 1.0, 1.5, 0.0), (26.5, 3.0, 0.0, 3.0, 1.0, 1.5, 0.0)
+    for boxes in ([near, far], [far, near]):
+        np.testing.assert_array_equal(slot_targets(boxes, VIEW), slot_targets([near], VIEW))
+
+
+def test_squares_with_unlabeled_cells_or_unsure_objects_are_not_learned():
+    labeled = np.ones((400, 200), bool)
+    labeled[399, 0] = False  # beyond the last whole square
+    labeled[200, 80] = False  # in the square of the car, which is learned anyway
+    labeled[0, 33] = False
+    unsure = [(46.0 - 0.1 * 330, 10.0 - 0.1 * 100, 0.0, 4.0, 2.0, 1.5, 0.0)]
+    presence = slot_targets([CAR], VIEW, labeled=labeled, unsure=unsure).reshape(12, 6, 5)[..., 4]
+    assert {tuple(at) for at in np.argwhere(presence == -1.0)} == {(11, 0), (0, 1), (10, 3)}
+    assert np.argwhere(presence == 1.0).tolist() == [[6, 2]]
+    assert slot_targets([CAR], VIEW, unsure=[CAR])[:, 4].max() == 1.0
+    assert slot_targets([], VIEW, unsure=np.empty((0, 7))).shape == (72, 5)
 
 
 @pytest.mark.parametrize("center", [(5.9, 0.0), (46.1, 0.0), (20.0, 10.1), (20.0, -10.1), (6.0, 0.0), (np.nan, 0.0)])
 def test_boxes_centered_outside_the_view_are_left_out(center):
     box = [(*center, *CAR[2:])]
-    assert not slot_targets(box, VIEW, 2).any()
+    assert not paper_slot_targets(box, VIEW, 2).any()
+    assert not slot_targets(box, VIEW).any()
     assert not dense_targets(box, VIEW).any()
 
 
-@pytest.mark.parametrize("targets", [lambda b: slot_targets(b, VIEW, 1), lambda b: dense_targets(b, VIEW)])
+@pytest.mark.parametrize(
+    "targets",
+    [lambda b: paper_slot_targets(b, VIEW, 1), lambda b: slot_targets(b, VIEW), lambda b: dense_targets(b, VIEW)],
+)
 def test_boxes_without_extent_are_refused(targets):
     with pytest.raises(ValueError, match="has no extent"):
         targets([(20.0, 0.0, 0.0, 4.0, 0.0, 1.5, 0.0)])
@@ -209,7 +249,7 @@ def painted(boxes):
     """Labels (400, 200) of upright boxes, by class."""
     labels = np.zeros((400, 200), np.uint8)
     for label, box in boxes.items():
-        col, row, width, height = slot_targets([box], VIEW, 1)[0] * [200, 400, 200, 400]
+        col, row, width, height = paper_slot_targets([box], VIEW, 1)[0] * [200, 400, 200, 400]
         rows, cols = np.ogrid[:400, :200]
         inside = (np.abs(rows + 0.5 - row) <= height / 2) & (np.abs(cols + 0.5 - col) <= width / 2)
         labels[inside] = CLASSES.index(label)
@@ -227,9 +267,21 @@ def same_boxes(found, boxes, *, atol):
 
 def test_slots_survive_the_round_trip():
     priors = {label: box[3:6] for label, box in ROUND_TRIP.items()}
-    slots = slot_targets(list(ROUND_TRIP.values()), VIEW, 8)[None]
+    slots = paper_slot_targets(list(ROUND_TRIP.values()), VIEW, 8)[None]
     scores = np.full((400, 200), 0.5, np.float32)
     found = decode_slots(slots, painted(ROUND_TRIP), scores, VIEW, CLASSES, CLASSES[2:], priors, 1.73)
+    standing = {label: (*box[:2], box[5] / 2 - 1.73, *box[3:]) for label, box in ROUND_TRIP.items()}
+    same_boxes(found, standing, atol=1e-4)
+
+
+def test_scored_slots_survive_the_round_trip():
+    priors = {label: box[3:6] for label, box in ROUND_TRIP.items()}
+    slots = slot_targets(list(ROUND_TRIP.values()), VIEW)
+    slots[:, 4] = 8.0 * slots[:, 4] - 4.0  # logits
+    probabilities = np.eye(5, dtype=np.float32)[painted(ROUND_TRIP)].transpose(2, 0, 1)
+    found = decode_scored_slots(
+        slots[None], probabilities, "class_probabilities", VIEW, CLASSES, CLASSES[2:], priors, 1.73
+    )
     standing = {label: (*box[:2], box[5] / 2 - 1.73, *box[3:]) for label, box in ROUND_TRIP.items()}
     same_boxes(found, standing, atol=1e-4)
 
@@ -377,18 +429,68 @@ def test_pointseg_loss_is_the_sum_of_its_parts(rng):
 # --- Boxes ----------------------------------------------------------------------------------------------------------
 
 
-def test_slots_loss_is_equations_5_and_6(rng):
+def test_paper_slots_loss_is_equations_5_and_6(rng):
     predicted, target = rng.random((2, 3, 6, 4)).astype(np.float32)
     n, k, _ = target.shape
     mean_squared = [((target[..., i] - predicted[..., i]) ** 2).sum() / (n * k) for i in range(4)]
-    assert slots_loss(torch.tensor(predicted), torch.tensor(target)).item() == pytest.approx(sum(mean_squared))
+    assert paper_slots_loss(torch.tensor(predicted), torch.tensor(target)).item() == pytest.approx(sum(mean_squared))
 
 
 def test_negative_slots_are_not_learned(rng):
     predicted, target = (torch.tensor(a.astype(np.float32)) for a in rng.random((2, 2, 6, 4)))
     target[1] = -1.0
-    torch.testing.assert_close(slots_loss(predicted, target), slots_loss(predicted[:1], target[:1]))
-    assert slots_loss(predicted[1:], target[1:]).item() == 0.0
+    torch.testing.assert_close(paper_slots_loss(predicted, target), paper_slots_loss(predicted[:1], target[:1]))
+    assert paper_slots_loss(predicted[1:], target[1:]).item() == 0.0
+
+
+def slots_case(rng):
+    target = np.stack([slot_targets([CAR, (15.0, -3.0, 0.0, 6.0, 2.0, 2.0, 0.7)], VIEW), slot_targets([], VIEW)])
+    target[:, :9, 4] = -1.0
+    predicted = rng.uniform(0.02, 0.3, target.shape)
+    predicted[..., :2] += target[..., :2] - 0.15
+    predicted[..., 4] = rng.normal(size=target.shape[:2])
+    return predicted.astype(np.float32), target
+
+
+def test_slots_loss_is_the_presence_and_the_error_of_each_box(rng):
+    predicted, target = slots_case(rng)
+    presence, boxes = slots_loss(torch.tensor(predicted), torch.tensor(target))
+    learned = target[..., 4] >= 0.0
+    cross = cross_of_logits(predicted[..., 4], target[..., 4] == 1.0)
+    assert presence.item() == pytest.approx(cross[learned].sum() / 2, rel=1e-5)
+    expected = 0.0
+    present = target[..., 4] == 1.0
+    for (x, y, w, h, _), (tx, ty, tw, th, _) in zip(predicted[present], target[present], strict=True):
+        across = min(x + w / 2, tx + tw / 2) - max(x - w / 2, tx - tw / 2)
+        along = min(y + h / 2, ty + th / 2) - max(y - h / 2, ty - th / 2)
+        shared = max(across, 0.0) * max(along, 0.0)
+        error = abs(x - tx) / tw + abs(y - ty) / th + abs(np.log(w / tw)) + abs(np.log(h / th))
+        expected += error + 1.0 - shared / (w * h + tw * th - shared)
+    assert boxes.item() == pytest.approx(expected / 2, rel=1e-4)
+
+
+def test_slots_loss_ignores_unlearned_slots_and_boxes_of_empty_ones(rng):
+    predicted, target = slots_case(rng)
+    tensor = torch.tensor(predicted, requires_grad=True)
+    sum(slots_loss(tensor, torch.tensor(target))).backward()
+    gradient = tensor.grad.numpy()
+    assert (gradient[..., 4].astype(bool) == (target[..., 4] >= 0.0)).all()
+    assert (gradient[..., :4].any(-1) == (target[..., 4] == 1.0)).all()
+
+
+def test_slots_loss_of_the_truth_is_small_and_of_no_objects_is_finite(rng):
+    _, target = slots_case(rng)
+    perfect = torch.tensor(target)
+    perfect[..., 4] = torch.where(perfect[..., 4] == 1.0, 30.0, -30.0)
+    presence, boxes = slots_loss(perfect, torch.tensor(target))
+    assert presence.item() < 1e-6
+    assert boxes.item() < 1e-5
+    for value in (0.0, -1e30, 1e30):
+        extreme = torch.full((1, 72, 5), value, requires_grad=True)
+        loss = sum(slots_loss(extreme, torch.tensor(target[1:])))
+        loss.backward()
+        assert extreme.grad.isfinite().all()
+        assert loss.isfinite()
 
 
 def cross_of_logits(logits, truth):
@@ -445,24 +547,28 @@ def test_dense_loss_of_the_truth_is_small_and_of_no_boxes_is_finite():
     assert torch.isfinite(extreme.grad).all()
 
 
-@pytest.mark.parametrize("head", ["slots", "dense"])
+@pytest.mark.parametrize("head", ["slots-paper", "slots", "dense"])
 def test_ssadnet_loss_is_equation_3(rng, head):
     logits, labels = (torch.tensor(a) for a in random_maps(rng))
     if head == "slots":
+        boxes, targets = (torch.tensor(a) for a in slots_case(rng))
+        detection = sum(slots_loss(boxes, targets))
+    elif head == "slots-paper":
         boxes, targets = (torch.tensor(a.astype(np.float32)) for a in rng.random((2, 2, 6, 4)))
-        detection = slots_loss(boxes, targets)
+        detection = paper_slots_loss(boxes, targets)
     else:
         boxes, targets = (torch.tensor(a) for a in dense_case(rng))
         detection = sum(dense_loss(boxes, targets))
     segmentation = cross_entropy(logits, labels)
     total, parts = ssadnet_loss(logits, boxes, labels, targets)
     torch.testing.assert_close(total, 1.0 * segmentation + 0.1 * detection)
-    assert set(parts) == ({"seg", "det"} if head == "slots" else {"seg", "heat", "geometry"})
+    own = {"slots-paper": {"det"}, "slots": {"presence", "geometry"}, "dense": {"heat", "geometry"}}
+    assert set(parts) == {"seg", *own[head]}
     total, _ = ssadnet_loss(logits, boxes, labels, targets, lw_seg=2.0, lw_det=0.5)
     torch.testing.assert_close(total, 2.0 * segmentation + 0.5 * detection)
 
 
-@pytest.mark.parametrize("shape", [(2, 6, 4), (2, 9, 4, 3), (2, 10, 4, 3)])
+@pytest.mark.parametrize("shape", [(2, 6, 4), (2, 6, 5), (2, 9, 4, 3), (2, 10, 4, 3)])
 def test_a_batch_without_ground_truth_is_not_learned(shape):
     logits, boxes = torch.randn(2, 5, 16, 12, requires_grad=True), torch.randn(shape, requires_grad=True)
     labels = torch.full((2, 16, 12), IGNORE, dtype=torch.uint8)

@@ -169,20 +169,19 @@ def test_of_equal_values_the_first_is_the_maximum(value):
 # --- SSADNet: the whole network
 
 
-@pytest.mark.parametrize("head", ["slots", "dense"])
+@pytest.mark.parametrize("head", ["slots", "slots-paper", "dense"])
 def test_ssadnet_shapes_at_each_stage(head):
     network = on_meta(lambda: SSADNet(head))
     names = [f"segmentation.{name}" for name in ("encoder", "context.dilated", "context", "decoder")]
-    blocks = {
-        "slots": {
-            "features.0": (16, 200, 100),
-            "features.1": (32, 100, 50),
-            "features.2": (64, 50, 25),
-            "features.3": (128, 25, 12),
-            "features.4": (128, 12, 6),
-        },
-        "dense": {"fine.0": (16, 200, 100), "fine.1": (32, 100, 50), "coarse": (64, 50, 25), "merge": (64, 100, 50)},
-    }[head]
+    five = {
+        "features.0": (16, 200, 100),
+        "features.1": (32, 100, 50),
+        "features.2": (64, 50, 25),
+        "features.3": (128, 25, 12),
+        "features.4": (128, 12, 6),
+    }
+    dense = {"fine.0": (16, 200, 100), "fine.1": (32, 100, 50), "coarse": (64, 50, 25), "merge": (64, 100, 50)}
+    blocks = dense if head == "dense" else five
     x = torch.empty(2, 3, 400, 200, device="meta")
     (logits, boxes), recorded = run_and_record(network, x, *names, *(f"detection.{name}" for name in blocks))
     encoded, dilated, context, decoded = (tuple(recorded[name][1].shape) for name in names)
@@ -193,16 +192,19 @@ def test_ssadnet_shapes_at_each_stage(head):
     for name, shape in blocks.items():
         assert tuple(recorded[f"detection.{name}"][1].shape) == (2, *shape)
     assert logits.shape == (2, 5, 400, 200)
-    assert boxes.shape == {"slots": (2, 16, 4), "dense": (2, 9, 100, 50)}[head]
+    assert boxes.shape == {"slots": (2, 72, 5), "slots-paper": (2, 16, 4), "dense": (2, 9, 100, 50)}[head]
 
 
-@pytest.mark.parametrize(("head", "height", "width"), [("slots", 32, 40), ("dense", 8, 24), ("dense", 72, 40)])
+@pytest.mark.parametrize(
+    ("head", "height", "width"), [("slots", 72, 40), ("slots-paper", 32, 40), ("dense", 8, 24), ("dense", 72, 40)]
+)
 def test_ssadnet_accepts_other_sizes(head, height, width):
     network = SSADNet(head, n_channels=2, n_classes=3, n_slots=7, context_width=4).eval()
     with torch.no_grad():
         logits, boxes = network(torch.randn(3, 2, height, width))
     assert logits.shape == (3, 3, height, width)
-    assert boxes.shape == ((3, 7, 4) if head == "slots" else (3, 9, height // 4, width // 4))
+    slots = {"slots": (3, 2, 5), "slots-paper": (3, 7, 4)}
+    assert boxes.shape == slots.get(head, (3, 9, height // 4, width // 4))
     assert logits.isfinite().all()
     assert boxes.isfinite().all()
 
@@ -212,7 +214,7 @@ def test_ssadnet_refuses_other_heads():
         SSADNet("anchors")
 
 
-@pytest.mark.parametrize(("head", "detection"), [("slots", 994_416), ("dense", 290_169)])
+@pytest.mark.parametrize(("head", "detection"), [("slots", 1_036_341), ("slots-paper", 994_416), ("dense", 290_169)])
 def test_parameters_and_arithmetic_of_ssadnet(head, detection):
     network = on_meta(lambda: SSADNet(head))
     assert n_parameters(network.segmentation) == 955_429
@@ -221,7 +223,7 @@ def test_parameters_and_arithmetic_of_ssadnet(head, detection):
     assert giga_macs(network, 1, 3, 400, 200) == pytest.approx(22.6, rel=0.05)
 
 
-@pytest.mark.parametrize("head", ["slots", "dense"])
+@pytest.mark.parametrize("head", ["slots", "slots-paper", "dense"])
 def test_the_bridge_is_the_input_and_the_decoders_features(head):
     x = torch.randn(2, 3, 32, 32)
     (logits, _), recorded = run_and_record(
@@ -239,8 +241,33 @@ def test_the_bridge_is_bfloat16_under_autocast():
     assert recorded["detection"][0].dtype == torch.bfloat16
 
 
+def test_slots_by_place():
+    """A slot's box starts in the middle of its square, and an object that moves by a square moves to the next slot."""
+    network = SSADNet("slots", context_width=4, batch_norm=True).eval()
+    with torch.no_grad():
+        _, boxes = network(torch.zeros(1, 3, 400, 200))
+    boxes = boxes[0].reshape(12, 6, 5).numpy()
+    np.testing.assert_allclose(boxes[3, :, 0] * 200, 16 + 32 * np.arange(6), atol=3.0)
+    np.testing.assert_allclose(boxes[:, 2, 1] * 400, 16 + 32 * np.arange(12), atol=3.0)
+    np.testing.assert_allclose(boxes[..., 2:4], 0.1, rtol=0.3)
+    assert (boxes[..., 4] < -2.0).all()
+
+    head = network.detection
+    for norm in (m for m in head.modules() if isinstance(m, nn.BatchNorm2d)):
+        nn.init.normal_(norm.bias, std=0.1)
+    x = torch.zeros(1, 35, 640, 640)
+    x[..., 300:320, 300:320] = torch.randn(35, 20, 20)
+    with torch.no_grad():
+        before, after = (head(image).reshape(20, 20, 5) for image in (x, x.roll((32, 32), (2, 3))))
+    after, before = after[5:16, 5:16], before[4:15, 4:15]  # other squares see the edge of the image
+    torch.testing.assert_close(after[..., 2:], before[..., 2:])
+    assert (before[..., 2:].std((0, 1)) > 1e-5).all()
+    moved = after[..., :2] - before[..., :2]
+    torch.testing.assert_close(moved, torch.full_like(moved, 32 / 640))
+
+
 def test_slots_head_has_five_feature_blocks_and_four_regressors():
-    network = SSADNet("slots", n_slots=6, context_width=4).eval()
+    network = SSADNet("slots-paper", n_slots=6, context_width=4).eval()
     blocks = [module for module in network.modules() if isinstance(module, FeatureBlock)]
     regressors = [module for module in network.modules() if isinstance(module, BoxRegressor)]
     assert len(regressors) == 4
