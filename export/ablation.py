@@ -53,7 +53,7 @@ VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "batches of eight": {"batch": 8},
         "weights not averaged": {"ema": 0.0},
         "the front of boxes too": {"front": True},
-        "the paper's slots": {"head": "slots"},
+        "the paper's slots": {"head": "slots-paper"},
     },
     # The settings that the paper of LoDNN-I varies (Electronics 12, 3165, Figure 16).
     "lodnn": {
