@@ -20,6 +20,9 @@ from .train import train
 __all__ = ["finish", "make"]
 
 N_SIMULATED = 2400
+SOURCES = {"real", "semantickitti", "simulated"}
+# What a card holds of the figures of a source; `edgeperc eval` prints the rest, which is four times as long.
+CARD_FIGURES = ("n_frames", "n_drives", "points", "boxes", "segmentation", "road")
 ROAD_TRUTH = "ssadnet-sim"
 """Model whose road is the ground truth of KITTI's scans, which have no road labels."""
 
@@ -161,6 +164,8 @@ def finish(
     command += [f"--road-by {ROAD_TRUTH}"] if road_by else []
     command += [f"--fold {fold}"] if fold is not None else []
     command += ["--no-agreement"]
+    for source in SOURCES & figures.keys():
+        figures[source] = {name: of for name, of in figures[source].items() if name in CARD_FIGURES}
     figures["command"] = " ".join(command)
     path.with_suffix(".json").write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
     write_card(onnx.load(path), replace(card, metrics=figures), path)

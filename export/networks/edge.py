@@ -4,7 +4,7 @@ They keep the papers' views, classes and boxes, and avoid what is slow on small 
 resolution, unpooling by position, and dilations wider than the map. Instead, the encoder halves the resolution twice,
 residual blocks form the context, and the decoder moves channels to pixels. Numbers of channels are multiples of 16, the
 width of a vector register: 24 channels took as long as 32. Batch norm is folded into its convolution on export, and
-ReLU by the engine. Both networks are distilled from the full ones (`edgeperc_export.recipe.Recipe.distil`).
+ReLU by the engine.
 """
 
 from __future__ import annotations
@@ -78,6 +78,12 @@ class Trunk(nn.Module):
         return spread(self.classifier(fine), self.stride), middle
 
 
+def _channels(width: float) -> tuple[int, int, int]:
+    """Channels at the stem's resolution, at half and at a quarter of it: multiples of 16."""
+    fine, middle, coarse = (16 * max(1, round(channels * width / 16)) for channels in (16, 64, 112))
+    return fine, middle, coarse
+
+
 def spread(x: Tensor, block: tuple[int, int]) -> Tensor:
     """Move channels to pixels: (B, C x rows x columns, H, W) to (B, C, H x rows, W x columns)."""
     rows, cols = block
@@ -95,6 +101,8 @@ class PointSegEdge(nn.Module):
     ----------
     n_channels, n_classes : int
         Channels of the input; classes of the output.
+    width : float
+        Factor of the numbers of channels in between.
 
     Notes
     -----
@@ -102,9 +110,9 @@ class PointSegEdge(nn.Module):
     Out: logits (B, 4, 64, 512) float32.
     """
 
-    def __init__(self, *, n_channels: int = 5, n_classes: int = 4) -> None:
+    def __init__(self, *, n_channels: int = 5, n_classes: int = 4, width: float = 1.0) -> None:
         super().__init__()
-        self.trunk = Trunk(n_channels, n_classes, (1, 2), fine=16, middle=64, coarse=112)
+        self.trunk = Trunk(n_channels, n_classes, (1, 2), *_channels(width))
         initialize(self, self.trunk.classifier)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -123,6 +131,8 @@ class SSADNetEdge(nn.Module):
         Channels of the input; classes of the segmentation map.
     front : bool
         Also predict which end of a vehicle is its front.
+    width : float
+        Factor of the numbers of channels in between.
 
     Notes
     -----
@@ -130,11 +140,12 @@ class SSADNetEdge(nn.Module):
     Out: segmentation logits (B, 5, 400, 200) and boxes (B, 9 or 11, 100, 50), in the format of `DenseHead`, float32.
     """
 
-    def __init__(self, *, n_channels: int = 3, n_classes: int = 5, front: bool = False) -> None:
+    def __init__(self, *, n_channels: int = 3, n_classes: int = 5, front: bool = False, width: float = 1.0) -> None:
         super().__init__()
-        self.trunk = Trunk(n_channels, n_classes, (2, 2), fine=16, middle=64, coarse=112)
-        self.detection = nn.Sequential(conv_bn_relu(64, 64, 3), conv_bn_relu(64, 64, 3))
-        self.predict = nn.Conv2d(64, N_DENSE_CHANNELS + N_FRONT_CHANNELS * front, 1)
+        fine, middle, coarse = _channels(width)
+        self.trunk = Trunk(n_channels, n_classes, (2, 2), fine, middle, coarse)
+        self.detection = nn.Sequential(conv_bn_relu(middle, middle, 3), conv_bn_relu(middle, middle, 3))
+        self.predict = nn.Conv2d(middle, N_DENSE_CHANNELS + N_FRONT_CHANNELS * front, 1)
         initialize(self, self.trunk.classifier, self.predict)
         assert self.predict.bias is not None
         self.predict.bias.data[0] = -math.log(1.0 / HEAT_PRIOR - 1.0)
