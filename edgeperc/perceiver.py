@@ -41,7 +41,7 @@ from .refine import label_points, remove_outliers
 from .remission import NO_REMISSION, RemissionMatcher
 from .sensor import SensorProfile, get_sensor
 from .session import Session
-from .zoo import DEFAULT
+from .zoo import CAMERA, DEFAULT
 
 __all__ = ["ADAPTATIONS", "BoxesFrom", "Perceiver"]
 
@@ -435,7 +435,7 @@ class Perceiver:
             raise ImageError(f"got no image, and {name} needs one; pass image=, (H, W, 3) uint8, or leave out {name}")
         if image is not None and self._camera is None:
             raise ImageError(
-                f"got an image, and none of the models is of a camera ({loaded}); add one such as camseg to models="
+                f"got an image, and none of the models is of a camera ({loaded}); add one such as {CAMERA} to models="
             )
 
     def _nothing(self, stamp_s: float | None, watch: _Stopwatch) -> Perception:

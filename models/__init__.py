@@ -19,6 +19,7 @@ from edgeperc.onnx_file import read_model
 
 __all__ = [
     "BF16_FEATURES",
+    "CAMERA",
     "DEFAULT",
     "INT8_FEATURES",
     "MAX_LOSS",
@@ -33,6 +34,9 @@ __all__ = [
 
 DEFAULT = ("ssadnet", "pointseg")
 """The best pair: drivable area and vehicles ahead, and a class for every point."""
+
+CAMERA = "camseg"
+"""The model of a camera's images."""
 
 MAX_LOSS = 0.3
 """Largest loss of mean IoU or AP, in percentage points, that ``precision="auto"`` accepts for speed."""

@@ -249,6 +249,7 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pyte
         "fitness": ["the scan has 32 beams"],
         "mounting": {"height_m": 1.73, "roll_deg": 0.0, "pitch_deg": 0.66, "yaw_deg": 0.0, "origin_m": [0.0, 0.0]},
         "remission": None,
+        "image": None,
     }
     complaints = captured.err.splitlines()
     assert [line.startswith("edgeperc: ") for line in complaints] == [True, True, True, False]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 __all__ = [
+    "CAMERA",
     "DEFAULT",
     "DEFAULT_SENSOR",
     "PRECISIONS",
@@ -39,6 +40,7 @@ _WIDTH = 78
 # Copies of the values in `edgeperc.zoo`, `edgeperc.session` and `edgeperc.agreement`. Those modules import numpy, which
 # would delay --help.
 DEFAULT = ("ssadnet", "pointseg")
+CAMERA = "camseg"
 DEFAULT_SENSOR = "hdl-64e"
 PROVIDERS = ("auto", "cpu", "openvino", "cuda", "tensorrt", "tensorrt-rtx", "coreml", "directml")
 RULES = ("boxes", "column", "fill", "ground", "height", "road", "share", "support")

@@ -48,7 +48,7 @@ def completion_command(arguments: argparse.Namespace) -> int:
         # For a function with "file" in its name, shtab adds no space after a completed folder.
         functions["bash"].append(f'{function}() {{ compgen -W \'{choices}\' -- "$1"; compgen -f -- "$1"; }}')
         functions["zsh"].append(f"{function}() {{ compadd {choices}; _files; }}")
-    completed["MODEL|SCAN"] = completed["MODEL"]
+    completed["MODEL|SCAN|IMAGE"] = completed["MODEL"]
     for action in _actions(arguments.parser):
         if action.choices is None and action.metavar in completed:
             action.complete = completed[action.metavar]

@@ -1,4 +1,4 @@
-"""``edgeperc info``: what a model is; what a scan looks like and which models suit it."""
+"""``edgeperc info``: what a model is; what a scan or an image looks like and which models suit it."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from ..card import ModelCard
     from ..level import MountingEstimator
     from ..sensor import SensorProfile
     from ..zoo import Variant
@@ -38,25 +39,27 @@ def add_parser(commands: Commands) -> None:
         commands,
         "info",
         info_command,
-        help="what a model is; what a scan looks like and which models suit it",
+        help="what a model is; what a scan or an image looks like and which models suit it",
         description="Describe models by their cards: view, classes, training data, licence and accuracy. Describe "
         "scans: extent [m], elevations [deg], remission, beams, the mounting that the ground shows, and for each "
-        "installed model whether the scan resembles its training scans. No model is run.",
+        "installed model whether the scan resembles its training scans. Describe images: size, and how camera models "
+        "scale it. No model is run.",
         examples=[
             "edgeperc info pointseg",
             "edgeperc info 000123.bin",
             "edgeperc info drive.pcap",
             "edgeperc info velodyne/*.bin --write my-sensor.json",
             "edgeperc info pointseg:int8 --json",
+            "edgeperc info street.jpg",
         ],
     )
     reading = parser.add_argument_group("input")
     reading.add_argument(
         "things",
         nargs="+",
-        metavar="MODEL|SCAN",
-        help="a name from 'edgeperc models', an .onnx file, a scan, or a capture (its first scan; its mounting by the "
-        "first five)",
+        metavar="MODEL|SCAN|IMAGE",
+        help="a name from 'edgeperc models', an .onnx file, a scan, a capture (its first scan; its mounting by the "
+        "first five), or an image",
     )
     add_sensor(reading, of_capture=True)
     add_mounting(reading)
@@ -77,7 +80,9 @@ def add_parser(commands: Commands) -> None:
 
 
 def info_command(arguments: argparse.Namespace) -> int:
-    """Describe models and scans; 1 if some failed."""
+    """Describe models, scans and images; 1 if some failed."""
+    from ..readers.images import IMAGE_SUFFIXES
+
     if arguments.sensor is not None:
         from ..sensor import get_sensor
 
@@ -91,6 +96,8 @@ def info_command(arguments: argparse.Namespace) -> int:
             if _is_model(thing):
                 variants = _variants(thing)
                 rows, document = _model_rows(variants), json.loads(variants[0].card.to_json())
+            elif Path(thing).suffix.lower() in IMAGE_SUFFIXES:
+                rows, document = _image_rows(Path(thing))
             else:
                 rows, document = _scan_rows(Path(thing), arguments, estimators)
         except MissingExtraError:
@@ -157,7 +164,7 @@ def _folded(rows: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
 
 def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
     """Rows that describe a model; accuracy and geometry come from the card of its first variant."""
-    from ..card import TopViewGeometry
+    from ..card import CameraGeometry, TopViewGeometry
     from ..listing import purpose
 
     path, card = variants[0].path, variants[0].card
@@ -171,6 +178,8 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
     if isinstance(card.view, TopViewGeometry):
         (x_near, x_far), (y_right, y_left) = card.view.x_range_m, card.view.y_range_m
         seen = f"x {x_near:g}..{x_far:g} m, y {y_right:g}..{y_left:g} m, cells of {card.view.cell_m:g} m"
+    elif isinstance(card.view, CameraGeometry):
+        seen = f"{card.view.width} x {card.view.height} pixels, images are {card.view.fit}ed to it"
     else:
         up, down = card.view.row_elevations_deg[0], card.view.row_elevations_deg[-1]
         left, right = card.view.azimuth_left_deg, card.view.azimuth_right_deg
@@ -234,6 +243,32 @@ def _estimated(
         except MountingError as exc:
             reason = exc
     return estimator, reason
+
+
+def _image_rows(path: Path) -> tuple[list[tuple[str, str]], dict[str, Any]]:
+    """Size and brightness of an image, and how the camera models scale it: rows to print, and the same for JSON."""
+    from ..readers.images import read_image
+    from ..zoo import listed
+
+    image = read_image(path)
+    height, width, _ = image.shape
+    mean = [round(float(value), 1) for value in image.mean(axis=(0, 1))]
+    rows = [
+        ("image", str(path)),
+        ("size", f"{width} x {height} pixels, upright as its EXIF orientation says"),
+        ("mean", "red {:g}, green {:g}, blue {:g} of 255".format(*mean)),
+    ]
+    models = {}
+    for card in {variant.name: variant.card for variant in listed()}.values():
+        if card.view.kind == "camera":
+            scales = round(card.view.width / width, 4), round(card.view.height / height, 4)
+            models[card.name] = {"scale_x": scales[0], "scale_y": scales[1]}
+            rows.append((card.name, "scales it to {} x {}: by {:g} across, {:g} down".format(*_size(card), *scales)))
+    return rows, {"image": str(path), "width": width, "height": height, "mean": mean, "models": models}
+
+
+def _size(card: ModelCard) -> tuple[int, int]:
+    return card.view.width, card.view.height
 
 
 def _scan_rows(
@@ -318,6 +353,8 @@ def _scan_rows(
     rows.append(("beams", f"about {profile.beams[0]:.0f} rows of points ({sensor.name}: {sensor.n_beams})"))
     findings: dict[str, list[str] | None] = {}
     for card in {variant.name: variant.card for variant in listed()}.values():
+        if card.view.kind == "camera":
+            continue
         if card.fitness is None:
             findings[card.name] = None
             rows.append((card.name, "its card does not describe its training scans"))

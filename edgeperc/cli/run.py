@@ -1,4 +1,4 @@
-"""``edgeperc run``: perceive scans, captures and live sources."""
+"""``edgeperc run``: perceive scans, captures, live sources and images."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..errors import EdgepercError, MissingExtraError, ModelError, PointsError
+from ..errors import EdgepercError, ImageError, MissingExtraError, ModelError, PointsError
 from ..extras import require
 from .arguments import (
+    CAMERA,
     DEFAULT,
     DEFAULT_SENSOR,
     Commands,
@@ -28,7 +29,7 @@ from .arguments import (
     positive_number,
 )
 from .output import many, one_line, print_error, print_line, progress
-from .scans import Scans, find_scans, output_names, scan_folders, scan_namer, scan_sensor
+from .scans import Scans, find_images, find_scans, output_names, scan_folders, scan_namer, scan_sensor
 
 if TYPE_CHECKING:
     import numpy as np
@@ -51,10 +52,10 @@ def add_parser(commands: Commands) -> None:
         commands,
         "run",
         run_command,
-        help="perceive scans: a line or a JSON object for each, and files",
+        help="perceive scans or images: a line or a JSON object for each, and files",
         description="Perceive scans and print one line for each: drivable area [m2], boxes, points of each class and "
-        "processing time [ms]. If a scan fails, the error is printed, the other scans are processed, and the exit code "
-        "is 1.",
+        "processing time [ms]; of a camera's images, the share of each class. If a scan fails, the error is printed, "
+        "the other scans are processed, and the exit code is 1.",
         examples=[
             "edgeperc run 000123.bin",
             "edgeperc run velodyne/ --out out --png --labels",
@@ -62,6 +63,8 @@ def add_parser(commands: Commands) -> None:
             "edgeperc run drive.pcap --track --gif --out out",
             "edgeperc run scans/ --sensor os1-64",
             "edgeperc run velodyne/ --live --rate 10",
+            "edgeperc run street.jpg --out out --png",
+            "edgeperc run image_2/000123.png --scan velodyne/000123.bin --json",
         ],
     )
     reading = parser.add_argument_group("input")
@@ -71,7 +74,16 @@ def add_parser(commands: Commands) -> None:
         type=Path,
         metavar="PATH",
         help="scan files (.bin, .pcd, .ply, .npy, .npz); folders of them; the root of a KITTI object set, of "
-        "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .osf, .bag, .mcap, a ROS 2 bag's folder (extra 'io')",
+        "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .osf, .bag, .mcap, a ROS 2 bag's folder (extra 'io'); "
+        "or images (.jpg, .png, .webp, .bmp, .tif, .ppm) and folders of them (extra 'camera')",
+    )
+    reading.add_argument(
+        "--scan",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="SCAN",
+        help="the scan of each image, in their order: both are perceived in one call (default: images alone)",
     )
     add_sensor(reading, of_capture=True)
     add_mounting(reading)
@@ -102,7 +114,11 @@ def add_parser(commands: Commands) -> None:
     output.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for the files below, made if needed (default: no files)"
     )
-    output.add_argument("--png", action="store_true", help="write NAME.png, a picture (needs the extra 'view')")
+    output.add_argument(
+        "--png",
+        action="store_true",
+        help="write NAME.png, a picture (needs the extra 'view'); NAME_scan.png is that of an image's --scan",
+    )
     output.add_argument("--html", action="store_true", help="write NAME.html, the labeled points in 3-D for a browser")
     output.add_argument(
         "--labels", action="store_true", help="write NAME.label, SemanticKITTI's layout: one uint32 for each point"
@@ -161,32 +177,41 @@ def run_command(arguments: argparse.Namespace) -> int:
     """Perceive scans; return 1 if some failed."""
     kinds = [kind for kind in _KINDS if getattr(arguments, kind)]
     _check_usage(arguments, kinds)
-    found = Scans([_live_source(arguments)], [], False) if arguments.live else find_scans(arguments.paths)
+    images = _images(arguments, kinds)
+    if images:
+        found = Scans([*images], [], False)
+    else:
+        found = Scans([_live_source(arguments)], [], False) if arguments.live else find_scans(arguments.paths)
     scans = found.paths
     names = output_names(scans, keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
-    sources = {os.path.realpath(scan) for scan in scans}
-    for file in (_file_of(target, kind) for target in targets for kind in kinds):
+    sources = {os.path.realpath(source) for source in (*scans, *images.values()) if source is not None}
+    of = {"of_image": bool(images), "of_scan": not images or bool(arguments.scan)}
+    for file in (file for target in targets for file in _files_of(target, kinds, **of).values()):
         if os.path.realpath(file) in sources:
-            arguments.usage_error(f"{file} is one of the scans and would be overwritten; choose another --out")
+            arguments.usage_error(
+                f"{file} is one of the {'images' if images else 'scans'} and would be overwritten; choose another --out"
+            )
 
     perceivers = _Perceivers(arguments)
-    perceivers.check(scans)
+    perceivers.check([*filter(None, images.values())] if images else scans, of_images=bool(images))
     for target in targets if kinds else ():
         target.parent.mkdir(parents=True, exist_ok=True)
     follow = _follower(arguments.rate) if arguments.track else None
-    report = _Report(arguments)
+    report = _Report(arguments, images)
     for folder in found.empty:
         report.add(folder, PointsError("no scan in this folder; expected scans, captures or a ROS 2 bag's folder"))
     started = time.perf_counter()
     with progress("file") as show:
         for done, (scan, target) in enumerate(zip(scans, targets, strict=True)):
             show(done, len(scans))
-            outcomes = (
-                _live(perceivers, follow, scan, arguments)
-                if arguments.live
-                else _each(perceivers, follow, scan, target, kinds, arguments)
-            )
+            outcomes: Iterator[tuple[Any, ...]]
+            if images:
+                outcomes = _each_image(perceivers, follow, scan, images[scan], target, kinds, arguments)
+            elif arguments.live:
+                outcomes = _live(perceivers, follow, scan, arguments)
+            else:
+                outcomes = _each(perceivers, follow, scan, target, kinds, arguments)
             for outcome in outcomes:
                 report.add(*outcome)
     if report.tracks:
@@ -197,7 +222,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     n_perceived = report.n - len(found.empty)
     if n_perceived > 1:
         each_ms = 1e3 * (time.perf_counter() - started) / n_perceived
-        things = "answers" if arguments.live else "scans"
+        things = "answers" if arguments.live else "images" if images else "scans"
         print_line(f"{report.n} {things}, {report.n_failed} failed, {each_ms:.0f} ms each with files", sys.stderr)
     return 1 if report.n_failed else 0
 
@@ -216,6 +241,25 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         require("matplotlib", "view", "Drawing a picture")
     if arguments.gif:
         require("PIL", "view", "Drawing an animation", package="pillow")
+
+
+def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, Path | None]:
+    """The images, each with its scan of ``--scan`` if that is passed; empty if the paths are scans."""
+    images = find_images(arguments.paths)
+    scans = find_scans(arguments.scan).paths
+    if arguments.scan and len(scans) != len(images):
+        arguments.usage_error(f"--scan: {many(len(scans), 'scan')} for {many(len(images), 'image')}; expected as many")
+    if not images:
+        return {}
+    if arguments.live:
+        arguments.usage_error("--live replays scans, not images")
+    of_scans = [kind for kind in (*kinds, *(["track"] if arguments.track else [])) if kind != "png"]
+    if of_scans and not scans:
+        arguments.usage_error(f"--{of_scans[0]} is of scans; add --scan, or leave it out")
+    require("PIL.Image", "camera", "Reading an image", package="pillow")
+    if arguments.model is None:
+        arguments.model = [*DEFAULT, CAMERA] if scans else [CAMERA]
+    return {image: scans[k] if scans else None for k, image in enumerate(images)}
 
 
 def _live_source(arguments: argparse.Namespace) -> Path:
@@ -242,8 +286,9 @@ class _Report:
         `edgeperc.view.flatten_scan` of every scan, drawn under the tracks.
     """
 
-    def __init__(self, arguments: argparse.Namespace) -> None:
+    def __init__(self, arguments: argparse.Namespace, images: Mapping[Path, Path | None]) -> None:
         self.n = self.n_failed = 0
+        self._images = images
         self.tracks: list[Tracks] = []
         self.under: list[bytes] = []
         self._json = arguments.json
@@ -265,7 +310,7 @@ class _Report:
             self.n_failed += 1
             print_error(f"{source}: {str(outcome).removeprefix(f'{source}: ')}")
             if self._json:
-                print_line(json.dumps({"scan": str(source), "error": one_line(outcome)}))
+                print_line(json.dumps({**self._names(source), "error": one_line(outcome)}))
             return
         answer, perception = (None, outcome) if isinstance(outcome, Perception) else (outcome, outcome.perception)
         timing = None if answer is None else _timing(answer)
@@ -276,7 +321,10 @@ class _Report:
             from ..records import scan_record
 
             stamp_s = perception.stamp_s
-            record = {"scan": str(source), "stamp_s": stamp_s, "live": timing, **scan_record(perception, tracks)}
+            names, record = self._names(source), scan_record(perception, tracks)
+            if record["image"] is not None:
+                record["image"] = {**names.pop("image"), **record["image"]}
+            record = {**names, "stamp_s": stamp_s, "live": timing, **record}
             print_line(json.dumps(record, allow_nan=False))
             return
         parts = [str(source)]
@@ -286,6 +334,13 @@ class _Report:
         if tracks is not None:
             parts.append(f"tracks: {many(len(tracks), 'object')}")
         print_line("  ".join(parts))
+
+    def _names(self, source: Path) -> dict[str, Any]:
+        """The files of a record: the scan, or the image and its scan."""
+        if source not in self._images:
+            return {"scan": str(source)}
+        scan = self._images[source]
+        return {"scan": None if scan is None else str(scan), "image": {"file": str(source)}}
 
 
 # Perceivers kept for the sensors of captures; each has its own networks in memory.
@@ -300,7 +355,7 @@ class _Perceivers:
         self._made: dict[str | SensorProfile, Perceiver] = {}
         self._sensors: dict[Path, str | SensorProfile] = {}
 
-    def check(self, scans: Sequence[Path]) -> None:
+    def check(self, scans: Sequence[Path], of_images: bool) -> None:
         """Make the first perceiver, so that errors of options and models come before any file is written."""
         for scan in scans:
             try:
@@ -316,6 +371,15 @@ class _Perceivers:
             raise ModelError(
                 "--labels and --ply need a class for every point; add a range-image model: --model pointseg"
             )
+        kinds = {c.view.kind for c in cards}
+        if ("camera" in kinds) != of_images:
+            raise ModelError(
+                f"images need a camera model; add --model {CAMERA}"
+                if of_images
+                else "scans without images need no camera model; leave it out, or pass images, with their --scan"
+            )
+        if of_images and not scans and kinds != {"camera"}:
+            raise ModelError("images alone need a camera model alone; leave out the others, or add --scan")
 
     def sensor_of(self, path: Path) -> str | SensorProfile:
         """The sensor of ``--sensor``, of the capture, or the default."""
@@ -387,6 +451,39 @@ def _each(
         yield path, exc, None, None
 
 
+def _each_image(
+    perceivers: _Perceivers,
+    follow: Follow | None,
+    path: Path,
+    scan: Path | None,
+    target: Path,
+    kinds: Sequence[str],
+    arguments: argparse.Namespace,
+) -> Iterator[tuple[Path, Perception | Exception, Tracks | None, bytes | None]]:
+    """Yield the name, perception or error, tracks and flattened scan of an image and of its scan, if it has one."""
+    from .. import view
+    from ..readers.files import read_points
+    from ..readers.images import read_image
+
+    try:
+        image = read_image(path)
+        perceive = perceivers.of(perceivers.sensor_of(scan) if scan else arguments.sensor or DEFAULT_SENSOR)
+        points = None if scan is None else read_points(scan)
+        perception = perceive(points, image=image)
+        tracks = None if follow is None else follow(perception)
+        wanted = _files_of(target, kinds, of_image=True, of_scan=points is not None)
+        if "image" in wanted:
+            view.draw_image(perception, image, wanted.pop("image"), title=path.name)
+        if points is not None:
+            _write(points, perception, wanted, title=str(scan))
+    except (EdgepercError, OSError) as exc:
+        yield path, exc, None, None
+    except MemoryError:
+        yield path, ImageError("the image takes more memory than there is"), None, None
+    else:
+        yield path, perception, tracks, None if points is None or not arguments.gif else _under(points, perception)
+
+
 def _live(
     perceivers: _Perceivers, follow: Follow | None, path: Path, arguments: argparse.Namespace
 ) -> Iterator[tuple[Path, Answer | Exception, Tracks | None]]:
@@ -412,6 +509,17 @@ def _live(
 
 def _file_of(target: Path, kind: str) -> Path:
     return target.with_name(f"{target.name}.{'label' if kind == 'labels' else kind}")
+
+
+def _files_of(target: Path, kinds: Sequence[str], *, of_image: bool, of_scan: bool) -> dict[str, Path]:
+    """The files to write by kind; ``"image"`` is the picture of an image."""
+    files = {kind: _file_of(target, kind) for kind in kinds}
+    if of_image and "png" in files:
+        picture = files.pop("png")
+        files["image"] = picture
+        if of_scan:
+            files["png"] = picture.with_name(f"{target.name}_scan.png")
+    return files
 
 
 def _write(points: NDArray[np.float32], perception: Perception, wanted: Mapping[str, Path], title: str) -> None:
@@ -445,7 +553,14 @@ def _timing(answer: Answer) -> dict[str, Any]:
 
 def _summary(perception: Perception) -> str:
     """Summarize on one line: points, time, drivable area, boxes and points of each class."""
-    parts = [f"{perception.n_points:,} points", f"{sum(perception.stage_ms.values()):.1f} ms"]
+    parts = []
+    if perception.image is not None:
+        height, width = perception.image.labels.shape
+        shares = ((name, n / (width * height)) for name, n in perception.image.counts().items())
+        parts.append(f"{width} x {height} pixels: {', '.join(f'{name} {100.0 * s:.1f} %' for name, s in shares if s)}")
+    if perception.points is None and perception.top_view is None:
+        return "  ".join([*parts, f"{sum(perception.stage_ms.values()):.1f} ms"])
+    parts += [f"{perception.n_points:,} points", f"{sum(perception.stage_ms.values()):.1f} ms"]
     if perception.top_view is not None:
         parts.append(f"drivable {perception.top_view.drivable_area_m2:.1f} m2")
     labels = [box.label for box in perception.boxes]

@@ -11,14 +11,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from ..errors import EdgepercError
+from ..errors import EdgepercError, ImageError
 from .arguments import DEFAULT_SENSOR
 
 if TYPE_CHECKING:
     from ..readers.identify import KnownSensor
     from ..sensor import SensorProfile
 
-__all__ = ["Scans", "find_scans", "output_names", "scan_folders", "scan_namer", "scan_sensor", "with_mounting"]
+__all__ = [
+    "Scans",
+    "find_images",
+    "find_scans",
+    "output_names",
+    "scan_folders",
+    "scan_namer",
+    "scan_sensor",
+    "with_mounting",
+]
 
 # Folders of scans in data sets: KITTI object and tracking, SemanticKITTI, a KITTI raw drive, a day of raw drives.
 _LAYOUTS = (
@@ -77,6 +86,30 @@ def find_scans(paths: Sequence[Path]) -> Scans:
         for scan in found:
             scans.setdefault(_absolute(scan), scan)
     return Scans(list(scans.values()), empty, of_data_set)
+
+
+def find_images(paths: Sequence[Path]) -> list[Path]:
+    """Find image files, in the order of ``paths``; those of a folder without scans are sorted. Empty if there are none.
+
+    Raises
+    ------
+    ImageError
+        Some of the paths are images, and others are not.
+    """
+    from ..readers.captures import is_capture
+    from ..readers.images import IMAGE_SUFFIXES
+
+    images: dict[str, Path] = {}
+    others = []
+    for path in paths:
+        found = [path] if path.suffix.lower() in IMAGE_SUFFIXES else []
+        if path.is_dir() and not is_capture(path) and not scan_folders(path):
+            found = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+        images |= {_absolute(image): image for image in found}
+        others += [] if found else [path]
+    if images and others:
+        raise ImageError(f"{others[0]} is not an image, and {next(iter(images.values()))} is; pass scans after --scan")
+    return [*images.values()]
 
 
 def scan_namer(path: Path) -> Callable[[int], Path]:

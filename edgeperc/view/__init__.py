@@ -1,6 +1,6 @@
 """Pictures, 3-D pages and label files of a perception.
 
-`draw`, `draw_mistakes` and `draw_tracks` need the extra ``view``; the others need numpy alone. All write
+`draw`, `draw_image`, `draw_mistakes` and `draw_tracks` need the extra ``view``; the others need numpy alone. All write
 to ``path`` and replace an existing file atomically. Pictures are also returned as bytes; their ``path`` is optional.
 """
 
@@ -9,7 +9,16 @@ from __future__ import annotations
 from .files import write_labels, write_ply
 from .mistakes import draw_mistakes
 from .page import write_html
-from .picture import draw
+from .picture import draw, draw_image
 from .tracks import draw_tracks, flatten_scan
 
-__all__ = ["draw", "draw_mistakes", "draw_tracks", "flatten_scan", "write_html", "write_labels", "write_ply"]
+__all__ = [
+    "draw",
+    "draw_image",
+    "draw_mistakes",
+    "draw_tracks",
+    "flatten_scan",
+    "write_html",
+    "write_labels",
+    "write_ply",
+]

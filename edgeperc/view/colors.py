@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "AMBER",
+    "CAMERA_COLORS",
     "CLASS_COLORS",
     "FAINT",
     "FALSE",
@@ -36,6 +37,18 @@ CLASS_COLORS = {
     "pedestrian": "#ff93f0",
     "cyclist": "#2a90ff",
 }
+# Classes of a camera's images, by name in lower case; those that scans have too keep their colors.
+CAMERA_COLORS = {
+    "sky": "#6fb7e8",
+    "building": "#8f6f5e",
+    "pole": "#d9d2c0",
+    "road": CLASS_COLORS["drivable"],
+    "pavement": "#b48ade",
+    "tree": "#5f7d1e",
+    "signsymbol": "#fff04a",
+    "fence": "#a34a2a",
+    "bicyclist": CLASS_COLORS["cyclist"],
+}
 _OTHER_COLOR = "#ffffff"
 INK, FAINT, FRAME, PANEL, GROUND = "#eef2f6", "#9fb0c0", "#2a343f", "#0b0f14", "#131920"
 AMBER = "#ffc46b"
@@ -47,7 +60,8 @@ FOUND, MISSED, FALSE = "#5d7468", "#ff4d4d", "#ffe14d"
 
 def color_of(name: str) -> str:
     """Color of a class, ``"#rrggbb"``; white for a class without a color of its own."""
-    return CLASS_COLORS.get(name, _OTHER_COLOR)
+    lower = name.casefold()
+    return CLASS_COLORS.get(lower) or CAMERA_COLORS.get(lower, _OTHER_COLOR)
 
 
 def rgb(colors: list[str]) -> NDArray[np.float64]:

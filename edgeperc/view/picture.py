@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..drivable import RoadAhead, road_ahead
+from ..errors import ImageError
+from ..image import as_image
 from ..perception import Box, Perception, TopView
 from .canvas import Label, add_axes, area_of, as_png, new_figure, place_labels, shorten, wrap, write_at
 from .colors import AMBER, FAINT, INK, PANEL, color_of, ramp, rgb
@@ -28,7 +30,7 @@ from .content import (
     timing_line,
 )
 
-__all__ = ["draw"]
+__all__ = ["draw", "draw_image"]
 
 # Sizes in pixels. A page that shows the picture 1000 pixels wide reduces text of 13 points to 8.
 _WIDTH, _MARGIN, _TOP, _BOTTOM = 1600, 28, 128, 868
@@ -101,6 +103,59 @@ def draw(
     write_at(figure, _MARGIN, notes_top, ran, fontsize=12.0, color=FAINT)
     for k, line in enumerate(warnings):
         write_at(figure, _MARGIN, notes_top + 32 + 26 * k, line, fontsize=13.0, color=AMBER)
+    return as_png(figure, path)
+
+
+def draw_image(
+    perception: Perception, image: NDArray[np.uint8], path: str | Path | None = None, *, title: str = ""
+) -> bytes:
+    """Draw a camera's image under the classes of its pixels.
+
+    Parameters
+    ----------
+    perception : Perception
+        With an `edgeperc.ImageLabels`.
+    image : (H, W, 3) uint8
+        The image that was perceived.
+    path : str or Path, optional
+        File to write as well; an existing file is replaced atomically.
+    title : str
+        The image's name.
+
+    Returns
+    -------
+    png : bytes
+        1600 pixels wide.
+
+    Raises
+    ------
+    MissingExtraError
+        matplotlib is not installed.
+    ImageError
+        ``image`` is not the image that was perceived.
+    OSError
+        The file cannot be written.
+    """
+    image, found = as_image(image), perception.image
+    if found is None or found.labels.shape != image.shape[:2]:
+        given = "no image" if found is None else f"an image of shape {found.labels.shape}"
+        raise ImageError(f"image has shape {image.shape}, of a perception of {given}; expected what was perceived")
+    counts = sorted(found.counts().items(), key=lambda item: -item[1])
+    facts = {name: [f"{100.0 * n / found.labels.size:.1f} %"] for name, n in counts if n}
+    height = min(_WIDTH * image.shape[0] // image.shape[1], _WIDTH) + 1
+    legend_top, legend_height = 80 + height + 24, 104 * -(-len(facts) // _CLASSES_A_ROW)
+    figure = new_figure(_WIDTH, legend_top + legend_height + 68)
+    axes = add_axes(figure, _MARGIN, 80, _WIDTH - 2 * _MARGIN, height)
+    colors = rgb([color_of(name) for name in found.classes]).astype(np.float32)[found.labels]
+    axes.imshow(0.55 * image.astype(np.float32) / 255.0 + 0.45 * colors, aspect="equal", interpolation="antialiased")
+    size = f"{image.shape[1]} x {image.shape[0]} pixels, {100.0 * found.drivable_share:.1f} % road"
+    write_at(figure, _WIDTH - _MARGIN, 46, size, fontsize=18.0, ha="right", color=FAINT)
+    style = {"fontsize": 23.0, "fontweight": "bold"}
+    write_at(figure, _MARGIN, 46, shorten(figure, title, 1000, **style), **style)
+    _draw_legend(figure, legend_top, legend_height, facts)
+    ran = " · ".join([timing_line(perception), *provider_lines(perception)])
+    ran = shorten(figure, ran, _WIDTH - 2 * _MARGIN, fontsize=12.0)
+    write_at(figure, _MARGIN, legend_top + legend_height + 34, ran, fontsize=12.0, color=FAINT)
     return as_png(figure, path)
 
 
