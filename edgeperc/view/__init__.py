@@ -1,7 +1,7 @@
 """Pictures, 3-D pages and label files of a perception.
 
-`draw`, `draw_image`, `draw_mistakes` and `draw_tracks` need the extra ``view``; the others need numpy alone. All write
-to ``path`` and replace an existing file atomically. Pictures are also returned as bytes; their ``path`` is optional.
+The functions that draw need the extra ``view``; the others need numpy alone. All write to ``path`` and replace an
+existing file atomically. Pictures are also returned as bytes; their ``path`` is optional.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from .files import write_labels, write_ply
 from .mistakes import draw_mistakes
 from .page import write_html
+from .painted import draw_painted
 from .picture import draw, draw_image
 from .tracks import draw_tracks, flatten_scan
 
@@ -16,6 +17,7 @@ __all__ = [
     "draw",
     "draw_image",
     "draw_mistakes",
+    "draw_painted",
     "draw_tracks",
     "flatten_scan",
     "write_html",

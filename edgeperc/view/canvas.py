@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,23 +14,27 @@ from numpy.typing import NDArray
 
 from ..atomic import write_atomic
 from ..extras import require
-from .colors import FAINT, FRAME, GROUND, INK, PANEL
+from .colors import FAINT, FRAME, GROUND, INK, PANEL, color_of
 
 __all__ = [
     "Label",
     "add_axes",
     "area_of",
     "as_png",
+    "draw_legend",
     "free_place",
+    "height_of_legend",
     "new_figure",
     "place_labels",
     "shorten",
     "wrap",
     "write_at",
+    "write_heading",
     "write_text",
 ]
 
 _DPI = 100.0
+_CLASSES_A_ROW, _LEGEND_ROW = 7, 104
 # More labels would cover the picture; the rest is only counted.
 _MOST_LABELS = 60
 # Largest distance of a label from its object [px]; farther away it does not help.
@@ -125,6 +129,32 @@ def wrap(figure: Any, text: str, width: float, **style: Any) -> list[str]:
         if n == 1 or all(_width(figure, line, **style) <= width for line in lines):
             return lines
         n = max(1, min(n - 1, int(0.97 * n)))
+
+
+def write_heading(figure: Any, left: float, top: float, heading: str, more: str) -> None:
+    """Write the heading of a panel, and in fainter text what it shows."""
+    end = write_at(figure, left, top, heading, fontsize=14.5, fontweight="bold")
+    write_at(figure, end + 12, top, more, fontsize=13.0, color=FAINT)
+
+
+def height_of_legend(facts: Mapping[str, Sequence[str]]) -> int:
+    """Height of a legend [px]."""
+    return _LEGEND_ROW * -(-max(1, len(facts)) // _CLASSES_A_ROW)
+
+
+def draw_legend(figure: Any, left: float, top: float, width: float, facts: Mapping[str, Sequence[str]]) -> None:
+    """Draw a panel with a field for each class: color, name, and what was found (at most two lines)."""
+    add_axes(figure, left, top, width, height_of_legend(facts))
+    across = width / min(_CLASSES_A_ROW, max(1, len(facts)))
+    for k, (name, lines) in enumerate(facts.items()):
+        x = left + 16 + across * (k % _CLASSES_A_ROW)
+        y = top + 24 + _LEGEND_ROW * (k // _CLASSES_A_ROW)
+        end = write_at(figure, x, y, "■", fontsize=20.0, color=color_of(name))
+        style = {"fontsize": 15.0, "fontweight": "bold"}
+        name = shorten(figure, name, across - 56, **style)
+        write_at(figure, end + 8, y, name, alpha=1.0 if lines else 0.5, **style)
+        for line, fact in enumerate(lines[:2] or ["none found"]):
+            write_at(figure, end + 8, y + 27 + 24 * line, fact, fontsize=13.0, color=FAINT, alpha=1.0 if lines else 0.6)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,20 @@ from ..drivable import RoadAhead, road_ahead
 from ..errors import ImageError
 from ..image import as_image
 from ..perception import Box, Perception, TopView
-from .canvas import Label, add_axes, area_of, as_png, new_figure, place_labels, shorten, wrap, write_at
+from .canvas import (
+    Label,
+    add_axes,
+    area_of,
+    as_png,
+    draw_legend,
+    height_of_legend,
+    new_figure,
+    place_labels,
+    shorten,
+    wrap,
+    write_at,
+    write_heading,
+)
 from .colors import AMBER, FAINT, INK, PANEL, color_of, ramp, rgb
 from .content import (
     EDGES,
@@ -35,7 +48,6 @@ __all__ = ["draw", "draw_image"]
 # Sizes in pixels. A page that shows the picture 1000 pixels wide reduces text of 13 points to 8.
 _WIDTH, _MARGIN, _TOP, _BOTTOM = 1600, 28, 128, 868
 _AXIS = 62
-_CLASSES_A_ROW = 7
 _NEAR_M = 1.0
 _HALF_STRIP_M = 1.0
 
@@ -84,7 +96,7 @@ def draw(
     facts = class_facts(perception)
     warnings = _wrapped_warnings(perception)
     legend_top = _BOTTOM + 40
-    legend_height = 104 * -(-max(1, len(facts)) // _CLASSES_A_ROW)
+    legend_height = height_of_legend(facts)
     notes_top = legend_top + legend_height + 30
     figure = new_figure(_WIDTH, notes_top + 38 + 26 * len(warnings))
 
@@ -97,7 +109,7 @@ def draw(
     _draw_range_image(figure, (left, 700, width, _BOTTOM - 700), points, names, painted)
 
     _write_header(figure, perception, title)
-    _draw_legend(figure, legend_top, legend_height, facts)
+    draw_legend(figure, _MARGIN, legend_top, _WIDTH - 2 * _MARGIN, facts)
     ran = " · ".join([timing_line(perception), *provider_lines(perception)])
     ran = shorten(figure, ran, _WIDTH - 2 * _MARGIN, fontsize=12.0)
     write_at(figure, _MARGIN, notes_top, ran, fontsize=12.0, color=FAINT)
@@ -143,7 +155,7 @@ def draw_image(
     counts = sorted(found.counts().items(), key=lambda item: -item[1])
     facts = {name: [f"{100.0 * n / found.labels.size:.1f} %"] for name, n in counts if n}
     height = min(_WIDTH * image.shape[0] // image.shape[1], _WIDTH) + 1
-    legend_top, legend_height = 80 + height + 24, 104 * -(-len(facts) // _CLASSES_A_ROW)
+    legend_top, legend_height = 80 + height + 24, height_of_legend(facts)
     figure = new_figure(_WIDTH, legend_top + legend_height + 68)
     axes = add_axes(figure, _MARGIN, 80, _WIDTH - 2 * _MARGIN, height)
     colors = rgb([color_of(name) for name in found.classes]).astype(np.float32)[found.labels]
@@ -152,7 +164,7 @@ def draw_image(
     write_at(figure, _WIDTH - _MARGIN, 46, size, fontsize=18.0, ha="right", color=FAINT)
     style = {"fontsize": 23.0, "fontweight": "bold"}
     write_at(figure, _MARGIN, 46, shorten(figure, title, 1000, **style), **style)
-    _draw_legend(figure, legend_top, legend_height, facts)
+    draw_legend(figure, _MARGIN, legend_top, _WIDTH - 2 * _MARGIN, facts)
     ran = " · ".join([timing_line(perception), *provider_lines(perception)])
     ran = shorten(figure, ran, _WIDTH - 2 * _MARGIN, fontsize=12.0)
     write_at(figure, _MARGIN, legend_top + legend_height + 34, ran, fontsize=12.0, color=FAINT)
@@ -171,27 +183,6 @@ def _write_header(figure: Any, perception: Perception, title: str) -> None:
     write_at(figure, _WIDTH - _MARGIN, 46, facts, fontsize=18.0, ha="right", color=FAINT)
     style = {"fontsize": 23.0, "fontweight": "bold"}
     write_at(figure, _MARGIN, 46, shorten(figure, title, 1100, **style), **style)
-
-
-def _write_heading(figure: Any, left: float, top: float, heading: str, more: str) -> None:
-    end = write_at(figure, left, top, heading, fontsize=14.5, fontweight="bold")
-    write_at(figure, end + 12, top, more, fontsize=13.0, color=FAINT)
-
-
-def _draw_legend(figure: Any, top: float, height: float, facts: dict[str, list[str]]) -> None:
-    """A panel with a field for each class: color, name, and what was found."""
-    width = _WIDTH - 2 * _MARGIN
-    add_axes(figure, _MARGIN, top, width, height)
-    across = width / min(_CLASSES_A_ROW, max(1, len(facts)))
-    for k, (name, lines) in enumerate(facts.items()):
-        left = _MARGIN + 16 + across * (k % _CLASSES_A_ROW)
-        y = top + 24 + 104 * (k // _CLASSES_A_ROW)
-        end = write_at(figure, left, y, "■", fontsize=20.0, color=color_of(name))
-        style = {"fontsize": 15.0, "fontweight": "bold"}
-        name = shorten(figure, name, across - 56, **style)
-        write_at(figure, end + 8, y, name, alpha=1.0 if lines else 0.5, **style)
-        for line, fact in enumerate(lines[:2] or ["none found"]):
-            write_at(figure, end + 8, y + 27 + 24 * line, fact, fontsize=13.0, color=FAINT, alpha=1.0 if lines else 0.6)
 
 
 def _strip(road: RoadAhead, x_near: float, x_far: float) -> tuple[str, NDArray[np.float64] | None]:
@@ -276,7 +267,7 @@ def _draw_top_view(
     if text:
         labels.append(Label(beside_arrow, text, AMBER if arrow is None else INK))
     n_omitted = place_labels(axes, labels, avoid)
-    _write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", _omitted("scores; gray: not observed", n_omitted))
+    write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", _omitted("scores; gray: not observed", n_omitted))
     return width
 
 
@@ -293,7 +284,7 @@ def _draw_range_image(
 ) -> None:
     """Draw the quarter turn ahead as a range image. It is only a picture, not the projection of a network."""
     axes = add_axes(figure, *place)
-    _write_heading(figure, place[0], place[1] - 20, "as the sensor sees it", "90° ahead, a class for every point")
+    write_heading(figure, place[0], place[1] - 20, "as the sensor sees it", "90° ahead, a class for every point")
     x, y, z = points[:, :3].astype(np.float64).T
     range_m = np.sqrt(x * x + y * y + z * z)
     azimuth = np.degrees(np.arctan2(y, x))
@@ -410,7 +401,7 @@ def _draw_from_behind(
             labels.append(Label((*low.tolist(), *high.tolist()), f"{box.label} {distance_m:.0f} m", color))
     n_omitted = place_labels(axes, labels[::-1])
     more = "drivable area, boxes and their distance"
-    _write_heading(figure, place[0], place[1] - 20, "from behind", _omitted(more, n_omitted))
+    write_heading(figure, place[0], place[1] - 20, "from behind", _omitted(more, n_omitted))
 
 
 def _clipped(start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64] | None:

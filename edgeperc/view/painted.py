@@ -1,0 +1,186 @@
+"""Picture of a street seen by both sensors: the image with its classes, the points in it, and both from above."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..calibration import Calibration
+from ..errors import ImageError
+from ..frame import ModelFrame
+from ..image import as_image
+from ..painting import UNSEEN, camera_road, paint
+from ..perception import Box, Perception, TopView
+from ..sensor import SensorProfile
+from .canvas import add_axes, as_png, draw_legend, height_of_legend, new_figure, shorten, write_at, write_heading
+from .colors import FAINT, INK, color_of, rgb
+from .content import check_points, drawable_boxes, drawable_points, provider_lines, timing_line
+
+__all__ = ["draw_painted"]
+
+# Sizes in pixels.
+_WIDTH, _MARGIN, _TOP, _GAP, _AXIS = 1600, 28, 128, 44, 62
+_WIDEST, _HIGHEST = 888, 560
+_BESIDE_M, _BEHIND_M, _BEYOND_M = 4.0, 8.0, 2.0  # of the panel from above, outside the view
+
+
+def draw_painted(
+    perception: Perception,
+    image: NDArray[np.uint8],
+    points: NDArray[np.float32],
+    calibration: Calibration,
+    path: str | Path | None = None,
+    *,
+    sensor: str | os.PathLike[str] | SensorProfile = "hdl-64e",
+    title: str = "",
+) -> bytes:
+    """Draw what a camera and a LiDAR see of the same street.
+
+    Parameters
+    ----------
+    perception : Perception
+        With an `edgeperc.ImageLabels`; its boxes are drawn from above.
+    image : (H, W, 3) uint8
+        The image that was perceived.
+    points : (n, 4) float32
+        The scan that was perceived: x, y, z [m] in the sensor frame, remission.
+    calibration : Calibration
+    path : str or Path, optional
+        File to write as well; an existing file is replaced atomically.
+    sensor : str, Path or SensorProfile
+        As for `edgeperc.paint`.
+    title : str
+
+    Returns
+    -------
+    png : bytes
+        1600 pixels wide. Above the image in the colors of its classes, below the points in the image, each in the
+        color of the class that `edgeperc.paint` gives it, beside them these points and the road of the image
+        (`edgeperc.camera_road`) from above.
+
+    Raises
+    ------
+    MissingExtraError
+        matplotlib is not installed.
+    ImageError, PointsError, CalibrationError
+        The image, the points and the calibration do not belong to the perception.
+    OSError
+        The file cannot be written.
+    """
+    image, found = as_image(image), perception.image
+    if found is None or found.labels.shape != image.shape[:2]:
+        given = "no image" if found is None else f"an image of shape {found.labels.shape}"
+        raise ImageError(f"image has shape {image.shape}, of a perception of {given}; expected what was perceived")
+    check_points(points, perception)
+    painted = paint(perception, points, calibration, sensor=sensor)
+    road = camera_road(perception, points, calibration, sensor=sensor)
+
+    aspect = calibration.width / calibration.height
+    width = min(_WIDEST, _HIGHEST * aspect)
+    height = width / aspect
+    bottom = _TOP + max(2.0 * height + _GAP, 740.0)
+    counts = np.bincount(painted, minlength=256)
+    facts = {
+        name: [f"{100.0 * n / found.labels.size:.1f} %"] + [f"{counts[k]:,} points"] * bool(counts[k])
+        for k, (name, n) in enumerate(found.counts().items())
+        if n
+    }
+    figure = new_figure(_WIDTH, int(bottom) + 40 + height_of_legend(facts) + 68)
+    colors = rgb([color_of(name) for name in found.classes])
+    _draw_image(figure, (_MARGIN, _TOP, width, height), image, colors, found.labels)
+    place = (_MARGIN, _TOP + height + _GAP, width, height)
+    _draw_points(figure, place, image, points, calibration, colors, painted)
+    left = _MARGIN + width + 34.0 + _AXIS
+    room = (left, _TOP, _WIDTH - _MARGIN - left, bottom - _TOP)
+    _draw_from_above(figure, room, points, road, perception.boxes, colors, painted)
+
+    style = {"fontsize": 23.0, "fontweight": "bold"}
+    write_at(figure, _MARGIN, 46, shorten(figure, title, 1000, **style), **style)
+    share = f"{np.count_nonzero(painted != UNSEEN):,} of {len(points):,} points are seen by the camera"
+    write_at(figure, _WIDTH - _MARGIN, 46, share, fontsize=18.0, ha="right", color=FAINT)
+    draw_legend(figure, _MARGIN, bottom + 40, _WIDTH - 2 * _MARGIN, facts)
+    ran = " · ".join([timing_line(perception), *provider_lines(perception)])
+    ran = shorten(figure, ran, _WIDTH - 2 * _MARGIN, fontsize=12.0)
+    write_at(figure, _MARGIN, bottom + 40 + height_of_legend(facts) + 34, ran, fontsize=12.0, color=FAINT)
+    return as_png(figure, path)
+
+
+def _draw_image(
+    figure: Any,
+    place: tuple[float, float, float, float],
+    image: NDArray[np.uint8],
+    colors: NDArray[np.float64],
+    labels: NDArray[np.uint8],
+) -> None:
+    write_heading(figure, place[0], place[1] - 20, "the camera", "a class for every pixel")
+    known = labels < len(colors)
+    tint = np.where(known[..., None], colors[np.where(known, labels, 0)], 0.5)
+    axes = add_axes(figure, *place)
+    axes.imshow(0.5 * image / 255.0 + 0.5 * tint, aspect="auto", interpolation="antialiased")
+
+
+def _draw_points(
+    figure: Any,
+    place: tuple[float, float, float, float],
+    image: NDArray[np.uint8],
+    points: NDArray[np.float32],
+    calibration: Calibration,
+    colors: NDArray[np.float64],
+    painted: NDArray[np.uint8],
+) -> None:
+    more = "in the colors of their pixels; black: hidden or no class"
+    write_heading(figure, place[0], place[1] - 20, "the points in the image", more)
+    axes = add_axes(figure, *place)
+    gray = image.mean(axis=2, keepdims=True).repeat(3, axis=2) / 255.0
+    axes.imshow(0.35 + 0.4 * gray, aspect="auto", interpolation="antialiased")
+    axes.set_autoscale_on(False)
+    u, v, depth = calibration.project(points)
+    inside = (u >= 0.0) & (u < calibration.width) & (v >= 0.0) & (v < calibration.height)
+    for shown, size in ((inside & (painted >= len(colors)), 1.0), (inside & (painted < len(colors)), 3.2)):
+        far_first = np.flatnonzero(shown)[np.argsort(-depth[shown], kind="stable")]
+        known = painted[far_first] < len(colors)
+        color = np.where(known[:, None], colors[np.where(known, painted[far_first], 0)], 0.0)
+        axes.scatter(u[far_first], v[far_first], s=size, c=color, linewidths=0)
+
+
+def _draw_from_above(
+    figure: Any,
+    room: tuple[float, float, float, float],
+    points: NDArray[np.float32],
+    road: TopView,
+    boxes: tuple[Box, ...],
+    colors: NDArray[np.float64],
+    painted: NDArray[np.uint8],
+) -> None:
+    from matplotlib.patches import Polygon
+
+    (x_near, x_far), (y_right, y_left) = road.x_range_m, road.y_range_m
+    low, high, right, left = x_near - _BEHIND_M, x_far + _BEYOND_M, y_right - _BESIDE_M, y_left + _BESIDE_M
+    px_per_m = min(room[2] / (left - right), room[3] / (high - low))
+    more = f"the image's road on the ground, {road.drivable_area_m2:.0f} m²; gray: not seen"
+    write_heading(figure, room[0], room[1] - 20, "from above", more)
+    axes = add_axes(figure, room[0], room[1], px_per_m * (left - right), px_per_m * (high - low))
+    axes.set_xlim(left, right)  # y grows to the left
+    axes.set_ylim(low, high)
+    layer = np.zeros((*road.labels.shape, 4))
+    layer[road.drivable] = (*rgb([color_of("road")])[0], 0.62)
+    layer[~road.observed] = (*rgb([FAINT])[0], 0.22)
+    axes.imshow(layer, extent=(y_left, y_right, x_near, x_far), aspect="auto", interpolation="nearest", zorder=1)
+    frame = ModelFrame(road.mounting)
+    shown = np.flatnonzero(drawable_points(points) & (painted < len(colors)))
+    x, y, z = frame.move(points[shown])[:, :3].astype(np.float64).T
+    order = np.argsort(z, kind="stable")
+    axes.scatter(y[order], x[order], s=2.0, c=colors[painted[shown[order]]], linewidths=0, zorder=2)
+    for box in drawable_boxes(frame.move_boxes(boxes)):
+        outline = Polygon(box.corners()[:, ::-1], closed=True, fill=False, edgecolor=color_of(box.label), zorder=3)
+        outline.set_linewidth(2.0)
+        axes.add_patch(outline)
+    ahead = np.arange(0.0, high, 10.0)
+    axes.set_yticks(ahead, labels=[f"{at:.0f} m" for at in ahead])
+    axes.grid(color=INK, alpha=0.12, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.add_patch(Polygon([[0.0, 1.2], [0.9, -1.2], [-0.9, -1.2]], closed=True, facecolor=INK, zorder=4))
