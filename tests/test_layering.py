@@ -61,7 +61,7 @@ FLOORS = {
         evaluation.evaluate
         view.colors
         view.canvas view.content
-        view.files view.mistakes view.page view.picture view.tracks
+        view.files view.mistakes view.page view.painted view.picture view.tracks
         view.__init__
         cli.arguments cli.output
         cli.scans
