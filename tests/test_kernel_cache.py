@@ -21,6 +21,7 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+import tiny_camera
 from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 
@@ -515,6 +516,18 @@ def perceptions(options):
             for boxes, tolerance_m in itertools.product([found.boxes, []], [0.1, 0, np.float32(0.2)]):
                 road_ahead(found.top_view, boxes, tolerance_m=tolerance_m)
 
+def images(options):
+    perceive = Perceiver(**options, provider="cpu", n_threads=1, on_mismatch="ignore")
+    yield
+    image = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    shapes = [
+        image, image[:1, :1], image[:, :, ::-1], image[::2], np.asfortranarray(image), image[:20],
+        np.frombuffer(image.tobytes(), np.uint8).reshape(image.shape), np.full((24, 32, 3), 7, np.uint8),
+        np.broadcast_to(np.uint8(9), (1, 2000, 3)), np.broadcast_to(np.uint8(9), (2000, 1, 3)),
+    ]
+    for picture in shapes:
+        perceive(None if len(perceive.cards) == 1 else points, image=picture).image.drivable_share
+
 def tracks():
     for posed in (None, np.asfortranarray(np.eye(4)), np.eye(4, dtype=np.float32), np.eye(4).tolist()):
         tracker = Tracker()
@@ -526,7 +539,8 @@ def tracks():
             [track.to_dict() for track in found]
 
 options = json.loads(sys.argv[1])
-calls = tracks() if options is None else perceptions(options)
+of_images = options is not None and any("tinycam" in str(model) for model in options["models"])
+calls = tracks() if options is None else images(options) if of_images else perceptions(options)
 next(calls)
 before = snapshot()
 for _ in calls:
@@ -545,16 +559,21 @@ print(json.dumps({"constructed": sum(before.values()), "later": later}))
         pytest.param({"models": "pointseg", "full_turn": True}, id="full turn"),
         pytest.param({"models": "pointseg", "sensor": "vlp-16"}, id="coarse sensor"),
         pytest.param({"models": "pointseg", "sensor": "os1-64", "boxes_from": "network", "adapt": "none"}, id="raw"),
+        pytest.param({"models": ["tinycam.onnx"]}, id="camera"),
+        pytest.param({"models": ["pointseg", "tinycam.onnx"]}, id="camera and scan"),
         pytest.param(None, id="tracker"),
     ],
 )
-def test_construction_compiles_what_calls_need(options: dict[str, Any] | None) -> None:
+def test_construction_compiles_what_calls_need(options: dict[str, Any] | None, tmp_path: Path) -> None:
     """Whatever the layout of a scan in memory and the number of boxes, in a process that does nothing else."""
+    camera = str(tiny_camera.write_camera(tmp_path))
+    if options is not None and "tinycam.onnx" in options["models"]:
+        options = {"models": [*options["models"][:-1], camera]}
     command = [sys.executable, "-c", CALLS, json.dumps(options)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    assert report["constructed"] > 5
+    assert report["constructed"] >= (2 if options == {"models": [camera]} else 6)
     assert report["later"] == []
 
 

@@ -57,7 +57,7 @@ FLOORS = {
         evaluation.ab3dmot evaluation.causes evaluation.datasets evaluation.headings
         evaluation.scan_folder evaluation.tables
         evaluation.unseen evaluation.truth
-        evaluation.judge evaluation.tracking evaluation.transfer
+        evaluation.camvid evaluation.judge evaluation.tracking evaluation.transfer
         evaluation.evaluate
         view.colors
         view.canvas view.content
@@ -74,13 +74,15 @@ FLOORS = {
     "edgeperc_export": """
         __init__ processes targets
         networks.pointseg networks.ssadnet recipe scans
-        augment cards losses networks.edge networks.lodnn networks.squeezesegv2 roads simulate
-        models_page networks.kulseg scan_sets task
+        augment cards losses networks.camseg networks.edge networks.lodnn networks.segnet networks.squeezesegv2
+        networks.unet roads simulate
+        camera models_page networks.fcn networks.kulseg scan_sets task
+        images
         networks.__init__ teacher
         checkpoint samples
         start watch curve
         to_onnx train
-        agree quantize ablation make
+        agree camvid quantize ablation make
         database.__init__ database.files
         database.coco database.torch
         database.label_page database.scenes database.folds

@@ -1,14 +1,15 @@
-"""``edgeperc eval``: accuracy on labeled scans."""
+"""``edgeperc eval``: accuracy on labeled scans and images."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..extras import require
 from .arguments import (
+    CAMERA,
     DEFAULT,
     RULES,
     Commands,
@@ -31,14 +32,16 @@ def add_parser(commands: Commands) -> None:
         commands,
         "eval",
         eval_command,
-        help="accuracy on labeled scans: the papers' tables",
+        help="accuracy on labeled scans and images: the papers' tables",
         description="Compare the models' results with the labels of scans: points, boxes, top view and road, over all "
         "distances and by range, with 95 % intervals over drives. It is an error to evaluate a model on a scan that it "
-        "was trained on, except with --split train.",
+        "was trained on, except with --split train.\n\nCompare a camera model with labeled images: IoU of each class "
+        "and their mean, with 95 % intervals over images; unlabeled pixels do not count.",
         examples=[
             "edgeperc eval simulation:24",
             "edgeperc eval KITTI/ SemanticKITTI/ --model pointseg --json figures.json",
             "edgeperc eval KITTI/ --split all --worst worst.png",
+            "edgeperc eval CamVid/ --model camseg",
         ],
     )
     reading = parser.add_argument_group("input")
@@ -48,13 +51,14 @@ def add_parser(commands: Commands) -> None:
         metavar="DATASET",
         help="the root of a KITTI object set or of SemanticKITTI, simulation:N for N simulated scans (simulation "
         "alone: 24), or labeled scans of any sensor: a folder with scans.json, or FOLDER:LAYOUT with the name of a "
-        "public set (pandaset, av2, vod, ddad, lyft, semantickitti)",
+        "public set (pandaset, av2, vod, ddad, lyft, semantickitti); or labeled images: a folder with classes.json, "
+        "train, trainannot, val, valannot as in CamVid",
     )
     reading.add_argument(
         "--split",
         choices=("test", "validation", "held-back", "train", "all"),
-        help="which drives (default: test, or those of --fold); nothing is trained on test and validation drives, "
-        "which are the held-back ones",
+        help="which drives (default: test, or those of --fold; of images without test images: validation); nothing is "
+        "trained on test and validation drives, which are the held-back ones",
     )
     reading.add_argument(
         "--fold",
@@ -110,6 +114,11 @@ def eval_command(arguments: argparse.Namespace) -> int:
         require("matplotlib", "view", "Drawing a picture")
     for file in filter(None, (arguments.json, arguments.worst)):
         file.parent.mkdir(parents=True, exist_ok=True)
+    from ..evaluation.camvid import LabeledImages
+
+    of_images = [Path(dataset) for dataset in arguments.datasets if LabeledImages.is_one(Path(dataset))]
+    if of_images:
+        return _eval_images(arguments, of_images)
     from ..evaluation.evaluate import evaluate
     from ..mounting import Mounting
 
@@ -135,6 +144,34 @@ def eval_command(arguments: argparse.Namespace) -> int:
 
         models = ", ".join(f"{name} {version}" for name, version in figures["models"].items())
         draw_mistakes(mistakes, arguments.worst, title=models)
+    return 0
+
+
+def _eval_images(arguments: argparse.Namespace, roots: Sequence[Path]) -> int:
+    """Compare a camera model with labeled images."""
+    from ..evaluation.camvid import evaluate_images
+
+    if len(roots) < len(arguments.datasets):
+        arguments.usage_error("labeled images and labeled scans have different figures; evaluate them one by one")
+    used = {"--fold": arguments.fold, "--mounted": arguments.mounted, "--road-by": arguments.road_by}
+    for option, value in (used | {"--worst": arguments.worst}).items():
+        if value is not None:
+            arguments.usage_error(f"{option} is for scans")
+    models = arguments.model or [CAMERA]
+    if len(models) > 1:
+        arguments.usage_error(f"got {len(models)} models; images are evaluated with one --model")
+    with progress("image") as show:
+        figures = evaluate_images(
+            roots,
+            models[0],
+            split=arguments.split,
+            provider=arguments.provider,
+            precision=arguments.precision,
+            on_image=show,
+        )
+    for line in _image_lines(figures):
+        print_line(line)
+    write_figures(arguments, figures)
     return 0
 
 
@@ -178,6 +215,11 @@ _ROAD_COLUMNS_2 = (
     *_with_intervals(("observed PRE", "drivable_precision"), ("observed REC", "drivable_recall")),
     ("cells", "n_cells"),
 )
+_PIXEL_COLUMNS = (*_with_intervals(("IoU", "iou"), *_RATES), ("pixels", "n_pixels"), ("images", "n_images"))
+_IMAGE_COLUMNS = (
+    *_with_intervals(("mIoU", "mean_iou"), ("accuracy", "accuracy"), ("mean recall", "mean_accuracy")),
+    ("pixels", "n_pixels"),
+)
 _FEW = " (n<10)"  # `edgeperc.evaluation.tables.FEWEST_OBJECTS`
 _BLOCKS = {"real": "real scans with boxes", "semantickitti": "SemanticKITTI", "simulated": "simulated scans"}
 
@@ -196,6 +238,20 @@ def _figure_lines(figures: Mapping[str, Any]) -> list[str]:
             lines += [*_labeled_lines(of_block), *_point_lines(of_block), *_box_lines(of_block)]
             lines += [*_error_lines(of_block), *_cell_lines(of_block), *_road_lines(of_block)]
     return lines
+
+
+def _image_lines(figures: Mapping[str, Any]) -> list[str]:
+    images = figures["images"]
+    models = ", ".join(f"{name} {version}" for name, version in figures["models"].items())
+    n_images, n_classes = many(images["n_images"], "image"), len(images["classes"])
+    return [
+        f"{models}; {figures['split']} images; shares in per cent, intervals over images",
+        f"ran as {'; '.join(figures['providers'].values())}",
+        "",
+        f"== {n_images}, {n_classes} classes, unlabeled pixels not counted ==",
+        *table_lines("all pixels", _IMAGE_COLUMNS, [(("all", ""), images["all"])]),
+        *table_lines("classes", _PIXEL_COLUMNS, [((name, ""), row) for name, row in images["classes"].items()]),
+    ]
 
 
 def _labeled_lines(of_block: Mapping[str, Any]) -> list[str]:

@@ -1,0 +1,265 @@
+"""Accuracy of camera models on labeled images in CamVid's layout (Brostow et al., 2008 and 2009).
+
+Each image is reduced to its confusion matrix. Figures are of the summed matrices of all images, so every pixel counts
+the same, as in the papers. Intervals are from resampled images. Images of one drive resemble one another, so intervals
+over drives would be wider; CamVid's validation images are of a single drive.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import CardMismatchError, ImageError, OptionError, SplitError
+from ..extras import require
+from ..perceiver import Perceiver
+from ..readers.images import IMAGE_SUFFIXES, read_image
+from .metrics import Confusion
+from .unseen import training_scans_of
+
+__all__ = ["LabeledImages", "evaluate_images", "image_figures", "image_hash"]
+
+FOLDERS = {"train": "train", "validation": "val", "test": "test"}
+UNLABELED = ("unlabelled", "unlabeled", "void")
+IGNORE = 255
+LEVEL = 0.95
+
+
+class LabeledImages:
+    """Images and the classes of their pixels: ``{train,val,test}/NAME``, ``{...}annot/NAME.png`` and ``classes.json``.
+
+    Parameters
+    ----------
+    root : Path
+
+    Attributes
+    ----------
+    classes : tuple of str
+        By id, without the one of unlabeled pixels.
+
+    Raises
+    ------
+    ImageError
+        ``classes.json`` cannot be read, or holds something else.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        try:
+            document = json.loads((root / "classes.json").read_text("utf-8"))
+            names = [str(document[str(k)]) for k in range(len(document))]
+        except (KeyError, OSError, RecursionError, TypeError, ValueError) as exc:
+            raise ImageError(
+                f"{root / 'classes.json'}: expected an object of id and name, ids from 0 ({type(exc).__name__}: {exc})"
+            ) from exc
+        self.classes = tuple(name for name in names if name.casefold() not in UNLABELED)
+        self._of_id = np.full(256, IGNORE, np.uint8)
+        for k, name in enumerate(names[:256]):
+            self._of_id[k] = self.classes.index(name) if name in self.classes else IGNORE
+
+    @staticmethod
+    def is_one(root: Path) -> bool:
+        """Whether a folder has this layout."""
+        annotated = any((root / f"{folder}annot").is_dir() for folder in FOLDERS.values())
+        return annotated and (root / "classes.json").is_file()
+
+    def files(self, split: str) -> list[Path]:
+        """The images of ``"train"``, ``"validation"``, ``"test"``, ``"held-back"`` (the last two) or ``"all"``, sorted.
+
+        Raises
+        ------
+        ImageError
+            There is none.
+        """
+        parts = {"held-back": ("validation", "test"), "all": tuple(FOLDERS)}.get(split, (split,))
+        folders = [self.root / FOLDERS[part] for part in parts]
+        found = [
+            file
+            for folder in folders
+            if folder.is_dir()
+            for file in sorted(folder.iterdir())
+            if file.suffix.lower() in IMAGE_SUFFIXES
+        ]
+        if not found:
+            raise ImageError(f"{self.root} has no images of split {split}; expected some in {folders[0]}")
+        return found
+
+    def read(self, file: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Read an image and its labels.
+
+        Returns
+        -------
+        image : (H, W, 3) uint8
+        labels : (H, W) uint8
+            Index into ``classes``; 255 where unlabeled.
+
+        Raises
+        ------
+        ImageError
+            A file cannot be read, or the sizes differ.
+        """
+        image = read_image(file)
+        path = file.parent.with_name(f"{file.parent.name}annot") / f"{file.stem}.png"
+        pillow = require("PIL.Image", "camera", "Reading an image", package="pillow")
+        try:
+            with pillow.open(path, formats=("PNG",)) as opened:
+                if opened.size != (image.shape[1], image.shape[0]) or opened.mode not in ("L", "P"):
+                    raise ImageError(
+                        f"{path}: {opened.size[0]} x {opened.size[1]} pixels of mode {opened.mode}; expected an id for "
+                        f"each of the {image.shape[1]} x {image.shape[0]} pixels of {file.name}"
+                    )
+                ids = np.asarray(opened)
+        except ImageError:
+            raise
+        except Exception as exc:  # on damaged files, Pillow's decoders raise nearly every kind of error
+            raise ImageError(f"{path}: the labels cannot be read ({type(exc).__name__}: {exc})") from exc
+        return image, self._of_id[ids]
+
+
+def image_hash(image: NDArray[np.uint8]) -> str:
+    """SHA-256 of an image's size and pixels, which a card records of the training images."""
+    return hashlib.sha256(f"{image.shape}".encode() + np.ascontiguousarray(image).tobytes()).hexdigest()
+
+
+def evaluate_images(
+    roots: Sequence[Path],
+    model: str | Path,
+    *,
+    split: str | None = None,
+    provider: str = "cpu",
+    precision: str = "auto",
+    n_resamples: int = 1000,
+    on_image: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """Compute the figures of a camera model on labeled images.
+
+    Parameters
+    ----------
+    roots : sequence of Path
+        Folders in CamVid's layout (`LabeledImages`).
+    model : str or Path
+    split : str or None
+        As in `LabeledImages.files`. None: the test images if there are any, else the validation images.
+    provider, precision
+        As in `edgeperc.Perceiver`.
+    n_resamples : int
+        Number of resamples of the images for the intervals.
+    on_image : callable
+        Called after each image with the number of images done and of all images.
+
+    Returns
+    -------
+    dict
+        ``"models"``, ``"providers"``, ``"split"``, ``"fold"`` (None) and ``"images"``: `image_figures`.
+
+    Raises
+    ------
+    ImageError
+        An image or its labels cannot be read.
+    CardMismatchError
+        The model has other classes than the images.
+    OptionError
+        The model is not of a camera.
+    SplitError
+        The model was trained on an image, and ``split`` is not ``"train"``.
+    """
+    perceive = Perceiver([model], provider=provider, precision=precision)
+    (card,) = perceive.cards
+    if card.view.kind != "camera":
+        raise OptionError(f"{card.name} is of a {card.view.kind}; images need a camera model such as camseg")
+    data = [LabeledImages(root) for root in roots]
+    if split is None:
+        split = "test" if any((each.root / FOLDERS["test"]).is_dir() for each in data) else "validation"
+    for each in data:
+        if [name.casefold() for name in each.classes] != [name.casefold() for name in card.classes]:
+            raise CardMismatchError(f"{card.name} has classes {card.classes}; those of {each.root} are {each.classes}")
+    files = [(each, file) for each in data for file in each.files(split)]
+    trained_on = {} if split == "train" else training_scans_of(perceive.cards)
+    counts = []
+    for done, (each, file) in enumerate(files, start=1):
+        image, truth = each.read(file)
+        for name, hashes in trained_on.items():
+            if image_hash(image) in hashes:
+                raise SplitError(f"{name} was trained on {file}; evaluate other images, or ask for split 'train'")
+        found = perceive(image=image).image
+        assert found is not None
+        confusion = Confusion(card.classes, ignore=IGNORE)
+        confusion.update(found.labels, truth)
+        counts.append(confusion.counts)
+        on_image(done, len(files))
+    return {
+        "models": {card.name: card.version},
+        "providers": dict(perceive.providers),
+        "split": split,
+        "fold": None,
+        "images": image_figures(card.classes, np.stack(counts), n_resamples),
+    }
+
+
+def image_figures(classes: Sequence[str], counts: NDArray[np.int64], n_resamples: int = 1000) -> dict[str, Any]:
+    """Figures of the summed confusion matrices of images, with 95 % intervals over resampled images.
+
+    Parameters
+    ----------
+    classes : sequence of C str
+    counts : (n, C, C) int64
+        Of each image; rows are the truth.
+    n_resamples : int
+
+    Returns
+    -------
+    dict
+        ``"n_images"``; ``"all"``: ``mean_iou`` over the classes that occur, ``mean_accuracy`` (mean recall of the
+        classes), ``accuracy``, ``n_pixels``; ``"classes"``: ``iou``, ``precision``, ``recall``, ``n_pixels``,
+        ``n_images`` of each class. Shares have four decimals, None for those of no pixels, and beside each its
+        ``..._interval``, None with fewer than two images.
+    """
+    n, n_classes, _ = counts.shape
+    rng = np.random.default_rng(0)
+    weights = rng.multinomial(n, np.full(n, 1.0 / n), n_resamples) if n > 1 else np.zeros((0, n), np.int64)
+    whole = _rates(counts.sum(axis=0)[None])
+    samples = _rates((weights @ counts.reshape(n, -1)).reshape(-1, n_classes, n_classes))
+    rows: dict[str, dict[str, Any]] = {"all": {}, **{name: {} for name in classes}}
+    for key, values in whole.items():
+        of_samples = samples[key]
+        if values.ndim == 1:
+            rows["all"] |= _with_interval(key, values[0], of_samples)
+        else:
+            for k, name in enumerate(classes):
+                rows[name] |= _with_interval(key, values[0, k], of_samples[:, k])
+    n_pixels = counts.sum(axis=2)
+    for k, name in enumerate(classes):
+        rows[name] |= {"n_pixels": int(n_pixels[:, k].sum()), "n_images": int((n_pixels[:, k] > 0).sum())}
+    return {"n_images": n, "all": rows.pop("all") | {"n_pixels": int(n_pixels.sum())}, "classes": rows}
+
+
+def _rates(counts: NDArray[np.int64]) -> Mapping[str, NDArray[np.float64]]:
+    """Rates of confusion matrices (m, C, C): per class (m, C), and over all (m,); NaN without pixels."""
+    hits, truth, found = np.diagonal(counts, axis1=1, axis2=2), counts.sum(axis=2), counts.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rates = {"iou": hits / (truth + found - hits), "precision": hits / found, "recall": hits / truth}
+        accuracy = hits.sum(axis=1) / truth.sum(axis=1)
+    means = {"mean_iou": _means(rates["iou"]), "mean_accuracy": _means(rates["recall"]), "accuracy": accuracy}
+    return {**rates, **means}
+
+
+def _means(rates: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean of each row without NaN; NaN for a row of NaN."""
+    known = ~np.isnan(rates)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(known, rates, 0.0).sum(axis=1) / known.sum(axis=1))
+
+
+def _with_interval(key: str, value: float, samples: NDArray[np.float64]) -> dict[str, Any]:
+    known = samples[~np.isnan(samples)]
+    bounds = None
+    if known.size:
+        bounds = [round(float(v), 4) for v in np.quantile(known, [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])]
+    return {key: None if math.isnan(value) else round(float(value), 4), f"{key}_interval": bounds}
