@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import argparse
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import MissingExtraError
-from .arguments import Commands, add_command, add_model, add_network
+from .arguments import CAMERA, DEFAULT, Commands, add_command, add_model, add_network
 from .output import one_line, print_rows
 from .run import make_perceiver
 
 if TYPE_CHECKING:
+    from ..calibration import Calibration
     from ..perception import Box, Perception
+    from ..simulation.camera import CameraImage
+    from ..simulation.scene import SimulatedScan
 
 __all__ = ["add_parser", "demo_command"]
 
 # A junction with cars, a van, pedestrians and a cyclist, most of which the models detect. Training scenes have other
 # seeds.
 DEMO_SCENE = (2_000_000_218, "junction")
+# Below this share of right pixels, the demo shows how painting works with the true classes instead of the network's.
+_GOOD_PIXELS = 0.8
 
 
 def add_parser(commands: Commands) -> None:
@@ -33,6 +39,7 @@ def add_parser(commands: Commands) -> None:
         "scene.png (needs the extra 'view') and scene.html. The command needs no data.",
         examples=[
             "edgeperc demo",
+            "edgeperc demo --camera",
             "edgeperc demo --out /tmp/demo --model pointseg --full-turn",
         ],
     )
@@ -43,6 +50,12 @@ def add_parser(commands: Commands) -> None:
         default=Path("edgeperc-demo"),
         metavar="DIR",
         help="folder for scene.png and scene.html, made if needed (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--camera",
+        action="store_true",
+        help="also draw the image of a camera in the street, label it, carry its classes to the points and its road to "
+        "the top view, and write camera.png",
     )
     models = parser.add_argument_group("models")
     add_model(models)
@@ -56,11 +69,22 @@ def demo_command(arguments: argparse.Namespace) -> int:
     from .. import view
     from ..simulation.drawn import random_scene
     from ..simulation.scene import simulate
+    from ..zoo import shipped_models
 
+    if arguments.camera and CAMERA in shipped_models():
+        given = arguments.model or DEFAULT
+        arguments.model = [*given, *([] if any(name.partition(":")[0] == CAMERA for name in given) else [CAMERA])]
     perceive = make_perceiver(arguments, sensor="hdl-64e", on_mismatch="ignore")
     scan = simulate(random_scene(*DEMO_SCENE), "hdl-64e", DEMO_SCENE[0])
-    perceive(scan.points)  # warm-up: the first scan takes longer
-    perception = perceive(scan.points)
+    image = None
+    if arguments.camera:
+        from ..simulation.camera import forward_camera, render
+
+        calibration = forward_camera()
+        drawn = render(scan.scene, calibration, scan.T_world_sensor, DEMO_SCENE[0])
+        image = drawn.rgb if any(card.view.kind == "camera" for card in perceive.cards) else None
+    perceive(scan.points, image=image)  # warm-up: the first scan takes longer
+    perception = perceive(scan.points, image=image)
 
     rows = [("scene", f"{perception.n_points:,} points, a simulated hdl-64e in a street with known labels")]
     if perception.top_view is not None:
@@ -87,8 +111,53 @@ def demo_command(arguments: argparse.Namespace) -> int:
     except MissingExtraError as exc:
         rows.append(("picture", one_line(exc)))
     rows.append(("3-D page", f"{page} (open it in a browser)"))
+    if arguments.camera:
+        rows += _camera_rows(scan, drawn, calibration, perception, arguments.out / "camera.png")
     print_rows(rows)
     return 0
+
+
+def _camera_rows(
+    scan: SimulatedScan, drawn: CameraImage, calibration: Calibration, perception: Perception, picture: Path
+) -> list[tuple[str, str]]:
+    """Paint the points, write the picture, and say what was painted."""
+    import numpy as np
+
+    from .. import view
+    from ..painting import UNSEEN, camera_road, paint
+    from ..perception import ImageLabels
+    from ..simulation.camera import CAMERA_CLASSES, VOID, true_classes
+
+    rows = [("image", f"{calibration.width} x {calibration.height} pixels, drawn from the scene; it is no photograph")]
+    known, found, source = drawn.labels != VOID, perception.image, "the network's classes"
+    if found is None:
+        rows.append(("camera", f"no model of a camera's images ran; '{CAMERA}' is that of this version, if installed"))
+    else:
+        names = [name.casefold() for name in CAMERA_CLASSES]
+        to_camvid = np.array([names.index(n) if (n := name.casefold()) in names else VOID for name in found.classes])
+        share = float(np.mean(to_camvid[found.labels[known]] == drawn.labels[known]))
+        rows.append(("camera", f"{100.0 * share:.0f} % of the pixels get their true class"))
+        rows.append(("", "The network was trained on photographs; a drawing says little about its accuracy."))
+    if found is None or share < _GOOD_PIXELS:
+        perception = replace(perception, image=ImageLabels(drawn.labels, CAMERA_CLASSES))
+        source = "the scene's true classes, not those of a network"
+    painted = paint(perception, scan.points, calibration)
+    seen, true = painted != UNSEEN, true_classes(scan)
+    rows.append(("painted", source))
+    rows.append(("", f"{np.count_nonzero(seen):,} points are seen by the camera"))
+    judged = seen & (true != VOID)
+    rows.append(
+        ("", f"{100.0 * np.mean(painted[judged] == true[judged]):.1f} % of them have the class of their surface")
+    )
+    road = camera_road(perception, scan.points, calibration)
+    rows.append(("road", f"{road.drivable_area_m2:.0f} m2 of the image's road lie on the ground that the scan shows"))
+    try:
+        title = f"edgeperc demo: a simulated street, {source}"
+        view.draw_painted(perception, drawn.rgb, scan.points, calibration, picture, title=title)
+        rows.append(("picture", str(picture)))
+    except MissingExtraError as exc:
+        rows.append(("picture", one_line(exc)))
+    return rows
 
 
 def _extent(perception: Perception) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from ..calibration import Calibration
 from ..errors import CalibrationError
 from .raycast import FACADE, GLASS, LEAVES, PAINT, RETRO, fill_cast, fill_ground_kinds
-from .scene import Scene, place_shapes
+from .scene import Scene, SimulatedScan, place_shapes
 from .street import CAMERA_CLASSES
 
-__all__ = ["CAMERA_CLASSES", "VOID", "CameraImage", "forward_camera", "render", "surface_classes"]
+__all__ = ["CAMERA_CLASSES", "VOID", "CameraImage", "forward_camera", "render", "surface_classes", "true_classes"]
 
 VOID = 255
 """No class: benches, bins and other shapes that CamVid counts to none of its eleven classes."""
@@ -24,6 +25,7 @@ _SECTORS = 1440
 # From the camera's frame (x right, y down, z ahead) to that of the rays (x ahead, y left, z up).
 _AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 _SKY, _ROAD, _PAVEMENT, _TREE = (CAMERA_CLASSES.index(name) for name in ("Sky", "Road", "Pavement", "Tree"))
+_OF_GROUND = np.array([_ROAD, _PAVEMENT, _TREE], np.uint8)  # CamVid counts grass as trees
 _OF_OBJECT = {
     **dict.fromkeys(("car", "van", "truck", "tram", "misc"), CAMERA_CLASSES.index("Car")),
     **dict.fromkeys(("pedestrian", "person_sitting"), CAMERA_CLASSES.index("Pedestrian")),
@@ -132,12 +134,9 @@ def render(
     surfaces[solid] = primitives[hits[solid], 19].astype(np.int64)
     labels[solid] = surface_classes(scene)[surfaces[solid]]
     row, col = np.nonzero(ground)
-    camera = np.stack([-np.tan(azimuths[col]), -slopes[row], np.ones(len(row))]) * depth[ground]
-    world = T_world_camera[:3, :3] @ camera + T_world_camera[:3, 3:]
-    kinds = np.empty(len(row), np.uint8)
-    remissions = np.empty(len(row))
-    fill_ground_kinds(scene.strips, scene.terrain, scene.tile, np.ascontiguousarray(world[:2].T), kinds, remissions)
-    labels[ground] = np.array([_ROAD, _PAVEMENT, _TREE], np.uint8)[kinds]
+    places = np.stack([-np.tan(azimuths[col]), -slopes[row], np.ones(len(row))], axis=1) * depth[ground][:, None]
+    kinds, remissions = _ground_at(scene, places, T_world_camera)
+    labels[ground] = _OF_GROUND[kinds]
 
     color = np.empty((*hits.shape, 3))
     color[:] = _mixed((236, 240, 245), (120, 165, 220), np.clip(4.0 * slopes, 0.0, 1.0))[:, None]
@@ -150,6 +149,25 @@ def render(
     color = color * (1.0 - haze[..., None]) + np.array([225.0, 230.0, 236.0]) * haze[..., None]
     color += rng.normal(0.0, 5.0, hits.shape)[..., None]
     return CameraImage(np.clip(color, 0.0, 255.0).astype(np.uint8), labels, depth.astype(np.float32))
+
+
+def true_classes(scan: SimulatedScan) -> NDArray[np.uint8]:
+    """Class of the surface that returned each point: index into `CAMERA_CLASSES`, `VOID` for none, (n,) uint8."""
+    labels = np.append(surface_classes(scan.scene), np.uint8(0))[scan.surfaces]
+    ground = scan.surfaces == -1
+    kinds, _ = _ground_at(scan.scene, scan.points[ground, :3], scan.T_world_sensor)
+    labels[ground] = _OF_GROUND[kinds]
+    return labels
+
+
+def _ground_at(
+    scene: Scene, places: NDArray[Any], T_world_frame: NDArray[np.float64]
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Kind and remission of the ground at places (n, 3) of a frame."""
+    world = places.astype(np.float64) @ T_world_frame[:3, :3].T + T_world_frame[:3, 3]
+    kinds, remissions = np.empty(len(world), np.uint8), np.empty(len(world))
+    fill_ground_kinds(scene.strips, scene.terrain, scene.tile, world[:, :2].copy(), kinds, remissions)
+    return kinds, remissions
 
 
 def surface_classes(scene: Scene) -> NDArray[np.uint8]:
