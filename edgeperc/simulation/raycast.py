@@ -604,8 +604,14 @@ def fill_ground_kinds(
     kinds: NDArray[np.uint8],
     remissions: NDArray[np.float64],
 ) -> None:
-    """Write the ground's kind (n,) at x, y [m], world frame, (n, 2): 0 road, 1 bay or pavement, 2 grass; remission."""
+    """Write the ground's kind (n,) at x, y [m], world frame, (n, 2), and its remission.
+
+    Kinds are 0 for a road, 1 for a bay or a pavement, 2 for grass and for places that are not finite.
+    """
     for i in range(xy.shape[0]):
+        kinds[i], remissions[i] = 2, math.nan
+        if not (abs(xy[i, 0]) < 1e6 and abs(xy[i, 1]) < 1e6):
+            continue
         _, outside, outside_bays, _, _ = ground_at(strips, terrain, tile, xy[i, 0], xy[i, 1])
         kinds[i] = 0 if outside < 0.0 else 1 if outside_bays < 0.0 or outside < terrain[PAVEMENT] else 2
         remissions[i] = _ground_remission(strips, terrain, tile, xy[i, 0], xy[i, 1])

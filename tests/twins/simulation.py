@@ -252,6 +252,19 @@ def ground_remission(scene, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     )
 
 
+def ground_kinds(scene, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Twin of `fill_ground_kinds`."""
+    kinds, remissions = np.full(len(xy), 2, np.uint8), np.full(len(xy), np.nan)
+    with np.errstate(invalid="ignore"):
+        near = (abs(xy) < 1e6).all(axis=1)
+    x, y = xy[near].T
+    outside, bays, islands, *_ = road_places(scene, x, y)
+    outside = np.where(np.minimum(outside, bays) <= 0, np.maximum(outside, -islands), outside)
+    kinds[near] = np.select([outside < 0, (bays < 0) | (outside < scene.terrain[9])], [0, 1], 2)
+    remissions[near] = ground_remission(scene, x, y)
+    return kinds, remissions
+
+
 def in_ego_shadow(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     """Twin of `_in_ego_shadow`."""
     a = (azimuth + math.pi) % (2 * math.pi) - math.pi
