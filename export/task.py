@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from edgeperc.card import InputSpec, ModelCard, RangeImageGeometry, TopViewGeometry
+from edgeperc.card import CameraGeometry, InputSpec, ModelCard, RangeImageGeometry, TopViewGeometry
 from edgeperc.decode import decode_top_view
 from edgeperc.evaluation.metrics import FEWEST_RETURNS, BoxEvaluator, Confusion, boxes_to_find
 from edgeperc.perception import Box
@@ -99,6 +99,7 @@ class Task(ABC):
     @property
     def view(self) -> RangeImageGeometry | TopViewGeometry:
         """The grid of the network's input."""
+        assert not isinstance(self.card.view, CameraGeometry)
         return self.card.view
 
     @property

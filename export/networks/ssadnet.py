@@ -358,8 +358,11 @@ class SSADNet(nn.Module):
             nn.init.normal_(self.detection.predict.weight, std=0.01)
             assert self.detection.predict.bias is not None
             self.detection.predict.bias.data[0] = -math.log(1.0 / HEAT_PRIOR - 1.0)
-        elif self.detection.by_place:
+        elif isinstance(self.detection, SlotsHead) and self.detection.by_place:
             # Before training, each square has a box in its middle, a tenth of the image wide and long, as a car is.
             for regressor, value in zip(self.detection.regressors, (0.0, 0.0, *SLOT_PRIORS), strict=True):
-                nn.init.normal_(regressor.layers[-1].weight, std=0.01)
-                nn.init.constant_(regressor.layers[-1].bias, value)
+                *_, last = regressor.modules()
+                assert isinstance(last, nn.Conv2d)
+                assert last.bias is not None
+                nn.init.normal_(last.weight, std=0.01)
+                nn.init.constant_(last.bias, value)
