@@ -74,11 +74,8 @@ class Calibration:
             )
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "T_camera_sensor", T)
-        for name in ("width", "height"):
-            given = getattr(self, name)
-            if isinstance(given, bool) or not isinstance(given, int | np.integer) or not 1 <= given <= MAX_EDGE:
-                raise CalibrationError(f"{name} is {given!r}; expected a whole number of pixels from 1 to {MAX_EDGE}")
-            object.__setattr__(self, name, int(given))
+        object.__setattr__(self, "width", _pixels("width", self.width))
+        object.__setattr__(self, "height", _pixels("height", self.height))
 
     @classmethod
     def from_kitti(cls, path: str | os.PathLike[str], width: int, height: int) -> Calibration:
@@ -114,7 +111,7 @@ class Calibration:
 
     def resized(self, width: int, height: int) -> Calibration:
         """The calibration of the same image, resized to ``width`` x ``height`` [px] without a crop."""
-        scale = np.diag([width / self.width, height / self.height, 1.0])
+        scale = np.diag([_pixels("width", width) / self.width, _pixels("height", height) / self.height, 1.0])
         half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # from centers of pixels to their edges
         return Calibration(np.linalg.inv(half) @ scale @ half @ self.K, self.T_camera_sensor, width, height)
 
@@ -190,6 +187,12 @@ def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[NDArray[np.flo
         raise CalibrationError(
             f"{path} holds no KITTI calibration ({type(exc).__name__}: {exc}); expected P2, R0_rect and Tr_velo_to_cam"
         ) from exc
+
+
+def _pixels(name: str, given: object) -> int:
+    if isinstance(given, bool) or not isinstance(given, int | np.integer) or not 1 <= given <= MAX_EDGE:
+        raise CalibrationError(f"{name} is {given!r:.80}; expected a whole number of pixels from 1 to {MAX_EDGE}")
+    return int(given)
 
 
 def _matrix(name: str, given: ArrayLike, n: int) -> NDArray[np.float64]:
