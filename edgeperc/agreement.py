@@ -19,7 +19,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from .cluster import MIN_OF_WHOLE, PART_OF
+from .cluster import MIN_OF_WHOLE, PART_OF, find_clusters
 from .errors import PointsError
 from .geometry import draw_footprints
 from .ground import Ground
@@ -27,7 +27,7 @@ from .kernel_cache import njit
 from .perception import Box, PointLabels, TopView
 from .points import read_only
 
-__all__ = ["RULES", "agree_on_boxes", "agree_on_cells", "agree_on_points"]
+__all__ = ["RULES", "agree_on_boxes", "agree_on_cells", "agree_on_points", "find_voters"]
 
 RULES = frozenset({"column", "share", "height", "fill", "support", "ground", "boxes", "road"})
 """Names of the rules, for ablations.
@@ -75,6 +75,58 @@ N_BINS = 64
 N_FOOTPRINTS = 1024
 _VEHICLE, _PERSON = 1, 2
 _NO_BOX = 255
+_NO_CLUSTER = -1
+
+
+def find_voters(
+    points: NDArray[np.float32],
+    labels: PointLabels,
+    ground: Ground,
+    boxes: Sequence[Box] = (),
+    *,
+    distance_per_m: float = 0.015,
+    rules: Collection[str] = RULES,
+) -> NDArray[np.int32]:
+    """Find the clusters above the ground that hold labeled points, as far as it matters for `agree_on_points`.
+
+    Parameters
+    ----------
+    points, labels, ground, boxes, rules
+        As in `agree_on_points`.
+    distance_per_m : float
+        As in `edgeperc.cluster.find_clusters`.
+
+    Returns
+    -------
+    (n,) int32
+        Cluster of every point, -1 for none, -2 for labeled points of clusters in which too few points can have a label.
+        Such a cluster is not searched further as soon as that is certain: a forest need not be searched because of a
+        few labels in it. The results of `agree_on_points` and of `edgeperc.cluster.objects_from_points` are those for
+        complete clusters.
+
+    Raises
+    ------
+    PointsError
+        Arrays disagree in shape, or a label is not in the classes.
+    """
+    _check(points, labels, ground)
+    roles = _roles(labels.classes)
+    in_view = read_only(labels.in_view, np.bool_)
+    scores, _ = _supported(points, in_view, ground, boxes if "support" in rules else (), labels.classes)
+    votes = np.empty(len(points), np.uint8)
+    fill_votes(in_view, read_only(labels.labels, np.uint8), roles, scores, votes)
+    # A share of exactly the limit is enough. Labels that are neither vehicles nor persons are never lost.
+    is_searched = "share" not in rules or not roles[1:].all()
+    shares = (-1.0, -1.0) if is_searched else np.nextafter((MIN_VEHICLE_SHARE, MIN_PERSON_SHARE), 0.0)
+    return find_clusters(
+        points,
+        among=~ground.mask,
+        seeds=labels.labels > 0,
+        votes=votes,
+        min_share=shares,
+        distance_per_m=distance_per_m,
+        min_points=1,
+    )
 
 
 def agree_on_points(
@@ -97,8 +149,7 @@ def agree_on_points(
     ground : Ground
         If it has no plane, rules that need heights are skipped.
     clusters : (n,) int32
-        Cluster of every point above the ground, -1 for none; every labeled point above the ground must be in one
-        (`edgeperc.cluster.find_clusters` with these as seeds and ``min_points=1``).
+        From `find_voters`.
     boxes : sequence of Box
         From a top-view model, with scores from 0.3.
     rules : collection of str
@@ -132,16 +183,15 @@ def agree_on_points(
     in_view, of = read_only(labels.in_view, np.bool_), read_only(clusters, np.int32)
     agreed = labels.labels.copy()
     roles = _roles(labels.classes)
-    limits = np.array([PERSON_TOP_M.get(name, 0.0) for name in labels.classes])
-    if "column" in rules and limits[agreed].any():
-        clear_columns(rows, height, limits, agreed)
+    if "column" in rules:
+        clear_columns(rows, height, np.array([PERSON_TOP_M.get(name, 0.0) for name in labels.classes]), agreed)
     n = int(clusters.max(initial=-1)) + 1
     counts = np.empty((n, len(labels.classes) + 1), np.int32)
     bounds = np.empty((n, 5), np.float32)
     fill_tallies(rows, height, in_view, read_only(agreed, np.uint8), of, counts, bounds)
     verdicts = _verdicts(labels.classes, counts, bounds, rules)
     support = boxes if "support" in rules else ()
-    scores, names = _supported(points, ground, support, labels.classes)
+    scores, names = _supported(points, in_view, ground, support, labels.classes)
     apply_verdicts(in_view, of, verdicts, roles, scores, names, agreed)
     if "ground" in rules:
         clear_ground(rows, on_ground, roles, agreed)
@@ -312,9 +362,13 @@ def _as_rows(boxes: Sequence[Box]) -> NDArray[np.float64]:
 
 
 def _supported(
-    points: NDArray[np.float32], ground: Ground, boxes: Sequence[Box], classes: Sequence[str]
+    points: NDArray[np.float32],
+    in_view: NDArray[np.bool_],
+    ground: Ground,
+    boxes: Sequence[Box],
+    classes: Sequence[str],
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """For each point, the best score of a vehicle's box around it (0 for none), and the class of that box."""
+    """For each point in view, the best score of a vehicle's box around it (0 for none), and the class of that box."""
     known = {name: classes.index(name) for name in VEHICLES if name in classes}
     usable = [box for box in boxes if box.label in VEHICLES] if "car" in known else []
     scores = np.empty(len(points), np.float32)
@@ -322,7 +376,7 @@ def _supported(
     fill_support(
         read_only(points),
         read_only(ground.height_m),
-        read_only(ground.mask, np.bool_),
+        in_view & ~ground.mask,
         _as_rows(usable),
         np.array([known.get(box.label, known["car"]) for box in usable], np.uint8),
         scores,
@@ -335,41 +389,84 @@ def _verdicts(
     classes: Sequence[str], counts: NDArray[np.int32], bounds: NDArray[np.float32], rules: Collection[str]
 ) -> NDArray[np.uint8]:
     """What becomes of each label in each cluster, (k, classes)."""
-    roles = _roles(classes)
-    vehicles, persons = np.flatnonzero(roles == _VEHICLE), np.flatnonzero(roles == _PERSON)
-    seen = np.maximum(counts[:, -1], 1)
-    vehicle_share = counts[:, vehicles].sum(axis=1) / seen
-    person_share = counts[:, persons].sum(axis=1) / seen
-    length = np.hypot(*(bounds[:, 2:4].astype(np.float64) - bounds[:, :2]).T)
-    top = bounds[:, 4]
-    large = (length > MAX_LENGTH_M) | (top > MAX_TOP_M)
-
-    no_vehicle, no_person = np.zeros((2, len(counts)), np.bool_)
-    if "share" in rules:
-        no_vehicle |= vehicle_share < np.where(large, MIN_LARGE_SHARE, MIN_VEHICLE_SHARE)
-        no_person |= person_share < MIN_PERSON_SHARE
-    if "height" in rules:
-        no_vehicle |= top < MIN_VEHICLE_TOP_M
-        no_person |= top < MIN_PERSON_TOP_M
-    verdicts = np.tile(np.arange(len(classes), dtype=np.uint8), (len(counts), 1))
-    verdicts[np.ix_(no_vehicle, vehicles)] = 0
-    verdicts[np.ix_(no_person, persons)] = 0
-    if "fill" in rules:
-        changed = np.array([0, *vehicles, *persons])
-        if len(vehicles):
-            filled = ~no_vehicle & (vehicle_share >= MIN_FILL_SHARE) & ~large
-            most = vehicles[np.argmax(counts[:, vehicles], axis=1)].astype(np.uint8)
-            verdicts[np.ix_(filled, changed)] = most[filled, None]
-        if len(persons):
-            filled = ~no_person & (person_share >= MIN_FILL_SHARE) & (length < MAX_GROUP_M) & (top < MAX_GROUP_TOP_M)
-            most = persons[np.argmax(counts[:, persons], axis=1)].astype(np.uint8)
-            for part, whole in PART_OF.items():
-                if part in classes and whole in classes:
-                    k, all_k = classes.index(part), classes.index(whole)
-                    is_whole = counts[:, all_k] >= MIN_OF_WHOLE * (counts[:, k] + counts[:, all_k])
-                    most = np.where(is_whole, all_k, most).astype(np.uint8)
-            verdicts[np.ix_(filled, np.array([0, *persons]))] = most[filled, None]
+    parts = [(classes.index(p), classes.index(w)) for p, w in PART_OF.items() if p in classes and w in classes]
+    verdicts = np.empty((len(counts), len(classes)), np.uint8)
+    fill_verdicts(
+        counts,
+        bounds,
+        _roles(classes),
+        np.array(parts, np.int64).reshape(-1, 2),
+        "share" in rules,
+        "height" in rules,
+        "fill" in rules,
+        verdicts,
+    )
     return verdicts
+
+
+@njit(cache=True, nogil=True)
+def fill_verdicts(
+    counts: NDArray[np.int32],
+    bounds: NDArray[np.float32],
+    roles: NDArray[np.uint8],
+    parts: NDArray[np.int64],
+    by_share: bool,
+    by_height: bool,
+    is_filled: bool,
+    verdicts: NDArray[np.uint8],
+) -> None:
+    """Decide what becomes of each label in each cluster.
+
+    Parameters
+    ----------
+    counts : (k, classes + 1) int32
+    bounds : (k, 5) float32
+        From `fill_tallies`.
+    roles : (classes,) uint8
+        1 for vehicles, 2 for persons, 0 for others.
+    parts : (p, 2) int64
+        Class, and the class that it may be a part of.
+    by_share, by_height, is_filled : bool
+        Rules that apply.
+    verdicts : (k, classes) uint8, overwritten
+    """
+    n_classes = len(roles)
+    for k in range(counts.shape[0]):
+        seen = max(counts[k, n_classes], 1)
+        n_of_role = np.zeros(3, np.int64)
+        most = np.zeros(3, np.int64)  # the most frequent class of each role, the first one on ties
+        for c in range(n_classes):
+            role = roles[c]
+            n_of_role[role] += counts[k, c]
+            if role > 0 and (most[role] == 0 or counts[k, c] > counts[k, most[role]]):
+                most[role] = c
+        vehicle_share, person_share = n_of_role[_VEHICLE] / seen, n_of_role[_PERSON] / seen
+        length = math.hypot(
+            np.float64(bounds[k, 2]) - np.float64(bounds[k, 0]), np.float64(bounds[k, 3]) - np.float64(bounds[k, 1])
+        )
+        top = bounds[k, 4]
+        is_large = length > MAX_LENGTH_M or top > MAX_TOP_M
+        no_vehicle = by_share and vehicle_share < (MIN_LARGE_SHARE if is_large else MIN_VEHICLE_SHARE)
+        no_person = by_share and person_share < MIN_PERSON_SHARE
+        if by_height:
+            no_vehicle |= top < MIN_VEHICLE_TOP_M
+            no_person |= top < MIN_PERSON_TOP_M
+        for c in range(n_classes):
+            is_lost = (roles[c] == _VEHICLE and no_vehicle) or (roles[c] == _PERSON and no_person)
+            verdicts[k, c] = 0 if is_lost else c
+        if is_filled and most[_VEHICLE] > 0 and not no_vehicle and vehicle_share >= MIN_FILL_SHARE and not is_large:
+            for c in range(n_classes):
+                if c == 0 or roles[c] > 0:
+                    verdicts[k, c] = most[_VEHICLE]
+        is_group = person_share >= MIN_FILL_SHARE and length < MAX_GROUP_M and top < MAX_GROUP_TOP_M
+        if is_filled and most[_PERSON] > 0 and not no_person and is_group:
+            for at in range(parts.shape[0]):
+                part, whole = parts[at]
+                if counts[k, whole] >= MIN_OF_WHOLE * (counts[k, part] + counts[k, whole]):
+                    most[_PERSON] = whole
+            for c in range(n_classes):
+                if c == 0 or roles[c] == _PERSON:
+                    verdicts[k, c] = most[_PERSON]
 
 
 @njit(cache=True, nogil=True)
@@ -398,15 +495,28 @@ def clear_columns(
     labels : (n,) uint8, modified
         Only points within 51.2 m along x and y are changed.
     """
-    taken = np.zeros((N_COLUMNS, N_COLUMNS), dtype=np.uint64)
+    first_row, last_row, first_col, last_col = N_COLUMNS, -1, N_COLUMNS, -1  # of the cells around persons
+    for i in range(points.shape[0]):
+        if limits[labels[i]] > 0.0:
+            row, col = cell_of(points, i, N_COLUMNS)
+            if row >= 0:
+                first_row, last_row = min(first_row, max(row - 1, 0)), max(last_row, min(row + 1, N_COLUMNS - 1))
+                first_col, last_col = min(first_col, max(col - 1, 0)), max(last_col, min(col + 1, N_COLUMNS - 1))
+    if last_row < 0:
+        return
+    half = 0.5 * N_COLUMNS * CELL_M + CELL_M  # a cell more, for what is rounded
+    low_x, high_x = first_row * CELL_M - half, (last_row + 3) * CELL_M - half
+    low_y, high_y = first_col * CELL_M - half, (last_col + 3) * CELL_M - half
+    taken = np.zeros((last_row - first_row + 1, last_col - first_col + 1), dtype=np.uint64)
     one = np.uint64(1)
     for i in range(points.shape[0]):
-        if not height[i] >= MIN_COLUMN_M:  # more than half of a scan's points, which saves a third of the time
+        x, y = points[i, 0], points[i, 1]
+        if not ((x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y) & (height[i] >= MIN_COLUMN_M)):
             continue
         z = np.float64(height[i])
         row, col = cell_of(points, i, N_COLUMNS)
-        if row >= 0 and z < N_BINS * BIN_M:
-            taken[row, col] |= one << np.uint64(min(int(z / BIN_M), N_BINS - 1))
+        if first_row <= row <= last_row and first_col <= col <= last_col and z < N_BINS * BIN_M:
+            taken[row - first_row, col - first_col] |= one << np.uint64(min(int(z / BIN_M), N_BINS - 1))
     most_missing = int(COLUMN_GAP_M / BIN_M + 0.5)
     for i in range(points.shape[0]):
         limit = limits[labels[i]]
@@ -419,7 +529,7 @@ def clear_columns(
         column = np.uint64(0)
         for r in range(max(row - 1, 0), min(row + 2, N_COLUMNS)):
             for c in range(max(col - 1, 0), min(col + 2, N_COLUMNS)):
-                column |= taken[r, c]
+                column |= taken[r - first_row, c - first_col]
         top = min(int(z / BIN_M), N_BINS - 1)
         for at in range(top + 1, N_BINS):
             if (column >> np.uint64(at)) & one:
@@ -476,19 +586,20 @@ def fill_tallies(
 def fill_support(
     points: NDArray[np.float32],
     height: NDArray[np.float32],
-    on_ground: NDArray[np.bool_],
+    among: NDArray[np.bool_],
     boxes: NDArray[np.float64],
     of_box: NDArray[np.uint8],
     scores: NDArray[np.float32],
     names: NDArray[np.uint8],
 ) -> None:
-    """Find the best box around each point above the ground.
+    """Find the best box around each point.
 
     Parameters
     ----------
     points : (n, 3 or more) float32, C-contiguous
     height : (n,) float32
-    on_ground : (n,) bool
+    among : (n,) bool
+        Points that may be in a box: those in view, above the ground.
     boxes : (m, 8) float64
         x, y, half length, half width [m], cosine and sine of the yaw, greatest height of a point [m], score.
     of_box : (m,) uint8
@@ -500,15 +611,46 @@ def fill_support(
     """
     scores[:] = 0.0
     names[:] = 0
+    if boxes.shape[0] == 0:
+        return
     low_x, high_x, low_y, high_y = bounds_of(boxes)
     for i in range(points.shape[0]):
+        if not among[i]:
+            continue
         x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
-        if on_ground[i] or not ((x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)):
+        if not ((x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)):
             continue
         for k in range(boxes.shape[0]):
             if boxes[k, 7] > scores[i] and is_inside(boxes, k, x, y) and height[i] <= boxes[k, 6]:
                 scores[i] = boxes[k, 7]
                 names[i] = of_box[k]
+
+
+@njit(cache=True, nogil=True)
+def fill_votes(
+    in_view: NDArray[np.bool_],
+    labels: NDArray[np.uint8],
+    roles: NDArray[np.uint8],
+    scores: NDArray[np.float32],
+    votes: NDArray[np.uint8],
+) -> None:
+    """Write what each point may count for in its cluster.
+
+    Parameters
+    ----------
+    in_view : (n,) bool
+    labels : (n,) uint8
+    roles : (classes,) uint8
+        1 for vehicles, 2 for persons, 0 for others.
+    scores : (n,) float32
+        From `fill_support`.
+    votes : (n,) uint8, overwritten
+        Bit 0: the point is in view. Bit 1: it may get the label of a vehicle. Bit 2: it has the label of a person.
+    """
+    for i in range(in_view.shape[0]):
+        role = roles[labels[i]]
+        is_vehicle = role == _VEHICLE or scores[i] >= COMPLETING_SCORE
+        votes[i] = (1 + 2 * is_vehicle + 4 * (role == _PERSON)) if in_view[i] else 0
 
 
 @njit(cache=True, nogil=True)
@@ -546,6 +688,7 @@ def apply_verdicts(
     ----------
     in_view : (n,) bool
     clusters : (n,) int32
+        -1 for none; -2 for a cluster in which no label of a vehicle or person stays.
     verdicts : (k, classes) uint8
         New label by cluster and label.
     roles : (classes,) uint8
@@ -559,8 +702,8 @@ def apply_verdicts(
             continue
         old, k = labels[i], clusters[i]
         new = old
-        if k >= 0:
-            new = verdicts[k, old]
+        if k != _NO_CLUSTER:
+            new = verdicts[k, old] if k >= 0 else (0 if roles[old] > 0 else old)
             if roles[old] == _VEHICLE and roles[new] == 0 and scores[i] >= SUPPORTING_SCORE:
                 new = old
         if scores[i] >= COMPLETING_SCORE and (new == 0 or roles[new] == _VEHICLE):
@@ -582,12 +725,21 @@ def clear_ground(
         1 for vehicles, 2 for persons, 0 for classes that are not changed.
     labels : (n,) uint8, modified
     """
+    labeled = np.empty(points.shape[0], dtype=np.int32)
+    n, n_lying = 0, 0
+    for i in range(points.shape[0]):
+        labeled[n] = i
+        has_role = roles[labels[i]] != 0
+        n += 1 if has_role else 0
+        n_lying += 1 if has_role and on_ground[i] else 0
+    if n_lying == 0:
+        return
     standing = np.zeros((N_FOOTPRINTS, N_FOOTPRINTS), dtype=np.uint8)
     for is_second in range(2):
-        for i in range(points.shape[0]):
-            role = roles[labels[i]]
-            if role == 0 or on_ground[i] != (is_second == 1):
+        for i in labeled[:n]:
+            if on_ground[i] != (is_second == 1):
                 continue
+            role = roles[labels[i]]
             row, col = cell_of(points, i, N_FOOTPRINTS)
             if is_second == 0:
                 if row >= 0:
@@ -668,9 +820,11 @@ def clear_road(
     """
     n_rows, n_cols = cells.shape
     lowest, highest = OBSTACLE_M
-    least = grid[0] - (n_rows + 1) * grid[2]
+    least_x, least_y = grid[0] - (n_rows + 1) * grid[2], grid[1] - (n_cols + 1) * grid[2]
+    most_x, most_y = grid[0] + grid[2], grid[1] + grid[2]
     for i in range(points.shape[0]):
-        if not points[i, 0] >= least:  # saves the divisions for most points
+        x, y = points[i, 0], points[i, 1]
+        if not ((x >= least_x) & (x <= most_x) & (y >= least_y) & (y <= most_y)):  # saves divisions for most points
             continue
         row = (grid[0] - np.float64(points[i, 0])) / grid[2]
         col = (grid[1] - np.float64(points[i, 1])) / grid[2]

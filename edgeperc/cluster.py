@@ -55,7 +55,8 @@ def find_clusters(
     *,
     among: NDArray[np.bool_] | None = None,
     seeds: NDArray[np.bool_] | None = None,
-    min_share: float = 0.0,
+    votes: NDArray[np.uint8] | None = None,
+    min_share: float | Sequence[float] | NDArray[np.float64] = 0.0,
     min_distance_m: float = 0.5,
     distance_per_m: float = 0.015,
     max_range_m: float = 100.0,
@@ -72,8 +73,12 @@ def find_clusters(
     seeds : (n,) bool, optional
         Points that a cluster must hold, such as those labeled as an object; all by default. Only the parts of the scan
         that are linked with seeds are searched.
-    min_share : float
-        Clusters are dropped unless more than this share of their points are seeds.
+    votes : (n,) uint8, optional
+        What every point counts for. Bit 0: the point counts; without it there are no other bits. Bit k + 1: it may
+        count for the share ``min_share[k]``. By default every point counts, and the seeds count for one share.
+    min_share : float or sequence of float
+        Clusters are dropped unless more than this share of their points are seeds; with ``votes``, unless one of the
+        shares is larger than its limit. A cluster that cannot reach that is not searched further.
     min_distance_m, distance_per_m : float
         Two points are linked if their distance is at most ``max(min_distance_m, distance_per_m * range)``, with the
         range of the nearer one. ``distance_per_m`` is twice the angle [rad] between neighboring beams, so that points
@@ -88,7 +93,7 @@ def find_clusters(
     -------
     (n,) int32
         Cluster of every point, -1 for none. Clusters are numbered by their first points, in input order. Points that
-        are not finite have -1.
+        are not finite have -1. With ``votes``, all seeds of dropped clusters have -2, and some of their other points.
 
     Raises
     ------
@@ -102,7 +107,8 @@ def find_clusters(
     are sorted into columns that are half the distance wide, wider where the distance is longer. Consecutive points of
     a column that are close in height are linked without a test and form a run. Clusters grow from run to run: a run of
     a neighboring column is joined if its bounds, and one pair of points, are near enough. Runs of many points are
-    halved again and again, and only halves whose bounds are near enough are tested.
+    halved again and again, and only halves whose bounds are near enough are tested. Columns beyond the reach of all
+    clusters are not even sorted.
 
     The time is bounded for any scan: a run has a bounded number of neighbors, and 64 tests a point decide which are
     linked. Real scans need up to 6. More are needed if thousands of points lie just beyond the distance from thousands
@@ -116,9 +122,9 @@ def find_clusters(
     """
     if points.ndim != 2 or points.shape[1] < 3:
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
-    for name, mask in (("among", among), ("seeds", seeds)):
+    for name, mask in (("among", among), ("seeds", seeds), ("votes", votes)):
         if mask is not None and mask.shape != (len(points),):
-            raise PointsError(f"got {name} of shape {mask.shape} for {len(points)} points; expected one bool a point")
+            raise PointsError(f"got {name} of shape {mask.shape} for {len(points)} points; expected one value a point")
     if not (
         0.0 < min_distance_m < math.inf
         and 0.0 <= distance_per_m <= 1.0
@@ -131,16 +137,18 @@ def find_clusters(
         )
     rows = read_only(points)
     every = np.ones(len(rows), np.bool_)
+    seeded = read_only(every if seeds is None else seeds, np.bool_)
     clusters = np.empty(len(rows), dtype=np.int32)
     work = np.empty(3, dtype=np.int64)
     fill_clusters(
         rows,
         read_only(every if among is None else among, np.bool_),
-        read_only(every if seeds is None else seeds, np.bool_),
-        min_share,
-        min_distance_m,
-        distance_per_m,
-        max_range_m,
+        seeded,
+        read_only(seeded.view(np.uint8) * 2 + 1 if votes is None else votes, np.uint8),
+        np.array(min_share, np.float64).reshape(-1),
+        float(min_distance_m),
+        float(distance_per_m),
+        float(max_range_m),
         min_points,
         clusters,
         work,
@@ -151,6 +159,8 @@ def find_clusters(
             f"{TESTS_PER_POINT} tests a point; a cluster may be split there. Is this the scan of a LiDAR, in meters?",
             stacklevel=2,
         )
+    if votes is None:
+        np.maximum(clusters, -1, out=clusters)
     return clusters
 
 
@@ -191,26 +201,89 @@ def cluster_labels(
         raise PointsError(
             f"got labels of shape {labels.shape} for clusters of shape {clusters.shape}; expected the same"
         )
-    inside = np.flatnonzero(clusters >= 0)
-    n = int(clusters.max(initial=-1)) + 1
-    sizes = np.bincount(clusters[inside], minlength=n)
-    # Only pairs of cluster and label that occur: a table of all may need gigabytes.
-    found, counts = np.unique(clusters[inside].astype(np.int64) * 256 + labels[inside], return_counts=True)
-    cluster, label = found // 256, found % 256
-    for part, whole in part_of.items():
-        n_part, n_whole = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        n_part[cluster[label == part]] = counts[label == part]
-        n_whole[cluster[label == whole]] = counts[label == whole]
-        moved = np.where(n_whole >= MIN_OF_WHOLE * (n_whole + n_part), n_part, 0)
-        counts[label == part] -= moved[cluster[label == part]]
-        counts[label == whole] += moved[cluster[label == whole]]
-    votes = np.zeros(n, np.int64)
-    best = np.zeros(n, np.int64)
-    cluster, label, counts = cluster[label > 0], label[label > 0], counts[label > 0]
-    order = np.lexsort((-label, counts))  # later entries replace earlier ones
-    votes[cluster[order]], best[cluster[order]] = counts[order], label[order]
-    shares = votes / np.maximum(sizes, 1)
-    return np.where(shares > min_share, best, 0).astype(np.uint8), shares
+    order, starts = _grouped(clusters)
+    classes = np.empty(len(starts) - 1, np.uint8)
+    shares = np.empty(len(starts) - 1)
+    parts = np.array([*part_of.items()], np.int64).reshape(-1, 2)
+    fill_cluster_labels(read_only(labels, np.uint8), order, starts, parts, float(min_share), classes, shares)
+    return classes, shares
+
+
+def _grouped(clusters: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Points of cluster 0 in input order, then those of cluster 1, and so on; and where each starts, (k + 1,)."""
+    starts = np.empty(int(clusters.max(initial=-1)) + 2, np.int64)
+    order = np.empty(len(clusters), np.int32)
+    fill_groups(read_only(clusters, np.int32), starts, order)
+    return order, starts
+
+
+@njit(cache=True, nogil=True)
+def fill_groups(clusters: NDArray[np.int32], starts: NDArray[np.int64], order: NDArray[np.int32]) -> None:
+    """Sort points by their clusters.
+
+    Parameters
+    ----------
+    clusters : (n,) int32
+        Negative for none.
+    starts : (k + 1,) int64, overwritten
+        Where each of the k clusters starts in ``order``; last, their number of points.
+    order : (n,) int32, overwritten
+        Rows of the points, in input order within a cluster.
+    """
+    starts[:] = 0
+    for i in range(len(clusters)):
+        if clusters[i] >= 0:
+            starts[clusters[i] + 1] += 1
+    for k in range(1, len(starts)):
+        starts[k] += starts[k - 1]
+    for i in range(len(clusters)):
+        if clusters[i] >= 0:
+            order[starts[clusters[i]]] = i
+            starts[clusters[i]] += 1
+    for k in range(len(starts) - 1, 0, -1):
+        starts[k] = starts[k - 1]
+    starts[0] = 0
+
+
+@njit(cache=True, nogil=True)
+def fill_cluster_labels(
+    labels: NDArray[np.uint8],
+    order: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    parts: NDArray[np.int64],
+    min_share: float,
+    classes: NDArray[np.uint8],
+    shares: NDArray[np.float64],
+) -> None:
+    """Write the class of every cluster; see `cluster_labels`.
+
+    Parameters
+    ----------
+    labels : (n,) uint8
+    order, starts
+        From `fill_groups`.
+    parts : (p, 2) int64
+        Class, and the class that it may be a part of; below 256.
+    min_share : float
+    classes : (k,) uint8, overwritten
+    shares : (k,) float64, overwritten
+    """
+    counts = np.zeros(256, np.int64)
+    for k in range(len(classes)):
+        for place in range(starts[k], starts[k + 1]):
+            counts[labels[order[place]]] += 1
+        for at in range(parts.shape[0]):
+            part, whole = parts[at]
+            if counts[whole] > 0 and counts[whole] >= MIN_OF_WHOLE * (counts[part] + counts[whole]):
+                counts[whole] += counts[part]
+                counts[part] = 0
+        best = 0
+        for c in range(1, 256):
+            if counts[c] > 0 and (best == 0 or counts[c] > counts[best]):
+                best = c
+        shares[k] = (counts[best] if best > 0 else 0) / max(starts[k + 1] - starts[k], 1)
+        classes[k] = best if shares[k] > min_share else 0
+        counts[:] = 0
 
 
 def objects_from_points(
@@ -302,23 +375,26 @@ def objects_from_points(
     number = {name: k for k, name in enumerate(classes)}
     part_of = {number[part]: number[whole] for part, whole in PART_OF.items() if part in number and whole in number}
     found, shares = cluster_labels(clusters, labels, min_share=min_share, part_of=part_of)
-    rows = np.flatnonzero(clusters >= 0)
-    sizes = np.bincount(clusters[rows], minlength=len(found))
+    order, starts = _grouped(clusters)
+    sizes = np.diff(starts)
     highest = np.where(
         (found > 0) & (sizes >= min_points), shares * sizes / (sizes + EVIDENCE), -math.inf
     )  # the box may reduce this score
     kept = np.argsort(-highest, kind="stable")[:MAX_OBJECTS]
     kept = np.sort(kept[(found[kept] > 0) & (highest[kept] >= min_score)])
-    rows = rows[np.isin(clusters[rows], kept)]
-    rows = rows[np.argsort(clusters[rows], kind="stable")]
     boxes = []
-    for k, members in zip(kept, np.split(rows, np.searchsorted(clusters[rows], kept[1:])), strict=False):
+    for k in kept.tolist():
         name = classes[found[k]]
+        members = order[starts[k] : starts[k + 1]]
         xyz = points[members, :3].astype(np.float64)
         rectangle = np.empty(5)
-        fill_rectangle(xyz[:, :2].copy(), name in L_SHAPED, rectangle)
+        fill_rectangle(xyz, name in L_SHAPED, rectangle)
         top = float(xyz[:, 2].max())
-        bottom = float(xyz[:, 2].min() if height_m is None else np.median(xyz[:, 2] - height_m[members]))
+        if height_m is None:
+            bottom = float(xyz[:, 2].min())
+        else:
+            levels = np.sort(xyz[:, 2] - height_m[members])
+            bottom = 0.5 * float(levels[(len(levels) - 1) // 2] + levels[len(levels) // 2])  # the median
         score = float(shares[k]) * len(members) / (len(members) + EVIDENCE)
         if name in size_m:
             _, width, height = size_m[name]
@@ -400,7 +476,7 @@ def fill_rectangle(members: NDArray[np.float64], l_shaped: bool, rectangle: NDAr
 
     Parameters
     ----------
-    members : (n, 2) float64
+    members : (n, 2 or more) float64
         x, y [m], at least one.
     l_shaped : bool
         True: the heading for which most points lie near a side. False: the heading of the smallest rectangle.

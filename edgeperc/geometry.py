@@ -46,20 +46,21 @@ def draw_footprints(
     classes : sequence of str
         Names of the labels; a footprint gets the number of its box's class.
     """
-    all_x, all_y = view.cell_centers()
-    for box in sorted(boxes, key=lambda box: -math.hypot(box.center[0], box.center[1])):
-        if box.label not in classes:
-            continue
-        corners = box.corners()
-        top = (view.x_range_m[1] - corners[:, 0]) / view.cell_m
-        left = (view.y_range_m[1] - corners[:, 1]) / view.cell_m
-        rows = slice(max(int(top.min()), 0), max(min(int(top.max()) + 1, view.height), 0))
-        cols = slice(max(int(left.min()), 0), max(min(int(left.max()) + 1, view.width), 0))
-        dx, dy = all_x[rows] - box.center[0], all_y[:, cols] - box.center[1]
-        cos, sin = math.cos(box.yaw), math.sin(box.yaw)
-        inside = np.abs(cos * dx + sin * dy) <= box.size[0] / 2.0
-        inside &= np.abs(cos * dy - sin * dx) <= box.size[1] / 2.0
-        labels[rows, cols][inside] = classes.index(box.label)
+    number = {name: k for k, name in enumerate(classes)}
+    known = [box for box in boxes if box.label in number]
+    known.sort(key=lambda box: -math.hypot(box.center[0], box.center[1]))
+    rows = [
+        (*box.center[:2], box.size[0] / 2.0, box.size[1] / 2.0, math.cos(box.yaw), math.sin(box.yaw)) for box in known
+    ]
+    drawn = np.require(labels, np.uint8, ["C", "W"])
+    fill_footprints(
+        np.array(rows, np.float64).reshape(-1, 6),
+        np.array([number[box.label] for box in known], np.uint8),
+        np.array([view.x_range_m[1], view.y_range_m[1], view.cell_m], np.float64),
+        drawn,
+    )
+    if drawn is not labels:
+        labels[:] = drawn
 
 
 def rectangles(boxes: Iterable[Box]) -> NDArray[np.float64]:
@@ -182,6 +183,40 @@ def _as_rectangles(given: ArrayLike) -> NDArray[np.float64]:
     if rows.ndim != 2 or rows.shape[1] != 5:
         raise PointsError(f"got rectangles of shape {rows.shape}; expected (n, 5): x, y, length, width, yaw")
     return rows
+
+
+@njit(cache=True, nogil=True)
+def fill_footprints(
+    boxes: NDArray[np.float64], of_box: NDArray[np.uint8], grid: NDArray[np.float64], labels: NDArray[np.uint8]
+) -> None:
+    """Write the class of each box into the cells whose centers lie in its footprint, one box after the other.
+
+    Parameters
+    ----------
+    boxes : (m, 6) float64
+        x, y, half length, half width [m], cosine and sine of the yaw.
+    of_box : (m,) uint8
+    grid : (3,) float64
+        x of the far edge, y of the left edge, edge of a cell [m].
+    labels : (rows, columns) uint8, modified
+    """
+    x_far, y_left, cell_m = grid
+    n_rows, n_cols = labels.shape
+    for k in range(boxes.shape[0]):
+        x, y, half_length, half_width, cos, sin = boxes[k]
+        reach_x = abs(cos) * half_length + abs(sin) * half_width
+        reach_y = abs(sin) * half_length + abs(cos) * half_width
+        # A cell more on each side; the view's size bounds them before they become whole numbers.
+        first_row = int(min(max((x_far - x - reach_x) / cell_m - 1.0, 0.0), n_rows))
+        last_row = int(min(max((x_far - x + reach_x) / cell_m + 1.0, -1.0), n_rows - 1.0))
+        first_col = int(min(max((y_left - y - reach_y) / cell_m - 1.0, 0.0), n_cols))
+        last_col = int(min(max((y_left - y + reach_y) / cell_m + 1.0, -1.0), n_cols - 1.0))
+        for row in range(first_row, last_row + 1):
+            dx = x_far - (row + 0.5) * cell_m - x
+            for col in range(first_col, last_col + 1):
+                dy = y_left - (col + 0.5) * cell_m - y
+                if abs(cos * dx + sin * dy) <= half_length and abs(cos * dy - sin * dx) <= half_width:
+                    labels[row, col] = of_box[k]
 
 
 @njit(cache=True, nogil=True)

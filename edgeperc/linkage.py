@@ -18,12 +18,13 @@ RUN_GAP = 0.7
 MAX_COLUMNS = 2**26
 LEVEL_STEP = 1.5  # 2 took 8 % longer on KITTI scans
 SAFE = 1.0 + 1e-6  # against rounding
+STRIP = 4  # columns
 MAX_SCANNED = 32  # runs of neighboring columns that are looked at in any order
 MAX_TESTED = 32  # points of a part that is not halved
 MAX_LAST_TESTED = 4  # the same, after the last of the tests
 MAX_PAIRS = 2048  # bounds of float32 coordinates can be halved 831 times
 TESTS_PER_POINT = 64  # 570 real scans of 10 sensors need at most 6
-FREE, DROPPED = -1, -2  # runs in no cluster; runs of clusters with too few seeds
+FREE, DROPPED = -1, -2  # runs in no cluster; runs of clusters without a sufficient share
 
 
 @njit(cache=True, nogil=True)
@@ -31,7 +32,8 @@ def fill_clusters(
     points: NDArray[np.float32],
     among: NDArray[np.bool_],
     seeds: NDArray[np.bool_],
-    min_share: float,
+    votes: NDArray[np.uint8],
+    min_shares: NDArray[np.float64],
     min_distance: float,
     distance_per_m: float,
     max_range: float,
@@ -41,34 +43,44 @@ def fill_clusters(
 ) -> None:
     """Compute every point's cluster; see `find_clusters`.
 
+    Only strips within reach of a growing cluster are opened: sorted, and divided into runs.
+
     Parameters
     ----------
     points : (n, 3 or more) float32, C-contiguous
     among, seeds : (n,) bool
-    min_share, min_distance, distance_per_m, max_range : float
+    votes : (n,) uint8
+        Bit 0: the point counts. Bit k + 1: it may count for share k.
+    min_shares : (k,) float64, at most 7
+    min_distance, distance_per_m, max_range : float
     min_points : int
     clusters : (n,) int32, overwritten
+        -1 without a cluster; -2 for points of clusters without a sufficient share, as far as they were looked at.
     work : (3,) int64, overwritten
         Number of pairs of runs looked at; of tests of their points and bounds; of pairs of runs whose tests were not
         completed.
     """
-    clusters[:] = -1
+    clusters[:] = FREE
     work[:] = 0
+    n_shares = len(min_shares)
+    n_left = np.zeros(n_shares + 1, dtype=np.int64)  # votes of points in no cluster yet
     rows = np.empty(points.shape[0], dtype=np.int32)  # of the points that take part
     m = 0
-    n_left = 0  # seeds in no cluster yet
+    n_seeds = 0
+    low_x, low_y, high_x, high_y = math.inf, math.inf, -math.inf, -math.inf
     for i in range(points.shape[0]):
-        if (
-            among[i]
-            and abs(points[i, 0]) <= max_range
-            and abs(points[i, 1]) <= max_range
-            and abs(points[i, 2]) <= max_range
-        ):
+        x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
+        if among[i] and abs(x) <= max_range and abs(y) <= max_range and abs(points[i, 2]) <= max_range:
             rows[m] = i
             m += 1
-            n_left += 1 if seeds[i] else 0
-    if n_left == 0:
+            n_seeds += 1 if seeds[i] else 0
+            low_x, high_x = min(low_x, x), max(high_x, x)
+            low_y, high_y = min(low_y, y), max(high_y, y)
+    if n_seeds == 0:
         return
+    for i in rows[:m]:
+        if votes[i] > 1:
+            add_votes(votes[i], n_left)
 
     # The reach of a point is the distance up to which it is linked. Points of a level have a reach from its edge up to
     # the next one, and columns in proportion: a point has few columns within its reach at any range.
@@ -79,113 +91,73 @@ def fill_clusters(
     limits = np.full(n_levels + 1, math.inf)  # squared ranges
     if distance_per_m > 0.0:
         limits = (edges / distance_per_m) ** 2
-    low = np.full((n_levels, 3), math.inf)
-    high = np.full((n_levels, 3), -math.inf)
-    for i in rows[:m]:
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        at = level_of(limits, x, y, z)
-        low[at, 0], high[at, 0] = min(low[at, 0], x), max(high[at, 0], x)
-        low[at, 1], high[at, 1] = min(low[at, 1], y), max(high[at, 1], y)
-        low[at, 2], high[at, 2] = min(low[at, 2], z), max(high[at, 2], z)
-    columns_per_m = 1.0 / (COLUMN_EDGE * edges)
-    layers_per_m = 1.0 / (0.5 * RUN_GAP * min_distance)
-    low_z = low[:, 2].min()
-    n_layers = int((high[:, 2].max() - low_z) * layers_per_m) + 1
-    n_rows = np.zeros(n_levels, dtype=np.int64)
-    n_cols = np.zeros(n_levels, dtype=np.int64)
-    offsets = np.zeros(n_levels + 1, dtype=np.int64)  # the first column of every level
+    grids = np.empty((n_levels, 3))  # lowest x and y, columns per meter
+    n_rows = np.empty(n_levels, dtype=np.int64)
+    n_cols = np.empty(n_levels, dtype=np.int64)
+    offsets = np.zeros(n_levels + 1, dtype=np.int64)  # the first strip of every level
     for at in range(n_levels):
-        if low[at, 0] <= high[at, 0]:
-            n_rows[at] = int((high[at, 0] - low[at, 0]) * columns_per_m[at]) + 1
-            n_cols[at] = int((high[at, 1] - low[at, 1]) * columns_per_m[at]) + 1
-        offsets[at + 1] = offsets[at] + n_rows[at] * n_cols[at]
-    n_columns = offsets[n_levels]
+        farthest = math.sqrt(limits[at + 1])
+        grids[at, 0], grids[at, 1] = max(low_x, -farthest), max(low_y, -farthest)
+        grids[at, 2] = 1.0 / (COLUMN_EDGE * edges[at])
+        n_rows[at] = max(int((min(high_x, farthest) - grids[at, 0]) * grids[at, 2]) + 1, 0)
+        n_cols[at] = max(int((min(high_y, farthest) - grids[at, 1]) * grids[at, 2]) + 1, 0)
+        offsets[at + 1] = offsets[at] + n_rows[at] * ((n_cols[at] + STRIP - 1) // STRIP)
 
-    # Points sorted by layer, then by column, so that those of a column are in upward order. Layers are half a gap
-    # high: points of neighboring layers of a column are linked, in any order.
-    layer = np.empty(m, dtype=np.int32)
-    column = np.empty(m, dtype=np.int32)
-    layer_starts = np.zeros(n_layers + 1, dtype=np.int32)
-    starts = np.zeros(n_columns + 1, dtype=np.int32)
-    for k in range(m):
-        i = rows[k]
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        at = level_of(limits, x, y, z)
-        row = int((x - low[at, 0]) * columns_per_m[at])
-        column[k] = offsets[at] + row * n_cols[at] + int((y - low[at, 1]) * columns_per_m[at])
-        layer[k] = int((z - low_z) * layers_per_m)
-        layer_starts[layer[k] + 1] += 1
-        starts[column[k] + 1] += 1
-    for at in range(n_layers):
-        layer_starts[at + 1] += layer_starts[at]
-    for at in range(n_columns):
-        starts[at + 1] += starts[at]
-    upwards = np.empty(m, dtype=np.int32)
-    for k in range(m):
-        upwards[layer_starts[layer[k]]] = k
-        layer_starts[layer[k]] += 1
+    # Points are kept by strips: `STRIP` columns of one row. The points of a strip are a chain: its head, then for every
+    # point the next one.
+    heads = np.full(offsets[n_levels], -1, dtype=np.int32)
+    chain = np.empty(points.shape[0], dtype=np.int32)
+    for i in rows[:m]:
+        strip = strip_of(points, i, limits, grids, n_cols, offsets)
+        chain[i] = heads[strip]
+        heads[strip] = i
+
+    # Runs: points of one column, each linked with the one before. Every run is the root of a tree of smaller parts,
+    # which are made when they are needed (are_linked). Runs are numbered from 0, smaller parts from the end down.
+    keys = np.empty(m)
     order = np.empty(m, dtype=np.int32)
     xyz = np.empty((m, 3), dtype=np.float32)
-    for source in upwards:
-        place, i = starts[column[source]], rows[source]
-        starts[column[source]] += 1
-        order[place] = i
-        xyz[place, 0], xyz[place, 1], xyz[place, 2] = points[i, 0], points[i, 1], points[i, 2]
-
-    # Runs: points of one column, each linked with the one before. From here on starts holds each column's first run.
-    # Every run is the root of a tree of smaller parts, which are made when they are needed (are_linked).
-    run_starts = np.empty(m + 1, dtype=np.int32)
-    run_level = np.empty(m, dtype=np.int8)
-    n_runs = 0
-    start = 0
-    for at in range(n_levels):
-        for place in range(offsets[at], offsets[at + 1]):
-            stop = starts[place]
-            starts[place] = n_runs
-            for k in range(start, stop):
-                if k == start or abs(np.float64(xyz[k, 2]) - xyz[k - 1, 2]) > RUN_GAP * edges[at]:
-                    run_starts[n_runs] = k
-                    run_level[n_runs] = at
-                    n_runs += 1
-            start = stop
-    run_starts[n_runs] = m
-    starts[n_columns] = n_runs
     reach = np.empty(m)
-    n_parts = n_runs + m // 2 + 64
+    n_parts = m + m // 2 + 64
     parts = np.empty((n_parts, 3), dtype=np.int32)  # first point, end, first child or 0
     bounds = np.empty((n_parts, 8))
-    run_seeds = np.zeros(n_runs, dtype=np.int32)
-    for run in range(n_runs):
-        parts[run, 0], parts[run, 1], parts[run, 2] = run_starts[run], run_starts[run + 1], 0
-        for k in range(parts[run, 0], parts[run, 1]):
-            x, y, z = np.float64(xyz[k, 0]), np.float64(xyz[k, 1]), np.float64(xyz[k, 2])
-            reach[k] = max(min_distance, distance_per_m * math.sqrt(x * x + y * y + z * z))
-            clusters[order[k]] = run
-            run_seeds[run] += 1 if seeds[order[k]] else 0
-        set_bounds(xyz, reach, parts, bounds, run)
+    run_level = np.empty(m, dtype=np.int8)
+    run_votes = np.empty((m, n_shares + 1), dtype=np.int32)
+    run_of = np.empty(points.shape[0], dtype=np.int32)
+    firsts = np.empty((m, STRIP + 1), dtype=np.int32)  # of opened strips: the first run of every column, and the end
+    owner = np.empty(m, dtype=np.int32)
+    # First of the smaller parts, tests left, the reserve of tests, points in opened strips, runs, opened strips.
+    state = np.array([n_parts, 2 * TESTS_PER_POINT * m, TESTS_PER_POINT * m, 0, 0, 0])
 
     # Clusters grow from seeds, run by run. A run of another cluster is not linked with this one, which was complete.
-    owner = np.full(n_runs, FREE, dtype=np.int32)
-    is_kept = np.zeros(n_runs, dtype=np.bool_)
-    queue = np.empty(n_runs, dtype=np.int32)
+    is_kept = np.zeros(n_seeds, dtype=np.bool_)
+    queue = np.empty(m, dtype=np.int32)
     pairs = np.empty((MAX_PAIRS, 2), dtype=np.int32)
-    state = np.array([n_runs, 2 * TESTS_PER_POINT * m, TESTS_PER_POINT * m])  # number of parts, tests left, reserve
+    n_votes = np.empty(n_shares + 1, dtype=np.int64)
     n_clusters = 0
-    for seed in range(n_runs):
-        if run_seeds[seed] == 0 or owner[seed] != FREE:
+    for seed in rows[:m]:
+        if not seeds[seed]:
             continue
-        queue[0], owner[seed] = seed, n_clusters
-        n_queued, n_done = 1, 0
-        size = parts[seed, 1] - parts[seed, 0]
-        n_seeds = run_seeds[seed]
-        n_left -= n_seeds
+        strip = strip_of(points, seed, limits, grids, n_cols, offsets)
+        if heads[strip] >= 0:
+            open_strip(
+                points, votes, heads, chain, strip, limits, grids, edges, max_range, distance_per_m, keys, order, xyz,
+                reach, parts, bounds, run_level, run_votes, run_of, firsts, owner, state,
+            )  # fmt: skip
+        if owner[run_of[seed]] != FREE:
+            continue
+        n_votes[:] = 0
+        queue[0], n_queued, n_done, size = run_of[seed], 1, 0, 0
+        owner[queue[0]] = n_clusters
         is_dropped = False
         while n_done < n_queued and not is_dropped:
-            if (n_seeds + n_left) / (size + n_left) <= min_share:  # too small, even if it gets all seeds that are left
-                is_dropped = True
-                break
             run = queue[n_done]
             n_done += 1
+            size += parts[run, 1] - parts[run, 0]
+            for k in range(n_shares + 1):
+                n_votes[k] += run_votes[run, k]
+                n_left[k] -= run_votes[run, k]
+            is_dropped = not may_reach(n_votes, n_left, min_shares)
             # The reaches of linked points differ by at most distance_per_m times the shorter one.
             differ = SAFE * (1.0 + distance_per_m)
             lowest, highest = run_level[run], run_level[run]
@@ -195,68 +167,114 @@ def fill_clusters(
                 highest += 1
             far = SAFE * bounds[run, 6]
             for at in range(lowest, highest + 1):
-                if n_rows[at] == 0:
-                    continue
-                scale = columns_per_m[at]
-                first_row = int(max((bounds[run, 0] - far - low[at, 0]) * scale, 0.0))
-                last_row = int(min((bounds[run, 3] + far - low[at, 0]) * scale, n_rows[at] - 1.0))
-                first_col = int(max((bounds[run, 1] - far - low[at, 1]) * scale, 0.0))
-                last_col = int(min((bounds[run, 4] + far - low[at, 1]) * scale, n_cols[at] - 1.0))
-                if first_col > last_col:
-                    continue
+                scale = grids[at, 2]
+                first_row = int(max((bounds[run, 0] - far - grids[at, 0]) * scale, 0.0))
+                last_row = int(min((bounds[run, 3] + far - grids[at, 0]) * scale, n_rows[at] - 1.0))
+                first_col = int(max((bounds[run, 1] - far - grids[at, 1]) * scale, 0.0))
+                last_col = int(min((bounds[run, 4] + far - grids[at, 1]) * scale, n_cols[at] - 1.0))
+                n_strips = (n_cols[at] + STRIP - 1) // STRIP
                 for row in range(first_row, last_row + 1):
-                    place = offsets[at] + row * n_cols[at] + first_col
-                    first, last = starts[place], starts[place + last_col - first_col + 1]
-                    # Neighboring columns follow each other. If they hold many runs, they are searched by height.
-                    n_searched = last_col - first_col + 1 if last - first > MAX_SCANNED else 1
-                    for col in range(n_searched):
-                        if n_searched > 1:
-                            first, last = starts[place + col], starts[place + col + 1]
-                            first = first_above(bounds, first, last, bounds[run, 2] - far)
-                        for other in range(first, last):
-                            if n_searched > 1 and bounds[other, 2] > bounds[run, 5] + far:
-                                break
-                            work[0] += 1
-                            if owner[other] >= 0:
-                                continue
-                            longest = min(bounds[run, 6], bounds[other, 6])
-                            if squared_gap(bounds, run, other) > longest * longest:
-                                continue
-                            n_points = max(parts[run, 1] - parts[run, 0], parts[other, 1] - parts[other, 0])
-                            if n_points <= MAX_TESTED:
-                                n_tests = test_points(xyz, reach, parts, bounds, state, run, other)
-                                state[1] -= abs(n_tests)
-                                linked = n_tests > 0
-                            else:
-                                linked = are_linked(xyz, reach, order, parts, bounds, pairs, state, work, run, other)
-                            if linked:
-                                if owner[other] == DROPPED:
-                                    is_dropped = True
+                    for number in range(first_col // STRIP, last_col // STRIP + 1):
+                        strip = offsets[at] + row * n_strips + number
+                        if heads[strip] == -1:
+                            continue
+                        if heads[strip] >= 0:
+                            open_strip(
+                                points, votes, heads, chain, strip, limits, grids, edges, max_range, distance_per_m,
+                                keys, order, xyz, reach, parts, bounds, run_level, run_votes, run_of, firsts, owner,
+                                state,
+                            )  # fmt: skip
+                        opened = -2 - heads[strip]
+                        col = max(first_col - number * STRIP, 0)
+                        last_here = min(last_col - number * STRIP, STRIP - 1)
+                        # If the columns hold many runs, they are searched one by one, by height.
+                        one_by_one = firsts[opened, last_here + 1] - firsts[opened, col] > MAX_SCANNED
+                        while col <= last_here and not is_dropped:
+                            end = col if one_by_one else last_here
+                            first, last = firsts[opened, col], firsts[opened, end + 1]
+                            col = end + 1
+                            if one_by_one:
+                                first = first_above(bounds, first, last, bounds[run, 2] - far)
+                            for other in range(first, last):
+                                if one_by_one and bounds[other, 2] > bounds[run, 5] + far:
+                                    break
+                                work[0] += 1
+                                if owner[other] >= 0:
                                     continue
-                                owner[other] = n_clusters
-                                queue[n_queued] = other
-                                n_queued += 1
-                                size += parts[other, 1] - parts[other, 0]
-                                n_seeds += run_seeds[other]
-                                n_left -= run_seeds[other]
-        if is_dropped:
-            for k in range(n_queued):
-                owner[queue[k]] = DROPPED
-        else:
-            is_kept[n_clusters] = size >= min_points and n_seeds / size > min_share
+                                longest = min(bounds[run, 6], bounds[other, 6])
+                                if squared_gap(bounds, run, other) > longest * longest:
+                                    continue
+                                n_points = max(parts[run, 1] - parts[run, 0], parts[other, 1] - parts[other, 0])
+                                if n_points <= MAX_TESTED:
+                                    n_tests = test_points(xyz, reach, parts, bounds, state, run, other)
+                                    state[1] -= abs(n_tests)
+                                    linked = n_tests > 0
+                                else:
+                                    linked = are_linked(
+                                        xyz, reach, order, parts, bounds, pairs, state, work, run, other
+                                    )
+                                if linked and owner[other] == DROPPED:
+                                    is_dropped = True
+                                elif linked:
+                                    owner[other] = n_clusters
+                                    queue[n_queued] = other
+                                    n_queued += 1
+        for k in range(n_done, n_queued):  # of a cluster that was dropped before it was complete
+            for share in range(n_shares + 1):
+                n_left[share] -= run_votes[queue[k], share]
+        n_none = np.zeros_like(n_left)
+        is_dropped = is_dropped or not may_reach(n_votes, n_none, min_shares)
+        for k in range(n_queued):
+            owner[queue[k]] = DROPPED if is_dropped else n_clusters
+            for place in range(parts[queue[k], 0], parts[queue[k], 1]):
+                clusters[order[place]] = owner[queue[k]]
+        if not is_dropped:
+            is_kept[n_clusters] = size >= min_points
             n_clusters += 1
     work[1] = 2 * TESTS_PER_POINT * m - state[1]
 
-    number = np.full(n_clusters, -1, dtype=np.int32)
+    renumbered = np.full(n_clusters, FREE, dtype=np.int32)
     n_kept = 0
-    for i in rows[:m]:
-        found = owner[clusters[i]]
-        clusters[i] = -1
-        if found >= 0 and is_kept[found]:
-            if number[found] < 0:
-                number[found] = n_kept
-                n_kept += 1
-            clusters[i] = number[found]
+    for i in range(points.shape[0]):
+        found = clusters[i]
+        if found < 0:
+            continue
+        if is_kept[found] and renumbered[found] < 0:
+            renumbered[found] = n_kept
+            n_kept += 1
+        clusters[i] = renumbered[found]
+
+
+@njit(cache=True, nogil=True)
+def add_votes(vote: np.uint8, counts: NDArray[np.int64]) -> None:
+    """Add a point's votes to ``counts``: one for every bit."""
+    for k in range(len(counts)):
+        counts[k] += (vote >> k) & 1
+
+
+@njit(cache=True, nogil=True)
+def may_reach(counts: NDArray[np.int64], left: NDArray[np.int64], min_shares: NDArray[np.float64]) -> bool:
+    """Whether a cluster may have more than one of the shares, if it gets all of the votes that are left."""
+    for k in range(len(min_shares)):
+        if (counts[k + 1] + left[k + 1]) / max(counts[0] + left[k + 1], 1) > min_shares[k]:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def strip_of(
+    points: NDArray[np.float32],
+    i: int,
+    limits: NDArray[np.float64],
+    grids: NDArray[np.float64],
+    n_cols: NDArray[np.int64],
+    offsets: NDArray[np.int64],
+) -> int:
+    """The strip of columns that holds a point."""
+    x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+    at = level_of(limits, x, y, z)
+    row, col = int((x - grids[at, 0]) * grids[at, 2]), int((y - grids[at, 1]) * grids[at, 2])
+    return int(offsets[at] + row * ((n_cols[at] + STRIP - 1) // STRIP) + col // STRIP)
 
 
 @njit(cache=True, nogil=True)
@@ -267,6 +285,96 @@ def level_of(limits: NDArray[np.float64], x: float, y: float, z: float) -> int:
     while squared_range >= limits[level + 1]:
         level += 1
     return level
+
+
+@njit(cache=True, nogil=True)
+def open_strip(
+    points: NDArray[np.float32],
+    votes: NDArray[np.uint8],
+    heads: NDArray[np.int32],
+    chain: NDArray[np.int32],
+    strip: int,
+    limits: NDArray[np.float64],
+    grids: NDArray[np.float64],
+    edges: NDArray[np.float64],
+    max_range: float,
+    distance_per_m: float,
+    keys: NDArray[np.float64],
+    order: NDArray[np.int32],
+    xyz: NDArray[np.float32],
+    reach: NDArray[np.float64],
+    parts: NDArray[np.int32],
+    bounds: NDArray[np.float64],
+    run_level: NDArray[np.int8],
+    run_votes: NDArray[np.int32],
+    run_of: NDArray[np.int32],
+    firsts: NDArray[np.int32],
+    owner: NDArray[np.int32],
+    state: NDArray[np.int64],
+) -> None:
+    """Sort the points of a strip by column and height, and divide them into runs; its head becomes -2 - its number."""
+    start = stop = state[3]
+    i = heads[strip]
+    level = level_of(limits, np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2]))
+    while i >= 0:
+        column = int((np.float64(points[i, 1]) - grids[level, 1]) * grids[level, 2]) % STRIP
+        keys[stop] = column * 4.0 * max_range + np.float64(points[i, 2])
+        order[stop] = i
+        stop += 1
+        i = chain[i]
+    gap = 1
+    while gap < (stop - start) // 3:
+        gap = 3 * gap + 1
+    while gap > 0:  # Shell's method: no strip makes it slow
+        for k in range(start + gap, stop):
+            key, i, place = keys[k], order[k], k
+            while place >= start + gap and keys[place - gap] > key:
+                keys[place], order[place] = keys[place - gap], order[place - gap]
+                place -= gap
+            keys[place], order[place] = key, i
+        gap //= 3
+    opened, first = state[5], state[4]
+    column, run = -1, first - 1
+    for k in range(start, stop):
+        i = order[k]
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        xyz[k, 0], xyz[k, 1], xyz[k, 2] = points[i, 0], points[i, 1], points[i, 2]
+        reach[k] = max(edges[0], distance_per_m * math.sqrt(x * x + y * y + z * z))
+        is_new = int((y - grids[level, 1]) * grids[level, 2]) % STRIP != column
+        if is_new or z - np.float64(xyz[k - 1, 2]) > RUN_GAP * edges[level]:
+            run += 1
+            parts[run, 0], parts[run, 2] = k, 0
+            run_level[run] = level
+            owner[run] = FREE
+            for share in range(run_votes.shape[1]):
+                run_votes[run, share] = 0
+        if is_new:
+            before = column
+            column = int((y - grids[level, 1]) * grids[level, 2]) % STRIP
+            for empty in range(before + 1, column + 1):
+                firsts[opened, empty] = run
+        parts[run, 1] = k + 1
+        run_of[i] = run
+        for share in range(run_votes.shape[1]):
+            run_votes[run, share] += (votes[i] >> share) & 1
+    for empty in range(column + 1, STRIP + 1):
+        firsts[opened, empty] = run + 1
+    for k in range(first, run + 1):
+        set_bounds(xyz, reach, parts, bounds, k)
+    heads[strip] = -2 - opened
+    state[3], state[4], state[5] = stop, run + 1, opened + 1
+
+
+@njit(cache=True, nogil=True)
+def first_above(bounds: NDArray[np.float64], first: int, last: int, z: float) -> int:
+    """The first of a column's runs whose top is not below z; ``last`` if there is none."""
+    while first < last:
+        middle = (first + last) // 2
+        if bounds[middle, 5] < z:
+            first = middle + 1
+        else:
+            last = middle
+    return first
 
 
 @njit(cache=True, nogil=True)
@@ -289,18 +397,6 @@ def set_bounds(
     bounds[part, 0], bounds[part, 1], bounds[part, 2] = low_x, low_y, low_z
     bounds[part, 3], bounds[part, 4], bounds[part, 5] = high_x, high_y, high_z
     bounds[part, 6], bounds[part, 7] = longest, shortest
-
-
-@njit(cache=True, nogil=True)
-def first_above(bounds: NDArray[np.float64], first: int, last: int, z: float) -> int:
-    """The first of a column's runs whose top is not below z; ``last`` if there is none."""
-    while first < last:
-        middle = (first + last) // 2
-        if bounds[middle, 5] < z:
-            first = middle + 1
-        else:
-            last = middle
-    return first
 
 
 @njit(cache=True, nogil=True)
@@ -408,7 +504,7 @@ def split(
     """Halve a part along the longest side of its bounds, unless that was done before; False if it stays whole."""
     if parts[part, 2] > 0:
         return True
-    if state[0] + 2 > len(parts):
+    if state[0] - 2 < len(order):
         state[1] = min(state[1], 0)  # no room for more parts
     if parts[part, 1] - parts[part, 0] <= MAX_TESTED or state[1] <= 0:
         return False
@@ -432,8 +528,8 @@ def split(
         reach[first], reach[last] = reach[last], reach[first]
         order[first], order[last] = order[last], order[first]
         last -= 1
+    state[0] -= 2
     child = state[0]
-    state[0] += 2
     parts[part, 2] = child
     parts[child, 0], parts[child, 1], parts[child, 2] = start, first, 0
     parts[child + 1, 0], parts[child + 1, 1], parts[child + 1, 2] = first, stop, 0

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .adapt import Interpolator, condition, render
-from .agreement import RULES, agree_on_boxes, agree_on_cells, agree_on_points
+from .agreement import RULES, agree_on_boxes, agree_on_cells, agree_on_points, find_voters
 from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
-from .cluster import MIN_SCORE, find_clusters, join_boxes, objects_from_points
+from .cluster import MIN_SCORE, join_boxes, objects_from_points
 from .decode import decode_classes, decode_top_view
 from .drivable import compile_kernels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
@@ -646,13 +646,7 @@ class Perceiver:
         clusters = None
         dropped: list[Box] = []
         if points is not None and self._rules:
-            clusters = find_clusters(
-                scan,
-                among=above,
-                seeds=points.labels > 0,
-                distance_per_m=self._distance_per_m,
-                min_points=1,
-            )
+            clusters = find_voters(scan, points, ground, boxes, distance_per_m=self._distance_per_m, rules=self._rules)
             watch.lap("cluster")
             points = agree_on_points(scan, points, ground, clusters, boxes, rules=self._rules)
             kept = agree_on_boxes(boxes, scan, points, ground, rules=self._rules)

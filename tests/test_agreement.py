@@ -30,10 +30,13 @@ from edgeperc.agreement import (
     count_inside,
     fill_support,
     fill_tallies,
+    fill_verdicts,
+    fill_votes,
+    find_voters,
 )
 from edgeperc.card import TopViewGeometry
 from edgeperc.cli import arguments
-from edgeperc.cluster import find_clusters
+from edgeperc.cluster import find_clusters, objects_from_points
 from edgeperc.geometry import inside
 from edgeperc.ground import Ground, find_ground
 from edgeperc.points import read_only
@@ -147,8 +150,9 @@ def test_boxes_around_points_match_the_twin(given: list, boxes: list[Box]) -> No
     of_box = (np.arange(len(boxes)) % 3 + 1).astype(np.uint8)
     scores, names = np.empty(len(scene.points), np.float32), np.empty(len(scene.points), np.uint8)
     arrays = map_read_only((scene.points, scene.height, scene.on_ground))
-    fill_support(*arrays, as_rows, of_box, scores, names)
-    right_scores, right_names = twins.agreement.support(*arrays, as_rows, of_box)
+    among = read_only(scene.in_view & ~scene.on_ground, np.bool_)
+    fill_support(*arrays[:2], among, as_rows, of_box, scores, names)
+    right_scores, right_names = twins.agreement.support(*arrays[:2], ~among, as_rows, of_box)
     np.testing.assert_array_equal(scores, right_scores)
     np.testing.assert_array_equal(names, right_names)
     counts = np.empty((len(boxes), 3), np.int64)
@@ -169,6 +173,80 @@ def test_verdicts_match_the_twin(given: list, seed: int) -> None:
     apply_verdicts(in_view, clusters, table, ROLES, scores, names, found)
     right = twins.agreement.verdicts(in_view, clusters, table, ROLES, scores, names, scene.labels)
     np.testing.assert_array_equal(found, right)
+    votes = np.empty(n, np.uint8)
+    fill_votes(in_view, read_only(scene.labels, np.uint8), ROLES, scores, votes)
+    np.testing.assert_array_equal(votes, twins.agreement.votes(scene.in_view, scene.labels, ROLES, scores))
+
+
+@patient
+@given(st.integers(0, 2**31), st.integers(0, 40), st.booleans(), st.booleans(), st.booleans())
+def test_what_becomes_of_clusters_matches_the_twin(
+    seed: int, n: int, by_share: bool, by_height: bool, is_filled: bool
+) -> None:
+    rules = by_share, by_height, is_filled
+    rng = np.random.default_rng(seed)
+    counts = rng.integers(0, 12, (n, 5)).astype(np.int32) * rng.integers(0, 2, (n, 5)).astype(np.int32)
+    counts[:, 4] = counts[:, :4].sum(axis=1)
+    sides = rng.choice([0.5, 2.9, 3.1, 9.0, 11.0, np.inf], (n, 2))
+    bounds = np.column_stack([-sides / 2, sides / 2, rng.choice([-np.inf, 0.4, 0.9, 1.5, 2.2, 4.5], n)])
+    bounds = bounds.astype(np.float32)
+    parts, found = np.array([[2, 3]]), np.empty((n, 4), np.uint8)
+    fill_verdicts(counts, bounds, ROLES, parts, *rules, found)
+    np.testing.assert_array_equal(found, twins.agreement.verdict_table(counts, bounds, ROLES, parts, *rules))
+
+
+def crowded(seed: int) -> tuple[NDArray[np.float32], PointLabels, Ground, list[Box]]:
+    """Heaps of points with few, some or many labels, some of them out of view, and boxes around some of them."""
+    rng = np.random.default_rng(seed)
+    n, heaps = 900, 14
+    of = rng.integers(0, heaps, n)
+    places = rng.uniform(-14, 14, (heaps, 2))
+    spread = rng.choice([0.2, 0.5, 1.5], heaps)
+    height = rng.uniform(0.2, 1.0, n) * rng.uniform(0.4, 4.0, heaps)[of]
+    points = np.zeros((n, 4), np.float32)
+    points[:, :2] = places[of] + rng.normal(0, 1, (n, 2)) * spread[of][:, None]
+    points[:, 2] = height + GROUND_Z
+    share = rng.choice([0.0, 0.02, 0.09, 0.11, 0.5, 0.58, 0.62, 0.72, 0.77, 1.0], heaps)
+    in_view = rng.random(n) < rng.choice([0.3, 1.0], heaps)[of]
+    labels = np.where(in_view & (rng.random(n) < share[of]), rng.integers(1, 4, heaps)[of], 0).astype(np.uint8)
+    on_ground = rng.random(n) < 0.05
+    boxes = [
+        Box("car", score, (*places[k], -1.0), (4.0 * spread[k], 2.0 * spread[k], 2.0), 0.3)
+        for k, score in enumerate(rng.choice([0.2, 0.35, 0.6, 0.9], heaps // 2))
+    ]
+    ground = Ground(on_ground, height.astype(np.float32), (0.0, 0.0, GROUND_Z))
+    return points, PointLabels(labels, in_view, CLASSES), ground, boxes
+
+
+@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("rules", [RULES, RULES - {"share"}, RULES - {"support"}])
+def test_voters_give_the_results_of_complete_clusters(seed: int, rules: frozenset[str]) -> None:
+    points, labels, ground, boxes = crowded(seed)
+    complete = find_clusters(points, among=~ground.mask, seeds=labels.labels > 0, min_points=1)
+    voters = find_voters(points, labels, ground, boxes, rules=rules)
+    expected = agree_on_points(points, labels, ground, complete, boxes, rules=rules)
+    agreed = agree_on_points(points, labels, ground, voters, boxes, rules=rules)
+    np.testing.assert_array_equal(agreed.labels, expected.labels)
+    found = [
+        objects_from_points(points, agreed.labels, CLASSES, height_m=ground.height_m, clusters=clusters)
+        for clusters in (voters, complete)
+    ]
+    assert found[0] == found[1]
+
+
+def test_a_forest_is_not_searched_because_of_a_few_labels() -> None:
+    rng = np.random.default_rng(0)
+    n = 60_000
+    points = np.column_stack([rng.uniform(-12, 12, (n, 2)), rng.uniform(-1.0, 2.0, n), np.zeros(n)]).astype(np.float32)
+    labels = np.zeros(n, np.uint8)
+    labels[rng.choice(n, 60, replace=False)] = rng.integers(1, 4, 60)
+    height = (points[:, 2] - np.float32(GROUND_Z)).astype(np.float32)
+    ground = Ground(np.zeros(n, np.bool_), height, (0.0, 0.0, GROUND_Z))
+    found = PointLabels(labels, np.ones(n, np.bool_), CLASSES)
+    voters = find_voters(points, found, ground)
+    assert (voters[labels > 0] == -2).all()
+    assert np.count_nonzero(voters != -1) < n // 3
+    assert not agree_on_points(points, found, ground, voters).labels.any()
 
 
 @patient
@@ -304,7 +382,7 @@ def agreed_scene(
     points = np.column_stack([rows[:, :2], rows[:, 2] + GROUND_Z, np.zeros(len(rows))]).astype(np.float32)
     labels = PointLabels(rows[:, 3].astype(np.uint8), np.ones(len(rows), np.bool_), CLASSES)
     ground = find_ground(points)
-    clusters = find_clusters(points, among=~ground.mask, seeds=labels.labels > 0, min_points=1)
+    clusters = find_voters(points, labels, ground, boxes, rules=rules)
     return rows, agree_on_points(points, labels, ground, clusters, boxes, rules=rules).labels
 
 

@@ -137,11 +137,12 @@ def test_the_work_on_hostile_scans_is_bounded(kind, seed, per_m):
     points = read_only(as_points(hostile(kind, np.random.default_rng(seed), 20_000)))
     every = read_only(np.ones(len(points)), np.bool_)
     clusters, work = np.empty(len(points), np.int32), np.empty(3, np.int64)
-    linkage.fill_clusters(points, every, every, 0.0, 0.5, per_m, 100.0, 1, clusters, work)
+    options = every, every, read_only(np.full(len(points), 3), np.uint8), np.zeros(1), 0.5, per_m, 100.0, 1
+    linkage.fill_clusters(points, *options, clusters, work)
     assert work[0] <= 100 * len(points)
     assert work[1] <= 2 * linkage.TESTS_PER_POINT * len(points)
     again = np.empty_like(clusters)
-    linkage.fill_clusters(points, every, every, 0.0, 0.5, per_m, 100.0, 1, again, work)
+    linkage.fill_clusters(points, *options, again, work)
     np.testing.assert_array_equal(again, clusters)
 
 
@@ -175,6 +176,32 @@ def test_clusters_with_enough_seeds_are_kept(seed, share, per_m, min_share):
             expected[everything == k] = number
             number += 1
     np.testing.assert_array_equal(found, expected)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**31), st.sampled_from([(-1.0, -1.0), (0.3, 0.6), (0.6, 0.1), (1.0, 1.0)]))
+def test_clusters_with_enough_votes_are_kept(seed, min_share):
+    rng = np.random.default_rng(seed)
+    centers = rng.uniform(-12, 12, (12, 3)) * [1, 1, 0.1]
+    of = rng.integers(0, 12, 200)
+    points = as_points(centers[of] + rng.normal(0, rng.choice([0.1, 0.4]), (200, 3)))
+    votes = np.where(rng.random(200) < rng.random(12)[of], rng.choice([0, 1, 3, 5, 7], 200), 1).astype(np.uint8)
+    seeds = rng.random(200) < 0.3
+    found = find_clusters(points, seeds=seeds, votes=votes, min_share=min_share, min_points=1)
+    everything = find_clusters(points, min_points=1)
+    expected = np.full(200, -1)
+    for k in range(everything.max(initial=-1) + 1):
+        own = everything == k
+        counted = max(np.count_nonzero(votes[own] & 1), 1)
+        shares = [np.count_nonzero(votes[own] & bit) / counted for bit in (2, 4)]
+        enough = any(share > least for share, least in zip(shares, min_share, strict=True))
+        expected[own] = (k if enough else -2) if seeds[own].any() else -1
+    kept, numbers = np.unique(expected[expected >= 0], return_inverse=True)
+    expected[expected >= 0] = numbers
+    is_certain = (expected != -2) | seeds  # of dropped clusters, some points are not looked at
+    np.testing.assert_array_equal(found[is_certain], expected[is_certain])
+    assert (found[~is_certain] < 0).all()
+    assert found.max(initial=-1) == len(kept) - 1
 
 
 @pytest.mark.parametrize("spread", [0.02, 0.5, 20.0])

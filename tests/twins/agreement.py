@@ -83,13 +83,43 @@ def verdicts(in_view, clusters, table, roles, scores, names, labels):
     agreed = labels.copy()
     for i in np.flatnonzero(in_view):
         old, k = labels[i], clusters[i]
-        new = old if k < 0 else table[k, old]
-        if k >= 0 and roles[old] == 1 and roles[new] == 0 and scores[i] >= 0.3:
+        new = old if k == -1 else table[k, old] if k >= 0 else 0 if roles[old] else old
+        if k != -1 and roles[old] == 1 and roles[new] == 0 and scores[i] >= 0.3:
             new = old
         if scores[i] >= 0.5 and (new == 0 or roles[new] == 1):
             new = names[i]
         agreed[i] = new
     return agreed
+
+
+def votes(in_view, labels, roles, scores):
+    """Twin of `edgeperc.agreement.fill_votes`."""
+    role = roles[labels]
+    return np.where(in_view, 1 + 2 * ((role == 1) | (scores >= 0.5)) + 4 * (role == 2), 0)
+
+
+def verdict_table(counts, bounds, roles, parts, by_share, by_height, is_filled):
+    """Twin of `edgeperc.agreement.fill_verdicts`: all clusters at once."""
+    vehicles, persons = np.flatnonzero(roles == 1), np.flatnonzero(roles == 2)
+    seen = np.maximum(counts[:, -1], 1)
+    vehicle_share, person_share = counts[:, vehicles].sum(axis=1) / seen, counts[:, persons].sum(axis=1) / seen
+    length, top = np.hypot(*(bounds[:, 2:4].astype(np.float64) - bounds[:, :2]).T), bounds[:, 4]
+    large = (length > 10.0) | (top > 4.0)
+    no_vehicle = by_share & (vehicle_share < np.where(large, 0.75, 0.6)) | by_height & (top < 0.5)
+    no_person = by_share & (person_share < 0.1) | by_height & (top < 1.0)
+    table = np.tile(np.arange(len(roles), dtype=np.uint8), (len(counts), 1))
+    table[np.ix_(no_vehicle, vehicles)] = 0
+    table[np.ix_(no_person, persons)] = 0
+    if is_filled:
+        filled = ~no_vehicle & (vehicle_share >= 0.6) & ~large
+        most = vehicles[np.argmax(counts[:, vehicles], axis=1)]
+        table[np.ix_(filled, np.array([0, *vehicles, *persons]))] = most[filled, None]
+        filled = ~no_person & (person_share >= 0.6) & (length < 3.0) & (top < 2.1)
+        most = persons[np.argmax(counts[:, persons], axis=1)]
+        for part, whole in parts:
+            most = np.where(counts[:, whole] >= 0.25 * (counts[:, part] + counts[:, whole]), whole, most)
+        table[np.ix_(filled, np.array([0, *persons]))] = most[filled, None]
+    return table
 
 
 def ground(points, on_ground, roles, labels):
