@@ -192,7 +192,7 @@ def _hidden_by(
     """
     if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
         raise PointsError(f"got {_described(points)} for points; expected an array (n, 3 or more): x, y, z")
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         rows: NDArray[np.float32] = read_only(points)
         frame = ModelFrame(_mounting_of(image, mounting))
         moved = rows[:, :3].astype(np.float64) @ frame.R.T + frame.t
