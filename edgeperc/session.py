@@ -32,7 +32,7 @@ from .errors import (
     ProviderError,
     SettingsError,
 )
-from .extras import require
+from .extras import require, without_telemetry
 from .onnx_file import check_graph, read_model
 from .printable import printable
 from .tuning import compiled_folder, cpu_features, fingerprint, read_setting, settings_path
@@ -66,6 +66,7 @@ MAX_FIRST_RUN_S = 30.0
 
 
 def _onnxruntime() -> Any:
+    without_telemetry()
     ort = require("onnxruntime", "cpu", "Running a model")
     ort.set_default_logger_severity(4)  # its exceptions contain the messages, and ours repeat them
     return ort
