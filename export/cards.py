@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.card import CameraGeometry, InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.sensor import get_sensor
 from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES
+from edgeperc.simulation.street import CAMERA_CLASSES
 
 from .recipe import Recipe
 
 __all__ = [
+    "CAMERA_INPUT",
     "HEIGHT_INPUT",
     "RANGE_IMAGE",
     "RANGE_IMAGE_INPUT",
@@ -42,11 +44,24 @@ HEIGHT_INPUT = InputSpec(
     (*RANGE_IMAGE_INPUT.std, 0.72),
 )
 
+# Means and standard deviations of the 367 training images.
+CAMERA_INPUT = InputSpec("image", ("red", "green", "blue"), (105.0, 108.5, 110.3), (78.3, 79.4, 78.3))
+# The comparison of networks on CamVid divides by 255 (Jebamikyous, 2021, section 4.2).
+PLAIN_CAMERA_INPUT = InputSpec("image", ("red", "green", "blue"), (0.0, 0.0, 0.0), (255.0, 255.0, 255.0))
+
 
 def card_of(recipe: Recipe, **facts: Any) -> ModelCard:
     """The card of a recipe's network; ``facts`` are further arguments of `ModelCard`, at least ``version``."""
     facts = {"name": recipe.network, **facts}
     task = recipe.task
+    if task == "camera":
+        return ModelCard(
+            view=CameraGeometry(recipe.image_width, recipe.image_height),
+            input=CAMERA_INPUT if recipe.network == "camseg" else PLAIN_CAMERA_INPUT,
+            outputs=(OutputSpec("logits", "camera_logits"),),
+            classes=CAMERA_CLASSES,
+            **facts,
+        )
     if task == "points":
         return ModelCard(
             view=RANGE_IMAGE,

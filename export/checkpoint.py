@@ -92,7 +92,12 @@ def _recipe(text: str) -> Recipe:
         kinds: Any = (int, float) if isinstance(usual, float) else type(usual)
         if not isinstance(value, kinds) or isinstance(value, bool) != isinstance(usual, bool):
             raise ValueError(f"its recipe has {field.name} {str(value)[:60]}")
-    if not (1 <= recipe.context_width <= MAX_WIDTH and 0.0 <= recipe.dropout < 1.0 and 0 <= recipe.seed < 2**63):
+    if not (
+        1 <= recipe.context_width <= MAX_WIDTH
+        and 0.0 < recipe.width <= 8.0
+        and 0.0 <= recipe.dropout < 1.0
+        and 0 <= recipe.seed < 2**63
+    ):
         raise ValueError("its recipe has a context_width, a dropout or a seed that is impossible")
     return recipe
 

@@ -26,6 +26,7 @@ SEMANTICKITTI = "root folder of SemanticKITTI, to evaluate the drivable area"
 FOLD = "fold of the training drives (0, 1 or 2) to validate on instead of training on it"
 THREADS = "number of CPU threads (default: one for each core)"
 COMPILE = "run the network through torch.compile, which needs a C++ compiler and a minute to start"
+CAMVID = "folder of CamVid: train, trainannot, val, valannot and classes.json"
 SCANS = "more real scans: FOLDER with a scans.json, or FOLDER:LAYOUT; may be repeated"
 WORKERS = "number of processes that make the training samples (default 1)"
 VERSION = "version to write into the card (default 1.0.0)"
@@ -83,6 +84,7 @@ def build_parser() -> argparse.ArgumentParser:
     train.add_argument("--kitti", type=Path, help=KITTI)
     train.add_argument("--scans", action="append", default=[], metavar="FOLDER[:LAYOUT]", help=SCANS)
     train.add_argument("--simulated", type=Path, help="folder of scans written by edgeperc-export simulate")
+    train.add_argument("--camvid", type=Path, help=f"{CAMVID}; for networks of a camera")
     train.add_argument("--fold", type=int, help=FOLD)
     train.add_argument(
         "--recipe",
@@ -208,22 +210,43 @@ def build_parser() -> argparse.ArgumentParser:
     make.add_argument("--model-version", default="1.0.0", help=VERSION)
     make.set_defaults(run=_make)
 
-    ablate = commands.add_parser("ablate", help="measure the effect of each part of the training on a fold")
-    ablate.add_argument("network", choices=["ssadnet", "pointseg", "lodnn"], help="network to train")
-    ablate.add_argument("out", type=Path, help="folder for the runs and ablation.json; finished runs in it are kept")
-    ablate.add_argument("--kitti", type=Path, required=True, help=KITTI)
-    ablate.add_argument("--simulated", type=Path, required=True, help="folder of scans from edgeperc-export simulate")
-    ablate.add_argument(
-        "--start-from", type=Path, help="checkpoint.pt of NETWORK-sim; lodnn starts from random weights"
+    ablations = commands.add_parser(
+        "ablate", help="measure the effect of each part of the training on a fold, or compare networks on CamVid"
+    ).add_subparsers(required=True, dest="network", metavar="NETWORK")
+    for network in ("lodnn", "pointseg", "ssadnet"):
+        ablate = ablations.add_parser(network, help=f"train variants of {network}")
+        ablate.add_argument("out", type=Path, help="folder for the runs and ablation.json; finished runs are kept")
+        ablate.add_argument("--kitti", type=Path, required=True, help=KITTI)
+        ablate.add_argument(
+            "--simulated", type=Path, required=True, help="folder of scans from edgeperc-export simulate"
+        )
+        ablate.add_argument(
+            "--start-from", type=Path, help="checkpoint.pt of NETWORK-sim; lodnn starts from random weights"
+        )
+        ablate.add_argument(
+            "--fold", type=int, default=0, help="fold of the training drives to evaluate on (default 0)"
+        )
+        ablate.add_argument("--steps", type=int, default=150, help="training steps of each run (default 150)")
+        ablate.add_argument(
+            "--variant", action="append", default=[], help="run this variant only; may be repeated (default: all)"
+        )
+        ablate.add_argument("--threads", type=int, help=THREADS)
+        ablate.add_argument("--plot", type=Path, metavar="PNG", help="also draw the results (lodnn only)")
+        ablate.set_defaults(run=_ablate)
+    camvid = ablations.add_parser("camvid", help="compare eleven networks on CamVid under one budget")
+    camvid.add_argument("camvid", type=Path, help=CAMVID)
+    camvid.add_argument("out", type=Path, help="folder for the table, plots and runs; finished networks are kept")
+    camvid.add_argument("--size", type=_size, default=(240, 180), help="size of the images (default 240x180)")
+    camvid.add_argument("--epochs", type=int, default=40, help="how often each image is trained on (default 40)")
+    camvid.add_argument("--batch", type=int, default=8, help="images in each step (default 8)")
+    camvid.add_argument("--learning-rate", type=float, help="default: 3e-4")
+    camvid.add_argument(
+        "--networks", action="append", default=[], metavar="NAME", help="this network only; may be repeated"
     )
-    ablate.add_argument("--fold", type=int, default=0, help="fold of the training drives to evaluate on (default 0)")
-    ablate.add_argument("--steps", type=int, default=150, help="training steps of each run (default 150)")
-    ablate.add_argument(
-        "--variant", action="append", default=[], help="run this variant only; may be repeated (default: all)"
-    )
-    ablate.add_argument("--threads", type=int, help=THREADS)
-    ablate.add_argument("--plot", type=Path, metavar="PNG", help="also draw the results (lodnn only)")
-    ablate.set_defaults(run=_ablate)
+    camvid.add_argument("--no-plots", action="store_true", help="write the table alone, without matplotlib")
+    camvid.add_argument("--compile", action="store_true", help=COMPILE)
+    camvid.add_argument("--threads", type=int, help=THREADS)
+    camvid.set_defaults(run=_ablate_camvid)
 
     add_database_commands(commands)
 
@@ -316,6 +339,7 @@ def _train(args: argparse.Namespace) -> int:
         kitti=args.kitti,
         scan_sets=[ScanFolder.parse(text) for text in args.scans],
         simulated=args.simulated,
+        camvid=args.camvid,
         fold=args.fold,
         start_from=args.start_from,
         teacher=args.teacher,
@@ -464,6 +488,40 @@ def _ablate(args: argparse.Namespace) -> int:
         print_line(f"{row['network']}, fold {row['fold']}, {row['steps']} steps, {row['variant']}: {row['figures']}")
     if args.plot is not None:
         plot(rows, args.plot)
+    return 0
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    try:
+        return int(width), int(height)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}; expected WIDTHxHEIGHT, for instance 240x180") from None
+
+
+def _ablate_camvid(args: argparse.Namespace) -> int:
+    from .camvid import ablate_camvid, plot_camvid, show_camvid, table
+
+    width, height = args.size
+    rows = ablate_camvid(
+        args.camvid,
+        args.out,
+        networks=args.networks,
+        width=width,
+        height=height,
+        epochs=args.epochs,
+        batch=args.batch,
+        learning_rate=args.learning_rate,
+        n_threads=args.threads,
+        compiled=args.compile,
+    )
+    (args.out / "camvid.md").write_text(table(rows))
+    for line in table(rows).splitlines():
+        print_line(line)
+    if not args.no_plots:
+        plot_camvid(rows, args.out)
+        show_camvid(args.out / "camvid.npz", args.out / "predictions.png")
+        show_camvid(args.out / "camvid.npz", args.out / "segmentations.png", args.camvid)
     return 0
 
 

@@ -106,8 +106,8 @@ class Recipe:
         "stop after this many epochs without a better validation figure, and keep the best weights; 0: never",
         TASKS["camera"],
     )
-    width: int = _option(480, "columns that images are scaled to", TASKS["camera"])
-    height: int = _option(360, "rows that images are scaled to", TASKS["camera"])
+    image_width: int = _option(480, "columns that images are scaled to", TASKS["camera"])
+    image_height: int = _option(360, "rows that images are scaled to", TASKS["camera"])
     simulated_share: float = _option(
         0.5, "share of simulated scans; the rest are real. 1: no real scan is read", SCAN_NETWORKS
     )
@@ -187,6 +187,9 @@ class Recipe:
     )
     edge: bool = _option(
         False, "train the network's version for small computers, with the same inputs and outputs", EDGE_NETWORKS
+    )
+    width: float = _option(
+        1.0, "factor of the channels of a network for small computers (with --edge)", ("pointseg", "ssadnet")
     )
     head_only: bool = _option(
         False,
@@ -309,10 +312,11 @@ EDGE = Recipe(
     n_pasted=3.0,
     turn_anywhere=0.3,
     redraw_every=4000,
+    drawn_roads=True,
 )
 
 # LoDNN-I's structure at a quarter of the resolution.
-LODNN = replace(EDGE, network="lodnn", front=False, drawn_roads=True)
+LODNN = replace(EDGE, network="lodnn", front=False)
 
 # SSADNet and LoDNN-I as published (23 and 20 GMAC). The papers' recipes lack examples, not parameters: here are
 # simulated and augmented scans, and a learning rate that batch norm allows.
@@ -320,6 +324,7 @@ PUBLISHED = Recipe(
     "ssadnet",
     steps=6000,
     batch=16,
+    reuse=3,
     learning_rate=2e-3,
     ema=0.999,
     n_pasted=3.0,
@@ -344,7 +349,9 @@ MODELS = {
     # The papers' own networks at their full width, from random weights and on labels alone.
     "ssadnet-paper": Stage(replace(PUBLISHED, network="ssadnet", head="slots")),
     "lodnn-paper": Stage(replace(PUBLISHED, network="lodnn", drawn_roads=True)),
-    "pointseg": Stage(replace(EDGE, network="pointseg", front=False, height_above_ground=True, n_pasted=6.0)),
+    "pointseg": Stage(
+        replace(EDGE, network="pointseg", front=False, drawn_roads=False, height_above_ground=True, n_pasted=6.0)
+    ),
     "lodnn": Stage(LODNN),
     "ssadnet": Stage(EDGE),
     "camseg": Stage(CAMSEG),

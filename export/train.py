@@ -9,11 +9,12 @@ from __future__ import annotations
 import copy
 import json
 import math
+import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,7 +26,9 @@ from edgeperc.evaluation.datasets import KittiObjects
 from edgeperc.evaluation.scan_folder import ScanFolder
 from edgeperc.simulation.scene import POINT_CLASSES
 
+from .camera import Camera
 from .checkpoint import build_network, read_checkpoint
+from .images import ImageSamples, ImageWatch, camvid_samples
 from .networks import build
 from .recipe import Recipe
 from .samples import RealScans, Samples, loaded, real_scans
@@ -53,6 +56,7 @@ def train(
     *,
     kitti: Path | None,
     simulated: Path | None,
+    camvid: Path | None = None,
     scan_sets: Sequence[ScanFolder] = (),
     given: RealScans | None = None,
     fold: int | None = None,
@@ -62,6 +66,7 @@ def train(
     n_workers: int = 0,
     compiled: bool = False,
     checkpoint_every: int = 100,
+    save_every_s: float = 0.0,
 ) -> Path:
     """Train the network of a recipe, or resume its training.
 
@@ -75,6 +80,9 @@ def train(
         a ``simulated_share`` of 1, all training drives are for validation only.
     simulated : Path or None
         Folder of scans written by ``edgeperc-export simulate``.
+    camvid : Path or None
+        Folder of CamVid, for a camera's networks: they are trained on its training images, and the curve is of its
+        validation images.
     scan_sets : sequence of ScanFolder
         More real scans, of any sensor; their drives for training are trained on, those for validation are watched.
     given : RealScans, optional
@@ -95,7 +103,9 @@ def train(
     compiled : bool
         Use `torch.compile`, which takes a minute and a C++ compiler; PointSeg then trains a third faster.
     checkpoint_every : int
-        Steps between checkpoints, and between points of the curve.
+        Steps between checkpoints, and between points of the curve; an epoch if the recipe has a ``stop_after``.
+    save_every_s : float
+        Seconds between checkpoints, at least; the last one is always written. Large networks take seconds to write.
 
     Returns
     -------
@@ -105,7 +115,8 @@ def train(
     Raises
     ------
     ValueError
-        There are no scans, the checkpoint is of another recipe, or the teacher is missing, unsuitable or unused.
+        There are no scans or images, the checkpoint is of another recipe, or the teacher is missing, unsuitable or
+        unused.
     FloatingPointError
         The loss is not finite.
     """
@@ -114,35 +125,25 @@ def train(
         torch.set_num_threads(n_threads)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     torch.backends.cudnn.benchmark = True  # inputs have one size
-    task = task_of(recipe)
-    objects = KittiObjects(kitti) if kitti else None
-    only_simulated = recipe.simulated_share == 1.0
-    real, weights, hashes, watched = (
-        _real(recipe, objects, scan_sets, fold)
-        if given is None
-        else (given.scans, [1.0] * len(given.scans), given.hashes, given.watched)
-    )
-    if recipe.distil > 0.0 and teacher is None:
-        raise ValueError(f"the recipe distils ({recipe.distil:g}) but there is no teacher; give --teacher")
-    if teacher is not None and recipe.distil == 0.0 and (objects is None or recipe.task != "points"):
-        raise ValueError("the teacher is not used; give --distil, or train a network that labels points on --kitti")
-    onnx_teacher = OnnxTeacher(teacher, task) if teacher is not None and teacher.suffix == ".onnx" else None
-    if onnx_teacher is not None and recipe.distil == 0.0:
-        raise ValueError(f"{teacher}: an exported teacher does not label scans; give its checkpoint.pt, or --distil")
-    teacher_network = None if teacher is None or onnx_teacher else _teacher(teacher, task).to(device)
-    if teacher_network is not None and objects is not None and recipe.distil == 0.0:
-        extra = unlabeled_scans(objects, fold)
-        real = pseudo_labeled(teacher_network.cpu(), task, [*real, *extra])
-        weights += [len(extra) ** -0.5] * len(extra)
-    paths = sorted(simulated.glob("*.npz")) if simulated else []
-    samples = Samples(recipe, real, weights, paths, onnx_teacher, n_workers)
-    watch = Watch(samples, watched) if watched else None
+    if recipe.task == "camera":
+        data = _image_data(recipe, camvid, device)
+    else:
+        data = _scan_data(
+            recipe, device, kitti, simulated, scan_sets, given=given, fold=fold, teacher=teacher, n_workers=n_workers
+        )
+    task, samples, watch, hashes = data.task, data.samples, data.watch, data.hashes
+    teacher_network, n_real = data.teacher, data.n_real
+    # Where no real scan or image is trained on, or other scans are given, the validation decides which step is best.
+    stops = fold is not None or given is not None or recipe.simulated_share == 1.0 or recipe.stop_after > 0
+    epoch = max(1, n_real // recipe.batch)
+    if recipe.stop_after:
+        checkpoint_every = epoch
 
     network = build(recipe)
     before: list[dict[str, Any]] = []
     checkpoint, step = out / "checkpoint.pt", 0
     if start_from is not None and not checkpoint.exists():
-        images = [torch.from_numpy(samples.batch(k)[0]) for k in range(STATISTICS_BATCHES)]
+        images = [torch.as_tensor(samples.batch(k)[0]).cpu() for k in range(STATISTICS_BATCHES)]
         before, frames = start(network, recipe, start_from, images)
         hashes = frames | hashes
     network = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in its stubs
@@ -188,36 +189,45 @@ def train(
     forward = torch.compile(network) if compiled else network
     progress = tqdm(total=recipe.steps, initial=step, desc=recipe.network, unit="step")
     losses: list[float] = []
+    saved_s = time.monotonic()
     with (out / "log.jsonl").open("a") as log, progress:
-        for inputs, *others in loaded(samples, step, recipe.steps, n_workers, device):
+        if isinstance(samples, ImageSamples):
+            batches: Iterator[Sequence[Tensor]] = samples.batches(step, _last(recipe, curve, epoch))
+        else:
+            batches = loaded(samples, step, recipe.steps, n_workers, device)
+        for arrays in batches:
             for group in optimizer.param_groups:
                 group["lr"] = recipe.learning_rate * _schedule(recipe, step) * 0.5**halvings
             torch.manual_seed((recipe.seed << 32) + step)
-            x = inputs.contiguous(memory_format=torch.channels_last)
-            y = others[: samples.n_targets]
-            taught: tuple[Any, ...] = tuple(others[samples.n_targets :])
             network.train()
             if recipe.head_only:
                 network.segmentation.requires_grad_(False).eval()
-            with torch.autocast(device.type, torch.bfloat16):
-                outputs = forward(x)
-            loss = task.loss(outputs, y)
-            if teacher_network is not None and recipe.distil > 0.0:
-                taught = teach(teacher_network, x, task.input, mirror=recipe.seen_twice)
-            if taught:
-                loss = loss + recipe.distil * task.distillation(outputs, *taught)
-            if not torch.isfinite(loss):
-                raise FloatingPointError(f"the loss is {loss.item()} at step {step}; lower --learning-rate")
             optimizer.zero_grad(set_to_none=True)
-            torch.autograd.backward(loss)
+            total = torch.zeros((), device=device)
+            for inputs, *others in zip(*(array.chunk(recipe.accumulate) for array in arrays), strict=True):
+                x = inputs.contiguous(memory_format=torch.channels_last)
+                y = others[: samples.n_targets]
+                taught: tuple[Any, ...] = tuple(others[samples.n_targets :])
+                with torch.autocast(device.type, torch.bfloat16):
+                    outputs = forward(x)
+                loss = task.loss(outputs, y)
+                if teacher_network is not None and recipe.distil > 0.0:
+                    taught = teach(teacher_network, x, task.input, mirror=recipe.seen_twice)
+                if taught and isinstance(task, Task):
+                    loss = loss + recipe.distil * task.distillation(outputs, *taught)
+                loss = loss * (len(inputs) / len(arrays[0]))
+                torch.autograd.backward(loss)
+                total += loss.detach()
+            losses.append(total.item())
+            if not math.isfinite(losses[-1]):
+                raise FloatingPointError(f"the loss is {losses[-1]} at step {step}; lower --learning-rate")
             nn.utils.clip_grad_norm_(network.parameters(), 5.0)
             optimizer.step()
             step += 1
             _average(averaged, network, min(recipe.ema, (1 + step) / (10 + step)))
-            losses.append(loss.item())
             progress.update()
             progress.set_postfix(loss=f"{losses[-1]:.3f}")
-            if recipe.redraw_every and step % recipe.redraw_every == 0:
+            if isinstance(samples, Samples) and recipe.redraw_every and step % recipe.redraw_every == 0:
                 samples.redraw(averaged, step)
             if step % checkpoint_every == 0 or step == recipe.steps:
                 line: dict[str, Any] = {"step": step, "samples": step * recipe.batch}
@@ -226,18 +236,80 @@ def train(
                 if watch is not None:
                     figure, watched_loss, figures = watch.validate(averaged)
                     line |= {"validation_loss": round(watched_loss, 5), "validation": figures}
-                    if figure > best_figure and (fold is not None or only_simulated or given is not None):
+                    if figure > best_figure and stops:
                         best_figure, best = figure, copy.deepcopy(averaged.state_dict())
                     since_best = 0 if watched_loss < lowest_loss else since_best + checkpoint_every
                     lowest_loss = min(lowest_loss, watched_loss)
-                    epoch = max(1, len(real) // recipe.batch)
                     if recipe.halve_after and since_best >= recipe.halve_after * epoch:
                         halvings, since_best = halvings + 1, 0
                 curve.append(line)
                 log.write(json.dumps(line) + "\n")
                 log.flush()
-                save()
+                over = step >= _last(recipe, curve, epoch)
+                if over or time.monotonic() - saved_s >= save_every_s:
+                    save()
+                    saved_s = time.monotonic()
+                if over:
+                    break
     return checkpoint
+
+
+class _Data(NamedTuple):
+    """What a network is trained on and watched on."""
+
+    task: Task | Camera
+    samples: Samples | ImageSamples
+    watch: Watch | ImageWatch | None
+    hashes: dict[str, str]
+    n_real: int
+    teacher: nn.Module | None = None
+
+
+def _image_data(recipe: Recipe, camvid: Path | None, device: torch.device) -> _Data:
+    """The training images of CamVid; the validation images are watched."""
+    if camvid is None:
+        raise ValueError(f"no images to train {recipe.network} on; give --camvid")
+    task = Camera.of(recipe)
+    samples, watch = camvid_samples(task, camvid, device)
+    return _Data(task, samples, watch, {}, len(samples.images.names))
+
+
+def _scan_data(
+    recipe: Recipe,
+    device: torch.device,
+    kitti: Path | None,
+    simulated: Path | None,
+    scan_sets: Sequence[ScanFolder],
+    *,
+    given: RealScans | None,
+    fold: int | None,
+    teacher: Path | None,
+    n_workers: int,
+) -> _Data:
+    """Real and simulated scans, and the teacher; parameters are those of `train`."""
+    task = task_of(recipe)
+    objects = KittiObjects(kitti) if kitti else None
+    real, weights, hashes, watched = (
+        _real(recipe, objects, scan_sets, fold)
+        if given is None
+        else (given.scans, [1.0] * len(given.scans), given.hashes, given.watched)
+    )
+    if recipe.distil > 0.0 and teacher is None:
+        raise ValueError(f"the recipe distils ({recipe.distil:g}) but there is no teacher; give --teacher")
+    if teacher is not None and recipe.distil == 0.0 and (objects is None or recipe.task != "points"):
+        raise ValueError("the teacher is not used; give --distil, or train a network that labels points on --kitti")
+    onnx_teacher = OnnxTeacher(teacher, task) if teacher is not None and teacher.suffix == ".onnx" else None
+    if onnx_teacher is not None and recipe.distil == 0.0:
+        raise ValueError(f"{teacher}: an exported teacher does not label scans; give its checkpoint.pt, or --distil")
+    teacher_network = None if teacher is None or onnx_teacher else _teacher(teacher, task).to(device)
+    if teacher_network is not None and objects is not None and recipe.distil == 0.0:
+        extra = unlabeled_scans(objects, fold)
+        real = pseudo_labeled(teacher_network.cpu(), task, [*real, *extra])
+        weights += [len(extra) ** -0.5] * len(extra)
+    paths = sorted(simulated.glob("*.npz")) if simulated else []
+    samples = Samples(recipe, real, weights, paths, onnx_teacher, n_workers)
+    watch = Watch(samples, watched) if watched else None
+    return _Data(task, samples, watch, hashes, len(real), teacher_network)
 
 
 def _real(
@@ -274,6 +346,16 @@ def _few_of_each_drive(names: Sequence[str], drives: Sequence[str]) -> list[str]
             chosen.append(name)
         seen[drive] += 1
     return chosen
+
+
+def _last(recipe: Recipe, curve: Sequence[dict[str, Any]], epoch: int) -> int:
+    """The last step: that of the recipe, or where the validation figure has not improved for ``stop_after`` epochs."""
+    figures = [row["validation"]["mean"] or 0.0 for row in curve] if recipe.stop_after else []
+    if figures:
+        since = len(figures) - 1 - int(np.argmax(figures))  # each row is of an epoch
+        if since >= recipe.stop_after:
+            return int(curve[-1]["step"])
+    return recipe.steps
 
 
 def _schedule(recipe: Recipe, step: int) -> float:

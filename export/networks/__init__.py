@@ -9,16 +9,27 @@ from torch import nn
 
 from ..cards import card_of
 from ..recipe import Recipe, task_name
+from .camseg import CamSeg
 from .edge import PointSegEdge, SSADNetEdge
+from .fcn import FCN
 from .kulseg import KULSeg
 from .lodnn import LoDNN, LoDNNEdge
 from .pointseg import PointSeg
+from .segnet import SegNet
 from .squeezesegv2 import SqueezeSegV2
 from .ssadnet import SSADNet
+from .unet import UNet
 
 __all__ = ["EDGE", "build"]
 
 EDGE: dict[str, type[nn.Module]] = {"lodnn": LoDNNEdge, "pointseg": PointSegEdge, "ssadnet": SSADNetEdge}
+
+UNETS: dict[str, dict[str, Any]] = {
+    "unet": {},
+    "unet-small": {"width": 16},
+    "unet-small-leaky": {"width": 16, "leaky": True},
+    "unet-long": {"n_levels": 7},
+}
 
 
 def build(recipe: Recipe) -> nn.Module:
@@ -38,8 +49,20 @@ def build(recipe: Recipe) -> nn.Module:
     if recipe.edge:
         if recipe.network not in EDGE:
             raise ValueError(f"{recipe.network} has no network for small computers; expected {' or '.join(EDGE)}")
+        if recipe.network != "lodnn":
+            sizes["width"] = recipe.width
         return EDGE[recipe.network](**sizes)
+    if recipe.width != 1.0:
+        raise ValueError(f"width is {recipe.width:g}; only networks for small computers (--edge) have one")
     sizes["dropout"] = recipe.dropout
+    if recipe.network == "camseg":
+        return CamSeg(**sizes, early=recipe.deep_supervision > 0.0)
+    if recipe.network == "segnet":
+        return SegNet(**sizes)
+    if recipe.network.startswith("fcn"):
+        return FCN(stride=int(recipe.network[3:]), **sizes)
+    if recipe.network.startswith("unet"):
+        return UNet(**UNETS[recipe.network], **sizes)
     if recipe.network == "pointseg":
         return PointSeg(**sizes, deep_supervision=recipe.deep_supervision > 0.0)
     if recipe.network == "squeezesegv2":

@@ -1,0 +1,93 @@
+"""SegNet (Badrinarayanan et al., 2017): an encoder as VGG-16's, and a decoder that unpools by the encoder's positions.
+
+What the comparison on CamVid (Jebamikyous, 2021, section 3.1.1) leaves open, and the choices made here:
+
+* 13 + 13 convolutions, each followed by batch norm and ReLU, except for the last one, which makes the logits. The
+  decoder mirrors the encoder; its last convolution at each resolution makes the channels of the next.
+* Poolings of odd sizes round up, as in the authors' network (360 rows become 23 after four poolings), and unpooling
+  restores the size before.
+* Dropout is where Bayesian SegNet has it (Kendall et al., 2017): at the end of the three deepest encoders and of the
+  three deepest decoders.
+* Weights start from He's initialization; the authors start from VGG-16 trained on ImageNet.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from .pointseg import conv_bn_relu, initialize
+
+__all__ = ["VGG_16", "SegNet", "unpool"]
+
+VGG_16 = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+"""Channels of VGG-16's 13 convolutions, by resolution (Simonyan and Zisserman, 2015, configuration D)."""
+N_DROPPED = 3
+
+
+def unpool(x: Tensor, positions: Tensor, size: tuple[int, int]) -> Tensor:
+    """Put pooled values back where they were the maximum; all other values are 0.
+
+    Parameters
+    ----------
+    x : (B, C, H, W) float
+    positions : (B, C, H, W) int64
+        Row x width + column of each value, as `torch.nn.functional.max_pool2d` returns them.
+    size : (int, int)
+        Rows and columns of the result.
+    """
+    flat = x.new_zeros((x.shape[0], x.shape[1], size[0] * size[1]))
+    return flat.scatter(2, positions.flatten(2), x.flatten(2)).unflatten(2, size)
+
+
+class SegNet(nn.Module):
+    """Labels every pixel of an image.
+
+    Parameters
+    ----------
+    n_channels, n_classes : int
+        Channels of the input; classes of the output.
+    dropout : float
+        Probability of dropping a value.
+
+    Notes
+    -----
+    In: (B, n_channels, H, W) float32 of any size. Out: logits (B, n_classes, H, W) float32.
+    """
+
+    def __init__(self, *, n_channels: int = 3, n_classes: int = 11, dropout: float = 0.0) -> None:
+        super().__init__()
+        self.encoders, self.decoders = nn.ModuleList(), nn.ModuleList()
+        c_in = n_channels
+        for widths in VGG_16:
+            self.encoders.append(_convolutions([c_in, *widths]))
+            c_in = widths[-1]
+        for level, widths in reversed([*enumerate(VGG_16)]):
+            c_out = VGG_16[level - 1][-1] if level else 0
+            # The last convolution of all is the classifier.
+            self.decoders.append(_convolutions([*widths, c_out] if level else [*widths]))
+        self.dropout = nn.Dropout(dropout)
+        self.classifier = nn.Conv2d(VGG_16[0][0], n_classes, 3, padding=1)
+        initialize(self, self.classifier)
+
+    def forward(self, x: Tensor) -> Tensor:
+        pooled: list[tuple[Tensor, tuple[int, int]]] = []
+        for level, encoder in enumerate(self.encoders):
+            x = encoder(x)
+            size = (x.shape[2], x.shape[3])
+            x, positions = F.max_pool2d(x, 2, ceil_mode=True, return_indices=True)
+            pooled.append((positions, size))
+            if level >= len(self.encoders) - N_DROPPED:
+                x = self.dropout(x)
+        for level, decoder in enumerate(self.decoders):
+            x = decoder(unpool(x, *pooled.pop()))
+            if level < N_DROPPED:
+                x = self.dropout(x)
+        logits: Tensor = self.classifier(x)
+        return logits
+
+
+def _convolutions(widths: list[int]) -> nn.Sequential:
+    return nn.Sequential(*(conv_bn_relu(a, b, 3) for a, b in pairwise(widths)))
