@@ -13,8 +13,16 @@ from .errors import CardMismatchError, InferenceError
 from .geometry import draw_footprints, suppress_overlaps
 from .kernel_cache import njit
 from .perception import Box
+from .points import read_only
 
-__all__ = ["decode_classes", "decode_dense", "decode_scored_slots", "decode_slots", "decode_top_view"]
+__all__ = [
+    "decode_classes",
+    "decode_dense",
+    "decode_labels",
+    "decode_scored_slots",
+    "decode_slots",
+    "decode_top_view",
+]
 
 STRIDE = 4  # cells of the top view behind one cell of a box_dense output, along each axis
 MIN_EXTENT_M = 0.5  # smaller slots are empty
@@ -23,10 +31,8 @@ SIZE_RANGE_M = (0.2, 40.0)  # boxes are clipped to these sizes
 MAX_PROBABILITY = 1.02  # rounded to bfloat16, probabilities add up to a little more than 1
 
 
-def decode_classes(
-    output: NDArray[np.float32], kind: str, *, model: str = "the model"
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The most probable class of every pixel, and its probability.
+def decode_labels(output: NDArray[np.float32], kind: str, *, model: str = "the model") -> NDArray[np.uint8]:
+    """The most probable class of every pixel.
 
     Parameters
     ----------
@@ -38,10 +44,8 @@ def decode_classes(
 
     Returns
     -------
-    labels : (H, W) uint8
+    (H, W) uint8
         The lower class on ties.
-    scores : (H, W) float32
-        Softmax probability of that class, or the probability as given.
 
     Raises
     ------
@@ -52,15 +56,44 @@ def decode_classes(
     """
     values = _class_values(output, kind, model)
     labels = np.empty(values.shape[1:], dtype=np.uint8)
-    scores = np.empty(values.shape[1:], dtype=np.float32)
-    n_bad = fill_classes(values, kind == "class_logits", labels, scores)
+    n_bad, lowest, highest = fill_labels(values, labels)
     if n_bad:
         _raise_not_finite(n_bad, values.size, kind, model)
-    if kind == "class_probabilities" and scores.size and not (scores.min() >= 0.0 and scores.max() <= MAX_PROBABILITY):
+    if kind == "class_probabilities" and labels.size and not (lowest >= 0.0 and highest <= MAX_PROBABILITY):
         raise InferenceError(
-            f"{model}: probabilities of classes are {scores.min():g} to {scores.max():g}; expected 0 to 1. "
+            f"{model}: probabilities of classes are {lowest:g} to {highest:g}; expected 0 to 1. "
             "Check the card: an output without softmax is of kind class_logits"
         )
+    return labels
+
+
+def decode_classes(
+    output: NDArray[np.float32], kind: str, *, model: str = "the model"
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """The most probable class of every pixel, and its probability.
+
+    Parameters
+    ----------
+    output, kind, model
+        As in `decode_labels`, which is faster.
+
+    Returns
+    -------
+    labels : (H, W) uint8
+        The lower class on ties.
+    scores : (H, W) float32
+        Softmax probability of that class, or the probability as given.
+
+    Raises
+    ------
+    InferenceError, CardMismatchError
+        As `decode_labels`.
+    """
+    labels = decode_labels(output, kind, model=model)
+    values = _class_values(output, kind, model)
+    scores = values.max(axis=0)
+    if kind == "class_logits":
+        fill_scores(values, scores)
     return labels, scores
 
 
@@ -408,7 +441,7 @@ def _class_values(output: NDArray[np.float32], kind: str, model: str) -> NDArray
 
 
 def _check_finite(values: NDArray[np.float32], kind: str, model: str) -> None:
-    n_bad = values.size - int(np.count_nonzero(np.isfinite(values)))
+    n_bad = count_not_finite(values.reshape(-1))
     if n_bad:
         _raise_not_finite(n_bad, values.size, kind, model)
 
@@ -429,30 +462,28 @@ def _logit(probability: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def fill_classes(
-    values: NDArray[np.float32], are_logits: bool, labels: NDArray[np.uint8], scores: NDArray[np.float32]
-) -> int:
-    """Write every pixel's best class and its probability.
+def fill_labels(values: NDArray[np.float32], labels: NDArray[np.uint8]) -> tuple[int, float, float]:
+    """Write every pixel's best class.
 
     Parameters
     ----------
     values : (C, H, W) float32, C-contiguous
         Logits or probabilities.
-    are_logits : bool
     labels : (H, W) uint8, overwritten
         The lower class on ties.
-    scores : (H, W) float32, overwritten
 
     Returns
     -------
     n_bad : int
-        Number of values that are not finite; if there are any, the outputs are undefined.
+        Number of values that are not finite; if there are any, the other results are undefined.
+    lowest, highest : float
+        Lowest and highest value of a best class.
     """
     n_classes, height, width = values.shape
     n_bad = 0
-    total = np.empty(width, dtype=np.float32)
+    lowest, highest = math.inf, -math.inf
+    best = np.empty(width, dtype=np.float32)
     for row in range(height):
-        best = scores[row]
         label = labels[row]
         # Class by class along a row: each of these loops is compiled to vector instructions.
         for col in range(width):
@@ -467,8 +498,26 @@ def fill_classes(
         for c in range(n_classes):
             for col in range(width):
                 n_bad += 0 if abs(values[c, row, col]) < np.float32(math.inf) else 1
-        if not are_logits:
-            continue
+        for col in range(width):
+            lowest, highest = min(lowest, best[col]), max(highest, best[col])
+    return n_bad, lowest, highest
+
+
+@njit(cache=True, nogil=True)
+def fill_scores(values: NDArray[np.float32], scores: NDArray[np.float32]) -> None:
+    """Replace every pixel's best logit by its softmax probability.
+
+    Parameters
+    ----------
+    values : (C, H, W) float32, C-contiguous
+        Finite logits.
+    scores : (H, W) float32, modified
+        The largest logit of each pixel.
+    """
+    n_classes, height, width = values.shape
+    total = np.empty(width, dtype=np.float32)
+    for row in range(height):
+        best = scores[row]
         total[:] = 0.0
         for c in range(n_classes):
             for col in range(width):
@@ -486,7 +535,31 @@ def fill_classes(
                 total[col] += e * e
         for col in range(width):
             best[col] = np.float32(1.0) / total[col]
+
+
+@njit(cache=True, nogil=True)
+def count_not_finite(values: NDArray[np.float32]) -> int:
+    """Number of values (n,) that are not finite, without a temporary array."""
+    n_bad = 0
+    for i in range(len(values)):
+        n_bad += 0 if abs(values[i]) < np.float32(math.inf) else 1
     return n_bad
+
+
+@njit(cache=True, nogil=True)
+def clear_empty(returned: NDArray[np.bool_], is_box: NDArray[np.bool_], labels: NDArray[np.uint8]) -> None:
+    """Make cells of box classes without a return background.
+
+    Parameters
+    ----------
+    returned : (H, W) bool
+    is_box : (classes,) bool
+    labels : (H, W) uint8, modified
+    """
+    for row in range(labels.shape[0]):
+        for col in range(labels.shape[1]):
+            if is_box[labels[row, col]] and not returned[row, col]:
+                labels[row, col] = 0
 
 
 @njit(cache=True, nogil=True)
@@ -628,7 +701,7 @@ def decode_top_view(
     """
     assert isinstance(card.view, TopViewGeometry)
     kind = next(k for k in outputs if k.startswith("class_"))
-    labels, scores = decode_classes(outputs[kind], kind, model=card.name)
+    labels = decode_labels(outputs[kind], kind, model=card.name)
     found: list[Box] = []
     if "box_dense" in outputs:
         found = decode_dense(
@@ -644,9 +717,9 @@ def decode_top_view(
             iou_threshold=card.nms_iou,
             model=card.name,
         )
-        is_box = np.array([name in card.box_classes for name in card.classes])
-        boxed = np.flatnonzero(is_box[labels])  # indices, because these cells are few
-        labels.reshape(-1)[boxed[~returned.reshape(-1)[boxed]]] = 0
+        clear_empty(
+            read_only(returned, np.bool_), np.array([name in card.box_classes for name in card.classes]), labels
+        )
         draw_footprints(labels, found, card.view, card.classes)
     elif "box_slots" in outputs and outputs["box_slots"].shape[-1] == 5:
         found = decode_scored_slots(
@@ -665,8 +738,7 @@ def decode_top_view(
     elif "box_slots" in outputs:
         found = decode_slots(
             outputs["box_slots"],
-            labels,
-            scores,
+            *decode_classes(outputs[kind], kind, model=card.name),
             card.view,
             card.classes,
             card.box_classes,

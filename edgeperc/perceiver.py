@@ -23,7 +23,7 @@ from .adapt import Interpolator, condition, render
 from .agreement import RULES, agree_on_boxes, agree_on_cells, agree_on_points, find_voters
 from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, join_boxes, objects_from_points
-from .decode import decode_classes, decode_top_view
+from .decode import decode_labels, decode_top_view
 from .drivable import compile_kernels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
 from .fitness import Finding, FitnessProfile, check_fitness
@@ -581,7 +581,7 @@ class Perceiver:
         outputs = network.session.run() if infer else network.session.outputs
         watch.lap("infer")
         ((kind, raw),) = outputs.items()
-        labels, _ = decode_classes(raw, kind, model=card.name)
+        labels = decode_labels(raw, kind, model=card.name)
         watch.lap("decode")
         edges_meet = card.view.azimuth_left_deg - card.view.azimuth_right_deg == 360.0
         cleaned = remove_outliers(scan, network.index, labels, card.classes, full_turn=edges_meet)

@@ -364,17 +364,19 @@ def fill_point_labels(
                         contested[r, c % width] = True
     gaps = np.empty(N_VOTES)  # differences in range, smallest first
     votes = np.empty(N_VOTES, dtype=np.uint8)
+    label_of, index_of, contested_of = labels.reshape(-1), index.reshape(-1), contested.reshape(-1)
     for i in range(points.shape[0]):
         point_labels[i] = 0
         if pixel[i] < 0:
             continue
+        at = np.uint32(pixel[i])
+        if index_of[at] == i:
+            point_labels[i] = label_of[at]
+            continue
+        if not contested_of[at]:
+            continue
         row = pixel[i] // width
         col = pixel[i] - row * width
-        if index[row, col] == i:
-            point_labels[i] = labels[row, col]
-            continue
-        if not contested[row, col]:
-            continue
         own = distance_to(points, i)
         n = 0
         for r in range(max(row - WINDOW, 0), min(row + WINDOW + 1, height)):

@@ -74,7 +74,7 @@ def softmax(logits):
 
 
 def classes(values, are_logits):
-    """Twin of `edgeperc.decode.fill_classes`: labels, scores and the number of values that are not finite."""
+    """Twin of `edgeperc.decode.fill_labels` and `fill_scores`: labels, scores and the number of values that are not finite."""
     labels = np.argmax(values, axis=0).astype(np.uint8)
     probabilities = softmax(values) if are_logits else values
     return labels, probabilities.max(axis=0), int((~np.isfinite(values)).sum())
