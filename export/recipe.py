@@ -329,6 +329,7 @@ PUBLISHED = Recipe(
     ema=0.999,
     n_pasted=3.0,
     turn_anywhere=0.2,
+    drawn_roads=True,
     dropout=0.0,
 )
 
@@ -347,8 +348,8 @@ MODELS = {
     "ssadnet-sim": Stage(replace(SSADNET, simulated_share=1.0, steps=1300, cooldown=0.3)),
     "ssadnet-full": Stage(replace(SSADNET, steps=2000), after="ssadnet-sim"),
     # The papers' own networks at their full width, from random weights and on labels alone.
-    "ssadnet-paper": Stage(replace(PUBLISHED, network="ssadnet", head="slots")),
-    "lodnn-paper": Stage(replace(PUBLISHED, network="lodnn", drawn_roads=True)),
+    "ssadnet-paper": Stage(replace(PUBLISHED, head="slots")),
+    "lodnn-paper": Stage(replace(PUBLISHED, network="lodnn")),
     "pointseg": Stage(
         replace(EDGE, network="pointseg", front=False, drawn_roads=False, height_above_ground=True, n_pasted=6.0)
     ),
