@@ -30,7 +30,7 @@ from .losses import cross_entropy
 __all__ = ["ImageSamples", "ImageWatch", "LabeledImages", "augmented_images", "confusions", "normalized", "read_camvid"]
 
 # Bounds of the random scale, of the change of the aspect, and of the factors of brightness, contrast and saturation.
-SCALES = (0.5, 2.0)
+SCALES = (0.7, 2.0)
 ASPECT = 1.1
 JITTER = 0.4
 VALIDATION_BATCH = 8

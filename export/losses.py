@@ -67,6 +67,8 @@ def lovasz_softmax(logits: Tensor, labels: Tensor) -> Tensor:
 
     Shapes as for `cross_entropy`; the batch counts as one image.
     """
+    if logits.is_cuda:
+        return _lovasz_at_once(logits, labels)
     known = labels != IGNORE
     probabilities = logits.float().softmax(1).movedim(1, -1)[known]  # (n, C)
     labels = labels[known].long()
@@ -88,6 +90,21 @@ def lovasz_softmax(logits: Tensor, labels: Tensor) -> Tensor:
         steps = torch.cat([jaccard[:1], jaccard[1:] - jaccard[:-1]])
         losses.append(errors @ steps)
     return torch.stack(losses).mean() if losses else logits.float().sum() * 0.0
+
+
+def _lovasz_at_once(logits: Tensor, labels: Tensor) -> Tensor:
+    """`lovasz_softmax` of all classes and all errors at once: it sorts more, but never waits for the GPU."""
+    known, n_classes = (labels != IGNORE).flatten(), logits.shape[1]
+    probabilities = logits.float().softmax(1).movedim(1, 0).flatten(1)  # (C, n)
+    truth = (labels.flatten() == torch.arange(n_classes, device=labels.device)[:, None]).float()
+    # Unlabeled pixels have no error, so they are sorted behind all others and change nothing.
+    errors, order = ((truth - probabilities).abs() * known).sort(dim=1, descending=True)
+    truth = truth.gather(1, order)
+    total = truth.sum(1, keepdim=True)
+    jaccard = 1.0 - (total - truth.cumsum(1)) / (total + (1.0 - truth).cumsum(1))
+    steps = jaccard.diff(dim=1, prepend=jaccard.new_zeros((n_classes, 1)))
+    present = total[:, 0] > 0
+    return ((errors * steps).sum(1) * present).sum() / present.sum().clamp(min=1)
 
 
 def pointseg_loss(
