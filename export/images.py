@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -61,16 +61,17 @@ class LabeledImages(NamedTuple):
             F.interpolate(image[None].float(), size, mode="bilinear", antialias=True).round().byte()
             for image in self.images
         ]
-        labels = F.interpolate(self.labels[:, None], size, mode="nearest-exact")[:, 0]
-        return LabeledImages(self.names, torch.cat(images), labels)
+        labels = F.interpolate(self.labels[:, None].float(), size, mode="nearest-exact")[:, 0]
+        return LabeledImages(self.names, torch.cat(images), labels.byte())
 
     def to(self, device: torch.device) -> LabeledImages:
         """The same on a device."""
         return LabeledImages(self.names, self.images.to(device), self.labels.to(device))
 
 
+@lru_cache(maxsize=2)
 def read_camvid(root: Path, split: str) -> LabeledImages:
-    """Read CamVid: ``{split}/NAME`` images, ``{split}annot/NAME.png`` labels and ``classes.json``.
+    """Read CamVid, once: ``{split}/NAME`` images, ``{split}annot/NAME.png`` labels and ``classes.json``.
 
     Parameters
     ----------
@@ -297,6 +298,5 @@ def camvid_samples(task: Camera, root: Path, device: torch.device) -> tuple[Imag
         Where all images go.
     """
     size = (task.view.width, task.view.height)
-    train, validation = (read_camvid(root, split) for split in ("train", "val"))
-    watch = ImageWatch(task, validation.scaled(*size).to(device), validation.labels.to(device))
-    return ImageSamples(task, train.scaled(*size).to(device)), watch
+    train, validation = (read_camvid(root, split).to(device) for split in ("train", "val"))
+    return ImageSamples(task, train.scaled(*size)), ImageWatch(task, validation.scaled(*size), validation.labels)

@@ -334,7 +334,15 @@ PUBLISHED = Recipe(
 )
 
 CAMSEG = Recipe(
-    "camseg", steps=20_000, batch=16, learning_rate=3e-3, cooldown=0.8, ema=0.999, dropout=0.1, deep_supervision=0.4
+    "camseg",
+    steps=30_000,
+    batch=16,
+    learning_rate=3e-3,
+    weight_decay=0.02,
+    cooldown=0.8,
+    ema=0.999,
+    dropout=0.1,
+    deep_supervision=0.4,
 )
 
 MODELS = {
