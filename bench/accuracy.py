@@ -30,19 +30,21 @@ def agreement(reference: Sequence[Prediction], found: Sequence[Prediction]) -> d
     Returns
     -------
     dict
-        ``"n_scans"``; for ``"points"`` in view and ``"cells"``: the share of ``equal`` labels, and ``mean_iou`` with
-        the reference as ground truth; for ``"boxes"``: ``n_reference``, ``n_found``, ``n_both`` (IoU at least 0.5) and
-        ``f1``. An entry is None if the models do not predict it.
+        ``"n_scans"``; for ``"points"`` in view, ``"cells"`` and ``"pixels"`` of images: the share of ``equal`` labels,
+        and ``mean_iou`` with the reference as ground truth; for ``"boxes"``: ``n_reference``, ``n_found``, ``n_both``
+        (IoU at least 0.5) and ``f1``. An entry is None if the models do not predict it.
     """
-    result: dict[str, Any] = {"n_scans": len(reference), "points": None, "cells": None, "boxes": None}
-    points, cells = [], []
+    result: dict[str, Any] = {"n_scans": len(reference), "points": None, "cells": None, "pixels": None, "boxes": None}
+    points, cells, pixels = [], [], []
     for right, guess in zip(reference, found, strict=True):
         if right.points is not None and guess.points is not None:
             seen = right.points.in_view
             points.append((right.points.classes, guess.points.labels[seen], right.points.labels[seen]))
         if right.top_view is not None and guess.top_view is not None:
             cells.append((right.top_view.classes, guess.top_view.labels, right.top_view.labels))
-    for name, pairs in (("points", points), ("cells", cells)):
+        if right.image is not None and guess.image is not None:
+            pixels.append((right.image.classes, guess.image.labels, right.image.labels))
+    for name, pairs in (("points", points), ("cells", cells), ("pixels", pixels)):
         if pairs:
             confusion = Confusion(pairs[0][0])
             for _, guess_labels, right_labels in pairs:

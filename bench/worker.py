@@ -108,6 +108,7 @@ class Prediction:
     points: edgeperc.PointLabels | None
     top_view: edgeperc.TopView | None
     boxes: tuple[edgeperc.Box, ...]
+    image: edgeperc.ImageLabels | None = None
 
 
 OnTick = Callable[[str, Sequence[float]], None]

@@ -57,7 +57,7 @@ FLOORS = {
         evaluation.ab3dmot evaluation.causes evaluation.datasets evaluation.headings
         evaluation.scan_folder evaluation.tables
         evaluation.unseen evaluation.truth
-        evaluation.camvid evaluation.judge evaluation.tracking evaluation.transfer
+        evaluation.camvid evaluation.judge evaluation.painting evaluation.tracking evaluation.transfer
         evaluation.evaluate
         view.colors
         view.canvas view.content
@@ -66,7 +66,7 @@ FLOORS = {
         cli.arguments cli.output
         cli.scans
         cli.completion cli.fit_sensor cli.info cli.program cli.run
-        cli.demo cli.eval cli.eval_sensors cli.eval_tracking cli.lists
+        cli.demo cli.eval cli.eval_painting cli.eval_sensors cli.eval_tracking cli.lists
         cli.main
         cli.__init__
         __init__ __main__
@@ -99,7 +99,8 @@ FLOORS = {
         measure
         peers.__init__ peers.arithmetic peers.rounds
         peers.engines peers.ground peers.projection peers.tracking
-        peers.numpy_pipeline peers.networks peers.contenders
+        peers.camera peers.numpy_pipeline peers.networks
+        peers.contenders
         peers.tables
         peers.turns
         commands.common

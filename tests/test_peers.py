@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tiny_camera
 
 from edgeperc import ModelCard, Perceiver
 from edgeperc.mounting import MODEL_MOUNTING
@@ -21,6 +22,7 @@ from edgeperc_bench.accuracy import agreement
 from edgeperc_bench.peers import arithmetic, turns
 from edgeperc_bench.peers import contenders as peers
 from edgeperc_bench.peers.arithmetic import PRODUCT_SIZE, cost, matrix_product, n_taps_inside
+from edgeperc_bench.peers.camera import N_IMAGES, NumpyCamera, small_unet
 from edgeperc_bench.peers.engines import open_engine, torch_network
 from edgeperc_bench.peers.networks import resized
 from edgeperc_bench.peers.numpy_pipeline import NumpyPipeline, iou
@@ -292,6 +294,44 @@ def test_networks_are_measured_alone_and_in_pairs(alone: None, tmp_path: Path, s
     both = tables["Scan to result: pointseg:int8 and ssadnet:fp32"]
     assert {c.paths for c in both} == {(model_path("pointseg:int8"), model_path("ssadnet"))}
     assert [c.name for c in both if not peers.why_missing(c)] == ["edgeperc, cpu", "numpy + onnxruntime"]
+
+
+def test_camera_models_are_measured_with_images(alone: None, tmp_path: Path, scan: np.ndarray) -> None:
+    path = tiny_camera.write_camera(tmp_path)
+    ((title, contenders),) = made([str(path)], tmp_path, scan).items()
+    assert title == "Image to result: tinycam:fp32"
+    files = [tmp_path / "scan.npy"]
+    measured = measure([c for c in contenders if not peers.why_missing(c) and c.kind != "peak"], files, n_rounds=1)
+    assert [each.missing for each in measured] == [""] * 3
+    names = ["edgeperc, cpu", "numpy + onnxruntime", "onnxruntime cpu, network alone"]
+    assert [each.contender.name for each in measured] == names
+    assert [len(each.ms) for each in measured[:2]] == [N_IMAGES, N_IMAGES]
+    own, numpy_s, _ = (each.predictions for each in measured)
+    assert len(own) == N_IMAGES
+    assert agreement(own, numpy_s)["pixels"]["equal"] > 0.999
+    table = latency_table(title, measured, 1)
+    assert "images of simulated streets" in table["sentences"][1]
+    assert table["rows"][1][7] != "-"
+
+
+def test_the_camera_pipeline_in_numpy_gives_the_same_labels(tmp_path: Path) -> None:
+    path = tiny_camera.write_camera(tmp_path)
+    image = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
+    camera = NumpyCamera(ModelCard.read(path), open_engine("onnxruntime", "fp32", path, 1))
+    own = Perceiver(path, provider="cpu", n_threads=1)(image=image).image
+    found = camera(image).image
+    assert own is not None
+    assert found is not None
+    assert (found.labels == own.labels).mean() > 0.999
+
+
+def test_the_small_unet_labels_images() -> None:
+    pytest.importorskip("torch")
+    card = tiny_camera.camera_card()
+    image = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
+    for precision in ("fp32", "bf16"):
+        labels = small_unet(card, precision, 1)(image)
+        assert (labels.shape, labels.dtype, labels.max() < 3) == ((24, 32), np.uint8, True)
 
 
 def test_edgeperc_runs_in_every_precision_of_a_provider(

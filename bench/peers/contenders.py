@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from edgeperc.adapt import condition
-from edgeperc.card import ModelCard
+from edgeperc.card import CameraGeometry, ModelCard
+from edgeperc.image import ImageScaler
 from edgeperc.network_input import project
 from edgeperc.projection import make_projector
 from edgeperc.sensor import get_sensor
@@ -25,6 +26,7 @@ from edgeperc.zoo import DEFAULT, Variant, listed, resolve
 
 from ..samples import percentile
 from ..worker import Prediction
+from .camera import camera_images
 
 __all__ = ["INSTALL", "OPENVINO", "PEAKS", "Contender", "Measured", "default_models", "groups", "why_missing"]
 
@@ -54,6 +56,8 @@ class Contender:
         The models' cards, JSON.
     image : Path or None
         Input of a network alone, .npy.
+    inputs : tuple of Path
+        A camera's images, .npy, in place of the scans of the run.
     """
 
     name: str
@@ -63,6 +67,7 @@ class Contender:
     paths: tuple[Path, ...] = ()
     cards: tuple[str, ...] = ()
     image: Path | None = None
+    inputs: tuple[Path, ...] = ()
 
 
 @dataclass
@@ -121,15 +126,22 @@ def groups(
     sensor : str
     """
     points, _ = condition(np.load(scan), get_sensor(sensor), rendered=False)
-    views: dict[str, list[Variant]] = {"range_image": [], "top_view": []}
+    views: dict[str, list[Variant]] = {"range_image": [], "top_view": [], "camera": []}
     for name in models:
         variant = resolve(name)[0]
         views[variant.card.view.kind].append(variant)
     tables: dict[str, list[Contender]] = {}
-    for variant in (*views["range_image"], *views["top_view"]):
+    for variant in (*views["range_image"], *views["top_view"], *views["camera"]):
         card, paths = variant.card, (variant.path,)
         image = folder / f"{variant.path.stem}-input.npy"
-        np.save(image, project(make_projector(card.view, card.input), points).image)
+        images: tuple[Path, ...] = ()
+        if isinstance(card.view, CameraGeometry):
+            images = camera_images(card.view, folder)
+            batch = np.empty((len(card.input.channels), card.view.height, card.view.width), np.float32)
+            ImageScaler(card.view, card.input).fill(np.load(images[0]), batch)
+            np.save(image, batch)
+        else:
+            np.save(image, project(make_projector(card.view, card.input), points).image)
         alone = [
             Contender(f"onnxruntime {own}, network alone", "session", own, "auto", paths, image=image)
             for own in dict.fromkeys(("cpu", provider))
@@ -142,12 +154,15 @@ def groups(
         peaks = [
             Contender(f"peak {engine} {kind}".strip(), "peak", engine, kind) for engine, kind in (*PEAKS, ("copy", ""))
         ]
-        tables[f"Scan to result: {variant}"] = [
-            *_pipelines([variant], provider, precision), *_full_network(variant), *alone, *peaks
+        pipelines = _pipelines([variant], provider, precision)
+        if images:
+            pipelines = [replace(each, inputs=images) for each in (*pipelines, *_small_unet(variant))]
+        tables[f"{'Image' if images else 'Scan'} to result: {variant}"] = [
+            *pipelines, *_full_network(variant), *alone, *peaks
         ]  # fmt: skip
     for pair in zip(views["range_image"], views["top_view"], strict=False):
         tables[f"Scan to result: {pair[0]} and {pair[1]}"] = _pipelines(pair, provider, precision)
-    for view in ("range image", "top view"):
+    for view in ("range image", "top view") if views["range_image"] or views["top_view"] else ():
         rows = ("edgeperc, numba", view), ("numpy", f"{view}, numpy")
         tables[f"Projection: {view}"] = [Contender(name, "projection", call) for name, call in rows]
     for variant in views["top_view"]:
@@ -181,6 +196,12 @@ def _full_network(variant: Variant) -> list[Contender]:
         return []
     name, card = f"numpy + torch fp32, {path.stem}", ModelCard.read(path).to_json()
     return [Contender(name, "pipeline", "torch", "fp32", (path,), (card,))]
+
+
+def _small_unet(variant: Variant) -> list[Contender]:
+    """The small U-Net in torch at the size of a camera model's input (`camera.small_unet`)."""
+    card = variant.card.to_json()
+    return [Contender(f"torch {kind}, small U-Net", "unet", "torch", kind, (), (card,)) for kind in ("fp32", "bf16")]
 
 
 def _one_or_two(variant: Variant, folder: Path) -> list[Contender]:

@@ -172,6 +172,10 @@ def _in_torch(op: str, inputs: Sequence[Any], attributes: Mapping[str, Any]) -> 
         _, scales, *sizes = others
         size = sizes[0].tolist()[2:] if sizes else None
         return F.interpolate, [x, size, None if sizes else scales.tolist()[2:], "nearest"]
+    if op == "Resize" and attributes.get("mode") == b"linear":
+        _, scales, *sizes = others
+        size = sizes[0].tolist()[2:] if sizes else None
+        return F.interpolate, [x, size, None if sizes else scales.tolist()[2:], "bilinear"]
     if op == "DepthToSpace" and attributes.get("mode") == b"CRD":
         return F.pixel_shuffle, [x, attributes["blocksize"]]
     if op == "Reshape":

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import Box, PointLabels, TopView
-from edgeperc.card import ModelCard, TopViewGeometry
+from edgeperc.card import ModelCard, RangeImageGeometry, TopViewGeometry
 from edgeperc.geometry import draw_footprints
 from edgeperc.ground import find_ground
 from edgeperc.mounting import MODEL_HEIGHT_M
@@ -53,6 +53,7 @@ class NumpyPipeline:
             if isinstance(card.view, TopViewGeometry):
                 projector = NumpyTopView(card.view, card.input)
             else:
+                assert isinstance(card.view, RangeImageGeometry)
                 projector = NumpyRangeImage(card.view, card.input)
             index = np.empty(engine.input.shape[1:], np.int32)
             self.networks.append((card, engine, projector, index))

@@ -27,7 +27,7 @@ def latency_table(title: str, measured: Sequence[Measured], n_threads: int) -> d
     for each in shown:
         figures = summary(each.ms)
         same = agreement(first.predictions, each.predictions) if first.predictions and each.predictions else {}
-        equal = [same[kind]["equal"] for kind in ("points", "cells") if same.get(kind)]
+        equal = [same[kind]["equal"] for kind in ("points", "cells", "pixels") if same.get(kind)]
         boxes = same.get("boxes")
         rows.append(
             [
@@ -42,7 +42,9 @@ def latency_table(title: str, measured: Sequence[Measured], n_threads: int) -> d
         f"ms; {n_threads} threads for every library; ratios are to the first row; noise: spread of the medians of the "
         "three thirds; labels and boxes: those equal to the first row's"
     ]
-    if any(each.contender.kind == "pipeline" for each in shown):
+    if first.contender.inputs:
+        sentences.append("images of simulated streets, at the size of the model's input")
+    elif any(each.contender.kind == "pipeline" for each in shown):
         sentences.append("the numpy pipelines leave out PointSeg's removal of outliers, so they do less than edgeperc")
     for alone in shown:
         if alone.contender.kind != "network" or (alone.contender.engine, alone.contender.precision) not in OPENVINO:

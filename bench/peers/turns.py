@@ -26,6 +26,7 @@ from ..context import conditions, disturbances, rss_mb
 from ..worker import Prediction
 from . import projection
 from .arithmetic import matrix_product, memory_copy
+from .camera import NumpyCamera, small_unet
 from .contenders import Contender, Measured, groups, why_missing
 from .engines import Engine, open_engine
 from .numpy_pipeline import NumpyPipeline
@@ -41,7 +42,7 @@ Calls = list[Callable[[], object]]
 # What runs in a contender's process: each function returns one call per scan
 
 
-def make_perceiver(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
+def make_perceiver(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
     """edgeperc itself."""
     perceive = Perceiver(
         list(contender.paths),
@@ -53,14 +54,26 @@ def make_perceiver(contender: Contender, scans: Sequence[NDArray[np.float32]], s
         boxes_from="network",  # as the numpy pipelines
         agree=False,
     )
+    if contender.inputs:
+        return [partial(perceive, image=image) for image in scans]
     return [partial(perceive, scan) for scan in scans]
 
 
-def make_pipeline(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
+def make_pipeline(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
     """The pipeline in numpy around another engine."""
+    if contender.inputs:
+        (path,), card = contender.paths, ModelCard.from_json(contender.cards[0])
+        camera = NumpyCamera(card, open_engine(contender.engine, contender.precision, path, n_threads))
+        return [partial(camera, image) for image in scans]
     engines = [open_engine(contender.engine, contender.precision, path, n_threads) for path in contender.paths]
     pipeline = NumpyPipeline([ModelCard.from_json(card) for card in contender.cards], engines, get_sensor(sensor))
     return [partial(pipeline, scan) for scan in scans]
+
+
+def make_unet(contender: Contender, images: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
+    """The small U-Net in torch, from image to labels, which mean nothing and are not compared."""
+    label = small_unet(ModelCard.from_json(contender.cards[0]), contender.precision, n_threads)
+    return [partial(label, image) for image in images]
 
 
 def make_network(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor: str, n_threads: int) -> Calls:
@@ -94,6 +107,7 @@ def make_peak(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor
 MAKERS: Mapping[str, Callable[[Contender, Sequence[NDArray[np.float32]], str, int], Calls]] = {
     "edgeperc": make_perceiver,
     "pipeline": make_pipeline,
+    "unet": make_unet,
     "session": make_network,
     "network": make_network,
     "projection": make_projection,
@@ -108,7 +122,7 @@ def serve(connection: Any, contender: Contender, files: Sequence[Path], sensor: 
     try:
         calls = MAKERS[contender.kind](contender, [np.load(file) for file in files], sensor, n_threads)
         results: list[Any] = [call() for call in calls]
-        predictions = [Prediction(r.points, r.top_view, r.boxes) for r in results if hasattr(r, "top_view")]
+        predictions = [Prediction(r.points, r.top_view, r.boxes, r.image) for r in results if hasattr(r, "top_view")]
         connection.send(("ready", predictions, rss_mb()))
         del results, predictions
         while connection.recv() == "turn":
@@ -177,7 +191,8 @@ def measure(
                 continue
             note(contender.name)
             here, there = spawn.Pipe()
-            process = spawn.Process(target=serve, args=(there, contender, tuple(files), sensor, n_threads))
+            inputs = contender.inputs or tuple(files)
+            process = spawn.Process(target=serve, args=(there, contender, inputs, sensor, n_threads))
             with _threads(n_threads):
                 process.start()
             there.close()
@@ -253,7 +268,7 @@ def run(
                 f"{title}: {each}" for each in disturbances(document["machine"], before, conditions(), own_s)
             ]
             document["peers"][title] = [
-                asdict(replace(each.contender, paths=(), cards=(), image=None))
+                asdict(replace(each.contender, paths=(), cards=(), inputs=(), image=None))
                 | {"models": [path.name for path in each.contender.paths]}
                 | {"rounds": each.rounds, "rss_mb": each.rss_mb, "missing": each.missing}
                 for each in measured
