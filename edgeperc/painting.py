@@ -86,11 +86,12 @@ def paint(
 
     Notes
     -----
-    The work is bounded: a point covers at most 49 x 49 cells of the depth buffer. The figures hold for ten simulated
-    streets, a camera mounted as KITTI's, and points at least three pixels from every edge of the true class image. Of
-    the points that take a class, 99.9 % take that of their own surface (HDL-64E, OS1-64 and VLP-16); 99.7 % without the
-    test for hidden points. Of the points that the camera sees, 98 % take a class. With the camera 0.9 m from the LiDAR,
-    it is 99.6 % (HDL-64E; 95.0 % without the test) and 98.8 % (VLP-16).
+    The work is bounded: a point covers at most 49 x 49 cells of the depth buffer.
+
+    On ten simulated streets (``edgeperc eval-painting``), at least 99.9 % of the painted points, 3 pixels from edges of
+    classes, have the class of their own surface with an HDL-64E, an OS1-64 and a VLP-16 and the camera 0.3 m from the
+    LiDAR; with the camera 0.9 m away 99.9, 99.9 and 99.7 %, against 97.1, 97.5 and 96.8 % without the test for hidden
+    points. 98, 96 and 99 % of the points that the camera sees are painted.
 
     Examples
     --------
@@ -144,8 +145,8 @@ def camera_road(
 
     Notes
     -----
-    On the same streets, 97.8 % of the observed cells outside vehicles are right with an HDL-64E, 96.0 % with an OS1-64;
-    98.4 and 98.0 % within 26 m. With a VLP-16 it is 87 %: a few rings show little of the ground between them.
+    On ten simulated streets (``edgeperc eval-painting``), 97.3, 95.4 and 94.0 % of the seen cells outside vehicles are
+    rightly road or not with an HDL-64E, an OS1-64 and a VLP-16; 98.9, 98.7 and 97.6 % up to 26 m.
 
     An error of the ground's height or of the camera's pitch moves the road away from the camera or towards it: at 20 m
     and 1.65 m above the road, 0.1 m of height by 1.2 m, 0.1 degree of pitch by 0.4 m.

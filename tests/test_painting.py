@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections import Counter
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,28 +26,24 @@ from edgeperc import (
     PointsError,
     SensorError,
     camera_road,
+    cli,
     paint,
     road_ahead,
 )
 from edgeperc.card import TopViewGeometry
+from edgeperc.evaluation.painting import _beside_edges, count_painting
 from edgeperc.mounting import MODEL_MOUNTING
 from edgeperc.painting import MAX_CELLS, UNSEEN, fill_nearest, fill_painted
-from edgeperc.simulation.camera import CAMERA_CLASSES, VOID, CameraImage, forward_camera, render, true_classes
+from edgeperc.simulation.camera import CAMERA_CLASSES, VOID, CameraImage, forward_camera, render
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import SimulatedScan, simulate
 
-ROAD, CAR = CAMERA_CLASSES.index("Road"), CAMERA_CLASSES.index("Car")
+ROAD = CAMERA_CLASSES.index("Road")
 SCENES = ((2_000_000_000, "urban"), (2_000_000_001, "residential"), (2_000_000_002, "junction"))
 NEAR = forward_camera(640, 480)
 
 
-def moved_camera(right_m: float, down_m: float, ahead_m: float) -> Calibration:
-    T = NEAR.T_camera_sensor.copy()
-    T[:3, 3] = -right_m, -down_m, -ahead_m
-    return Calibration(NEAR.K, T, NEAR.width, NEAR.height)
-
-
-FAR = moved_camera(-0.5, 0.6, 0.5)  # 0.9 m from the LiDAR
+FAR = forward_camera(640, 480, at_m=(0.5, 0.5, -0.6))  # 0.9 m from the LiDAR
 
 
 @cache
@@ -58,13 +57,6 @@ def seen(scene: int, sensor: str, calibration: Calibration) -> tuple[SimulatedSc
 def perceived(scan: SimulatedScan, image: CameraImage, mounting: Mounting = MODEL_MOUNTING) -> Perception:
     labels = ImageLabels(image.labels, CAMERA_CLASSES)
     return Perception(len(scan.points), 0, None, None, (), {}, {}, (), None, mounting, image=labels)
-
-
-def beside_edges(labels: np.ndarray, reach: int = 3) -> np.ndarray:
-    """Pixels with another class within ``reach`` pixels along rows and columns."""
-    wide = np.pad(labels, reach, mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(wide, (2 * reach + 1, 2 * reach + 1))
-    return (windows.min(axis=(2, 3)) != labels) | (windows.max(axis=(2, 3)) != labels)
 
 
 # --- kernels ----------------------------------------------------------------------------------------------------------
@@ -124,26 +116,30 @@ def test_a_window_is_bounded() -> None:
 
 @pytest.mark.parametrize(("sensor", "calibration"), [("hdl-64e", NEAR), ("hdl-64e", FAR), ("os1-64", NEAR)])
 def test_points_get_the_class_of_their_surface(sensor: str, calibration: Calibration) -> None:
-    right = judged = without = covered = visible = 0
-    for scene in range(len(SCENES)):
-        scan, image = seen(scene, sensor, calibration)
-        painted, true = paint(image.labels, scan.points, calibration, sensor=sensor), true_classes(scan)
-        u, v, depth = calibration.project(scan.points)
-        inside = (u > 0.0) & (u < calibration.width - 1.0) & (v > 0.0) & (v < calibration.height - 1.0)
-        row, col = np.rint(v[inside]).astype(int), np.rint(u[inside]).astype(int)
-        away = ~beside_edges(image.labels)[row, col] & (true[inside] != VOID) & (image.labels[row, col] != VOID)
-        took = painted[inside] != UNSEEN
-        right += np.count_nonzero((painted[inside] == true[inside])[took & away])
-        judged += np.count_nonzero(took & away)
-        without += np.count_nonzero((image.labels[row, col] == true[inside])[away]) / np.count_nonzero(away)
-        shown = away & (depth[inside] <= 1.02 * image.depth_m[row, col] + 0.3)
-        covered += np.count_nonzero(took & shown)
-        visible += np.count_nonzero(shown)
-        assert not (painted[~inside] != UNSEEN)[~np.isfinite(u[~inside])].any()
-    assert judged > 10_000
-    assert right / judged >= 0.99
-    assert right / judged > without / len(SCENES)  # than each point with the class of its pixel, hidden or not
-    assert covered / visible >= 0.94
+    n = sum((count_painting(*seen(k, sensor, calibration), calibration, sensor) for k in range(3)), Counter[str]())
+    assert n["painted"] > 10_000
+    assert n["right"] / n["painted"] >= 0.99
+    assert n["right"] / n["painted"] > n["right_untested"] / n["in_image"]  # each point with the class of its pixel
+    assert n["seen"] / n["visible"] >= 0.94
+
+
+def test_points_beside_edges_are_not_judged() -> None:
+    labels = np.zeros((12, 20), np.uint8)
+    labels[4, 10] = 1
+    wanted = np.zeros(labels.shape, bool)
+    wanted[1:8, 7:14] = True
+    np.testing.assert_array_equal(_beside_edges(labels), wanted)
+
+
+def test_evaluate_painting(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["eval-painting", "--sensor", "vlp-16", "--scenes", "1", "--json", str(tmp_path / "out.json")]) == 0
+    assert "1 simulated street;" in (out := capsys.readouterr().out)
+    assert out.count("0.9 m") == 2
+    figures = json.loads((tmp_path / "out.json").read_text("utf-8"))
+    assert figures["vlp-16, 0.3 m"]["points_right"] > 0.99
+    assert figures["vlp-16, 0.3 m"]["n_points"] > 500
+    assert cli.main(["eval-painting", "--scenes", "0"]) == 2
+    assert "n_scenes is 0; expected at least 1" in capsys.readouterr().err
 
 
 def test_a_hidden_point_is_not_painted() -> None:
@@ -154,7 +150,7 @@ def test_a_hidden_point_is_not_painted() -> None:
     ground = np.column_stack([np.repeat(np.arange(3.0, 15.0, 0.2), 60), np.tile(np.arange(-6.0, 6.0, 0.2), 60)])
     ground = np.column_stack([ground, np.full(len(ground), -1.73)])
     points = np.concatenate([screen, wall, ground]).astype(np.float32)
-    low = moved_camera(0.0, 0.8, 0.0)
+    low = forward_camera(640, 480, at_m=(0.0, 0.0, -0.8))
     u, v, _ = low.project(points)
     labels = np.full((480, 640), 7, np.uint8)
     painted = paint(labels, points, low)
@@ -255,21 +251,15 @@ def test_a_sensor_that_is_mounted_otherwise() -> None:
 
 
 def test_the_road_of_an_image_lies_on_the_roads_of_the_scene() -> None:
-    right = observed = road_seen = road_there = 0
-    for scene in range(len(SCENES)):
-        scan, image = seen(scene, "hdl-64e", NEAR)
-        found = camera_road(perceived(scan, image), scan.points, NEAR)
-        true = scan.top_view_labels()
-        judged = found.observed & (true < 2)  # below vehicles, it depends on how far the camera sees under them
-        right += np.count_nonzero((found.road == (true == 1))[judged])
-        observed += np.count_nonzero(judged)
-        road_seen += np.count_nonzero(judged & (true == 1))
-        road_there += np.count_nonzero(true == 1)
-        assert found.classes == ("background", "drivable")
-        assert found.drivable_area_m2 > 50.0
-        assert road_ahead(found).free_ahead_m() > 6.0
-    assert right / observed >= 0.96
-    assert road_seen / road_there >= 0.5
+    n = sum((count_painting(*seen(k, "hdl-64e", NEAR), NEAR, "hdl-64e") for k in range(3)), Counter[str]())
+    assert n["cells_right"] / n["cells"] >= 0.96
+    assert n["near_right"] / n["near_cells"] >= 0.97
+    assert n["road_observed"] / n["road"] >= 0.5
+    scan, image = seen(0, "hdl-64e", NEAR)
+    found = camera_road(perceived(scan, image), scan.points, NEAR)
+    assert found.classes == ("background", "drivable")
+    assert found.drivable_area_m2 > 50.0
+    assert road_ahead(found).free_ahead_m() > 6.0
 
 
 def test_cells_behind_a_car_are_not_seen() -> None:

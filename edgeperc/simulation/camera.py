@@ -52,8 +52,14 @@ class CameraImage:
     depth_m: NDArray[np.float32]
 
 
-def forward_camera(width: int = 960, height: int = 720, *, fov_deg: float = 60.0) -> Calibration:
-    """Make the calibration of a camera that looks ahead, mounted as KITTI's: 0.27 m ahead of the LiDAR, 0.08 m lower.
+def forward_camera(
+    width: int = 960,
+    height: int = 720,
+    *,
+    fov_deg: float = 60.0,
+    at_m: tuple[float, float, float] = (0.27, 0.0, -0.08),
+) -> Calibration:
+    """Make the calibration of a camera that looks ahead.
 
     Parameters
     ----------
@@ -61,11 +67,13 @@ def forward_camera(width: int = 960, height: int = 720, *, fov_deg: float = 60.0
         Size of the image [px].
     fov_deg : float
         Horizontal field of view [deg].
+    at_m : tuple of 3 float
+        Place of the camera in the frame of the LiDAR: x ahead, y left, z up [m]. By default as on KITTI's car.
     """
     focal = width / (2.0 * math.tan(math.radians(fov_deg) / 2.0))
     K = np.array([[focal, 0.0, (width - 1) / 2.0], [0.0, focal, (height - 1) / 2.0], [0.0, 0.0, 1.0]])
     T_camera_sensor = _AHEAD.T.copy()
-    T_camera_sensor[:3, 3] = 0.0, -0.08, -0.27
+    T_camera_sensor[:3, 3] = -T_camera_sensor[:3, :3] @ at_m
     return Calibration(K, T_camera_sensor, width, height)
 
 
