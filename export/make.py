@@ -143,7 +143,8 @@ def finish(
         A key of `MODELS`, and the name of the model.
     checkpoint : Path
     path : Path
-        The .onnx file to write. The JSON file has the same name, but ends in .json.
+        The .onnx file to write. The JSON file has the same name, but ends in .json. If ``ssadnet-sim.onnx`` is in the
+        same folder, its road is the ground truth of KITTI's scans.
     kitti, semantickitti, fold, version
         As for `make`.
     """
@@ -156,8 +157,9 @@ def finish(
     if kitti is not None:
         datasets = {"KITTI": kitti, **datasets}
     # SSADNet 3.1.2 takes another network's road as ground truth where no road is labeled.
-    learned_road = "drivable" in card.classes and (stage.after or stage.teacher) is not None
-    road_by = path.with_name(f"{ROAD_TRUTH}.onnx") if learned_road and kitti is not None else None
+    truth = path.with_name(f"{ROAD_TRUTH}.onnx")
+    learned_road = "drivable" in card.classes and kitti is not None and path != truth and truth.exists()
+    road_by = truth if learned_road else None
     # The figures of a card are of its network alone.
     figures, _ = evaluate([*datasets.values()], [path], fold=fold, road_by=road_by, rules=())
     command = ["edgeperc eval", *datasets, f"--model {name}"]
