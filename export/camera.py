@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 import torch.nn.functional as F
@@ -24,9 +24,10 @@ ImageOutputs: TypeAlias = "Tensor | tuple[Tensor, ...]"
 
 CLASS_SHARES = (0.169, 0.233, 0.010, 0.317, 0.045, 0.097, 0.012, 0.011, 0.059, 0.006, 0.003)
 """Shares of CamVid's classes among the pixels of the training images."""
-# Of the Lovasz-softmax loss: every fourth row and column, from a random first one. Sorting all pixels of all classes
-# would take longer than the network.
-LOVASZ_STRIDE = 4
+# Rows and columns of which one is compared, from a random first one: of logits coarser than the labels, whose
+# neighbors are alike, in the cross-entropy, and of all logits in the Lovasz-softmax loss, which sorts them. With all
+# pixels, the losses would take longer than a small network.
+COARSE_STRIDE, LOVASZ_STRIDE, EARLY_STRIDE = 2, 4, 4
 
 
 @dataclass(frozen=True)
@@ -67,21 +68,30 @@ class Camera:
     def loss(self, outputs: ImageOutputs, targets: tuple[Tensor, ...] | list[Tensor]) -> Tensor:
         """Cross-entropy (categorical, as in the comparison) and, by the recipe, `lovasz_softmax` and early logits.
 
-        Logits are interpolated to the labels (B, H, W). Early logits count with cross-entropy alone.
+        Logits are interpolated to the labels (B, H, W). If they are coarser, every second row and column is compared.
+        Early logits count with cross-entropy alone, at a quarter of the labels' resolution.
         """
         recipe, (labels,) = self.recipe, targets
         weights = _weights(labels.device) if recipe.class_weights else None
         logits, *early = [outputs] if isinstance(outputs, Tensor) else outputs
-        size = labels.shape[1:]
-        logits = upsampled(logits, size)
-        loss = cross_entropy(logits, labels, weights)
+        coarse = logits.shape[2:] != labels.shape[1:]
+        logits = upsampled(logits, labels.shape[1:])
+        few: Any = _every(COARSE_STRIDE) if coarse else ...
+        loss = cross_entropy(logits[few], labels[few], weights)
         if recipe.lovasz_weight > 0.0:
-            row, col = torch.randint(LOVASZ_STRIDE, (2,)).tolist()
-            few = (..., slice(row, None, LOVASZ_STRIDE), slice(col, None, LOVASZ_STRIDE))
+            few = _every(LOVASZ_STRIDE)
             loss = loss + recipe.lovasz_weight * lovasz_softmax(logits[few], labels[few])
+        few = (..., slice(EARLY_STRIDE // 2, None, EARLY_STRIDE), slice(EARLY_STRIDE // 2, None, EARLY_STRIDE))
         for one in early:
-            loss = loss + recipe.deep_supervision * cross_entropy(upsampled(one, size), labels, weights)
+            one = upsampled(one, labels[few].shape[1:])
+            loss = loss + recipe.deep_supervision * cross_entropy(one, labels[few], weights)
         return loss
+
+
+def _every(stride: int) -> tuple[Any, ...]:
+    """An index that takes one row and column in ``stride`` of the last two axes, from a random first one."""
+    row, col = torch.randint(stride, (2,)).tolist()
+    return (..., slice(row, None, stride), slice(col, None, stride))
 
 
 def class_weights() -> tuple[float, ...]:
