@@ -52,7 +52,7 @@ class FakePerceiver:
         self.cards = tuple(known[name] for name in models)
         FakePerceiver.made.append(self)
 
-    def __call__(self, points, stamp_s=None) -> Perception:
+    def __call__(self, points, stamp_s=None, *, image=None) -> Perception:
         if len(points) and points[0, 3] == 1.0:
             raise InferenceError("pointseg answered\nwith NaN")
         if len(points) and points[0, 3] == 2.0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections import Counter
 from dataclasses import replace
 from functools import cache
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tiny_camera
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -37,6 +39,8 @@ from edgeperc.painting import MAX_CELLS, UNSEEN, fill_nearest, fill_painted
 from edgeperc.simulation.camera import CAMERA_CLASSES, VOID, CameraImage, forward_camera, render
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import SimulatedScan, simulate
+from edgeperc.view import draw_painted
+from edgeperc.view.colors import color_of, rgb
 
 ROAD = CAMERA_CLASSES.index("Road")
 SCENES = ((2_000_000_000, "urban"), (2_000_000_001, "residential"), (2_000_000_002, "junction"))
@@ -317,3 +321,58 @@ def test_what_does_not_fit_is_refused() -> None:
         paint(labels, points, NEAR, sensor="hdl-65e")
     with pytest.raises(OptionError, match="mounting"):
         paint(labels, points, NEAR, mounting="roof")  # type: ignore[arg-type]
+
+
+# --- picture and demo -------------------------------------------------------------------------------------------------
+
+
+def test_draw_painted(tmp_path: Path) -> None:
+    pillow = pytest.importorskip("PIL.Image")
+    pytest.importorskip("matplotlib")
+    scan, image = seen(0, "hdl-64e", NEAR)
+    found = perceived(scan, image)
+    png = draw_painted(found, image.rgb, scan.points, NEAR, tmp_path / "both.png", title="a street")
+    assert (tmp_path / "both.png").read_bytes() == png
+    with pillow.open(tmp_path / "both.png") as picture:
+        assert picture.size[0] == 1600
+        whole = np.asarray(picture.convert("RGB")).astype(np.int16)
+    # Without any class, the same picture has no color of a class beside the image itself.
+    nothing = replace(found, image=ImageLabels(np.full_like(image.labels, VOID), CAMERA_CLASSES))
+    draw_painted(nothing, image.rgb, scan.points, NEAR, tmp_path / "nothing.png")
+    with pillow.open(tmp_path / "nothing.png") as picture:
+        empty = np.asarray(picture.convert("RGB")).astype(np.int16)
+    car = (rgb([color_of("car")])[0] * 255.0).round()
+    dots = [int((np.abs(each - car).max(axis=2) < 12).sum()) for each in (whole, empty)]
+    assert dots[0] > 300
+    assert dots[1] == 0
+    wide = forward_camera(1240, 376)
+    labels = ImageLabels(np.zeros((376, 1240), np.uint8), ("Sky",))
+    draw_painted(replace(found, image=labels), np.zeros((376, 1240, 3), np.uint8), scan.points, wide)
+
+    with pytest.raises(ImageError, match="of a perception of an image of shape"):
+        draw_painted(found, image.rgb[:-1], scan.points, NEAR)
+    with pytest.raises(ImageError, match="of a perception of no image"):
+        draw_painted(replace(found, image=None), image.rgb, scan.points, NEAR)
+    with pytest.raises(PointsError, match="expected the scan that was perceived"):
+        draw_painted(found, image.rgb, scan.points[:-1], NEAR)
+    with pytest.raises(CalibrationError, match="calibration is for"):
+        draw_painted(found, image.rgb, scan.points, wide)
+
+
+def test_the_demo_with_a_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("onnxruntime")
+    options = ("--out", str(tmp_path / "out"), "--model", "pointseg")
+    assert cli.main(["demo", "--camera", *options]) == 0
+    out = capsys.readouterr().out
+    assert "it is no photograph" in out
+    assert "no model of a camera's images ran" in out
+    assert "the scene's true classes, not those of a network" in out
+    assert float(re.search(r"([\d.]+) % of them have the class of their surface", out)[1]) > 98.0  # type: ignore[index]
+    assert float(re.search(r"(\d+) m2 of the image's road", out)[1]) > 100.0  # type: ignore[index]
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {"camera.png", "scene.html", "scene.png"}
+    # A network that calls every pixel road, sky or tree.
+    assert cli.main(["demo", "--camera", *options, "--model", str(tiny_camera.write_camera(tmp_path))]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"camera +\d+ % of the pixels get their true class\n", out)
+    assert "the scene's true classes, not those of a network" in out

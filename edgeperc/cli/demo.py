@@ -71,9 +71,8 @@ def demo_command(arguments: argparse.Namespace) -> int:
     from ..simulation.scene import simulate
     from ..zoo import shipped_models
 
-    if arguments.camera and CAMERA in shipped_models():
-        given = arguments.model or DEFAULT
-        arguments.model = [*given, *([] if any(name.partition(":")[0] == CAMERA for name in given) else [CAMERA])]
+    if arguments.camera and not arguments.model and CAMERA in shipped_models():
+        arguments.model = [*DEFAULT, CAMERA]
     perceive = make_perceiver(arguments, sensor="hdl-64e", on_mismatch="ignore")
     scan = simulate(random_scene(*DEMO_SCENE), "hdl-64e", DEMO_SCENE[0])
     image = None
@@ -131,7 +130,7 @@ def _camera_rows(
     rows = [("image", f"{calibration.width} x {calibration.height} pixels, drawn from the scene; it is no photograph")]
     known, found, source = drawn.labels != VOID, perception.image, "the network's classes"
     if found is None:
-        rows.append(("camera", f"no model of a camera's images ran; '{CAMERA}' is that of this version, if installed"))
+        rows.append(("camera", "no model of a camera's images ran"))
     else:
         names = [name.casefold() for name in CAMERA_CLASSES]
         to_camvid = np.array([names.index(n) if (n := name.casefold()) in names else VOID for name in found.classes])
