@@ -270,7 +270,7 @@ def png(width: int, height: int, depth: int, color: int, rows: bytes) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
-@pytest.mark.parametrize("kind", ["PNG", "BMP", "TIFF", "PPM", "JPEG", "WEBP"])
+@pytest.mark.parametrize("kind", ["PNG", "BMP", "PPM", "JPEG", "WEBP"])
 def test_files_are_read(tmp_path: Path, image: NDArray[np.uint8], kind: str) -> None:
     pillow = pytest.importorskip("PIL.Image")
     path = tmp_path / "image.bin"  # the content decides
@@ -330,8 +330,8 @@ def test_files_that_are_not_images(tmp_path: Path, image: NDArray[np.uint8]) -> 
         "16 bits of color": (png(5, 4, 16, 2, rows), "more than 8 bits a channel"),
         "bits": (saved(picture.convert("1"), "PNG"), "of mode 1; expected colors"),
         "cmyk": (saved(picture.convert("CMYK"), "JPEG"), "of mode CMYK; expected colors"),
-        "float": (saved(picture.convert("F"), "TIFF"), "more than 8 bits a channel"),
-        "two": (saved(picture, "TIFF", save_all=True, append_images=[picture]), "the file holds 2 images"),
+        "tiff": (saved(picture, "TIFF"), "another format than BMP"),
+        "two": (saved(picture, "PNG", save_all=True, append_images=[picture.rotate(9)]), "the file holds 2 images"),
         "gigantic": (png(9000, 9000, 8, 2, b""), "9000 x 9000; expected at most 67,108,864 pixels"),
         "more than Pillow opens": (png(60_000, 60_000, 8, 2, b""), "3600000000 pixels"),
         "long": (png(MAX_EDGE + 1, 1, 8, 2, b""), "expected at most 67,108,864 pixels and 32,768 along an edge"),

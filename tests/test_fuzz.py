@@ -38,7 +38,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 CORPUS = sorted((Path(__file__).parent / "fuzz" / "corpus").iterdir())
 
 
-@pytest.mark.parametrize(("kind", "cases"), [("scans", 600), ("trackers", 250), ("models", 250)])
+@pytest.mark.parametrize(("kind", "cases"), [("scans", 600), ("trackers", 250), ("models", 250), ("images", 400)])
 def test_a_round(kind: str, cases: int) -> None:
     module = importlib.import_module(f"fuzz.{kind}")
     state = run_job(lambda: module.make(7), State(kind, 7), cases=cases)

@@ -16,9 +16,9 @@ from ..image import check_size
 
 __all__ = ["IMAGE_SUFFIXES", "read_image"]
 
-IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".ppm", ".tif", ".tiff", ".webp")
-# Only these decoders: others of Pillow start programs (EPS) or read what no camera writes.
-FORMATS = ("BMP", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
+IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".ppm", ".webp")
+# Only these decoders: others of Pillow start programs (EPS), print what is damaged (TIFF) or are of no camera.
+FORMATS = ("BMP", "JPEG", "PNG", "PPM", "WEBP")
 MAX_FILE_BYTES = 256 * 2**20
 # Modes of Pillow that have one meaning as red, green and blue of 8 bits.
 CONVERTED = {"RGB", "L", "P", "RGBA", "LA", "PA"}
@@ -33,7 +33,7 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
     Parameters
     ----------
     path : str or path
-        A JPEG, PNG, WebP, BMP, TIFF or PPM file of one image.
+        A JPEG, PNG, WebP, BMP or PPM file of one image.
 
     Returns
     -------
@@ -54,7 +54,7 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
     path = Path(path)
     try:
         if not path.is_file():
-            raise ImageError("there is no such file; expected an image as .jpg, .png, .webp, .bmp, .tif or .ppm")
+            raise ImageError("there is no such file; expected an image as .jpg, .png, .webp, .bmp or .ppm")
         size = path.stat().st_size
         if not 0 < size <= MAX_FILE_BYTES:
             raise ImageError(f"the file has {size:,} bytes; expected 1 to {MAX_FILE_BYTES:,}")

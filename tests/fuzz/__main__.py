@@ -22,7 +22,7 @@ from edgeperc.atomic import write_atomic
 
 from .running import Kind, State, attempt, new_case, run_job, summary_of, supervise
 
-KINDS = ("scans", "captures", "models", "trackers", "commands")
+KINDS = ("scans", "captures", "images", "models", "trackers", "commands")
 
 
 def kind_of(name: str, seed: int) -> Kind:

@@ -98,6 +98,7 @@ class MadeUp:
         view, n = card.view, len(card.classes)
         self.input = np.zeros((len(card.input.channels), view.height, view.width), np.float32)
         shapes: dict[str, tuple[int, ...]] = {
+            "camera_logits": (n, view.height // 4, view.width // 4),
             "box_dense": card.output_shape("box_dense")[1:], "box_slots": (20, 4),
             **dict.fromkeys(("class_logits", "class_probabilities"), (n, view.height, view.width)),
         }  # fmt: skip
@@ -121,7 +122,7 @@ class MadeUp:
             if kind == "box_dense":
                 values[0] -= np.float32(rng.uniform(-5.0, 8.0))
                 values[1:] *= np.float32(0.3)
-            elif kind != "class_logits":
+            elif kind not in ("class_logits", "camera_logits"):
                 np.clip(np.abs(values, out=values), 0.0, 1.2 if kind == "box_slots" else 1.0, out=values)
         elif way <= 13:
             values.fill(case.pick([0.0, 1.0, -1.0, 20.0, 1e9, 3.4e38, -3.4e38, 1e-45]))
