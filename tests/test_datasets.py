@@ -13,10 +13,10 @@ import pytest
 pytest.importorskip("tqdm")
 
 from edgeperc.card import TopViewGeometry
-from edgeperc.errors import PointsError
+from edgeperc.errors import CalibrationError, PointsError
 from edgeperc.evaluation.datasets import (
-    Calibration,
     Frame,
+    KittiCalibration,
     KittiObjects,
     RoadFrame,
     SemanticKitti,
@@ -41,19 +41,19 @@ Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27
 
 
 @pytest.fixture
-def calibration(tmp_path: Path) -> Calibration:
+def calibration(tmp_path: Path) -> KittiCalibration:
     path = tmp_path / "calib.txt"
     path.write_text(CALIBRATION)
-    return Calibration.read(path)
+    return KittiCalibration.read(path)
 
 
-def objects(tmp_path: Path, calibration: Calibration, *lines: str) -> tuple[tuple[Box, ...], np.ndarray]:
+def objects(tmp_path: Path, calibration: KittiCalibration, *lines: str) -> tuple[tuple[Box, ...], np.ndarray]:
     path = tmp_path / "label.txt"
     path.write_text("\n".join(lines) + "\n")
     return read_objects(path, calibration)
 
 
-def test_a_box_comes_into_the_sensor_frame(tmp_path: Path, calibration: Calibration) -> None:
+def test_a_box_comes_into_the_sensor_frame(tmp_path: Path, calibration: KittiCalibration) -> None:
     # 1.5 m high, 1.6 m wide, 4 m long, facing right; 20 m ahead of the sensor, 3 m to the right.
     boxes, unlabeled = objects(
         tmp_path,
@@ -69,7 +69,7 @@ def test_a_box_comes_into_the_sensor_frame(tmp_path: Path, calibration: Calibrat
 
 
 @pytest.mark.parametrize("turn", [-2.0, -math.pi / 2, 0.3, 3.0])
-def test_headings_turn_the_right_way(tmp_path: Path, calibration: Calibration, turn: float) -> None:
+def test_headings_turn_the_right_way(tmp_path: Path, calibration: KittiCalibration, turn: float) -> None:
     ((box,), _) = objects(tmp_path, calibration, f"Car 0 0 0 0 0 0 0 1.5 1.6 4.0 0 1.65 20 {turn}")
     # KITTI's angle grows about the camera's y axis, which points down.
     assert math.cos(box.yaw - (-turn - math.pi / 2)) == pytest.approx(1.0)
@@ -78,16 +78,16 @@ def test_headings_turn_the_right_way(tmp_path: Path, calibration: Calibration, t
 def test_a_calibration_that_is_none(tmp_path: Path) -> None:
     path = tmp_path / "calib.txt"
     path.write_text("P2: 1 2 3\n")
-    with pytest.raises(PointsError, match="R0_rect"):
-        Calibration.read(path)
+    with pytest.raises(CalibrationError, match="R0_rect"):
+        KittiCalibration.read(path)
 
 
-def frame(calibration: Calibration, points: np.ndarray, *boxes: Box, unlabeled: tuple = ()) -> Frame:
+def frame(calibration: KittiCalibration, points: np.ndarray, *boxes: Box, unlabeled: tuple = ()) -> Frame:
     rectangles = np.array(unlabeled, np.float64).reshape(-1, 4)
     return Frame("0", "drive", "A", np.asarray(points, np.float32), boxes, rectangles, calibration)
 
 
-def test_points_get_the_class_of_their_box(calibration: Calibration) -> None:
+def test_points_get_the_class_of_their_box(calibration: KittiCalibration) -> None:
     car = Box("van", 1.0, (20.0, 0.0, -1.0), (4.0, 2.0, 1.5), math.pi / 4)
     rider = Box("cyclist", 1.0, (10.0, 2.0, -0.8), (1.8, 0.6, 1.8), 0.0)
     tram = Box("tram", 1.0, (40.0, 0.0, 0.0), (10.0, 3.0, 3.0), 0.0)
@@ -105,7 +105,7 @@ def test_points_get_the_class_of_their_box(calibration: Calibration) -> None:
     np.testing.assert_array_equal(labels, [1, 1, 0, 3, IGNORE, IGNORE, IGNORE, 0])
 
 
-def test_nothing_is_known_where_nobody_labeled(calibration: Calibration) -> None:
+def test_nothing_is_known_where_nobody_labeled(calibration: KittiCalibration) -> None:
     point = np.array([[20.0, 0.0, -1.0, 0.0]])
     (pixel,), _ = calibration.to_image(point)
     around = (pixel[0] - 5, pixel[1] - 5, pixel[0] + 5, pixel[1] + 5)
@@ -314,7 +314,7 @@ def test_layouts_of_test_drives_are_left_out(data_root) -> None:  # type: ignore
     kept = [r for r in rows if not any(d in r for d in TEST_DRIVES)]
     first = next(iter(layouts(root)))
     name = kept[0].split(",")[0]
-    calibration = Calibration.read(root / "calib" / f"{name}.txt")
+    calibration = KittiCalibration.read(root / "calib" / f"{name}.txt")
     assert first == read_objects(root / "label_2" / f"{name}.txt", calibration)[0]
     assert sum(1 for _ in itertools.islice(layouts(root), 50)) == 50
 

@@ -26,7 +26,7 @@ from edgeperc.cli.output import print_line
 from edgeperc.errors import ModelError, PointsError, SplitError
 from edgeperc.evaluation import evaluate
 from edgeperc.evaluation.causes import count_causes
-from edgeperc.evaluation.datasets import Calibration, Frame, KittiObjects, RoadFrame, SemanticKitti, scan_hash
+from edgeperc.evaluation.datasets import Frame, KittiCalibration, KittiObjects, RoadFrame, SemanticKitti, scan_hash
 from edgeperc.evaluation.judge import Judge
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
 from edgeperc.evaluation.tables import BANDS, FEWEST_OBJECTS, Record, banded, figures
@@ -40,7 +40,7 @@ POINTS = ("background", "car", "pedestrian", "cyclist")
 CELLS = ("background", "drivable", "car", "van", "truck")
 # The camera stands at the sensor and looks along x; a quarter turn of the scan is in its image.
 T_CAM_VELO = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], np.float64)
-CAMERA = Calibration(T_CAM_VELO, np.array([[621.0, 0, 621.0, 0], [0, 621.0, 187.0, 0], [0, 0, 1, 0]]))
+CAMERA = KittiCalibration(T_CAM_VELO, np.array([[621.0, 0, 621.0, 0], [0, 621.0, 187.0, 0], [0, 0, 1, 0]]))
 
 
 def card(name: str, **given: Any) -> ModelCard:

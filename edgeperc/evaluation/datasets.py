@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..calibration import read_kitti_calibration
 from ..card import TopViewGeometry
 from ..errors import PointsError
 from ..geometry import inside
@@ -29,8 +30,8 @@ __all__ = [
     "IMAGE_SIZE",
     "ROAD_CLASSES",
     "SEQUENCE_DRIVES",
-    "Calibration",
     "Frame",
+    "KittiCalibration",
     "KittiObjects",
     "RoadFrame",
     "SemanticKitti",
@@ -43,7 +44,7 @@ IMAGE_SIZE = (1242, 375)
 
 
 @dataclass(frozen=True)
-class Calibration:
+class KittiCalibration:
     """Pose and projection of the left color camera.
 
     Attributes
@@ -58,26 +59,9 @@ class Calibration:
     P2: NDArray[np.float64]
 
     @classmethod
-    def read(cls, path: Path) -> Calibration:
-        """Read a KITTI object or tracking calibration file.
-
-        Raises
-        ------
-        PointsError
-            P2, R0_rect or Tr_velo_to_cam is missing or malformed.
-        """
-        values = {}
-        for line in path.read_text().splitlines():
-            key, _, numbers = line.replace(":", " ", 1).partition(" ")
-            if numbers.strip():
-                values[key] = np.array([float(v) for v in numbers.split()])
-        rectify, from_velo = np.eye(4), np.eye(4)
-        try:
-            rectify[:3, :3] = values["R0_rect" if "R0_rect" in values else "R_rect"].reshape(3, 3)
-            from_velo[:3] = values["Tr_velo_to_cam" if "Tr_velo_to_cam" in values else "Tr_velo_cam"].reshape(3, 4)
-            return cls(rectify @ from_velo, values["P2"].reshape(3, 4))
-        except (KeyError, ValueError) as exc:
-            raise PointsError(f"{path} holds no KITTI calibration; expected P2, R0_rect and Tr_velo_to_cam") from exc
+    def read(cls, path: Path) -> KittiCalibration:
+        """Read a file of `read_kitti_calibration`, whose errors this raises."""
+        return cls(*read_kitti_calibration(path))
 
     def to_image(self, points: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Project points into the image.
@@ -150,7 +134,7 @@ class Frame:
         In the sensor frame, labels in lower case (car, van, truck, pedestrian, person_sitting, cyclist, tram, misc).
     unlabeled : (k, 4) float64
         Image rectangles (left, top, right, bottom) [px] in which objects are not labeled (DontCare).
-    calibration : Calibration
+    calibration : KittiCalibration
     """
 
     name: str
@@ -159,7 +143,7 @@ class Frame:
     points: NDArray[np.float32]
     boxes: tuple[Box, ...]
     unlabeled: NDArray[np.float64]
-    calibration: Calibration
+    calibration: KittiCalibration
 
     @cached_property
     def known(self) -> NDArray[np.bool_]:
@@ -178,7 +162,7 @@ class Frame:
         return labels
 
 
-def read_objects(label_path: Path, calibration: Calibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
+def read_objects(label_path: Path, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
     """Read a KITTI label file: boxes in the sensor frame, and (k, 4) DontCare rectangles [px] (SSADNet 3.1.1)."""
     kinds, rows, unlabeled = [], [], []
     for line in label_path.read_text().splitlines():
@@ -252,7 +236,7 @@ class KittiObjects:
     def frame(self, name: str) -> Frame:
         """Read a labeled scan with its labels and calibration."""
         row = next(row for row in self.rows if row["name"] == name)
-        calibration = Calibration.read(self.root / "training/calib" / f"{name}.txt")
+        calibration = KittiCalibration.read(self.root / "training/calib" / f"{name}.txt")
         boxes, unlabeled = read_objects(self.root / "training/label_2" / f"{name}.txt", calibration)
         points = read_points(self.root / "training/velodyne" / f"{name}.bin")
         return Frame(name, row["drive"], row.get("grade", "A"), points, boxes, unlabeled, calibration)
@@ -276,7 +260,7 @@ def layouts(root: Path | str) -> Iterator[tuple[Box, ...]]:
     """Yield the boxes of every KITTI label file below ``root``, except those of test drives: layouts to simulate."""
     root = Path(root)
     for name in [row["name"] for row in _frame_rows(root) if row["drive"] not in TEST_DRIVES]:
-        calibration = Calibration.read(root / "calib" / f"{name}.txt")
+        calibration = KittiCalibration.read(root / "calib" / f"{name}.txt")
         yield read_objects(root / "label_2" / f"{name}.txt", calibration)[0]
 
 

@@ -39,7 +39,7 @@ from ..readers.files import read_points
 from ..sensor import SensorProfile, get_sensor
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
-from .datasets import IMAGE_SIZE, SEQUENCE_DRIVES, Calibration, read_objects
+from .datasets import IMAGE_SIZE, SEQUENCE_DRIVES, KittiCalibration, read_objects
 from .splits import in_split
 
 __all__ = ["SCHEMA", "ScanFolder", "ScanFrame", "ScanLayout", "class_number", "known_layouts", "read_layout"]
@@ -229,7 +229,7 @@ class ScanFrame:
         Index into `class_names`; None if the points of this scan are not labeled.
     drivable : tuple of (k, 2) float64, or None
         Polygons of the drivable area [m]; None if this scan has none.
-    calibration : Calibration or None
+    calibration : KittiCalibration or None
         Of the camera in whose image objects are labeled, if the labels are KITTI's.
     unlabeled : (k, 4) float64
         DontCare rectangles of that image [px].
@@ -242,7 +242,7 @@ class ScanFrame:
     boxes: tuple[Box, ...] | None
     point_classes: NDArray[np.uint8] | None
     drivable: tuple[NDArray[np.float64], ...] | None
-    calibration: Calibration | None = None
+    calibration: KittiCalibration | None = None
     unlabeled: NDArray[np.float64] | None = None
 
     @cached_property
@@ -388,7 +388,7 @@ class ScanFolder:
         calibration = unlabeled = boxes = None
         path = self._path("boxes", name)
         if path is not None and self.layout.box_format == "kitti":
-            calibration = Calibration.read(self.root / "calib" / f"{name}.txt")
+            calibration = KittiCalibration.read(self.root / "calib" / f"{name}.txt")
             found, unlabeled = read_objects(path, calibration)
             boxes = self._renamed(found, path)
         elif path is not None:

@@ -22,7 +22,7 @@ from ..readers.files import read_points
 from ..tracking.tracker import Tracker
 from ..tracking.tracks import ClassParameters, Tracks
 from .ab3dmot import SETTINGS, Ab3dmot
-from .datasets import IMAGE_SIZE, Calibration, KittiObjects
+from .datasets import IMAGE_SIZE, KittiCalibration, KittiObjects
 from .headings import Headings, count_headings
 from .tracking_metrics import FrameTracks, FrameTruth, evaluate_tracks
 from .unseen import check_unseen, training_scans_of
@@ -74,7 +74,7 @@ class TrackingSequence:
         By class and frame.
     unlabeled : tuple of (k, 4) float64
         By frame: image rectangles (left, top, right, bottom) without labels (DontCare).
-    calibration : Calibration
+    calibration : KittiCalibration
     """
 
     name: str
@@ -82,7 +82,7 @@ class TrackingSequence:
     image_boxes: tuple[NDArray[np.float64], ...]
     truth: Mapping[str, tuple[FrameTruth, ...]]
     unlabeled: tuple[NDArray[np.float64], ...]
-    calibration: Calibration
+    calibration: KittiCalibration
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,12 +169,12 @@ def sequence_scans(root: Path | str, name: str) -> dict[int, Path]:
     return {frame: training / "velodyne" / f"{of}.bin" for frame, of in enumerate(with_ids)}
 
 
-def _labels(root: Path, name: str) -> tuple[Path, list[list[str]], Calibration]:
+def _labels(root: Path, name: str) -> tuple[Path, list[list[str]], KittiCalibration]:
     """Read the labels of a sequence: their path, KITTI's 17 columns of each label as text, and the calibration."""
     path = root / "label_02" / f"{name}.txt"
     if path.parent.is_dir():
         lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
-        return path, lines, Calibration.read(root / "calib" / f"{name}.txt")
+        return path, lines, KittiCalibration.read(root / "calib" / f"{name}.txt")
     path, lines, stem = root / "training/label_2", [], ""
     for frame, scan in sequence_scans(root, name).items():
         stem = scan.stem
@@ -185,7 +185,7 @@ def _labels(root: Path, name: str) -> tuple[Path, list[list[str]], Calibration]:
                 f"{path}/{stem}.txt has {len(labels)} labels, and {len(ids)} track ids; expected as many"
             )
         lines += [[str(frame), one, *label.split()] for one, label in zip(ids, labels, strict=True)]
-    return path, lines, Calibration.read(root / "training/calib" / f"{stem}.txt")
+    return path, lines, KittiCalibration.read(root / "training/calib" / f"{stem}.txt")
 
 
 def read_sequence(
@@ -264,7 +264,7 @@ def read_sequence(
 
 
 def _read_detections(
-    root: Path, name: str, classes: Sequence[str], calibration: Calibration, n_frames: int
+    root: Path, name: str, classes: Sequence[str], calibration: KittiCalibration, n_frames: int
 ) -> tuple[list[list[Box]], list[NDArray[np.float64]]]:
     """Read detections and their image rectangles by frame.
 
@@ -375,7 +375,7 @@ def _frame_tracks(sequence: TrackingSequence, results: Sequence[FrameResult], of
     return frames
 
 
-def _image_rectangles(boxes: NDArray[np.float64], calibration: Calibration) -> NDArray[np.float64]:
+def _image_rectangles(boxes: NDArray[np.float64], calibration: KittiCalibration) -> NDArray[np.float64]:
     """Project boxes (n, 7): left, top, right, bottom [px] within the image; without area if a box is not in it."""
     signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
     local = signs[None] * boxes[:, None, 3:6]
