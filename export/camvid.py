@@ -235,8 +235,8 @@ def _keep(path: Path, name: str, names: Sequence[str], truth: torch.Tensor, labe
     """Add a network's labels of three images, evenly spread, to a file."""
     kept = dict(np.load(path)) if path.exists() else {}
     shown = np.linspace(0, len(names) - 1, min(N_SHOWN, len(names)) + 2).round().astype(int)[1:-1]
-    kept |= {"names": np.array([names[k] for k in shown]), "truth": truth[shown].cpu().numpy()}
-    kept[name] = labels[shown].cpu().numpy()
+    kept |= {"names": np.array([names[k] for k in shown]), "truth": truth.cpu().numpy()[shown]}
+    kept[name] = labels.cpu().numpy()[shown]
     with open_atomic(path) as file:
         np.savez_compressed(file, **kept)
 
