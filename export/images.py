@@ -150,7 +150,8 @@ def augmented_images(images: Tensor, labels: Tensor, rng: np.random.Generator) -
         `IGNORE` outside an image scaled down.
     """
     n = len(images)
-    scale = np.exp(rng.uniform(*np.log(SCALES), n))
+    smallest, largest = np.log(SCALES)
+    scale = np.exp(rng.uniform(smallest, largest, n))
     aspect = np.exp(rng.uniform(-np.log(ASPECT), np.log(ASPECT), n))
     theta = np.zeros((n, 2, 3), np.float32)
     for axis, zoom in enumerate((scale * aspect, scale / aspect)):

@@ -78,7 +78,7 @@ class CamSeg(nn.Module):
         self.dropout = nn.Dropout2d(dropout)
         self.classifier = nn.Conv2d(FINE, n_classes, 1)
         self.early = nn.ModuleList(nn.Conv2d(c, n_classes, 1) for c in (MIDDLE, COARSE)) if early else None
-        initialize(self, self.classifier, *(self.early or ()))  # type: ignore[arg-type]  # they are convolutions
+        initialize(self, self.classifier, *(self.early or ()))
         for module in self.modules():
             if isinstance(module, Bottleneck):
                 nn.init.zeros_(module.norm.weight)  # an untrained block is the identity

@@ -77,9 +77,10 @@ class FCN(nn.Module):
         self.upsamplings = nn.ModuleList(
             nn.ConvTranspose2d(n_classes, n_classes, 4, stride=2, padding=1, bias=False) for _ in SKIPS[stride]
         )
-        initialize(self, self.score, *self.score_skips)  # type: ignore[arg-type]  # they are convolutions
+        initialize(self, self.score, *self.score_skips)
         for layer in self.upsamplings:
-            layer.weight.data.copy_(bilinear(n_classes, 2))  # type: ignore[operator, union-attr]  # likewise
+            layer.weight.data.copy_(bilinear(n_classes, 2))  # type: ignore[operator]  # a module's attribute
+        self.last: Tensor
         self.register_buffer("last", bilinear(n_classes, stride), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:

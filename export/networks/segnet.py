@@ -38,8 +38,9 @@ def unpool(x: Tensor, positions: Tensor, size: tuple[int, int]) -> Tensor:
     size : (int, int)
         Rows and columns of the result.
     """
-    flat = x.new_zeros((x.shape[0], x.shape[1], size[0] * size[1]))
-    return flat.scatter(2, positions.flatten(2), x.flatten(2)).unflatten(2, size)
+    batch, channels = x.shape[:2]
+    flat = x.new_zeros((batch, channels, size[0] * size[1]))
+    return flat.scatter(2, positions.flatten(2), x.flatten(2)).view(batch, channels, *size)
 
 
 class SegNet(nn.Module):
@@ -64,16 +65,17 @@ class SegNet(nn.Module):
         for widths in VGG_16:
             self.encoders.append(_convolutions([c_in, *widths]))
             c_in = widths[-1]
-        for level, widths in reversed([*enumerate(VGG_16)]):
-            c_out = VGG_16[level - 1][-1] if level else 0
+        for level in reversed(range(len(VGG_16))):
             # The last convolution of all is the classifier.
-            self.decoders.append(_convolutions([*widths, c_out] if level else [*widths]))
+            finer = [VGG_16[level - 1][-1]] if level else []
+            self.decoders.append(_convolutions([*VGG_16[level], *finer]))
         self.dropout = nn.Dropout(dropout)
         self.classifier = nn.Conv2d(VGG_16[0][0], n_classes, 3, padding=1)
         initialize(self, self.classifier)
 
     def forward(self, x: Tensor) -> Tensor:
         pooled: list[tuple[Tensor, tuple[int, int]]] = []
+        size: tuple[int, int]
         for level, encoder in enumerate(self.encoders):
             x = encoder(x)
             size = (x.shape[2], x.shape[3])
