@@ -22,6 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from edgeperc.atomic import open_atomic
+from edgeperc.evaluation.camvid import image_figures
 from edgeperc.evaluation.metrics import Confusion
 
 from .camera import Camera
@@ -65,7 +66,6 @@ PAPER_ROWS: Mapping[str, tuple[float, ...]] = {
 
 TITLES = {"loss": "loss", "accuracy": "accuracy", "miou": "mean IoU", "f1": "F1", "dice": "Dice"}
 N_SHOWN = 3
-N_RESAMPLES = 1000
 N_POINTS = 12  # of each curve
 # Colors of CamVid's eleven classes, as its authors draw them.
 COLORS = (
@@ -105,15 +105,6 @@ def figures_of(counts: NDArray[np.int64]) -> dict[str, float]:
         "f1": float(f1[present].mean()),
         "dice": float(2.0 * overlap / total),
     }
-
-
-def _interval(counts: NDArray[np.int64]) -> list[float]:
-    """95 % interval of the mean IoU by a bootstrap over the images."""
-    rng = np.random.default_rng(0)
-    drawn = [counts[rng.integers(len(counts), size=len(counts))].sum(0) for _ in range(N_RESAMPLES)]
-    return [
-        round(float(bound), 4) for bound in np.quantile([figures_of(each)["miou"] for each in drawn], (0.025, 0.975))
-    ]
 
 
 def ablate_camvid(
@@ -167,7 +158,7 @@ def ablate_camvid(
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     path = out / RESULTS
     rows: list[dict[str, Any]] = json.loads(path.read_text()) if path.exists() else []
-    n_images = len(read_camvid(camvid, "train").names)
+    n_images = len(read_camvid(camvid, "train").hashes)
     for name in networks or ELEVEN:
         network, dropout = ELEVEN[name]
         recipe = replace(
@@ -216,14 +207,14 @@ def ablate_camvid(
                 "budget": budget,
                 "loss": round(loss, 4),
                 **{figure: round(value, 4) for figure, value in figures_of(counts.sum(0)).items()},
-                "miou_interval": _interval(counts),
+                "miou_interval": image_figures(task.classes, counts)["all"]["mean_iou_interval"],
                 "iou": dict(zip(task.classes, np.nan_to_num(confusion.iou()).round(4).tolist(), strict=True)),
                 "parameters": sum(weight.numel() for weight in trained.parameters()),
                 "seconds": round(seconds, 1),
                 "curve": state["curve"],
             }
         )
-        _keep(out / PREDICTIONS, name, watch.images.names, watch.truth, labels)
+        _keep(out / PREDICTIONS, name, [*watch.images.hashes], watch.truth, labels)
         path.write_text(json.dumps(rows, indent=1) + "\n")
         checkpoint.unlink()
         del trained, state
@@ -327,8 +318,8 @@ def show_camvid(predictions: Path, path: Path, camvid: Path | None = None) -> No
     shown: dict[str, NDArray[np.uint8]] = {}
     colors = np.array([*COLORS, *[(0, 0, 0)] * (256 - len(COLORS))], np.uint8)
     if camvid is not None:
-        images = read_camvid(camvid, "val")
-        at = [images.names.index(name) for name in kept["names"]]
+        images = read_camvid(camvid, "validation")
+        at = [[*images.hashes].index(name) for name in kept["names"]]
         shown["image"] = images.images[at].permute(0, 2, 3, 1).numpy()
         shown["true labels"] = colors[kept["truth"]]
     shown |= {name: colors[kept[name]] for name in ELEVEN if name in kept.files}

@@ -6,7 +6,6 @@ As 8-bit integers they take 250 MB, so a training step reads no file and waits f
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from functools import cache, lru_cache
 from pathlib import Path
@@ -19,7 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from edgeperc.card import InputSpec
-from edgeperc.errors import MissingExtraError, PointsError
+from edgeperc.errors import ImageError
+from edgeperc.evaluation.camvid import LabeledImages, image_hash
 from edgeperc.evaluation.metrics import Confusion
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.street import CAMERA_CLASSES
@@ -36,23 +36,24 @@ JITTER = 0.4
 VALIDATION_BATCH = 8
 
 
-class LabeledImages(NamedTuple):
+class ImageSet(NamedTuple):
     """Images and their labels.
 
     Attributes
     ----------
-    names : list of str
+    hashes : dict of str to str
+        Name of each image -> its `edgeperc.evaluation.camvid.image_hash`.
     images : (n, 3, H, W) uint8
         Red, green, blue.
     labels : (n, H, W) uint8
         Indices into `edgeperc.simulation.street.CAMERA_CLASSES`; `IGNORE` where unlabeled.
     """
 
-    names: list[str]
+    hashes: dict[str, str]
     images: Tensor
     labels: Tensor
 
-    def scaled(self, width: int, height: int) -> LabeledImages:
+    def scaled(self, width: int, height: int) -> ImageSet:
         """Images, bilinearly, and labels, of the nearest pixel, at another size."""
         if self.labels.shape[1:] == (height, width):
             return self
@@ -62,62 +63,41 @@ class LabeledImages(NamedTuple):
             for image in self.images
         ]
         labels = F.interpolate(self.labels[:, None].float(), size, mode="nearest-exact")[:, 0]
-        return LabeledImages(self.names, torch.cat(images), labels.byte())
+        return ImageSet(self.hashes, torch.cat(images), labels.byte())
 
-    def to(self, device: torch.device) -> LabeledImages:
+    def to(self, device: torch.device) -> ImageSet:
         """The same on a device."""
-        return LabeledImages(self.names, self.images.to(device), self.labels.to(device))
+        return ImageSet(self.hashes, self.images.to(device), self.labels.to(device))
 
 
 @lru_cache(maxsize=2)
-def read_camvid(root: Path, split: str) -> LabeledImages:
-    """Read CamVid, once: ``{split}/NAME`` images, ``{split}annot/NAME.png`` labels and ``classes.json``.
+def read_camvid(root: Path, split: str) -> ImageSet:
+    """Read CamVid's images and labels, once.
 
     Parameters
     ----------
     root : Path
-    split : {"train", "val"}
+        As for `edgeperc.evaluation.camvid.LabeledImages`.
+    split : {"train", "validation"}
 
     Raises
     ------
-    PointsError
-        There is no image, an image has no labels of its size, or the classes are others than CamVid's eleven.
+    ImageError
+        There is no image, one or its labels cannot be read, their sizes differ, or the classes are not CamVid's eleven.
     MissingExtraError
         Pillow is not installed.
     """
-    try:
-        from PIL import Image
-    except ModuleNotFoundError as exc:
-        raise MissingExtraError("PIL", "camera", "edgeperc-export") from exc
-
-    try:
-        classes = json.loads((root / "classes.json").read_text())
-        files = sorted((root / split).iterdir())
-    except OSError as exc:
-        raise PointsError(
-            f"{root}: {exc}; expected a folder of CamVid with classes.json, {split} and {split}annot"
-        ) from exc
-    if tuple(classes.get(str(k)) for k in range(len(CAMERA_CLASSES))) != CAMERA_CLASSES:
-        raise PointsError(f"{root / 'classes.json'}: classes {classes}; expected {', '.join(CAMERA_CLASSES)}, from 0")
-    images, labels = [], []
-    for file in files:
-        truth = root / f"{split}annot" / f"{file.stem}.png"
-        try:
-            with Image.open(file) as image, Image.open(truth) as annotation:
-                images.append(np.asarray(image.convert("RGB")))
-                labels.append(np.asarray(annotation))
-        except OSError as exc:
-            raise PointsError(f"{file}, {truth}: {exc}; expected an image and its labels") from exc
-        if images[-1].shape != images[0].shape or labels[-1].shape != images[0].shape[:2]:
-            raise PointsError(
-                f"{file} is {images[-1].shape[:2]}, its labels {labels[-1].shape}; expected {images[0].shape[:2]}"
-            )
-    if not files:
-        raise PointsError(f"{root / split} is empty; expected images of CamVid")
-    ids = np.stack(labels)
-    ids = np.where(ids < len(CAMERA_CLASSES), ids, IGNORE).astype(np.uint8)
-    pixels = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous()
-    return LabeledImages([file.stem for file in files], pixels, torch.from_numpy(ids))
+    data = LabeledImages(root)
+    if data.classes != CAMERA_CLASSES:
+        raise ImageError(f"{root} has classes {data.classes}; expected {CAMERA_CLASSES}")
+    files = data.files(split)
+    pairs = [data.read(file) for file in files]
+    if len(sizes := {image.shape for image, _ in pairs}) > 1:
+        raise ImageError(f"{root} has images of {len(sizes)} sizes; expected one size, to train in batches")
+    images = torch.from_numpy(np.stack([image for image, _ in pairs])).permute(0, 3, 1, 2).contiguous()
+    labels = torch.from_numpy(np.stack([labels for _, labels in pairs]))
+    hashes = {file.stem: image_hash(image) for file, (image, _) in zip(files, pairs, strict=True)}
+    return ImageSet(hashes, images, labels)
 
 
 def normalized(images: Tensor, spec: InputSpec) -> Tensor:
@@ -183,7 +163,7 @@ class ImageSamples:
     Parameters
     ----------
     task : Camera
-    images : LabeledImages
+    images : ImageSet
         To train on, of the size of the task's view, on the device that trains.
 
     Attributes
@@ -198,13 +178,13 @@ class ImageSamples:
     n_targets = 1
     simulated: ClassVar[tuple[()]] = ()
 
-    def __init__(self, task: Camera, images: LabeledImages) -> None:
+    def __init__(self, task: Camera, images: ImageSet) -> None:
         self.task, self.recipe, self.images = task, task.recipe, images
         self.odds: dict[str, NDArray[np.float64]] = {}
 
     def batch(self, step: int) -> tuple[Tensor, Tensor]:
         """Inputs (B, 3, H, W) float32 and labels (B, H, W) uint8 of one step, always the same for the same step."""
-        seed, batch, n = self.recipe.seed, self.recipe.batch, len(self.images.names)
+        seed, batch, n = self.recipe.seed, self.recipe.batch, len(self.images.hashes)
         at = np.arange(step * batch, (step + 1) * batch)
         orders = {epoch: np.random.default_rng((seed, 2, epoch)).permutation(n) for epoch in {*(at // n).tolist()}}
         chosen = torch.from_numpy(np.array([orders[k // n][k % n] for k in at.tolist()]))
@@ -221,7 +201,7 @@ class ImageSamples:
 
 @torch.no_grad()
 def confusions(
-    network: nn.Module, images: LabeledImages, truth: Tensor, spec: InputSpec
+    network: nn.Module, images: ImageSet, truth: Tensor, spec: InputSpec
 ) -> tuple[NDArray[np.int64], float, Tensor]:
     """Compare a network's labels with the truth.
 
@@ -229,7 +209,7 @@ def confusions(
     ----------
     network : nn.Module
         In inference mode.
-    images : LabeledImages
+    images : ImageSet
         At the size of the network's input, on its device.
     truth : (n, H, W) uint8
         At the size at which labels are compared; logits are interpolated to it.
@@ -245,7 +225,7 @@ def confusions(
         Predicted, on the device.
     """
     counts, losses, predicted = [], [], []
-    for first in range(0, len(images.names), VALIDATION_BATCH):
+    for first in range(0, len(images.hashes), VALIDATION_BATCH):
         x = normalized(images.images[first : first + VALIDATION_BATCH], spec)
         right = truth[first : first + VALIDATION_BATCH]
         logits = upsampled(network(x.contiguous(memory_format=torch.channels_last)), right.shape[1:])
@@ -268,13 +248,13 @@ class ImageWatch:
     Parameters
     ----------
     task : Camera
-    images : LabeledImages
+    images : ImageSet
         At the size of the task's view.
     truth : (n, H, W) uint8
         Labels at the images' own size.
     """
 
-    def __init__(self, task: Camera, images: LabeledImages, truth: Tensor) -> None:
+    def __init__(self, task: Camera, images: ImageSet, truth: Tensor) -> None:
         self.task, self.images, self.truth = task, images, truth
 
     def validate(self, network: nn.Module) -> tuple[float, float, dict[str, float | None]]:
@@ -299,5 +279,5 @@ def camvid_samples(task: Camera, root: Path, device: torch.device) -> tuple[Imag
         Where all images go.
     """
     size = (task.view.width, task.view.height)
-    train, validation = (read_camvid(root, split).to(device) for split in ("train", "val"))
+    train, validation = (read_camvid(root, split).to(device) for split in ("train", "validation"))
     return ImageSamples(task, train.scaled(*size)), ImageWatch(task, validation.scaled(*size), validation.labels)

@@ -271,7 +271,7 @@ def _image_data(recipe: Recipe, camvid: Path | None, device: torch.device) -> _D
         raise ValueError(f"no images to train {recipe.network} on; give --camvid")
     task = Camera.of(recipe)
     samples, watch = camvid_samples(task, camvid, device)
-    return _Data(task, samples, watch, {}, len(samples.images.names))
+    return _Data(task, samples, watch, samples.images.hashes, len(samples.images.hashes))
 
 
 def _scan_data(
