@@ -16,7 +16,7 @@ from .points import read_only
 
 __all__ = ["Calibration", "fill_projected", "read_kitti_calibration"]
 
-MAX_EDGE = 16_384  # pixels of an edge of an image
+MAX_EDGE, MAX_PIXELS = 2**15, 2**26  # of an image, as in `edgeperc.image`
 MAX_DISTANCE_M = 100.0  # between the sensors; more is probably a translation in millimeters
 # KITTI's rotations have seven digits; a product of two of them is off by some 1e-6.
 ROTATION_TOLERANCE = 1e-3
@@ -76,6 +76,8 @@ class Calibration:
         object.__setattr__(self, "T_camera_sensor", T)
         object.__setattr__(self, "width", _pixels("width", self.width))
         object.__setattr__(self, "height", _pixels("height", self.height))
+        if self.width * self.height > MAX_PIXELS:
+            raise CalibrationError(f"width x height is {self.width} x {self.height}; expected at most {MAX_PIXELS:,}")
 
     @classmethod
     def from_kitti(cls, path: str | os.PathLike[str], width: int, height: int) -> Calibration:

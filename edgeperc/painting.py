@@ -353,7 +353,8 @@ def fill_painted(
         painted[i] = UNSEEN
         if not (-0.5 <= u[i] < width - 0.5 and -0.5 <= v[i] < height - 0.5):
             continue
-        row, column = int(v[i] + 0.5), int(u[i] + 0.5)
+        # The last float below half a pixel is rounded onto the next pixel.
+        row, column = min(int(v[i] + 0.5), height - 1), min(int(u[i] + 0.5), width - 1)
         near = np.float64(buffer[row // cell_h, column // cell_w])
         if depth[i] <= near + slack_m + slack_share * near:
             painted[i] = labels[row, column]

@@ -74,12 +74,14 @@ def test_what_is_no_matrix_is_refused(matrix: object) -> None:
         Calibration(matrix, AHEAD, 640, 480)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("width", [0, -1, 640.0, True, "640", None, 2**15])
+@pytest.mark.parametrize("width", [0, -1, 640.0, True, "640", None, 2**15 + 1])
 def test_what_is_no_size_is_refused(width: object) -> None:
     with pytest.raises(CalibrationError, match="width"):
         Calibration(K, AHEAD, width, 480)  # type: ignore[arg-type]
     with pytest.raises(CalibrationError, match="height"):
         Calibration(K, AHEAD, 640, width)  # type: ignore[arg-type]
+    with pytest.raises(CalibrationError, match="width x height is 32768 x 32768"):
+        Calibration(K, AHEAD, 2**15, 2**15)
 
 
 def test_projection_by_hand() -> None:

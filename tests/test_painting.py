@@ -106,6 +106,17 @@ def test_kernels_equal_twins(seed: int, n: int) -> None:
         assert painted[first] == labels[round(v[first]), round(u[first])]
 
 
+@pytest.mark.kernel
+def test_the_last_float_of_a_pixel() -> None:
+    """0.49999999999999994 + 0.5 is 1.0, beside an image of one pixel."""
+    last, painted = np.array([np.nextafter(0.5, 0.0)]), np.empty(1, np.uint8)
+    fill_painted(
+        np.array([[3]], np.uint8), last, last, np.ones(1), np.ones((1, 1), np.float32), 1, 1, 0.1, 0.0, painted
+    )
+    assert painted.tolist() == [3]
+
+
+@pytest.mark.kernel
 def test_a_window_is_bounded() -> None:
     """A point that nearly touches the camera covers 49 x 49 cells at most."""
     points = np.array([[0.2701, 0.0, -0.08]], np.float32)
