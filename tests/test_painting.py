@@ -387,3 +387,32 @@ def test_the_demo_with_a_camera(tmp_path: Path, capsys: pytest.CaptureFixture[st
     out = capsys.readouterr().out
     assert re.search(r"camera +\d+ % of the pixels get their true class\n", out)
     assert "the scene's true classes, not those of a network" in out
+
+
+def test_run_draws_an_image_and_its_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pillow = pytest.importorskip("PIL.Image")
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("onnxruntime")
+    scan, image = seen(0, "hdl-64e", NEAR)
+    pillow.fromarray(image.rgb).save(tmp_path / "street.png")
+    scan.points.tofile(tmp_path / "street.bin")
+    calib = tmp_path / "calib.txt"
+    calib.write_text(
+        "P2: 554 0 320 0 0 554 240 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
+        "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27\n"
+    )
+    model, out = str(tiny_camera.write_camera(tmp_path)), tmp_path / "out"
+    both = [str(tmp_path / "street.png"), "--scan", str(tmp_path / "street.bin"), "--calib", str(calib)]
+    options = ["--model", model, "--model", "pointseg", "--on-mismatch", "ignore"]
+    assert cli.main(["run", *both, *options, "--png", "--out", str(out)]) == 0
+    assert {file.name for file in out.iterdir()} == {"street.png", "street_both.png", "street_scan.png"}
+    with pillow.open(out / "street_both.png") as picture:
+        assert picture.size[0] == 1600
+    capsys.readouterr()
+    for wrong in ([*both, *options], [both[0], "--calib", str(calib), "--png", "--out", str(out)], both[2:]):
+        with pytest.raises(SystemExit):
+            cli.main(["run", *wrong])
+    assert "--calib is for the picture of images and their scans" in capsys.readouterr().err
+    calib.write_text("P2: 1 2 3\n")
+    assert cli.main(["run", *both, *options, "--png", "--out", str(out)]) == 2
+    assert "holds no KITTI calibration" in capsys.readouterr().err

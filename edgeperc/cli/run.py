@@ -8,7 +8,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -65,6 +65,7 @@ def add_parser(commands: Commands) -> None:
             "edgeperc run velodyne/ --live --rate 10",
             "edgeperc run street.jpg --out out --png",
             "edgeperc run image_2/000123.png --scan velodyne/000123.bin --json",
+            "edgeperc run image_2/000123.png --scan velodyne/000123.bin --calib calib/000123.txt --png --out pictures",
         ],
     )
     reading = parser.add_argument_group("input")
@@ -84,6 +85,13 @@ def add_parser(commands: Commands) -> None:
         default=[],
         metavar="SCAN",
         help="the scan of each image, in their order: both are perceived in one call (default: images alone)",
+    )
+    reading.add_argument(
+        "--calib",
+        type=Path,
+        metavar="FILE",
+        help="KITTI's calibration of camera and LiDAR, the same for all images; with --scan and --png, NAME_both.png "
+        "shows the classes of the image on the points, and its road from above",
     )
     add_sensor(reading, of_capture=True)
     add_mounting(reading)
@@ -186,7 +194,7 @@ def run_command(arguments: argparse.Namespace) -> int:
     names = output_names(scans, keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
     sources = {os.path.realpath(source) for source in (*scans, *images.values()) if source is not None}
-    of = {"of_image": bool(images), "of_scan": not images or bool(arguments.scan)}
+    of = _pictures_of(arguments, images)
     for file in (file for target in targets for file in _files_of(target, kinds, **of).values()):
         if os.path.realpath(file) in sources:
             arguments.usage_error(
@@ -249,6 +257,12 @@ def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, P
     scans = find_scans(arguments.scan).paths
     if arguments.scan and len(scans) != len(images):
         arguments.usage_error(f"--scan: {many(len(scans), 'scan')} for {many(len(images), 'image')}; expected as many")
+    if arguments.calib is not None:
+        from ..calibration import read_kitti_calibration
+
+        if not (images and scans and arguments.png):
+            arguments.usage_error("--calib is for the picture of images and their scans; add --scan and --png")
+        read_kitti_calibration(arguments.calib)  # errors of the file come before the first image
     if not images:
         return {}
     if arguments.live:
@@ -462,6 +476,7 @@ def _each_image(
 ) -> Iterator[tuple[Path, Perception | Exception, Tracks | None, bytes | None]]:
     """Yield the name, perception or error, tracks and flattened scan of an image and of its scan, if it has one."""
     from .. import view
+    from ..calibration import Calibration
     from ..readers.files import read_points
     from ..readers.images import read_image
 
@@ -471,9 +486,14 @@ def _each_image(
         points = None if scan is None else read_points(scan)
         perception = perceive(points, image=image)
         tracks = None if follow is None else follow(perception)
-        wanted = _files_of(target, kinds, of_image=True, of_scan=points is not None)
+        wanted = _files_of(target, kinds, **_pictures_of(arguments, [path]))
         if "image" in wanted:
             view.draw_image(perception, image, wanted.pop("image"), title=path.name)
+        if "both" in wanted:
+            calibration = Calibration.from_kitti(arguments.calib, image.shape[1], image.shape[0])
+            both, sensor = wanted.pop("both"), perceive.sensor
+            assert points is not None
+            view.draw_painted(perception, image, points, calibration, both, sensor=sensor, title=path.name)
         if points is not None:
             _write(points, perception, wanted, title=str(scan))
     except (EdgepercError, OSError) as exc:
@@ -511,14 +531,22 @@ def _file_of(target: Path, kind: str) -> Path:
     return target.with_name(f"{target.name}.{'label' if kind == 'labels' else kind}")
 
 
-def _files_of(target: Path, kinds: Sequence[str], *, of_image: bool, of_scan: bool) -> dict[str, Path]:
-    """The files to write by kind; ``"image"`` is the picture of an image."""
+def _pictures_of(arguments: argparse.Namespace, images: Collection[Path]) -> dict[str, bool]:
+    """Which pictures there are: of images, of scans, of both."""
+    of_scan = not images or bool(arguments.scan)
+    return {"of_image": bool(images), "of_scan": of_scan, "of_both": bool(images) and arguments.calib is not None}
+
+
+def _files_of(target: Path, kinds: Sequence[str], *, of_image: bool, of_scan: bool, of_both: bool) -> dict[str, Path]:
+    """The files to write by kind; ``"image"`` is the picture of an image, ``"both"`` that of an image and its scan."""
     files = {kind: _file_of(target, kind) for kind in kinds}
     if of_image and "png" in files:
         picture = files.pop("png")
         files["image"] = picture
         if of_scan:
             files["png"] = picture.with_name(f"{target.name}_scan.png")
+        if of_both:
+            files["both"] = picture.with_name(f"{target.name}_both.png")
     return files
 
 
