@@ -30,7 +30,7 @@ CAMVID = "folder of CamVid: train, trainannot, val, valannot and classes.json"
 SCANS = "more real scans: FOLDER with a scans.json, or FOLDER:LAYOUT; may be repeated"
 WORKERS = "number of processes that make the training samples (default 1)"
 VERSION = "version to write into the card (default 1.0.0)"
-PROOF = "scan files on which torch and onnxruntime must agree, in addition to four simulated scans"
+PROOF = "scan (or image) files on which torch and onnxruntime must agree, in addition to four simulated ones"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -362,15 +362,17 @@ def _curve(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    from .simulate import fitness_of, parity_scans
+    from .checkpoint import read_checkpoint
+    from .simulate import fitness_of, parity_images, parity_scans
     from .to_onnx import export
 
     metrics = json.loads(args.metrics.read_text()) if args.metrics else None
+    camera = read_checkpoint(args.checkpoint)["recipe"].task == "camera"
     card = export(
         args.checkpoint,
         args.out,
-        scans=parity_scans(args.scans),
-        fitness=fitness_of(args.kitti),
+        scans=parity_images(args.scans) if camera else parity_scans(args.scans),
+        fitness=None if camera else fitness_of(args.kitti),
         name=args.name,
         version=args.model_version,
         metrics=metrics,
@@ -381,10 +383,12 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    from .simulate import parity_scans
+    from .simulate import parity_images, parity_scans
     from .to_onnx import load, verify
 
-    print_line(json.dumps(verify(load(args.checkpoint)[0], args.model, parity_scans(args.scans))))
+    network, recipe, _ = load(args.checkpoint)
+    samples = parity_images(args.scans) if recipe.task == "camera" else parity_scans(args.scans)
+    print_line(json.dumps(verify(network, args.model, samples)))
     return 0
 
 

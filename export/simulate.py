@@ -14,12 +14,14 @@ from edgeperc.evaluation.datasets import KittiObjects, layouts
 from edgeperc.fitness import FitnessProfile
 from edgeperc.perception import Box
 from edgeperc.readers.files import read_points
+from edgeperc.readers.images import read_image
+from edgeperc.simulation.camera import forward_camera, render
 from edgeperc.simulation.samples import simulated_scan
 
 from .processes import mapped
 from .scans import LabeledScan
 
-__all__ = ["fitness_of", "parity_scans", "simulate"]
+__all__ = ["fitness_of", "parity_images", "parity_scans", "simulate"]
 
 
 def simulate(
@@ -67,6 +69,15 @@ def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor:
 def parity_scans(paths: Sequence[Path]) -> list[NDArray[np.float32]]:
     """Scans to verify an export on: the given files, and four simulated scans that are in no training set."""
     return [read_points(p) for p in paths] + [simulated_scan(10**9 + k).points for k in range(4)]
+
+
+def parity_images(paths: Sequence[Path]) -> list[NDArray[np.uint8]]:
+    """Images to verify an export on: the given files, and four of simulated streets."""
+    images = [read_image(path) for path in paths]
+    for seed in range(10**9, 10**9 + 4):
+        scan = simulated_scan(seed)
+        images.append(render(scan.scene, forward_camera(480, 360), scan.T_world_sensor, seed).rgb)
+    return images
 
 
 def fitness_of(kitti: Path | None) -> FitnessProfile:

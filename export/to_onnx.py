@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -21,19 +21,31 @@ from numpy.typing import NDArray
 from torch import nn
 
 from edgeperc.atomic import open_atomic
-from edgeperc.card import CARD_KEY, Golden, ModelCard
+from edgeperc.card import CARD_KEY, CameraGeometry, Golden, ModelCard
 from edgeperc.decode import decode_classes, decode_top_view
 from edgeperc.errors import EdgepercError
 from edgeperc.fitness import FitnessProfile
+from edgeperc.image import ImageScaler
 from edgeperc.network_input import project
 from edgeperc.projection import make_projector
 from edgeperc.session import Session, golden_input
 
 from .cards import card_of
 from .checkpoint import build_network, read_checkpoint
+from .networks.segnet import SegNet
 from .recipe import Recipe
 
-__all__ = ["ParityError", "export", "load", "to_graph", "verify", "with_golden", "write_card"]
+__all__ = [
+    "ParityError",
+    "export",
+    "load",
+    "pixel_labels",
+    "to_graph",
+    "verify",
+    "views",
+    "with_golden",
+    "write_card",
+]
 
 OPSET = 18
 # In standard deviations of the output. Measured: 1e-4 for fp32 convolutions summed in another order, and 0.1 or more
@@ -49,6 +61,9 @@ MIN_AGREEMENT = 0.999
 # Smaller tensors, such as biases and scales, stay in fp32.
 FEWEST_HALVED = 1024
 N_GOLDEN_VALUES = 64
+CAMVID_LICENCE = (
+    "terms of CamVid: free for research; cite Brostow, Fauqueur and Cipolla (2009), and Brostow et al. (2008)"
+)
 
 
 class ParityError(EdgepercError):
@@ -66,10 +81,14 @@ def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:
     """The card's record of the training."""
     frames = notes["frames"]
     simulated = f"{notes['n_simulated']} simulated scans"
+    data = f"{len(frames)} real frames, {simulated}" if frames else f"{simulated}, no real frame"
+    licence = "terms of the data sets of the real frames; KITTI: CC BY-NC-SA 3.0" if frames else notes["licence"]
+    if recipe.task == "camera":
+        data, licence = f"{len(frames)} images of CamVid", CAMVID_LICENCE
     return {
-        "data": f"{len(frames)} real frames, {simulated}" if frames else f"{simulated}, no real frame",
+        "data": data,
         "frames": frames,
-        "licence": "terms of the data sets of the real frames; KITTI: CC BY-NC-SA 3.0" if frames else notes["licence"],
+        "licence": licence,
         "recipe": json.loads(json.dumps(asdict(recipe))),  # as a card is read again: without tuples
         "steps": notes["step"],
         "started_from": notes["before"],
@@ -102,9 +121,9 @@ def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
         if hasattr(holder, "doc_string"):
             holder.doc_string = ""
     model.producer_name, model.producer_version = "edgeperc", ""
-    # Top-view networks stay in fp32: in unpooling, a rounded weight can move a maximum to another cell, which changed
-    # outputs by up to 0.12 standard deviations.
-    if card.view.kind == "range_image":
+    # Networks that unpool stay in fp32: a rounded weight can move a maximum to another cell, which changed outputs by
+    # up to 0.12 standard deviations.
+    if card.view.kind != "top_view" and not any(isinstance(module, SegNet) for module in network.modules()):
         _halve(model.graph)
     return model
 
@@ -169,7 +188,27 @@ def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
     return replace(card, golden=Golden(0, hashlib.sha256(x.tobytes()).hexdigest(), records))
 
 
-def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]]) -> dict[str, float]:
+def views(card: ModelCard, samples: Sequence[NDArray[Any]]) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
+    """The network's input of each scan or image, (C, H, W) float32, and the pixels with a return, (H, W) bool."""
+    if isinstance(card.view, CameraGeometry):
+        scaler = ImageScaler(card.view, card.input)
+        for sample in samples:
+            image = np.empty(scaler.shape, np.float32)
+            scaler.fill(sample, image)
+            yield image, np.ones(image.shape[1:], np.bool_)
+        return
+    projector = make_projector(card.view, card.input)
+    for sample in samples:
+        projected = project(projector, np.ascontiguousarray(sample, np.float32))
+        yield projected.image.copy(), projected.index >= 0
+
+
+def pixel_labels(raw: NDArray[np.float32], kind: str) -> NDArray[np.uint8]:
+    """Labels (h, w) of raw outputs (C, h, w) of a kind of classes, at the outputs' own resolution."""
+    return raw.argmax(0).astype(np.uint8) if kind == "camera_logits" else decode_classes(raw, kind)[0]
+
+
+def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[Any]]) -> dict[str, float]:
     """Compare an exported model with its torch network: raw outputs, and labels and boxes after post-processing.
 
     Parameters
@@ -178,7 +217,7 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
     path : Path
         The .onnx.
     scans : sequence of (n, 4) float32
-        x, y, z [m] in the sensor frame, remission in 0..1.
+        x, y, z [m] in the sensor frame, remission in 0..1. Of a camera's model: images (H, W, 3) uint8.
 
     Returns
     -------
@@ -194,14 +233,12 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
     """
     session = Session(path, "cpu")
     card = session.card
-    projector = make_projector(card.view, card.input)
     worst, agreement, box_deviation = 0.0, 1.0, 0.0
-    for points in scans:
-        projected = project(projector, np.ascontiguousarray(points, np.float32))
+    for image, returned in views(card, scans):
         with torch.no_grad():
-            outputs = network.eval()(torch.from_numpy(projected.image[None]))
+            outputs = network.eval()(torch.from_numpy(image[None]))
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
-        session.input[:] = projected.image
+        session.input[:] = image
         actual = session.run()
         expected = {o.kind: output[0].numpy() for o, output in zip(card.outputs, outputs, strict=True)}
         for kind, values in expected.items():
@@ -209,7 +246,7 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
             worst = max(worst, float(difference) / max(float(values.std()), 1e-6))
         if card.view.kind == "top_view":
             (labels, boxes), (expected_labels, expected_boxes) = (
-                decode_top_view(card, projected.index >= 0, raw, card.score_threshold) for raw in (actual, expected)
+                decode_top_view(card, returned, raw, card.score_threshold) for raw in (actual, expected)
             )
             kinds, expected_kinds = [box.label for box in boxes], [box.label for box in expected_boxes]
             if kinds != expected_kinds:
@@ -219,7 +256,7 @@ def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[np.float32]])
                 box_deviation = max(box_deviation, float(difference.max()))
         else:
             ((kind, logits),) = expected.items()
-            labels, expected_labels = (decode_classes(raw, kind)[0] for raw in (actual[kind], logits))
+            labels, expected_labels = (pixel_labels(raw, kind) for raw in (actual[kind], logits))
         agreement = min(agreement, float((labels == expected_labels).mean()))
     if worst > MAX_DEVIATION or agreement < MIN_AGREEMENT or box_deviation > 0.05:
         raise ParityError(
@@ -239,7 +276,7 @@ def export(
     checkpoint: Path,
     path: Path,
     *,
-    scans: Sequence[NDArray[np.float32]],
+    scans: Sequence[NDArray[Any]],
     fitness: FitnessProfile | None,
     name: str | None = None,
     version: str = "1.0.0",
@@ -256,7 +293,7 @@ def export(
     scans : sequence of (n, 4) float32
         Scans to verify on, as for `verify`.
     fitness : FitnessProfile or None
-        Profile of the training scans, for the check of inputs at runtime.
+        Profile of the training scans, for the check of inputs at runtime; None for a camera's network.
     name : str, optional
         Name of the model; by default the network's.
     version : str
