@@ -23,6 +23,8 @@ INSTALLED_BY: Mapping[str, str] = MappingProxyType(
         "openvino": "pip install 'edgeperc[openvino]'",
         "coreml": "pip install 'edgeperc[cpu]', on macOS",
         "directml": "pip install onnxruntime-directml, on Windows",
+        "qnn": "pip install onnxruntime-qnn, beside edgeperc[cpu]",
+        "webgpu": "pip install onnxruntime-ep-webgpu, beside edgeperc[cpu]",
         "cpu": "pip install 'edgeperc[cpu]'",
     }
 )

@@ -49,11 +49,18 @@ PROVIDERS: Mapping[str, str] = {
     "openvino": "OpenVINOExecutionProvider",
     "coreml": "CoreMLExecutionProvider",
     "directml": "DmlExecutionProvider",
+    "qnn": "QNNExecutionProvider",
+    "webgpu": "WebGpuExecutionProvider",
     "cpu": "CPUExecutionProvider",
 }
 AUTO = ("cuda", "openvino", "cpu")
 # Providers that come as plugins beside stock onnxruntime: provider, then the package with its library.
-PLUGINS = {"openvino": "onnxruntime_ep_openvino", "tensorrt-rtx": "onnxruntime_ep_nv_tensorrt_rtx"}
+PLUGINS = {
+    "openvino": "onnxruntime_ep_openvino",
+    "tensorrt-rtx": "onnxruntime_ep_nv_tensorrt_rtx",
+    "qnn": "onnxruntime_qnn",
+    "webgpu": "onnxruntime_ep_webgpu",
+}
 PRECISIONS = ("fp32", "bf16", "int8")
 # Largest accepted deviation, in standard deviations of an output. The same graph in fp32 differs by 1e-5 between
 # engines; tripled weights of one layer give 0.5.
@@ -77,13 +84,17 @@ def _version(package: str) -> str:
 
 
 def _plugin_devices(ort: Any, short: str) -> list[Any]:
-    """Devices of a plugin provider on this computer; empty if its package is not installed or finds none."""
+    """Devices of a plugin provider on this computer; empty if its package is not installed or finds none.
+
+    Of Qualcomm's, the NPU comes first: its plugin also offers the GPU and the processor.
+    """
     if not hasattr(ort, "get_ep_devices"):
         return []
     name = PROVIDERS[short]
 
     def devices() -> list[Any]:
-        return [d for d in ort.get_ep_devices() if d.ep_name == name]
+        found = [d for d in ort.get_ep_devices() if d.ep_name == name]
+        return sorted(found, key=lambda d: d.device.type.name != "NPU") if short == "qnn" else found
 
     if not devices():
         try:
@@ -318,6 +329,8 @@ class Session:
                     if compiled is not None:
                         cpu["CACHE_DIR"] = str(compiled)
                     settings["load_config"] = json.dumps({"CPU": cpu})
+                elif short == "qnn":
+                    settings["htp_performance_mode"] = "burst"  # its default clocks the NPU down between two scans
                 options.add_provider_for_devices(plugin[:1], settings)
                 session = ort.InferenceSession(blob, options, enable_fallback=0)
             else:

@@ -48,7 +48,9 @@ BF16_FEATURES = frozenset({"amx_bf16", "avx512_bf16"})
 BF16_PROVIDERS = ("openvino",)
 # The reduced precisions of a provider, the fastest first. Measured on two cores with avx512_vnni and avx512_bf16, fp32
 # / bf16 / int8 in the fastest engine of each: pointseg 9.8 / 5.5 / 3.3 ms, ssadnet 15.5 / 8.4 / 5.2 ms.
-FASTEST = {"cpu": ("int8",), "openvino": ("int8", "bf16")}
+FASTEST = {"cpu": ("int8",), "openvino": ("int8", "bf16"), "qnn": ("int8",)}
+NPU_PROVIDERS = ("qnn",)
+"""Providers that compute int8 on a device of its own, whatever the processor."""
 
 RENAMED = {
     "ssadnet-edge": "ssadnet:fp32",
@@ -195,7 +197,10 @@ def choose(
         if precision not in runs:
             raise ProviderError(_not_in(variants[0].name, provider, precision, sorted(runs)))
         return runs[precision]
-    native = {"int8": bool(INT8_FEATURES & {*features}), "bf16": bool(BF16_FEATURES & {*features})}
+    native = {
+        "int8": provider in NPU_PROVIDERS or bool(INT8_FEATURES & {*features}),
+        "bf16": bool(BF16_FEATURES & {*features}),
+    }
     for reduced in FASTEST.get(provider, ()):
         if reduced in runs and native[reduced] and _loss(runs[reduced][0].card, reduced) <= MAX_LOSS:
             return runs[reduced]

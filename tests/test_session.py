@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import sys
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -234,6 +237,86 @@ def test_the_openvino_plugin_agrees_with_the_cpu_provider() -> None:
         pytest.skip("the OpenVINO plugin is absent, or finds no device of Intel's")
     for variant in listed():
         assert Session(str(variant), "openvino", precision=variant.precision).golden_deviation < 0.05
+
+
+class FakePlugins:
+    """onnxruntime with plugins whose devices compute on the CPU provider, under the plugins' names."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, devices: Sequence[tuple[str, str]]) -> None:
+        self.libraries: list[str] = []
+        self.chosen: list[tuple[str, dict[str, str]]] = []
+        self.ort = ort = session_module._onnxruntime()
+        fakes = [
+            SimpleNamespace(ep_name=name, device=SimpleNamespace(type=SimpleNamespace(name=kind)))
+            for name, kind in devices
+        ]
+        plugins = self
+
+        class Options:
+            def __init__(self) -> None:
+                self.own, self.names = ort.SessionOptions(), list[str]()
+
+            def __getattr__(self, name: str) -> object:
+                return getattr(self.own, name)
+
+            def add_session_config_entry(self, key: str, value: str) -> None:
+                if key != "session.disable_cpu_ep_fallback":  # the CPU provider stands in for the device
+                    self.own.add_session_config_entry(key, value)
+
+            def add_provider_for_devices(self, given: Sequence[SimpleNamespace], settings: dict[str, str]) -> None:
+                plugins.chosen += [(device.device.type.name, dict(settings)) for device in given]
+                self.names += [device.ep_name for device in given]
+
+        class Inference:
+            def __init__(self, blob: bytes, options: Options, providers: object = None, **more: int) -> None:
+                self.own, self.names = ort.InferenceSession(blob, options.own, ["CPUExecutionProvider"]), options.names
+
+            def __getattr__(self, name: str) -> object:
+                return getattr(self.own, name)
+
+            def get_providers(self) -> list[str]:
+                return [*self.names, "CPUExecutionProvider"]
+
+        class Ort:
+            SessionOptions, InferenceSession = Options, Inference
+
+            def __getattr__(self, name: str) -> object:
+                return getattr(ort, name)
+
+            def get_ep_devices(self) -> list[SimpleNamespace]:
+                return fakes if plugins.libraries else []
+
+            def register_execution_provider_library(self, name: str, library: str) -> None:
+                assert name in {device.ep_name for device in fakes}
+                plugins.libraries.append(library)
+
+        monkeypatch.setattr(session_module, "_onnxruntime", Ort)
+        for short, package in session_module.PLUGINS.items():
+            offered = PROVIDERS[short] in {name for name, _ in devices}
+            fake = SimpleNamespace(get_library_path=lambda package=package: f"{package}.so") if offered else None
+            monkeypatch.setitem(sys.modules, package, fake)  # None: it cannot be imported
+
+
+def test_qualcomms_plugin_runs_int8_on_the_npu(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = PROVIDERS["qnn"]
+    fake = FakePlugins(monkeypatch, [(name, "CPU"), (name, "GPU"), (name, "NPU")])
+    assert available_providers() == ("qnn", "cpu")
+    assert fake.libraries == ["onnxruntime_qnn.so"]
+    monkeypatch.setattr(session_module, "cpu_features", lambda: frozenset({"asimd"}))  # no int8 on the processor
+    session = Session("pointseg", "qnn")
+    assert session.description == f"pointseg int8, {name}"
+    assert fake.chosen == [("NPU", {"htp_performance_mode": "burst"})]
+    assert Session("pointseg", "qnn", precision="fp32").precision == "fp32"
+    assert Session("pointseg", "auto").short == "cpu"  # it was not measured on this computer
+
+
+def test_the_webgpu_plugin_runs_fp32(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = FakePlugins(monkeypatch, [(PROVIDERS["webgpu"], "GPU")])
+    assert available_providers() == ("webgpu", "cpu")
+    assert Session("pointseg", "webgpu").description == f"pointseg fp32, {PROVIDERS['webgpu']}"
+    assert fake.chosen == [("GPU", {})]
+    with pytest.raises(ProviderError, match="provider 'qnn' is not available"):
+        Session("pointseg", "qnn")
 
 
 def test_a_failing_run_is_an_inference_error() -> None:
