@@ -18,7 +18,7 @@ from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .perception import Box
 from .points import read_only
 
-__all__ = ["ModelFrame", "fill_moved"]
+__all__ = ["ModelFrame", "fill_moved", "fill_turned", "turned"]
 
 
 class ModelFrame:
@@ -63,6 +63,13 @@ class ModelFrame:
         return tuple(boxes) if self.is_identity else _moved(boxes, self.R.T, -self.R.T @ self.t)
 
 
+def turned(points: NDArray[np.float32], angle_rad: float) -> NDArray[np.float32]:
+    """Scan (n, 4) float32 as a sensor that is turned to the left by an angle sees it, read-only."""
+    result = np.empty(points.shape, np.float32)
+    fill_turned(read_only(points), np.float32(math.cos(angle_rad)), np.float32(math.sin(angle_rad)), result)
+    return read_only(result)
+
+
 def _moved(boxes: Iterable[Box], R: NDArray[np.float64], t: NDArray[np.float64]) -> tuple[Box, ...]:
     moved = []
     for box in boxes:
@@ -91,3 +98,23 @@ def fill_moved(
         for axis in range(3):
             moved[i, axis] = R[axis, 0] * x + R[axis, 1] * y + R[axis, 2] * z + t[axis]
         moved[i, 3] = points[i, 3]
+
+
+@njit(cache=True, nogil=True)
+def fill_turned(points: NDArray[np.float32], cos: np.float32, sin: np.float32, turned: NDArray[np.float32]) -> None:
+    """Write the points, turned about the z axis in float32.
+
+    Parameters
+    ----------
+    points : (n, 4) float32, C-contiguous
+    cos, sin : float32
+        Of the angle by which the sensor is turned to the left.
+    turned : (n, 4) float32, overwritten
+        A coordinate beyond the range of float32 becomes infinite.
+    """
+    for i in range(points.shape[0]):
+        x, y = points[i, 0], points[i, 1]
+        turned[i, 0] = cos * x + sin * y
+        turned[i, 1] = cos * y - sin * x
+        turned[i, 2] = points[i, 2]
+        turned[i, 3] = points[i, 3]

@@ -27,7 +27,7 @@ from .decode import decode_labels, decode_top_view
 from .drivable import compile_kernels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
 from .fitness import Finding, FitnessProfile, check_fitness
-from .frame import ModelFrame
+from .frame import ModelFrame, turned
 from .ground import Ground, find_ground
 from .image import ImageScaler, as_image, label_pixels
 from .level import MountingEstimate, MountingEstimator
@@ -604,12 +604,8 @@ class Perceiver:
         ahead = self._label_sector(network, scan, height_m, watch, infer)
         labels, in_view = ahead.labels, ahead.in_view
         for k in range(1, math.ceil(360.0 / width_deg)):
-            cos, sin = math.cos(math.radians(k * width_deg)), math.sin(math.radians(k * width_deg))
-            turned = scan.copy()
-            with np.errstate(over="ignore"):  # what float32 cannot hold is not in view
-                turned[:, 0] = cos * scan[:, 0] + sin * scan[:, 1]
-                turned[:, 1] = cos * scan[:, 1] - sin * scan[:, 0]
-            aside = self._label_sector(network, turned, height_m, watch, infer)
+            # What float32 cannot hold after the turn is not in view.
+            aside = self._label_sector(network, turned(scan, math.radians(k * width_deg)), height_m, watch, infer)
             labels = np.where(in_view, labels, aside.labels)
             in_view = in_view | aside.in_view
         return PointLabels(labels, in_view, ahead.classes)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import twins.frame
 from edgeperc import Box, FitnessError, ModelFrame, Mounting, MountingError, OptionError, Perceiver, SensorError
-from edgeperc.frame import fill_moved
+from edgeperc.frame import fill_moved, turned
 from edgeperc.level import FROZEN_AFTER, MountingEstimator
 from edgeperc.mounting import MODEL_MOUNTING
 from edgeperc.sensor import SensorProfile, get_sensor
@@ -192,6 +192,8 @@ def test_the_kernel_agrees_with_its_twin(kind: str) -> None:
     found = np.empty_like(points)
     fill_moved(points, frame.R, frame.t, found)
     np.testing.assert_array_equal(found, twins.frame.moved(points, frame.R, frame.t))
+    for angle_rad in (0.0, math.pi / 2, math.pi, 2.0):
+        np.testing.assert_array_equal(turned(points, angle_rad), twins.frame.turned(points, angle_rad))
 
 
 @given(mountings, st.floats(-3.0, 3.0))
