@@ -9,7 +9,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from edgeperc.card import ModelCard, TopViewGeometry
+from edgeperc.card import CameraGeometry, ModelCard, TopViewGeometry
 from edgeperc.evaluation.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES
 from edgeperc.evaluation.tables import BANDS
 from edgeperc.zoo import DEFAULT, MAX_LOSS, Variant, digest, resolve
@@ -20,7 +20,11 @@ __all__ = ["models_page"]
 
 NO_AGREEMENT = "--no-agreement"
 
-TASKS = {"range_image": "a class for every point", "top_view": "drivable area and vehicles ahead"}
+TASKS = {
+    "camera": "a class for every pixel of an image",
+    "range_image": "a class for every point",
+    "top_view": "drivable area and vehicles ahead",
+}
 SOURCES = {"real": "real", "semantickitti": "SemanticKITTI", "simulated": "simulated"}
 ALL_RANGES = ("all",)
 
@@ -106,6 +110,8 @@ def _view(card: ModelCard) -> str:
         (near, far), (right, left) = view.x_range_m, view.y_range_m
         ranges = f"x {near:g} to {far:g} m, y {right:g} to {left:g} m"
         return f"{view.height} x {view.width} cells of {view.cell_m:g} m, {ranges}"
+    if isinstance(view, CameraGeometry):
+        return f"{view.height} x {view.width} pixels, images are {view.fit}ed to it"
     return (
         f"{view.height} x {view.width} pixels, azimuth {view.azimuth_left_deg:g} to {view.azimuth_right_deg:g} degrees"
     )
