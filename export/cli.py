@@ -164,6 +164,9 @@ def build_parser() -> argparse.ArgumentParser:
     )
     quantize.add_argument("--semantickitti", type=Path, help=SEMANTICKITTI)
     quantize.add_argument(
+        "--camvid", type=Path, help=f"{CAMVID}; for a camera's model: calibrates on training images, not on scans"
+    )
+    quantize.add_argument(
         "--seven-bits",
         action="store_true",
         default=None,
@@ -411,9 +414,13 @@ def _card(args: argparse.Namespace) -> int:
 
 
 def _quantize(args: argparse.Namespace) -> int:
-    from .quantize import calibration_scans, quantize
+    from .quantize import calibration_images, calibration_scans, quantize
 
-    scans, hashes = calibration_scans(args.scans, kitti=args.kitti, n_simulated=args.simulated)
+    scans: Sequence[Any]
+    if args.camvid is not None:
+        scans, hashes = calibration_images(args.camvid)
+    else:
+        scans, hashes = calibration_scans(args.scans, kitti=args.kitti, n_simulated=args.simulated)
     card = quantize(
         args.model,
         args.out,
@@ -421,6 +428,7 @@ def _quantize(args: argparse.Namespace) -> int:
         hashes=hashes,
         kitti=args.kitti,
         semantickitti=args.semantickitti,
+        camvid=args.camvid,
         exclude=args.exclude,
         seven_bits=args.seven_bits,
         n_evaluated=args.evaluate_on,

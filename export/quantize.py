@@ -28,24 +28,23 @@ from onnxruntime.quantization import CalibrationMethod, QDQQuantizer, QuantType,
 from tqdm import tqdm
 
 from edgeperc.card import ModelCard
-from edgeperc.decode import decode_classes, decode_top_view
+from edgeperc.decode import decode_top_view
 from edgeperc.errors import EdgepercError, ModelError, OptionError, PointsError, SplitError
+from edgeperc.evaluation.camvid import LabeledImages, evaluate_images, image_hash
 from edgeperc.evaluation.datasets import SEQUENCE_DRIVES, KittiObjects, scan_hash
 from edgeperc.evaluation.evaluate import evaluate
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
 from edgeperc.evaluation.splits import in_split
-from edgeperc.network_input import project
-from edgeperc.projection import make_projector
 from edgeperc.readers.files import read_points
 from edgeperc.session import Session
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.tuning import cpu_features
 from edgeperc.zoo import INT8_FEATURES
 
-from .simulate import parity_scans
-from .to_onnx import with_golden, write_card
+from .simulate import parity_images, parity_scans
+from .to_onnx import pixel_labels, views, with_golden, write_card
 
-__all__ = ["RefusedError", "calibration_scans", "quantize"]
+__all__ = ["RefusedError", "calibration_images", "calibration_scans", "quantize"]
 
 # Operators that onnxruntime's CPU provider computes in int8. It has no int8 kernel for ConvTranspose, Elu or Equal.
 ROUNDED_OPS = (
@@ -53,6 +52,7 @@ ROUNDED_OPS = (
 )
 FIRST_SEED = 3 * 10**9  # seeds of training start at 0, of parity scans at 10**9, of evaluation at 2 * 10**9
 N_PROBES = 8
+N_IMAGES = 64
 KEPT_PERCENT = 99.99
 # Limit of `_disagreement`. With all convolutions in int8: pointseg 0.024, ssadnet 0.079, both as accurate as in fp32;
 # ssadnet-full 0.17, of which 0.16 is due to one convolution before its unpooling.
@@ -113,6 +113,14 @@ def calibration_scans(
     return scans, [scan_hash(points) for points in real]
 
 
+def calibration_images(camvid: Path) -> tuple[list[NDArray[np.uint8]], list[str]]:
+    """64 training images of CamVid, evenly spread, and their `edgeperc.evaluation.camvid.image_hash`."""
+    data = LabeledImages(camvid)
+    files = data.files("train")
+    images = [data.read(file)[0] for file in files[:: max(1, len(files) // N_IMAGES)][:N_IMAGES]]
+    return images, [image_hash(image) for image in images]
+
+
 def _drive(file: Path) -> str | None:
     """The KITTI drive of a scan; None if its folders do not show it."""
     file = file.resolve()
@@ -160,13 +168,10 @@ class _Calibrated:
     seven_bits: bool
 
     @classmethod
-    def on(
-        cls, path: Path, card: ModelCard, scans: Sequence[NDArray[np.float32]], seven_bits: bool = False
-    ) -> _Calibrated:
-        """Calibrate the model of a file on scans."""
-        model, projector = _folded(path), make_projector(card.view, card.input)
-        views = [project(projector, np.ascontiguousarray(points, np.float32)) for points in scans]
-        images = [view.image[None] for view in views]
+    def on(cls, path: Path, card: ModelCard, scans: Sequence[NDArray[Any]], seven_bits: bool = False) -> _Calibrated:
+        """Calibrate the model of a file on scans, or images."""
+        model, seen = _folded(path), [*views(card, scans)]
+        images = [image[None] for image, _ in seen]
         with tempfile.TemporaryDirectory() as folder:
             onnx.save(model, f"{folder}/folded.onnx")
             augmented = f"{folder}/augmented.onnx"
@@ -179,8 +184,8 @@ class _Calibrated:
                 for image in tqdm(images, desc="calibrating", unit="scan"):
                     calibrator.collect_data(_Reader(iter([{card.input.name: image}])))
                 ranges = calibrator.compute_data()
-        probed = views[:: max(1, len(views) // N_PROBES)][:N_PROBES]
-        probes, returned = [view.image[None] for view in probed], [view.index >= 0 for view in probed]
+        probed = seen[:: max(1, len(seen) // N_PROBES)][:N_PROBES]
+        probes, returned = [image[None] for image, _ in probed], [cells for _, cells in probed]
         return cls(card, model, ranges, probes, returned, _outputs(model, card, probes), seven_bits)
 
     def rounded(self, convolutions: Collection[str]) -> onnx.ModelProto:
@@ -272,7 +277,7 @@ def _disagreement(fp32: _Calibrated, outputs: Sequence[Mapping[str, NDArray[np.f
             boxes.update(own_boxes, fp32_boxes)
         else:
             own_labels, fp32_labels = (
-                decode_classes(next(iter(raw.values())), next(iter(raw)))[0] for raw in (actual, expected)
+                pixel_labels(next(iter(raw.values())), next(iter(raw))) for raw in (actual, expected)
             )
         labels.update(own_labels, fp32_labels)
     return 1.0 - float(np.nanmin([labels.mean_iou(), boxes.overall().ap]))
@@ -353,6 +358,8 @@ def _scores(figures: Mapping[str, Any]) -> dict[str, float]:
             scores[f"{block} {kind} vehicle AP"] = bands["all"]["vehicle"]["ap"]
     if road := figures.get("semantickitti", {}).get("road"):
         scores["road F1"] = road["all"]["f1"]
+    if images := figures.get("images"):
+        scores["image mean IoU"] = images["all"]["mean_iou"]
     return {name: score for name, score in scores.items() if score is not None and np.isfinite(score)}
 
 
@@ -360,10 +367,11 @@ def quantize(
     path: Path,
     out: Path,
     *,
-    scans: Sequence[NDArray[np.float32]],
+    scans: Sequence[NDArray[Any]],
     hashes: Sequence[str] = (),
     kitti: Path | None = None,
     semantickitti: Path | None = None,
+    camvid: Path | None = None,
     exclude: Sequence[str] = (),
     seven_bits: bool | None = None,
     n_evaluated: int = 48,
@@ -380,13 +388,16 @@ def quantize(
     path, out : Path
         The model in fp32, and the .onnx to write.
     scans : sequence of (n, 4) float32
-        To calibrate on, from `calibration_scans`.
+        To calibrate on, from `calibration_scans`; of a camera's model images (H, W, 3) uint8, from
+        `calibration_images`.
     hashes : sequence of str
         Hashes of the real scans. The card lists them, so that the model is never evaluated on these scans.
     kitti : Path or None
         Root of a KITTI object set; both models are evaluated on its test drives.
     semantickitti : Path or None
         Root of SemanticKITTI; both models are evaluated on its roads.
+    camvid : Path or None
+        Folder of CamVid; both models are evaluated on its validation images.
     exclude : sequence of str
         Nodes to keep in fp32.
     seven_bits : bool or None
@@ -419,6 +430,8 @@ def quantize(
         raise PointsError("no scan to calibrate on; expected at least one")
     session = Session(path, "cpu")
     card = session.card
+    if card.view.kind == "camera" and camvid is None:
+        raise OptionError(f"{path} is of a camera; give --camvid to calibrate and evaluate it on")
     if card.precision != "fp32":
         raise ModelError(f"{path} is in {card.precision}; quantize the model in fp32")
     seven_bits = _saturates() if seven_bits is None else seven_bits
@@ -435,7 +448,9 @@ def quantize(
         "quantized": {
             "from": f"{card.name} {card.version}",
             "graph_sha256": hashlib.sha256(onnx.load(path).graph.SerializeToString(deterministic=True)).hexdigest(),
-            "calibration": f"{len(hashes)} real and {len(scans) - len(hashes)} simulated scans",
+            "calibration": f"{len(hashes)} images of CamVid"
+            if card.view.kind == "camera"
+            else f"{len(hashes)} real and {len(scans) - len(hashes)} simulated scans",
             "left_alone": kept,
             "disagreement": disagreement,
             "weight_bits": 7 if seven_bits else 8,
@@ -455,10 +470,16 @@ def quantize(
         )
         if most >= 1.0:
             raise RefusedError(f"{path}: not faster here with {share}: {speed}; expected an interval below 1")
-        simulated = f"simulation:{n_evaluated}"
-        given = {"KITTI": kitti, "SEMANTICKITTI": semantickitti, simulated: simulated}
-        datasets = {name: root for name, root in given.items() if root is not None}
-        figures, before = (evaluate([*datasets.values()], [each], rules=())[0] for each in (trial, path))
+        if card.view.kind == "camera":
+            assert camvid is not None
+            figures, before = (evaluate_images([camvid], each, split="validation") for each in (trial, path))
+            command = f"edgeperc eval CAMVID --split validation --model {out.name}"
+        else:
+            simulated = f"simulation:{n_evaluated}"
+            given = {"KITTI": kitti, "SEMANTICKITTI": semantickitti, simulated: simulated}
+            datasets = {name: root for name, root in given.items() if root is not None}
+            figures, before = (evaluate([*datasets.values()], [each], rules=())[0] for each in (trial, path))
+            command = " ".join(["edgeperc eval", *datasets, f"--model {out.name}", "--no-agreement"])
         int8_scores, fp32_scores = _scores(figures), _scores(before)
         lost = {name: score - int8_scores.get(name, 0.0) for name, score in fp32_scores.items()}
         worse = [
@@ -468,7 +489,7 @@ def quantize(
         ]
         if worse:
             raise RefusedError(f"{path}: more than {MAX_LOSS} lost with {share}: {'; '.join(worse)} ({speed})")
-        figures["command"] = " ".join(["edgeperc eval", *datasets, f"--model {out.name}", "--no-agreement"])
+        figures["command"] = command
         parity = {**_parity(path, trial), "speed": speed, "largest_loss": max(lost.values(), default=0.0)}
         card = replace(card, parity=parity, metrics=figures)
         write_card(model, card, out)
@@ -479,15 +500,14 @@ def quantize(
 
 def _parity(path: Path, rounded: Path) -> dict[str, float]:
     """Smallest share of pixels with the same label as in fp32, on simulated scans outside training and calibration."""
-    sessions, scans, agreement = [Session(each, "cpu") for each in (path, rounded)], parity_scans([]), 1.0
+    sessions, agreement = [Session(each, "cpu") for each in (path, rounded)], 1.0
     card = sessions[0].card
-    projector = make_projector(card.view, card.input)
-    for points in scans:
-        image = project(projector, points).image
+    scans: Sequence[NDArray[Any]] = parity_images([]) if card.view.kind == "camera" else parity_scans([])
+    for image, _ in views(card, scans):
         labels = []
         for session in sessions:
             session.input[:] = image
-            kind = next(o.kind for o in card.outputs if o.kind.startswith("class_"))
-            labels.append(decode_classes(session.run()[kind], kind)[0])
+            kind = next(o.kind for o in card.outputs if not o.kind.startswith("box_"))
+            labels.append(pixel_labels(session.run()[kind], kind))
         agreement = min(agreement, float((labels[0] == labels[1]).mean()))
     return {"n_scans": len(scans), "label_agreement": agreement}
