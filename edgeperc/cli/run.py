@@ -65,7 +65,7 @@ def add_parser(commands: Commands) -> None:
             "edgeperc run velodyne/ --live --rate 10",
             "edgeperc run street.jpg --out out --png",
             "edgeperc run image_2/000123.png --scan velodyne/000123.bin --json",
-            "edgeperc run image_2/000123.png --scan velodyne/000123.bin --calib calib/000123.txt --png --out pictures",
+            "edgeperc run 0.png --scan 0.bin --calib calib.txt --png --out pictures",
         ],
     )
     reading = parser.add_argument_group("input")
