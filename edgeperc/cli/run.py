@@ -91,7 +91,7 @@ def add_parser(commands: Commands) -> None:
         type=Path,
         metavar="FILE",
         help="KITTI's calibration of camera and LiDAR, the same for all images; with --scan and --png, NAME_both.png "
-        "shows the classes of the image on the points, and its road from above",
+        "shows the classes of the image on the points, and its road from above (default: no such picture)",
     )
     add_sensor(reading, of_capture=True)
     add_mounting(reading)
