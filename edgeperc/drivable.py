@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import PointsError
+from .errors import OptionError, PointsError
 from .frame import ModelFrame
 from .geometry import draw_footprints
 from .kernel_cache import njit
+from .outline import outline_of
 from .perception import Box, TopView
 
 __all__ = [
@@ -24,9 +25,6 @@ __all__ = [
     "compile_kernels",
     "fill_corridor",
     "fill_free",
-    "fill_rings",
-    "mark_connected",
-    "mark_kept",
     "road_ahead",
 ]
 
@@ -45,9 +43,14 @@ class RoadAhead:
     ----------
     outline : (k, 2) float64
         Corners x, y of the connected road nearest to the sensor, counter-clockwise seen from above, the first not
-        repeated. Cells that share only a corner are not connected. Shape (0, 2) if no cell is drivable.
+        repeated. Shape (0, 2) if no cell is drivable. With the holes it is a valid polygon: no ring touches or crosses
+        itself or another one.
     holes : tuple of (k, 2) float64
-        Areas inside the outline that are not road, such as vehicles; clockwise.
+        Obstacles inside the outline: objects, and ground that the scan observed and that is not road; clockwise. Gaps
+        inside the road that the scan did not observe are not holes.
+    tolerance_m : float
+        The outline leaves out no road that is farther than this from the edges of the cells [m]. It is larger than the
+        tolerance that was asked for if that needs too many corners.
     y_m : (columns,) float64
         Middles of the top view's columns, leftmost first.
     free_m : (columns,) float64
@@ -68,6 +71,7 @@ class RoadAhead:
 
     outline: NDArray[np.float64]
     holes: tuple[NDArray[np.float64], ...]
+    tolerance_m: float
     y_m: NDArray[np.float64]
     free_m: NDArray[np.float64]
     x_m: NDArray[np.float64]
@@ -89,7 +93,9 @@ class RoadAhead:
         return float(self.free_m[near].min()) if near.any() else math.nan
 
 
-def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: float = 0.1) -> RoadAhead:
+def road_ahead(
+    top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: float = 0.2, max_corners: int = 40
+) -> RoadAhead:
     """Measure the road in a top view: polygon, free distance and lane width.
 
     Parameters
@@ -100,9 +106,12 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
         Obstacles that are not road, such as `Perception.boxes`, in the frame of the scan: the top view has no class for
         pedestrians.
     tolerance_m : float
-        Largest distance of the polygon from the edges of the cells [m] (Douglas and Peucker, 1973); 0 keeps every
-        corner. The default is one cell of the shipped models, which removes the steps of a slanting edge. With more
-        than one cell, edges of a ring may cross.
+        Largest distance of the polygon from the edges of the cells [m], in both directions; 0 keeps all corners. Gaps
+        in the road narrower than twice the tolerance are closed, and road that is connected only over a narrower
+        passage is left out. No cell of an object is ever inside.
+    max_corners : int
+        Largest number of corners of the outline. If the tolerance needs more, more road is left out, up to 2, 4 or 8
+        times the tolerance from its edges or, at last, any distance (`RoadAhead.tolerance_m`). Nothing is added.
 
     Returns
     -------
@@ -112,6 +121,8 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
     ------
     PointsError
         The tolerance is negative or NaN.
+    OptionError
+        ``max_corners`` is below 4.
 
     Examples
     --------
@@ -122,10 +133,12 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
     """
     if not tolerance_m >= 0.0:
         raise PointsError(f"tolerance_m is {tolerance_m}; expected 0 or more meters")
+    if not max_corners >= 4:
+        raise OptionError(f"max_corners is {max_corners}; expected at least 4")
     drivable = np.array(top_view.drivable, np.bool_, order="C")
+    taken = np.zeros(drivable.shape, np.uint8)
     standing = ModelFrame(top_view.mounting).move_boxes(boxes)
     if standing:
-        taken = np.zeros(drivable.shape, np.uint8)
         draw_footprints(taken, standing, top_view.geometry, ("free", *{box.label for box in standing}))
         drivable &= taken == 0
     height, width = drivable.shape
@@ -146,16 +159,23 @@ def road_ahead(top_view: TopView, boxes: Iterable[Box] = (), *, tolerance_m: flo
     right_m = np.where(there, y_left - bounds[:, 1] * cell_m, np.nan)
     whole = there & (bounds[:, 0] > 0) & (bounds[:, 1] < width) & (x_m < x_near + LANE_RANGE_M)
 
-    rings = [
-        _simplified(np.column_stack([x_far - ring[:, 0] * cell_m, y_left - ring[:, 1] * cell_m]), float(tolerance_m))
-        for ring in _rings(_nearest_part(drivable, y_m, x_m[::-1]))
-    ]
-    # Rings run with the road on their left, so only the outer ring has a positive area.
-    areas = [_area(ring) for ring in rings]
-    outer = int(np.argmax(areas)) if rings else -1
+    # Labels other than these two are objects.
+    ground = [k for k, name in enumerate(top_view.classes) if name in ("background", "drivable")]
+    objects = (taken > 0) | ~np.isin(top_view.labels, ground)
+    found = outline_of(
+        drivable,
+        (x_far / cell_m - 0.5, y_left / cell_m - 0.5),
+        objects,
+        objects | (top_view.observed & ~top_view.road),
+        # A multiple of a cell's edge may have been rounded down. No distance in the view is larger.
+        tolerance=min(float(tolerance_m) / cell_m + 1e-6, float(height + width)) if tolerance_m > 0.0 else 0.0,
+        max_corners=int(max_corners),
+    )
+    at_corner, turned = np.array([x_far, y_left]), np.float64(-cell_m)
     return RoadAhead(
-        outline=rings[outer] if rings else np.empty((0, 2)),
-        holes=tuple(ring for k, ring in enumerate(rings) if k != outer),
+        outline=at_corner + found.outer * turned,
+        holes=tuple(at_corner + hole * turned for hole in found.holes),
+        tolerance_m=float(tolerance_m) * found.factor,
         y_m=y_m,
         free_m=free_m,
         x_m=x_m,
@@ -170,8 +190,9 @@ def compile_kernels() -> None:
     cells = np.ones((2, 2), np.bool_)
     fill_free(cells, np.empty(2, np.int64))
     fill_corridor(cells, 0.0, 2.0, np.empty((2, 2), np.int64))
-    for ring in _rings(_nearest_part(cells, np.zeros(2), np.zeros(2))):
-        _simplified(ring.astype(np.float64), 0.0)
+    cells = np.ones((9, 9), np.bool_)
+    cells[4, 4] = False
+    outline_of(cells, (0.0, 0.0), ~cells, ~cells, tolerance=1.0, max_corners=4)
 
 
 def _lane_width(x: NDArray[np.float64], left: NDArray[np.float64], right: NDArray[np.float64]) -> float:
@@ -183,37 +204,6 @@ def _lane_width(x: NDArray[np.float64], left: NDArray[np.float64], right: NDArra
     slope = float(np.median((middle[-half:] - middle[:half]) / (x[-half:] - x[:half]))) if half else 0.0
     width = float(np.median(left - right)) / math.hypot(1.0, slope)
     return width / max(1, round(width / USUAL_LANE_M))
-
-
-def _nearest_part(drivable: NDArray[np.bool_], y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """The connected drivable cells around the one nearest to the sensor."""
-    part = np.zeros(drivable.shape, np.bool_)
-    rows, cols = np.nonzero(drivable)
-    if len(rows):
-        nearest = int(np.argmin(np.hypot(x[rows], y[cols])))
-        mark_connected(drivable, int(rows[nearest]), int(cols[nearest]), part)
-    return part
-
-
-def _rings(part: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-    """Rings of corners (row, column) around the cells of ``part``, with these cells on the left."""
-    padded = np.pad(part, 1)
-    n_sides = sum(int(np.count_nonzero(padded & ~np.roll(padded, shift, axis))) for axis in (0, 1) for shift in (1, -1))
-    corners, ends = np.empty((n_sides, 2), np.int64), np.empty(n_sides // 4 + 1, np.int64)
-    n_rings = fill_rings(padded, corners, ends)
-    return [ring - 1 for ring in np.split(corners, ends[:n_rings])[:n_rings]]
-
-
-def _simplified(ring: NDArray[np.float64], tolerance_m: float) -> NDArray[np.float64]:
-    kept = np.empty(len(ring), np.bool_)
-    mark_kept(ring, tolerance_m, kept)
-    # Fewer than three corners are no ring.
-    return ring[kept] if np.count_nonzero(kept) >= 3 else ring
-
-
-def _area(ring: NDArray[np.float64]) -> float:
-    x, y = ring[:, 0], ring[:, 1]
-    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
 
 @njit(cache=True, nogil=True)
@@ -274,130 +264,3 @@ def fill_corridor(drivable: NDArray[np.bool_], first: float, last: float, bounds
             low, high = np.float64(bounds[row, 0]), np.float64(bounds[row, 1])
         elif begun:
             return
-
-
-@njit(cache=True, nogil=True)
-def mark_connected(cells: NDArray[np.bool_], row: int, col: int, part: NDArray[np.bool_]) -> None:
-    """Mark the cells that are connected to a start cell over shared sides.
-
-    Parameters
-    ----------
-    cells : (rows, columns) bool
-    row, col : int
-        A marked cell of ``cells``, where the search begins.
-    part : (rows, columns) bool, overwritten
-    """
-    height, width = cells.shape
-    part[:] = False
-    pending = np.empty((height * width, 2), np.int32)
-    pending[0, 0], pending[0, 1] = row, col
-    part[row, col] = True
-    n = 1
-    while n > 0:
-        n -= 1
-        r, c = pending[n, 0], pending[n, 1]
-        for k in range(4):
-            dr = -1 if k == 0 else 1 if k == 1 else 0
-            dc = -1 if k == 2 else 1 if k == 3 else 0
-            if 0 <= r + dr < height and 0 <= c + dc < width and cells[r + dr, c + dc] and not part[r + dr, c + dc]:
-                part[r + dr, c + dc] = True
-                pending[n, 0], pending[n, 1] = r + dr, c + dc
-                n += 1
-
-
-@njit(cache=True, nogil=True)
-def fill_rings(cells: NDArray[np.bool_], corners: NDArray[np.int64], ends: NDArray[np.int64]) -> int:
-    """Trace the edges of marked cells, with the cells on the left.
-
-    Parameters
-    ----------
-    cells : (rows, columns) bool
-        None marked along the border.
-    corners : (n, 2) int64, overwritten
-        Row and column of the corners where the trace turns, ring after ring; a cell's upper left corner has its row and
-        column. ``n`` is at least the number of sides between a marked and an unmarked cell.
-    ends : (m,) int64, overwritten
-        Where each ring ends in ``corners``; ``m`` at least a quarter of ``n``.
-
-    Returns
-    -------
-    n_rings : int
-    """
-    height, width = cells.shape
-    walked = np.zeros((height, width), np.bool_)  # lower sides
-    n_corners, n_rings = 0, 0
-    for top in range(height - 1):
-        for left in range(width):
-            if not cells[top, left] or cells[top + 1, left] or walked[top, left]:
-                continue
-            row, col, heading = top + 1, left, 0  # to the right along the lower side of the cell
-            begun = False
-            while not begun or row != top + 1 or col != left or heading != 0:
-                begun = True
-                if heading == 0:
-                    walked[row - 1, col] = True
-                    col += 1
-                    ahead_left, ahead_right = cells[row - 1, col], cells[row, col]
-                elif heading == 1:  # up
-                    row -= 1
-                    ahead_left, ahead_right = cells[row - 1, col - 1], cells[row - 1, col]
-                elif heading == 2:  # left
-                    col -= 1
-                    ahead_left, ahead_right = cells[row, col - 1], cells[row - 1, col - 1]
-                else:  # down
-                    row += 1
-                    ahead_left, ahead_right = cells[row, col], cells[row, col - 1]
-                turn = 1 if not ahead_left else -1 if ahead_right else 0
-                if turn != 0:
-                    corners[n_corners, 0], corners[n_corners, 1] = row, col
-                    n_corners += 1
-                    heading = (heading + turn) % 4
-            ends[n_rings] = n_corners
-            n_rings += 1
-    return n_rings
-
-
-@njit(cache=True, nogil=True)
-def mark_kept(ring: NDArray[np.float64], tolerance: float, kept: NDArray[np.bool_]) -> None:
-    """Mark the corners that a simplified ring needs (Douglas and Peucker).
-
-    Parameters
-    ----------
-    ring : (n, 2) float64
-        At least one corner; the first is not repeated.
-    tolerance : float
-        Every corner left out lies within this distance of the edge that replaces it.
-    kept : (n,) bool, overwritten
-    """
-    n = ring.shape[0]
-    kept[:] = False
-    # Split the ring into two lines: from its first corner to the corner farthest from it, and back.
-    farthest, most = 0, 0.0
-    for k in range(n):
-        apart = math.hypot(ring[k, 0] - ring[0, 0], ring[k, 1] - ring[0, 1])
-        if apart > most:
-            farthest, most = k, apart
-    kept[0] = True
-    kept[farthest] = True
-    pending = np.empty((n + 2, 2), np.int64)
-    pending[0, 0], pending[0, 1] = 0, farthest
-    pending[1, 0], pending[1, 1] = farthest, n
-    n_pending = 2
-    while n_pending > 0:
-        n_pending -= 1
-        begin, end = pending[n_pending, 0], pending[n_pending, 1]
-        x, y = ring[begin, 0], ring[begin, 1]
-        dx, dy = ring[end % n, 0] - x, ring[end % n, 1] - y
-        length2 = dx * dx + dy * dy
-        worst, most = -1, tolerance
-        for k in range(begin + 1, end):
-            ux, uy = ring[k, 0] - x, ring[k, 1] - y
-            along = min(max((ux * dx + uy * dy) / length2, 0.0), 1.0) if length2 > 0.0 else 0.0
-            off = math.hypot(ux - along * dx, uy - along * dy)
-            if off > most:
-                worst, most = k, off
-        if worst >= 0:
-            kept[worst] = True
-            pending[n_pending, 0], pending[n_pending, 1] = begin, worst
-            pending[n_pending + 1, 0], pending[n_pending + 1, 1] = worst, end
-            n_pending += 2

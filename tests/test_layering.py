@@ -26,7 +26,7 @@ FLOORS = {
         extras mounting onnx_file
         card points sensor tuning
         kernel_cache perception zoo.__init__
-        calibration frame geometry linkage
+        calibration frame geometry linkage outline
         adapt cluster decode drivable fitness ground image observed projection refine sensor_fit session
         agreement level network_input painting remission
         readers.__init__ readers.tables
