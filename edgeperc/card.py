@@ -205,7 +205,7 @@ class CameraGeometry:
         Columns and rows of the input.
     fit : {"stretch"}
         How an image of another size gets there: all of it is scaled to ``width`` and ``height``, bilinearly with
-        half-pixel centers (`edgeperc.image.fill_scaled`), whatever its aspect; nothing is cropped or padded.
+        half-pixel centers (`edgeperc.image.ImageScaler`), whatever its aspect; nothing is cropped or padded.
     """
 
     width: int
