@@ -204,6 +204,7 @@ def build_parser() -> argparse.ArgumentParser:
     make.add_argument("--kitti", type=Path, help=KITTI)
     make.add_argument("--layouts", type=Path, help=LAYOUTS)
     make.add_argument("--semantickitti", type=Path, help=SEMANTICKITTI)
+    make.add_argument("--camvid", type=Path, help=f"{CAMVID}; for camseg")
     make.add_argument("--fold", type=int, help=FOLD)
     make.add_argument("--scans", action="append", default=[], metavar="FOLDER[:LAYOUT]", help=SCANS)
     make.add_argument("--steps", type=int, help="training steps (default: as many as for the shipped model)")
@@ -468,6 +469,7 @@ def _make(args: argparse.Namespace) -> int:
         kitti=args.kitti,
         layouts=args.layouts,
         semantickitti=args.semantickitti,
+        camvid=args.camvid,
         scan_sets=[ScanFolder.parse(text) for text in args.scans],
         fold=args.fold,
         steps=args.steps,

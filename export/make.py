@@ -6,14 +6,17 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import onnx
 
+from edgeperc.card import ModelCard
+from edgeperc.evaluation.camvid import evaluate_images
 from edgeperc.evaluation.evaluate import evaluate
 from edgeperc.evaluation.scan_folder import ScanFolder
 
 from .recipe import MODELS
-from .simulate import fitness_of, parity_scans, simulate
+from .simulate import fitness_of, parity_images, parity_scans, simulate
 from .to_onnx import export, write_card
 from .train import train
 
@@ -34,6 +37,7 @@ def make(
     kitti: Path | None,
     layouts: Path | None,
     semantickitti: Path | None = None,
+    camvid: Path | None = None,
     scan_sets: Sequence[ScanFolder] = (),
     fold: int | None = None,
     steps: int | None = None,
@@ -53,6 +57,8 @@ def make(
     kitti, layouts, semantickitti : Path or None
         Folders of a KITTI object set, of its labels and calibrations alone, and of SemanticKITTI. Models whose name
         ends in ``-sim`` need none of them; ``kitti`` then serves for evaluation only.
+    camvid : Path or None
+        Folder of CamVid, which the network of a camera is trained and evaluated on; it needs nothing else.
     scan_sets : sequence of ScanFolder
         More real scans to train on.
     fold : int, optional
@@ -74,10 +80,16 @@ def make(
     Raises
     ------
     ValueError
-        The model is trained on real scans too, and a folder of them is missing.
+        The model is trained on real scans too, or on images, and a folder of them is missing.
     """
     stage = MODELS[name]
     recipe = stage.recipe if steps is None else replace(stage.recipe, steps=steps)
+    if recipe.task == "camera":
+        checkpoint = train(
+            recipe, out / name, kitti=None, simulated=None, camvid=camvid, n_threads=n_threads, compiled=compiled
+        )
+        finish(name, checkpoint, out / f"{name}.onnx", kitti=None, semantickitti=None, camvid=camvid, version=version)
+        return out / f"{name}.onnx"
     simulated_only = stage.recipe.simulated_share == 1.0
     if not simulated_only and (kitti is None or layouts is None):
         raise ValueError(f"{name} is trained on real scans too; give --kitti and --layouts")
@@ -132,6 +144,7 @@ def finish(
     *,
     kitti: Path | None,
     semantickitti: Path | None,
+    camvid: Path | None = None,
     fold: int | None = None,
     version: str = "1.0.0",
 ) -> None:
@@ -145,10 +158,18 @@ def finish(
     path : Path
         The .onnx file to write. The JSON file has the same name, but ends in .json. If ``ssadnet-sim.onnx`` is in the
         same folder, its road is the ground truth of KITTI's scans.
-    kitti, semantickitti, fold, version
+    kitti, semantickitti, camvid, fold, version
         As for `make`.
     """
     stage = MODELS[name]
+    if stage.recipe.task == "camera":
+        assert camvid is not None
+        card = export(checkpoint, path, scans=parity_images([]), fitness=None, name=name, version=version)
+        figures = evaluate_images([camvid], path, split="validation")
+        _write_figures(
+            path, card, figures | {"command": f"edgeperc eval CAMVID --split validation --model {name}:fp32"}
+        )
+        return
     fitness = fitness_of(None if stage.recipe.simulated_share == 1.0 else kitti)
     card = export(checkpoint, path, scans=parity_scans([]), fitness=fitness, name=name, version=version)
     datasets: dict[str, str | Path] = {"simulation": "simulation"}
@@ -168,6 +189,10 @@ def finish(
     command += ["--no-agreement"]
     for source in SOURCES & figures.keys():
         figures[source] = {name: of for name, of in figures[source].items() if name in CARD_FIGURES}
-    figures["command"] = " ".join(command)
+    _write_figures(path, card, figures | {"command": " ".join(command)})
+
+
+def _write_figures(path: Path, card: ModelCard, figures: dict[str, Any]) -> None:
+    """Write figures into a model's card and into the JSON file beside it."""
     path.with_suffix(".json").write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
     write_card(onnx.load(path), replace(card, metrics=figures), path)
