@@ -16,7 +16,7 @@ from .kernel_cache import njit
 from .points import read_only
 from .sensor import SensorProfile
 
-__all__ = ["Finding", "FitnessProfile", "check_fitness", "fill_scan_sums"]
+__all__ = ["Finding", "FitnessProfile", "check_fitness", "check_profiles", "fill_scan_sums"]
 
 # About 6,000 points are enough. Steps are prime, so that they do not align with the rows of an organized scan.
 _STEPS = np.array([1, 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 53, 61, 71, 83, 97, 127, 167, 223, 307, 401])
@@ -465,7 +465,40 @@ def check_fitness(points: NDArray[np.float32], profile: FitnessProfile, sensor: 
     PointsError
         ``points`` has another shape.
     """
-    scan = _measure(points, profile.azimuth_deg)
+    return check_profiles(points, [profile], sensor)
+
+
+def check_profiles(
+    points: NDArray[np.float32], profiles: Iterable[FitnessProfile], sensor: SensorProfile
+) -> tuple[Finding, ...]:
+    """Describe how a scan differs from the training scans of several models, each difference once.
+
+    Parameters
+    ----------
+    points, sensor
+        As in `check_fitness`.
+    profiles : iterable of FitnessProfile
+        The scan is measured once for all profiles of the same view.
+
+    Returns
+    -------
+    tuple of Finding
+
+    Raises
+    ------
+    PointsError
+        ``points`` has another shape.
+    """
+    measured: dict[Range, _Measures | None] = {}
+    found: dict[Finding, None] = {}
+    for profile in profiles:
+        if profile.azimuth_deg not in measured:
+            measured[profile.azimuth_deg] = _measure(points, profile.azimuth_deg)
+        found |= dict.fromkeys(_findings(measured[profile.azimuth_deg], profile, sensor))
+    return tuple(found)
+
+
+def _findings(scan: _Measures | None, profile: FitnessProfile, sensor: SensorProfile) -> tuple[Finding, ...]:
     if scan is None:
         return (Finding("The scan holds no finite point: is the sensor connected and its driver running?", True),)
     if scan.n_sampled < 300.0 and scan.points_in_view < 0.2 * profile.points_in_view[0]:

@@ -26,7 +26,7 @@ from .cluster import MIN_SCORE, join_boxes, objects_from_points
 from .decode import decode_labels, decode_top_view
 from .drivable import compile_kernels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
-from .fitness import Finding, FitnessProfile, check_fitness
+from .fitness import Finding, FitnessProfile, check_profiles
 from .frame import ModelFrame, turned
 from .ground import Ground, find_ground
 from .image import ImageScaler, as_image, label_pixels
@@ -515,11 +515,7 @@ class Perceiver:
         )
 
     def _check(self, scan: NDArray[np.float32], sensor: SensorProfile) -> tuple[Finding, ...]:
-        found: dict[Finding, None] = {}
-        for network in self._networks:
-            if network.fitness is not None:
-                found |= dict.fromkeys(check_fitness(scan, network.fitness, sensor))
-        return tuple(found)
+        return check_profiles(scan, [n.fitness for n in self._networks if n.fitness is not None], sensor)
 
     def _refuse(self, fitness: tuple[Finding, ...]) -> None:
         """Raise FitnessError if ``on_mismatch`` asks for it."""
