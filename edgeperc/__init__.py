@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from .listing import ModelInfo, ProviderInfo, SensorInfo, models, providers, sensors
     from .live import Answer, Stream, stream
     from .mounting import Mounting
+    from .occupancy import OccupancyGrid, occupancy_grid
     from .painting import camera_road, paint
     from .perceiver import Perceiver
     from .perception import Box, ImageLabels, Perception, PointLabels, TopView
@@ -83,6 +84,7 @@ __all__ = [
     "ModelInfo",
     "Mounting",
     "MountingError",
+    "OccupancyGrid",
     "OptionError",
     "Perceiver",
     "Perception",
@@ -107,6 +109,7 @@ __all__ = [
     "camera_road",
     "draw",
     "models",
+    "occupancy_grid",
     "paint",
     "providers",
     "read_image",
@@ -129,6 +132,7 @@ _MODULES = {
     "ModelFrame": "frame",
     "ModelInfo": "listing",
     "Mounting": "mounting",
+    "OccupancyGrid": "occupancy",
     "Perceiver": "perceiver",
     "Perception": "perception",
     "PointLabels": "perception",
@@ -144,6 +148,7 @@ _MODULES = {
     "camera_road": "painting",
     "draw": "view",
     "models": "listing",
+    "occupancy_grid": "occupancy",
     "paint": "painting",
     "providers": "listing",
     "read_image": "readers.images",

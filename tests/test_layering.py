@@ -28,7 +28,7 @@ FLOORS = {
         kernel_cache perception zoo.__init__
         calibration frame geometry linkage outline
         adapt cluster decode drivable fitness ground image observed projection refine sensor_fit session
-        agreement level network_input painting remission
+        agreement level network_input occupancy painting remission
         readers.__init__ readers.tables
         readers.inflate readers.packets
         readers.pcd readers.ply
