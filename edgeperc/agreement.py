@@ -498,7 +498,7 @@ def clear_columns(
     first_row, last_row, first_col, last_col = N_COLUMNS, -1, N_COLUMNS, -1  # of the cells around persons
     for i in range(points.shape[0]):
         if limits[labels[i]] > 0.0:
-            row, col = cell_of(points, i, N_COLUMNS)
+            row, col = cell_of(points, i, np.int64(N_COLUMNS))
             if row >= 0:
                 first_row, last_row = min(first_row, max(row - 1, 0)), max(last_row, min(row + 1, N_COLUMNS - 1))
                 first_col, last_col = min(first_col, max(col - 1, 0)), max(last_col, min(col + 1, N_COLUMNS - 1))
@@ -514,7 +514,7 @@ def clear_columns(
         if not ((x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y) & (height[i] >= MIN_COLUMN_M)):
             continue
         z = np.float64(height[i])
-        row, col = cell_of(points, i, N_COLUMNS)
+        row, col = cell_of(points, i, np.int64(N_COLUMNS))
         if first_row <= row <= last_row and first_col <= col <= last_col and z < N_BINS * BIN_M:
             taken[row - first_row, col - first_col] |= one << np.uint64(min(int(z / BIN_M), N_BINS - 1))
     most_missing = int(COLUMN_GAP_M / BIN_M + 0.5)
@@ -523,7 +523,7 @@ def clear_columns(
         if limit <= 0.0:
             continue
         z = np.float64(height[i])
-        row, col = cell_of(points, i, N_COLUMNS)
+        row, col = cell_of(points, i, np.int64(N_COLUMNS))
         if row < 0 or not ((z >= 0.0) & (z < N_BINS * BIN_M)):
             continue
         column = np.uint64(0)
@@ -740,7 +740,7 @@ def clear_ground(
             if on_ground[i] != (is_second == 1):
                 continue
             role = roles[labels[i]]
-            row, col = cell_of(points, i, N_FOOTPRINTS)
+            row, col = cell_of(points, np.int64(i), np.int64(N_FOOTPRINTS))
             if is_second == 0:
                 if row >= 0:
                     standing[row, col] |= role

@@ -502,7 +502,7 @@ def fill_rectangle(members: NDArray[np.float64], l_shaped: bool, rectangle: NDAr
             best = merit
             heading = angle
     cos, sin = math.cos(heading), math.sin(heading)
-    low_u, high_u, low_v, high_v = bounds_along(members, 1, cos, sin)
+    low_u, high_u, low_v, high_v = bounds_along(members, np.int64(1), cos, sin)
     u, v = 0.5 * (low_u + high_u), 0.5 * (low_v + high_v)
     rectangle[0] = u * cos - v * sin
     rectangle[1] = u * sin + v * cos

@@ -204,12 +204,12 @@ def fit_first_plane(
     n = fill_residuals(points, lowest, start, start, size, 0.0, 0.0, plane, MAX_MOUNT_ERROR_M, MAX_SLOPE, residuals)
     step = (n + MAX_TESTED - 1) // MAX_TESTED
     tested = np.empty((3, MAX_TESTED))
-    n_tested = 0
+    n_tested = np.int64(0)
     for k in range(0, n, max(step, 1)):
         for axis in range(3):
             tested[axis, n_tested] = residuals[axis, k]
         n_tested += 1
-    find_plane(tested, n_tested, MAX_SLOPE, MAX_MOUNT_ERROR_M, N_FIRST_HYPOTHESES, np.int64(1), fitted)
+    find_plane(tested, n_tested, MAX_SLOPE, MAX_MOUNT_ERROR_M, np.int64(N_FIRST_HYPOTHESES), np.int64(1), fitted)
     if refine_plane(residuals, n, 0.0, MAX_SLOPE, MAX_MOUNT_ERROR_M, fitted) < MIN_FIRST_SUPPORT:
         return False
     plane += fitted
@@ -263,15 +263,14 @@ def fill_planes(
                     expected[0], expected[1], expected[2] = first[0], first[1], first[2]
                     expected[2] += first[0] * middle_x + first[1] * middle_y
                 row, col = r * CELLS_A_REGION, q * CELLS_A_REGION
-                n = fill_residuals(
-                    points, lowest, row, col, CELLS_A_REGION, middle_x, middle_y, expected, BAND_M, 0.0, residuals
-                )
+                size = np.int64(CELLS_A_REGION)
+                n = fill_residuals(points, lowest, row, col, size, middle_x, middle_y, expected, BAND_M, 0.0, residuals)
                 # Element by element: to copy an array, numba compiles a broadcast with its error messages, for 3 s.
                 for k in range(3):
                     planes[r, q, k] = expected[k]
                 solved[r, q] = 1.0
                 if n >= MIN_SUPPORT:
-                    find_plane(residuals, n, MAX_BEND, MAX_SHIFT_M, N_HYPOTHESES, r * N_REGIONS + q, fitted)
+                    find_plane(residuals, n, MAX_BEND, MAX_SHIFT_M, np.int64(N_HYPOTHESES), r * N_REGIONS + q, fitted)
                     support = refine_plane(residuals, n, prior, MAX_BEND, MAX_SHIFT_M, fitted)
                     if support >= MIN_SUPPORT:
                         for k in range(3):

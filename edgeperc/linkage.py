@@ -151,7 +151,7 @@ def fill_clusters(
         owner[queue[0]] = n_clusters
         is_dropped = False
         while n_done < n_queued and not is_dropped:
-            run = queue[n_done]
+            run = np.int64(queue[n_done])
             n_done += 1
             size += parts[run, 1] - parts[run, 0]
             for k in range(n_shares + 1):
@@ -429,7 +429,7 @@ def are_linked(
     n_pairs = 1
     while n_pairs > 0:
         n_pairs -= 1
-        a, b = pairs[n_pairs, 0], pairs[n_pairs, 1]
+        a, b = np.int64(pairs[n_pairs, 0]), np.int64(pairs[n_pairs, 1])
         if parts[a, 1] - parts[a, 0] < parts[b, 1] - parts[b, 0]:
             a, b = b, a
         if not split(xyz, reach, order, parts, bounds, state, a):
@@ -442,7 +442,7 @@ def are_linked(
                 continue
         if state[1] <= state[2]:
             n_pairs = 0  # only the reserve is left: only the nearest parts are halved further
-        left, right = parts[a, 2], parts[a, 2] + 1
+        left, right = np.int64(parts[a, 2]), np.int64(parts[a, 2]) + 1
         gap_left, gap_right = squared_gap(bounds, left, b), squared_gap(bounds, right, b)
         if gap_left < gap_right:
             left, right = right, left

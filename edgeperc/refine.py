@@ -389,7 +389,7 @@ def fill_point_labels(
                 if index[r, c] < 0:
                     continue
                 if ranges[r, c] < 0.0:
-                    ranges[r, c] = distance_to(points, index[r, c])
+                    ranges[r, c] = distance_to(points, np.int64(index[r, c]))
                 gap = abs(ranges[r, c] - own)
                 if not gap <= MAX_RANGE_GAP_M or (n == N_VOTES and gap >= gaps[n - 1]):
                     continue
