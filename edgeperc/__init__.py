@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from .frame import ModelFrame
     from .listing import ModelInfo, ProviderInfo, SensorInfo, models, providers, sensors
     from .live import Answer, Stream, stream
+    from .motion import Motion, deskew, merge
     from .mounting import Mounting
     from .occupancy import OccupancyGrid, occupancy_grid
     from .painting import camera_road, paint
@@ -82,6 +83,7 @@ __all__ = [
     "ModelFileError",
     "ModelFrame",
     "ModelInfo",
+    "Motion",
     "Mounting",
     "MountingError",
     "OccupancyGrid",
@@ -107,7 +109,9 @@ __all__ = [
     "Tracks",
     "__version__",
     "camera_road",
+    "deskew",
     "draw",
+    "merge",
     "models",
     "occupancy_grid",
     "paint",
@@ -131,6 +135,7 @@ _MODULES = {
     "ModelCard": "card",
     "ModelFrame": "frame",
     "ModelInfo": "listing",
+    "Motion": "motion",
     "Mounting": "mounting",
     "OccupancyGrid": "occupancy",
     "Perceiver": "perceiver",
@@ -146,7 +151,9 @@ _MODULES = {
     "Tracker": "tracking",
     "Tracks": "tracking",
     "camera_road": "painting",
+    "deskew": "motion",
     "draw": "view",
+    "merge": "motion",
     "models": "listing",
     "occupancy_grid": "occupancy",
     "paint": "painting",

@@ -27,7 +27,7 @@ FLOORS = {
         card points sensor tuning
         kernel_cache perception zoo.__init__
         calibration frame geometry linkage outline
-        adapt cluster decode drivable fitness ground image observed projection refine sensor_fit session
+        adapt cluster decode drivable fitness ground image motion observed projection refine sensor_fit session
         agreement level network_input occupancy painting remission
         readers.__init__ readers.tables
         readers.inflate readers.packets

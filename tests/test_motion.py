@@ -1,0 +1,128 @@
+"""Motion during a scan and scans of several sensors: kernels against their twins, and worlds that are known."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from numpy.typing import NDArray
+
+import edgeperc
+import twins.motion
+from edgeperc import Motion, OptionError, PointsError, SensorError, StampError, TrackingError, deskew, merge
+from edgeperc.motion import fill_deskewed
+
+RATES = st.tuples(*3 * [st.floats(-4.0, 4.0)])
+NUMBERS = st.one_of(st.floats(-90, 90, width=32), st.sampled_from([math.nan, math.inf, -math.inf]))
+
+
+@given(st.integers(0, 9), RATES, RATES, st.data())
+def test_points_are_moved_as_by_the_twin(n: int, velocity: Any, rate: Any, data: st.DataObject) -> None:
+    points = data.draw(npst.arrays(np.float32, (n, 4), elements=NUMBERS))
+    after_s = data.draw(npst.arrays(np.float64, n, elements=st.one_of(st.floats(-0.5, 0.5), st.just(math.nan))))
+    moved = np.empty_like(points)
+    fill_deskewed(points, after_s, np.array(velocity), np.array(rate), moved)
+    expected = twins.motion.deskewed(points, after_s, velocity, rate)
+    good = np.isfinite(points[:, :3]).all(axis=1) & np.isfinite(after_s)
+    np.testing.assert_allclose(moved[good], expected[good], rtol=1e-6, atol=1e-5)
+    assert not np.isfinite(moved[~good, :3]).all(axis=1).any()
+
+
+@given(RATES, RATES, st.floats(0.05, 0.4))
+def test_the_motion_between_two_poses(velocity: Any, rate: Any, seconds: float) -> None:
+    start = twins.motion.exponential(twins.motion.screw((30.0, -7.0, 2.0), (0.3, -0.2, 1.4)))
+    end = start @ twins.motion.exponential(twins.motion.screw(velocity, rate) * seconds)
+    found = Motion.between(start, 5.0, end, 5.0 + seconds)
+    np.testing.assert_allclose(found.velocity_mps, velocity, atol=1e-6)
+    np.testing.assert_allclose(found.rate_radps, rate, atol=1e-6)
+
+
+def room(n: int = 3600) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points on the walls of a room 40 x 30 m, in the order in which a spinning sensor meets them, and their times."""
+    turn = np.linspace(math.pi, -math.pi, n, endpoint=False)
+    reach = np.minimum(20.0 / np.maximum(np.abs(np.cos(turn)), 1e-9), 15.0 / np.maximum(np.abs(np.sin(turn)), 1e-9))
+    return np.column_stack([reach * np.cos(turn), reach * np.sin(turn), 0.2 * np.cos(5 * turn)]), np.linspace(0, 0.1, n)
+
+
+@pytest.mark.parametrize("at_s", [None, 1000.0, 1000.05])
+def test_walls_are_straight_again(at_s: float | None) -> None:
+    world, times = room()
+    times = times + 1000.0
+    motion = Motion((18.0, 0.5, 0.0), (0.02, -0.03, 0.6))
+    screw = twins.motion.screw(motion.velocity_mps, motion.rate_radps)
+    # What the sensor sees while it moves: each point in the frame of its own time. The world is its frame at at_s.
+    at = times.max() if at_s is None else at_s
+    seen = np.array(
+        [
+            np.linalg.solve(twins.motion.exponential(screw * (t - at)), [*p, 1.0])[:3]
+            for p, t in zip(world, times, strict=True)
+        ]
+    )
+    assert np.abs(seen - world).max() > 0.7
+    scan = np.column_stack([seen, np.full(len(seen), 0.5)]).astype(np.float32)
+    found = deskew(scan, times, motion, at_s=at_s)
+    np.testing.assert_allclose(found[:, :3], world, atol=1e-4)
+    assert (found[:, 3] == 0.5).all()
+    assert found.dtype == np.float32
+
+
+def test_without_motion_nothing_moves() -> None:
+    world, times = room(90)
+    np.testing.assert_array_equal(deskew(world, times, Motion((0, 0, 0)))[:, :3], world.astype(np.float32))
+    assert np.isnan(deskew(world, np.full(90, math.nan), Motion((0, 0, 0)))[:, :3]).all()
+    assert deskew(np.empty((0, 4)), [], Motion((1, 0, 0))).shape == (0, 4)
+
+
+@given(RATES, st.integers(1, 4), st.integers(0, 99))
+def test_merged_scans_lie_in_the_vehicles_frame(rate: Any, n_sensors: int, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    vehicle = [random.uniform(-50, 50, (random.integers(0, 20), 3)) for _ in range(n_sensors)]
+    poses = [twins.motion.exponential(twins.motion.screw((k, -0.5 * k, 1.6), rate)) for k in range(n_sensors)]
+    scans = [
+        np.column_stack([(p - T[:3, 3]) @ T[:3, :3], np.full(len(p), k)])
+        for k, (p, T) in enumerate(zip(vehicle, poses, strict=True))
+    ]
+    merged = merge(scans, poses)
+    np.testing.assert_allclose(merged[:, :3], np.concatenate(vehicle), atol=1e-4)
+    assert merged[:, 3].tolist() == [k for k, p in enumerate(vehicle) for _ in p]
+
+
+def test_errors_name_the_reason() -> None:
+    world, times = room(9)
+    still = Motion((0, 0, 0))
+    for wrong in (times[1:], times[:, None], "soon"):
+        with pytest.raises(PointsError, match="got times"):
+            deskew(world, wrong, still)
+    with pytest.raises(PointsError):
+        deskew(world[:, :2], times, still)
+    with pytest.raises(StampError, match="at_s is nan"):
+        deskew(world, times, still, at_s=math.nan)
+    with pytest.raises(OptionError, match="expected a Motion"):
+        deskew(world, times, (1, 0, 0))  # type: ignore[arg-type]
+    for velocity in ((1, 2), "abc", (math.nan, 0, 0), (1e5, 0, 0), None):
+        with pytest.raises(OptionError, match=r"velocity_mps is .*expected three numbers"):
+            Motion(velocity)  # type: ignore[arg-type]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        still.velocity_mps = (1, 0, 0)  # type: ignore[misc]
+    eye = np.eye(4)
+    for pose in (2 * eye, np.diag([1, 1, -1, 1]), np.full((4, 4), math.nan), np.eye(3), "T"):
+        with pytest.raises(TrackingError, match="T_world_second"):
+            Motion.between(eye, 0.0, pose, 1.0)
+        with pytest.raises(SensorError, match=r"T_vehicle_sensor\[1\]"):
+            merge([world, world], [eye, pose])
+    for stamps in ((1.0, 1.0), (2.0, 1.0), (0.0, math.nan), (0.0, math.inf)):
+        with pytest.raises(StampError, match="expected a second one that is later"):
+            Motion.between(eye, stamps[0], eye, stamps[1])
+    with pytest.raises(TrackingError, match="180 degrees"):
+        Motion.between(eye, 0.0, np.diag([-1.0, -1.0, 1.0, 1.0]), 1.0)
+    with pytest.raises(PointsError, match="no scan"):
+        merge([], [])
+    with pytest.raises(SensorError, match="1 poses for 2 scans"):
+        merge([world, world], [eye])
+    assert edgeperc.deskew is deskew

@@ -1,0 +1,34 @@
+"""Slow twins of motion and zones."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def exponential(matrix):
+    """The matrix exponential, by its series of a small part of the matrix, squared as often as needed."""
+    n = max(0, int(np.ceil(np.log2(np.abs(matrix).max() + 1e-300)))) + 4
+    term = total = np.eye(len(matrix))
+    for k in range(1, 20):
+        term = term @ matrix / (k * 2.0**n)
+        total = total + term
+    for _ in range(n):
+        total = total @ total
+    return total
+
+
+def screw(velocity, rate):
+    """The (4, 4) matrix whose exponential is the pose after one second."""
+    x, y, z = rate
+    return np.array([[0, -z, y, velocity[0]], [z, 0, -x, velocity[1]], [-y, x, 0, velocity[2]], [0, 0, 0, 0]], float)
+
+
+def deskewed(points, after_s, velocity, rate):
+    """Twin of `edgeperc.motion.fill_deskewed`."""
+    moved = points.copy()
+    for i, seconds in enumerate(after_s):
+        with np.errstate(invalid="ignore", over="ignore"):
+            good = np.isfinite(points[i, :3]).all() and np.isfinite(seconds)
+            pose = exponential(screw(velocity, rate) * seconds) if good else np.full((4, 4), np.nan)
+            moved[i, :3] = (pose @ [*points[i, :3].astype(float), 1.0])[:3]
+    return moved
