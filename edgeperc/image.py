@@ -6,6 +6,8 @@ per operation and in one thread, so compiled code, interpreted code and any numb
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -53,6 +55,8 @@ def as_image(array: ArrayLike) -> NDArray[np.uint8]:
     """
     if isinstance(array, np.ma.MaskedArray):
         raise ImageError("got a masked array; fill it first, e.g. with array.filled(0)")
+    if isinstance(array, str | os.PathLike):
+        raise ImageError(f"got {os.fspath(array)!r:.80}; expected (H, W, 3) uint8: pass edgeperc.read_image(path)")
     try:
         # Ragged sequences raise ValueError; the __array__ of an object may raise anything.
         values = np.asarray(array)

@@ -146,7 +146,7 @@ def purpose(card: ModelCard) -> str:
     if card.view.kind == "range_image":
         return f"a class for every point ({', '.join(card.classes[1:])})"
     if card.view.kind == "camera":
-        return f"a class for every pixel of a camera's image ({', '.join(card.classes)})"
+        return f"a class for every pixel of a camera's image ({len(card.classes)} classes)"
     found = ["drivable area"] if "drivable" in card.classes else []
     found += [f"boxes of {', '.join(card.box_classes)}"] if card.box_classes else []
     return " and ".join(found) or "classes of a top view"

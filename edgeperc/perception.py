@@ -16,6 +16,7 @@ from .sensor import RemissionFunction
 
 __all__ = ["Box", "ImageLabels", "Perception", "PointLabels", "TopView"]
 
+_PART = 2**20
 ROADS = ("drivable", "road")  # names of classes of an image on which a vehicle may drive, in lower case
 
 
@@ -205,7 +206,10 @@ class ImageLabels:
 
     def counts(self) -> dict[str, int]:
         """Number of pixels, by class."""
-        counted = np.bincount(self.labels.ravel(), minlength=len(self.classes))
+        flat, n_classes = self.labels.reshape(-1), len(self.classes)
+        # In parts, because bincount makes eight bytes of each label.
+        parts = (np.bincount(flat[k : k + _PART], minlength=n_classes) for k in range(0, flat.size, _PART))
+        counted = sum(parts, np.zeros(n_classes, np.int64))
         return {name: int(counted[k]) for k, name in enumerate(self.classes)}
 
     def to_dict(self) -> dict[str, Any]:

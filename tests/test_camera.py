@@ -95,6 +95,11 @@ def test_classes_of_roads_are_drivable() -> None:
     assert ImageLabels(labels, ("a", "b", "c", "d")).drivable_share == 0.0
 
 
+def test_pixels_are_counted_in_parts() -> None:
+    labels = np.resize(np.uint8([0, 1, 1, 2]), (3, 2**20))
+    assert ImageLabels(labels, ("a", "b", "c", "d")).counts() == {"a": 786432, "b": 1572864, "c": 786432, "d": 0}
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 900), (24, 32), (25, 31), (700, 1)])
 def test_any_size_of_image(perceive: Perceiver, size: tuple[int, int]) -> None:
     found = perceive(image=np.broadcast_to(np.uint8(RED), (*size, 3))).image

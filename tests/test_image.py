@@ -69,7 +69,7 @@ def scaled(image: NDArray[np.uint8], width: int, height: int, spec: InputSpec = 
         (np.ma.zeros((4, 5, 3), np.uint8), "masked"),
         ([[1, 2], [3]], "not an array"),
         (None, r"shape \(\)"),
-        ("street.jpg", r"shape \(\)"),
+        ("street.jpg", r"got 'street.jpg'; expected .*: pass edgeperc.read_image\(path\)"),
         (np.zeros(4, [("r", "u1")]), r"shape \(4,\)"),
     ],
 )
