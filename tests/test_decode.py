@@ -12,6 +12,7 @@ from edgeperc.card import TopViewGeometry
 from edgeperc.decode import decode_classes, decode_dense, decode_scored_slots, decode_slots, decode_top_view
 from edgeperc.errors import CardMismatchError, InferenceError
 from edgeperc.geometry import draw_footprints
+from edgeperc.points import read_only
 from edgeperc_export.cards import card_of
 from edgeperc_export.recipe import Recipe
 
@@ -64,6 +65,23 @@ def test_classes_that_are_not_finite_raise(value, kind):
     output[0, 1, 2, 3] = output[0, 2, 0, 0] = value
     with pytest.raises(InferenceError, match=r"pointseg: 2 of 60 values of class_"):
         decode_classes(output, kind, model="pointseg")
+
+
+@pytest.mark.parametrize("shape", [(0, 4), (1, 1), (7, 33)])
+def test_cells_without_a_return_lose_a_class_of_boxes(shape):
+    rng = np.random.default_rng(3)
+    labels, returned = rng.integers(0, 4, shape).astype(np.uint8), rng.random(shape) < 0.5
+    is_box = np.array([False, False, True, True])
+    found = labels.copy()
+    decode.clear_empty(read_only(returned, np.bool_), is_box, found)
+    np.testing.assert_array_equal(found, np.where(is_box[labels] & ~returned, 0, labels))
+
+
+def test_values_that_are_not_finite_are_counted():
+    values = np.linspace(-3e38, 3e38, 1000, dtype=np.float32)
+    assert decode.count_not_finite(values) == decode.count_not_finite(values[:0]) == 0
+    values[::7], values[1::70], values[-1] = np.nan, np.inf, -np.inf
+    assert decode.count_not_finite(values) == np.count_nonzero(~np.isfinite(values))
 
 
 def test_classes_of_another_shape_or_kind_raise():

@@ -8,8 +8,16 @@ from hypothesis import strategies as st
 
 import twins.decode
 from edgeperc import geometry
+from edgeperc.card import TopViewGeometry
 from edgeperc.errors import PointsError
-from edgeperc.geometry import bounding_rectangles, oriented_iou, rectangles, shared_area, suppress_overlaps
+from edgeperc.geometry import (
+    bounding_rectangles,
+    draw_footprints,
+    oriented_iou,
+    rectangles,
+    shared_area,
+    suppress_overlaps,
+)
 from edgeperc.perception import Box
 
 
@@ -151,3 +159,24 @@ def test_shared_area_follows_from_iou():
     c, d = some_rectangles(rng, 20), some_rectangles(rng, 20)
     shared = shared_area(oriented_iou(c, d), c, d)
     assert (shared <= np.minimum.outer(c[:, 2] * c[:, 3], d[:, 2] * d[:, 3]) * (1.0 + 1e-12)).all()
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("layout", ["C", "F"])
+def test_footprints_agree_with_the_twin(seed, layout):
+    rng = np.random.default_rng(seed)
+    view = TopViewGeometry((2.0, 22.0), (-7.0, 9.0), cell_m=0.5)
+    boxes = [
+        Box(name, 0.5, (*rng.uniform(-15.0, 40.0, 2), 0.0), (*rng.uniform(0.1, 14.0, 2), 1.5), yaw)
+        for name, yaw in zip(rng.choice(["car", "van", "bus"], 12), rng.uniform(-4.0, 4.0, 12), strict=True)
+    ]
+    if seed == 0:
+        boxes = []
+    elif seed == 1:
+        boxes.append(Box("car", 0.5, (1e300, 0.0, 0.0), (4.0, 2.0, 1.5), 0.0))
+        boxes.append(Box("van", 0.5, (12.0, 1.0, 0.0), (1e300, 1e300, 1.5), 0.3))
+    labels = np.require(rng.integers(0, 2, (view.height, view.width)).astype(np.uint8), None, layout)
+    expected = labels.copy()
+    draw_footprints(labels, boxes, view, ("none", "road", "car", "van"))
+    twins.decode.footprints(expected, boxes, view, ("none", "road", "car", "van"))
+    np.testing.assert_array_equal(labels, expected)

@@ -22,6 +22,16 @@ def street(rng, n=4000, slope_x=0.0, slope_y=0.0, kerb=0.0, reach=30.0, mount=1.
     return points, on
 
 
+@pytest.mark.parametrize("columns", [3, 5])
+def test_other_columns_do_not_matter(columns):
+    points, _ = street(np.random.default_rng(0))
+    other = np.full((len(points), columns), np.nan, np.float32)
+    other[:, :3] = points[:, :3]
+    ground, expected = find_ground(other), find_ground(points)
+    np.testing.assert_array_equal(ground.height_m, expected.height_m)
+    assert ground.plane == expected.plane
+
+
 @pytest.mark.parametrize("regions", [True, False])
 @pytest.mark.parametrize(("slope_x", "slope_y"), [(0.0, 0.0), (0.08, -0.05), (-0.2, 0.1)])
 def test_a_slope_is_ground_and_what_stands_on_it_is_not(slope_x, slope_y, regions):

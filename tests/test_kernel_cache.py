@@ -460,6 +460,35 @@ def test_processes_start_from_a_damaged_cache_and_together(tmp_path: Path) -> No
     shutil.rmtree(tmp_path / "cache")
 
 
+LOADED = """
+import sys
+from pathlib import Path
+
+sys.path.insert(0, sys.argv[1])
+import numpy as np
+import some_kernels
+
+assert some_kernels.total(np.arange(5.0)) == 30.0
+print(some_kernels.total.stats.cache_misses.total(), "numba.np.arraymath" in sys.modules)
+"""
+
+
+def test_cached_kernels_load_without_the_compiler_which_is_there_when_one_is_missing(place: Place) -> None:
+    def started() -> str:
+        command = [sys.executable, "-c", LOADED, str(place.source.parent)]
+        environment = os.environ | {"NUMBA_CACHE_DIR": numba.config.CACHE_DIR}
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.strip()
+
+    place.start()
+    assert started() == "0 False"
+    (called, caller) = place.files
+    caller.unlink()  # it is compiled again, with the one that it calls from the cache
+    assert started() == "1 True"
+    assert started() == "0 False"
+    called.unlink()
+    assert started() == "0 False"
+
+
 # --- what is compiled when -------------------------------------------------------------------------------------------
 
 CALLS = """

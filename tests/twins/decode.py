@@ -74,7 +74,7 @@ def softmax(logits):
 
 
 def classes(values, are_logits):
-    """Twin of `edgeperc.decode.fill_labels` and `fill_scores`: labels, scores and the number of values that are not finite."""
+    """Twin of `edgeperc.decode.fill_labels` and `fill_scores`: labels, scores, number of values that are not finite."""
     labels = np.argmax(values, axis=0).astype(np.uint8)
     probabilities = softmax(values) if are_logits else values
     return labels, probabilities.max(axis=0), int((~np.isfinite(values)).sum())
@@ -134,3 +134,13 @@ def footprint_sums(values, are_logits, rectangles, x_far, y_left, cell, max_summ
             inside[row, col] = True
         sums[i] = probabilities[:, inside].sum(axis=1)
     return sums
+
+
+def footprints(labels, boxes, view, classes):
+    """Twin of `edgeperc.geometry.draw_footprints`: every cell of the view for every box."""
+    x, y = view.cell_centers()
+    for box in sorted(boxes, key=lambda box: -np.hypot(*box.center[:2])):
+        dx, dy, cos, sin = x - box.center[0], y - box.center[1], np.cos(box.yaw), np.sin(box.yaw)
+        is_in = (abs(cos * dx + sin * dy) <= box.size[0] / 2) & (abs(cos * dy - sin * dx) <= box.size[1] / 2)
+        if box.label in classes:
+            labels[is_in] = classes.index(box.label)
