@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from .sensor import SensorProfile
     from .tracking import Track, Tracker, Tracks
     from .view import draw
+    from .zones import Crossing, Line, Zone
 
 __all__ = [
     "Answer",
@@ -72,11 +73,13 @@ __all__ = [
     "CalibrationError",
     "CardError",
     "CardMismatchError",
+    "Crossing",
     "EdgepercError",
     "FitnessError",
     "ImageError",
     "ImageLabels",
     "InferenceError",
+    "Line",
     "MissingExtraError",
     "ModelCard",
     "ModelError",
@@ -107,6 +110,7 @@ __all__ = [
     "Tracker",
     "TrackingError",
     "Tracks",
+    "Zone",
     "__version__",
     "camera_road",
     "deskew",
@@ -130,7 +134,9 @@ __version__ = "0.1.0"
 _MODULES = {
     "Answer": "live",
     "Box": "perception",
+    "Crossing": "zones",
     "ImageLabels": "perception",
+    "Line": "zones",
     "Calibration": "calibration",
     "ModelCard": "card",
     "ModelFrame": "frame",
@@ -150,6 +156,7 @@ _MODULES = {
     "Track": "tracking",
     "Tracker": "tracking",
     "Tracks": "tracking",
+    "Zone": "zones",
     "camera_road": "painting",
     "deskew": "motion",
     "draw": "view",

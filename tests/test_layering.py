@@ -42,7 +42,7 @@ FLOORS = {
         tracking.tracks
         tracking.tracker
         tracking.__init__
-        listing perceiver records
+        listing perceiver records zones
         live
         simulation.raycast
         simulation.shapes
