@@ -223,7 +223,8 @@ def _model(variant: Variant) -> Iterable[str]:
 def _recipe(recipe: Mapping[str, Any]) -> str:
     """The options that differ from the defaults of `Recipe`."""
     usual = {field.name: field.default for field in fields(Recipe)}
-    return _flat({name: value for name, value in recipe.items() if name not in usual or value != usual[name]})
+    own = {name: tuple(value) if isinstance(value, list) else value for name, value in recipe.items()}
+    return _flat({name: value for name, value in own.items() if name not in usual or value != usual[name]})
 
 
 def _alone(command: str) -> str:
