@@ -214,43 +214,37 @@ def build_parser() -> argparse.ArgumentParser:
     make.add_argument("--model-version", default="1.0.0", help=VERSION)
     make.set_defaults(run=_make)
 
-    ablations = commands.add_parser(
+    ablate = commands.add_parser(
         "ablate", help="measure the effect of each part of the training on a fold, or compare networks on CamVid"
-    ).add_subparsers(required=True, dest="network", metavar="NETWORK")
-    for network in ("lodnn", "pointseg", "ssadnet"):
-        ablate = ablations.add_parser(network, help=f"train variants of {network}")
-        ablate.add_argument("out", type=Path, help="folder for the runs and ablation.json; finished runs are kept")
-        ablate.add_argument("--kitti", type=Path, required=True, help=KITTI)
-        ablate.add_argument(
-            "--simulated", type=Path, required=True, help="folder of scans from edgeperc-export simulate"
-        )
-        ablate.add_argument(
-            "--start-from", type=Path, help="checkpoint.pt of NETWORK-sim; lodnn starts from random weights"
-        )
-        ablate.add_argument(
-            "--fold", type=int, default=0, help="fold of the training drives to evaluate on (default 0)"
-        )
-        ablate.add_argument("--steps", type=int, default=150, help="training steps of each run (default 150)")
-        ablate.add_argument(
-            "--variant", action="append", default=[], help="run this variant only; may be repeated (default: all)"
-        )
-        ablate.add_argument("--threads", type=int, help=THREADS)
-        ablate.add_argument("--plot", type=Path, metavar="PNG", help="also draw the results (lodnn only)")
-        ablate.set_defaults(run=_ablate)
-    camvid = ablations.add_parser("camvid", help="compare eleven networks on CamVid under one budget")
-    camvid.add_argument("camvid", type=Path, help=CAMVID)
-    camvid.add_argument("out", type=Path, help="folder for the table, plots and runs; finished networks are kept")
-    camvid.add_argument("--size", type=_size, default=(240, 180), help="size of the images (default 240x180)")
-    camvid.add_argument("--epochs", type=int, default=40, help="how often each image is trained on (default 40)")
-    camvid.add_argument("--batch", type=int, default=8, help="images in each step (default 8)")
-    camvid.add_argument("--learning-rate", type=float, help="default: 3e-4")
-    camvid.add_argument(
-        "--networks", action="append", default=[], metavar="NAME", help="this network only; may be repeated"
     )
-    camvid.add_argument("--no-plots", action="store_true", help="write the table alone, without matplotlib")
-    camvid.add_argument("--compile", action="store_true", help=COMPILE)
-    camvid.add_argument("--threads", type=int, help=THREADS)
-    camvid.set_defaults(run=_ablate_camvid)
+    ablate.add_argument(
+        "network",
+        choices=["ssadnet", "pointseg", "lodnn", "camvid"],
+        help="network whose variants are trained, or camvid: eleven networks under one budget",
+    )
+    ablate.add_argument("out", type=Path, help="folder for the runs and their figures; finished runs in it are kept")
+    scans = ablate.add_argument_group("variants of a network")
+    scans.add_argument("--kitti", type=Path, help=KITTI)
+    scans.add_argument("--simulated", type=Path, help="folder of scans from edgeperc-export simulate")
+    scans.add_argument("--start-from", type=Path, help="checkpoint.pt of NETWORK-sim; lodnn starts from random weights")
+    scans.add_argument("--fold", type=int, default=0, help="fold of the training drives to evaluate on (default 0)")
+    scans.add_argument("--steps", type=int, default=150, help="training steps of each run (default 150)")
+    scans.add_argument("--plot", type=Path, metavar="PNG", help="also draw the results (lodnn only)")
+    images = ablate.add_argument_group("networks on CamVid")
+    images.add_argument("--camvid", type=Path, help=CAMVID)
+    images.add_argument(
+        "--size", type=_size, default=(120, 90), metavar="WxH", help="size of the images (default 120x90)"
+    )
+    images.add_argument("--epochs", type=int, default=10, help="how often each image is trained on (default 10)")
+    images.add_argument("--batch", type=int, default=8, help="images in each step (default 8)")
+    images.add_argument("--learning-rate", type=float, help="learning rate (default 3e-4)")
+    images.add_argument("--no-plots", action="store_true", help="write the table alone, without matplotlib")
+    images.add_argument("--compile", action="store_true", help=COMPILE)
+    ablate.add_argument(
+        "--variant", action="append", default=[], help="run this variant, or network, only; may be repeated"
+    )
+    ablate.add_argument("--threads", type=int, help=THREADS)
+    ablate.set_defaults(run=_ablate)
 
     add_database_commands(commands)
 
@@ -483,8 +477,12 @@ def _make(args: argparse.Namespace) -> int:
 
 
 def _ablate(args: argparse.Namespace) -> int:
+    if args.network == "camvid":
+        return _ablate_camvid(args)
     from .ablation import ablate, plot
 
+    if args.kitti is None or args.simulated is None:
+        raise ValueError(f"{args.network} is trained on real and simulated scans; give --kitti and --simulated")
     if args.network != "lodnn" and args.start_from is None:
         raise ValueError(f"{args.network} starts from its -sim model; give --start-from")
     rows = ablate(
@@ -516,11 +514,13 @@ def _size(text: str) -> tuple[int, int]:
 def _ablate_camvid(args: argparse.Namespace) -> int:
     from .camvid import ablate_camvid, plot_camvid, show_camvid, table
 
+    if args.camvid is None:
+        raise ValueError("no images to train on; give --camvid")
     width, height = args.size
     rows = ablate_camvid(
         args.camvid,
         args.out,
-        networks=args.networks,
+        networks=args.variant,
         width=width,
         height=height,
         epochs=args.epochs,
