@@ -302,8 +302,8 @@ EDGE = Recipe("ssadnet", edge=True, steps=6000, batch=4, learning_rate=3e-3, coo
 
 DISTILLED = replace(EDGE, steps=1000, learning_rate=1e-3, cooldown=0.4, distil=1.0, seen_twice=False)
 
-# On labels alone, and with more scans: PandaSet (--scans), roads drawn by hand, streets turned by any angle. Each sample is
-# used twice, which takes a quarter less time for each step of two cores.
+# On labels alone, and with more scans: PandaSet (--scans), roads drawn by hand, turns by any angle. Each sample
+# is used twice, which saves a quarter of the time of a step on two cores.
 CONTINUED = replace(
     EDGE,
     front=True,
