@@ -647,10 +647,13 @@ def fill_votes(
     votes : (n,) uint8, overwritten
         Bit 0: the point is in view. Bit 1: it may get the label of a vehicle. Bit 2: it has the label of a person.
     """
+    of_label = np.empty(len(roles), np.uint8)
+    for c in range(len(roles)):
+        of_label[c] = 3 if roles[c] == _VEHICLE else 5 if roles[c] == _PERSON else 1
     for i in range(in_view.shape[0]):
-        role = roles[labels[i]]
-        is_vehicle = role == _VEHICLE or scores[i] >= COMPLETING_SCORE
-        votes[i] = (1 + 2 * is_vehicle + 4 * (role == _PERSON)) if in_view[i] else 0
+        votes[i] = 0
+        if in_view[i]:
+            votes[i] = of_label[labels[i]] | (2 if scores[i] >= COMPLETING_SCORE else 0)
 
 
 @njit(cache=True, nogil=True)
