@@ -170,8 +170,8 @@ def test_points_by_hand(world: World) -> None:
 
 def test_boxes_by_hand(world: World) -> None:
     near, middle, far, hidden = box(10, 0), box(29, 0), box(40, 4, "van"), box(20, 5)
-    beside = box(30, -13)
-    points = [p for each in (near, middle, far, beside) for p in hits(each, 3)] + hits(hidden, 2)
+    beside, unseen = box(30, -13), box(9, -9.5)  # beside the view, and in it but out of the camera's sight
+    points = [p for each in (near, middle, far, beside, unseen) for p in hits(each, 3)] + hits(hidden, 2)
     world.boxes = (
         box(10, 0, score=0.9),
         box(30.2, 0, score=0.8),  # 2.8 of 5.2 m: a hit, of a truth in the middle band
@@ -180,7 +180,7 @@ def test_boxes_by_hand(world: World) -> None:
         box(35, -5, score=0.5),  # nothing there
         box(9, -9.9, score=0.4),  # out of the camera's sight
     )
-    table = evaluated(Judge(["ssadnet"]), frame(near, middle, far, hidden, beside, points=points))["boxes"]
+    table = evaluated(Judge(["ssadnet"]), frame(near, middle, far, hidden, beside, unseen, points=points))["boxes"]
     for kind in ("upright", "oriented"):
         every = table[kind]["all"]
         assert {key for key in every if not key.startswith("mean")} == {"car", "van", "vehicle"}
@@ -272,14 +272,15 @@ def test_boxes_all_round_by_hand(world: World) -> None:
     assert not {"all_round", "heading"} & {*evaluated(Judge(["pointseg"]), one)}
 
 
-def test_unknown_places_are_not_all_round(world: World) -> None:
+def test_boxes_at_unknown_places_do_not_count(world: World) -> None:
     seen, dont_care = box(10, 0), box(20, 0)
     points = [p for each in (seen, dont_care) for p in hits(each, 3)]
     world.boxes = (seen, dont_care)
     # The center of the second is at column 621, row 187 + 621 / 20 of the image.
     one = frame(seen, dont_care, points=points, unlabeled=[[600, 210, 640, 225]])
-    row = evaluated(Judge(["ssadnet"]), one)["all_round"]["all"]["car"]
-    assert [row[k] for k in ("n_truth", "n_predicted", "n_hits")] == [1, 1, 1]
+    found = evaluated(Judge(["ssadnet"]), one)
+    for row in (found["all_round"]["all"]["car"], found["boxes"]["oriented"]["all"]["car"]):
+        assert [row[k] for k in ("n_truth", "n_predicted", "n_hits")] == [1, 1, 1]
 
 
 def test_few_objects_are_marked() -> None:

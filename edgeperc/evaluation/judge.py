@@ -21,7 +21,7 @@ from ..geometry import inside
 from ..mounting import MODEL_MOUNTING, Mounting
 from ..network_input import project
 from ..perceiver import BoxesFrom, Perceiver
-from ..perception import Perception, PointLabels, TopView
+from ..perception import Box, Perception, PointLabels, TopView
 from ..projection import make_projector
 from ..sensor import SensorProfile
 from ..session import Session
@@ -216,22 +216,25 @@ class Judge:
     def _count_boxes(
         self, tallies: dict[tuple[str, ...], Any], truth: Truth, found: Perception, mistakes: Mistakes
     ) -> Mistakes:
-        """Match predicted boxes where the truth is known.
+        """Match boxes where the truth is known; predicted and true ones with their center elsewhere count for nothing.
 
         Boxes that the models detect are matched by axis-aligned and by oriented footprints, in the top-view model's
         view. Vehicles, pedestrians and cyclists are matched all round, detected or not.
         """
-        centers = np.array([box.center for box in found.boxes], np.float64).reshape(-1, 3)
-        predicted = [box for box, known in zip(found.boxes, truth.known(centers), strict=True) if known]
+
+        def known(box: Box) -> bool:
+            return bool(truth.known(np.array([box.center]))[0])
+
+        predicted = [box for box in found.boxes if known(box)]
         returns = list(zip(truth.boxes, truth.returns, strict=True))
-        to_find, ignored = boxes_to_find(returns, self.view, self.box_classes, classes_anywhere=self.cluster_classes)
+        to_find, ignored = boxes_to_find(
+            returns, self.view, self.box_classes, classes_anywhere=self.cluster_classes, known=known
+        )
         for kind in ("upright", "oriented"):
             evaluator = tallies["boxes", kind] = BoxEvaluator(oriented=kind == "oriented", together=VEHICLES)
             pairs = evaluator.update(predicted, to_find, ignored=ignored, drive=truth.drive)
         every = tuple(name for classes, _ in ALL_ROUND.values() for name in classes)
-        to_find, ignored = boxes_to_find(
-            returns, None, (), classes_anywhere=every, known=lambda box: bool(truth.known(np.array([box.center]))[0])
-        )
+        to_find, ignored = boxes_to_find(returns, None, (), classes_anywhere=every, known=known)
         for group, (classes, least_iou) in ALL_ROUND.items():
             evaluator = tallies["all_round", group] = BoxEvaluator(least_iou, together=classes)
             guesses, rights = ([box for box in of if box.label in classes] for of in (predicted, to_find))
