@@ -6,6 +6,7 @@ which variant runs on which provider, and in which precision.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 from collections.abc import Collection, Sequence
@@ -91,7 +92,13 @@ def listed() -> tuple[Variant, ...]:
         A model file is damaged.
     """
     paths = [Path(str(entry)) for entry in resources.files(__name__).iterdir() if entry.name.endswith(".onnx")]
-    return tuple(sorted((Variant(path, ModelCard.read(path)) for path in paths), key=str))
+    return tuple(sorted((Variant(path, _card(path, path.stat().st_mtime_ns)) for path in paths), key=str))
+
+
+@functools.cache
+def _card(path: Path, changed_ns: int) -> ModelCard:
+    """The card of a file, read once as long as the file does not change: every model's name asks for all cards."""
+    return ModelCard.read(path)
 
 
 def shipped_models() -> tuple[str, ...]:
