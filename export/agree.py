@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import onnx
@@ -18,10 +18,13 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from edgeperc.errors import ModelError, PointsError
+from edgeperc.evaluation.camvid import LabeledImages
 from edgeperc.evaluation.datasets import KittiObjects, SemanticKitti
 from edgeperc.evaluation.judge import Judge
+from edgeperc.evaluation.metrics import Confusion
 from edgeperc.evaluation.tables import Record, figures
 from edgeperc.evaluation.truth import Truth
+from edgeperc.perceiver import Perceiver
 from edgeperc.perception import Perception
 from edgeperc.session import Session
 from edgeperc.tuning import cpu_features, cpu_model
@@ -30,6 +33,8 @@ from edgeperc.zoo import BF16_FEATURES, Variant, resolve
 from .to_onnx import write_card
 
 __all__ = ["agree", "summary"]
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,7 @@ def agree(
     *,
     kitti: Path | None,
     semantickitti: Path | None = None,
+    camvid: Path | None = None,
     split: str = "validation",
     n_scans: int | None = None,
     on_scan: Callable[[str], None] = lambda precision: None,
@@ -64,10 +70,13 @@ def agree(
         Roots of a KITTI object set and of SemanticKITTI. Their labels are the ground truth: of points or vehicles
         (KITTI) and of road (SemanticKITTI). All scans of SemanticKITTI are used, although they are of a test drive,
         because no other real scans have road labels.
+    camvid : Path or None
+        Folder of CamVid, for a network of a camera; then the other sets are not used.
     split : str
-        Drives of the KITTI object set (`edgeperc.evaluation.splits.in_split`).
+        Drives of the KITTI object set (`edgeperc.evaluation.splits.in_split`), or images of CamVid
+        (`edgeperc.evaluation.camvid.LabeledImages.files`).
     n_scans : int or None
-        At most this many scans of each set, evenly spread; None takes all.
+        At most this many scans, or images, of each set, evenly spread; None takes all.
     on_scan : callable
         Called with the precision after each scan.
 
@@ -81,7 +90,7 @@ def agree(
     ModelError
         The files are not of one network, or none is in fp32.
     PointsError
-        There are no labeled scans.
+        There are no labeled scans or images.
     SplitError
         The network was trained on one of the scans.
     """
@@ -96,11 +105,20 @@ def agree(
     if importlib.util.find_spec("openvino") is not None and not BF16_FEATURES.isdisjoint(cpu_features()):
         runs["bf16"] = variants["fp32"]
     runs |= variants
-    measured = {
-        precision: _measure(variant, precision, kitti, semantickitti, split, n_scans, on_scan)
-        for precision, variant in runs.items()
-    }
+    if variants["fp32"].card.view.kind == "camera":
+        if camvid is None:
+            raise PointsError(f"{variants['fp32'].name} is of a camera, and there is no labeled image; name CamVid")
+        measured = {
+            precision: _measure_images(variant, precision, LabeledImages(camvid), split, n_scans, on_scan)
+            for precision, variant in runs.items()
+        }
+    else:
+        measured = {
+            precision: _measure(variant, precision, kitti, semantickitti, split, n_scans, on_scan)
+            for precision, variant in runs.items()
+        }
     options = [f"--kitti KITTI --split {split}"] * (kitti is not None)
+    options += [f"--camvid CAMVID --split {split}"] * (camvid is not None)
     options += ["--semantickitti SEMANTICKITTI"] * (semantickitti is not None) + [f"--scans {n_scans}"] * bool(n_scans)
     command = " ".join(["edgeperc-export agree", variants["fp32"].name, *options])
     records = {precision: _record(each, measured["fp32"], command) for precision, each in measured.items()}
@@ -177,6 +195,30 @@ def _measure(
     return _Measured(labels, float(np.nanmean(ious)), ap[0] if ap else None, f"{by}, {cpu_model()}")
 
 
+def _measure_images(
+    variant: Variant,
+    precision: str,
+    data: LabeledImages,
+    split: str,
+    n_images: int | None,
+    on_image: Callable[[str], None],
+) -> _Measured:
+    perceive = Perceiver([variant.path])
+    (session,) = perceive.sessions
+    by = f"onnxruntime {onnxruntime.__version__}, {session.provider}"
+    if precision == "bf16":
+        by = _run_in_openvino(session)
+    labels, confusion = [], Confusion(variant.card.classes)
+    for file in _spread(data.files(split), n_images):
+        image, truth = data.read(file)
+        found = perceive(image=image).image
+        assert found is not None
+        labels.append(found.labels.ravel())
+        confusion.update(found.labels, truth)
+        on_image(precision)
+    return _Measured(labels, confusion.mean_iou(), None, f"{by}, {cpu_model()}")
+
+
 def _kitti(judge: Judge, objects: KittiObjects, name: str) -> Truth:
     return judge.kitti(objects.frame(name))
 
@@ -185,8 +227,8 @@ def _semantickitti(judge: Judge, roads: SemanticKitti, name: str) -> Truth:
     return judge.semantickitti(roads.frame(name))
 
 
-def _spread(names: Sequence[str], most: int | None) -> Sequence[str]:
-    """At most ``most`` of the names, evenly spread."""
+def _spread(names: Sequence[T], most: int | None) -> Sequence[T]:
+    """At most ``most`` of the names or files, evenly spread."""
     return names if most is None else names[:: max(1, -(-len(names) // most))]
 
 

@@ -189,7 +189,8 @@ def build_parser() -> argparse.ArgumentParser:
     agree.add_argument("models", nargs="+", metavar="MODEL", help="a network's name, or its files, one of them in fp32")
     agree.add_argument("--kitti", type=Path, help="root of a KITTI object set")
     agree.add_argument("--semantickitti", type=Path, help="root of SemanticKITTI, for the road")
-    agree.add_argument("--split", default="validation", help="drives of the KITTI set (default: validation)")
+    agree.add_argument("--camvid", type=Path, help=f"{CAMVID}; for a network of a camera")
+    agree.add_argument("--split", default="validation", help="drives of the KITTI set, or images (default: validation)")
     agree.add_argument("--scans", type=int, metavar="N", help="at most N scans of each set (default: all)")
     agree.set_defaults(run=_agree)
 
@@ -443,7 +444,12 @@ def _agree(args: argparse.Namespace) -> int:
     from .agree import agree, summary
 
     measured = agree(
-        args.models, kitti=args.kitti, semantickitti=args.semantickitti, split=args.split, n_scans=args.scans
+        args.models,
+        kitti=args.kitti,
+        semantickitti=args.semantickitti,
+        camvid=args.camvid,
+        split=args.split,
+        n_scans=args.scans,
     )
     for line in summary(measured):
         print_line(line)

@@ -18,11 +18,13 @@ Image = pytest.importorskip("PIL.Image")
 import torch.nn.functional as F
 from torch import nn
 
-from edgeperc.errors import ImageError
+from edgeperc.card import ModelCard
+from edgeperc.errors import ImageError, PointsError, SplitError
 from edgeperc.evaluation.camvid import evaluate_images
 from edgeperc.readers.images import read_image
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.street import CAMERA_CLASSES
+from edgeperc_export.agree import agree
 from edgeperc_export.camera import Camera, class_weights
 from edgeperc_export.camvid import (
     ELEVEN,
@@ -455,9 +457,6 @@ def test_exported_camseg_equals_the_network(trained: tuple[Path, Path]) -> None:
 
 
 def test_card_of_camseg_names_camvid(trained: tuple[Path, Path], drawn: Path) -> None:
-    from edgeperc.card import ModelCard
-    from edgeperc.errors import SplitError
-
     card = ModelCard.read(trained[1])
     assert (card.view.kind, card.view.width, card.view.height) == ("camera", 64, 48)
     assert card.classes == CAMERA_CLASSES
@@ -506,6 +505,15 @@ def test_int8_of_a_camera(trained: tuple[Path, Path], drawn: Path, tmp_path: Pat
     assert card.precision == "int8"
     assert card.training["quantized"]["calibration"] == "6 images of CamVid"
     assert card.metrics["images"]["n_images"] == 3
+    # The record that "auto" decides by, with OpenVINO in bf16 too if it is installed and the processor has bf16.
+    records = agree([trained[1], tmp_path / "int8.onnx"], kitti=None, camvid=drawn)
+    assert records.keys() >= {"fp32", "int8"}
+    assert records["int8"]["n_scans"] == 3
+    assert records["fp32"]["label_agreement"] == 1.0
+    assert records["int8"]["command"] == "edgeperc-export agree camseg --camvid CAMVID --split validation"
+    assert ModelCard.read(tmp_path / "int8.onnx").precisions["int8"] == records["int8"]
+    with pytest.raises(PointsError, match="is of a camera"):
+        agree([trained[1]], kitti=drawn)
 
 
 def test_comparison_is_one_command(
