@@ -183,7 +183,8 @@ class ImageLabels:
     Attributes
     ----------
     labels : (H, W) uint8
-        Index into ``classes``. Row 0 is the top, column 0 leftmost.
+        Index into ``classes``; 255 for a pixel without a class, which a network never gives, but labeled images have.
+        Row 0 is the top, column 0 leftmost.
     classes : tuple of str
     """
 
@@ -208,7 +209,7 @@ class ImageLabels:
         """Number of pixels, by class."""
         flat, n_classes = self.labels.reshape(-1), len(self.classes)
         # In parts, because bincount makes eight bytes of each label.
-        parts = (np.bincount(flat[k : k + _PART], minlength=n_classes) for k in range(0, flat.size, _PART))
+        parts = (np.bincount(flat[k : k + _PART], minlength=n_classes)[:n_classes] for k in range(0, flat.size, _PART))
         counted = sum(parts, np.zeros(n_classes, np.int64))
         return {name: int(counted[k]) for k, name in enumerate(self.classes)}
 

@@ -231,6 +231,7 @@ def test_a_perception_and_its_labels_paint_alike() -> None:
     image = replace(image, labels=labels)
     painted, found = paint(labels, scan.points, NEAR), perceived(scan, image)
     assert found.image is not None
+    assert sum(found.image.counts().values()) == np.count_nonzero(labels != VOID)
     np.testing.assert_array_equal(paint(found, scan.points, NEAR), painted)
     np.testing.assert_array_equal(paint(found.image, scan.points, NEAR), painted)
     by_mask = camera_road(found.image.drivable, scan.points, NEAR)
