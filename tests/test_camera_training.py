@@ -189,6 +189,9 @@ def test_camseg_is_small_enough() -> None:
     network(torch.zeros(1, 3, 360, 480))
     assert weights(network) < 1.5e6
     assert multiplications < 3e9
+    dilated = [m for m in network.modules() if isinstance(m, nn.Conv2d) and m.dilation != (1, 1)]
+    assert dilated
+    assert not any(module.in_channels % 16 for module in dilated)
 
 
 def test_early_logits_are_of_training_alone() -> None:
