@@ -252,8 +252,8 @@ PAPER = {
         **{**PLAIN, "augment": True},
     ),
     # Jebamikyous (2021), section 3.1: Adam, categorical cross-entropy, batch 32, at most 100 epochs (1,147 steps of the
-    # 367 images), stopped after ten without a better validation IoU. Images divided by 255 (`cards`). The rate is not
-    # stated; here it is 3e-4 (see docs/research/camvid.md).
+    # 367 images), stopped after ten without a better validation figure. Images divided by 255 (`cards`). The learning
+    # rate is not stated; here it is 3e-4.
     **{
         network: Recipe(
             network,
