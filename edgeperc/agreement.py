@@ -507,7 +507,7 @@ def clear_columns(
     half = 0.5 * N_COLUMNS * CELL_M + CELL_M  # a cell more, for what is rounded
     low_x, high_x = first_row * CELL_M - half, (last_row + 3) * CELL_M - half
     low_y, high_y = first_col * CELL_M - half, (last_col + 3) * CELL_M - half
-    taken = np.zeros((last_row - first_row + 1, last_col - first_col + 1), dtype=np.uint64)
+    taken = np.zeros((last_row - first_row + 1, last_col - first_col + 1), np.uint64)
     one = np.uint64(1)
     for i in range(points.shape[0]):
         x, y = points[i, 0], points[i, 1]
@@ -728,7 +728,7 @@ def clear_ground(
         1 for vehicles, 2 for persons, 0 for classes that are not changed.
     labels : (n,) uint8, modified
     """
-    labeled = np.empty(points.shape[0], dtype=np.int32)
+    labeled = np.empty(points.shape[0], np.int32)
     n, n_lying = 0, 0
     for i in range(points.shape[0]):
         labeled[n] = i
@@ -737,7 +737,7 @@ def clear_ground(
         n_lying += 1 if has_role and on_ground[i] else 0
     if n_lying == 0:
         return
-    standing = np.zeros((N_FOOTPRINTS, N_FOOTPRINTS), dtype=np.uint8)
+    standing = np.zeros((N_FOOTPRINTS, N_FOOTPRINTS), np.uint8)
     for is_second in range(2):
         for i in labeled[:n]:
             if on_ground[i] != (is_second == 1):

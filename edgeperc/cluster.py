@@ -138,8 +138,8 @@ def find_clusters(
     rows = read_only(points)
     every = np.ones(len(rows), np.bool_)
     seeded = read_only(every if seeds is None else seeds, np.bool_)
-    clusters = np.empty(len(rows), dtype=np.int32)
-    work = np.empty(3, dtype=np.int64)
+    clusters = np.empty(len(rows), np.int32)
+    work = np.empty(3, np.int64)
     fill_clusters(
         rows,
         read_only(every if among is None else among, np.bool_),

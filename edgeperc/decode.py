@@ -55,7 +55,7 @@ def decode_labels(output: NDArray[np.float32], kind: str, *, model: str = "the m
         The output has another shape, or ``kind`` is not a class output.
     """
     values = _class_values(output, kind, model)
-    labels = np.empty(values.shape[1:], dtype=np.uint8)
+    labels = np.empty(values.shape[1:], np.uint8)
     n_bad, lowest, highest = fill_labels(values, labels)
     if n_bad:
         _raise_not_finite(n_bad, values.size, kind, model)
@@ -362,7 +362,7 @@ def decode_dense(
     if max_boxes < 1 or not box_classes:
         return []
 
-    peak = np.empty(maps.shape[1:], dtype=np.bool_)
+    peak = np.empty(maps.shape[1:], np.bool_)
     mark_peaks(maps[0], _logit(score_threshold), peak)
     rows, cols = np.nonzero(peak)
     best = np.argsort(-maps[0, rows, cols], kind="stable")[:max_boxes]
@@ -482,7 +482,7 @@ def fill_labels(values: NDArray[np.float32], labels: NDArray[np.uint8]) -> tuple
     n_classes, height, width = values.shape
     n_bad = 0
     lowest, highest = math.inf, -math.inf
-    best = np.empty(width, dtype=np.float32)
+    best = np.empty(width, np.float32)
     for row in range(height):
         label = labels[row]
         # Class by class along a row: each of these loops is compiled to vector instructions.
@@ -515,7 +515,7 @@ def fill_scores(values: NDArray[np.float32], scores: NDArray[np.float32]) -> Non
         The largest logit of each pixel.
     """
     n_classes, height, width = values.shape
-    total = np.empty(width, dtype=np.float32)
+    total = np.empty(width, np.float32)
     for row in range(height):
         best = scores[row]
         total[:] = 0.0

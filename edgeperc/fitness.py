@@ -77,7 +77,7 @@ def fill_scan_sums(
     heights[:] = 0
     n_rows[:] = 0
     sums[:] = 0.0
-    seen = np.zeros(64, dtype=np.bool_)
+    seen = np.zeros(64, np.bool_)
     far = np.zeros(64)
     lowest = math.inf
     highest = -math.inf
@@ -225,9 +225,9 @@ def _measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> _
     if points.ndim != 2 or points.shape[1] != 4:
         raise PointsError(f"got an array of shape {points.shape}; expected (n, 4): x, y, z, remission")
     points = read_only(points)
-    remissions, elevations, ranges = (np.empty(size, dtype=np.int64) for size in (258, 360, 200))
-    heights = np.empty((3, 100), dtype=np.int64)
-    rows, n_rows, sums = np.empty((8, 1024)), np.empty(8, dtype=np.int64), np.empty(9)
+    remissions, elevations, ranges = (np.empty(size, np.int64) for size in (258, 360, 200))
+    heights = np.empty((3, 100), np.int64)
+    rows, n_rows, sums = np.empty((8, 1024)), np.empty(8, np.int64), np.empty(9)
     step = int(_STEPS[np.searchsorted(_STEPS[:-1], len(points) // _SAMPLE)])
     left, right = (_pseudo_azimuth(angle) for angle in azimuth_deg)
     fill_scan_sums(

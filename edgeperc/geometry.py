@@ -144,7 +144,7 @@ def suppress_overlaps(
     if values.shape != (len(rows),):
         raise PointsError(f"got scores of shape {values.shape} for {len(rows)} rectangles; pass one score a rectangle")
     order = np.argsort(-values, kind="stable")
-    keep = np.empty(len(rows), dtype=np.bool_)
+    keep = np.empty(len(rows), np.bool_)
     mark_nms(read_only(rows[order], np.float64), iou_threshold, max_inside, keep)
     return order[keep]
 

@@ -131,17 +131,17 @@ def find_ground(
             f"got mount_height_m={mount_height_m} and max_height_m={max_height_m}; expected meters above 0"
         )
     rows = read_only(points if points.shape[1] == 4 else np.pad(points[:, :3], ((0, 0), (0, 1))))
-    cell = np.empty(len(rows), dtype=np.int32)
-    lowest = np.empty((N_CELLS, N_CELLS), dtype=np.int32)
+    cell = np.empty(len(rows), np.int32)
+    lowest = np.empty((N_CELLS, N_CELLS), np.int32)
     fill_lowest(rows, cell, lowest)
     plane = np.array([0.0, 0.0, -mount_height_m])
     found = fit_first_plane(rows, lowest, FIRST_REACH_M, plane)
-    height = np.empty(len(rows), dtype=np.float32)
-    mask = np.empty(len(rows), dtype=np.bool_)
+    height = np.empty(len(rows), np.float32)
+    mask = np.empty(len(rows), np.bool_)
     if found and regions:
         planes = np.empty((N_REGIONS, N_REGIONS, 3))
         fill_planes(rows, lowest, plane, planes)
-        level = np.empty((N_CELLS, N_CELLS), dtype=np.float32)
+        level = np.empty((N_CELLS, N_CELLS), np.float32)
         fill_levels(rows, lowest, planes, level)
         fill_heights(rows, cell, level, planes, max_height_m, height, mask)
     else:
@@ -170,9 +170,9 @@ def fill_lowest(points: NDArray[np.float32], cell: NDArray[np.int32], lowest: ND
     # Smallest of `bits of z << 32 | row of points`, without a branch; the bits of z are in the order of z. Points out
     # of the grid go to an entry of their own. A first loop without branches compiles to vector instructions. Both
     # together halve the time.
-    best = np.full(N_CELLS * N_CELLS + 1, EMPTY, dtype=np.int64)
-    ordered = np.empty(BLOCK, dtype=np.int32)
-    unused = np.empty(BLOCK, dtype=np.float32)  # a gap in the loads would prevent vector instructions
+    best = np.full(N_CELLS * N_CELLS + 1, EMPTY, np.int64)
+    ordered = np.empty(BLOCK, np.int32)
+    unused = np.empty(BLOCK, np.float32)  # a gap in the loads would prevent vector instructions
     for start in range(0, points.shape[0], BLOCK):
         block = values[4 * start : 4 * (start + BLOCK)]
         cells = cell[start : start + BLOCK]
@@ -327,7 +327,7 @@ def find_plane(
     if n == 0:
         return
     most = count_support(residuals, n, 0.0, 0.0, 0.0)
-    corners = np.empty(3, dtype=np.int64)
+    corners = np.empty(3, np.int64)
     for _ in range(n_hypotheses):
         for corner in range(3):
             draw = (draw * 1103515245 + 12345) & 0x7FFFFFFF
@@ -416,8 +416,8 @@ def fill_levels(
         z [m]; NaN without a point.
     """
     # Padded with zeros, so that the sums below need no bounds checks: this halves the time.
-    step = np.zeros((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), dtype=np.float32)
-    counts = np.zeros((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), dtype=np.float32)
+    step = np.zeros((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), np.float32)
+    counts = np.zeros((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), np.float32)
     for row in range(N_CELLS):
         u = min(max((row + 0.5) / CELLS_A_REGION - 0.5, 0.0), N_REGIONS - 1.0)
         r = min(int(u), N_REGIONS - 2)

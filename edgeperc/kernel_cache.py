@@ -63,7 +63,8 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     kept = options.pop("cache", False)
 
     def decorate(function: Callable[..., Any]) -> Any:
-        kernel = numba.njit(**options)(function)
+        # Kernels are never called from C: without that wrapper, they compile faster.
+        kernel = numba.njit(no_cfunc_wrapper=True, **options)(function)
         if (
             kept and function.__closure__ is None and hasattr(kernel, "_cache")
         ):  # with NUMBA_DISABLE_JIT, the kernel is the function itself

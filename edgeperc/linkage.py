@@ -63,8 +63,8 @@ def fill_clusters(
     clusters[:] = FREE
     work[:] = 0
     n_shares = len(min_shares)
-    n_left = np.zeros(n_shares + 1, dtype=np.int64)  # votes of points in no cluster yet
-    rows = np.empty(points.shape[0], dtype=np.int32)  # of the points that take part
+    n_left = np.zeros(n_shares + 1, np.int64)  # votes of points in no cluster yet
+    rows = np.empty(points.shape[0], np.int32)  # of the points that take part
     m = 0
     n_seeds = 0
     low_x, low_y, high_x, high_y = math.inf, math.inf, -math.inf, -math.inf
@@ -92,9 +92,9 @@ def fill_clusters(
     if distance_per_m > 0.0:
         limits = (edges / distance_per_m) ** 2
     grids = np.empty((n_levels, 3))  # lowest x and y, columns per meter
-    n_rows = np.empty(n_levels, dtype=np.int64)
-    n_cols = np.empty(n_levels, dtype=np.int64)
-    offsets = np.zeros(n_levels + 1, dtype=np.int64)  # the first strip of every level
+    n_rows = np.empty(n_levels, np.int64)
+    n_cols = np.empty(n_levels, np.int64)
+    offsets = np.zeros(n_levels + 1, np.int64)  # the first strip of every level
     for at in range(n_levels):
         farthest = math.sqrt(limits[at + 1])
         grids[at, 0], grids[at, 1] = max(low_x, -farthest), max(low_y, -farthest)
@@ -105,8 +105,8 @@ def fill_clusters(
 
     # Points are kept by strips: `STRIP` columns of one row. The points of a strip are a chain: its head, then for every
     # point the next one.
-    heads = np.full(offsets[n_levels], -1, dtype=np.int32)
-    chain = np.empty(points.shape[0], dtype=np.int32)
+    heads = np.full(offsets[n_levels], -1, np.int32)
+    chain = np.empty(points.shape[0], np.int32)
     for i in rows[:m]:
         strip = strip_of(points, i, limits, grids, n_cols, offsets)
         chain[i] = heads[strip]
@@ -115,25 +115,25 @@ def fill_clusters(
     # Runs: points of one column, each linked with the one before. Every run is the root of a tree of smaller parts,
     # which are made when they are needed (are_linked). Runs are numbered from 0, smaller parts from the end down.
     keys = np.empty(m)
-    order = np.empty(m, dtype=np.int32)
-    xyz = np.empty((m, 3), dtype=np.float32)
+    order = np.empty(m, np.int32)
+    xyz = np.empty((m, 3), np.float32)
     reach = np.empty(m)
     n_parts = m + m // 2 + 64
-    parts = np.empty((n_parts, 3), dtype=np.int32)  # first point, end, first child or 0
+    parts = np.empty((n_parts, 3), np.int32)  # first point, end, first child or 0
     bounds = np.empty((n_parts, 8))
-    run_level = np.empty(m, dtype=np.int8)
-    run_votes = np.empty((m, n_shares + 1), dtype=np.int32)
-    run_of = np.empty(points.shape[0], dtype=np.int32)
-    firsts = np.empty((m, STRIP + 1), dtype=np.int32)  # of opened strips: the first run of every column, and the end
-    owner = np.empty(m, dtype=np.int32)
+    run_level = np.empty(m, np.int8)
+    run_votes = np.empty((m, n_shares + 1), np.int32)
+    run_of = np.empty(points.shape[0], np.int32)
+    firsts = np.empty((m, STRIP + 1), np.int32)  # of opened strips: the first run of every column, and the end
+    owner = np.empty(m, np.int32)
     # First of the smaller parts, tests left, the reserve of tests, points in opened strips, runs, opened strips.
     state = np.array([n_parts, 2 * TESTS_PER_POINT * m, TESTS_PER_POINT * m, 0, 0, 0])
 
     # Clusters grow from seeds, run by run. A run of another cluster is not linked with this one, which was complete.
-    is_kept = np.zeros(n_seeds, dtype=np.bool_)
-    queue = np.empty(m, dtype=np.int32)
-    pairs = np.empty((MAX_PAIRS, 2), dtype=np.int32)
-    n_votes = np.empty(n_shares + 1, dtype=np.int64)
+    is_kept = np.zeros(n_seeds, np.bool_)
+    queue = np.empty(m, np.int32)
+    pairs = np.empty((MAX_PAIRS, 2), np.int32)
+    n_votes = np.empty(n_shares + 1, np.int64)
     n_clusters = 0
     for seed in rows[:m]:
         if not seeds[seed]:
@@ -233,7 +233,7 @@ def fill_clusters(
             n_clusters += 1
     work[1] = 2 * TESTS_PER_POINT * m - state[1]
 
-    renumbered = np.full(n_clusters, FREE, dtype=np.int32)
+    renumbered = np.full(n_clusters, FREE, np.int32)
     n_kept = 0
     for i in range(points.shape[0]):
         found = clusters[i]

@@ -450,7 +450,7 @@ class RangeImageProjector:
         self._wedge = wedge(view)
         self._rows = tabulate(row_edges(view), "rows")
         self._cols = tabulate(column_edges(view), "columns")
-        self._winner = np.empty(view.height * view.width, dtype=np.int64)
+        self._winner = np.empty(view.height * view.width, np.int64)
 
     def fill(
         self,
@@ -521,7 +521,7 @@ def column_edges(view: RangeImageGeometry) -> NDArray[np.float32]:
 def wedge(view: RangeImageGeometry) -> NDArray[np.float32]:
     """Coefficients of x, y, x, y in two sums that are not negative for any point in view, (4,) float32."""
     if view.azimuth_left_deg - view.azimuth_right_deg > 179.0:
-        return np.zeros(4, dtype=np.float32)
+        return np.zeros(4, np.float32)
     slack = 1e-5  # [rad] a hundred times what rounding can do to a sum
     left = math.radians(view.azimuth_left_deg) + slack
     right = math.radians(view.azimuth_right_deg) - slack
@@ -564,7 +564,7 @@ def tabulate(
         at = ((first - inner) * cells_per_unit).astype(np.int32)
         if np.all(np.diff(at) > 0):
             base = np.searchsorted(at, np.arange(cells + 2)).astype(np.int32)
-            split = np.full(cells + 2, -np.inf, dtype=np.float32)
+            split = np.full(cells + 2, -np.inf, np.float32)
             split[at] = inner
             # -2 is straight behind; azimuths slightly to the left of that are rounded to it.
             open_end = np.float32(-3.0) if last == np.float32(-2.0) else last
@@ -641,9 +641,9 @@ def _project(
 ) -> Projection:
     _check_points(points)
     projection = Projection(
-        image=np.empty(projector.shape, dtype=np.float32),
-        index=np.empty(projector.shape[1:], dtype=np.int32),
-        pixel=np.empty(points.shape[0], dtype=np.int32),
+        image=np.empty(projector.shape, np.float32),
+        index=np.empty(projector.shape[1:], np.int32),
+        pixel=np.empty(points.shape[0], np.int32),
     )
     projector.fill(points, projection.image, projection.index, projection.pixel, height_m)
     return projection

@@ -93,7 +93,7 @@ def remove_outliers(
     radii = np.array([radius_m.get(name, 0.0) for name in classes])
     if labels.size and int(labels.max()) >= len(radii):
         raise PointsError(f"got label {int(labels.max())} for {len(radii)} classes; pass the classes of the labels")
-    cleaned = np.empty(labels.shape, dtype=np.uint8)
+    cleaned = np.empty(labels.shape, np.uint8)
     fill_without_outliers(*arrays, radii, full_turn, cleaned)
     return cleaned
 
@@ -146,7 +146,7 @@ def label_points(
             f"got pixel of shape {pixel.shape} for {len(points)} points and {labels.size} pixels; "
             "expected one pixel a point, from the same projection"
         )
-    point_labels = np.empty(len(points), dtype=np.uint8)
+    point_labels = np.empty(len(points), np.uint8)
     fill_point_labels(rows, read_only(pixel, np.int32), behind, classes, full_turn, point_labels)
     return point_labels
 
@@ -195,10 +195,10 @@ def fill_without_outliers(
     for row in range(height):
         for col in range(width):
             cleaned[row, col] = labels[row, col]
-    seen = np.zeros((height, width), dtype=np.bool_)
-    rim = np.full((height, width), -1, dtype=np.int32)  # the component that has an object near this pixel
-    rows = np.empty(height * width, dtype=np.int32)
-    cols = np.empty(height * width, dtype=np.int32)
+    seen = np.zeros((height, width), np.bool_)
+    rim = np.full((height, width), -1, np.int32)  # the component that has an object near this pixel
+    rows = np.empty(height * width, np.int32)
+    cols = np.empty(height * width, np.int32)
     ground = np.empty((height * width, 2))  # x, y of every member
     center = np.empty(2)
     for first_row in range(height):
@@ -351,7 +351,7 @@ def fill_point_labels(
     height, width = labels.shape
     ranges = np.full((height, width), -1.0)  # of each pixel's point [m], computed when needed
     # Most hidden points have only background around them and need no vote: 0.5 ms a scan instead of 1.0.
-    contested = np.zeros((height, width), dtype=np.bool_)
+    contested = np.zeros((height, width), np.bool_)
     for row in range(height):
         for col in range(width):
             if labels[row, col] == 0:
@@ -363,7 +363,7 @@ def fill_point_labels(
                     elif full_turn:
                         contested[r, c % width] = True
     gaps = np.empty(N_VOTES)  # differences in range, smallest first
-    votes = np.empty(N_VOTES, dtype=np.uint8)
+    votes = np.empty(N_VOTES, np.uint8)
     label_of, index_of, contested_of = labels.reshape(-1), index.reshape(-1), contested.reshape(-1)
     for i in range(points.shape[0]):
         point_labels[i] = 0
