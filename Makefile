@@ -29,7 +29,7 @@ help:
 	@echo "make test-wheel    build the wheel, run the demo from it outside the checkout"
 	@echo "make test-minimal  pytest with nothing but the runtime: no torch, no onnx, no matplotlib"
 	@echo "make docs          build the documentation into docs/_build/html; warnings are errors"
-	@echo "make fuzz          hostile scans, captures, models, boxes and commands; SECONDS=300 SEED=7 KINDS='scans models'"
+	@echo "make fuzz          hostile scans, captures, models, boxes, commands, images; SECONDS=300 SEED=7 KINDS='scans models'"
 	@echo "make soak          whether memory grows over SCANS=20000 scans with stream, tracker and pictures"
 	@echo "make release       the packages, their SBOM and SHA256SUMS in dist/; make sbom does the same"
 	@echo "make clean         remove the environments and whatever else is made here"
