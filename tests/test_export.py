@@ -767,7 +767,14 @@ def exported(tmp_path_factory: pytest.TempPathFactory, scans: Sequence[np.ndarra
 
 @pytest.mark.parametrize(
     ("network", "head"),
-    [("kulseg", "dense"), ("lodnn", "dense"), ("pointseg", "dense"), ("ssadnet", "dense"), ("ssadnet", "slots"), ("ssadnet", "slots-paper")],
+    [
+        ("kulseg", "dense"),
+        ("lodnn", "dense"),
+        ("pointseg", "dense"),
+        ("ssadnet", "dense"),
+        ("ssadnet", "slots"),
+        ("ssadnet", "slots-paper"),
+    ],
 )
 def test_an_export_is_verified(exported: Exported, scans: Sequence[np.ndarray], network: str, head: str) -> None:
     checkpoint, path, card = exported(network, head)
