@@ -64,7 +64,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         # Kernels are never called from C: without that wrapper, they compile faster.
-        kernel = numba.njit(no_cfunc_wrapper=True, **options)(function)
+        kernel = numba.njit(**{"no_cfunc_wrapper": True, **options})(function)
         if (
             kept and function.__closure__ is None and hasattr(kernel, "_cache")
         ):  # with NUMBA_DISABLE_JIT, the kernel is the function itself

@@ -14,24 +14,16 @@ from numpy.typing import NDArray
 import twins.agreement
 from edgeperc import Box, Perceiver, PointLabels, PointsError, TopView
 from edgeperc.agreement import (
-    MAX_LENGTH_M,
-    MAX_TOP_M,
-    MIN_LARGE_SHARE,
-    MIN_VEHICLE_SHARE,
     RULES,
     _as_rows,
     agree_on_boxes,
     agree_on_cells,
     agree_on_points,
-    apply_verdicts,
     clear_columns,
     clear_ground,
     clear_road,
     count_inside,
     fill_support,
-    fill_tallies,
-    fill_verdicts,
-    fill_votes,
     find_voters,
 )
 from edgeperc.card import TopViewGeometry
@@ -42,6 +34,16 @@ from edgeperc.ground import Ground, find_ground
 from edgeperc.points import read_only
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
+from edgeperc.voting import (
+    MAX_LENGTH_M,
+    MAX_TOP_M,
+    MIN_LARGE_SHARE,
+    MIN_VEHICLE_SHARE,
+    apply_verdicts,
+    fill_tallies,
+    fill_verdicts,
+    fill_votes,
+)
 
 CLASSES = ("background", "car", "pedestrian", "cyclist")
 ROLES = np.array([0, 1, 2, 2], np.uint8)

@@ -28,6 +28,7 @@ FLOORS = {
         kernel_cache perception zoo.__init__
         calibration frame geometry linkage outline
         adapt cluster decode drivable fitness ground image motion observed projection refine sensor_fit session
+        voting
         agreement level network_input occupancy painting remission
         readers.__init__ readers.tables
         readers.inflate readers.packets

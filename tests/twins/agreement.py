@@ -32,7 +32,7 @@ def columns(points, height, limits, labels):
 
 
 def tallies(points, height, in_view, labels, clusters, n, n_classes):
-    """Twin of `edgeperc.agreement.fill_tallies`."""
+    """Twin of `edgeperc.voting.fill_tallies`."""
     counts = np.zeros((n, n_classes + 1), np.int32)
     bounds = np.empty((n, 5), np.float32)
     for k in range(n):
@@ -79,7 +79,7 @@ def inside_counts(points, height, on_ground, in_view, labels, roles, boxes):
 
 
 def verdicts(in_view, clusters, table, roles, scores, names, labels):
-    """Twin of `edgeperc.agreement.apply_verdicts`."""
+    """Twin of `edgeperc.voting.apply_verdicts`."""
     agreed = labels.copy()
     for i in np.flatnonzero(in_view):
         old, k = labels[i], clusters[i]
@@ -93,13 +93,13 @@ def verdicts(in_view, clusters, table, roles, scores, names, labels):
 
 
 def votes(in_view, labels, roles, scores):
-    """Twin of `edgeperc.agreement.fill_votes`."""
+    """Twin of `edgeperc.voting.fill_votes`."""
     role = roles[labels]
     return np.where(in_view, 1 + 2 * ((role == 1) | (scores >= 0.5)) + 4 * (role == 2), 0)
 
 
 def verdict_table(counts, bounds, roles, parts, by_share, by_height, is_filled):
-    """Twin of `edgeperc.agreement.fill_verdicts`: all clusters at once."""
+    """Twin of `edgeperc.voting.fill_verdicts`: all clusters at once."""
     vehicles, persons = np.flatnonzero(roles == 1), np.flatnonzero(roles == 2)
     seen = np.maximum(counts[:, -1], 1)
     vehicle_share, person_share = counts[:, vehicles].sum(axis=1) / seen, counts[:, persons].sum(axis=1) / seen
