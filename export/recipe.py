@@ -302,18 +302,19 @@ EDGE = Recipe("ssadnet", edge=True, steps=6000, batch=4, learning_rate=3e-3, coo
 
 DISTILLED = replace(EDGE, steps=1000, learning_rate=1e-3, cooldown=0.4, distil=1.0, seen_twice=False)
 
-# On labels alone, and with more scans: PandaSet (--scans), roads drawn by hand, turns by any angle. Each sample
-# is used twice, which saves a quarter of the time of a step on two cores.
+# On labels alone, and with more scans: PandaSet (--scans), turns by any angle. Each sample is used twice, which saves a
+# quarter of the time of a step on two cores.
 CONTINUED = replace(
     EDGE,
-    front=True,
-    drawn_roads=True,
-    steps=2400,
+    network="pointseg",
+    height_above_ground=True,
+    steps=5000,
     batch=16,
     reuse=2,
     learning_rate=1e-3,
     cooldown=0.4,
     ema=0.999,
+    n_pasted=6.0,
     turn_anywhere=0.3,
 )
 
@@ -389,22 +390,10 @@ MODELS = {
     "pointseg-start": Stage(
         replace(DISTILLED, network="pointseg", n_pasted=6.0, steps=1600), "pointseg-first-start", "pointseg-full"
     ),
-    "pointseg": Stage(
-        replace(
-            CONTINUED,
-            network="pointseg",
-            front=False,
-            drawn_roads=False,
-            height_above_ground=True,
-            n_pasted=6.0,
-            steps=5000,
-        ),
-        "pointseg-start",
-    ),
+    "pointseg": Stage(CONTINUED, "pointseg-start"),
     "lodnn": Stage(LODNN, teacher="ssadnet"),
-    "ssadnet-first-start": Stage(EDGE),
-    "ssadnet-start": Stage(DISTILLED, "ssadnet-first-start", "ssadnet-full"),
-    "ssadnet": Stage(CONTINUED, "ssadnet-start"),
+    "ssadnet-start": Stage(EDGE),
+    "ssadnet": Stage(DISTILLED, "ssadnet-start", "ssadnet-full"),
     "camseg": Stage(CAMSEG),
 }
 """The training run of every model, by name; names that end in ``-start`` are intermediate results."""
