@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-__all__ = ["MODELS", "NETWORKS", "PAPER", "TASKS", "Recipe", "Stage", "task_name"]
+__all__ = ["MODELS", "NETWORKS", "PAPER", "SCAN_NETWORKS", "TASKS", "Recipe", "Stage", "task_name"]
 
 TASKS: Mapping[str, tuple[str, ...]] = {
     "points": ("kulseg", "pointseg", "squeezesegv2"),

@@ -17,7 +17,8 @@ import twins.adapt
 from edgeperc import Perceiver, cli
 from edgeperc.adapt import Interpolator, condition, render
 from edgeperc.card import InputSpec, RangeImageGeometry
-from edgeperc.errors import PointsError, SensorError
+from edgeperc.errors import PointsError, SensorError, SplitError
+from edgeperc.evaluation.datasets import scan_hash
 from edgeperc.evaluation.transfer import compare
 from edgeperc.mounting import MODEL_MOUNTING
 from edgeperc.projection import RangeImageProjector
@@ -514,6 +515,23 @@ def test_adapt_fit_writes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureF
     (tmp_path / "none").mkdir()
     assert cli.main(["fit-sensor", str(tmp_path / "none"), *fit[2:]]) == 2
     assert "no scan in this folder" in capsys.readouterr().err
+
+
+def test_eval_sensors_counts_test_drives_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "velodyne").mkdir()
+    (tmp_path / "label").mkdir()
+    scan = simulate(random_scene(4, "urban"), "hdl-64e", seed=4)
+    for name in ("a", "b"):
+        scan.points.tofile(tmp_path / "velodyne" / f"{name}.bin")
+        (tmp_path / "label" / f"{name}.txt").write_text("")
+    names = {"car": "car", "*": "ignore"}
+    description = {"schema": 1, "sensor": "hdl-64e", "boxes": names, "splits": {"train": ["a"], "test": ["b"]}}
+    (tmp_path / "scans.json").write_text(json.dumps(description))
+    assert compare([str(tmp_path)])[str(tmp_path)]["n_scans"] == 1
+    seen = {"pointseg 1": {scan_hash(scan.points)}}
+    monkeypatch.setattr("edgeperc.evaluation.transfer.training_scans_of", lambda cards: seen)
+    with pytest.raises(SplitError, match="was trained on scan b"):
+        compare([str(tmp_path)])
 
 
 def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

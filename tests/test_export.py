@@ -40,7 +40,7 @@ from edgeperc_export.cli import main
 from edgeperc_export.curve import curve_table
 from edgeperc_export.models_page import models_page
 from edgeperc_export.networks import build
-from edgeperc_export.recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe, Stage
+from edgeperc_export.recipe import MODELS, PAPER, SCAN_NETWORKS, TASKS, Recipe, Stage
 from edgeperc_export.roads import DRAWN, drawn_roads
 from edgeperc_export.samples import Recent, Samples, loaded, real_scans
 from edgeperc_export.scans import LabeledScan, mirrored
@@ -551,7 +551,7 @@ def test_an_unused_or_unsuitable_teacher_is_refused(tmp_path: Path, simulated: P
 @pytest.mark.parametrize("network", ["pointseg", "ssadnet", "lodnn"])
 def test_an_exported_teacher_answers_with_each_sample(simulated: Path, network: str) -> None:
     path = SHIPPED_MODELS / ("pointseg.onnx" if network == "pointseg" else "ssadnet.onnx")
-    recipe = small(network, edge=True, distil=1.0, seen_twice=False)
+    recipe = small(network, edge=True, distil=1.0, seen_twice=False, height_above_ground=network == "pointseg")
     task = task_of(recipe)
     samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")), OnnxTeacher(path, task))
     arrays = [torch.from_numpy(array) for array in samples.batch(0)]
@@ -921,7 +921,7 @@ def test_the_command_line_from_scans_to_a_model(tmp_path: Path, capsys: pytest.C
     assert Session(model, "cpu").card.fitness is not None
 
 
-@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize("network", SCAN_NETWORKS)
 def test_a_network_has_one_task(network: str, simulated: Path) -> None:
     """Targets fit the outputs: the loss is finite, and lower for correct labels than for wrong ones."""
     recipe = small(network)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import multiprocessing
 import os
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -38,10 +40,16 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 CORPUS = sorted((Path(__file__).parent / "fuzz" / "corpus").iterdir())
 
 
+def _round(kind: str, cases: int) -> State:
+    module = importlib.import_module(f"fuzz.{kind}")
+    return run_job(lambda: module.make(7), State(kind, 7), cases=cases)
+
+
 @pytest.mark.parametrize(("kind", "cases"), [("scans", 600), ("trackers", 250), ("models", 250), ("images", 400)])
 def test_a_round(kind: str, cases: int) -> None:
-    module = importlib.import_module(f"fuzz.{kind}")
-    state = run_job(lambda: module.make(7), State(kind, 7), cases=cases)
+    # In a process of its own: other tests may have left this one with more memory than a case may take.
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        state = pool.submit(_round, kind, cases).result()
     assert state.cases == cases
     assert not state.failures, state.failures[0]["traceback"]
     assert sum(count for name, count in state.outcomes.items() if "answer" in name) > cases // 15, state.outcomes

@@ -561,12 +561,12 @@ def test_boxes_all_around_the_vehicle(scan: SimulatedScan) -> None:
     np.testing.assert_array_equal(every.points.labels[in_view], seen.points.labels[in_view])
     elevation = np.degrees(np.arcsin(scan.points[:, 2] / np.linalg.norm(scan.points[:, :3], axis=1)))
     assert every.points.in_view[(elevation < 2.0) & (elevation > -23.0)].mean() > 0.98
-    # A quarter turn of the scan is a quarter turn of the answer.
+    # A quarter turn of the scan is a quarter turn of the answer, but for heights: the ground is found in other cells.
     behind = scan.points[:, [1, 0, 2, 3]] * np.array([1, -1, 1, 1], np.float32)  # what is left is ahead
     left = ahead(behind).points
     assert left is not None
     fresh = left.in_view & ~in_view
-    np.testing.assert_array_equal(every.points.labels[fresh], left.labels[fresh])
+    assert (every.points.labels[fresh] == left.labels[fresh]).mean() > 0.999
     assert any(box.center[0] < 0.0 for box in every.boxes)
 
 

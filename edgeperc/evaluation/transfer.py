@@ -18,6 +18,7 @@ from ..simulation.samples import FIRST_SEED, IGNORE, labels_by_boxes, simulated_
 from ..simulation.scene import POINT_CLASSES
 from .metrics import Confusion
 from .scan_folder import ScanFolder, ScanFrame
+from .unseen import check_unseen, training_scans_of
 
 __all__ = ["Scan", "compare"]
 
@@ -71,10 +72,10 @@ def compare(
     datasets : sequence of str
         ``SENSOR=SOURCE``. The sensor is a built-in name or the file of a profile. The source is ``simulation:N``, a
         folder of labeled scans (`scan_folder.ScanFolder.parse`), or one with range images ``NAME.npy`` (H, W, 6).
-        Labeled scans need no ``SENSOR=``, because their description names it. Their points are labeled by boxes, as
-        KITTI's are. Scans go through a `Perceiver` as a user's do, with ``full_turn=True``: it finds the mounting, and
-        nothing from the labels helps it. The remission function of a simulated sensor is fitted to eight other scenes.
-        That of a real sensor comes from its profile.
+        Labeled scans need no ``SENSOR=``, because their description names it; those of test drives count. Their points
+        are labeled by boxes, as KITTI's are. Scans go through a `Perceiver` as a user's do, with ``full_turn=True``: it
+        finds the mounting, and nothing from the labels helps it. The remission function of a simulated sensor is fitted
+        to eight other scenes. That of a real sensor comes from its profile.
     model : str or Path
         A range-image model.
     provider, precision : str
@@ -94,6 +95,8 @@ def compare(
         A dataset cannot be read.
     ModelError
         The model is not a range-image model.
+    SplitError
+        The model was trained on a scan.
     """
     result: dict[str, Any] = {}
     sets = [(name, *_dataset(name)) for name in datasets]
@@ -113,7 +116,9 @@ def compare(
             for adaptation in ADAPTATIONS
         }
         counts = {adaptation: Confusion(POINT_CLASSES) for adaptation in ADAPTATIONS}
+        trained_on = training_scans_of(perceivers["none"].cards)
         for scan in read():
+            check_unseen(trained_on, scan.name, scan.name, scan.points)
             for adaptation, perceive in perceivers.items():
                 _count(counts[adaptation], perceive, scan)
                 done += 1
@@ -152,7 +157,7 @@ def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]
     sensor_name, equals, source = name.partition("=")
     if not equals:
         folder = _folder(name)
-        return folder.layout.sensor, len(folder.drives), lambda: map(_of_frame, _frames(folder))
+        return folder.layout.sensor, len(folder.names("test")), lambda: map(_of_frame, _frames(folder))
     sensor = get_sensor(sensor_name)
     kind, _, number = source.partition(":")
     if kind == "simulation":
@@ -166,7 +171,7 @@ def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]
     if images:
         return sensor, len(images), lambda: map(_from_image, images)
     folder = _folder(source)
-    return sensor, len(folder.drives), lambda: map(_of_frame, _frames(folder))
+    return sensor, len(folder.names("test")), lambda: map(_of_frame, _frames(folder))
 
 
 def _folder(source: str) -> ScanFolder:
@@ -180,7 +185,7 @@ def _folder(source: str) -> ScanFolder:
 
 
 def _frames(folder: ScanFolder) -> Iterator[ScanFrame]:
-    return map(folder.frame, folder.names("all"))
+    return map(folder.frame, folder.names("test"))
 
 
 def _of_frame(frame: ScanFrame) -> Scan:
