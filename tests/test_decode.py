@@ -67,6 +67,7 @@ def test_classes_that_are_not_finite_raise(value, kind):
         decode_classes(output, kind, model="pointseg")
 
 
+@pytest.mark.kernel
 @pytest.mark.parametrize("shape", [(0, 4), (1, 1), (7, 33)])
 def test_cells_without_a_return_lose_a_class_of_boxes(shape):
     rng = np.random.default_rng(3)
