@@ -297,6 +297,7 @@ def test_networks_are_measured_alone_and_in_pairs(alone: None, tmp_path: Path, s
 
 
 def test_camera_models_are_measured_with_images(alone: None, tmp_path: Path, scan: np.ndarray) -> None:
+    pytest.importorskip("psutil")
     path = tiny_camera.write_camera(tmp_path)
     ((title, contenders),) = made([str(path)], tmp_path, scan).items()
     assert title == "Image to result: tinycam:fp32"
