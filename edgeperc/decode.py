@@ -205,12 +205,7 @@ def decode_scored_slots(
         Shapes disagree, or a box class has no size prior.
     """
     rows = _slot_rows(slots, 5, box_classes, box_size_priors, model)
-    values = _class_values(class_output, class_kind, model)
-    if values.shape != (len(classes), geometry.height, geometry.width):
-        raise CardMismatchError(
-            f"{model}: {class_kind} has shape {class_output.shape}; expected "
-            f"{(1, len(classes), geometry.height, geometry.width)}; check the card"
-        )
+    values = _cell_values(class_output, class_kind, geometry, classes, model)
     _check_finite(values, class_kind, model)
     if max_boxes < 1 or not box_classes:
         return []
@@ -225,6 +220,19 @@ def decode_scored_slots(
     evidence = _footprint_evidence(values, class_kind, rectangles[keep], geometry, classes, box_classes)
     names = [box_classes[k] for k in np.argmax(evidence, axis=1)]
     return _standing(rectangles[keep], scores[keep], names, box_size_priors, mount_height_m)
+
+
+def _cell_values(
+    class_output: NDArray[np.float32], class_kind: str, geometry: TopViewGeometry, classes: Sequence[str], model: str
+) -> NDArray[np.float32]:
+    """The values of all classes in all cells of a view, (classes, height, width) float32."""
+    values = _class_values(class_output, class_kind, model)
+    expected = (len(classes), geometry.height, geometry.width)
+    if values.shape != expected:
+        raise CardMismatchError(
+            f"{model}: {class_kind} has shape {class_output.shape}; expected {(1, *expected)}; check the card"
+        )
+    return values
 
 
 def _slot_rows(
@@ -350,12 +358,7 @@ def decode_dense(
             f"{model}: box_dense has shape {dense.shape}; expected {(1, *expected[0])} or {(1, *expected[1])} "
             f"for a view of {(height, width)}; check the card"
         )
-    values = _class_values(class_output, class_kind, model)
-    if values.shape != (len(classes), height, width):
-        raise CardMismatchError(
-            f"{model}: {class_kind} has shape {class_output.shape}; expected {(1, len(classes), height, width)}; "
-            "check the card"
-        )
+    values = _cell_values(class_output, class_kind, geometry, classes, model)
     maps = np.ascontiguousarray(maps, dtype=np.float32)
     _check_finite(maps, "box_dense", model)
     _check_finite(values, class_kind, model)

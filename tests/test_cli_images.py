@@ -17,6 +17,7 @@ pillow = pytest.importorskip("PIL.Image")
 import edgeperc
 from edgeperc.errors import ImageError
 from edgeperc.perception import ImageLabels, Perception
+from edgeperc.simulation.camera import CAMERA_CLASSES
 from edgeperc.view import draw_image
 from edgeperc.view.colors import CAMERA_COLORS, CLASS_COLORS, color_of
 
@@ -158,21 +159,8 @@ def test_pictures_of_images(tmp_path: Path) -> None:
 
 
 def test_classes_of_images_have_colors() -> None:
-    names = (
-        "Sky",
-        "Building",
-        "Pole",
-        "Road",
-        "Pavement",
-        "Tree",
-        "SignSymbol",
-        "Fence",
-        "Car",
-        "Pedestrian",
-        "Bicyclist",
-    )
-    colors = [color_of(name) for name in names]
-    assert len({*colors}) == len(names)
+    colors = [color_of(name) for name in CAMERA_CLASSES]
+    assert len({*colors}) == len(CAMERA_CLASSES) == 11
     assert color_of("Car") == CLASS_COLORS["car"]
     assert not CAMERA_COLORS.keys() & CLASS_COLORS.keys()
     assert edgeperc.__all__

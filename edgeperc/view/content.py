@@ -7,12 +7,13 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ..errors import PointsError
+from ..errors import ImageError, PointsError
 from ..frame import ModelFrame
+from ..image import as_image
 from ..mounting import MODEL_MOUNTING
-from ..perception import Box, Perception
+from ..perception import Box, ImageLabels, Perception
 from .colors import CLASS_COLORS
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "fit_ground",
     "in_model_frame",
     "paint_points",
+    "perceived_image",
     "provider_lines",
     "timing_line",
 ]
@@ -45,6 +47,15 @@ def check_points(points: NDArray[np.float32], perception: Perception) -> None:
         raise PointsError(
             f"{len(points)} points with a perception of {perception.n_points}; expected the scan that was perceived"
         )
+
+
+def perceived_image(image: ArrayLike, perception: Perception) -> tuple[NDArray[np.uint8], ImageLabels]:
+    """The image that was perceived, checked, and its labels; `ImageError` if it is another."""
+    image, found = as_image(image), perception.image
+    if found is None or found.labels.shape != image.shape[:2]:
+        given = "no image" if found is None else f"an image of shape {found.labels.shape}"
+        raise ImageError(f"image has shape {image.shape}, of a perception of {given}; expected what was perceived")
+    return image, found
 
 
 def in_model_frame(perception: Perception, points: NDArray[np.float32]) -> tuple[Perception, NDArray[np.float32]]:

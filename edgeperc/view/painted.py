@@ -10,15 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration import Calibration
-from ..errors import ImageError
 from ..frame import ModelFrame
-from ..image import as_image
 from ..painting import UNSEEN, camera_road, paint
 from ..perception import Box, Perception, TopView
 from ..sensor import SensorProfile
 from .canvas import add_axes, as_png, draw_legend, height_of_legend, new_figure, shorten, write_at, write_heading
 from .colors import FAINT, INK, color_of, rgb
-from .content import check_points, drawable_boxes, drawable_points, provider_lines, timing_line
+from .content import check_points, drawable_boxes, drawable_points, perceived_image, provider_lines, timing_line
 
 __all__ = ["draw_painted"]
 
@@ -71,10 +69,7 @@ def draw_painted(
     OSError
         The file cannot be written.
     """
-    image, found = as_image(image), perception.image
-    if found is None or found.labels.shape != image.shape[:2]:
-        given = "no image" if found is None else f"an image of shape {found.labels.shape}"
-        raise ImageError(f"image has shape {image.shape}, of a perception of {given}; expected what was perceived")
+    image, found = perceived_image(image, perception)
     check_points(points, perception)
     painted = paint(perception, points, calibration, sensor=sensor)
     road = camera_road(perception, points, calibration, sensor=sensor)

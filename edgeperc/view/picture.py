@@ -11,8 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..drivable import RoadAhead, road_ahead
-from ..errors import ImageError
-from ..image import as_image
 from ..perception import Box, Perception, TopView
 from .canvas import (
     Label,
@@ -39,6 +37,7 @@ from .content import (
     fit_ground,
     in_model_frame,
     paint_points,
+    perceived_image,
     provider_lines,
     timing_line,
 )
@@ -148,10 +147,7 @@ def draw_image(
     OSError
         The file cannot be written.
     """
-    image, found = as_image(image), perception.image
-    if found is None or found.labels.shape != image.shape[:2]:
-        given = "no image" if found is None else f"an image of shape {found.labels.shape}"
-        raise ImageError(f"image has shape {image.shape}, of a perception of {given}; expected what was perceived")
+    image, found = perceived_image(image, perception)
     counts = sorted(found.counts().items(), key=lambda item: -item[1])
     facts = {name: [f"{100.0 * n / found.labels.size:.1f} %"] for name, n in counts if n}
     height = min(_WIDTH * image.shape[0] // image.shape[1], _WIDTH) + 1
