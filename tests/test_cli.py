@@ -42,6 +42,7 @@ class FakePerceiver:
         self, models, *, sensor="hdl-64e", provider="auto", n_threads=None, on_mismatch="warn", **more
     ) -> None:
         self.given = (list(models), sensor, provider, n_threads, on_mismatch)
+        self.sensor = sensor
         self.more = more
         known = {"pointseg": POINTSEG, "ssadnet": SSADNET}
         for name in models:

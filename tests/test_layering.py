@@ -43,7 +43,7 @@ FLOORS = {
         tracking.tracks
         tracking.tracker
         tracking.__init__
-        listing perceiver records zones
+        listing perceiver records sinks.__init__ zones
         live
         simulation.raycast
         simulation.shapes
@@ -65,7 +65,7 @@ FLOORS = {
         view.files view.mistakes view.page view.painted view.picture view.tracks
         view.__init__
         cli.arguments cli.output
-        cli.scans
+        cli.report cli.scans cli.sinks
         cli.completion cli.fit_sensor cli.info cli.program cli.run
         cli.demo cli.eval cli.eval_painting cli.eval_sensors cli.eval_tracking cli.lists
         cli.main

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import itertools
-import json
 import os
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-from ..errors import EdgepercError, ImageError, MissingExtraError, ModelError, PointsError
+from ..errors import EdgepercError, ImageError, ModelError, PointsError
 from ..extras import require
+from ..sinks import PerceivedScan, Sink
 from .arguments import (
     CAMERA,
     DEFAULT,
@@ -28,8 +28,10 @@ from .arguments import (
     add_topic,
     positive_number,
 )
-from .output import many, one_line, print_error, print_line, progress
+from .output import many, print_line, progress
+from .report import Report
 from .scans import Scans, find_images, find_scans, output_names, scan_folders, scan_namer, scan_sensor
+from .sinks import add_sinks, open_sinks, wanted_sinks
 
 if TYPE_CHECKING:
     import numpy as np
@@ -132,6 +134,7 @@ def add_parser(commands: Commands) -> None:
         "--labels", action="store_true", help="write NAME.label, SemanticKITTI's layout: one uint32 for each point"
     )
     output.add_argument("--ply", action="store_true", help="write NAME.ply, the points with labels and colors")
+    add_sinks(parser)
     tracking = parser.add_argument_group("tracking")
     tracking.add_argument(
         "--track", action="store_true", help="track the boxes from scan to scan; the scans must be one drive, in order"
@@ -152,7 +155,7 @@ def add_parser(commands: Commands) -> None:
         type=positive_number,
         default=10.0,
         metavar="HZ",
-        help="scans per second, for files without time stamps with --live or --track (default: 10)",
+        help="scans per second of files without time stamps (default: 10)",
     )
 
 
@@ -195,7 +198,11 @@ def run_command(arguments: argparse.Namespace) -> int:
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
     sources = {os.path.realpath(source) for source in (*scans, *images.values()) if source is not None}
     of = _pictures_of(arguments, images)
-    for file in (file for target in targets for file in _files_of(target, kinds, **of).values()):
+    whole = [getattr(arguments, name) for name in wanted_sinks(arguments)]
+    for file in (
+        *(file for target in targets for file in _files_of(target, kinds, **of).values()),
+        *(value for value in whole if isinstance(value, Path)),
+    ):
         if os.path.realpath(file) in sources:
             arguments.usage_error(
                 f"{file} is one of the {'images' if images else 'scans'} and would be overwritten; choose another --out"
@@ -205,21 +212,21 @@ def run_command(arguments: argparse.Namespace) -> int:
     perceivers.check([*filter(None, images.values())] if images else scans, of_images=bool(images))
     for target in targets if kinds else ():
         target.parent.mkdir(parents=True, exist_ok=True)
-    follow = _follower(arguments.rate) if arguments.track else None
-    report = _Report(arguments, images)
+    report = Report(arguments, images)
     for folder in found.empty:
         report.add(folder, PointsError("no scan in this folder; expected scans, captures or a ROS 2 bag's folder"))
     started = time.perf_counter()
-    with progress("file") as show:
+    with progress("file") as show, ExitStack() as stack:
+        sinks = open_sinks(arguments)
+        for sink in sinks:
+            stack.callback(sink.close)
+        run = _Run(arguments, perceivers, kinds, sinks)
         for done, (scan, target) in enumerate(zip(scans, targets, strict=True)):
             show(done, len(scans))
-            outcomes: Iterator[tuple[Any, ...]]
             if images:
-                outcomes = _each_image(perceivers, follow, scan, images[scan], target, kinds, arguments)
-            elif arguments.live:
-                outcomes = _live(perceivers, follow, scan, arguments)
+                outcomes = run.image(scan, images[scan], target)
             else:
-                outcomes = _each(perceivers, follow, scan, target, kinds, arguments)
+                outcomes = run.live(scan) if arguments.live else run.scans(scan, target)
             for outcome in outcomes:
                 report.add(*outcome)
     if report.tracks:
@@ -268,6 +275,7 @@ def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, P
     if arguments.live:
         arguments.usage_error("--live replays scans, not images")
     of_scans = [kind for kind in (*kinds, *(["track"] if arguments.track else [])) if kind != "png"]
+    of_scans += [name.replace("_", "-") for name in wanted_sinks(arguments)]
     if of_scans and not scans:
         arguments.usage_error(f"--{of_scans[0]} is of scans; add --scan, or leave it out")
     require("PIL.Image", "camera", "Reading an image", package="pillow")
@@ -285,76 +293,6 @@ def _live_source(arguments: argparse.Namespace) -> Path:
     if len(folders) > 1:
         arguments.usage_error(f"--live replays one folder of scans; {path} has {len(folders)}, such as {folders[0]}")
     return folders[0] if folders else path
-
-
-class _Report:
-    """Prints the result of each scan, and counts scans and failures.
-
-    Attributes
-    ----------
-    n, n_failed : int
-        Number of scans, and of failed scans.
-    tracks : list of Tracks
-        Tracks of every scan, kept only for ``--gif``.
-    under : list of bytes
-        `edgeperc.view.flatten_scan` of every scan, drawn under the tracks.
-    """
-
-    def __init__(self, arguments: argparse.Namespace, images: Mapping[Path, Path | None]) -> None:
-        self.n = self.n_failed = 0
-        self._images = images
-        self.tracks: list[Tracks] = []
-        self.under: list[bytes] = []
-        self._json = arguments.json
-
-    def add(
-        self,
-        source: Path,
-        outcome: Perception | Answer | Exception,
-        tracks: Tracks | None = None,
-        under: bytes | None = None,
-    ) -> None:
-        """Print one scan's line or JSON object; print an error on stderr as well."""
-        from ..perception import Perception
-
-        if isinstance(outcome, MissingExtraError):
-            raise outcome
-        self.n += 1
-        if isinstance(outcome, Exception):
-            self.n_failed += 1
-            print_error(f"{source}: {str(outcome).removeprefix(f'{source}: ')}")
-            if self._json:
-                print_line(json.dumps({**self._names(source), "error": one_line(outcome)}))
-            return
-        answer, perception = (None, outcome) if isinstance(outcome, Perception) else (outcome, outcome.perception)
-        timing = None if answer is None else _timing(answer)
-        if tracks is not None and under is not None:
-            self.tracks.append(tracks)
-            self.under.append(under)
-        if self._json:
-            from ..records import scan_record
-
-            stamp_s = perception.stamp_s
-            names, record = self._names(source), scan_record(perception, tracks)
-            if record["image"] is not None:
-                record["image"] = {**names.pop("image"), **record["image"]}
-            record = {**names, "stamp_s": stamp_s, "live": timing, **record}
-            print_line(json.dumps(record, allow_nan=False))
-            return
-        parts = [str(source)]
-        if timing is not None:
-            parts.append("  ".join(f"{key} {value}" for key, value in timing.items()))
-        parts.append(_summary(perception))
-        if tracks is not None:
-            parts.append(f"tracks: {many(len(tracks), 'object')}")
-        print_line("  ".join(parts))
-
-    def _names(self, source: Path) -> dict[str, Any]:
-        """The files of a record: the scan, or the image and its scan."""
-        if source not in self._images:
-            return {"scan": str(source)}
-        scan = self._images[source]
-        return {"scan": None if scan is None else str(scan), "image": {"file": str(source)}}
 
 
 # Perceivers kept for the sensors of captures; each has its own networks in memory.
@@ -412,119 +350,141 @@ class _Perceivers:
         return self._made[sensor]
 
 
-Follow = Callable[["Perception"], "Tracks"]
+Outcome = tuple[Path, "Perception | Answer | Exception", "Tracks | None", "bytes | None"]
+"""Name, answer or error, tracks and flattened scan (`edgeperc.view.flatten_scan`) of a scan or image."""
 
 
-def _follower(rate_hz: float) -> Follow:
-    """Make a function from a perception to tracks. Scans without stamps are 1 / ``rate_hz`` apart."""
-    from ..tracking.tracker import Tracker
+class _Run:
+    """What a run does with every scan: perceive it, track its boxes, write its files and its part of the run's."""
 
-    tracker, counted = Tracker(), itertools.count(1)
+    def __init__(
+        self, arguments: argparse.Namespace, perceivers: _Perceivers, kinds: Sequence[str], sinks: Sequence[Sink]
+    ) -> None:
+        from ..tracking.tracker import Tracker
 
-    def follow(perception: Perception) -> Tracks:
-        k = next(counted)
-        return tracker.update(perception.boxes, k / rate_hz if perception.stamp_s is None else perception.stamp_s)
+        self._arguments = arguments
+        self._perceivers = perceivers
+        self._kinds = kinds
+        self._sinks = sinks
+        self._tracker = Tracker() if arguments.track else None
+        self._n = 0
 
-    return follow
+    def scans(self, path: Path, target: Path) -> Iterator[Outcome]:
+        """Perceive each scan of a file or capture."""
+        from ..readers.captures import is_capture, read_scans
 
+        try:
+            perceive = self._perceivers.of(self._perceivers.sensor_of(path))
+            numbered = is_capture(path)
+            for k, (stamp_s, points) in enumerate(read_scans(path, topic=self._arguments.topic)):
+                name, file = (path / f"{k:06d}", target / f"{k:06d}") if numbered else (path, target)
+                try:
+                    perception = perceive(points, stamp_s)
+                    if self._kinds and numbered:
+                        target.mkdir(exist_ok=True)
+                    wanted = {kind: _file_of(file, kind) for kind in self._kinds}
+                    yield self._answered(name, points, perception, perceive.sensor, wanted)
+                except (EdgepercError, OSError) as exc:
+                    yield name, exc, None, None
+                except MemoryError:
+                    yield name, PointsError(f"{len(points):,} points take more memory than there is"), None, None
+        except (EdgepercError, OSError) as exc:
+            yield path, exc, None, None
 
-def _each(
-    perceivers: _Perceivers,
-    follow: Follow | None,
-    path: Path,
-    target: Path,
-    kinds: Sequence[str],
-    arguments: argparse.Namespace,
-) -> Iterator[tuple[Path, Perception | Exception, Tracks | None, bytes | None]]:
-    """Yield the name, perception or error, tracks and flattened scan of each scan in a file or capture."""
-    from ..readers.captures import is_capture, read_scans
+    def image(self, path: Path, scan: Path | None, target: Path) -> Iterator[Outcome]:
+        """Perceive an image and its scan, if it has one."""
+        from .. import view
+        from ..calibration import Calibration
+        from ..readers.files import read_points
+        from ..readers.images import read_image
 
-    try:
-        sensor = perceivers.sensor_of(path)
-    except (EdgepercError, OSError) as exc:
-        yield path, exc, None, None
-        return
-    perceive = perceivers.of(sensor)
-    try:
-        numbered = is_capture(path)
-        for k, (stamp_s, points) in enumerate(read_scans(path, topic=arguments.topic)):
-            name, file = (path / f"{k:06d}", target / f"{k:06d}") if numbered else (path, target)
-            try:
-                perception = perceive(points, stamp_s)
-                tracks = None if follow is None else follow(perception)
-                if kinds and numbered:
-                    target.mkdir(exist_ok=True)
-                _write(points, perception, {kind: _file_of(file, kind) for kind in kinds}, title=str(name))
-            except (EdgepercError, OSError) as exc:
-                yield name, exc, None, None
-            except MemoryError:
-                yield name, PointsError(f"{len(points):,} points take more memory than there is"), None, None
-            else:
-                yield name, perception, tracks, _under(points, perception) if arguments.gif else None
-    except (EdgepercError, OSError) as exc:
-        yield path, exc, None, None
-
-
-def _each_image(
-    perceivers: _Perceivers,
-    follow: Follow | None,
-    path: Path,
-    scan: Path | None,
-    target: Path,
-    kinds: Sequence[str],
-    arguments: argparse.Namespace,
-) -> Iterator[tuple[Path, Perception | Exception, Tracks | None, bytes | None]]:
-    """Yield the name, perception or error, tracks and flattened scan of an image and of its scan, if it has one."""
-    from .. import view
-    from ..calibration import Calibration
-    from ..readers.files import read_points
-    from ..readers.images import read_image
-
-    try:
-        image = read_image(path)
-        perceive = perceivers.of(perceivers.sensor_of(scan) if scan else arguments.sensor or DEFAULT_SENSOR)
-        points = None if scan is None else read_points(scan)
-        perception = perceive(points, image=image)
-        tracks = None if follow is None else follow(perception)
-        wanted = _files_of(target, kinds, **_pictures_of(arguments, [path]))
-        if "image" in wanted:
-            view.draw_image(perception, image, wanted.pop("image"), title=path.name)
-        if "both" in wanted:
-            calibration = Calibration.from_kitti(arguments.calib, image.shape[1], image.shape[0])
-            both, sensor = wanted.pop("both"), perceive.sensor
-            assert points is not None
-            view.draw_painted(perception, image, points, calibration, both, sensor=sensor, title=path.name)
-        if points is not None:
-            _write(points, perception, wanted, title=str(scan))
-    except (EdgepercError, OSError) as exc:
-        yield path, exc, None, None
-    except MemoryError:
-        yield path, ImageError("the image takes more memory than there is"), None, None
-    else:
-        yield path, perception, tracks, None if points is None or not arguments.gif else _under(points, perception)
-
-
-def _live(
-    perceivers: _Perceivers, follow: Follow | None, path: Path, arguments: argparse.Namespace
-) -> Iterator[tuple[Path, Answer | Exception, Tracks | None]]:
-    """Yield scan name, answer or error, and tracks, as a stream delivers them."""
-    from ..live import stream
-
-    name_of = scan_namer(path)
-    perceive = perceivers.of(
-        perceivers.sensor_of(path)
-    ).__call__  # without a sensor, of which `stream` would warn again
-    with stream(path, perceive, follow, rate_hz=arguments.rate, topic=arguments.topic) as answers:
-        while True:
-            try:
-                answer = answers.take()
-            except StopIteration:
+        arguments, perceivers = self._arguments, self._perceivers
+        try:
+            image = read_image(path)
+            perceive = perceivers.of(perceivers.sensor_of(scan) if scan else arguments.sensor or DEFAULT_SENSOR)
+            points = None if scan is None else read_points(scan)
+            perception = perceive(points, image=image)
+            wanted = _files_of(target, self._kinds, **_pictures_of(arguments, [path]))
+            if "image" in wanted:
+                view.draw_image(perception, image, wanted.pop("image"), title=path.name)
+            if points is None:
+                yield path, perception, None, None
                 return
-            except (EdgepercError, OSError) as exc:
-                yield path, exc, None  # newer scans may have arrived, so the failed scan's number is unknown
-            else:
+            if "both" in wanted:
+                calibration = Calibration.from_kitti(arguments.calib, image.shape[1], image.shape[0])
+                both, sensor = wanted.pop("both"), perceive.sensor
+                view.draw_painted(perception, image, points, calibration, both, sensor=sensor, title=path.name)
+            yield self._answered(path, points, perception, perceive.sensor, wanted, title=str(scan))
+        except (EdgepercError, OSError) as exc:
+            yield path, exc, None, None
+        except MemoryError:
+            yield path, ImageError("the image takes more memory than there is"), None, None
+
+    def live(self, path: Path) -> Iterator[Outcome]:
+        """Perceive the newest scan, as a stream delivers them."""
+        from ..live import stream
+
+        name_of = scan_namer(path)
+        perceiver = self._perceivers.of(self._perceivers.sensor_of(path))
+        perceive = perceiver.__call__  # without a sensor, of which `stream` would warn again
+        rate_hz, topic = self._arguments.rate, self._arguments.topic
+        with stream(
+            path, perceive, None if self._tracker is None else self._track, rate_hz=rate_hz, topic=topic
+        ) as answers:
+            while True:
+                try:
+                    answer = answers.take()
+                except StopIteration:
+                    return
+                except (EdgepercError, OSError) as exc:
+                    yield path, exc, None, None  # newer scans may have arrived, so the failed scan's number is unknown
+                    continue
                 assert answer is not None
-                yield name_of(answer.n_scans - 1), answer, answer.tracks
+                name = name_of(answer.n_scans - 1)
+                scan = PerceivedScan(
+                    str(name),
+                    answer.stamp_s,
+                    answer.points,
+                    answer.perception,
+                    answer.tracks,
+                    perceiver.sensor,
+                    answer.health,
+                )
+                try:
+                    self._sink(scan)
+                except (EdgepercError, OSError) as exc:
+                    yield name, exc, None, None
+                else:
+                    yield name, answer, answer.tracks, None
+
+    def _answered(
+        self,
+        name: Path,
+        points: NDArray[np.float32],
+        perception: Perception,
+        sensor: SensorProfile,
+        wanted: Mapping[str, Path],
+        title: str | None = None,
+    ) -> Outcome:
+        """Track the boxes and write everything about a scan."""
+        stamp_s = self._stamp_s(perception)
+        tracks = None if self._tracker is None else self._tracker.update(perception.boxes, stamp_s)
+        _write(points, perception, wanted, title=title or str(name))
+        self._sink(PerceivedScan(str(name), stamp_s, points, perception, tracks, sensor))
+        return name, perception, tracks, _under(points, perception) if self._arguments.gif else None
+
+    def _track(self, perception: Perception) -> Tracks:
+        assert self._tracker is not None
+        return self._tracker.update(perception.boxes, self._stamp_s(perception))
+
+    def _stamp_s(self, perception: Perception) -> float:
+        """Time of the next scan; scans without time stamps are 1 / ``--rate`` apart."""
+        self._n += 1
+        return self._n / self._arguments.rate if perception.stamp_s is None else perception.stamp_s
+
+    def _sink(self, scan: PerceivedScan) -> None:
+        for sink in self._sinks:
+            sink.write(scan)
 
 
 def _file_of(target: Path, kind: str) -> Path:
@@ -567,34 +527,3 @@ def _under(points: NDArray[np.float32], perception: Perception) -> bytes:
     from ..view import flatten_scan
 
     return flatten_scan(points, perception)
-
-
-def _timing(answer: Answer) -> dict[str, Any]:
-    """Age, health and counts of an answer, which ``run --live`` prints."""
-    return {
-        "age_ms": round(1e3 * answer.age_s, 3),
-        "health": answer.health,
-        "scans": answer.n_scans,
-        "dropped": answer.n_dropped,
-    }
-
-
-def _summary(perception: Perception) -> str:
-    """Summarize on one line: points, time, drivable area, boxes and points of each class."""
-    parts = []
-    if perception.image is not None:
-        height, width = perception.image.labels.shape
-        shares = ((name, n / (width * height)) for name, n in perception.image.counts().items())
-        parts.append(f"{width} x {height} pixels: {', '.join(f'{name} {100.0 * s:.1f} %' for name, s in shares if s)}")
-    if perception.points is None and perception.top_view is None:
-        return "  ".join([*parts, f"{sum(perception.stage_ms.values()):.1f} ms"])
-    parts += [f"{perception.n_points:,} points", f"{sum(perception.stage_ms.values()):.1f} ms"]
-    if perception.top_view is not None:
-        parts.append(f"drivable {perception.top_view.drivable_area_m2:.1f} m2")
-    labels = [box.label for box in perception.boxes]
-    boxes = ", ".join(f"{labels.count(label)} {label}" for label in dict.fromkeys(labels))
-    parts.append(f"boxes: {boxes or 'none'}")
-    if perception.points is not None:
-        counts = perception.points.counts()
-        parts.append("points: " + ", ".join(f"{name} {counts[name]:,}" for name in perception.points.classes[1:]))
-    return "  ".join(parts)

@@ -1,0 +1,120 @@
+"""What ``edgeperc run`` prints of each scan: a line or a JSON object; an error also on stderr."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import MissingExtraError
+from .output import many, one_line, print_error, print_line
+
+if TYPE_CHECKING:
+    from ..live import Answer
+    from ..perception import Perception
+    from ..tracking.tracks import Tracks
+
+__all__ = ["Report"]
+
+
+class Report:
+    """Prints the result of each scan, and counts scans and failures.
+
+    Attributes
+    ----------
+    n, n_failed : int
+        Number of scans, and of failed scans.
+    tracks : list of Tracks
+        Tracks of every scan, kept only for ``--gif``.
+    under : list of bytes
+        `edgeperc.view.flatten_scan` of every scan, drawn under the tracks.
+    """
+
+    def __init__(self, arguments: argparse.Namespace, images: Mapping[Path, Path | None]) -> None:
+        self.n = self.n_failed = 0
+        self._images = images
+        self.tracks: list[Tracks] = []
+        self.under: list[bytes] = []
+        self._json = arguments.json
+
+    def add(
+        self,
+        source: Path,
+        outcome: Perception | Answer | Exception,
+        tracks: Tracks | None = None,
+        under: bytes | None = None,
+    ) -> None:
+        """Print one scan's line or JSON object; print an error on stderr as well."""
+        from ..perception import Perception
+
+        if isinstance(outcome, MissingExtraError):
+            raise outcome
+        self.n += 1
+        if isinstance(outcome, Exception):
+            self.n_failed += 1
+            print_error(f"{source}: {str(outcome).removeprefix(f'{source}: ')}")
+            if self._json:
+                print_line(json.dumps({**self._names(source), "error": one_line(outcome)}))
+            return
+        answer, perception = (None, outcome) if isinstance(outcome, Perception) else (outcome, outcome.perception)
+        timing = None if answer is None else _timing(answer)
+        if tracks is not None and under is not None:
+            self.tracks.append(tracks)
+            self.under.append(under)
+        if self._json:
+            from ..records import scan_record
+
+            stamp_s = perception.stamp_s
+            names, record = self._names(source), scan_record(perception, tracks)
+            if record["image"] is not None:
+                record["image"] = {**names.pop("image"), **record["image"]}
+            record = {**names, "stamp_s": stamp_s, "live": timing, **record}
+            print_line(json.dumps(record, allow_nan=False))
+            return
+        parts = [str(source)]
+        if timing is not None:
+            parts.append("  ".join(f"{key} {value}" for key, value in timing.items()))
+        parts.append(_summary(perception))
+        if tracks is not None:
+            parts.append(f"tracks: {many(len(tracks), 'object')}")
+        print_line("  ".join(parts))
+
+    def _names(self, source: Path) -> dict[str, Any]:
+        """The files of a record: the scan, or the image and its scan."""
+        if source not in self._images:
+            return {"scan": str(source)}
+        scan = self._images[source]
+        return {"scan": None if scan is None else str(scan), "image": {"file": str(source)}}
+
+
+def _timing(answer: Answer) -> dict[str, Any]:
+    """Age, health and counts of an answer, which ``run --live`` prints."""
+    return {
+        "age_ms": round(1e3 * answer.age_s, 3),
+        "health": answer.health,
+        "scans": answer.n_scans,
+        "dropped": answer.n_dropped,
+    }
+
+
+def _summary(perception: Perception) -> str:
+    """Summarize on one line: points, time, drivable area, boxes and points of each class."""
+    parts = []
+    if perception.image is not None:
+        height, width = perception.image.labels.shape
+        shares = ((name, n / (width * height)) for name, n in perception.image.counts().items())
+        parts.append(f"{width} x {height} pixels: {', '.join(f'{name} {100.0 * s:.1f} %' for name, s in shares if s)}")
+    if perception.points is None and perception.top_view is None:
+        return "  ".join([*parts, f"{sum(perception.stage_ms.values()):.1f} ms"])
+    parts += [f"{perception.n_points:,} points", f"{sum(perception.stage_ms.values()):.1f} ms"]
+    if perception.top_view is not None:
+        parts.append(f"drivable {perception.top_view.drivable_area_m2:.1f} m2")
+    labels = [box.label for box in perception.boxes]
+    boxes = ", ".join(f"{labels.count(label)} {label}" for label in dict.fromkeys(labels))
+    parts.append(f"boxes: {boxes or 'none'}")
+    if perception.points is not None:
+        counts = perception.points.counts()
+        parts.append("points: " + ", ".join(f"{name} {counts[name]:,}" for name in perception.points.classes[1:]))
+    return "  ".join(parts)
