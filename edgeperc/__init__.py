@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from .live import Answer, Stream, stream
     from .motion import Motion, deskew, merge
     from .mounting import Mounting
+    from .moving import movable_points, moving_points
     from .occupancy import OccupancyGrid, occupancy_grid
     from .painting import camera_road, paint
     from .perceiver import Perceiver
@@ -117,6 +118,8 @@ __all__ = [
     "draw",
     "merge",
     "models",
+    "movable_points",
+    "moving_points",
     "occupancy_grid",
     "paint",
     "providers",
@@ -162,6 +165,8 @@ _MODULES = {
     "draw": "view",
     "merge": "motion",
     "models": "listing",
+    "movable_points": "moving",
+    "moving_points": "moving",
     "occupancy_grid": "occupancy",
     "paint": "painting",
     "providers": "listing",
