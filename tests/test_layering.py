@@ -43,8 +43,9 @@ FLOORS = {
         tracking.tracks
         tracking.tracker
         tracking.__init__
-        listing perceiver records sinks.__init__ zones
-        live
+        listing moving perceiver records sinks.__init__ zones
+        live sinks.names
+        sinks.prelabels sinks.static
         simulation.raycast
         simulation.shapes
         simulation.scene simulation.vehicles
@@ -55,7 +56,7 @@ FLOORS = {
         simulation.__init__
         simulation.samples
         evaluation.__init__ evaluation.metrics evaluation.mistakes evaluation.splits evaluation.tracking_metrics
-        evaluation.ab3dmot evaluation.causes evaluation.datasets evaluation.headings
+        evaluation.ab3dmot evaluation.annotations evaluation.causes evaluation.datasets evaluation.headings
         evaluation.scan_folder evaluation.tables
         evaluation.unseen evaluation.truth
         evaluation.camvid evaluation.judge evaluation.painting evaluation.tracking evaluation.transfer

@@ -248,8 +248,16 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error("--live replays one PATH and writes no files")
     if (kinds or arguments.gif) and arguments.out is None:
         arguments.usage_error(f"--{[*kinds, 'gif'][0]} writes files; add --out DIR")
-    if arguments.out is not None and not kinds and not arguments.gif:
-        arguments.usage_error("--out DIR has nothing to write; add --png, --html, --labels, --ply or --gif")
+    if arguments.labels_for is not None and arguments.out is None:
+        arguments.usage_error("--labels-for writes files; add --out DIR")
+    if arguments.out is not None and not kinds and not arguments.gif and arguments.labels_for is None:
+        arguments.usage_error(
+            "--out DIR has nothing to write; add --png, --html, --labels, --ply, --gif or --labels-for"
+        )
+    if arguments.static is not None and not (arguments.track or arguments.movable):
+        arguments.usage_error("--static leaves out what moves; add --track, or --movable for all that could move")
+    if arguments.movable and arguments.static is None:
+        arguments.usage_error("--movable is of --static DIR; add it")
     if arguments.gif and not arguments.track:
         arguments.usage_error("--gif shows tracks; add --track")
     if arguments.png:
@@ -264,7 +272,7 @@ def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, P
     scans = find_scans(arguments.scan).paths
     if arguments.scan and len(scans) != len(images):
         arguments.usage_error(f"--scan: {many(len(scans), 'scan')} for {many(len(images), 'image')}; expected as many")
-    if arguments.calib is not None:
+    if arguments.calib is not None and arguments.labels_for != "kitti":
         from ..calibration import read_kitti_calibration
 
         if not (images and scans and arguments.png):

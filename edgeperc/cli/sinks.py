@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -10,13 +11,34 @@ if TYPE_CHECKING:
 
 __all__ = ["SINKS", "add_sinks", "open_sinks", "wanted_sinks"]
 
-SINKS: tuple[str, ...] = ()
+SINKS: tuple[str, ...] = (
+    "static",
+    "labels_for",
+)
 """Names of the options below as attributes of the arguments."""
 
 
 def add_sinks(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    parser.add_argument_group("files of the whole run")
+    group = parser.add_argument_group("files of the whole run")
+    group.add_argument(
+        "--static",
+        type=Path,
+        metavar="DIR",
+        help="write every scan without its points on moving objects, as DIR/NAME in the format of the scan; scans of "
+        "captures become .bin. Needs --track, or --movable",
+    )
+    group.add_argument(
+        "--movable",
+        action="store_true",
+        help="with --static: leave out the points on everything that could move, too: vehicles and people",
+    )
+    group.add_argument(
+        "--labels-for",
+        choices=("labelcloud", "cvat", "kitti", "sustechpoints"),
+        help="write the boxes to --out as labels for an annotation tool; with --track with the ids of tracks. kitti "
+        "takes the camera of --calib (a file, or a folder with one for each scan), or a nominal one",
+    )
 
 
 def wanted_sinks(arguments: argparse.Namespace) -> list[str]:
@@ -27,4 +49,12 @@ def wanted_sinks(arguments: argparse.Namespace) -> list[str]:
 def open_sinks(arguments: argparse.Namespace) -> list[Sink]:
     """Make the sinks of the passed options; errors of options and missing extras come here, before the first scan."""
     sinks: list[Sink] = []
+    if arguments.static is not None:
+        from ..sinks.static import StaticSink
+
+        sinks.append(StaticSink(arguments.static, without="movable" if arguments.movable else "moving"))
+    if arguments.labels_for is not None:
+        from ..sinks.prelabels import PrelabelSink
+
+        sinks.append(PrelabelSink(arguments.out, arguments.labels_for, calib=arguments.calib))
     return sinks

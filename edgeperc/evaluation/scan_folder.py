@@ -4,7 +4,7 @@
 
     FOLDER/scans.json             the description (`ScanLayout`), unless another one is named
     FOLDER/velodyne/NAME.bin      scans, in any format that `read_points` reads
-    FOLDER/label/NAME.txt         boxes: class x y z l w h yaw [points], in the frame of the scan
+    FOLDER/label/NAME.txt         boxes: class x y z l w h yaw [points], in the frame of the scan; or those of a tool
     FOLDER/semseg/NAME.u8         a class for every point, uint8; or NAME.label, uint32 as in SemanticKITTI
     FOLDER/semseg_classes.json    names of these classes by their numbers
     FOLDER/drivable/NAME.json     the drivable area: a list of polygons [[x, y], ...] or [[x, y, z], ...]
@@ -39,6 +39,7 @@ from ..readers.files import read_points
 from ..sensor import SensorProfile, get_sensor
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
+from .annotations import read_datumaro, read_labelcloud, read_sustechpoints
 from .datasets import IMAGE_SIZE, SEQUENCE_DRIVES, KittiCalibration, read_objects
 from .splits import in_split
 
@@ -50,6 +51,12 @@ LAYOUTS = Path(__file__).with_name("layouts")
 BACKGROUND, DRIVABLE, IGNORED, ANY = "background", "drivable", "ignore", "*"
 BOX_COLUMNS = ("class", "x", "y", "z", "l", "w", "h", "yaw")
 SUFFIXES = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".ply")
+_BOX_FILES = {
+    "kitti": "label_2/{}.txt",
+    "labelcloud": "labels/{}.json",
+    "sustechpoints": "label/{}.json",
+    "cvat": "annotations/default.json",
+}
 MARGIN_M = 0.05  # a label box is often a little smaller than its object
 
 _COARSE = {"van": "car", "truck": "car", "person_sitting": "pedestrian"}
@@ -103,7 +110,9 @@ class ScanLayout:
         ``person_sitting``, ``cyclist``, ``background``, a new name, or ``ignore`` (objects and points of which nothing
         is known); for points also ``drivable``. The key ``*`` stands for all other classes.
     box_format : str
-        ``"plain"``: ``label/NAME.txt``, or ``"kitti"``: ``label_2/NAME.txt`` with ``calib/NAME.txt``.
+        ``"plain"``: ``label/NAME.txt``; ``"kitti"``: ``label_2/NAME.txt`` with ``calib/NAME.txt``; or what an
+        annotation tool saves: ``"labelcloud"``: ``labels/NAME.json``, ``"sustechpoints"``: ``label/NAME.json``,
+        ``"cvat"``: ``annotations/default.json`` of its format "Datumaro 3D".
     box_columns : tuple of str
         Columns of ``label/NAME.txt``. Columns that are not among `BOX_COLUMNS` are skipped; columns after the listed
         ones are too.
@@ -173,7 +182,7 @@ class ScanLayout:
         if not isinstance(name, str) or not re.fullmatch(r"[\w.-]{1,40}", name):
             raise PointsError(f"name is {name!r:.60}; expected 1 to 40 letters, digits, '.', '_' or '-'")
         own: dict[str, Any] = {"name": name, "sensor": _sensor(given, folder), "boxes": boxes, "points": points}
-        allowed = {"files": ("plain", "semantickitti"), "box_format": ("plain", "kitti")}
+        allowed = {"files": ("plain", "semantickitti"), "box_format": ("plain", *_BOX_FILES)}
         for key, choices in {**allowed, "drives": ("table", "scan", "one")}.items():
             if key in given and given[key] not in choices:
                 raise PointsError(f"{key} is {given[key]!r:.60}; expected {' or '.join(choices)}")
@@ -356,6 +365,7 @@ class ScanFolder:
                 )
         self.layout = layout if isinstance(layout, ScanLayout) else read_layout(layout)
         self.scans = self._scans()
+        self._annotated = read_datumaro(self.root / _BOX_FILES["cvat"]) if self.layout.box_format == "cvat" else {}
         self.drives = self._drives()
         self._point_numbers: NDArray[np.uint8] | None = None
 
@@ -392,7 +402,7 @@ class ScanFolder:
             found, unlabeled = read_objects(path, calibration)
             boxes = self._renamed(found, path)
         elif path is not None:
-            boxes = self._renamed(_read_boxes(path, self.layout.box_columns), path)
+            boxes = self._renamed(self._read_boxes(path, name), path)
         classes = self._path("points", name)
         area = self._path("drivable", name)
         return ScanFrame(
@@ -409,7 +419,7 @@ class ScanFolder:
 
     def _path(self, kind: str, name: str) -> Path | None:
         """The label file of a scan: boxes, points or drivable; None if the scan has none."""
-        boxes = f"label_2/{name}.txt" if self.layout.box_format == "kitti" else f"label/{name}.txt"
+        boxes = _BOX_FILES.get(self.layout.box_format, "label/{}.txt").format(name)
         sequence, _, stem = name.rpartition("/")
         if sequence:
             path = self.root / "sequences" / sequence / "labels" / f"{stem}.label"
@@ -419,6 +429,8 @@ class ScanFolder:
             "points": (f"semseg/{name}.u8", f"semseg/{name}.label"),
             "drivable": (f"drivable/{name}.json",),
         }[kind]
+        if kind == "boxes" and self.layout.box_format == "cvat" and name not in self._annotated:
+            return None
         return next((self.root / path for path in candidates if (self.root / path).is_file()), None)
 
     def _scans(self) -> dict[str, Path]:
@@ -473,6 +485,16 @@ class ScanFolder:
         if missing := [name for name in labeled if name not in drives]:
             raise PointsError(f"{table} has no drive of {', '.join(missing[:5])}; add a row for every labeled scan")
         return {name: drives[name] for name in labeled}
+
+    def _read_boxes(self, path: Path, name: str) -> list[Box]:
+        """Boxes of a scan with the classes of its label file."""
+        if self.layout.box_format == "cvat":
+            return self._annotated[name]
+        if self.layout.box_format == "labelcloud":
+            return read_labelcloud(path)
+        if self.layout.box_format == "sustechpoints":
+            return read_sustechpoints(path)
+        return _read_boxes(path, self.layout.box_columns)
 
     def _renamed(self, boxes: Sequence[Box], path: Path) -> tuple[Box, ...]:
         """Boxes with the classes of the description; boxes of background are left out."""

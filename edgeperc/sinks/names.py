@@ -1,0 +1,44 @@
+"""Names of the files that a run writes for its scans."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from ..errors import OptionError
+
+__all__ = ["ScanFiles", "stem_of"]
+
+_SUFFIXES = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".ply")
+
+
+def stem_of(name: str) -> tuple[str, str]:
+    """Name of a scan without its folder and its suffix, and its suffix in lower case.
+
+    The scan of a capture, ``drive.pcap/000003``, has no suffix. Neither has an image, whose scan has the image's name.
+    """
+    last = Path(name).name
+    suffix = next((each for each in _SUFFIXES if last.lower().endswith(each)), "")
+    return (last[: -len(suffix)] if suffix else Path(last).stem), suffix
+
+
+class ScanFiles:
+    """The files of one run in one folder: each scan has its own, and none replaces a scan."""
+
+    def __init__(self) -> None:
+        self._sources: dict[Path, str] = {}
+
+    def checked(self, target: Path, scan: str) -> Path:
+        """Return ``target`` for the scan of this name.
+
+        Raises
+        ------
+        OptionError
+            It is the scan itself, or the file of another scan of this run.
+        """
+        if os.path.realpath(target) == os.path.realpath(scan):
+            raise OptionError(f"{target} is the scan itself and would be overwritten; choose another folder")
+        source = self._sources.setdefault(target, scan)
+        if source != scan:
+            raise OptionError(f"{target} is already the file of {source}; run each folder of scans by itself")
+        return target

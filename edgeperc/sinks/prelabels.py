@@ -1,0 +1,252 @@
+"""Boxes of a run as pre-labels for annotation tools: labelCloud, CVAT, KITTI's format, SUSTechPOINTS."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..atomic import open_atomic, write_atomic
+from ..calibration import read_kitti_calibration
+from ..errors import OptionError
+from ..perception import Box
+from . import PerceivedScan
+from .names import ScanFiles, stem_of
+
+__all__ = ["KINDS", "PrelabelSink"]
+
+KINDS = ("labelcloud", "cvat", "kitti", "sustechpoints")
+"""The tools and formats."""
+
+_CLASSES = ("car", "van", "truck", "pedestrian", "cyclist")
+_COLORS = ("#4363d8", "#42d4f4", "#f58231", "#e6194b", "#3cb44b", "#911eb4", "#f032e6", "#bfef45", "#9a6324", "#808000")
+_SUSTECH_CLASSES = {"cyclist": "BicycleRider"}  # the others have their own names, with a capital
+
+# The camera that KITTI's format needs, where no calibration is given: at the sensor, looking ahead, with the lens of
+# KITTI's left color camera.
+_NOMINAL_P2 = np.array([[721.5377, 0.0, 609.5593, 0.0], [0.0, 721.5377, 172.854, 0.0], [0.0, 0.0, 1.0, 0.0]])
+_NOMINAL_TR = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+_IMAGE_SIZE = (1242, 375)
+_NEAREST_M = 0.1  # a corner nearer to the camera plane has no place in the image
+
+Named = tuple[Box, "int | None"]
+"""A box and the id of its track."""
+
+
+class PrelabelSink:
+    """Writes the boxes of each scan as a tool's own labels.
+
+    With tracks, these are the reported tracks that were detected in the scan, with their ids; otherwise the boxes of
+    the perception. Boxes are in the frame of the scan (KITTI: of the camera). A scan without boxes gets an empty file.
+
+    - ``"labelcloud"``: ``labels/NAME.json`` (labelCloud's ``centroid_rel``) and ``labels/_classes.json``
+    - ``"cvat"``: ``annotations.zip`` for a 3-D task of CVAT, format "Datumaro 3D 1.0". With tracks, each object is one
+      track; it ends where it is not detected
+    - ``"kitti"``: ``label_2/NAME.txt``, KITTI's object labels in the rectified camera frame, and ``calib/NAME.txt``.
+      The image has KITTI's 1242 x 375 pixels; the 2-D box of an object outside it is 0 0 0 0. Occlusion is 3: unknown
+    - ``"sustechpoints"``: ``label/NAME.json``
+
+    Parameters
+    ----------
+    folder : str or Path
+        Made if needed.
+    kind : str
+        One of `KINDS`.
+    calib : str or Path, optional
+        Calibration of ``"kitti"``: a file of `read_kitti_calibration` for all scans, or a folder with ``NAME.txt`` for
+        each. Default: a nominal camera in the place of the sensor that looks ahead, so that the boxes come back
+        exactly, but fit no image.
+
+    Raises
+    ------
+    OptionError
+        ``kind`` is unknown, or ``calib`` is given for another format than KITTI's.
+    OSError
+        The folder cannot be made.
+    """
+
+    def __init__(self, folder: str | Path, kind: str, *, calib: str | Path | None = None) -> None:
+        writers: dict[str, Callable[[str, PerceivedScan, Sequence[Named]], None]] = {
+            "labelcloud": self._labelcloud,
+            "cvat": self._cvat,
+            "kitti": self._kitti,
+            "sustechpoints": self._sustechpoints,
+        }
+        if kind not in writers:
+            raise OptionError(f"no labels are known for {kind!r}; expected one of {', '.join(KINDS)}")
+        if calib is not None and kind != "kitti":
+            raise OptionError(f"labels for {kind} need no calibration; leave it out, or choose kitti")
+        self._folder, self._kind, self._writer = Path(folder), kind, writers[kind]
+        self._calib = None if calib is None else Path(calib)
+        self._files, self._classes = ScanFiles(), [*_CLASSES]
+        self._stack = ExitStack()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        if kind == "cvat":
+            self._before: Mapping[int, Box] = {}
+            self._n_items = 0
+            file = self._stack.enter_context(open_atomic(self._folder / "annotations.zip"))
+            archive = self._stack.enter_context(zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED))
+            self._document = self._stack.enter_context(archive.open("annotations/default.json", "w", force_zip64=True))
+            self._document.write(b'{"info": {}, "items": [')
+
+    def write(self, scan: PerceivedScan) -> None:
+        """Write the labels of one scan.
+
+        Raises
+        ------
+        OptionError
+            Another scan of the run has this name.
+        CalibrationError
+            The calibration of the scan is malformed.
+        OSError
+            The file cannot be written, or the calibration cannot be read.
+        """
+        boxes: list[Named] = [(box, None) for box in scan.perception.boxes]
+        if scan.tracks is not None:
+            boxes = [(track.box, track.id) for track in scan.tracks if not track.coasting]
+        for box, _ in boxes:
+            if box.label not in self._classes:
+                self._classes.append(box.label)
+        self._writer(stem_of(scan.name)[0], scan, boxes)
+
+    def close(self) -> None:
+        """Finish the files that are of all scans."""
+        if self._kind == "labelcloud":
+            classes = [
+                {"name": name, "id": k, "color": _COLORS[k % len(_COLORS)]} for k, name in enumerate(self._classes)
+            ]
+            document = {"classes": classes, "default": 0, "type": "object_detection", "format": "centroid_rel"}
+            self._write_json("labels/_classes.json", "", document)
+        elif self._kind == "cvat" and not self._document.closed:
+            labels = [{"name": name, "parent": "", "attributes": []} for name in self._classes]
+            categories = {"label": {"labels": labels, "attributes": ["occluded"]}}
+            self._document.write(f'], "categories": {json.dumps(categories)}}}'.encode())
+            self._stack.close()
+
+    def _labelcloud(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
+        source = Path(scan.name)
+        objects = [
+            {
+                "name": box.label,
+                "centroid": _named("xyz", box.center),
+                "dimensions": _named(("length", "width", "height"), box.size),
+                "rotations": _named("xyz", (0.0, 0.0, _wrapped(box.yaw))),
+            }
+            for box, _ in boxes
+        ]
+        document = {"folder": source.parent.name, "filename": source.name, "path": scan.name, "objects": objects}
+        self._write_json(f"labels/{name}.json", scan.name, document)
+
+    def _sustechpoints(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
+        document = [
+            {
+                "obj_id": "" if number is None else str(number),
+                "obj_type": _SUSTECH_CLASSES.get(box.label, _capital(box.label)),
+                "psr": {
+                    "position": _named("xyz", box.center),
+                    "rotation": _named("xyz", (0.0, 0.0, _wrapped(box.yaw))),
+                    "scale": _named("xyz", box.size),
+                },
+            }
+            for box, number in boxes
+        ]
+        self._write_json(f"label/{name}.json", scan.name, document)
+
+    def _cvat(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
+        self._files.checked(self._folder / name, scan.name)
+        now = {number: box for box, number in boxes if number is not None}
+        # CVAT keeps a track to the end of the task, unless a box says that it is outside.
+        gone = [(box, number, True) for number, box in self._before.items() if number not in now]
+        annotations = []
+        for k, (box, number, outside) in enumerate([*((box, number, False) for box, number in boxes), *gone]):
+            attributes: dict[str, Any] = {"occluded": False}
+            if number is not None:
+                attributes |= {"track_id": number, "keyframe": True, "outside": outside}
+            annotations.append(
+                {
+                    "id": k,
+                    "type": "cuboid_3d",
+                    "attributes": attributes,
+                    "group": 0,
+                    "label_id": self._classes.index(box.label),
+                    "position": _rounded(box.center),
+                    "rotation": [0.0, 0.0, *_rounded([_wrapped(box.yaw)])],
+                    "scale": _rounded(box.size),
+                }
+            )
+        item = {"id": name, "annotations": annotations, "attr": {"frame": self._n_items}}
+        self._document.write((", " if self._n_items else "").encode() + json.dumps(item).encode())
+        self._n_items += 1
+        self._before = now
+
+    def _kitti(self, name: str, scan: PerceivedScan, boxes: Sequence[Named]) -> None:
+        T_cam_sensor, P2, text = _NOMINAL_TR, _NOMINAL_P2, None
+        if self._calib is not None:
+            path = self._calib / f"{name}.txt" if self._calib.is_dir() else self._calib
+            T_cam_sensor, P2 = read_kitti_calibration(path)
+            text = path.read_text("utf-8")
+        if text is None:
+            rows = {f"P{k}": P2 for k in range(4)} | {"R0_rect": np.eye(3), "Tr_velo_to_cam": T_cam_sensor[:3]}
+            rows["Tr_imu_to_velo"] = np.eye(4)[:3]
+            text = "".join(f"{key}: {' '.join(f'{v:.6e}' for v in row.ravel())}\n" for key, row in rows.items())
+        lines = [_kitti_line(box, T_cam_sensor, P2) for box, _ in boxes]
+        self._write(f"label_2/{name}.txt", scan.name, "".join(lines).encode())
+        self._write(f"calib/{name}.txt", scan.name, text.encode())
+
+    def _write_json(self, name: str, scan: str, document: Any) -> None:
+        self._write(name, scan, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+
+    def _write(self, name: str, scan: str, content: bytes) -> None:
+        target = self._files.checked(self._folder / name, scan)
+        target.parent.mkdir(exist_ok=True)
+        write_atomic(target, content)
+
+
+def _kitti_line(box: Box, T_cam_sensor: NDArray[np.float64], P2: NDArray[np.float64]) -> str:
+    R, t = T_cam_sensor[:3, :3], T_cam_sensor[:3, 3]
+    length, width, height = box.size
+    center = R @ np.array(box.center) + t
+    ahead = R @ np.array([math.cos(box.yaw), math.sin(box.yaw), 0.0])
+    turn = math.atan2(-ahead[2], ahead[0])
+    x, y, z = center[0], center[1] + height / 2.0, center[2]  # the middle of the bottom face; y points down
+    signs = np.array([[i, j, k] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)])
+    cos, sin = math.cos(turn), math.sin(turn)
+    corners = signs * [length, height, width] @ np.array([[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]]) + center
+    image = corners @ P2[:, :3].T + P2[:, 3]
+    rectangle, cut = np.zeros(4), 1.0
+    if (image[:, 2] > _NEAREST_M).all():
+        pixels = image[:, :2] / image[:, 2:]
+        whole = np.array([*pixels.min(axis=0), *pixels.max(axis=0)])
+        seen = np.clip(whole, 0.0, np.tile(np.array(_IMAGE_SIZE) - 1.0, 2))
+        if (seen[2:] > seen[:2]).all():
+            rectangle = seen
+            cut = 1.0 - float(np.prod(seen[2:] - seen[:2]) / np.prod(whole[2:] - whole[:2]))
+    numbers = [*rectangle, height, width, length, x, y, z]
+    alpha = _wrapped(turn - math.atan2(x, z))
+    texts = [f"{cut:.2f} 3 {alpha:.4f}", *(f"{v:.2f}" for v in rectangle), *(f"{v:.4f}" for v in numbers[4:])]
+    return f"{_capital(box.label)} {' '.join(texts)} {turn:.5f}\n"
+
+
+def _capital(label: str) -> str:
+    """KITTI's way to write a class: without blanks, with a capital."""
+    text = "_".join(label.split())
+    return text[:1].upper() + text[1:]
+
+
+def _wrapped(angle: float) -> float:
+    return (float(angle) + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def _rounded(values: Sequence[float]) -> list[float]:
+    return [round(float(value), 5) for value in values]
+
+
+def _named(names: Sequence[str], values: Sequence[float]) -> dict[str, float]:
+    return dict(zip(names, _rounded(values), strict=True))

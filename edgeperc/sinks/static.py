@@ -1,0 +1,117 @@
+"""Scans without what moves, or without what could move, for mapping and localization."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..atomic import write_atomic
+from ..errors import OptionError, PointsError
+from ..moving import movable_points, moving_points
+from ..points import as_points
+from . import PerceivedScan
+from .names import ScanFiles, stem_of
+
+__all__ = ["StaticSink"]
+
+_FIELDS = ("x", "y", "z", "intensity")
+
+
+class StaticSink:
+    """Writes each scan without its points on moving, or on movable, objects.
+
+    A file has the name and the format of the scan's file: ``.bin``, ``.npy``, ``.npz``, ``.pcd`` or ``.ply`` with x, y,
+    z and remission of the remaining points, in their order; ``.pcd.bin`` with the ring, too. Scans of captures and
+    bags become ``NUMBER.bin``, float32 x, y, z, remission. Files are replaced atomically.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Made if needed.
+    without : {"moving", "movable"}
+        ``"moving"``: points inside the boxes of tracks that move (`edgeperc.moving_points`). ``"movable"``: also those
+        on everything that could move (`edgeperc.movable_points`).
+
+    Attributes
+    ----------
+    n_points, n_removed : int
+        Points of all scans so far, and those that were left out.
+
+    Raises
+    ------
+    OptionError
+        ``without`` is another value.
+    OSError
+        The folder cannot be made.
+    """
+
+    def __init__(self, folder: str | Path, *, without: Literal["moving", "movable"] = "moving") -> None:
+        if without not in ("moving", "movable"):
+            raise OptionError(f"without is {without!r}; expected 'moving' or 'movable'")
+        self._folder, self._without = Path(folder), without
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._files = ScanFiles()
+        self.n_points = self.n_removed = 0
+
+    def write(self, scan: PerceivedScan) -> None:
+        """Write one scan.
+
+        Raises
+        ------
+        OptionError
+            There are no tracks, the file would replace the scan itself, or another scan of the run has its name.
+        PointsError
+            A ``.pcd.bin`` file holds another number of points than the scan.
+        OSError
+            The file cannot be written.
+        """
+        points = as_points(scan.points)
+        gone = np.zeros(len(points), np.bool_)
+        if scan.tracks is not None:
+            gone |= moving_points(scan.tracks, points)
+        elif self._without == "moving":
+            raise OptionError("there are no tracks, so nothing is known to move; track the boxes (--track)")
+        if self._without == "movable":
+            gone |= movable_points(scan.perception, points)
+        stem, suffix = stem_of(scan.name)
+        name = Path(scan.name).name if suffix else f"{stem}.bin"
+        target = self._files.checked(self._folder / name, scan.name)
+        write_atomic(target, _content(points, ~gone, suffix, scan.name))
+        self.n_points += len(points)
+        self.n_removed += int(np.count_nonzero(gone))
+
+    def close(self) -> None:
+        """Do nothing; every file is complete."""
+
+
+def _content(points: NDArray[np.float32], kept: NDArray[np.bool_], suffix: str, source: str) -> bytes:
+    rows = np.ascontiguousarray(points[kept], "<f4")
+    if suffix == ".pcd.bin":
+        whole = np.fromfile(source, "<f4")
+        if whole.size != 5 * len(points):
+            raise PointsError(
+                f"{source} holds {whole.size} values for a scan of {len(points):,} points; expected 5 for each point"
+            )
+        return whole.reshape(-1, 5)[kept].tobytes()
+    if suffix in (".npy", ".npz"):
+        file = io.BytesIO()
+        if suffix == ".npy":
+            np.save(file, rows)
+        else:
+            np.savez(file, points=rows)
+        return file.getvalue()
+    header = ""
+    if suffix == ".pcd":
+        header = (
+            f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {' '.join(_FIELDS)}\nSIZE 4 4 4 4\n"
+            f"TYPE F F F F\nCOUNT 1 1 1 1\nWIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\n"
+            "DATA binary\n"
+        )
+    elif suffix == ".ply":
+        properties = "".join(f"property float {name}\n" for name in _FIELDS)
+        header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+    return header.encode("ascii") + rows.tobytes()
