@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tiny_camera
 
-from edgeperc import ModelCard, Perceiver
+from edgeperc import ModelCard, ModelError, Perceiver
 from edgeperc.mounting import MODEL_MOUNTING
 from edgeperc.perception import Box
 from edgeperc.sensor import get_sensor
@@ -118,8 +118,6 @@ def test_open_shapes_are_refused() -> None:
     pytest.importorskip("onnx")
     from onnx import TensorProto, helper
 
-    from edgeperc.errors import ModelError
-
     matrices = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", "n"]) for name in "xyz"]
     node = helper.make_node("MatMul", ["x", "y"], ["z"])
     model = helper.make_model(helper.make_graph([node], "open", matrices[:2], matrices[2:]))
@@ -148,11 +146,24 @@ def test_every_library_multiplies_the_same_matrices(
 # the pipeline in numpy
 
 
-@pytest.mark.parametrize("engine", ["onnxruntime", "torch", "openvino"])
+@pytest.mark.parametrize("engine", ["onnxruntime", "torch", "openvino", "mnn"])
 def test_the_pipeline_in_numpy_agrees(engine: str, scan: np.ndarray, right: Prediction) -> None:
-    for package in (engine, *peers.NEEDS.get(engine, ())):
+    for package in peers.NEEDS.get(engine, (engine,)):
         pytest.importorskip(package)
     assert_agrees(right, predict(engine, "fp32", scan))
+
+
+def test_ncnn_computes_the_network_or_says_that_it_cannot() -> None:
+    for package in peers.NEEDS["ncnn"]:
+        pytest.importorskip(package)
+    theirs, ours = (open_engine(engine, "fp32", model_path("ssadnet:fp32"), 1) for engine in ("ncnn", "onnxruntime"))
+    image = np.random.default_rng(0).normal(size=ours.input.shape)
+    theirs.input[:] = ours.input[:] = image
+    expected = ours.run()
+    for name, output in theirs.run().items():
+        np.testing.assert_allclose(output, expected[name], atol=1e-4 * np.abs(expected[name]).max())
+    with pytest.raises(ModelError, match="ncnn cannot run pointseg"):
+        open_engine("ncnn", "fp32", model_path("pointseg:fp32"), 1)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -241,7 +252,7 @@ def test_the_floor_is_arithmetic_over_peak(variant: str) -> None:
 @pytest.fixture
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing but onnxruntime's CPU provider and numpy, on any computer."""
-    monkeypatch.setattr(peers, "NEEDS", dict.fromkeys(("openvino", "torch", "torch.compile"), ("no_such_package",)))
+    monkeypatch.setattr(peers, "NEEDS", dict.fromkeys(peers.NEEDS, ("no_such_package",)))
     monkeypatch.setattr(peers, "available_providers", lambda: ("cpu",))
 
 
@@ -382,7 +393,7 @@ def test_what_is_missing_is_reported(
     assert document["complete"]
     for title, contenders in document["peers"].items():
         for contender in contenders:
-            missing = contender["engine"].startswith(("torch", "openvino"))
+            missing = contender["engine"].startswith(tuple(peers.NEEDS))
             if missing or (title.startswith("One") and contender["name"] != "one network"):
                 assert contender["missing"]
                 assert not contender["rounds"]

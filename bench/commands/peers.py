@@ -19,9 +19,9 @@ def add_parser(subparsers: Subparsers) -> None:
         "peers",
         parents=[model_options(), scan_options(), engine_options(), output_options()],
         help="measure edgeperc beside torch, other engines and numpy (extra 'peers')",
-        description="Measure edgeperc, the same networks in torch, torch.compile, onnxruntime and OpenVINO with a "
-        "pipeline in numpy, and the fastest matrix products and memory copies of this computer, all in turns. What is "
-        "not installed is listed and left out.",
+        description="Measure edgeperc, the same networks in torch, torch.compile, onnxruntime, OpenVINO, MNN and ncnn "
+        "with a pipeline in numpy, and the fastest matrix products and memory copies of this computer, all in turns. "
+        "What is not installed is listed and left out.",
         allow_abbrev=False,
     )
     parser.add_argument(

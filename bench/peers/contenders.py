@@ -33,7 +33,17 @@ __all__ = ["INSTALL", "OPENVINO", "PEAKS", "Contender", "Measured", "default_mod
 INSTALL = "not installed: pip install 'edgeperc[peers]'"
 TORCH = (("torch", "fp32"), ("torch.compile", "fp32"), ("torch", "bf16"), ("torch.compile", "bf16"))
 OPENVINO = (("openvino", "fp32"), ("openvino", "bf16"))
-NEEDS = {"openvino": ("openvino",), "torch": ("torch", "onnx"), "torch.compile": ("torch", "onnx")}
+# Engines for phones and small boards. They cannot run the int8 graphs: MNN 3.6 takes the weights of a dequantized
+# convolution for an input, and pnnx has no translation.
+SMALL = (("mnn", "fp32"), ("ncnn", "fp32"))
+NEEDS = {
+    "mnn": ("MNN", "onnx"),
+    "ncnn": ("ncnn", "onnx", "pnnx"),
+    "openvino": ("openvino",),
+    "torch": ("torch", "onnx"),
+    "torch.compile": ("torch", "onnx"),
+}
+NAMES = {"openvino": "OpenVINO API", "mnn": "MNN", "ncnn": "ncnn"}
 PEAKS = (("numpy", "fp32"), ("torch", "fp32"), ("torch", "bf16"), ("torch", "int8"), *OPENVINO)
 
 
@@ -148,8 +158,8 @@ def groups(
             if own != "auto"
         ]
         alone += [
-            Contender(f"OpenVINO API {kind}, network alone", "network", engine, kind, paths, image=image)
-            for engine, kind in OPENVINO
+            Contender(f"{NAMES[engine]} {kind}, network alone", "network", engine, kind, paths, image=image)
+            for engine, kind in (*OPENVINO, *(() if variant.precision == "int8" else SMALL))
         ]
         peaks = [
             Contender(f"peak {engine} {kind}".strip(), "peak", engine, kind) for engine, kind in (*PEAKS, ("copy", ""))
@@ -178,7 +188,7 @@ def _pipelines(models: Sequence[Variant], provider: str, precision: str) -> list
     own = dict.fromkeys(((provider, precision), ("cpu", "auto"), *([("openvino", "auto")] if int8 else OPENVINO)))
     if (provider, precision) == ("auto", "auto") and available_providers() == ("cpu",):
         del own["cpu", "auto"]  # the same as auto
-    others = (("onnxruntime", ""), *OPENVINO, *(() if int8 else TORCH))  # torch cannot run the int8 graphs
+    others = (("onnxruntime", ""), *OPENVINO, *(() if int8 else (*SMALL, *TORCH)))  # torch cannot run the int8 graphs
     return [
         *(Contender(f"edgeperc, {_label(name, kind)}", "edgeperc", name, kind, paths) for name, kind in own),
         *(Contender(f"numpy + {_label(name, kind)}", "pipeline", name, kind, paths, cards) for name, kind in others),

@@ -246,7 +246,7 @@ def run(
 ) -> None:
     """Measure every table, one after the other, and record it in a report's document."""
     document["peers"] = {}
-    for package in ("onnx", "openvino", "torch"):
+    for package in ("mnn", "ncnn", "onnx", "openvino", "torch"):
         with suppress(importlib.metadata.PackageNotFoundError):
             document["software"][package] = importlib.metadata.version(package)
     for title, contenders in groups(models, provider, precision, folder, files[0], sensor).items():
