@@ -75,7 +75,8 @@ def setting_label(setting: Mapping[str, Any]) -> str:
     """Label of a setting: each model with its active precision and provider, and the threads."""
     engines = [each for repeat in setting["repeats"][:1] for each in repeat["engines"]]
     ran = "; ".join(f"{each['name']} {each['precision']}, {each['provider']}" for each in engines)
-    return f"{ran or setting['provider']}, {setting['n_threads'] or 'default'} threads"
+    turn = ", full turn" if setting.get("full_turn") else ""
+    return f"{ran or setting['provider']}, {setting['n_threads'] or 'default'} threads{turn}"
 
 
 def _parts(setting: Mapping[str, Any], scenario: str) -> list[dict[str, Any]]:

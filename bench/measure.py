@@ -32,6 +32,7 @@ def new_setting(job: Job) -> dict[str, Any]:
         "precision": job.precision,
         "n_threads": job.n_threads,
         "sensor": job.sensor,
+        "full_turn": job.full_turn,
         "repeats": [],
         "accuracy": None,
         "offline": [],
@@ -81,7 +82,7 @@ def reference(job: Job, files: Sequence[Path]) -> Reference:
     models = tuple(
         model if Path(model).suffix == ".onnx" else f"{model.partition(':')[0]}:fp32" for model in job.models
     )
-    (result,) = measure([Job(models, provider="cpu", sensor=job.sensor, predict=tuple(files))])
+    (result,) = measure([Job(models, provider="cpu", sensor=job.sensor, full_turn=job.full_turn, predict=tuple(files))])
     if result["interrupted"]:
         raise KeyboardInterrupt
     return Reference(result["predictions"], [engine["description"] for engine in result["engines"]])

@@ -81,7 +81,7 @@ class Job:
     Attributes
     ----------
     models : tuple of str
-    provider, precision, n_threads, sensor
+    provider, precision, n_threads, sensor, full_turn
         As in `Perceiver`.
     scenarios : tuple of Scenario
         One after the other.
@@ -96,6 +96,7 @@ class Job:
     precision: str = "auto"
     n_threads: int | None = None
     sensor: str = "hdl-64e"
+    full_turn: bool = False
     scenarios: tuple[Scenario, ...] = ()
     predict: tuple[Path, ...] = ()
     loadgen: Path | None = None
@@ -122,6 +123,7 @@ def perceiver_arguments(job: Job) -> dict[str, Any]:
         "provider": job.provider,
         "precision": job.precision,
         "n_threads": job.n_threads,
+        "full_turn": job.full_turn,
         "on_mismatch": "warn",  # the time is of interest even for scans that are too large or sparse for the models
     }
 

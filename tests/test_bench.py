@@ -29,7 +29,7 @@ from edgeperc.simulation.scene import TOP_VIEW_CLASSES
 from edgeperc_bench import accuracy, cli, context, inputs, measure, render, report, worker
 from edgeperc_bench.commands.matrix import recommend, settings_to_try
 from edgeperc_bench.commands.soak import memory_growth
-from edgeperc_bench.document import ReportError, latency, read_report, stage_medians, write_report
+from edgeperc_bench.document import ReportError, latency, read_report, setting_label, stage_medians, write_report
 from edgeperc_bench.plots import pictures
 from edgeperc_bench.render import LiveTable, html_page, markdown
 from edgeperc_bench.scenarios import Timings
@@ -517,6 +517,16 @@ FEW += ["--warm-up", "1", "--min-seconds", "0"]
 @pytest.fixture
 def no_wait(psutil: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(context, "busiest", lambda: [])
+
+
+def test_a_full_turn_is_a_setting_of_its_own(no_wait: None, tmp_path: Path) -> None:
+    simulated_scan(5).points[::10].tofile(tmp_path / "own.bin")
+    command = ["run", *FEW, "--scenario", "single-stream", "--min-scans", "2", "--input", str(tmp_path / "own.bin")]
+    for name, extra in (("ahead", []), ("around", ["--full-turn"])):
+        assert cli.main([*command, *extra, "--json", str(tmp_path / f"{name}.json")]) == 0
+    (ahead,), (around,) = (read_report(tmp_path / f"{name}.json")["settings"] for name in ("ahead", "around"))
+    assert setting_label(around) == f"{setting_label(ahead)}, full turn"
+    assert worker.make_perceiver(worker.Job(("pointseg",), "cpu", full_turn=around["full_turn"])).full_turn
 
 
 def test_a_run_from_scans_to_files(no_wait: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

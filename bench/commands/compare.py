@@ -67,8 +67,14 @@ def run_command(arguments: argparse.Namespace) -> int:
 
 def _pairs(a: Sequence[dict[str, Any]], b: Sequence[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     """The settings to compare: equal ones, or, if each report has only one, two settings of the same models."""
-    keys = ("models", "provider", "precision", "n_threads")
-    same = [(one, other) for one in a for other in b if all(one[key] == other[key] for key in keys)]
+    # Reports of older versions have no "full_turn"; without it, only the quarter ahead was measured.
+    keys = ("models", "provider", "precision", "n_threads", "full_turn")
+    same = [
+        (one, other)
+        for one in a
+        for other in b
+        if all((one.get(key) or None) == (other.get(key) or None) for key in keys)
+    ]
     if same or len(a) != 1 or len(b) != 1:
         return same
     return [(a[0], b[0])] if a[0]["models"] == b[0]["models"] else []

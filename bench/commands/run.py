@@ -52,6 +52,11 @@ def add_parser(subparsers: Subparsers) -> None:
         f"(default: {', '.join(DEFAULT_SCENARIOS)})",
     )
     parser.add_argument(
+        "--full-turn",
+        action="store_true",
+        help="run the range-image model on all four quarters of the turn (default: only the quarter ahead)",
+    )
+    parser.add_argument(
         "--loadgen",
         type=Path,
         metavar="DIR",
