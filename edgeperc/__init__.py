@@ -59,9 +59,10 @@ if TYPE_CHECKING:
     from .painting import camera_road, paint
     from .perceiver import Perceiver
     from .perception import Box, ImageLabels, Perception, PointLabels, TopView
-    from .readers.captures import read_scans, sensor_of
+    from .readers.captures import read_scans, read_timed_scans, sensor_of
     from .readers.files import read_points
     from .readers.images import read_image
+    from .readers.times import TimedScan
     from .sensor import SensorProfile
     from .tracking import Track, Tracker, Tracks
     from .view import draw
@@ -106,6 +107,7 @@ __all__ = [
     "SplitError",
     "StampError",
     "Stream",
+    "TimedScan",
     "TopView",
     "Track",
     "Tracker",
@@ -126,6 +128,7 @@ __all__ = [
     "read_image",
     "read_points",
     "read_scans",
+    "read_timed_scans",
     "road_ahead",
     "sensor_of",
     "sensors",
@@ -155,6 +158,7 @@ _MODULES = {
     "SensorInfo": "listing",
     "SensorProfile": "sensor",
     "Stream": "live",
+    "TimedScan": "readers.times",
     "TopView": "perception",
     "Track": "tracking",
     "Tracker": "tracking",
@@ -173,6 +177,7 @@ _MODULES = {
     "read_image": "readers.images",
     "read_points": "readers.files",
     "read_scans": "readers.captures",
+    "read_timed_scans": "readers.captures",
     "road_ahead": "drivable",
     "sensor_of": "readers.captures",
     "sensors": "listing",

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from .errors import PointsError
 
-__all__ = ["as_points", "assemble", "plain_name", "read_only", "remission_name"]
+__all__ = ["as_points", "assemble", "plain_name", "read_only", "remission_name", "table_columns"]
 
 # Best first; of an Ouster's fields, "intensity" is the raw signal and "reflectivity" the calibrated byte.
 _REMISSION_NAMES = ("remission", "intensity", "i", "reflectivity", "reflectance")
@@ -46,13 +46,7 @@ def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArra
     except Exception as exc:
         raise PointsError(f"got an object that is not an array: {exc}; expected (n, 4) x, y, z, remission") from exc
     if values.dtype.names is not None:
-        flat = values.reshape(-1)
-        fields: dict[str, NDArray[Any]] = {}
-        for name in values.dtype.names:
-            field = flat[name]
-            if field.ndim == 1 and field.dtype.kind in "fiu":
-                fields.setdefault(plain_name(name), field)
-        return assemble(flat.shape[0], fields, values.dtype.names, remission_field)
+        return assemble(values.size, table_columns(values), values.dtype.names, remission_field)
     if values.dtype.kind not in "fiu":
         raise PointsError(f"got an array of {values.dtype}; expected (n, 4) numbers: x, y, z, remission")
     if values.ndim != 2 or values.shape[1] not in (3, 4):
@@ -66,6 +60,17 @@ def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArra
         return assemble(values.shape[0], dict(zip("xyz", values.T, strict=True)), "xyz", None)
     with np.errstate(over="ignore", invalid="ignore"):
         return np.require(values, dtype=np.float32, requirements=["C", "A"])
+
+
+def table_columns(table: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """The numeric fields of a structured array of any shape, each (n,), by `plain_name`."""
+    flat = table.reshape(-1)
+    columns: dict[str, NDArray[Any]] = {}
+    for name in table.dtype.names or ():
+        field = flat[name]
+        if field.ndim == 1 and field.dtype.kind in "fiu":
+            columns.setdefault(plain_name(name), field)
+    return columns
 
 
 def read_only(array: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray[Any]:

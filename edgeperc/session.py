@@ -38,7 +38,7 @@ from .printable import printable
 from .tuning import compiled_folder, cpu_features, fingerprint, read_setting, settings_path
 from .zoo import Variant, choose, digest, resolve
 
-__all__ = ["PRECISIONS", "PROVIDERS", "Session", "available_providers", "golden_input"]
+__all__ = ["PRECISIONS", "PROVIDERS", "Session", "available_providers", "devices", "golden_input"]
 
 logger = logging.getLogger(__name__)
 
@@ -121,6 +121,26 @@ def available_providers() -> tuple[str, ...]:
     ort = _onnxruntime()
     stock = ort.get_available_providers()
     return tuple(s for s, name in PROVIDERS.items() if name in stock or (s in PLUGINS and _plugin_devices(ort, s)))
+
+
+def devices() -> tuple[str, ...]:
+    """The devices that onnxruntime and its installed plugins offer here, such as ``"cpu: CPU Intel"``.
+
+    Empty if onnxruntime is older than 1.23, which does not list them.
+
+    Raises
+    ------
+    MissingExtraError, ProviderError
+        As `available_providers`.
+    """
+    present, ort = available_providers(), _onnxruntime()  # in this order, which loads the plugins
+    found = ort.get_ep_devices() if hasattr(ort, "get_ep_devices") else ()
+    names = {PROVIDERS[short]: short for short in present}
+    listed = (
+        f"{names.get(each.ep_name, each.ep_name)}: {each.device.type.name} {each.device.vendor or each.ep_vendor}"
+        for each in found
+    )
+    return tuple(dict.fromkeys(each.strip() for each in listed))
 
 
 _Attempt = tuple[str, Variant, str, int | None]

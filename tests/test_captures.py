@@ -425,7 +425,7 @@ def test_an_hdl_64e_is_scaled_as_kitti_is(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(velodyne, "read_pcap", read_pcap)
     for model, remission in ((velodyne.Model.HDL64E_S2, 0.2), (velodyne.Model.VLP32C, 51.0), (None, 51.0)):
         found.append(model)
-        ((_, points),) = list(decode_here(path))
+        ((_, points, _),) = list(decode_here(path))
         assert points[:, 3].tolist() == pytest.approx([remission] * 2)
         assert points[0, :3].tolist() == [51.0] * 3
 
@@ -567,17 +567,17 @@ def test_files_that_are_not_captures_are_refused(tmp_path: Path, name: str, cont
 
 
 @pytest.mark.parametrize(
-    ("name", "modules"),
+    ("name", "extra", "modules"),
     [
-        ("vlp16.pcap", ("velodyne_decoder",)),
-        ("other.pcap", ("ouster", "ouster.sdk", "ouster.sdk.pcap")),
-        ("frames.osf", ("ouster", "ouster.sdk", "ouster.sdk.osf")),
-        ("drive.bag", ("rosbags", "rosbags.highlevel")),
-        ("drive.mcap", ("rosbags", "rosbags.highlevel")),
+        ("vlp16.pcap", "velodyne", ("velodyne_decoder",)),
+        ("other.pcap", "ouster", ("ouster", "ouster.sdk", "ouster.sdk.pcap")),
+        ("frames.osf", "ouster", ("ouster", "ouster.sdk", "ouster.sdk.osf")),
+        ("drive.bag", "ros", ("rosbags", "rosbags.highlevel")),
+        ("drive.mcap", "ros", ("rosbags", "rosbags.highlevel")),
     ],
 )
 def test_missing_extra_names_the_install_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, modules: Sequence[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, extra: str, modules: Sequence[str]
 ) -> None:
     path = tmp_path / name
     path.write_bytes(b"#ROSBAG V2.0\n")
@@ -587,7 +587,7 @@ def test_missing_extra_names_the_install_command(
         monkeypatch.setitem(sys.modules, module, None)
     if name == "frames.osf":
         path.write_bytes(b"")
-    with pytest.raises(MissingExtraError, match=r"pip install 'edgeperc\[io\]'"):
+    with pytest.raises(MissingExtraError, match=rf"pip install 'edgeperc\[{extra}\]'"):
         next(decode_here(path))
 
 

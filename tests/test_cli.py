@@ -376,7 +376,7 @@ def test_a_missing_reader_is_said_at_once(tmp_path: Path, capsys: pytest.Capture
     (tmp_path / "absent" / "rosbags.py").write_text("raise ImportError('not installed')\n")
     monkeypatch.syspath_prepend(tmp_path / "absent")  # the process that decodes captures has this process's path
     assert run("run", tmp_path / "drive.bag") == 2
-    assert "pip install 'edgeperc[io]'" in capsys.readouterr().err
+    assert "pip install 'edgeperc[ros]'" in capsys.readouterr().err
 
 
 def test_live(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MissingExtraError, PointsError
-from .decoders import Scan
 from .tables import MAX_BYTES, MAX_SCAN_BYTES
-from .worker import ALIVE, END, ERROR, FOUND, HEADER, MISSING, READY, SCAN, WARNING
+from .times import TimedScan
+from .worker import ALIVE, END, ERROR, FOUND, HEADER, MISSING, READY, SCAN, TIMES, WARNING
 
 __all__ = ["SCAN_LIMIT_S", "decode_apart", "describe_apart"]
 
@@ -36,8 +36,10 @@ _MOST_TEXT_BYTES = 1 << 24
 _START = "import sys; sys.path[:] = sys.argv[1:]; from edgeperc.readers.worker import main; main()"
 
 
-def decode_apart(path: Path, kind: str, topic: str | None, remission_field: str | None) -> Iterator[Scan]:
-    """Like `decoders.decode`, in a process of its own.
+def decode_apart(
+    path: Path, kind: str, topic: str | None, remission_field: str | None, times: bool
+) -> Iterator[TimedScan]:
+    """Like `decoders.decode`, in a process of its own; without ``times``, those of the points are None.
 
     The process runs ahead by one scan and waits then, so the memory stays flat. It ends with the iterator.
 
@@ -46,7 +48,7 @@ def decode_apart(path: Path, kind: str, topic: str | None, remission_field: str 
     PointsError
         As `decoders.decode`, or the process ended, or it exceeded the limits of memory or time.
     """
-    request = {"path": str(path), "kind": kind, "topic": topic, "remission_field": remission_field}
+    request = {"path": str(path), "kind": kind, "topic": topic, "remission_field": remission_field, "times": times}
     return _serve(request, path, [])
 
 
@@ -67,7 +69,7 @@ def describe_apart(path: Path, kind: str, topic: str | None) -> dict[str, Any]:
     return description
 
 
-def _serve(request: dict[str, Any], path: Path, found: list[Any]) -> Iterator[Scan]:
+def _serve(request: dict[str, Any], path: Path, found: list[Any]) -> Iterator[TimedScan]:
     """The scans of a request's reply; a description is appended to ``found``."""
     request_line = json.dumps(request).encode() + b"\n"
     with (
@@ -136,24 +138,33 @@ class _Watch:
 
 def _replies(
     process: subprocess.Popen[bytes], replies: IO[bytes], path: Path, watch: _Watch, found: list[Any]
-) -> Iterator[Scan]:
+) -> Iterator[TimedScan]:
     n_scans, ready = 0, False
+    times_s: NDArray[np.float64] | None = None
     while True:
         watch.since_s = time.monotonic()
         header = replies.read(HEADER.size)
         if len(header) < HEADER.size:
             break
         kind, stamp, n_bytes = HEADER.unpack(header)
-        known = kind in (ALIVE, END, ERROR, FOUND, MISSING, READY, SCAN, WARNING)
-        if not known or not 0 <= n_bytes <= (MAX_SCAN_BYTES if kind == SCAN else _MOST_TEXT_BYTES):
+        known = kind in (ALIVE, END, ERROR, FOUND, MISSING, READY, SCAN, TIMES, WARNING)
+        if not known or not 0 <= n_bytes <= (MAX_SCAN_BYTES if kind in (SCAN, TIMES) else _MOST_TEXT_BYTES):
             break
+        if kind == TIMES and n_bytes % 8 == 0:
+            times_s = np.empty(n_bytes // 8, "<f8")
+            if n_bytes and _fill(replies, times_s) < n_bytes:
+                break
+            continue
         if kind == SCAN and n_bytes % 16 == 0:
             points: NDArray[np.float32] = np.empty((n_bytes // 16, 4), "<f4")
             if n_bytes and _fill(replies, points) < n_bytes:
                 break
+            if times_s is not None and len(times_s) != len(points):
+                break
             n_scans += 1
             watch.since_s = None
-            yield None if np.isnan(stamp) else stamp, points
+            yield TimedScan(None if np.isnan(stamp) else stamp, points, times_s)
+            times_s = None
             continue
         text = replies.read(n_bytes)
         if len(text) < n_bytes:
@@ -190,9 +201,9 @@ def _replies(
     )
 
 
-def _fill(replies: Any, points: NDArray[np.float32]) -> int:
-    """Read into the points; fewer bytes than they have if the process ends."""
-    n_bytes: int = replies.readinto(points.data.cast("B"))
+def _fill(replies: Any, values: NDArray[Any]) -> int:
+    """Read into an array; fewer bytes than it has if the process ends."""
+    n_bytes: int = replies.readinto(values.data.cast("B"))
     return n_bytes
 
 

@@ -7,13 +7,16 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..errors import PointsError, SensorError
 from ..sensor import SensorProfile
 from .apart import decode_apart, describe_apart
-from .decoders import Scan
-from .files import read_points
+from .files import read_timed_file
 from .identify import KnownSensor, of_cloud, of_metadata, of_packets
 from .packets import PCAP_MAGIC
+from .times import TimedScan
 
 __all__ = [
     "CAPTURE_SUFFIXES",
@@ -21,6 +24,7 @@ __all__ = [
     "is_capture",
     "known_sensor",
     "read_scans",
+    "read_timed_scans",
     "scan_files",
     "sensor_of",
 ]
@@ -40,8 +44,8 @@ _MAGIC = {
 
 def read_scans(
     source: str | os.PathLike[str], *, topic: str | None = None, remission_field: str | None = None
-) -> Iterator[Scan]:
-    """Read the scans of a recording, one after another.
+) -> Iterator[tuple[float | None, NDArray[np.float32]]]:
+    """Read the scans of a recording, one after another; `read_timed_scans` gives the times of their points too.
 
     Captures are decoded in a process of their own, because a damaged one can make the libraries that decode them end
     their process. It ends with the iterator: at the last scan, or when the iterator is closed or deleted. It may use
@@ -84,13 +88,44 @@ def read_scans(
     UserWarning
         Damaged packets of an Ouster capture were dropped; the message has their number.
     """
-    path = Path(source)
+    return ((stamp_s, points) for stamp_s, points, _ in _scans(Path(source), topic, remission_field, times=False))
+
+
+def read_timed_scans(
+    source: str | os.PathLike[str], *, topic: str | None = None, remission_field: str | None = None
+) -> Iterator[TimedScan]:
+    """Like `read_scans`, with the time of each point, where the source holds it, for `edgeperc.deskew`.
+
+    Parameters
+    ----------
+    source, topic, remission_field
+        As in `read_scans`.
+
+    Yields
+    ------
+    stamp_s : float or None
+    points : (n, 4) float32
+    times_s : (n,) float64 or None
+        Time of each point [s]. An Ouster's packets have one for each column, a Velodyne's for each firing. Of point
+        clouds, ``.pcd``, ``.ply`` and structured ``.npy`` files, it is the field t, time, timestamp, time_stamp,
+        offset_time or time_offset, whose unit shows in the duration of the scan: 2 ms to 2 s. Values below 2 s count
+        from ``stamp_s``. None without such a field, or if no unit gives such a duration.
+
+    Raises
+    ------
+    PointsError, MissingExtraError
+        As `read_scans`.
+    """
+    return _scans(Path(source), topic, remission_field, times=True)
+
+
+def _scans(path: Path, topic: str | None, remission_field: str | None, times: bool) -> Iterator[TimedScan]:
     kind = _readable_kind(path)
     if kind == "folder":
-        return _folder(path, topic, remission_field)
+        return _folder(path, topic, remission_field, times)
     if kind == "scan":
-        return iter([(None, read_points(path, remission_field=remission_field))])
-    return decode_apart(path, kind, topic, remission_field)
+        return iter([read_timed_file(path, remission_field)])
+    return decode_apart(path, kind, topic, remission_field, times)
 
 
 def is_capture(path: Path) -> bool:
@@ -193,7 +228,7 @@ def _kind(path: Path) -> str:
     return next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), by_name)
 
 
-def _folder(folder: Path, topic: str | None, remission_field: str | None) -> Iterator[Scan]:
+def _folder(folder: Path, topic: str | None, remission_field: str | None, times: bool) -> Iterator[TimedScan]:
     files = scan_files(folder)
     if not files:
         raise PointsError(
@@ -201,4 +236,4 @@ def _folder(folder: Path, topic: str | None, remission_field: str | None) -> Ite
             "bag's metadata.yaml"
         )
     for file in files:
-        yield from read_scans(file, topic=topic, remission_field=remission_field)
+        yield from _scans(file, topic, remission_field, times)

@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from ..errors import MissingExtraError, PointsError
 from ..extras import require
-from ..points import as_points
+from ..points import as_points, table_columns
 from .inflate import inflate, inflate_file, most_bytes
 from .mcap import McapFile
 from .ouster import check_osf, open_capture
 from .packets import pcap_packets, refuse_hesai, velodyne_packets
 from .tables import MAX_BYTES
+from .times import TimedScan, point_times
 
-__all__ = ["Scan", "cloud_points", "decode", "describe", "is_ouster_cloud"]
+__all__ = ["cloud_points", "decode", "describe", "describe_cloud", "is_ouster_cloud"]
 
-Scan = tuple[float | None, NDArray[np.float32]]
 _Item = TypeVar("_Item")
 
 _CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -43,7 +43,7 @@ def decode(
     remission_field: str | None,
     warn: Callable[[str], None],
     alive: Callable[[], None],
-) -> Iterator[Scan]:
+) -> Iterator[TimedScan]:
     """The scans of a capture, decoded in this process.
 
     Parameters
@@ -103,14 +103,25 @@ def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]
             yield {"metadata": chosen.to_json_string()}
         else:
             for name, message, _ in _clouds(path, kind, topic, alive):
-                yield {
-                    "topic": name,
-                    "frame": str(message.header.frame_id),
-                    "fields": [str(f.name) for f in message.fields],
-                    "elevations_deg": _ring_elevations(message),
-                }
+                yield describe_cloud(name, message)
 
     return next(_with_typed_errors(path, found()))
+
+
+def describe_cloud(topic: str, message: Any) -> dict[str, Any]:
+    """What a ROS ``sensor_msgs/PointCloud2`` message says about its sensor; see `describe`.
+
+    Raises
+    ------
+    PointsError
+        As `cloud_points`.
+    """
+    return {
+        "topic": topic,
+        "frame": str(message.header.frame_id),
+        "fields": [str(f.name) for f in message.fields],
+        "elevations_deg": _ring_elevations(message),
+    }
 
 
 def _with_typed_errors(path: Path, items: Iterator[_Item]) -> Iterator[_Item]:
@@ -235,8 +246,8 @@ def _packet_scans(
     remission_field: str | None,
     warn: Callable[[str], None],
     alive: Callable[[], None],
-) -> Iterator[Scan]:
-    scans: Iterator[Scan] = iter(())
+) -> Iterator[TimedScan]:
+    scans: Iterator[TimedScan] = iter(())
     if kind == ".osf":
         scans = _ouster_scans(_open_osf(path), topic, remission_field)
     elif next(velodyne_packets(path), None) is not None:
@@ -258,24 +269,24 @@ def _packet_scans(
 
 
 def _open_osf(path: Path) -> Any:
-    osf = require("ouster.sdk.osf", "io", "Reading an Ouster capture", package="ouster-sdk")
+    osf = require("ouster.sdk.osf", "ouster", "Reading an Ouster capture", package="ouster-sdk")
     check_osf(path)
     return osf.OsfFrameSetSource(str(path))
 
 
-def _velodyne_scans(path: Path) -> Iterator[Scan]:
-    velodyne = require("velodyne_decoder", "io", "Reading a Velodyne capture", package="velodyne-decoder")
+def _velodyne_scans(path: Path) -> Iterator[TimedScan]:
+    velodyne = require("velodyne_decoder", "velodyne", "Reading a Velodyne capture", package="velodyne-decoder")
     config = velodyne.Config()
     for stamp, points in velodyne.read_pcap(str(path), config):
         scan = as_points(points[:, :4])
         # After the first scan the decoder knows the model of the sensor.
         if config.model is not None and config.model.name.startswith("HDL64E"):
             scan[:, 3] /= 255.0
-        yield stamp.device, scan
+        yield TimedScan(stamp.device, scan, stamp.device + points[:, 4].astype(np.float64))
 
 
-def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -> Iterator[Scan]:
-    core = require("ouster.sdk.core", "io", "Reading an Ouster capture", package="ouster-sdk")
+def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -> Iterator[TimedScan]:
+    core = require("ouster.sdk.core", "ouster", "Reading an Ouster capture", package="ouster-sdk")
     serials = [str(info.sn) for info in frames.sensor_info]
     chosen = _choose("sensor", serials, topic)
     to_xyz = core.XYZLut(frames.sensor_info[chosen], False)  # in the sensor's frame, not the vehicle's
@@ -290,7 +301,8 @@ def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -
         scan = np.empty((np.count_nonzero(returned), 4), np.float32)
         scan[:, :3] = to_xyz(frame)[returned]
         scan[:, 3] = frame.field(name)[returned]
-        yield float(frame.timestamp.max()) * 1e-9, scan
+        column = np.nonzero(returned)[1]
+        yield TimedScan(float(frame.timestamp.max()) * 1e-9, scan, frame.timestamp[column] * 1e-9)
 
 
 # --- bags ------------------------------------------------------------------------------------------------------------
@@ -298,16 +310,17 @@ def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -
 
 def _bag_scans(
     path: Path, kind: str, topic: str | None, remission_field: str | None, alive: Callable[[], None]
-) -> Iterator[Scan]:
+) -> Iterator[TimedScan]:
     for _, message, stamp_s in _clouds(path, kind, topic, alive):
-        yield stamp_s, cloud_points(message, remission_field=remission_field)
+        points = cloud_points(message, remission_field=remission_field)
+        yield TimedScan(stamp_s, points, point_times(table_columns(_as_table(message)), points, stamp_s))
 
 
 def _clouds(path: Path, kind: str, topic: str | None, alive: Callable[[], None]) -> Iterator[tuple[str, Any, float]]:
     """Topic, message and stamp [s] of each point cloud."""
-    highlevel = require("rosbags.highlevel", "io", "Reading a bag")
-    typesys = require("rosbags.typesys", "io", "Reading a bag")
-    rosbag2 = require("rosbags.rosbag2", "io", "Reading a bag")
+    highlevel = require("rosbags.highlevel", "ros", "Reading a bag")
+    typesys = require("rosbags.typesys", "ros", "Reading a bag")
+    rosbag2 = require("rosbags.rosbag2", "ros", "Reading a bag")
     humble = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     if kind == "ros2":
         path = _unpacked_files(path, rosbag2.Reader(path), alive)

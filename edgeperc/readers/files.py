@@ -7,6 +7,7 @@ import math
 import os
 import zipfile
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
-from ..points import as_points
+from ..points import as_points, assemble, table_columns
 from .inflate import inflate, most_bytes
 from .pcd import begins_like_pcd, parse_pcd
 from .ply import parse_ply
-from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES
+from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES, Columns
+from .times import TimedScan, point_times
 
-__all__ = ["read_points"]
+__all__ = ["read_points", "read_timed_file"]
 
 _TEXT_BYTES = np.zeros(256, dtype=np.bool_)
 _TEXT_BYTES[[9, 10, 13, *range(32, 127)]] = True
@@ -65,7 +67,20 @@ def read_points(
     """
     if not isinstance(source, str | os.PathLike):
         return as_points(source, remission_field=remission_field)
-    path = Path(source)
+    return _read(Path(source), columns, remission_field)[0]
+
+
+def read_timed_file(path: Path, remission_field: str | None) -> TimedScan:
+    """Read a scan file with the times of its points; options and errors as `read_points`."""
+    points, fields = _read(path, None, remission_field)
+    return TimedScan(None, points, point_times(fields, points, None))
+
+
+_Read = tuple[NDArray[np.float32], Mapping[str, NDArray[Any]]]
+"""Points, and the fields of the file if they have names."""
+
+
+def _read(path: Path, columns: int | None, remission_field: str | None) -> _Read:
     try:
         size = path.stat().st_size if path.is_file() else 0
         if size > MAX_SCAN_BYTES:
@@ -85,7 +100,7 @@ def read_points(
         raise PointsError(f"{path}: reading {data.size:,} bytes takes more memory than there is") from exc
 
 
-def _parse(data: NDArray[np.uint8], name: str, columns: int | None, remission_field: str | None) -> NDArray[np.float32]:
+def _parse(data: NDArray[np.uint8], name: str, columns: int | None, remission_field: str | None) -> _Read:
     if data.size == 0:
         raise PointsError(
             "the file is empty (0 bytes), as an interrupted recording leaves it; "
@@ -93,21 +108,29 @@ def _parse(data: NDArray[np.uint8], name: str, columns: int | None, remission_fi
         )
     head = data[:MAX_HEADER_BYTES].tobytes()
     if head.startswith(b"\x93NUMPY"):
-        return as_points(_parse_npy(data), remission_field=remission_field)
+        return _of_array(_parse_npy(data), remission_field)
     if head.startswith(b"PK\x03\x04"):
-        return as_points(_parse_npz(data), remission_field=remission_field)
+        return _of_array(_parse_npz(data), remission_field)
     if head.startswith((b"ply\n", b"ply\r")):
-        return parse_ply(data, head, remission_field)
+        return _of_columns(parse_ply(data, head, remission_field), remission_field)
     if begins_like_pcd(head):
-        return parse_pcd(data, head, remission_field)
+        return _of_columns(parse_pcd(data, head, remission_field), remission_field)
     if columns is None:
         if not name.endswith(".bin"):
             raise PointsError(
                 "neither PCD, PLY, .npy nor .npz by its first bytes; for raw float32 values name it .bin or pass "
                 "columns=4 (x, y, z, remission)"
             )
-        return _parse_raw(data, 5 if name.endswith(".pcd.bin") else 4, by_name=True)
-    return _parse_raw(data, columns, by_name=False)
+        return _parse_raw(data, 5 if name.endswith(".pcd.bin") else 4, by_name=True), {}
+    return _parse_raw(data, columns, by_name=False), {}
+
+
+def _of_array(array: NDArray[Any], remission_field: str | None) -> _Read:
+    return as_points(array, remission_field=remission_field), table_columns(array)
+
+
+def _of_columns(found: Columns, remission_field: str | None) -> _Read:
+    return assemble(*found, remission_field), found.fields
 
 
 def _parse_raw(data: NDArray[np.uint8], columns: int, by_name: bool) -> NDArray[np.float32]:

@@ -33,8 +33,8 @@ def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], No
     ouster.sdk.pcap.PcapFrameSetSource or None
         None if no packet has the size that the metadata says.
     """
-    pcap = require("ouster.sdk.pcap", "io", "Reading a capture of another sensor than Velodyne's", package="ouster-sdk")
-    core = require("ouster.sdk.core", "io", "Reading an Ouster capture", package="ouster-sdk")
+    pcap = require("ouster.sdk.pcap", "ouster", "Reading a capture that is not Velodyne's", package="ouster-sdk")
+    core = require("ouster.sdk.core", "ouster", "Reading an Ouster capture", package="ouster-sdk")
     metadata = metadata_beside(path)
     sizes = set()
     for file in metadata:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..kernel_cache import njit
-from ..points import assemble, plain_name
-from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES, column, cut_short, parse_table, whole_number
+from ..points import plain_name
+from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES, Columns, column, cut_short, parse_table, whole_number
 
 __all__ = ["begins_like_pcd", "fill_unpacked_lzf", "parse_pcd"]
 
@@ -80,7 +80,7 @@ def _parse_pcd_header(head: bytes) -> _PcdHeader:
     return _PcdHeader(tuple(names), tuple(types), tuple(counts), n_points, encoding, at)
 
 
-def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> NDArray[np.float32]:
+def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> Columns:
     """Parse a PCD file: ascii, binary or binary_compressed.
 
     Parameters
@@ -94,8 +94,7 @@ def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
 
     Returns
     -------
-    (n, 4) float32
-        x, y, z [m], remission.
+    Columns
 
     Raises
     ------
@@ -127,7 +126,7 @@ def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
         }
     else:
         raise PointsError(f"PCD data is ascii, binary or binary_compressed, got {header.encoding!r}")
-    return assemble(n, fields, header.names, remission_field)
+    return Columns(n, fields, header.names)
 
 
 def _unpack_pcd(body: NDArray[np.uint8], n_bytes: int) -> NDArray[np.uint8]:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..points import assemble, plain_name
-from .tables import column, cut_short, parse_table, whole_number
+from ..points import plain_name
+from .tables import Columns, column, cut_short, parse_table, whole_number
 
 __all__ = ["parse_ply"]
 
@@ -67,7 +67,7 @@ def _parse_ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
     return encoding, elements, at
 
 
-def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> NDArray[np.float32]:
+def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> Columns:
     """Parse the vertices of a PLY file: ascii, or binary in either byte order.
 
     Parameters
@@ -81,8 +81,7 @@ def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
 
     Returns
     -------
-    (n, 4) float32
-        x, y, z [m], remission.
+    Columns
 
     Raises
     ------
@@ -127,7 +126,7 @@ def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
             kind = order + vertex.properties[k][1]
             octets = starts[:, k, None] + np.arange(np.dtype(kind).itemsize)
             fields[name] = body[octets].reshape(-1).view(kind)
-    return assemble(n, fields, names, remission_field)
+    return Columns(n, fields, names)
 
 
 def _row_starts(

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..points import assemble, remission_name
+from ..points import remission_name
+from .times import time_name
 
 __all__ = [
     "MAX_BYTES",
     "MAX_HEADER_BYTES",
     "MAX_SCAN_BYTES",
+    "Columns",
     "column",
     "cut_short",
     "parse_table",
@@ -30,6 +32,24 @@ MAX_BYTES = 1 << 31
 # Limit for a scan: 16 million points of KITTI's files, where a turn of the densest sensors has half a million. Reading
 # so much text takes 2 GiB of memory.
 MAX_SCAN_BYTES = 1 << 28
+
+
+class Columns(NamedTuple):
+    """The fields of a scan, for `edgeperc.points.assemble`.
+
+    Attributes
+    ----------
+    n : int
+        Number of points.
+    fields : mapping of str to (n,) array
+        Columns by `edgeperc.points.plain_name`.
+    names : sequence of str
+        All fields of the source.
+    """
+
+    n: int
+    fields: Mapping[str, NDArray[Any]]
+    names: Sequence[str]
 
 
 def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int) -> NDArray[Any]:
@@ -63,14 +83,14 @@ def parse_table(
     places: Mapping[str, int],
     names: Sequence[str],
     remission_field: str | None,
-) -> NDArray[np.float32]:
-    """Parse rows of numbers as text; ``places`` has each field's position in a row."""
+) -> Columns:
+    """Parse coordinates, remission and time from rows of text; ``places`` has each field's position in a row."""
     wanted = {name: places[name] for name in "xyz" if name in places}
-    remission = remission_name(places, remission_field)
-    if remission is not None:
-        wanted[remission] = places[remission]
-    if len(wanted) < 3 or n == 0:
-        return assemble(0, {name: np.empty(0) for name in wanted}, names, remission_field)
+    for name in (remission_name(places, remission_field), time_name(places)):
+        if name is not None:
+            wanted[name] = places[name]
+    if not {"x", "y", "z"} <= wanted.keys() or n == 0:
+        return Columns(0, {name: np.empty(0) for name in wanted}, names)
     ends = np.flatnonzero(np.append(body, np.uint8(10)) == 10) + 1
     if skipped_rows + n > len(ends):
         raise PointsError(f"cut short: {skipped_rows + n} rows declared, {len(ends)} are there")
@@ -85,4 +105,4 @@ def parse_table(
         raise PointsError(f"a row of text does not hold numbers: {exc}") from exc
     if len(rows) != n:
         raise PointsError(f"cut short: {n} rows declared, {len(rows)} of numbers are there")
-    return assemble(n, dict(zip(wanted, rows.T, strict=True)), names, remission_field)
+    return Columns(n, dict(zip(wanted, rows.T, strict=True)), names)

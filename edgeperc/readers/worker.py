@@ -19,14 +19,17 @@ from ..errors import MissingExtraError, PointsError
 from .decoders import decode, describe
 from .tables import MAX_BYTES, MAX_SCAN_BYTES
 
-__all__ = ["ALIVE", "END", "ERROR", "FOUND", "HEADER", "MISSING", "READY", "SCAN", "WARNING", "main"]
+__all__ = ["ALIVE", "END", "ERROR", "FOUND", "HEADER", "MISSING", "READY", "SCAN", "TIMES", "WARNING", "main"]
 
 HEADER = struct.Struct("<cdq")
-ALIVE, END, ERROR, FOUND, MISSING, READY, SCAN, WARNING = b"A", b"Z", b"E", b"F", b"M", b"R", b"S", b"W"
+ALIVE, END, ERROR, FOUND, MISSING, READY, SCAN, TIMES, WARNING = b"A", b"Z", b"E", b"F", b"M", b"R", b"S", b"T", b"W"
 
 
 def main() -> None:
-    """Serve the request: a JSON object with path, kind, topic, and remission_field unless it asks for a description."""
+    """Serve the request: a JSON object with path, kind, topic; and remission_field and times, if it asks for scans.
+
+    The times of a scan's points come before the scan, if they are asked for and known.
+    """
     # What the libraries print must not come between the replies.
     replies = os.fdopen(os.dup(1), "wb", 0)
     os.dup2(2, 1)
@@ -46,7 +49,7 @@ def main() -> None:
             if "remission_field" not in request:
                 reply(FOUND, json.dumps(describe(*capture, lambda: reply(ALIVE))).encode())
                 return
-            for stamp_s, points in decode(
+            for stamp_s, points, times_s in decode(
                 *capture,
                 request["remission_field"],
                 lambda text: reply(WARNING, text.encode("utf-8", "replace")),
@@ -57,6 +60,8 @@ def main() -> None:
                         f"{request['path']}: a scan of {len(points):,} points is too large; expected at most "
                         f"{MAX_SCAN_BYTES // 16:,}"
                     )
+                if request["times"] and times_s is not None:
+                    reply(TIMES, np.ascontiguousarray(times_s, "<f8").data.cast("B") if times_s.size else b"")
                 content = np.ascontiguousarray(points, "<f4").data.cast("B") if points.size else b""
                 reply(SCAN, content, np.nan if stamp_s is None else stamp_s)
         except MissingExtraError as exc:

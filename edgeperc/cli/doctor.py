@@ -1,0 +1,368 @@
+"""``edgeperc doctor``: what is installed, what is missing, and whether what is needed works."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from importlib import import_module, resources
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal
+
+from .. import __version__
+from ..errors import EdgepercError
+from ..extras import without_telemetry
+from .arguments import DEFAULT, Commands, add_command
+from .output import many, one_line, print_columns, print_line
+
+__all__ = ["Finding", "add_parser", "doctor_command", "examine"]
+
+# Extras for work on edgeperc itself, and the builds of onnxruntime, of which one at a time can be installed.
+_FOR_DEVELOPERS = ("docs", "test")
+_BUILDS = ("onnxruntime", "onnxruntime-gpu", "onnxruntime-directml", "onnxruntime-openvino")
+# Versions with a leak at each convolution on ARM processors with SME (pyproject.toml excludes them there).
+_LEAKING = ("1.23.", "1.24.", "1.25.", "1.26.")
+_REINSTALL = "pip install --force-reinstall edgeperc"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report.
+
+    Attributes
+    ----------
+    name : str
+        What was examined, e.g. ``"cache folder"``.
+    state : {"ok", "note", "broken"}
+        ``"note"`` is something that edgeperc works without; ``"broken"`` something that it needs.
+    found : str
+    advice : str
+        A command or what to do; empty if nothing is to be done.
+    """
+
+    name: str
+    state: Literal["ok", "note", "broken"]
+    found: str
+    advice: str = ""
+
+
+def add_parser(commands: Commands) -> None:
+    """Add ``doctor``."""
+    parser = add_command(
+        commands,
+        "doctor",
+        doctor_command,
+        help="what is installed, what is missing and how to install it, and whether what is needed works",
+        description="Examine this installation: versions, processor, compiled kernels, execution providers and their "
+        "devices, caches, the files of the models, extras. The default models are opened and checked against their "
+        "golden inputs. The exit code is 1 if something that edgeperc needs is missing or broken.",
+        examples=["edgeperc doctor", "edgeperc doctor --json"],
+    )
+    output = parser.add_argument_group("output")
+    output.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def doctor_command(arguments: argparse.Namespace) -> int:
+    """Print what `examine` finds; 1 if something is broken."""
+    findings = [*examine()]
+    broken = [finding for finding in findings if finding.state == "broken"]
+    if arguments.json:
+        print_line(json.dumps({"works": not broken, "findings": [asdict(finding) for finding in findings]}))
+        return 1 if broken else 0
+    marks = {"ok": "ok", "note": "-", "broken": "BROKEN"}
+    print_columns(
+        ("what", "", "found"),
+        [(each.name, marks[each.state], each.found + (f"; {each.advice}" if each.advice else "")) for each in findings],
+    )
+    print_line("")
+    if broken:
+        print_line(f"{many(len(broken), 'fault')}: {', '.join(finding.name for finding in broken)}")
+    else:
+        print_line("What edgeperc needs is here and works.")
+    return 1 if broken else 0
+
+
+def examine() -> Iterator[Finding]:
+    """Examine this installation and yield a `Finding` for each thing. Nothing is written but the caches."""
+    checks: dict[str, Callable[[], Iterator[Finding]]] = {
+        "edgeperc": _program,
+        "processor": _processor,
+        "packages": _packages,
+        "kernels": _kernels,
+        "providers": _providers,
+        "caches": _caches,
+        "models": _models,
+        "extras": _extras,
+    }
+    for name, check in checks.items():
+        try:
+            yield from check()
+        except Exception as exc:  # a broken package may raise anything, and the other checks still run
+            yield _broken(name, exc)
+
+
+def _broken(name: str, exc: BaseException, advice: str = "") -> Finding:
+    kind = "" if isinstance(exc, EdgepercError) else f"{type(exc).__name__}: "
+    return Finding(name, "broken", one_line(f"{kind}{exc}"), advice)
+
+
+def _program() -> Iterator[Finding]:
+    yield Finding("edgeperc", "ok", f"{__version__} in {Path(__file__).parent.parent}")
+    yield Finding("python", "ok", f"{platform.python_implementation()} {platform.python_version()}, {sys.executable}")
+    yield Finding("platform", "ok", f"{platform.platform()}, {platform.machine()}")
+
+
+def _processor() -> Iterator[Finding]:
+    from ..tuning import cpu_features, cpu_model
+
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    yield Finding("processor", "ok", f"{cpu_model()}, {usable} of {os.cpu_count()} cores usable")
+    from ..zoo import BF16_FEATURES, INT8_FEATURES
+
+    present = cpu_features()
+    for precision, features in (("int8", INT8_FEATURES), ("bf16", BF16_FEATURES)):
+        found = ", ".join(sorted(features & present))
+        yield Finding(
+            precision,
+            "ok" if found else "note",
+            f"fast here ({found})" if found else "no instructions for it here; fp32 is used",
+        )
+
+
+def _installed(prefix: str = "") -> dict[str, str]:
+    """Version of each installed distribution whose name has this beginning."""
+    found: dict[str, str] = {}
+    for each in importlib.metadata.distributions():
+        name = each.metadata["Name"]  # None if its folder is damaged
+        if name and name.lower().replace("_", "-").startswith(prefix):
+            found.setdefault(name.lower().replace("_", "-"), each.version)
+    return found
+
+
+def _packages() -> Iterator[Finding]:
+    for name in ("numpy", "numba", "llvmlite"):
+        try:
+            yield Finding(name, "ok", str(import_module(name).__version__))
+        except Exception as exc:  # a wheel for another processor or numpy raises other errors than ImportError
+            yield _broken(name, exc, f"pip install --force-reinstall {name}")
+    without_telemetry()
+    versions = _installed("onnxruntime")
+    builds = [name for name in _BUILDS if name in versions]
+    try:
+        version = str(import_module("onnxruntime").__version__)
+    except ImportError as exc:
+        missing = isinstance(exc, ModuleNotFoundError) and not builds
+        reinstall = f"pip install --force-reinstall {builds[0] if builds else 'onnxruntime'}"
+        yield (
+            Finding("onnxruntime", "broken", "not installed", "pip install 'edgeperc[cpu]'")
+            if missing
+            else _broken("onnxruntime", exc, reinstall)
+        )
+        return
+    shown = ", ".join(f"{name} {versions[name]}" for name in sorted(versions)) or version
+    if len(builds) > 1:
+        both = f"{shown}: they overwrite one another"
+        yield Finding("onnxruntime", "broken", both, f"pip uninstall {' '.join(builds)}, then install one")
+    elif version.startswith(_LEAKING) and _has_sme():
+        leaks = f"{shown}: leaks memory at each convolution on this processor"
+        yield Finding("onnxruntime", "note", leaks, "pip install 'onnxruntime>=1.27'")
+    else:
+        yield Finding("onnxruntime", "ok", shown)
+    off = os.environ.get("ORT_DISABLE_TELEMETRY") == "1"
+    value = "off (ORT_DISABLE_TELEMETRY=1)" if off else "not turned off: ORT_DISABLE_TELEMETRY is set to another value"
+    yield Finding("telemetry", "ok" if off else "note", value)
+
+
+def _has_sme() -> bool:
+    from ..tuning import cpu_features
+
+    return "sme" in cpu_features() or (sys.platform == "darwin" and platform.machine() == "arm64")
+
+
+def _kernels() -> Iterator[Finding]:
+    import numpy as np
+
+    from ..frame import fill_moved
+    from ..points import read_only
+
+    moved = np.empty((1, 4), np.float32)
+    started = time.perf_counter()
+    fill_moved(read_only(np.ones((1, 4))), np.eye(3), np.ones(3), moved)
+    took_s = time.perf_counter() - started
+    if moved.tolist() != [[2.0, 2.0, 2.0, 1.0]]:
+        yield Finding("kernels", "broken", f"a kernel gave {moved.tolist()}", "pip install --force-reinstall numba")
+        return
+    kept = getattr(fill_moved, "_cache", None)
+    place = None if kept is None else kept.cache_path
+    compiled = f"compiled or loaded in {took_s:.1f} s"
+    if place is None:
+        keep = "set NUMBA_CACHE_DIR to a folder that only you can write"
+        yield Finding("kernels", "note", f"{compiled}; not kept, so that every start compiles again", keep)
+    else:
+        yield Finding("kernels", "ok", f"{compiled}; kept in {place}")
+
+
+def _providers() -> Iterator[Finding]:
+    from ..listing import providers
+
+    present = [provider.name for provider in providers() if provider.available]
+    if not present:
+        return  # without onnxruntime, which `_packages` reports
+    from ..session import PLUGINS, devices
+
+    for short, package in PLUGINS.items():
+        if short not in present and find_spec(package) is not None:
+            yield Finding(f"plugin {short}", "note", "installed, but finds no device on this computer")
+    yield Finding("providers", "ok", f"{', '.join(present)}; 'edgeperc providers' says how to install others")
+    found = devices()
+    yield Finding("devices", "ok", ", ".join(found) or "this version of onnxruntime does not list them")
+
+
+def _caches() -> Iterator[Finding]:
+    from ..errors import SettingsError
+    from ..tuning import cache_folder, fingerprint, read_setting, settings_path, unsafe_because
+    from ..zoo import digest, resolve
+
+    try:
+        folder = cache_folder()
+    except SettingsError as exc:
+        yield Finding("cache folder", "note", one_line(exc))
+        return
+    for name, part in (
+        ("cache folder", folder),
+        ("compiled models", folder / "compiled"),
+        ("compiled kernels", folder / "kernels"),
+    ):
+        if name != "cache folder" and not part.exists():
+            continue
+        reason = _unwritable(part) or (unsafe_because(part.stat()) if part.exists() else None)
+        held = _size(part) if part.exists() else "not made yet"
+        if reason is None:
+            yield Finding(name, "ok", f"{part}: {held}, writable")
+        else:
+            again = "every start compiles again; set EDGEPERC_CACHE_DIR to a folder that only you can write"
+            yield Finding(name, "note", f"{part}: {held}, {reason}", again)
+    try:
+        measured = [read_setting(settings_path(), fingerprint(), digest(resolve(model))) for model in DEFAULT]
+    except SettingsError as exc:
+        yield Finding("settings", "note", one_line(exc))
+        return
+    if all(measured):
+        yield Finding("settings", "ok", f"{settings_path()}: the fastest of this computer")
+    else:
+        yield Finding("settings", "note", "nothing was measured here", "edgeperc-bench matrix --recommend")
+
+
+def _unwritable(folder: Path) -> str | None:
+    """Why files cannot be made in a folder, or the folder itself; None if they can."""
+    place = next(path for path in (folder, *folder.parents) if path.exists())
+    if not place.is_dir():
+        return f"{place} is not a folder"
+    return None if os.access(place, os.W_OK | os.X_OK) else f"{place} cannot be written"
+
+
+def _size(folder: Path) -> str:
+    files = [file for file in folder.rglob("*") if file.is_file() and not file.is_symlink()] if folder.is_dir() else []
+    return f"{sum(file.stat().st_size for file in files) / 1e6:.1f} MB in {many(len(files), 'file')}"
+
+
+def _models() -> Iterator[Finding]:
+    from ..card import ModelCard
+
+    folder = resources.files("edgeperc.zoo")
+    page = folder / "MODELS.md"
+    listed = page.read_text("utf-8") if page.is_file() else ""
+    if not listed:
+        yield Finding("MODELS.md", "note", "missing, so that the models' hashes are not compared", _REINSTALL)
+    found = set()
+    for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
+        if not entry.name.endswith(".onnx"):
+            continue
+        path = Path(str(entry))
+        try:
+            card = ModelCard.read(path)
+        except EdgepercError as exc:
+            yield _broken(f"model {path.name}", exc, _REINSTALL)
+            continue
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        found.add(card.name)
+        if listed and sha256 not in listed:
+            other = f"SHA-256 {sha256} is not in MODELS.md, so it is not the file of this release"
+            yield Finding(f"model {path.name}", "broken", other, _REINSTALL)
+        else:
+            checked = "as in MODELS.md" if listed else "not compared"
+            yield Finding(f"model {path.name}", "ok", f"{card.name} {card.version}, SHA-256 {sha256[:16]}... {checked}")
+    for name in DEFAULT:
+        if name not in found:
+            yield Finding(f"model {name}", "broken", "missing", _REINSTALL)
+    yield from _runs(found)
+
+
+def _runs(found: set[str]) -> Iterator[Finding]:
+    """Whether the default models open and answer their golden inputs, with the provider that is chosen here."""
+    try:
+        import_module("onnxruntime")
+    except ImportError:  # `_packages` reports it
+        return
+    from ..session import Session
+
+    for name in DEFAULT:
+        if name in found:
+            try:
+                yield Finding(f"runs {name}", "ok", Session(name).description)
+            except EdgepercError as exc:
+                yield _broken(f"runs {name}", exc)
+
+
+def _extras() -> Iterator[Finding]:
+    try:
+        metadata = importlib.metadata.metadata("edgeperc")
+        requirement: Any = import_module("packaging.requirements").Requirement
+    except importlib.metadata.PackageNotFoundError:
+        yield Finding("extras", "note", "edgeperc was not installed by pip, so its extras are not known")
+        return
+    except ImportError:
+        yield Finding("extras", "note", "not examined: that needs packaging, which comes with onnxruntime")
+        return
+    needed = [requirement(text) for text in metadata.get_all("Requires-Dist") or ()]
+    versions = _installed()
+    for each, fault in _faults(needed, "", versions):
+        yield Finding(each, "broken", fault, f"pip install '{each}'")
+    present = []
+    for extra in sorted(metadata.get_all("Provides-Extra") or ()):
+        faults = _faults(needed, extra, versions)
+        if not faults:
+            present.append(extra)
+        elif extra == "gpu" and "onnxruntime" in versions:
+            yield Finding("extra gpu", "note", "in place of cpu", "'edgeperc providers' says how to install it")
+        elif extra not in _FOR_DEVELOPERS:
+            missing = ", ".join(fault for _, fault in faults)
+            yield Finding(f"extra {extra}", "note", missing, f"pip install 'edgeperc[{extra}]'")
+    yield Finding("extras", "ok", ", ".join(present) or "none is complete")
+
+
+def _faults(needed: list[Any], extra: str, versions: dict[str, str]) -> list[tuple[str, str]]:
+    """Requirements of an extra, or of edgeperc itself, that are not met: each with what is wrong."""
+    faults = []
+    for each in needed:
+        of_extra = each.marker is not None and "extra" in str(each.marker)
+        if of_extra != bool(extra) or (each.marker is not None and not each.marker.evaluate({"extra": extra})):
+            continue
+        name = each.name.lower().replace("_", "-")
+        if name == "edgeperc":  # an extra that consists of others
+            for other in sorted(each.extras):
+                faults += _faults(needed, other, versions)
+        elif name not in versions:
+            faults.append((str(each).partition(";")[0].strip(), f"{name} is missing"))
+        elif not each.specifier.contains(versions[name], prereleases=True):
+            wanted = f"{name} is {versions[name]}, expected {each.specifier}"
+            faults.append((str(each).partition(";")[0].strip(), wanted))
+    return faults

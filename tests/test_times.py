@@ -1,0 +1,325 @@
+"""Times of points from captures and scan files: of a sensor that moves in a room, whose walls become straight."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from test_captures import write_pcap
+
+import edgeperc
+import twins.motion
+from edgeperc import Motion, deskew, read_timed_scans
+from edgeperc.readers.times import point_times, time_name
+
+MOTION = Motion((18.0, 0.5, 0.0), (0.02, -0.03, 0.6))
+HALF_X_M, HALF_Y_M = 20.0, 15.0
+
+
+def seen_from(times: NDArray[np.float64], at_s: float, directions: NDArray[np.float64], offsets: Any = 0.0) -> Any:
+    """Ranges (n,) at which rays of a moving sensor meet the walls of the room; the sensor's frame at ``at_s`` is the
+    room's. ``directions`` (n, 3) and the rays' origins ``offsets`` are in the sensor's frame at the time of each."""
+    screw = twins.motion.screw(MOTION.velocity_mps, MOTION.rate_radps)
+    moments, inverse = np.unique(times, return_inverse=True)
+    poses = np.array([twins.motion.exponential(screw * (t - at_s)) for t in moments])[inverse.ravel()]
+    way = np.einsum("nij,nj->ni", poses[:, :3, :3], directions)
+    start = np.einsum("nij,nj->ni", poses[:, :3, :3], np.broadcast_to(offsets, directions.shape)) + poses[:, :3, 3]
+    with np.errstate(divide="ignore"):
+        to_x = (np.sign(way[:, 0]) * HALF_X_M - start[:, 0]) / way[:, 0]
+        to_y = (np.sign(way[:, 1]) * HALF_Y_M - start[:, 1]) / way[:, 1]
+    return np.fmin(to_x, to_y)
+
+
+def off_the_walls(points: NDArray[Any]) -> float:
+    """Largest distance of a point from its wall [m]."""
+    x, y = np.abs(points[:, 0]), np.abs(points[:, 1])
+    return float(np.minimum(np.abs(x - HALF_X_M), np.abs(y - HALF_Y_M)).max())
+
+
+def turn(at_s: float, n: int = 900) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A turn of 0.1 s that ends at ``at_s``: points (n, 4) in the sensor's frame at their times (n,)."""
+    times = at_s + np.linspace(-0.1, 0.0, n)
+    angle = np.linspace(math.pi, -math.pi, n, endpoint=False)
+    directions = np.column_stack([np.cos(angle), np.sin(angle), 0.05 * np.cos(5 * angle)])
+    return np.column_stack([directions * seen_from(times, at_s, directions)[:, None], np.full(n, 0.5)]), times
+
+
+def check_straight(found: edgeperc.TimedScan, at_s: float, tolerance_m: float) -> None:
+    assert found.times_s is not None
+    assert found.times_s.shape == (len(found.points),)
+    assert found.times_s.dtype == np.float64
+    assert off_the_walls(found.points) > 0.7
+    assert off_the_walls(deskew(found.points, found.times_s, MOTION, at_s=at_s)) < tolerance_m
+
+
+# --- fields ----------------------------------------------------------------------------------------------------------
+
+
+@given(
+    st.sampled_from([1.0, 1e-3, 1e-6, 1e-9]),
+    st.floats(0.0021, 1.9),
+    st.sampled_from([0.0, 40.0, 1.7e9]),
+    st.sampled_from([None, 123.5]),
+)
+def test_the_duration_shows_the_unit(unit: float, duration_s: float, start_s: float, stamp_s: float | None) -> None:
+    times = start_s + np.linspace(0.0, duration_s, 50)
+    points = np.ones((50, 4), np.float32)
+    found = point_times({"t": times / unit}, points, stamp_s)
+    np.testing.assert_allclose(found, times if start_s else times + (stamp_s or 0.0), rtol=1e-12, atol=1e-6)
+
+
+def test_points_without_return_do_not_hide_the_unit() -> None:
+    points = np.ones((6, 4), np.float32)
+    points[0, :3], points[1, 0] = 0.0, np.nan
+    times = np.array([0.0, 7.0, 1.7e9, 1.7e9 + 0.05, 1.7e9 + 0.1, np.nan])
+    found = point_times({"timestamp": times}, points, 5.0)
+    np.testing.assert_array_equal(found, times)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {},
+        {"ring": np.arange(5)},
+        {"t": np.zeros(5)},
+        {"time": np.full(5, np.nan)},
+        {"time": np.array([0, 0, 0, 0, 1e-12])},
+        {"timestamp": np.full(5, 1.7e9, np.float32)},
+        {"t": np.array([0, 1, 2, 3, 3e12])},
+    ],
+)
+def test_fields_that_are_no_times_give_none(fields: dict[str, NDArray[Any]]) -> None:
+    assert point_times(fields, np.ones((5, 4), np.float32), 1.0) is None
+    assert point_times({name: values[:0] for name, values in fields.items()}, np.ones((0, 4), np.float32), 1.0) is None
+
+
+def test_the_best_known_field_counts() -> None:
+    assert time_name(["x", "time_offset", "timestamp", "t"]) == "t"
+    assert time_name(["x", "ring"]) is None
+
+
+# --- scan files ------------------------------------------------------------------------------------------------------
+
+TABLE = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")]
+
+
+def table(times: NDArray[Any], points: NDArray[np.float64], name: str, kind: str) -> NDArray[Any]:
+    rows = np.zeros(len(points), [*TABLE, (name, kind)])
+    for k, (axis, _) in enumerate(TABLE):
+        rows[axis] = points[:, k]
+    rows[name] = times
+    return rows
+
+
+def write_pcd(path: Path, rows: NDArray[Any], encoding: str) -> Path:
+    kinds = [rows.dtype[name] for name in rows.dtype.names or ()]
+    header = (
+        f"VERSION 0.7\nFIELDS {' '.join(rows.dtype.names or ())}\nSIZE {' '.join(str(k.itemsize) for k in kinds)}\n"
+        f"TYPE {' '.join(k.kind.upper() for k in kinds)}\nCOUNT{' 1' * len(kinds)}\nWIDTH {len(rows)}\nHEIGHT 1\n"
+        f"POINTS {len(rows)}\nDATA {encoding}\n"
+    )
+    text = "\n".join(" ".join(repr(value.item()) for value in row) for row in rows) + "\n"
+    path.write_bytes(header.encode() + (text.encode() if encoding == "ascii" else rows.tobytes()))
+    return path
+
+
+def write_ply(path: Path, rows: NDArray[Any]) -> Path:
+    kinds = {"f4": "float", "f8": "double", "u4": "uint"}
+    properties = [f"property {kinds[rows.dtype[name].str[1:]]} {name}" for name in rows.dtype.names or ()]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *properties, "end_header", ""]
+    path.write_bytes("\n".join(header).encode() + rows.tobytes())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "count"),
+    [("t", "<u4", 1e9), ("time", "<f4", 1.0), ("timestamp", "<f8", 1.0), ("Time", "<f8", 1e3)],
+)
+@pytest.mark.parametrize("suffix", ["ascii.pcd", "binary.pcd", "ply", "npy"])
+def test_scan_files(tmp_path: Path, name: str, kind: str, count: float, suffix: str) -> None:
+    points, times = turn(0.1)
+    rows = table(np.round(times * count, 6), points, name, kind)
+    path = tmp_path / f"scan.{suffix}"
+    if suffix == "npy":
+        np.save(path, rows)
+    elif suffix == "ply":
+        write_ply(path, rows)
+    else:
+        write_pcd(path, rows, suffix.partition(".")[0])
+    (found,) = list(read_timed_scans(path))
+    assert found.stamp_s is None
+    np.testing.assert_array_equal(found.points, points.astype(np.float32))
+    np.testing.assert_array_equal(edgeperc.read_points(path), found.points)
+    np.testing.assert_allclose(found.times_s, times, atol=1e-6)
+    check_straight(found, 0.1, 1e-3)
+
+
+def test_files_without_times(tmp_path: Path) -> None:
+    points = turn(0.1)[0].astype(np.float32)
+    points.tofile(tmp_path / "a.bin")
+    np.save(tmp_path / "b.npy", points)
+    write_pcd(tmp_path / "c.pcd", table(np.zeros(len(points)), points.astype(float), "ring", "<u4"), "binary")
+    scans = list(read_timed_scans(tmp_path))
+    assert [scan.times_s for scan in scans] == [None] * 3
+    for scan in scans:
+        np.testing.assert_array_equal(scan.points, points)
+
+
+# --- bags ------------------------------------------------------------------------------------------------------------
+
+
+def write_bag(path: Path, scans: Sequence[tuple[float, NDArray[Any]]]) -> Path:
+    """A ROS 1 bag of clouds with these stamps."""
+    typesys, rosbag1 = pytest.importorskip("rosbags.typesys"), pytest.importorskip("rosbags.rosbag1")
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    codes = {"f4": 7, "f8": 8, "u4": 6}
+    with rosbag1.Writer(path) as bag:
+        connection = bag.add_connection("/points", "sensor_msgs/msg/PointCloud2", typestore=store)
+        for k, (stamp_s, rows) in enumerate(scans):
+            stamp = store.types["builtin_interfaces/msg/Time"](int(stamp_s), round(stamp_s % 1 * 1e9))
+            names = rows.dtype.names or ()
+            message = store.types["sensor_msgs/msg/PointCloud2"](
+                store.types["std_msgs/msg/Header"](k, stamp, "lidar"),
+                1,
+                len(rows),
+                [
+                    store.types["sensor_msgs/msg/PointField"](
+                        n, rows.dtype.fields[n][1], codes[rows.dtype[n].str[1:]], 1
+                    )
+                    for n in names
+                ],
+                False,
+                rows.dtype.itemsize,
+                rows.nbytes,
+                np.frombuffer(rows.tobytes(), np.uint8),
+                True,
+            )
+            kind = "sensor_msgs/msg/PointCloud2"
+            bag.write(connection, round(stamp_s * 1e9), store.serialize_ros1(message, kind))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "stored"),
+    [
+        ("t", "<u4", lambda times, stamp_s: np.round((times - stamp_s) * 1e9)),
+        ("time", "<f4", lambda times, stamp_s: times - stamp_s),
+        ("timestamp", "<f8", lambda times, stamp_s: times),
+        ("timestamp", "<f8", lambda times, stamp_s: times * 1e9),
+        ("offset_time", "<u4", lambda times, stamp_s: np.round((times - stamp_s) * 1e9)),
+    ],
+    ids=["ouster", "velodyne", "hesai", "livox", "livox offsets"],
+)
+def test_bags(tmp_path: Path, name: str, kind: str, stored: Callable[[Any, float], Any]) -> None:
+    """The stamp is that of the scan's beginning, as drivers set it."""
+    ends = [1700.0, 1700.1]
+    turns = [turn(end) for end in ends]
+    stamps = [float(times[0]) for _, times in turns]
+    path = write_bag(
+        tmp_path / "drive.bag",
+        [(s, table(stored(times, s), points, name, kind)) for s, (points, times) in zip(stamps, turns, strict=True)],
+    )
+    found = list(read_timed_scans(path))
+    assert [scan.stamp_s for scan in found] == pytest.approx(stamps)
+    for scan, end, (_, times) in zip(found, ends, turns, strict=True):
+        np.testing.assert_allclose(scan.times_s, times, atol=1e-6)
+        check_straight(scan, end, 1e-3)
+    for timed, (stamp_s, points) in zip(found, edgeperc.read_scans(path), strict=True):
+        assert stamp_s == timed.stamp_s
+        np.testing.assert_array_equal(points, timed.points)
+
+
+# --- packets ---------------------------------------------------------------------------------------------------------
+
+VLP16_FIRING_S, VLP16_LASER_S, VLP16_START_S = 55.296e-6, 2.304e-6, 1.0
+VLP16_DEG = np.array([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15])
+
+
+def moving_vlp16(at_s: float, n_packets: int = 75) -> list[bytes]:
+    """Packets of a VLP-16 that moves in the room: a turn of 0.0995 s and 10 Hz."""
+    packets = []
+    for k in range(n_packets):
+        stamp_us = round(1e6 * VLP16_START_S) + 1327 * k
+        block, firing, laser = np.meshgrid(np.arange(12), np.arange(2), np.arange(16), indexing="ij")
+        since_s = (2 * block + firing) * VLP16_FIRING_S + laser * VLP16_LASER_S
+        times = stamp_us * 1e-6 + since_s
+        azimuth = np.radians(-(12 * k * 0.4 + since_s / VLP16_FIRING_S * 0.2))
+        elevation = np.radians(VLP16_DEG[laser])
+        directions = np.stack(
+            [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], axis=-1
+        )
+        ranges = seen_from(times.ravel(), at_s, directions.reshape(-1, 3)).reshape(12, 32)
+        body = b""
+        for b in range(12):
+            body += b"\xff\xee" + struct.pack("<H", (12 * k + b) * 40 % 36000)
+            body += b"".join(struct.pack("<HB", round(r / 0.002), 77) for r in ranges[b])
+        packets.append(body + struct.pack("<IBB", stamp_us, 0x37, 0x22))
+    return packets
+
+
+def test_a_velodyne_that_moves(tmp_path: Path) -> None:
+    pytest.importorskip("velodyne_decoder")
+    at_s = VLP16_START_S + 0.05
+    scans = list(read_timed_scans(write_pcap(tmp_path / "vlp16.pcap", moving_vlp16(at_s))))
+    first = scans[0]
+    assert first.stamp_s == pytest.approx(VLP16_START_S + 0.0995, abs=0.002)
+    assert first.times_s is not None
+    assert first.times_s[0] == pytest.approx(VLP16_START_S, abs=1e-5)
+    assert first.times_s[-1] == pytest.approx(first.stamp_s, abs=0.002)
+    check_straight(first, at_s, 0.1)  # the lasers sit some centimeters off the origin
+
+
+@pytest.mark.parametrize("name", ["room.pcap", "room.osf"])
+def test_an_ouster_that_moves(tmp_path: Path, name: str) -> None:
+    core, pcap = pytest.importorskip("ouster.sdk.core"), pytest.importorskip("ouster.sdk.pcap")
+    osf = pytest.importorskip("ouster.sdk.osf")
+    info = core.SensorInfo.from_default(core.LidarMode._512x10)
+    info.sn = 991
+    info.format.udp_profile_lidar = core.UDPProfileLidar.RNG19_RFL8_SIG16_NIR16
+    info.config.udp_port_lidar, info.config.udp_port_imu = 7502, 7503
+    frame = core.LidarFrame(info)
+    frame.frame_id = 1
+    columns_ns = 5 * 10**9 + np.arange(512) * 195_312
+    frame.timestamp[:], frame.measurement_id[:] = columns_ns, np.arange(512)
+    frame.packet_timestamp[:], frame.status[:] = 10**18, 1
+    lut = core.XYZLut(info, False)
+    near, far = (lut(np.full((64, 512), mm, np.uint32)).reshape(-1, 3) for mm in (10_000, 20_000))
+    at_s = 5.05
+    times = np.broadcast_to(columns_ns * 1e-9, (64, 512)).ravel()
+    # At range r [mm] a point lies at near + (r - 10,000) * step.
+    step = (far - near) / 10_000
+    ranges = seen_from(times, at_s, step, near - 10_000 * step)
+    frame.field("RANGE")[:] = np.round(ranges).reshape(64, 512)
+    frame.field("RANGE")[:, 1::7] = 0
+    path = tmp_path / name
+    if path.suffix == ".osf":
+        with osf.Writer(str(path), info) as writer:
+            writer.save(0, frame)
+    else:
+        packets = core.frame_to_packets(frame, core.PacketFormat(info), info.init_id, info.sn)
+        pcap.record(packets, str(path))
+        path.with_suffix(".json").write_text(info.to_json_string())
+    (found,) = list(read_timed_scans(path))
+    assert found.times_s is not None
+    assert found.stamp_s == found.times_s.max()
+    assert len(found.points) == 64 * (512 - 73)
+    check_straight(found, at_s, 0.01)
+
+
+@pytest.mark.parametrize("name", ["velodyne/sample_velodyne_hdl32.pcap", "ouster/OS-1-64_1024x10_fw20.pcap"])
+def test_real_captures(data_root: Callable[[str], Path], name: str) -> None:
+    path = data_root("other_sensors") / name
+    pytest.importorskip("velodyne_decoder" if name.startswith("velodyne") else "ouster.sdk.pcap")
+    scan = next(iter(read_timed_scans(path)))
+    assert scan.times_s is not None
+    assert scan.stamp_s is not None
+    assert 0.01 < np.ptp(scan.times_s) < 0.12
+    assert scan.times_s.max() == pytest.approx(scan.stamp_s, abs=0.001)
