@@ -119,6 +119,11 @@ def roads(server: LabelServer, name: str) -> list[list[list[float]]]:
     return polygons
 
 
+def states(server: LabelServer) -> dict[str, str]:
+    """State of each scene with polygons."""
+    return {scene["name"]: scene["state"] for scene in ask(server, "scenes").json if scene["state"]}
+
+
 # --- what it saves ---------------------------------------------------------------------------------------------------
 
 
@@ -134,7 +139,7 @@ def test_the_page_saves_drawn_polygons(server: LabelServer, out: Path) -> None:
     assert roads(server, "000004") == [[[0, 0], [200, 0], [100, 400]]]  # clamped to the image
     saved = read_coco([server.polygons])
     np.testing.assert_array_equal(mask_of(saved["000003"]), mask_of([[np.ravel(TRAPEZIUM).tolist()]]))
-    assert [scene["name"] for scene in ask(server, "scenes").json if scene["drawn"]] == ["000003", "000004"]
+    assert states(server) == {"000003": "drawn", "000004": "drawn"}
     assert ask(server, "road/000004", "[]").json == 0
     assert [*read_coco([server.polygons])] == ["000003"]
     (image,) = json.loads(server.polygons.read_text())["images"]
@@ -143,6 +148,36 @@ def test_the_page_saves_drawn_polygons(server: LabelServer, out: Path) -> None:
         assert again.roads == {"000003": [TRAPEZIUM]}
         assert again.server_address[0] == "127.0.0.1"
         assert again.token != server.token
+
+
+def test_a_draft_counts_as_drawn_only_after_it_is_confirmed(server: LabelServer, out: Path) -> None:
+    for name in ("000002", "000003"):
+        assert ask(server, f"draft/{name}", ROAD).json == 1
+    assert states(server) == {"000002": "draft", "000003": "draft"}
+    assert roads(server, "000003") == [TRAPEZIUM]
+    assert read_coco([server.polygons]) == {}  # nothing for training
+    with LabelServer(out, server.polygons) as again:  # drafts outlive the server
+        assert (again.roads, again.drafts) == ({}, {"000002": [TRAPEZIUM], "000003": [TRAPEZIUM]})
+    assert ask(server, "road/000003", ROAD).json == 1  # confirmed
+    assert states(server) == {"000002": "draft", "000003": "drawn"}
+    assert [*read_coco([server.polygons])] == ["000003"]
+    assert ask(server, "draft/000003", ROAD).json == 1  # a draft was added to it: to be checked again
+    assert read_coco([server.polygons]) == {}
+    for name in ("000002", "000003"):
+        assert ask(server, f"draft/{name}", "[]").json == 0
+    assert states(server) == {}
+    assert "drafts" not in json.loads(server.polygons.read_text())
+
+
+@pytest.mark.parametrize(
+    "drafts", [[], "x", {"000001": 3}, {"000001": [[1, 2]]}, {"000001": [[[1, 2], [3, 4], ["x", 1]]]}]
+)
+def test_malformed_drafts_of_a_file_are_refused(server: LabelServer, out: Path, drafts: Any) -> None:
+    ask(server, "road/000003", ROAD)
+    content = json.loads(server.polygons.read_text())
+    server.polygons.write_text(json.dumps(content | {"drafts": drafts}))
+    with pytest.raises(DatabaseError, match="drafts that are no polygons"):
+        LabelServer(out, server.polygons)
 
 
 def test_run_lengths_cannot_be_edited(out: Path, tmp_path: Path) -> None:
@@ -214,6 +249,8 @@ def test_both_names_of_this_computer_are_accepted(server: LabelServer) -> None:
     for host in (f"127.0.0.1:{port}", f"localhost:{port}", f"LocalHost:{port}"):
         assert ask(server, "", Host=host).status == 200
         assert ask(server, "road/000001", ROAD, Host=host, Origin=f"http://{host.lower()}").status == 200
+    for host, other in (("127.0.0.1", "localhost"), ("localhost", "127.0.0.1")):  # something between may change Host
+        assert ask(server, "road/000001", ROAD, Host=f"{host}:{port}", Origin=f"http://{other}:{port}").status == 200
     two = f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\nHost: evil.example\r\n\r\n"
     assert raw(server, two.encode()).status == 403
 
@@ -228,7 +265,8 @@ def test_both_names_of_this_computer_are_accepted(server: LabelServer) -> None:
         {"Origin": None},
         {"Origin": "null"},
         {"Origin": "http://evil.example"},
-        {"Origin": "http://localhost:{port}"},  # the page was opened under the other name, so this is not it
+        {"Origin": "http://localhost"},
+        {"Origin": "http://localhost:1"},
         {"Origin": "https://127.0.0.1:{port}"},
         {"Sec-Fetch-Site": "cross-site"},
         {"Sec-Fetch-Site": "same-site"},
@@ -558,12 +596,22 @@ def test_drawing_undoing_saving_and_reloading_in_a_browser(server: LabelServer, 
     page.keyboard.press("f")
     page.keyboard.press("d")
     page.wait_for_function(
-        "() => polygons.length > 1 && /Saved 000000: [2-9]/.test(document.getElementById('saved').textContent)"
+        "() => polygons.length > 1 && /the draft of 000000: [2-9]/.test(document.getElementById('saved').textContent)"
     )
     assert len(saved()) > 1
+    assert states(server) == {"000000": "draft"}
+    assert read_coco([server.polygons]) == {}
+    page.wait_for_selector("#review:visible")
     look("5-draft")
-    page.click("#undo")
+    page.keyboard.press("c")
+    page.wait_for_function("() => /Saved 000000: [2-9]/.test(document.getElementById('saved').textContent)")
+    assert states(server) == {"000000": "drawn"}
+    page.wait_for_selector("#review", state="hidden")
+    page.click("#undo")  # the confirmation
+    page.wait_for_selector("#review:visible")
+    page.click("#undo")  # the draft
     wait_saved(1)
+    assert states(server) == {"000000": "drawn"}
 
     # Dragging the middle of a selected polygon's edge adds a corner, which is then removed.
     page.mouse.click(*place(100, 300))
@@ -611,6 +659,19 @@ def test_drawing_undoing_saving_and_reloading_in_a_browser(server: LabelServer, 
     assert all(url.startswith((server.url, "data:")) for url in asked)
     (road,) = read_coco([server.polygons]).values()
     assert mask_of(road)[250, 100] == 1
+
+
+def test_the_page_works_by_the_name_localhost(server: LabelServer, browser: Any) -> None:
+    page = browser.new_page()
+    page.goto(server.url.replace("127.0.0.1", "localhost"))
+    page.wait_for_selector("body[data-scene='000000']")
+    page.keyboard.press("d")
+    page.wait_for_function("() => /^Saved the draft/.test(document.getElementById('saved').textContent)")
+    page.click("#confirm")
+    page.wait_for_function("() => /^Saved 000000/.test(document.getElementById('saved').textContent)")
+    assert page.text_content("#count") == "1 of 8 scenes drawn"
+    page.close()
+    assert states(server) == {"000000": "drawn"}
 
 
 class OtherSite(http.server.BaseHTTPRequestHandler):
@@ -706,4 +767,4 @@ def test_names_of_scenes_are_only_text(out: Path, tmp_path: Path, browser: Any) 
             page.keyboard.press("d")
             page.wait_for_function("() => /^(Saved|The model)/.test(document.getElementById('saved').textContent)")
         page.close()
-        assert {*hostile.values()} & {*server.roads}
+        assert {*hostile.values()} & {*server.drafts}

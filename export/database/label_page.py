@@ -1,9 +1,10 @@
 """A local web page to draw roads over a database's images (section 3.3).
 
 Only this computer can open the page, and the page loads nothing from the network. Each change is saved to the COCO
-file. Pages of other sites, which a browser on this computer may have open, can neither read nor write: a request must
-name this server as its host, and a write also needs the page's origin and its token. No site can show the page in a
-frame. Requests are limited in size, number and time.
+file. A model's draft counts as drawn only after it is confirmed: until then its polygons are in the file's ``drafts``,
+and no road of the scene is in the annotations. Pages of other sites, which a browser on this computer may have open,
+can neither read nor write: a request must name this server as its host, and a write also needs the page's origin and
+its token. No site can show the page in a frame. Requests are limited in size, number and time.
 """
 
 from __future__ import annotations
@@ -79,7 +80,9 @@ class LabelServer(ThreadingHTTPServer):
     token : str
         Random; every write has it in the header ``X-Edgeperc-Token``.
     hosts : set of str
-        The ``Host`` headers that are answered.
+        The ``Host`` headers that are answered: of 127.0.0.1 and of localhost.
+    roads, drafts : dict of str to list
+        Polygons of the drawn scenes, and of scenes with an unconfirmed draft. A scene is in one of them at most.
 
     Raises
     ------
@@ -96,7 +99,7 @@ class LabelServer(ThreadingHTTPServer):
         self.names = {*self.database.names}
         self.polygons, self.kitti = polygons, kitti
         self.lock = threading.Lock()
-        self.roads, scans = _polygons(polygons) if polygons.exists() else ({}, {})
+        self.roads, self.drafts, scans = _polygons(polygons) if polygons.exists() else ({}, {}, {})
         self.scans = scans | {row["scene"]: row["scan_sha256"] for row in self.database.rows}
         self.token = secrets.token_urlsafe(32)
         self.slots = threading.BoundedSemaphore(MOST_CONNECTIONS)
@@ -107,14 +110,21 @@ class LabelServer(ThreadingHTTPServer):
             f"{name}{end}" for name in ("127.0.0.1", "localhost") for end in (f":{taken}", "")[: 1 + (taken == 80)]
         }
 
-    def save(self, name: str, polygons: list[Any]) -> None:
-        """Set a scene's polygons and write the file."""
+    def save(self, name: str, polygons: list[Any], *, confirmed: bool) -> None:
+        """Set a scene's polygons, drawn or a draft, and write the file."""
         with self.lock:
-            roads = {known: of for known, of in self.roads.items() if known != name}
+            roads, drafts = ({k: v for k, v in known.items() if k != name} for known in (self.roads, self.drafts))
             if polygons:
-                roads[name] = polygons
-            write_atomic(self.polygons, write_coco(roads, self.scans).encode())
-            self.roads = roads
+                (roads if confirmed else drafts)[name] = polygons
+            content = json.loads(write_coco(roads, self.scans))
+            if drafts:
+                content["drafts"] = drafts
+            write_atomic(self.polygons, (json.dumps(content, indent=1) + "\n").encode())
+            self.roads, self.drafts = roads, drafts
+
+    def state(self, name: str) -> str:
+        """``"drawn"``, ``"draft"``, or ``""`` for a scene without polygons."""
+        return "drawn" if name in self.roads else "draft" if name in self.drafts else ""
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Answer in a thread; refuse the connection if too many are open."""
@@ -152,16 +162,21 @@ def _hang_up(connection: socket.socket) -> None:
         connection.shutdown(socket.SHUT_RDWR)
 
 
-def _polygons(path: Path) -> tuple[dict[str, list[Any]], dict[str, str]]:
-    """Scene -> polygons, and scene -> hash of its scan."""
+def _polygons(path: Path) -> tuple[dict[str, list[Any]], dict[str, list[Any]], dict[str, str]]:
+    """Scene -> polygons, scene -> polygons of its draft, and scene -> hash of its scan."""
     roads = {}
     for name, segmentations in read_coco([path]).items():
         if not all(isinstance(each, list) for each in segmentations):
             raise DatabaseError(f"{path} has run lengths for {name}; the page edits polygons only; give another file")
         rings = [ring for each in segmentations for ring in each]
         roads[name] = [[[float(x), float(y)] for x, y in zip(ring[::2], ring[1::2], strict=True)] for ring in rings]
-    images = json.loads(path.read_text())["images"]
-    return roads, {Path(image["file_name"]).stem: image["scan"] for image in images if "scan" in image}
+    content = json.loads(path.read_text())
+    scans = {Path(image["file_name"]).stem: image["scan"] for image in content["images"] if "scan" in image}
+    try:
+        drafts = {name: [_clamped_ring(ring) for ring in rings] for name, rings in content.get("drafts", {}).items()}
+    except (AttributeError, TypeError, _RefusedError) as exc:
+        raise DatabaseError(f"{path} has drafts that are no polygons ({exc}); expected them by scene") from exc
+    return roads, {name: rings for name, rings in drafts.items() if rings and name not in roads}, scans
 
 
 class _RefusedError(Exception):
@@ -201,7 +216,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(self._get)
 
     def do_PUT(self) -> None:
-        """Set the polygons of a scene: corners [x, y] in pixels of the image."""
+        """Set the polygons of a scene, ``road`` or an unconfirmed ``draft``: corners [x, y] in pixels of the image."""
         self._answer(self._put)
 
     def _answer(self, method: Callable[[str, str], None]) -> None:
@@ -239,7 +254,7 @@ class _Handler(BaseHTTPRequestHandler):
                         "title": printable(row["scene"]),
                         "drive": printable(row["drive"]),
                         "split": printable(row["split"]),
-                        "drawn": row["scene"] in server.roads,
+                        "state": server.state(row["scene"]),
                     }
                     for row in server.database.rows
                 ]
@@ -255,12 +270,12 @@ class _Handler(BaseHTTPRequestHandler):
             if what == "draft":
                 return self._send_json(draft(server.database.scene(name).map))
             if what == "road":
-                return self._send_json(server.roads.get(name, []))
+                return self._send_json(server.roads.get(name) or server.drafts.get(name, []))
         raise _RefusedError(HTTPStatus.NOT_FOUND, "there is no such thing here")
 
     def _put(self, what: str, name: str) -> None:
         body = self._body()  # read in any case: a connection closed with unread data may lose the answer
-        if self.headers.get("Origin") != f"http://{self.headers['Host']}".lower():
+        if self.headers.get("Origin") not in {f"http://{host}" for host in self.server.hosts}:
             raise _RefusedError(HTTPStatus.FORBIDDEN, "only the page of this server can write")
         if self.headers.get("Sec-Fetch-Site", "same-origin") != "same-origin":
             raise _RefusedError(HTTPStatus.FORBIDDEN, "another site asked for it")
@@ -268,10 +283,10 @@ class _Handler(BaseHTTPRequestHandler):
             raise _RefusedError(HTTPStatus.FORBIDDEN, "the page belongs to an earlier start of this server; reload it")
         if self.headers.get_content_type() != "application/json":
             raise _RefusedError(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "expected application/json")
-        if what != "road" or name not in self.server.names:
+        if what not in ("road", "draft") or name not in self.server.names:
             raise _RefusedError(HTTPStatus.NOT_FOUND, "there is no such scene")
         polygons = _clamped(body)
-        self.server.save(name, polygons)
+        self.server.save(name, polygons, confirmed=what == "road")
         self._send_json(len(polygons))
 
     def _body(self) -> bytes:
