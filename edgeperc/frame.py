@@ -18,7 +18,7 @@ from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .perception import Box
 from .points import read_only
 
-__all__ = ["ModelFrame", "fill_moved", "fill_turned", "turned"]
+__all__ = ["ModelFrame", "fill_moved", "fill_turned", "quaternion", "turned"]
 
 
 class ModelFrame:
@@ -68,6 +68,22 @@ def turned(points: NDArray[np.float32], angle_rad: float) -> NDArray[np.float32]
     result = np.empty(points.shape, np.float32)
     fill_turned(read_only(points), np.float32(math.cos(angle_rad)), np.float32(math.sin(angle_rad)), result)
     return read_only(result)
+
+
+def quaternion(R: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """x, y, z, w of a rotation matrix (3, 3); w >= 0."""
+    # Of these four rows, each the quaternion times four of its entries, the longest is the most exact.
+    rows = np.array(
+        [
+            [1 + R[0, 0] - R[1, 1] - R[2, 2], R[1, 0] + R[0, 1], R[2, 0] + R[0, 2], R[2, 1] - R[1, 2]],
+            [R[1, 0] + R[0, 1], 1 - R[0, 0] + R[1, 1] - R[2, 2], R[2, 1] + R[1, 2], R[0, 2] - R[2, 0]],
+            [R[2, 0] + R[0, 2], R[2, 1] + R[1, 2], 1 - R[0, 0] - R[1, 1] + R[2, 2], R[1, 0] - R[0, 1]],
+            [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1 + R[0, 0] + R[1, 1] + R[2, 2]],
+        ]
+    )
+    row = rows[np.argmax(np.diag(rows))]
+    x, y, z, w = (math.copysign(1.0, row[3]) * row / np.linalg.norm(row)).tolist()
+    return x, y, z, w
 
 
 def _moved(boxes: Iterable[Box], R: NDArray[np.float64], t: NDArray[np.float64]) -> tuple[Box, ...]:

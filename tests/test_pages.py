@@ -111,7 +111,7 @@ def test_the_data_of_the_page_is_complete(tmp_path: Path) -> None:
     (data,) = [part.split("</script>")[0] for part in page.split('<script id="scene" type="application/json">')[1:]]
     names = [one["name"] for one in json.loads(data)["classes"]]
     assert set(map(printable, HOSTILE)) < set(names)
-    assert {box["name"] for box in json.loads(data)["boxes"]} <= set(names)
+    assert {box["name"] for box in json.loads(data)["scans"][0]["boxes"]} <= set(names)
 
 
 # Any character, lone surrogates too.

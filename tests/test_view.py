@@ -210,9 +210,10 @@ def test_html_holds_every_finite_point_and_no_address(scan: np.ndarray, percepti
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert not re.search(r"https?:|src=|@@", text)
     scene = json.loads(re.search(r'type="application/json">(.*?)</script>', text, re.DOTALL).group(1))
-    xyz = np.frombuffer(base64.b64decode(scene["xyz"]), dtype="<f4").reshape(-1, 3)
-    label = np.frombuffer(base64.b64decode(scene["label"]), dtype=np.uint8)
-    remission = np.frombuffer(base64.b64decode(scene["remission"]), dtype=np.uint8)
+    (shown,) = scene["scans"]
+    xyz = np.frombuffer(base64.b64decode(shown["xyz"]), dtype="<f4").reshape(-1, 3)
+    label = np.frombuffer(base64.b64decode(shown["label"]), dtype=np.uint8)
+    remission = np.frombuffer(base64.b64decode(shown["remission"]), dtype=np.uint8)
     np.testing.assert_array_equal(xyz, scan[:-1, :3])
     assert len(remission) == len(label) == len(xyz)
     assert remission.max() == 255
@@ -222,16 +223,16 @@ def test_html_holds_every_finite_point_and_no_address(scan: np.ndarray, percepti
     road = label == names.index("drivable")
     assert road.sum() > 100
     assert (np.abs(xyz[road, 1]) <= 4.01).all()
-    assert scene["ground"] == pytest.approx([-1.73, 0.0, 0.0], abs=0.01)
-    facts = {one["name"]: one["facts"] for one in scene["classes"]}
+    assert shown["ground"] == pytest.approx([-1.73, 0.0, 0.0], abs=0.01)
+    facts = {names[int(k)]: texts for k, texts in shown["facts"].items()}
     assert facts["drivable"] == [f"{perception.top_view.drivable_area_m2:.0f} m²"]
     assert facts["car"] == ["1 box", "600 points"]
     assert facts["van"] == ["1 box"]
     road_cells = np.zeros_like(perception.top_view.drivable)
-    for row, first, last in scene["road"]["strips"]:
+    for row, first, last in shown["road"]["strips"]:
         road_cells[row, first:last] = True
     np.testing.assert_array_equal(road_cells, perception.top_view.drivable)
-    corners = np.array(scene["boxes"][0]["corners"])
+    corners = np.array(shown["boxes"][0]["corners"])
     np.testing.assert_allclose(corners.mean(axis=0), CAR.center, atol=2e-3)
     assert np.ptp(corners[:, 2]) == pytest.approx(CAR.size[2], abs=2e-3)
 

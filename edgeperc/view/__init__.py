@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from .files import write_labels, write_ply
 from .mistakes import draw_mistakes
-from .page import write_html
+from .page import DrivePage, write_html
 from .painted import draw_painted
 from .picture import draw, draw_image
 from .tracks import draw_tracks, flatten_scan
 
 __all__ = [
+    "DrivePage",
     "draw",
     "draw_image",
     "draw_mistakes",

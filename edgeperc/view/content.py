@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,11 +15,16 @@ from ..frame import ModelFrame
 from ..image import as_image
 from ..mounting import MODEL_MOUNTING
 from ..perception import Box, ImageLabels, Perception
+from ..printable import printable
 from .colors import CLASS_COLORS
+
+if TYPE_CHECKING:
+    from ..tracking.tracks import Track
 
 __all__ = [
     "EDGES",
     "box_corners",
+    "box_text",
     "check_points",
     "class_facts",
     "drawable_boxes",
@@ -29,6 +35,7 @@ __all__ = [
     "perceived_image",
     "provider_lines",
     "timing_line",
+    "track_text",
 ]
 
 # Limits of what is drawn: no sensor reaches as far, and a drawing library may fail on huge coordinates.
@@ -162,6 +169,16 @@ def box_corners(box: Box) -> NDArray[np.float64]:
     """The eight corners, (8, 3) float64 [m]: the four of `Box.corners` at the bottom, then at the top."""
     z = box.center[2] + np.repeat([-0.5, 0.5], 4) * box.size[2]
     return np.column_stack([np.tile(box.corners(), (2, 1)), z])
+
+
+def box_text(box: Box) -> str:
+    """Label and score of a box."""
+    return f"{printable(box.label)} {box.score:.2f}"
+
+
+def track_text(track: Track) -> str:
+    """Id, label and speed of a track."""
+    return f"#{track.id} {printable(track.label)} {math.hypot(*track.velocity):.1f} m/s"
 
 
 def class_facts(perception: Perception) -> dict[str, list[str]]:

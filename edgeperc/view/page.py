@@ -1,4 +1,4 @@
-"""The 3-D page: one self-contained HTML file."""
+"""The 3-D page of a scan or of a drive: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -7,19 +7,23 @@ import hashlib
 import html
 import json
 import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import write_atomic
-from ..perception import Perception, TopView
+from ..frame import ModelFrame
+from ..perception import Box, Perception, TopView
 from ..printable import printable
 from .colors import HIGH, LOW, color_of
 from .content import (
     box_corners,
+    box_text,
     check_points,
     class_facts,
     drawable_boxes,
@@ -29,9 +33,19 @@ from .content import (
     paint_points,
     provider_lines,
     timing_line,
+    track_text,
 )
 
-__all__ = ["write_html"]
+if TYPE_CHECKING:
+    from ..tracking.tracks import Tracks
+
+__all__ = ["DrivePage", "write_html"]
+
+# Of a drive: a step of coordinates, the farthest one, the fewest points of a scan, and the steps in time.
+_STEP_M, _FARTHEST_M = 0.01, 320.0
+_FEWEST_POINTS = 3000
+_SHORTEST_S, _LONGEST_S = 0.001, 1.0
+_MOST_WARNINGS = 5
 
 
 def write_html(perception: Perception, points: NDArray[np.float32], path: str | Path, *, title: str = "") -> None:
@@ -56,23 +70,177 @@ def write_html(perception: Perception, points: NDArray[np.float32], path: str | 
         The file cannot be written.
     """
     check_points(points, perception)
-    perception, points = in_model_frame(perception, points)
+    classes: dict[str, int] = {}
+    scan, xyz, remission, label = _scan(perception, points, classes)
+    scan |= {"xyz": _base64(xyz), "remission": _base64(remission), "label": _base64(label)}
+    facts = f"{perception.n_points:,} points · {_escaped(timing_line(perception))}"
+    facts += "".join(f"<br>{_escaped(line)}" for line in provider_lines(perception))
+    _fill_page(path, title or "A scan", facts, perception.fitness, classes, [json.dumps(scan, allow_nan=False)], [0.0])
+
+
+class DrivePage:
+    """An interactive 3-D page that plays the scans of a drive: play and pause, a slider, speeds and single steps.
+
+    Scans are thinned. A page begins with 12,000 points of each scan, chosen at random with a preference for far points
+    and for points on objects. If the page grows beyond its limit, the points of every scan are halved, down to 3,000;
+    then every second scan is left out, as often as needed. Points are rounded to 1 cm; those farther than 320 m along
+    an axis are left out.
+
+    Parameters
+    ----------
+    title : str
+    max_bytes : int
+        Limit of the page's size, and about that of the memory that it takes until it is written.
+
+    Attributes
+    ----------
+    n_points : int
+        Points that are kept of a scan, at most.
+    every : int
+        1 if all scans are kept, 2 for every second one, and so on.
+    """
+
+    def __init__(self, *, title: str = "", max_bytes: int = 48 * 2**20) -> None:
+        self.n_points, self.every = 12_000, 1
+        self._title, self._max_bytes = title, max_bytes
+        self._n = self._n_bytes = 0
+        self._classes: dict[str, int] = {}
+        self._scans: list[_Thin] = []
+        self._fitness: dict[str, None] = {}
+
+    def __len__(self) -> int:
+        """Number of scans that are kept."""
+        return len(self._scans)
+
+    def add(
+        self,
+        perception: Perception,
+        points: NDArray[np.float32],
+        stamp_s: float,
+        tracks: Tracks | None = None,
+        *,
+        name: str = "",
+    ) -> None:
+        """Add the next scan of the drive.
+
+        Parameters
+        ----------
+        perception : Perception
+        points : (n, 4) float32
+            The scan that was perceived, as in `write_html`.
+        stamp_s : float
+            Its time [s]. A pause of more than a second is played as a second.
+        tracks : Tracks, optional
+            Those of the scan; their boxes, speeds and trails are shown.
+        name : str
+            The scan's name.
+
+        Raises
+        ------
+        PointsError
+            ``points`` is not the scan that was perceived.
+        """
+        check_points(points, perception)
+        self._n += 1
+        if (self._n - 1) % self.every:
+            return
+        for line in perception.fitness:
+            if len(self._fitness) < _MOST_WARNINGS:
+                self._fitness[line] = None
+        scan, xyz, remission, label = _scan(perception, points, self._classes, tracks)
+        names = [*self._classes]
+        near = (np.abs(xyz) < _FARTHEST_M).all(axis=1)
+        xyz, remission, label = xyz[near], remission[near], label[near]
+        chosen = _sample(xyz, label, names, self.n_points)
+        scan |= {"name": printable(name), "scale": _STEP_M}
+        text = json.dumps(scan, allow_nan=False)
+        cells = np.round(xyz[chosen] / _STEP_M).astype("<i2")
+        self._scans.append(_Thin(text, stamp_s, cells, remission[chosen], label[chosen]))
+        self._n_bytes += self._scans[-1].n_bytes
+        while self._n_bytes > self._max_bytes and (self.n_points > _FEWEST_POINTS or len(self._scans) > 1):
+            if self.n_points > _FEWEST_POINTS:
+                self.n_points //= 2
+                self._scans = [each.reduced(self.n_points) for each in self._scans]
+            else:
+                self.every *= 2
+                self._scans = self._scans[::2]
+            self._n_bytes = sum(each.n_bytes for each in self._scans)
+
+    def write(self, path: str | Path) -> None:
+        """Write the page.
+
+        Parameters
+        ----------
+        path : str or Path
+            An existing file is replaced atomically.
+
+        Raises
+        ------
+        OSError
+            The file cannot be written.
+        """
+        stamps = np.array([scan.stamp_s for scan in self._scans], np.float64)
+        steps = np.clip(np.nan_to_num(np.diff(stamps)), _SHORTEST_S, _LONGEST_S)
+        times = np.concatenate([np.zeros(min(1, len(stamps))), np.cumsum(steps)])
+        kept = f"every {self.every}. of {self._n:,}" if self.every > 1 else "all"
+        facts = f"{len(self._scans):,} scans ({kept}), thinned to {self.n_points:,} points"
+        texts = [scan.to_json() for scan in self._scans]
+        _fill_page(
+            path, self._title or "A drive", facts, [*self._fitness], self._classes, texts, times.round(3).tolist()
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Thin:
+    """A scan of a drive, its points in the order in which they are kept."""
+
+    text: str
+    stamp_s: float
+    xyz: NDArray[np.int16]
+    remission: NDArray[np.uint8]
+    label: NDArray[np.uint8]
+
+    @property
+    def n_bytes(self) -> int:
+        """Size on the page."""
+        return len(self.text) + 4 * (self.xyz.nbytes + 2 * len(self.xyz)) // 3 + 100
+
+    def reduced(self, n: int) -> _Thin:
+        """The first ``n`` points alone, as copies."""
+        return replace(self, xyz=self.xyz[:n].copy(), remission=self.remission[:n].copy(), label=self.label[:n].copy())
+
+    def to_json(self) -> str:
+        parts: dict[str, NDArray[Any]] = {"xyz": self.xyz, "remission": self.remission, "label": self.label}
+        return self.text[:-1] + "".join(f', "{key}": "{_base64(part)}"' for key, part in parts.items()) + "}"
+
+
+def _sample(xyz: NDArray[np.float32], label: NDArray[np.uint8], names: list[str], n: int) -> NDArray[np.intp]:
+    """Indices of at most ``n`` points, drawn without replacement; the first k of them are such a sample of k points."""
+    objects = np.array([name not in ("background", "drivable") for name in names])
+    # A scan is denser near the sensor, by about the square of the distance.
+    weights = np.clip(np.hypot(xyz[:, 0], xyz[:, 1]), 2.0, 40.0) * np.where(objects[label], 4.0, 1.0)
+    # Weighted random sampling with a reservoir (Efraimidis and Spirakis 2006): the smallest exponential times.
+    times = np.random.default_rng(0).exponential(size=len(xyz)) / weights
+    chosen = np.argpartition(times, n)[:n] if len(times) > n else np.arange(len(times))
+    return np.asarray(chosen[np.argsort(times[chosen], kind="stable")])
+
+
+def _scan(
+    perception: Perception, points: NDArray[np.float32], classes: dict[str, int], tracks: Tracks | None = None
+) -> tuple[dict[str, Any], NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]:
+    """What the page shows of a scan, and its points: x, y, z, remission and class; new classes get the next numbers."""
+    facts = class_facts(perception)
+    boxes, texts = _boxes(perception, tracks)
+    frame = ModelFrame(perception.mounting)
+    perception, points = in_model_frame(replace(perception, boxes=tuple(boxes)), points)
     names, painted = paint_points(points, perception)
     seen = drawable_points(points)
     points, painted = points[seen], painted[seen]
-    facts = class_facts(perception)
-    listed = [*names, *(name for name in facts if name not in names)]
+    for name in (*names, *facts, *(box.label for box in perception.boxes)):
+        classes.setdefault(name, len(classes))
     # Some sensors give remission up to 255 or 65535.
     remission = np.maximum(points[:, 3], 0.0) / max(1.0, float(points[:, 3].max(initial=0.0)))
-    scene = {
-        "xyz": _base64(points[:, :3].astype("<f4")),
-        "remission": _base64((remission * 255.0).astype(np.uint8)),
-        "label": _base64(painted),
-        "classes": [
-            {"name": printable(name), "color": color_of(name), "facts": facts.get(name, [])} for name in listed
-        ],
-        "low": LOW,
-        "high": HIGH,
+    scan: dict[str, Any] = {
         "ground": [round(value, 5) for value in fit_ground(points, names, painted)],
         "road": None if perception.top_view is None else _road(perception.top_view),
         "boxes": [
@@ -80,21 +248,57 @@ def write_html(perception: Perception, points: NDArray[np.float32], path: str | 
                 "name": printable(box.label),
                 "corners": np.round(box_corners(box), 3).tolist(),
                 "color": color_of(box.label),
-                "text": f"{printable(box.label)} {box.score:.2f}",
+                "text": text,
             }
-            for box in drawable_boxes(perception.boxes)
+            for box, text in zip(perception.boxes, texts, strict=True)
         ],
+        "facts": {classes[name]: texts for name, texts in facts.items() if texts},
     }
-    # A class name with "</script>" or "<!--" must not end the script element.
-    data = json.dumps(scene, allow_nan=False).replace("<", "\\u003c")
-    ran = "".join(f"<br>{_escaped(line)}" for line in provider_lines(perception))
+    if tracks is not None:
+        # A point p of the tracker's frame lies at pose @ (p, 1) in the frame of the models.
+        R, t = frame.R @ tracks.T_world_sensor[:3, :3].T, tracks.T_world_sensor[:3, 3]
+        scan["pose"] = np.column_stack([R, frame.t - R @ t]).round(5).tolist()
+        scan["tracks"] = [[track.id, *(round(v, 2) for v in track.world_box.center)] for track in tracks]
+    numbers = np.array([classes[name] for name in names], np.uint8)[painted]
+    return scan, points[:, :3].astype("<f4"), (remission * 255.0).astype(np.uint8), numbers
+
+
+def _boxes(perception: Perception, tracks: Tracks | None) -> tuple[list[Box], list[str]]:
+    """Drawable boxes with their texts: those of tracks in place of the boxes that belong to them."""
+    shown = {-1 - k: (box, box_text(box)) for k, box in enumerate(perception.boxes)}
+    for k, track in enumerate(tracks or ()):
+        assert tracks is not None
+        source = int(tracks.sources[k])
+        shown[-1 - source if source >= 0 else k] = track.box, track_text(track)
+    pairs = [(box, text) for box, text in shown.values() if drawable_boxes([box])]
+    return [box for box, _ in pairs], [text for _, text in pairs]
+
+
+def _fill_page(
+    path: str | Path,
+    title: str,
+    facts: str,
+    warnings: Sequence[str],
+    classes: Mapping[str, int],
+    scans: Sequence[str],
+    times_s: Sequence[float],
+) -> None:
+    """Write the page: ``facts`` as HTML, ``scans`` as JSON, everything else as it came."""
+    scene = {
+        "classes": [{"name": printable(name), "color": color_of(name)} for name in classes],
+        "low": LOW,
+        "high": HIGH,
+        "times": times_s,
+    }
+    data = f'{json.dumps(scene, allow_nan=False)[:-1]}, "scans": [{", ".join(scans)}]}}'
     template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
     filled = {
         "@@POLICY@@": _policy(template),
-        "@@TITLE@@": _escaped(title or "A scan"),
-        "@@FACTS@@": f"{perception.n_points:,} points · {_escaped(timing_line(perception))}{ran}",
-        "@@FITNESS@@": "".join(f"<p class=warning>{_escaped(line)}</p>" for line in perception.fitness),
-        "@@SCENE@@": data,
+        "@@TITLE@@": _escaped(title),
+        "@@FACTS@@": facts,
+        "@@FITNESS@@": "".join(f"<p class=warning>{_escaped(line)}</p>" for line in warnings),
+        # A class name with "</script>" or "<!--" must not end the script element.
+        "@@SCENE@@": data.replace("<", "\\u003c"),
     }
     # One pass, so that a title such as "@@SCENE@@" is not replaced.
     page = re.sub("|".join(filled), lambda match: filled[match.group()], template)

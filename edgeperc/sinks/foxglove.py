@@ -1,0 +1,444 @@
+"""A run in Foxglove's schemas: as an MCAP file, or live over a WebSocket server.
+
+Topics, all with the time of the scan:
+
+=============  ==================================================================================================
+``/points``    ``foxglove.PointCloud`` in ``lidar``: x, y, z, remission, red, green, blue, alpha, class; all points in
+               the scan's order. The channel's metadata names the classes.
+``/boxes``     ``foxglove.SceneUpdate`` in ``lidar``: a cube, its text and, if its front is known, an arrow for each
+               box. The entity of a tracked box is called ``track ID``.
+``/tracks``    ``foxglove.SceneUpdate`` in ``odom``: for each track its box as lines, its trail, its velocity as an
+               arrow and its text; the entity is called ``track ID``. Only with a tracker.
+``/drivable``  ``foxglove.Grid`` in ``base_link``: colors and class of every cell, and whether it is drivable.
+``/status``    JSON: numbers of points, boxes and tracks, stage times [ms], health, fitness, providers.
+``/tf``        ``foxglove.FrameTransforms``: ``base_link`` to ``lidar`` and, with a tracker, ``odom`` to ``base_link``.
+=============  ==================================================================================================
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..atomic import open_atomic
+from ..errors import OptionError
+from ..extras import require
+from ..frame import quaternion
+from ..mounting import MODEL_HEIGHT_M
+from ..perception import Box, TopView
+from ..printable import printable
+from ..view.content import box_text, track_text
+from . import PerceivedScan
+from .scene import (
+    BASE,
+    LIDAR,
+    ODOM,
+    Trails,
+    base_pose,
+    byte_colors,
+    checked_target,
+    colored_points,
+    nanoseconds,
+)
+
+__all__ = ["STATUS_SCHEMA", "McapSink", "ServeSink"]
+
+_POINT = np.dtype(
+    [(name, "<f4") for name in ("x", "y", "z", "remission")]
+    + [(name, "u1") for name in ("red", "green", "blue", "alpha", "class")]
+)
+_CELL = np.dtype([(name, "u1") for name in ("red", "green", "blue", "alpha", "class", "drivable")])
+_TYPES = {"<f4": "Float32", "|u1": "Uint8"}
+
+# Messages that wait for a slow viewer; then the oldest are dropped. A scan has at most 6 messages, up to 3 MB in all.
+_BACKLOG = 60
+
+# The edges of a box from -0.5 to 0.5, as pairs of corners.
+_CORNERS = np.array([[x, y, z] for z in (-0.5, 0.5) for x, y in ((0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5))])
+_EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
+
+STATUS_SCHEMA: dict[str, Any] = {
+    "title": "edgeperc.Status",
+    "type": "object",
+    "properties": {
+        "scan": {"type": "string"},
+        "sensor": {"type": "string"},
+        "health": {"type": "string"},
+        "n_points": {"type": "integer"},
+        "n_boxes": {"type": "integer"},
+        "n_tracks": {"type": "integer"},
+        "drivable_area_m2": {"type": "number"},
+        "total_ms": {"type": "number"},
+        "stage_ms": {"type": "object", "additionalProperties": {"type": "number"}},
+        "providers": {"type": "object", "additionalProperties": {"type": "string"}},
+        "fitness": {"type": "array", "items": {"type": "string"}},
+    },
+}
+"""JSON schema of ``/status``; a key without a value is left out."""
+
+
+class _Channels:
+    """The topics of one run, and the messages of a scan."""
+
+    def __init__(self, context: Any) -> None:
+        self._context = context
+        self._messages: Any = require("foxglove.messages", "foxglove", "Messages for Foxglove", package="foxglove-sdk")
+        self._channels: Any = require("foxglove.channels", "foxglove", "Messages for Foxglove", package="foxglove-sdk")
+        self._open: dict[str, Any] = {}
+        self._trails = Trails()
+
+    def _channel(self, kind: str, topic: str, metadata: dict[str, str] | None = None) -> Any:
+        if topic not in self._open:
+            make = getattr(self._channels, f"{kind}Channel")
+            self._open[topic] = make(topic, context=self._context, metadata=metadata)
+        return self._open[topic]
+
+    def write(self, scan: PerceivedScan) -> None:
+        """Log the messages of a scan."""
+        now = nanoseconds(scan)
+        stamp = self._messages.Timestamp(now // 10**9, now % 10**9)
+        self._write_frames(scan, now, stamp)
+        self._write_points(scan, now, stamp)
+        self._write_boxes(scan, now, stamp)
+        if scan.tracks is not None:
+            self._write_tracks(scan, now, stamp)
+        if scan.perception.top_view is not None:
+            self._write_drivable(scan.perception.top_view, now, stamp)
+        self._write_status(scan, now)
+
+    def _write_frames(self, scan: PerceivedScan, now: int, stamp: Any) -> None:
+        make = self._messages
+        R, t = base_pose(scan)
+        transforms = [(BASE, LIDAR, R, t)]
+        if scan.tracks is not None:
+            pose = scan.tracks.T_world_sensor
+            turned = pose[:3, :3] @ R.T
+            transforms.append((ODOM, BASE, turned, pose[:3, 3] - turned @ t))
+        made = []
+        for parent, child, rotation, translation in transforms:
+            x, y, z, w = quaternion(rotation)
+            made.append(
+                make.FrameTransform(
+                    timestamp=stamp,
+                    parent_frame_id=parent,
+                    child_frame_id=child,
+                    translation=self._vector(translation),
+                    rotation=make.Quaternion(x=x, y=y, z=z, w=w),
+                )
+            )
+        self._channel("FrameTransforms", "/tf").log(make.FrameTransforms(transforms=made), log_time=now)
+
+    def _write_points(self, scan: PerceivedScan, now: int, stamp: Any) -> None:
+        points, labels, classes, colors = colored_points(scan)
+        rows = np.empty(len(points), _POINT)
+        for k, name in enumerate(("x", "y", "z", "remission")):
+            rows[name] = points[:, k]
+        for k, name in enumerate(("red", "green", "blue")):
+            rows[name] = colors[:, k]
+        rows["alpha"], rows["class"] = 255, labels
+        names = json.dumps([printable(name) for name in classes])
+        message = self._messages.PointCloud(
+            timestamp=stamp,
+            frame_id=LIDAR,
+            pose=self._pose((0.0, 0.0, 0.0), 0.0),
+            point_stride=_POINT.itemsize,
+            fields=self._fields(_POINT),
+            data=rows.tobytes(),
+        )
+        self._channel("PointCloud", "/points", {"classes": names}).log(message, log_time=now)
+
+    def _write_boxes(self, scan: PerceivedScan, now: int, stamp: Any) -> None:
+        make, entities = self._messages, []
+        sources = {} if scan.tracks is None else dict(zip(scan.tracks.sources.tolist(), scan.tracks.ids, strict=True))
+        for k, box in enumerate(scan.perception.boxes):
+            pose, color = self._pose(box.center, box.yaw), self._color(box.label, 1.0)
+            cube = make.CubePrimitive(pose=pose, size=self._vector(box.size), color=self._color(box.label, 0.4))
+            arrows = [] if box.front is None else [self._arrow(pose, box.size[0] / 2.0 + 1.0, color)]
+            entity = make.SceneEntity(
+                timestamp=stamp,
+                frame_id=LIDAR,
+                id=f"track {sources[k]}" if k in sources else f"box {k}",
+                metadata=self._pairs(label=printable(box.label), score=f"{box.score:.4f}"),
+                cubes=[cube],
+                arrows=arrows,
+                texts=[self._text(box, box_text(box), color)],
+            )
+            entities.append(entity)
+        self._update("/boxes", entities, now, stamp)
+
+    def _write_tracks(self, scan: PerceivedScan, now: int, stamp: Any) -> None:
+        assert scan.tracks is not None
+        make, entities, trails = self._messages, [], self._trails.update(scan.tracks)
+        R = scan.tracks.T_world_sensor[:3, :3]
+        for track in scan.tracks:
+            box, color = track.world_box, self._color(track.label, 1.0)
+            dx, dy, _ = R @ [*track.velocity, 0.0]
+            speed = math.hypot(dx, dy)
+            cos, sin = math.cos(box.yaw), math.sin(box.yaw)
+            edges = (_CORNERS * box.size) @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]) + box.center
+            lines = [self._line("LineList", edges[_EDGES].reshape(-1, 3), color)]
+            lines.append(self._line("LineStrip", trails[track.id], color))
+            ahead = self._pose(box.center, math.atan2(dy, dx))
+            entity = make.SceneEntity(
+                timestamp=stamp,
+                frame_id=ODOM,
+                id=f"track {track.id}",
+                metadata=self._pairs(
+                    label=printable(track.label), score=f"{track.score:.4f}", coasting=str(track.coasting).lower()
+                ),
+                lines=lines,
+                arrows=[self._arrow(ahead, speed, color)] if speed > 0.5 else [],  # to where it is in a second
+                texts=[self._text(box, track_text(track), color)],
+            )
+            entities.append(entity)
+        self._update("/tracks", entities, now, stamp)
+
+    def _update(self, topic: str, entities: list[Any], now: int, stamp: Any) -> None:
+        # All older entities go, so that a viewer that missed a message shows no old box.
+        make = self._messages
+        gone = make.SceneEntityDeletion(timestamp=stamp, type=make.SceneEntityDeletionType.All)
+        self._channel("SceneUpdate", topic).log(make.SceneUpdate(deletions=[gone], entities=entities), log_time=now)
+
+    def _write_drivable(self, view: TopView, now: int, stamp: Any) -> None:
+        drivable = view.drivable
+        cells = np.zeros(view.labels.shape, _CELL)
+        colors = byte_colors(list(view.classes))[view.labels]
+        for k, name in enumerate(("red", "green", "blue")):
+            cells[name] = colors[..., k]
+        # Only the drivable cells are opaque. Foxglove's rows begin at the lowest x and y.
+        cells["alpha"], cells["class"], cells["drivable"] = np.where(drivable, 160, 0), view.labels, drivable
+        cells = np.ascontiguousarray(cells[::-1, ::-1].T)
+        message = self._messages.Grid(
+            timestamp=stamp,
+            frame_id=BASE,
+            pose=self._pose((view.x_range_m[0], view.y_range_m[0], -MODEL_HEIGHT_M), 0.0),
+            column_count=view.labels.shape[0],
+            cell_size=self._messages.Vector2(x=view.cell_m, y=view.cell_m),
+            row_stride=view.labels.shape[0] * _CELL.itemsize,
+            cell_stride=_CELL.itemsize,
+            fields=self._fields(_CELL),
+            data=cells.tobytes(),
+        )
+        names = json.dumps([printable(name) for name in view.classes])
+        self._channel("Grid", "/drivable", {"classes": names}).log(message, log_time=now)
+
+    def _write_status(self, scan: PerceivedScan, now: int) -> None:
+        if "/status" not in self._open:
+            sdk = require("foxglove", "foxglove", "Messages for Foxglove", package="foxglove-sdk")
+            self._open["/status"] = sdk.Channel("/status", schema=STATUS_SCHEMA, context=self._context)
+        perception = scan.perception
+        status: dict[str, Any] = {
+            "scan": printable(scan.name),
+            "sensor": printable(scan.sensor.name),
+            "health": scan.health,
+            "n_points": perception.n_points,
+            "n_boxes": len(perception.boxes),
+            "n_tracks": None if scan.tracks is None else len(scan.tracks),
+            "drivable_area_m2": None if perception.top_view is None else perception.top_view.drivable_area_m2,
+            "total_ms": sum(perception.stage_ms.values()),
+            "stage_ms": {printable(name): ms for name, ms in perception.stage_ms.items()},
+            "providers": {printable(name): printable(text) for name, text in perception.providers.items()},
+            "fitness": [printable(line) for line in perception.fitness],
+        }
+        known = {name: value for name, value in status.items() if value is not None}
+        self._open["/status"].log(known, log_time=now)
+
+    def _fields(self, dtype: np.dtype[Any]) -> list[Any]:
+        make, fields, offset = self._messages, [], 0
+        for name in dtype.names or ():
+            number = getattr(make.PackedElementFieldNumericType, _TYPES[dtype[name].str])
+            fields.append(make.PackedElementField(name=name, offset=offset, type=number))
+            offset += int(dtype[name].itemsize)
+        return fields
+
+    def _vector(self, values: Any) -> Any:
+        x, y, z = map(float, values)
+        return self._messages.Vector3(x=x, y=y, z=z)
+
+    def _pose(self, center: Any, yaw: float) -> Any:
+        turned = self._messages.Quaternion(z=math.sin(yaw / 2.0), w=math.cos(yaw / 2.0))
+        return self._messages.Pose(position=self._vector(center), orientation=turned)
+
+    def _color(self, label: str, alpha: float) -> Any:
+        r, g, b = (byte_colors([label])[0] / 255.0).tolist()
+        return self._messages.Color(r=r, g=g, b=b, a=alpha)
+
+    def _pairs(self, **texts: str) -> list[Any]:
+        return [self._messages.KeyValuePair(key=key, value=value) for key, value in texts.items()]
+
+    def _arrow(self, pose: Any, length: float, color: Any) -> Any:
+        return self._messages.ArrowPrimitive(
+            pose=pose, shaft_length=length, shaft_diameter=0.1, head_length=0.4, head_diameter=0.3, color=color
+        )
+
+    def _line(self, kind: str, corners: NDArray[np.float64], color: Any) -> Any:
+        make = self._messages
+        return make.LinePrimitive(
+            type=getattr(make.LinePrimitiveLineType, kind),
+            thickness=2.0,
+            scale_invariant=True,
+            points=[make.Point3(x=x, y=y, z=z) for x, y, z in corners.tolist()],
+            color=color,
+        )
+
+    def _text(self, box: Box, text: str, color: Any) -> Any:
+        x, y, z = box.center
+        top = self._pose((x, y, z + box.size[2] / 2.0 + 0.4), 0.0)
+        return self._messages.TextPrimitive(
+            pose=top, billboard=True, font_size=14.0, scale_invariant=True, color=color, text=text
+        )
+
+
+class McapSink:
+    """Writes a run to an MCAP file in Foxglove's schemas; the module's text lists the topics.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; it replaces an existing one when the sink is closed.
+
+    Raises
+    ------
+    MissingExtraError
+        foxglove-sdk is not installed.
+    OSError
+        The file cannot be written.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        require("foxglove.mcap", "foxglove", "Writing an MCAP file", package="foxglove-sdk")
+        self._path = checked_target(path)
+        self._open = ExitStack()
+        self._channels: _Channels | None = None
+
+    def _start(self) -> _Channels:
+        """Open the file: with the first scan, so that a run without answers replaces no file."""
+        sdk = require("foxglove", "foxglove", "Writing an MCAP file", package="foxglove-sdk")
+        mcap = require("foxglove.mcap", "foxglove", "Writing an MCAP file", package="foxglove-sdk")
+        self._file = _Kept(self._open.enter_context(open_atomic(self._path)))
+        # Of a scan of 113,000 points, zstd's level 1 takes 10 ms and its default 30 ms for the same size.
+        options = mcap.MCAPWriteOptions(compression_level=1, compression_threads=0)
+        context = sdk.Context()
+        self._writer = sdk.open_mcap(self._file, context=context, writer_options=options)
+        return _Channels(context)
+
+    def write(self, scan: PerceivedScan) -> None:
+        """Write one scan.
+
+        Raises
+        ------
+        PointsError
+            The points are not those that were perceived, or the scan's time is out of the range of MCAP.
+        OSError
+            The file cannot be written.
+        """
+        if self._channels is None:
+            self._channels = self._start()
+        self._file.check()
+        self._channels.write(scan)
+        self._file.check()
+
+    def close(self) -> None:
+        """Finish the file. A file that could not be written whole is removed, and the existing one stays.
+
+        Raises
+        ------
+        OSError
+            The file cannot be written.
+        """
+        with self._open:
+            if self._channels is not None:
+                self._writer.close()
+                self._file.check()
+
+
+class _Kept:
+    """A file that keeps its first error. The SDK only logs errors of a file, and a panic follows some."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self._error: OSError | None = None
+
+    def check(self) -> None:
+        """Raise the error, if there was one."""
+        if self._error is not None:
+            raise OSError(self._error.errno, self._error.strerror)
+
+    def write(self, data: bytes) -> int:
+        try:
+            if self._error is None:
+                self._file.write(data)
+        except OSError as exc:
+            self._error = exc
+        return len(data)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        return int(self._file.seek(offset, whence))
+
+    def flush(self) -> None:
+        try:
+            if self._error is None:
+                self._file.flush()
+        except OSError as exc:
+            self._error = exc
+
+
+class ServeSink:
+    """Streams a run to viewers over the WebSocket server of the SDK, with the topics of `McapSink`.
+
+    Viewers only receive. The connection is neither encrypted nor protected by a password: whoever reaches the port sees
+    the scans. A slow viewer misses messages; it neither delays the run nor takes more than some 30 MB of memory.
+
+    Parameters
+    ----------
+    host : str
+        Address to listen on; by default only programs on this computer can connect.
+    port : int
+        0 chooses a free one.
+
+    Attributes
+    ----------
+    url : str
+        Address for the viewer, ``"ws://HOST:PORT"``.
+
+    Raises
+    ------
+    MissingExtraError
+        foxglove-sdk is not installed.
+    OptionError
+        The address is not one of this computer, or the port is in use.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 8765) -> None:
+        sdk = require("foxglove", "foxglove", "Streaming to Foxglove", package="foxglove-sdk")
+        context = sdk.Context()
+        self._channels = _Channels(context)
+        try:
+            self._server = sdk.start_server(
+                name="edgeperc", host=host, port=port, context=context, message_backlog_size=_BACKLOG
+            )
+        except (RuntimeError, OverflowError) as exc:
+            raise OptionError(
+                f"cannot listen on {host}:{port} ({exc}); expected an address of this computer and a free port"
+            ) from exc
+        self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self._server.port}"
+
+    def write(self, scan: PerceivedScan) -> None:
+        """Send one scan to all viewers that are connected, without waiting for them.
+
+        Raises
+        ------
+        PointsError
+            The points are not those that were perceived, or the scan's time is negative or not finite.
+        """
+        self._channels.write(scan)
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._server.stop()

@@ -1,0 +1,188 @@
+"""A run as a recording of the Rerun viewer."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..atomic import open_atomic
+from ..extras import require
+from ..mounting import MODEL_HEIGHT_M
+from ..perception import Box, TopView
+from ..printable import printable
+from ..view.content import box_text, track_text
+from . import PerceivedScan
+from .scene import Trails, base_pose, byte_colors, checked_target, colored_points, nanoseconds
+
+__all__ = ["RerunSink"]
+
+# The SDK writes in a thread of its own and waits for ever if that has failed, so space is checked beforehand. A point
+# takes 20 bytes; the rest of a scan less than 8 MB.
+_POINT_BYTES, _ROOM_BYTES = 20, 8 * 2**20
+_PATIENCE_S = 60.0
+
+
+class RerunSink:
+    """Writes a run to a recording (.rrd) of the Rerun viewer: ``rerun OUT.rrd`` shows it.
+
+    The timeline ``stamp`` has the times of the scans. Entities:
+
+    ==========================  ====================================================================================
+    ``/world``                  classes with their colors
+    ``/world/lidar``            the sensor's pose: that of the tracker, or none
+    ``/world/lidar/points``     finite points, their remission, class and color
+    ``/world/lidar/boxes``      boxes with class and score
+    ``/world/lidar/drivable``   the drivable cells, as a mesh
+    ``/world/tracks``           boxes of the tracks with id, class and speed
+    ``/world/trails``           the way of each track so far
+    ``/status/STAGE``           processing time [ms] of each stage; ``/status/health`` is the health of a live answer
+    ==========================  ====================================================================================
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; it replaces an existing one when the sink is closed.
+
+    Raises
+    ------
+    MissingExtraError
+        rerun-sdk is not installed.
+    OSError
+        The file cannot be written.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._rr: Any = require("rerun", "rerun", "Writing a recording for Rerun", package="rerun-sdk")
+        self._path = checked_target(path)
+        self._open = ExitStack()
+        self._recording: Any = None
+        self._trails = Trails()
+        self._classes: dict[str, int] = {}
+        self._failed = False
+
+    def _start(self) -> None:
+        """Open the file: with the first scan, so that a run without answers replaces no file."""
+        file = self._open.enter_context(open_atomic(self._path))
+        self._recording = self._rr.RecordingStream("edgeperc")
+        self._recording.save(file.name)
+        self._recording.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    def write(self, scan: PerceivedScan) -> None:
+        """Write one scan.
+
+        Raises
+        ------
+        PointsError
+            The points are not those that were perceived, or the scan's time is out of the range of the viewer.
+        OSError
+            The file cannot be written.
+        """
+        points, labels, classes, colors = colored_points(scan)
+        stamp_ns = nanoseconds(scan)
+        if self._recording is None:
+            self._start()
+        self._check_room(len(points) * _POINT_BYTES)
+        rr, log = self._rr, self._recording.log
+        self._recording.set_time("stamp", duration=np.timedelta64(stamp_ns, "ns"))
+        view, tracks = scan.perception.top_view, scan.tracks
+        boxes = [*scan.perception.boxes, *(track.box for track in tracks or ())]
+        self._annotate([*classes, *(view.classes if view is not None else ()), *(box.label for box in boxes)])
+        shown = np.isfinite(points[:, :3]).all(axis=1)
+        ids = np.array([self._classes[name] for name in classes], np.uint16)[labels[shown]]
+        log("world/lidar/points", rr.Points3D(points[shown, :3], colors=colors[shown], class_ids=ids))
+        log("world/lidar/points", rr.AnyValues(remission=points[shown, 3]))
+        log("world/lidar/boxes", self._boxes(scan.perception.boxes, [box_text(box) for box in scan.perception.boxes]))
+        if view is not None:
+            log("world/lidar/drivable", self._drivable(view, *base_pose(scan)))
+        if tracks is not None:
+            pose = tracks.T_world_sensor
+            log("world/lidar", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+            trails = self._trails.update(tracks)
+            found = [track.world_box for track in tracks]
+            log("world/tracks", self._boxes(found, [track_text(track) for track in tracks]))
+            log(
+                "world/trails",
+                rr.LineStrips3D([trails[track.id] for track in tracks], class_ids=self._ids(found)),
+            )
+        for name, ms in scan.perception.stage_ms.items():
+            log(["status", printable(name)], rr.Scalars(ms))
+        if scan.health is not None:
+            level = {"OK": "INFO", "LATE": "WARN"}.get(scan.health, "ERROR")
+            log("status/health", rr.TextLog(scan.health, level=level))
+        self._flush()
+
+    def _annotate(self, names: list[str]) -> None:
+        """Number the classes in the order in which they come; static, so a new class is shown in earlier scans, too."""
+        known = len(self._classes)
+        for name in names:
+            self._classes.setdefault(name, len(self._classes))
+        if len(self._classes) > known:
+            colors = byte_colors(list(self._classes)).tolist()
+            context = [(k, printable(name), tuple(colors[k])) for name, k in self._classes.items()]
+            self._recording.log("world", self._rr.AnnotationContext(context), static=True)
+
+    def _ids(self, boxes: Any) -> NDArray[np.uint16]:
+        return np.array([self._classes[box.label] for box in boxes], np.uint16)
+
+    def _boxes(self, boxes: Any, texts: list[str]) -> Any:
+        found: list[Box] = list(boxes)
+        yaws = np.array([box.yaw for box in found]) / 2.0
+        turns = np.column_stack([np.zeros((len(found), 2)), np.sin(yaws), np.cos(yaws)])
+        return self._rr.Boxes3D(
+            centers=np.array([box.center for box in found]).reshape(-1, 3),
+            sizes=np.array([box.size for box in found]).reshape(-1, 3),
+            quaternions=turns,
+            class_ids=self._ids(found),
+            labels=texts,
+        )
+
+    def _drivable(self, view: TopView, R: NDArray[np.float64], t: NDArray[np.float64]) -> Any:
+        """Two triangles for each run of drivable cells along a row."""
+        padded = np.pad(view.drivable, ((0, 0), (1, 1))).astype(np.int8)
+        change = np.diff(padded, axis=1)
+        (row, first), (_, last) = np.nonzero(change == 1), np.nonzero(change == -1)
+        far, left = view.x_range_m[1] - view.cell_m * row, view.y_range_m[1] - view.cell_m * first
+        near, right = far - view.cell_m, view.y_range_m[1] - view.cell_m * last
+        x, y = np.stack([far, far, near, near], axis=1), np.stack([left, right, right, left], axis=1)
+        corners = np.stack([x, y, np.full(x.shape, -MODEL_HEIGHT_M)], axis=2).reshape(-1, 3)
+        triangles = 4 * np.arange(len(row))[:, None] + np.array([0, 2, 1, 0, 3, 2])
+        color = [*byte_colors(["drivable"])[0].tolist(), 160]
+        return self._rr.Mesh3D(
+            vertex_positions=((corners - t) @ R).astype(np.float32),
+            triangle_indices=triangles.reshape(-1, 3).astype(np.uint32),
+            albedo_factor=color,
+        )
+
+    def _check_room(self, n_bytes: int) -> None:
+        if self._failed:
+            raise OSError(errno.EIO, "an earlier scan could not be written to the recording")
+        if shutil.disk_usage(os.path.realpath(self._path.parent)).free < n_bytes + _ROOM_BYTES:
+            raise OSError(errno.ENOSPC, "the recording does not fit on the disk", str(self._path))
+
+    def _flush(self) -> None:
+        try:
+            self._recording.flush(timeout_sec=_PATIENCE_S)
+        except RuntimeError as exc:
+            self._failed = True
+            raise OSError(errno.EIO, f"the recording could not be written ({exc})") from exc
+
+    def close(self) -> None:
+        """Finish the file. A file that could not be written whole is removed, and the existing one stays.
+
+        Raises
+        ------
+        OSError
+            The file cannot be written.
+        """
+        with self._open:
+            if self._recording is not None:
+                self._check_room(0)
+                self._flush()
+                self._recording.disconnect()

@@ -1,0 +1,118 @@
+"""What viewers show of a perceived scan: colored points, texts, trails of tracks, and the frames between them.
+
+The frames have the names that ROS users expect: ``lidar`` is that of the scan, ``base_link`` that of the models (x
+forward, y left, the road at z = -1.73 m), and ``odom`` the fixed frame of the tracker.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PointsError
+from ..frame import ModelFrame
+from ..points import as_points
+from ..tracking.tracks import Tracks
+from ..view.colors import color_of, rgb
+from ..view.content import check_points, in_model_frame, paint_points
+from . import PerceivedScan
+
+__all__ = [
+    "BASE",
+    "LIDAR",
+    "ODOM",
+    "Trails",
+    "base_pose",
+    "byte_colors",
+    "checked_target",
+    "colored_points",
+    "nanoseconds",
+]
+
+BASE, LIDAR, ODOM = "base_link", "lidar", "odom"
+
+_TRAIL = 100  # scans
+
+
+def checked_target(path: str | os.PathLike[str]) -> Path:
+    """A file that a run will write; `FileNotFoundError` before the first scan if its folder is missing."""
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, "the file's folder is missing", str(target.parent))
+    return target
+
+
+def byte_colors(names: list[str]) -> NDArray[np.uint8]:
+    """Colors of classes, (n, 3) uint8 red, green, blue."""
+    return np.asarray((rgb([color_of(name) for name in names]) * 255.0).round().astype(np.uint8))
+
+
+def colored_points(
+    scan: PerceivedScan,
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], tuple[str, ...], NDArray[np.uint8]]:
+    """The points of a scan with their classes and colors.
+
+    Returns
+    -------
+    points : (n, 4) float32
+        x, y, z [m] in the sensor's frame, remission. All points of the scan, in its order, those that are not finite
+        too.
+    labels : (n,) uint8
+        Index into ``classes``; 0 if no model labels points.
+    classes : tuple of str
+    colors : (n, 3) uint8
+        Of the class; of the cell of the top view for a background point on the road.
+
+    Raises
+    ------
+    PointsError
+        The points are not those that were perceived.
+    """
+    points, perception = as_points(scan.points), scan.perception
+    check_points(points, perception)
+    found = perception.points
+    classes: tuple[str, ...] = ("background",) if found is None else found.classes
+    labels = np.zeros(len(points), np.uint8) if found is None else found.labels
+    names, painted = paint_points(in_model_frame(perception, points)[1], perception)
+    return points, labels, classes, byte_colors(names)[painted]
+
+
+def base_pose(scan: PerceivedScan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation (3, 3) and translation (3,) [m] of `LIDAR` in `BASE`."""
+    frame = ModelFrame(scan.perception.mounting)
+    return frame.R, frame.t
+
+
+class Trails:
+    """The way of each track so far: its centers in `ODOM`, of the last 100 scans."""
+
+    def __init__(self) -> None:
+        self._ways: dict[int, deque[tuple[float, float, float]]] = {}
+
+    def update(self, tracks: Tracks) -> dict[int, NDArray[np.float64]]:
+        """Add a scan's tracks; return the trail of each, (k, 3) float64 [m], oldest first. Others are forgotten."""
+        ways = {}
+        for track in tracks:
+            way = self._ways.get(track.id, deque(maxlen=_TRAIL))
+            way.append(track.world_box.center)
+            ways[track.id] = way
+        self._ways = ways
+        return {id_: np.array(way) for id_, way in ways.items()}
+
+
+def nanoseconds(scan: PerceivedScan) -> int:
+    """The time of a scan [ns], which viewers hold as an unsigned number.
+
+    Raises
+    ------
+    PointsError
+        It is not finite, negative, or 2^32 s (the year 2106) or more.
+    """
+    if not 0.0 <= scan.stamp_s < 2.0**32:
+        raise PointsError(f"the scan's time is {scan.stamp_s} s; a viewer needs one from 0 to 2^32 s")
+    return round(scan.stamp_s * 1e9)
