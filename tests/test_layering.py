@@ -65,9 +65,12 @@ FLOORS = {
         view.canvas view.content
         view.files view.mistakes view.page view.painted view.picture view.tracks
         view.__init__
+        ros2.__init__ ros2.graph ros2.messages
+        ros2.node ros2.rclpy_graph ros2.zenoh_graph sinks.rosbag
         cli.arguments cli.output
         cli.report cli.scans cli.sinks
         cli.completion cli.fit_sensor cli.info cli.program cli.run
+        cli.ros2
         cli.demo cli.eval cli.eval_painting cli.eval_sensors cli.eval_tracking cli.lists
         cli.main
         cli.__init__

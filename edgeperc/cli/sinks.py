@@ -14,6 +14,7 @@ __all__ = ["SINKS", "add_sinks", "open_sinks", "wanted_sinks"]
 SINKS: tuple[str, ...] = (
     "static",
     "labels_for",
+    "bag",
 )
 """Names of the options below as attributes of the arguments."""
 
@@ -39,6 +40,22 @@ def add_sinks(parser: argparse.ArgumentParser) -> None:
         help="write the boxes to --out as labels for an annotation tool; with --track with the ids of tracks. kitti "
         "takes the camera of --calib (a file, or a folder with one for each scan), or a nominal one",
     )
+    group.add_argument(
+        "--bag",
+        type=Path,
+        metavar="DIR",
+        help="write a ROS 2 bag, a folder that must not exist: points with classes, markers, grid, detections, "
+        "diagnostics (extra 'ros')",
+    )
+    group.add_argument(
+        "--bag-storage",
+        choices=("sqlite3", "mcap"),
+        default="sqlite3",
+        help="format of the file in --bag; mcap needs rosbags 0.10 (default: %(default)s)",
+    )
+    group.add_argument(
+        "--bag-frame", default="lidar", metavar="NAME", help="frame of the messages in --bag (default: %(default)s)"
+    )
 
 
 def wanted_sinks(arguments: argparse.Namespace) -> list[str]:
@@ -57,4 +74,8 @@ def open_sinks(arguments: argparse.Namespace) -> list[Sink]:
         from ..sinks.prelabels import PrelabelSink
 
         sinks.append(PrelabelSink(arguments.out, arguments.labels_for, calib=arguments.calib))
+    if arguments.bag is not None:
+        from ..sinks.rosbag import BagSink
+
+        sinks.append(BagSink(arguments.bag, storage=arguments.bag_storage, frame_id=arguments.bag_frame))
     return sinks

@@ -1,0 +1,199 @@
+"""``edgeperc ros2``: a live node, over Zenoh without a ROS installation, or by rclpy."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from .arguments import (
+    Commands,
+    add_adapt,
+    add_command,
+    add_model,
+    add_mounting,
+    add_network,
+    positive,
+    positive_number,
+)
+from .output import many, print_error, print_line
+from .run import make_perceiver
+from .scans import with_mounting
+
+if TYPE_CHECKING:
+    from ..perceiver import Perceiver
+    from ..ros2.graph import Graph
+
+__all__ = ["add_parser", "ros2_command"]
+
+
+def add_parser(commands: Commands) -> None:
+    """Add ``ros2``."""
+    parser = add_command(
+        commands,
+        "ros2",
+        ros2_command,
+        help="a live ROS 2 node, with or without a ROS installation",
+        description="Perceive the newest point cloud of a ROS 2 topic and publish classes of points, boxes, tracks and "
+        "the drivable grid, until it is stopped (Ctrl-C). Clouds that are damaged or cannot be perceived are reported "
+        "in /diagnostics and on stderr; the node goes on.\n\n"
+        "Without --rclpy it needs no ROS installation: it speaks Zenoh with the nodes of rmw_zenoh_cpp "
+        "(RMW_IMPLEMENTATION=rmw_zenoh_cpp), through their router.",
+        examples=[
+            "edgeperc ros2 --topic /points",
+            "edgeperc ros2 --topic /ouster/points --sensor os1-64 --connect tcp/192.168.1.10:7447",
+            "edgeperc ros2 --rclpy --topic /points --ros-args -r __ns:=/front",
+        ],
+    )
+    reading = parser.add_argument_group("input")
+    reading.add_argument(
+        "--topic", default="/points", metavar="NAME", help="topic of sensor_msgs/PointCloud2 (default: %(default)s)"
+    )
+    reading.add_argument(
+        "--sensor",
+        metavar="SENSOR",
+        help="the LiDAR: a name from 'edgeperc sensors', or a .json file written by 'edgeperc fit-sensor' (default: "
+        "the one that the first cloud names by its fields, frame, topic and rings)",
+    )
+    add_mounting(reading)
+    reading.add_argument(
+        "--rate",
+        type=positive_number,
+        default=10.0,
+        metavar="HZ",
+        help="scans per second of the sensor: an answer is late after two periods, stale after five (default: 10)",
+    )
+    reading.add_argument(
+        "--anyway",
+        action="store_true",
+        help="perceive scans that differ grossly from those that a model was trained on, too, with a warning (default: "
+        "refuse them)",
+    )
+    models = parser.add_argument_group("models")
+    add_model(models)
+    add_network(models)
+    add_adapt(models)
+    output = parser.add_argument_group("output")
+    output.add_argument(
+        "--prefix",
+        default="/edgeperc",
+        metavar="NAME",
+        help="publish NAME/points, NAME/markers, NAME/occupancy and NAME/detections (default: %(default)s)",
+    )
+    output.add_argument("--no-track", action="store_true", help="do not track the boxes from scan to scan")
+    output.add_argument("--frame", metavar="NAME", help="frame of the answers (default: that of the clouds)")
+    output.add_argument(
+        "--grid-frame",
+        metavar="NAME",
+        help="frame of the grid: level, on the road below the sensor, x forward (default: that of the answers, with "
+        "the pose of the ground in the grid's origin)",
+    )
+    graph = parser.add_argument_group("graph")
+    graph.add_argument("--name", default="edgeperc", metavar="NAME", help="name of the node (default: %(default)s)")
+    graph.add_argument("--namespace", default="/", metavar="NAME", help="namespace of the node (default: %(default)s)")
+    graph.add_argument(
+        "--domain", type=int, metavar="N", help="ROS domain (default: that of the variable ROS_DOMAIN_ID, or 0)"
+    )
+    graph.add_argument(
+        "--connect",
+        metavar="ENDPOINT",
+        help="Zenoh endpoint of a router or a peer (default: the configuration that the variable "
+        "ZENOH_SESSION_CONFIG_URI names, or tcp/localhost:7447)",
+    )
+    graph.add_argument("--rclpy", action="store_true", help="use rclpy of the sourced ROS installation, not Zenoh")
+    graph.add_argument(
+        "--ros-args",
+        nargs=argparse.REMAINDER,
+        default=[],
+        metavar="ARGUMENT",
+        help="with --rclpy, last: remappings, and parameters in place of the options above: topic, sensor, model, "
+        "frame, grid_frame, prefix, rate (such as -p sensor:=os1-64)",
+    )
+    graph.add_argument(
+        "--scans", type=positive, metavar="N", help="end after N perceived scans (default: when it is stopped)"
+    )
+
+
+def ros2_command(arguments: argparse.Namespace) -> int:
+    """Run the node until it is stopped."""
+    from ..ros2.node import PerceptionNode
+    from ..tracking.tracker import Tracker
+
+    graph = _open_graph(arguments)
+    try:
+        _take_parameters(graph, arguments)
+        perceiver = None if arguments.sensor is None else _perceiver(arguments, arguments.sensor)
+
+        def perceiver_for(cloud: Mapping[str, Any]) -> Perceiver:
+            from ..readers.identify import of_cloud
+
+            if perceiver is not None:
+                return perceiver
+            known = of_cloud(cloud)
+            print_line(f"{known.profile.name}, by {known.because}")
+            return _perceiver(arguments, known.profile)
+
+        node = PerceptionNode(
+            graph,
+            perceiver_for,
+            topic=arguments.topic,
+            tracker=None if arguments.no_track else Tracker(),
+            frame_id=arguments.frame,
+            grid_frame_id=arguments.grid_frame,
+            prefix=arguments.prefix,
+            rate_hz=arguments.rate,
+        )
+    except BaseException:
+        graph.close()
+        raise
+    print_line(f"{graph.name}: waiting for clouds on {arguments.topic}, publishing {arguments.prefix}/*")
+    n_answers, said = 0, ""
+    with node:
+        try:
+            for outcome in node:
+                if isinstance(outcome, Exception):
+                    if str(outcome) != said:  # the same of every cloud is printed once; the diagnostics repeat it
+                        print_error(f"{arguments.topic}: {outcome}")
+                    said = str(outcome)
+                    continue
+                said = ""
+                n_answers += 1
+                if n_answers == 1:
+                    print_line(f"perceiving: {many(outcome.perception.n_points, 'point')} in the first cloud")
+                if n_answers == arguments.scans:
+                    break
+        finally:
+            print_line(
+                f"{many(node.n_scans, 'cloud')}: {n_answers} perceived, {node.n_dropped} dropped for newer ones, "
+                f"{node.n_failed} failed"
+            )
+    return 0
+
+
+def _open_graph(arguments: argparse.Namespace) -> Graph:
+    names: dict[str, Any] = {"namespace": arguments.namespace, "domain": arguments.domain}
+    if arguments.rclpy:
+        from ..ros2.rclpy_graph import RclpyGraph
+
+        if arguments.connect is not None:
+            arguments.usage_error("--connect is of Zenoh; leave it out, or leave out --rclpy")
+        return RclpyGraph(arguments.name, ros_args=arguments.ros_args, **names)
+    from ..ros2.zenoh_graph import ZenohGraph
+
+    if arguments.ros_args:
+        arguments.usage_error("--ros-args is read by rclpy; add --rclpy, or pass the options of this command")
+    return ZenohGraph(arguments.name, connect=arguments.connect, **names)
+
+
+def _take_parameters(graph: Graph, arguments: argparse.Namespace) -> None:
+    """Let parameters of the node replace options; ROS has no None, so an option that was not passed is empty."""
+    for name in ("topic", "sensor", "frame", "grid_frame", "prefix"):
+        setattr(arguments, name, graph.parameter(name, getattr(arguments, name) or "") or None)
+    arguments.model = [*filter(None, graph.parameter("model", arguments.model or [""]))] or None
+    arguments.rate = graph.parameter("rate", arguments.rate)
+
+
+def _perceiver(arguments: argparse.Namespace, sensor: Any) -> Perceiver:
+    mounted = with_mounting(sensor, arguments)
+    mismatch: Any = "warn" if arguments.anyway else "refuse"
+    return make_perceiver(arguments, sensor=mounted, on_mismatch=mismatch, adapt=arguments.adapt)

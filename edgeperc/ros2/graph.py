@@ -1,0 +1,97 @@
+"""What a node needs of its middleware: names, qualities of service, and topics of CDR bytes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from ..errors import OptionError
+
+__all__ = ["RELIABLE", "SENSOR_DATA", "Graph", "Output", "Qos", "full_name"]
+
+
+@dataclass(frozen=True)
+class Qos:
+    """Quality of service: always volatile, and the last ``depth`` messages are kept.
+
+    Attributes
+    ----------
+    reliable : bool
+        False: best effort.
+    depth : int
+    """
+
+    reliable: bool
+    depth: int
+
+
+SENSOR_DATA = Qos(reliable=False, depth=5)
+"""ROS 2's profile for sensor data: it receives from reliable and from best-effort publishers."""
+RELIABLE = Qos(reliable=True, depth=10)
+"""ROS 2's default profile. Subscribers of sensor data receive from it, too; those of RViz receive from nothing else."""
+
+
+class Output(Protocol):
+    """A topic to publish on."""
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether there is a subscriber."""
+
+    def publish(self, data: bytes) -> None:
+        """Publish the CDR bytes of a message."""
+
+
+class Graph(Protocol):
+    """A node in a ROS graph; one for each middleware.
+
+    Attributes
+    ----------
+    name : str
+        Fully qualified name of the node.
+    """
+
+    name: str
+
+    def parameter(self, name: str, default: Any) -> Any:
+        """Declare a parameter that does not change later. Returns its value: the default, unless the user set it."""
+
+    def advertise(self, topic: str, message_type: str, qos: Qos) -> Output:
+        """Begin to publish on a topic."""
+
+    def subscribe(self, topic: str, message_type: str, receive: Callable[[bytes], None]) -> None:
+        """Call ``receive`` with the CDR bytes of each message, in a thread of the middleware, as sensor data."""
+
+    def close(self) -> None:
+        """Leave the graph."""
+
+
+def full_name(name: str, namespace: str = "/") -> str:
+    """Resolve the name of a topic or a node.
+
+    Parameters
+    ----------
+    name : str
+        Absolute (``"/points"``), or relative to the namespace.
+    namespace : str
+
+    Returns
+    -------
+    str
+        With a leading slash.
+
+    Raises
+    ------
+    OptionError
+        ROS does not allow the name.
+    """
+    full = name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"
+    full = full if full.startswith("/") else f"/{full}"
+    if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", full) or "__" in full:
+        raise OptionError(
+            f"{full!r} is no name of ROS 2; expected words of letters, digits and single underscores after slashes, "
+            "such as /lidar_top/points"
+        )
+    return full

@@ -1,0 +1,434 @@
+"""ROS 2 messages of a perceived scan, and their CDR bytes, by rosbags' definitions.
+
+Frames follow REP-103: x forward, y left, z up [m], angles counter-clockwise [rad]. Messages are in the frame of the
+scan, the one of the sensor. Only the grid can be in a frame of its own: see `RosMessages`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PointsError
+from ..extras import require
+from ..frame import ModelFrame
+from ..mounting import MODEL_HEIGHT_M
+from ..occupancy import OCCUPIED, occupancy_grid
+from ..points import as_points
+from ..view.colors import color_of, rgb
+
+if TYPE_CHECKING:
+    from ..perception import Box
+    from ..sinks import PerceivedScan
+
+__all__ = ["CLOUD", "OUTPUTS", "RosMessages", "nanoseconds"]
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+OUTPUTS: Mapping[str, str] = {
+    "points": CLOUD,
+    "markers": "visualization_msgs/msg/MarkerArray",
+    "occupancy": "nav_msgs/msg/OccupancyGrid",
+    "detections": "vision_msgs/msg/Detection3DArray",
+    "diagnostics": DIAGNOSTICS,
+}
+"""Methods of `RosMessages` that make a message of a scan, and the types of these messages."""
+
+# vision_msgs 4 (ROS 2 Humble and later), which rosbags does not have. The other definitions are rosbags' of ROS 2
+# Humble; their type hashes are the same from Iron to Lyrical.
+_VISION = {
+    "ObjectHypothesis": "string class_id\nfloat64 score\n",
+    "ObjectHypothesisWithPose": "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n",
+    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+    "Detection3D": "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\nstring id\n",
+    "Detection3DArray": "std_msgs/Header header\nDetection3D[] detections\n",
+}
+_POINT = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "label", "in_view"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "u1", "u1"],
+        "offsets": [0, 4, 8, 12, 16, 17],
+        "itemsize": 20,  # a multiple of 4, so that every float of the array is aligned
+    }
+)
+_FIELD_TYPES = {"f4": 7, "u1": 2}  # PointField.FLOAT32 and UINT8
+# Marker.type and Marker.action
+_ARROW, _CUBE, _LINE_LIST, _TEXT = 0, 1, 5, 9
+_ADD, _DELETE_ALL = 0, 3
+_LEVELS = {None: 0, "OK": 0, "LATE": 1, "STALE": 3}  # of DiagnosticStatus, by the health of an answer
+_MOVING_MPS = 0.5  # slower tracks get no arrow
+# The twelve edges of a box with corners at -0.5 and 0.5: pairs of corners that differ in one coordinate.
+_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_EDGES = np.array([[a, b] for a in range(8) for b in range(a) if (a ^ b).bit_count() == 1])
+
+
+def nanoseconds(stamp_s: float) -> int:
+    """A time [s] in whole nanoseconds; times of today are exact to 0.2 us in a float."""
+    return round(stamp_s * 1e9)
+
+
+class RosMessages:
+    """Makes messages of perceived scans, serializes them and reads clouds.
+
+    Parameters
+    ----------
+    frame_id : str
+        Frame of the scans.
+    grid_frame_id : str, optional
+        Frame of the occupancy grid: level, on the road below the sensor, x forward, such as a ``base_footprint`` that
+        lies there. By default the grid is in the frame of the scans, and its origin has the pose of the ground in it.
+        Tools that ignore the origin's orientation, such as nav2's static layer, need this frame if the sensor is
+        turned or tilted.
+    lifetime_s : float
+        Time after which a viewer removes markers that were not replaced [s].
+    cell_m : float
+        Edge of a cell of the grid [m].
+    off_road : int
+        Value of observed ground that is neither drivable nor an obstacle, as in `edgeperc.OccupancyGrid.values`.
+
+    Attributes
+    ----------
+    types : mapping
+        Classes of messages by name, e.g. ``"std_msgs/msg/Header"``.
+
+    Raises
+    ------
+    MissingExtraError
+        rosbags is not installed.
+    """
+
+    def __init__(
+        self,
+        frame_id: str = "lidar",
+        *,
+        grid_frame_id: str | None = None,
+        lifetime_s: float = 0.5,
+        cell_m: float = 0.2,
+        off_road: int = OCCUPIED,
+    ) -> None:
+        typesys = require("rosbags.typesys", "ros", "Making ROS 2 messages")
+        self.typestore: Any = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        for name, text in _VISION.items():
+            self.typestore.register(typesys.get_types_from_msg(text, f"vision_msgs/msg/{name}"))
+        self.types: Mapping[str, Any] = self.typestore.types
+        self.frame_id, self.grid_frame_id = frame_id, grid_frame_id
+        self._lifetime_s, self._cell_m, self._off_road = lifetime_s, cell_m, off_road
+
+    def type_hash(self, name: str) -> str:
+        """The hash of a type, ``RIHS01_`` and the SHA-256 of its description (REP-2016)."""
+        return str(self.typestore.hash_rihs01(name))
+
+    def encode(self, message: Any) -> bytes:
+        """Serialize a message as CDR, little endian, with its header of 4 bytes."""
+        return bytes(self.typestore.serialize_cdr(message, message.__msgtype__))
+
+    def decode(self, data: bytes, name: str) -> Any:
+        """Read a message of CDR bytes from elsewhere.
+
+        Raises
+        ------
+        PointsError
+            The bytes are no such message.
+        """
+        try:
+            return self.typestore.deserialize_cdr(data, name)
+        except Exception as exc:  # of rosbags, struct, numpy: whatever the bytes lead to
+            reason = " ".join(str(exc).split()) or type(exc).__name__
+            raise PointsError(f"got {len(data):,} bytes that are no {name} ({reason}); expected one in CDR") from exc
+
+    def points(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
+        """Every point of the scan with its class: a sensor_msgs/PointCloud2.
+
+        Fields are ``x``, ``y``, ``z``, ``intensity`` (the remission as it came; 0 without one), ``label`` (uint8, index
+        into the classes that `diagnostics` lists) and ``in_view`` (uint8, 0 where the label is no prediction).
+
+        Parameters
+        ----------
+        scan : PerceivedScan
+        stamp_ns : int, optional
+            Stamp of the header [ns], by default that of the scan.
+
+        Returns
+        -------
+        message
+        """
+        points, labels = as_points(scan.points), scan.perception.points
+        rows = np.zeros(len(points), _POINT)
+        for column, name in enumerate(("x", "y", "z", "intensity")):
+            rows[name] = points[:, column]
+        if labels is not None:
+            rows["label"], rows["in_view"] = labels.labels, labels.in_view
+        fields = [
+            self._make(
+                "sensor_msgs/msg/PointField",
+                name=name,
+                offset=int(_POINT.fields[name][1]),  # type: ignore[index]
+                datatype=_FIELD_TYPES[_POINT[name].str[1:]],
+                count=1,
+            )
+            for name in _POINT.names or ()
+        ]
+        return self._make(
+            CLOUD,
+            header=self._header(scan, stamp_ns),
+            height=1,
+            width=len(rows),
+            fields=fields,
+            is_bigendian=False,
+            point_step=_POINT.itemsize,
+            row_step=rows.nbytes,
+            data=rows.view(np.uint8),
+            is_dense=bool(np.isfinite(points[:, :3]).all()),
+        )
+
+    def markers(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
+        """Boxes and tracks for RViz: a visualization_msgs/MarkerArray.
+
+        The first marker deletes those of the scan before. Namespaces are ``boxes`` (cubes; ids count from 0),
+        ``tracks`` (edges of the box), ``track_labels`` (class, id, speed) and ``track_velocities`` (an arrow of the way
+        in one second); in the latter three, the id of a marker is that of its track.
+
+        Parameters
+        ----------
+        scan, stamp_ns
+            As in `points`.
+
+        Returns
+        -------
+        message
+        """
+        header = self._header(scan, stamp_ns)
+        markers = [self._marker(header, "", 0, _CUBE, action=_DELETE_ALL)]
+        for k, box in enumerate(scan.perception.boxes):
+            cube: dict[str, Any] = {"pose": self._pose(box), "scale": box.size, "color": (box.label, 0.4)}
+            markers.append(self._marker(header, "boxes", k, _CUBE, **cube))
+        for track in scan.tracks or ():
+            box, color = track.box, (track.label, 0.4 if track.coasting else 1.0)
+            number = track.id % 2**31
+            edges = (_CORNERS * box.size)[_EDGES].reshape(-1, 3)
+            thin: dict[str, Any] = {"scale": (0.08, 0.0, 0.0), "color": color}
+            markers.append(
+                self._marker(header, "tracks", number, _LINE_LIST, pose=self._pose(box), points=edges, **thin)
+            )
+            speed_mps = math.hypot(*track.velocity)
+            above = (*box.center[:2], box.center[2] + box.size[2] / 2.0 + 0.5)
+            text: dict[str, Any] = {"pose": self._pose(center=above), "scale": (0.0, 0.0, 0.6), "color": color}
+            text["text"] = f"{track.label} {track.id} {speed_mps:.1f} m/s"
+            markers.append(self._marker(header, "track_labels", number, _TEXT, **text))
+            if speed_mps > _MOVING_MPS:
+                way = np.array([box.center, np.add(box.center, [*track.velocity, 0.0])])
+                arrow: dict[str, Any] = {"scale": (0.15, 0.3, 0.3), "color": color, "points": way}
+                markers.append(self._marker(header, "track_velocities", number, _ARROW, **arrow))
+        return self._make("visualization_msgs/msg/MarkerArray", markers=markers)
+
+    def occupancy(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
+        """The grid of `edgeperc.occupancy_grid`: a nav_msgs/OccupancyGrid, 0 drivable, 100 obstacle, -1 unknown.
+
+        Parameters
+        ----------
+        scan, stamp_ns
+            As in `points`.
+
+        Returns
+        -------
+        message
+        """
+        grid = occupancy_grid(scan.perception, scan.points, cell_m=self._cell_m, sensor=scan.sensor)
+        fields = grid.to_occupancy_grid(off_road=self._off_road)
+        header = self._header(scan, stamp_ns, self.grid_frame_id)
+        corner = np.array([grid.x_range_m[0], grid.y_range_m[0], -MODEL_HEIGHT_M])
+        if self.grid_frame_id is None:
+            frame = ModelFrame(grid.mounting)
+            pose = self._pose(center=frame.R.T @ (corner - frame.t), quaternion=_quaternion(frame.R.T))
+        else:
+            pose = self._pose(center=(corner[0], corner[1], 0.0))
+        info = self._make(
+            "nav_msgs/msg/MapMetaData",
+            map_load_time=header.stamp,
+            resolution=fields["info"]["resolution"],
+            width=fields["info"]["width"],
+            height=fields["info"]["height"],
+            origin=pose,
+        )
+        return self._make("nav_msgs/msg/OccupancyGrid", header=header, info=info, data=fields["data"])
+
+    def detections(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
+        """Tracks or, without a tracker, boxes: a vision_msgs/Detection3DArray of vision_msgs 4.
+
+        The class is its name; the id is that of the track, empty without one.
+
+        Parameters
+        ----------
+        scan, stamp_ns
+            As in `points`.
+
+        Returns
+        -------
+        message
+        """
+        header = self._header(scan, stamp_ns)
+        found = [(box, "") for box in scan.perception.boxes]
+        if scan.tracks is not None:
+            found = [(track.box, str(track.id)) for track in scan.tracks]
+        detections = []
+        for box, track_id in found:
+            pose = self._make("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(box), covariance=np.zeros(36))
+            what = self._make("vision_msgs/msg/ObjectHypothesis", class_id=box.label, score=float(box.score))
+            result = self._make("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=what, pose=pose)
+            around = self._make("vision_msgs/msg/BoundingBox3D", center=self._pose(box), size=self._vector(box.size))
+            detections.append(
+                self._make("vision_msgs/msg/Detection3D", header=header, results=[result], bbox=around, id=track_id)
+            )
+        return self._make("vision_msgs/msg/Detection3DArray", header=header, detections=detections)
+
+    def diagnostics(
+        self,
+        scan: PerceivedScan | None,
+        stamp_ns: int | None = None,
+        *,
+        name: str = "edgeperc: perception",
+        level: int | None = None,
+        message: str | None = None,
+        values: Mapping[str, object] | None = None,
+    ) -> Any:
+        """Health, times of the stages, providers and names of the classes: a diagnostic_msgs/DiagnosticArray.
+
+        Parameters
+        ----------
+        scan : PerceivedScan or None
+            The newest; None if there is none yet.
+        stamp_ns : int, optional
+            As in `points`; 0 without a scan.
+        name : str
+            Name of the only status.
+        level : int, optional
+            0 OK, 1 WARN, 2 ERROR, 3 STALE; by default from the scan's health, and STALE without a scan.
+        message : str, optional
+            By default the health.
+        values : mapping, optional
+            More keys and values, before the others.
+
+        Returns
+        -------
+        message
+        """
+        listed: dict[str, object] = dict(values or {})
+        if scan is None:
+            level, message = 3 if level is None else level, message or "no scan yet"
+        else:
+            found = scan.perception
+            level = _LEVELS[scan.health] if level is None else level
+            message = message or scan.health or "OK"
+            listed |= {"points": found.n_points, "points not finite": found.n_dropped, "boxes": len(found.boxes)}
+            if scan.tracks is not None:
+                listed["tracks"] = len(scan.tracks)
+            if found.top_view is not None:
+                listed["drivable [m2]"] = f"{found.top_view.drivable_area_m2:.1f}"
+            listed |= {f"{stage} [ms]": f"{ms:.1f}" for stage, ms in found.stage_ms.items()}
+            listed |= {f"provider of {model}": ran for model, ran in found.providers.items()}
+            if found.points is not None:
+                listed["labels"] = ", ".join(f"{k} {label}" for k, label in enumerate(found.points.classes))
+            listed |= {f"unlike the training scans {k}": said for k, said in enumerate(found.fitness, 1)}
+        status = self._make(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=level,
+            name=name,
+            message=message,
+            hardware_id="" if scan is None else scan.sensor.name,
+            values=[
+                self._make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value)) for key, value in listed.items()
+            ],
+        )
+        return self._make(DIAGNOSTICS, header=self._header(scan, stamp_ns, ""), status=[status])
+
+    def _make(self, kind: str, /, **fields: Any) -> Any:
+        return self.types[kind](**fields)
+
+    def _header(self, scan: PerceivedScan | None, stamp_ns: int | None, frame_id: str | None = None) -> Any:
+        if stamp_ns is None:
+            stamp_ns = 0 if scan is None else nanoseconds(scan.stamp_s)
+        seconds, rest = divmod(stamp_ns, 10**9)
+        if not -(2**31) <= seconds < 2**31:
+            raise PointsError(f"the stamp is {seconds} s; expected a time that 32 bits hold, up to the year 2038")
+        stamp = self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=self.frame_id if frame_id is None else frame_id)
+
+    def _marker(
+        self,
+        header: Any,
+        namespace: str,
+        number: int,
+        kind: int,
+        *,
+        action: int = _ADD,
+        pose: Any = None,
+        scale: Any = (0.0, 0.0, 0.0),
+        color: tuple[str, float] = ("", 0.0),
+        points: NDArray[np.float64] | None = None,
+        text: str = "",
+    ) -> Any:
+        lasting_ns = nanoseconds(self._lifetime_s)
+        (red, green, blue), alpha = rgb([color_of(color[0])])[0].tolist(), color[1]
+        image = self._make("sensor_msgs/msg/CompressedImage", header=header, format="", data=np.zeros(0, np.uint8))
+        mesh = self._make("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8))
+        return self._make(
+            "visualization_msgs/msg/Marker",
+            header=header,
+            ns=namespace,
+            id=number,
+            type=kind,
+            action=action,
+            pose=self._pose() if pose is None else pose,
+            scale=self._vector(scale),
+            color=self._make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=alpha),
+            lifetime=self._make("builtin_interfaces/msg/Duration", sec=lasting_ns // 10**9, nanosec=lasting_ns % 10**9),
+            frame_locked=False,
+            points=[self._point(each) for each in (() if points is None else points)],
+            colors=[],
+            texture_resource="",
+            texture=image,
+            uv_coordinates=[],
+            text=text,
+            mesh_resource="",
+            mesh_file=mesh,
+            mesh_use_embedded_materials=False,
+        )
+
+    def _point(self, at: Any) -> Any:
+        return self._make("geometry_msgs/msg/Point", x=float(at[0]), y=float(at[1]), z=float(at[2]))
+
+    def _vector(self, along: Any) -> Any:
+        return self._make("geometry_msgs/msg/Vector3", x=float(along[0]), y=float(along[1]), z=float(along[2]))
+
+    def _pose(
+        self,
+        box: Box | None = None,
+        *,
+        center: Any = (0.0, 0.0, 0.0),
+        quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0),
+    ) -> Any:
+        if box is not None:
+            center, quaternion = box.center, (0.0, 0.0, math.sin(box.yaw / 2.0), math.cos(box.yaw / 2.0))
+        x, y, z, w = quaternion
+        turned = self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+        return self._make("geometry_msgs/msg/Pose", position=self._point(center), orientation=turned)
+
+
+def _quaternion(R: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """x, y, z, w of a rotation; w >= 0."""
+    # Of these four rows, each the quaternion times four of its entries, the longest is the most exact.
+    rows = np.array(
+        [
+            [1 + R[0, 0] - R[1, 1] - R[2, 2], R[1, 0] + R[0, 1], R[2, 0] + R[0, 2], R[2, 1] - R[1, 2]],
+            [R[1, 0] + R[0, 1], 1 - R[0, 0] + R[1, 1] - R[2, 2], R[2, 1] + R[1, 2], R[0, 2] - R[2, 0]],
+            [R[2, 0] + R[0, 2], R[2, 1] + R[1, 2], 1 - R[0, 0] - R[1, 1] + R[2, 2], R[1, 0] - R[0, 1]],
+            [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1 + R[0, 0] + R[1, 1] + R[2, 2]],
+        ]
+    )
+    row = rows[np.argmax(np.diag(rows))]
+    x, y, z, w = (math.copysign(1.0, row[3]) * row / np.linalg.norm(row)).tolist()
+    return x, y, z, w
