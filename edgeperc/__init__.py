@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from .frame import ModelFrame
     from .listing import ModelInfo, ProviderInfo, SensorInfo, models, providers, sensors
     from .live import Answer, Stream, stream
-    from .motion import Motion, deskew, merge
+    from .motion import Motion, Trajectory, deskew, merge
     from .mounting import Mounting
     from .moving import movable_points, moving_points
     from .occupancy import OccupancyGrid, occupancy_grid
@@ -113,6 +113,7 @@ __all__ = [
     "Tracker",
     "TrackingError",
     "Tracks",
+    "Trajectory",
     "Zone",
     "__version__",
     "camera_road",
@@ -163,6 +164,7 @@ _MODULES = {
     "Track": "tracking",
     "Tracker": "tracking",
     "Tracks": "tracking",
+    "Trajectory": "motion",
     "Zone": "zones",
     "camera_road": "painting",
     "deskew": "motion",

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,10 +17,12 @@ from .frame import fill_moved
 from .kernel_cache import njit
 from .points import as_points, read_only
 
-__all__ = ["Motion", "deskew", "fill_deskewed", "merge"]
+__all__ = ["Motion", "Trajectory", "deskew", "fill_deskewed", "merge"]
 
 MAX_RATE = 1e4  # of m/s and rad/s
 MAX_TURN = 3.1  # rad; the axis of half a turn has no sign
+MAX_BYTES = 1 << 28  # of a file of poses; a line has about 100
+OUTSIDE_S = 0.2  # the motion at the ends of a trajectory holds for two scans of 10 Hz
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +98,108 @@ class Motion:
         duration = second_s - first_s
         (x, y, z), (roll, pitch, yaw) = (way / duration).tolist(), (turn / duration).tolist()
         return cls((x, y, z), (roll, pitch, yaw))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Trajectory:
+    """Poses of a sensor over ground, by time.
+
+    Attributes
+    ----------
+    times_s : (n,) float64
+        Rising, on the clock of the scans [s]; at least two.
+    T_world_sensor : (n, 4, 4) float64
+
+    Raises
+    ------
+    TrackingError
+        A pose is not rigid, or there is not one for each time.
+    StampError
+        Fewer than two times, or they do not rise.
+    """
+
+    times_s: NDArray[np.float64]
+    T_world_sensor: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        times, poses = np.array(self.times_s, np.float64), np.array(self.T_world_sensor, np.float64)
+        if times.ndim != 1 or len(times) < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0.0).any():
+            raise StampError(f"got {times.size} times of poses; expected two or more finite ones that rise")
+        if poses.shape != (len(times), 4, 4):
+            raise TrackingError(
+                f"got poses of shape {poses.shape} for {len(times)} times; expected ({len(times)}, 4, 4)"
+            )
+        object.__setattr__(self, "times_s", times)
+        object.__setattr__(
+            self, "T_world_sensor", np.array([_rigid(f"pose {k}", pose, TrackingError) for k, pose in enumerate(poses)])
+        )
+
+    @classmethod
+    def from_tum(cls, path: str | os.PathLike[str]) -> Trajectory:
+        """Read a file in TUM's format, as kiss-icp, evo and others write it.
+
+        Parameters
+        ----------
+        path : str or path
+            Lines of time [s], x, y, z [m] and the quaternion x, y, z, w of T_world_sensor; ``#`` begins a comment.
+
+        Raises
+        ------
+        TrackingError
+            The file cannot be read, or a line is not such eight numbers.
+        StampError
+            Fewer than two lines, or their times do not rise.
+        """
+        try:
+            with Path(path).open("rb") as file:
+                content = file.read(MAX_BYTES + 1)
+            rows = np.loadtxt(io.BytesIO(content[:MAX_BYTES]), np.float64, ndmin=2, encoding="latin-1")
+            if len(content) > MAX_BYTES or rows.shape[1] != 8:
+                raise ValueError(f"{len(content):,} bytes, {rows.shape[1]} numbers in a line")
+        except (OSError, ValueError) as exc:
+            raise TrackingError(
+                f"{path} cannot be read as poses ({exc}); expected lines of time, x, y, z, qx, qy, qz, qw"
+            ) from exc
+        norm = np.linalg.norm(rows[:, 4:], axis=1)
+        if not (np.abs(norm - 1.0) < 1e-2).all():
+            raise TrackingError(
+                f"{path}: the quaternion of line {int(np.argmax(~(np.abs(norm - 1.0) < 1e-2))) + 1} has not length 1"
+            )
+        x, y, z, w = (rows[:, 4:] / norm[:, None]).T
+        poses = np.zeros((len(rows), 4, 4))
+        poses[:, 0, :3] = np.column_stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)])
+        poses[:, 1, :3] = np.column_stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)])
+        poses[:, 2, :3] = np.column_stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])
+        poses[:, :3, 3], poses[:, 3, 3] = rows[:, 1:4], 1.0
+        return cls(rows[:, 0], poses)
+
+    def motion(self, first_s: float, last_s: float) -> Motion:
+        """The motion during a scan, between the poses around it.
+
+        Parameters
+        ----------
+        first_s, last_s : float
+            Times of the scan's first and last point [s].
+
+        Raises
+        ------
+        StampError
+            The times are not finite, or more than 0.2 s outside those of the poses.
+        """
+        begin, end = float(self.times_s[0]), float(self.times_s[-1])
+        if not begin - OUTSIDE_S <= first_s <= last_s <= end + OUTSIDE_S:
+            raise StampError(
+                f"the poses are of {begin:.3f}..{end:.3f} s, the scan of {first_s:.3f}..{last_s:.3f} s; expected "
+                "poses around it, on its clock"
+            )
+        before = int(np.clip(np.searchsorted(self.times_s, first_s, "right") - 1, 0, len(self.times_s) - 2))
+        after = int(np.clip(np.searchsorted(self.times_s, last_s, "left"), before + 1, len(self.times_s) - 1))
+        return Motion.between(
+            self.T_world_sensor[before],
+            float(self.times_s[before]),
+            self.T_world_sensor[after],
+            float(self.times_s[after]),
+        )
 
 
 def deskew(points: ArrayLike, times: ArrayLike, motion: Motion, *, at_s: float | None = None) -> NDArray[np.float32]:

@@ -496,8 +496,11 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: t
         (("--on-mismatch", "explode"), "invalid choice"),
         (("--rate", "0"), "above 0"),
         (("--rate", "nan"), "above 0"),
-        (("--live", "--ply", "--out", tmp_path / "out"), "--live replays one PATH"),
-        ((scan, "--live"), "--live replays one PATH"),
+        (("--live", "--ply", "--out", tmp_path / "out"), "--live writes no files; leave out --ply"),
+        ((scan, "--live"), f"--live replays one path, got 2: {scan}, {scan}"),
+        (("--deskew",), "--deskew needs --poses FILE or --track"),
+        (("--poses", scan), "--poses is of --deskew"),
+        (("--deskew", "--track", "--live"), "and no --live"),
     ]:
         assert usage_code("run", scan, *arguments) == 2
         assert words in capsys.readouterr().err

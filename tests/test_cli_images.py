@@ -109,7 +109,8 @@ def test_wrong_usage(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[
         ((scan, "--scan", scan), "--scan: 1 scan for 0 images"),
         ((image, "--labels", *out), "--labels is of scans; add --scan"),
         ((image, "--track"), "--track is of scans; add --scan"),
-        ((image, "--live"), "--live replays scans, not images"),
+        ((image, "--live"), f"--live is of scans, and {image} is an image"),
+        ((image, "--deskew", "--track"), "--deskew is of scans"),
         ((image, "--png", "--out", tmp_path, "--model", model), "is one of the images and would be overwritten"),
     ):
         with pytest.raises(SystemExit, match="2"):

@@ -24,6 +24,9 @@ from edgeperc.kernel_cache import KernelCache
 posix = pytest.mark.skipif(os.name != "posix", reason="Windows' folders have access lists")
 
 
+RUNS = doctor._runs
+
+
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A cache of its own; only the tests of the models open them."""
@@ -45,7 +48,8 @@ def broken(found: dict[str, dict[str, str]]) -> set[str]:
 
 def test_an_installation_that_works(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("onnxruntime")
-    monkeypatch.undo()
+    monkeypatch.setattr(doctor, "_runs", RUNS)
+    monkeypatch.setenv("ORT_DISABLE_TELEMETRY", "1")
     code, found = report(capsys)
     assert (code, broken(found)) == (0, set())
     assert {"python", "platform", "processor", "int8", "bf16", "numpy", "numba", "kernels", "cache folder"} <= {*found}
@@ -116,11 +120,17 @@ def test_builds_of_onnxruntime(
     assert text in found["onnxruntime"].found
 
 
-@pytest.mark.parametrize(("value", "state"), [("1", "ok"), ("0", "note")])
-def test_telemetry(value: str, state: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("value", "state", "text"), [("1", "ok", "off"), ("0", "note", "=0"), ("", "note", "imported")]
+)
+def test_telemetry(value: str, state: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", SimpleNamespace(__version__="1.31.1"))
     monkeypatch.setenv("ORT_DISABLE_TELEMETRY", value)
-    assert {finding.name: finding for finding in doctor._packages()}["telemetry"].state == state
+    if not value:
+        monkeypatch.delenv("ORT_DISABLE_TELEMETRY")
+    found = {finding.name: finding for finding in doctor._packages()}["telemetry"]
+    assert found.state == state
+    assert text in found.found
 
 
 def test_a_plugin_that_does_not_load(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 
 import edgeperc
 import twins.motion
-from edgeperc import Motion, OptionError, PointsError, SensorError, StampError, TrackingError, deskew, merge
+from edgeperc import Motion, OptionError, PointsError, SensorError, StampError, TrackingError, Trajectory, deskew, merge
 from edgeperc.motion import fill_deskewed
 
 RATES = st.tuples(*3 * [st.floats(-4.0, 4.0)])
@@ -126,3 +128,83 @@ def test_errors_name_the_reason() -> None:
     with pytest.raises(SensorError, match="1 poses for 2 scans"):
         merge([world, world], [eye])
     assert edgeperc.deskew is deskew
+
+
+# --- poses -----------------------------------------------------------------------------------------------------------
+
+
+def quaternion(R: NDArray[np.float64]) -> tuple[float, ...]:
+    """x, y, z, w of a rotation by less than half a turn."""
+    w = math.sqrt(1.0 + np.trace(R)) / 2.0
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    return x / (4 * w), y / (4 * w), z / (4 * w), w
+
+
+def write_tum(path: Path, times: Any, poses: Any) -> Path:
+    lines = ["# time x y z qx qy qz qw"]
+    for t, T in zip(times, poses, strict=True):
+        lines.append(" ".join(f"{value:.17g}" for value in (t, *T[:3, 3], *quaternion(T[:3, :3]))))
+    path.write_text("\n".join(lines))
+    return path
+
+
+@given(st.tuples(*3 * [st.floats(-3.0, 3.0)]), RATES)
+def test_poses_are_read_as_they_were_written(rate: Any, velocity: Any) -> None:
+    screw = twins.motion.screw(velocity, np.array(rate) / 3.0)
+    poses = [twins.motion.exponential(screw * t) for t in (0.0, 0.5, 1.0)]
+    with tempfile.TemporaryDirectory() as folder:
+        found = Trajectory.from_tum(write_tum(Path(folder) / "poses.txt", (10.0, 10.5, 11.0), poses))
+    np.testing.assert_allclose(found.T_world_sensor, poses, atol=1e-12)
+    for first_s, last_s in ((10.1, 10.2), (10.4, 10.6), (9.9, 10.0), (11.0, 11.2), (10.5, 10.5)):
+        motion = found.motion(first_s, last_s)
+        np.testing.assert_allclose(motion.velocity_mps, velocity, atol=1e-9)
+        np.testing.assert_allclose(motion.rate_radps, np.array(rate) / 3.0, atol=1e-9)
+
+
+def test_the_poses_around_a_scan_count() -> None:
+    """A sensor that stands, drives at 10 m/s for a second and stands again."""
+    x = np.array([0.0, 0.0, 10.0, 10.0])
+    poses = np.broadcast_to(np.eye(4), (4, 4, 4)).copy()
+    poses[:, 0, 3] = x
+    drive = Trajectory(np.arange(4.0), poses)
+    assert [drive.motion(t, t + 0.1).velocity_mps[0] for t in (0.2, 1.0, 1.5, 1.9, 2.0)] == [0, 10, 10, 10, 0]
+    assert drive.motion(0.95, 1.05).velocity_mps[0] == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize(
+    ("first_s", "last_s"), [(-1.0, 0.5), (0.5, 9.0), (math.nan, 1.0), (0.0, math.nan), (1.7e9, 1.7e9), (0.8, 0.7)]
+)
+def test_poses_of_another_time_are_refused(first_s: float, last_s: float) -> None:
+    with pytest.raises(StampError, match=r"the poses are of 0\.000\.\.1\.000 s"):
+        Trajectory(np.arange(2.0), np.stack([np.eye(4)] * 2)).motion(first_s, last_s)
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("", "cannot be read as poses|2 or more|two or more"),
+        ("no numbers", "cannot be read as poses"),
+        ("0 0 0 0 0 0 0", "7 numbers in a line"),
+        ("0 0 0 0 0 0 0 1", "two or more"),
+        ("0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1", "that rise"),
+        ("0 0 0 0 0 0 0 1\nnan 0 0 0 0 0 0 1", "that rise"),
+        ("0 0 0 0 0 0 0 2\n1 0 0 0 0 0 0 1", "line 1 has not length 1"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 nan", "line 2 has not length 1"),
+        ("0 0 0 0 0 0 0 1\n1 inf 0 0 0 0 0 1", "expected \\(4, 4\\) finite"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0", "cannot be read as poses"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:loadtxt")
+def test_files_that_are_no_poses_are_refused(text: str, error: str, tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text(text)
+    with pytest.raises(TrackingError, match=error):
+        Trajectory.from_tum(tmp_path / "poses.txt")
+    with pytest.raises(TrackingError, match="cannot be read"):
+        Trajectory.from_tum(tmp_path / "absent.txt")
+
+
+def test_impossible_trajectories_are_refused() -> None:
+    with pytest.raises(TrackingError, match="of shape"):
+        Trajectory(np.arange(3.0), np.stack([np.eye(4)] * 2))
+    with pytest.raises(TrackingError, match="not rigid"):
+        Trajectory(np.arange(2.0), np.stack([np.eye(4), 2 * np.eye(4)]))

@@ -6,6 +6,7 @@ import math
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from test_captures import write_pcap
+from test_motion import write_tum
 
 import edgeperc
 import twins.motion
+from cli_helpers import run
 from edgeperc import Motion, deskew, read_timed_scans
+from edgeperc.cli.straighten import Straightener
 from edgeperc.readers.times import point_times, time_name
 
 MOTION = Motion((18.0, 0.5, 0.0), (0.02, -0.03, 0.6))
@@ -323,3 +327,80 @@ def test_real_captures(data_root: Callable[[str], Path], name: str) -> None:
     assert scan.stamp_s is not None
     assert 0.01 < np.ptp(scan.times_s) < 0.12
     assert scan.times_s.max() == pytest.approx(scan.stamp_s, abs=0.001)
+
+
+# --- edgeperc run --deskew -------------------------------------------------------------------------------------------
+
+
+def drive(path: Path, ends: Sequence[float], name: str = "time") -> Path:
+    """A bag of turns that end then, of the sensor that moves in one room; the stamps are those of the ends."""
+    scans = []
+    for end in ends:
+        points, times = turn(end)
+        scans.append((end, table(times - end, points, name, "<f4")))
+    return write_bag(path, scans)
+
+
+def pose_at(t: float) -> NDArray[np.float64]:
+    return twins.motion.exponential(twins.motion.screw(MOTION.velocity_mps, MOTION.rate_radps) * t)
+
+
+def test_scans_are_straightened_by_poses(tmp_path: Path) -> None:
+    path = drive(tmp_path / "drive.bag", [1700.0, 1700.1])
+    times = 1699.5 + 0.1 * np.arange(10)
+    poses = write_tum(tmp_path / "poses.txt", times, [pose_at(t - 1699.5) for t in times])
+    scans = list(Straightener(poses).scans(path))
+    assert [stamp for stamp, _ in scans] == pytest.approx([1700.0, 1700.1])
+    for _, points in scans:
+        assert off_the_walls(points) < 1e-3
+    write_tum(poses, times + 5.0, [pose_at(t) for t in 0.1 * np.arange(10)])
+    with pytest.raises(edgeperc.StampError, match="poses around it"):
+        next(Straightener(poses).scans(path))
+
+
+def test_scans_are_straightened_by_the_tracks_before(tmp_path: Path) -> None:
+    """The tracker knows the motion from the second scan on."""
+    straightener, straight = Straightener(None), []
+    scans = straightener.scans(drive(tmp_path / "drive.bag", [1700.0, 1700.1, 1700.2, 1700.3]))
+    with pytest.warns(UserWarning, match="first two scans stay"):
+        found = next(scans)
+    for k in range(4):
+        stamp_s, points = found
+        straight.append(off_the_walls(points) < 1e-3)
+        tracks: Any = SimpleNamespace(T_world_sensor=pose_at(0.1 * k), stamp_s=stamp_s)
+        straightener.follow(tracks)
+        found = next(scans, found)
+    assert straight == [False, False, True, True]
+
+
+def test_scans_without_times_are_not_straightened(tmp_path: Path) -> None:
+    np.zeros((8, 4), np.float32).tofile(tmp_path / "scan.bin")
+    with pytest.raises(edgeperc.PointsError, match=r"scan\.bin: the scan has no times of points; leave out --deskew"):
+        next(Straightener(None).scans(tmp_path / "scan.bin"))
+
+
+@pytest.mark.filterwarnings("default:--deskew")
+@pytest.mark.parametrize("by", ["--poses", "--track"])
+def test_run_with_deskew(by: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("onnxruntime")
+    path = drive(tmp_path / "drive.bag", [1700.0, 1700.1, 1700.2])
+    times = 1699.5 + 0.1 * np.arange(10)
+    write_tum(tmp_path / "poses.txt", times, [pose_at(t - 1699.5) for t in times])
+    options = ["--poses", tmp_path / "poses.txt"] if by == "--poses" else ["--track"]
+    options += [
+        "--model",
+        "pointseg",
+        "--sensor",
+        "hdl-64e",
+        "--on-mismatch",
+        "ignore",
+        "--ply",
+        "--out",
+        tmp_path / "out",
+    ]
+    assert run("run", path, "--deskew", *options) == 0
+    assert ("first two scans" in capsys.readouterr().err) == (by == "--track")
+    off = [off_the_walls(edgeperc.read_points(file)) for file in sorted((tmp_path / "out").rglob("*.ply"))]
+    assert len(off) == 3
+    if by == "--poses":
+        assert max(off) < 1e-3

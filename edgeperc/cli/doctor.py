@@ -176,9 +176,9 @@ def _packages() -> Iterator[Finding]:
         yield Finding("onnxruntime", "note", leaks, "pip install 'onnxruntime>=1.27'")
     else:
         yield Finding("onnxruntime", "ok", shown)
-    off = os.environ.get("ORT_DISABLE_TELEMETRY") == "1"
-    value = "off (ORT_DISABLE_TELEMETRY=1)" if off else "not turned off: ORT_DISABLE_TELEMETRY is set to another value"
-    yield Finding("telemetry", "ok" if off else "note", value)
+    setting = os.environ.get("ORT_DISABLE_TELEMETRY")
+    on = "not turned off: onnxruntime was imported before" if setting is None else f"ORT_DISABLE_TELEMETRY={setting}"
+    yield Finding("telemetry", "ok", "off") if setting == "1" else Finding("telemetry", "note", on)
 
 
 def _has_sme() -> bool:
