@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Literal, NoReturn, ParamSpec
+from typing import Literal, NamedTuple, NoReturn, ParamSpec
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,7 +43,7 @@ from .sensor import SensorProfile, get_sensor
 from .session import Session
 from .zoo import CAMERA, DEFAULT
 
-__all__ = ["ADAPTATIONS", "BoxesFrom", "Perceiver"]
+__all__ = ["ADAPTATIONS", "BoxesFrom", "Learned", "Perceiver"]
 
 STAGES = ("check", "project", "infer", "decode", "refine", "cluster", "agree")
 Adaptation = Literal["both", "remission", "interpolation", "none"]
@@ -96,6 +96,25 @@ class _Camera:
         labels = label_pixels(outputs["camera_logits"], height, width, model=card.name)
         watch.lap("decode")
         return ImageLabels(labels, card.classes)
+
+
+class Learned(NamedTuple):
+    """What a perceiver has learned from its scans so far; it can be pickled.
+
+    Attributes
+    ----------
+    mounting : MountingEstimator
+    remission : RemissionMatcher
+    to_check : int
+        Number of scans that are still compared with the training scans.
+    is_settled : bool
+        Whether further scans change nothing: the answer to a scan then depends on this scan alone.
+    """
+
+    mounting: MountingEstimator
+    remission: RemissionMatcher
+    to_check: int
+    is_settled: bool
 
 
 def _renamed(**names: str) -> Callable[[Callable[_P, None]], Callable[_P, None]]:
@@ -355,6 +374,18 @@ class Perceiver:
         with self._lock:
             self._remission = RemissionMatcher(self.sensor)
             self._set_mounting(MountingEstimator(self._estimator.known))
+
+    @property
+    def learned(self) -> Learned:
+        """What the scans so far have shown, for a perceiver of the same options elsewhere (`start_from`)."""
+        is_settled = self._estimator.is_complete and (self._remission.is_complete or not self._renders)
+        return Learned(self._estimator, self._remission, self._to_check, is_settled and self._to_check == 0)
+
+    def start_from(self, learned: Learned) -> None:
+        """Forget the scans so far, and continue from what another perceiver has learned."""
+        with self._lock:
+            self._remission, self._to_check = learned.remission, learned.to_check
+            self._set_mounting(learned.mounting)
 
     def _set_mounting(self, estimator: MountingEstimator) -> None:
         self._estimator = estimator

@@ -24,7 +24,7 @@ FLOORS = {
     "edgeperc": """
         errors atomic printable
         extras mounting onnx_file
-        card points sensor tuning
+        card engine points remote sensor tuning
         kernel_cache perception zoo.__init__
         calibration frame geometry linkage outline
         adapt cluster decode drivable fitness ground image motion observed projection refine sensor_fit session
@@ -69,6 +69,7 @@ FLOORS = {
         ros2.node ros2.rclpy_graph ros2.zenoh_graph sinks.rosbag
         cli.arguments cli.output
         cli.report cli.scans cli.sinks
+        cli.engine
         cli.completion cli.fit_sensor cli.info cli.program cli.run
         cli.ros2
         cli.demo cli.eval cli.eval_painting cli.eval_sensors cli.eval_tracking cli.lists

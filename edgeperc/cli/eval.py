@@ -21,6 +21,7 @@ from .arguments import (
     add_provider,
     finite_number,
 )
+from .engine import add_engine
 from .output import many, print_line, progress, table_lines, write_figures
 
 __all__ = ["add_parser", "eval_command"]
@@ -73,6 +74,7 @@ def add_parser(commands: Commands) -> None:
         help="perceive each scan as a sensor of this height, roll and pitch would have recorded it, the mounting to be "
         "estimated from that scan alone; evaluates points and boxes (default: as recorded)",
     )
+    add_engine(parser)
     models = parser.add_argument_group("models")
     add_model(models)
     add_provider(models, provider="cpu")
@@ -134,6 +136,8 @@ def eval_command(arguments: argparse.Namespace) -> int:
             mounted=None if arguments.mounted is None else Mounting(*arguments.mounted),
             provider=arguments.provider,
             precision=arguments.precision,
+            engine=arguments.engine,
+            workers=arguments.workers,
             on_scan=show,
         )
     for line in _figure_lines(figures):
@@ -153,6 +157,8 @@ def _eval_images(arguments: argparse.Namespace, roots: Sequence[Path]) -> int:
 
     if len(roots) < len(arguments.datasets):
         arguments.usage_error("labeled images and labeled scans have different figures; evaluate them one by one")
+    if arguments.engine == "ray":
+        arguments.usage_error("--engine ray is for scans; leave it out")
     used = {"--fold": arguments.fold, "--mounted": arguments.mounted, "--road-by": arguments.road_by}
     for option, value in (used | {"--worst": arguments.worst}).items():
         if value is not None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import MissingExtraError
+from ..remote import Remote
 from .output import many, one_line, print_error, print_line
 
 if TYPE_CHECKING:
@@ -47,22 +48,33 @@ class Report:
         under: bytes | None = None,
     ) -> None:
         """Print one scan's line or JSON object; print an error on stderr as well."""
-        from ..perception import Perception
-
         if isinstance(outcome, MissingExtraError):
             raise outcome
-        self.n += 1
-        if isinstance(outcome, Exception):
-            self.n_failed += 1
-            print_error(f"{source}: {str(outcome).removeprefix(f'{source}: ')}")
-            if self._json:
-                print_line(json.dumps({**self._names(source), "error": one_line(outcome)}))
-            return
-        answer, perception = (None, outcome) if isinstance(outcome, Perception) else (outcome, outcome.perception)
-        timing = None if answer is None else _timing(answer)
         if tracks is not None and under is not None:
             self.tracks.append(tracks)
             self.under.append(under)
+        error = str(outcome).removeprefix(f"{source}: ") if isinstance(outcome, Exception) else None
+        self.show(source, self.text(source, outcome, tracks), error)
+
+    def show(self, source: Path | Remote, text: str, error: str | None) -> None:
+        """Count a scan, and print its `text` and its error."""
+        self.n += 1
+        if error is not None:
+            self.n_failed += 1
+            print_error(f"{source}: {error}")
+        if text:
+            print_line(text)
+
+    def text(
+        self, source: Path | Remote, outcome: Perception | Answer | Exception, tracks: Tracks | None = None
+    ) -> str:
+        """One scan's line or JSON object; of a failed scan without ``--json``, nothing."""
+        from ..perception import Perception
+
+        if isinstance(outcome, Exception):
+            return json.dumps({**self._names(source), "error": one_line(outcome)}) if self._json else ""
+        answer, perception = (None, outcome) if isinstance(outcome, Perception) else (outcome, outcome.perception)
+        timing = None if answer is None else _timing(answer)
         if self._json:
             from ..records import scan_record
 
@@ -70,20 +82,18 @@ class Report:
             names, record = self._names(source), scan_record(perception, tracks)
             if record["image"] is not None:
                 record["image"] = {**names.pop("image"), **record["image"]}
-            record = {**names, "stamp_s": stamp_s, "live": timing, **record}
-            print_line(json.dumps(record, allow_nan=False))
-            return
+            return json.dumps({**names, "stamp_s": stamp_s, "live": timing, **record}, allow_nan=False)
         parts = [str(source)]
         if timing is not None:
             parts.append("  ".join(f"{key} {value}" for key, value in timing.items()))
         parts.append(_summary(perception))
         if tracks is not None:
             parts.append(f"tracks: {many(len(tracks), 'object')}")
-        print_line("  ".join(parts))
+        return "  ".join(parts)
 
-    def _names(self, source: Path) -> dict[str, Any]:
+    def _names(self, source: Path | Remote) -> dict[str, Any]:
         """The files of a record: the scan, or the image and its scan."""
-        if source not in self._images:
+        if isinstance(source, Remote) or source not in self._images:
             return {"scan": str(source)}
         scan = self._images[source]
         return {"scan": None if scan is None else str(scan), "image": {"file": str(source)}}

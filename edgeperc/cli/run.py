@@ -6,13 +6,14 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ..errors import EdgepercError, ImageError, ModelError, PointsError
 from ..extras import require
+from ..remote import Remote, location
 from ..sinks import PerceivedScan, Sink
 from .arguments import (
     CAMERA,
@@ -28,9 +29,19 @@ from .arguments import (
     add_topic,
     positive_number,
 )
+from .engine import add_engine, check_engine, perceive_on_ray, through_temporary
 from .output import many, print_line, progress
 from .report import Report
-from .scans import Scans, find_images, find_scans, output_names, scan_folders, scan_namer, scan_sensor
+from .scans import (
+    Scans,
+    find_images,
+    find_scans,
+    output_names,
+    scan_folders,
+    scan_namer,
+    scan_sensor,
+    with_mounting,
+)
 from .sinks import add_sinks, open_sinks, wanted_sinks
 
 if TYPE_CHECKING:
@@ -74,7 +85,7 @@ def add_parser(commands: Commands) -> None:
     reading.add_argument(
         "paths",
         nargs="+",
-        type=Path,
+        type=location,
         metavar="PATH",
         help="scan files (.bin, .pcd, .ply, .npy, .npz); folders of them; the root of a KITTI object set, of "
         "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .osf, .bag, .mcap, a ROS 2 bag's folder (extra 'io'); "
@@ -122,7 +133,10 @@ def add_parser(commands: Commands) -> None:
         "--json", action="store_true", help="print one JSON object for each scan, and nothing else, on stdout"
     )
     output.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the files below, made if needed (default: no files)"
+        "--out",
+        type=location,
+        metavar="DIR",
+        help="folder or URL for the files below, made if needed (default: no files)",
     )
     output.add_argument(
         "--png",
@@ -135,6 +149,7 @@ def add_parser(commands: Commands) -> None:
     )
     output.add_argument("--ply", action="store_true", help="write NAME.ply, the points with labels and colors")
     add_sinks(parser)
+    add_engine(parser)
     tracking = parser.add_argument_group("tracking")
     tracking.add_argument(
         "--track", action="store_true", help="track the boxes from scan to scan; the scans must be one drive, in order"
@@ -196,21 +211,22 @@ def run_command(arguments: argparse.Namespace) -> int:
     scans = found.paths
     names = output_names(scans, keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
-    sources = {os.path.realpath(source) for source in (*scans, *images.values()) if source is not None}
+    sources = {_real(source) for source in (*scans, *images.values()) if source is not None}
     of = _pictures_of(arguments, images)
     whole = [getattr(arguments, name) for name in wanted_sinks(arguments)]
     for file in (
         *(file for target in targets for file in _files_of(target, kinds, **of).values()),
         *(value for value in whole if isinstance(value, Path)),
     ):
-        if os.path.realpath(file) in sources:
+        if _real(file) in sources:
             arguments.usage_error(
                 f"{file} is one of the {'images' if images else 'scans'} and would be overwritten; choose another --out"
             )
 
     perceivers = _Perceivers(arguments)
-    perceivers.check([*filter(None, images.values())] if images else scans, of_images=bool(images))
-    for target in targets if kinds else ():
+    local = [scan for scan in scans if isinstance(scan, Path)]
+    perceivers.check([*filter(None, images.values())] if images else local, of_images=bool(images))
+    for target in targets if kinds and isinstance(arguments.out, Path) else ():
         target.parent.mkdir(parents=True, exist_ok=True)
     report = Report(arguments, images)
     for folder in found.empty:
@@ -221,7 +237,9 @@ def run_command(arguments: argparse.Namespace) -> int:
         for sink in sinks:
             stack.callback(sink.close)
         run = _Run(arguments, perceivers, kinds, sinks)
-        for done, (scan, target) in enumerate(zip(scans, targets, strict=True)):
+        if arguments.engine == "ray":
+            perceive_on_ray(arguments, _alone, perceivers, scans, targets, report, show)
+        for done, (scan, target) in enumerate(zip(scans, targets, strict=True) if arguments.engine == "local" else ()):
             show(done, len(scans))
             if images:
                 outcomes = run.image(scan, images[scan], target)
@@ -244,6 +262,7 @@ def run_command(arguments: argparse.Namespace) -> int:
 
 def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
     """Check for contradictory options and missing extras before any work."""
+    check_engine(arguments, wanted_sinks(arguments))
     if arguments.live and (kinds or arguments.gif or len(arguments.paths) > 1):
         arguments.usage_error("--live replays one PATH and writes no files")
     if (kinds or arguments.gif) and arguments.out is None:
@@ -377,15 +396,19 @@ class _Run:
         self._tracker = Tracker() if arguments.track else None
         self._n = 0
 
-    def scans(self, path: Path, target: Path) -> Iterator[Outcome]:
-        """Perceive each scan of a file or capture."""
+    def scans(self, path: Path, target: Path, shown: Path | None = None) -> Iterator[Outcome]:
+        """Perceive each scan of a file or capture; ``shown`` is printed in place of its path."""
         from ..readers.captures import is_capture, read_scans
 
+        if isinstance(path, Remote) or isinstance(target, Remote):
+            yield from through_temporary(self.scans, path, target)
+            return
+        shown = shown or path
         try:
             perceive = self._perceivers.of(self._perceivers.sensor_of(path))
             numbered = is_capture(path)
             for k, (stamp_s, points) in enumerate(read_scans(path, topic=self._arguments.topic)):
-                name, file = (path / f"{k:06d}", target / f"{k:06d}") if numbered else (path, target)
+                name, file = (shown / f"{k:06d}", target / f"{k:06d}") if numbered else (shown, target)
                 try:
                     perception = perceive(points, stamp_s)
                     if self._kinds and numbered:
@@ -397,7 +420,7 @@ class _Run:
                 except MemoryError:
                     yield name, PointsError(f"{len(points):,} points take more memory than there is"), None, None
         except (EdgepercError, OSError) as exc:
-            yield path, exc, None, None
+            yield shown, exc, None, None
 
     def image(self, path: Path, scan: Path | None, target: Path) -> Iterator[Outcome]:
         """Perceive an image and its scan, if it has one."""
@@ -493,6 +516,21 @@ class _Run:
     def _sink(self, scan: PerceivedScan) -> None:
         for sink in self._sinks:
             sink.write(scan)
+
+
+def _alone(
+    arguments: argparse.Namespace, perceivers: _Perceivers | None = None
+) -> tuple[Perceiver, Callable[..., Iterator[Outcome]], Callable[[Path], list[Path]]]:
+    """For `perceive_on_ray`: a perceiver of scan files, what perceives one and writes its files, and these files."""
+    kinds = [kind for kind in _KINDS if getattr(arguments, kind)]
+    perceivers = perceivers or _Perceivers(arguments)
+    perceive = perceivers.of(with_mounting(arguments.sensor or DEFAULT_SENSOR, arguments))
+    run = _Run(arguments, perceivers, kinds, [])
+    return perceive, run.scans, lambda target: [_file_of(target, kind) for kind in kinds]
+
+
+def _real(path: Path) -> str:
+    return str(path) if isinstance(path, Remote) else os.path.realpath(path)
 
 
 def _file_of(target: Path, kind: str) -> Path:

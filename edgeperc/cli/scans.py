@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import EdgepercError, ImageError
+from ..remote import Remote
 from .arguments import DEFAULT_SENSOR
 
 if TYPE_CHECKING:
@@ -70,14 +71,21 @@ def scan_folders(root: Path) -> list[Path]:
 
 
 def find_scans(paths: Sequence[Path]) -> Scans:
-    """Find scan files and captures, in the order of ``paths``; the scans of a folder or data set are sorted."""
-    from ..readers.captures import is_capture, scan_files
+    """Find scan files and captures, in the order of ``paths``; the scans of a folder or data set are sorted.
+
+    Those at a URL may lie in any folder below it.
+    """
+    from ..readers.captures import CAPTURE_SUFFIXES, SCAN_SUFFIXES, is_capture, scan_files
 
     scans: dict[str, Path] = {}
     empty, of_data_set = [], False
     for path in paths:
         found = [path]
-        if path.is_dir() and not is_capture(path):
+        if isinstance(path, Remote):
+            found = path.files(SCAN_SUFFIXES + CAPTURE_SUFFIXES)
+            of_data_set |= any(scan.parent != path for scan in found if scan != path)
+            empty += [] if found else [path]
+        elif path.is_dir() and not is_capture(path):
             folders = scan_folders(path)
             found = [scan for folder in folders for scan in scan_files(folder)]
             of_data_set |= folders not in ([], [path])
@@ -103,6 +111,11 @@ def find_images(paths: Sequence[Path]) -> list[Path]:
     others = []
     for path in paths:
         found = [path] if path.suffix.lower() in IMAGE_SUFFIXES else []
+        if isinstance(path, Remote):
+            if found:
+                raise ImageError(f"{path}: images are read from this computer; copy it, and pass its path")
+            others.append(path)
+            continue
         if path.is_dir() and not is_capture(path) and not scan_folders(path):
             found = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
         images |= {_absolute(image): image for image in found}
@@ -210,6 +223,8 @@ def output_names(scans: Sequence[Path], *, keep_folder: bool = False) -> list[Pa
 
 
 def _absolute(path: Path) -> str:
+    if isinstance(path, Remote):
+        return path.place
     return os.path.abspath(path)  # noqa: PTH100 - resolve() would follow links; a link keeps its name
 
 

@@ -7,14 +7,17 @@ over resampled drives.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ..agreement import RULES
-from ..errors import OptionError, PointsError
+from ..engine import Lost, map_on_ray
+from ..errors import EdgepercError, OptionError, PointsError
 from ..mounting import Mounting
-from ..perceiver import BoxesFrom
+from ..perceiver import BoxesFrom, Learned, Perceiver
 from ..simulation.samples import FIRST_SEED
 from ..zoo import DEFAULT
 from .datasets import KittiObjects, SemanticKitti
@@ -26,10 +29,12 @@ from .tables import Record, figures
 __all__ = ["evaluate"]
 
 N_WORST = 20
+MOST_FIRST = 20  # scans that are evaluated before the workers start; usually five
 KINDS, OF_FOLDER = ("real", "semantickitti", "simulated"), "folder "
 
 _Figures = tuple[Record, Mistakes | None]
-_Scan = tuple[str, Callable[[], _Figures]]
+_Scan = tuple[str, str | None, Callable[[], _Figures]]
+"""Block of figures; the drive, if the mounting is found from its scans in their order; the evaluation."""
 
 
 def evaluate(
@@ -45,6 +50,8 @@ def evaluate(
     rules: Collection[str] = RULES,
     mounted: Mounting | None = None,
     n_resamples: int = 1000,
+    engine: Literal["local", "ray"] = "local",
+    workers: int | None = None,
     on_scan: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[dict[str, Any], list[Mistakes]]:
     """Compute the figures of models on labeled scans.
@@ -66,6 +73,11 @@ def evaluate(
         Fold of the training drives, 0 to 2 (`splits.in_split`).
     n_resamples : int
         Number of resamples of the drives for the intervals.
+    engine : {"local", "ray"}
+        This process, or processes with one thread each on a Ray cluster (`edgeperc.engine.map_on_ray`); the figures are
+        the same.
+    workers : int or None
+        Number of processes of ``"ray"``.
     on_scan : callable
         Called after each scan with the number of scans done and the number of all scans.
 
@@ -89,29 +101,18 @@ def evaluate(
     """
     split = split or ("test" if fold is None else "validation")
     options: dict[str, Any] = {"provider": provider, "precision": precision, "boxes_from": boxes_from}
-    options["rules"] = rules
-    options["training_scans"] = split == "train"
-    folders = {str(dataset): folder for dataset in datasets if (folder := _folder(dataset)) is not None}
-    if folders and (mounted is not None or road_by is not None):
-        raise OptionError(f"{next(iter(folders))} is of another sensor; mounted and road_by are for KITTI's scans")
-    judges: list[Judge] = []
-    scans: list[_Scan] = []
-    for folder in folders.values():
-        judges.append(Judge(models, sensor=folder.layout.sensor, **options))
-        scans += _folder_scans(judges[-1], folder, split, fold)
-    if len(folders) < len(datasets):
-        judges.append(Judge(models, road_by=road_by, mounted=mounted, **options))
-        scans += [s for d in datasets if str(d) not in folders for s in _scans(judges[-1], d, split, fold)]
+    options |= {"rules": rules, "training_scans": split == "train"}
+    job = _Job(tuple(datasets), tuple(models), split, fold, road_by, mounted, options)
+    perceive, scans = job.scans()
     records: dict[str, list[Record]] = {}
     worst: dict[str, list[Mistakes]] = {}
-    for done, (block, evaluated) in enumerate(scans, start=1):
-        record, mistakes = evaluated()
+    evaluated = _on_ray(job, perceive, scans, workers) if engine == "ray" else (evaluate() for _, _, evaluate in scans)
+    for done, ((block, _, _), (record, mistakes)) in enumerate(zip(scans, evaluated, strict=True), start=1):
         records.setdefault(block, []).append(record)
         if mistakes is not None:
             ranked = sorted([*worst.get(block, ()), mistakes], key=lambda each: -each.n_errors)
             worst[block] = ranked[:N_WORST]
         on_scan(done, len(scans))
-    perceive = judges[-1].perceive
     result: dict[str, Any] = {"models": {card.name: card.version for card in perceive.cards}}
     result |= {"providers": dict(perceive.providers), "split": split, "fold": fold}
     blocks = {block: figures(of_block, n_resamples) for block, of_block in records.items()}
@@ -120,6 +121,80 @@ def evaluate(
         result["folders"] = {block.removeprefix(OF_FOLDER): of_block for block, of_block in blocks.items()}
     in_order = ("real", *(block for block in worst if block.startswith(OF_FOLDER)), "simulated")
     return result, next((worst[block] for block in in_order if block in worst), [])
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What is evaluated; worker processes get it and find the same scans."""
+
+    datasets: tuple[str | Path, ...]
+    models: tuple[str | Path, ...]
+    split: str
+    fold: int | None
+    road_by: str | Path | None
+    mounted: Mounting | None
+    options: dict[str, Any]
+
+    def scans(self, n_threads: int | None = None) -> tuple[Perceiver, list[_Scan]]:
+        """The perceiver of the last data set, and the scans of all."""
+        options, split, fold = self.options | {"n_threads": n_threads}, self.split, self.fold
+        folders = {str(dataset): folder for dataset in self.datasets if (folder := _folder(dataset)) is not None}
+        if folders and (self.mounted is not None or self.road_by is not None):
+            raise OptionError(f"{next(iter(folders))} is of another sensor; mounted and road_by are for KITTI's scans")
+        judges: list[Judge] = []
+        scans: list[_Scan] = []
+        for folder in folders.values():
+            judges.append(Judge(self.models, sensor=folder.layout.sensor, **options))
+            scans += _folder_scans(judges[-1], folder, split, fold)
+        if len(folders) < len(self.datasets):
+            judges.append(Judge(self.models, road_by=self.road_by, mounted=self.mounted, **options))
+            scans += [s for d in self.datasets if str(d) not in folders for s in _scans(judges[-1], d, split, fold)]
+        return judges[-1].perceive, scans
+
+
+class _Evaluator:
+    """Evaluates scans in a worker process; those without a drive each from the same state of the perceiver."""
+
+    def __init__(self, job: _Job, learned: Learned) -> None:
+        self._perceive, self._scans = job.scans(n_threads=1)
+        self._learned = learned
+
+    def __call__(self, numbers: Sequence[int]) -> list[_Figures] | EdgepercError:
+        found = []
+        try:
+            for _, drive, evaluate in (self._scans[number] for number in numbers):
+                if drive is None:
+                    self._perceive.start_from(self._learned)
+                found.append(evaluate())
+        except EdgepercError as exc:
+            return exc
+        return found
+
+
+def _on_ray(job: _Job, perceive: Perceiver, scans: Sequence[_Scan], workers: int | None) -> Iterator[_Figures]:
+    """Evaluate each scan, or each drive whose scans need their order, in a worker process."""
+    # The perceiver learns from the first scans, so they are evaluated here.
+    first: dict[int, _Figures] = {}
+    for k in [k for k, (_, drive, _) in enumerate(scans) if drive is None][:MOST_FIRST]:
+        if perceive.learned.is_settled:
+            break
+        first[k] = scans[k][2]()
+    # Consecutive scans of one drive stay together; the others are apart.
+    rest = (k for k in range(len(scans)) if k not in first)
+    groups = [[*each] for _, each in groupby(rest, lambda k: (scans[k][0], scans[k][1] or k))]
+    found = map_on_ray(_Evaluator, (job, perceive.learned), groups, workers=workers) if groups else iter(())
+    done = 0
+    for numbers, answer in zip(groups, found, strict=True):
+        if isinstance(answer, EdgepercError):
+            raise answer
+        if isinstance(answer, Lost):
+            raise EdgepercError(f"scan {numbers[0] + 1} of {len(scans)} was not evaluated: {answer.reason}")
+        while done < numbers[0]:
+            yield first[done]
+            done += 1
+        yield from answer
+        done += len(numbers)
+    yield from (first[k] for k in range(done, len(scans)))
 
 
 def _folder(dataset: str | Path) -> ScanFolder | None:
@@ -142,7 +217,8 @@ def _folder_scans(judge: Judge, folder: ScanFolder, split: str, fold: int | None
         raise PointsError(
             f"{folder.root} has no scans of the {split} drives (fold: {fold}); pass another split, or 'all'"
         )
-    return [(f"{OF_FOLDER}{folder.layout.name}", _later(judge.record_scan, folder.frame, name)) for name in names]
+    block, drives = f"{OF_FOLDER}{folder.layout.name}", folder.drives
+    return [(block, drives[name], _later(judge.record_scan, folder.frame, name)) for name in names]
 
 
 def _names(scans: ScanFolder | KittiObjects | SemanticKitti, split: str, fold: int | None) -> list[str]:
@@ -157,18 +233,18 @@ def _scans(judge: Judge, dataset: str | Path, split: str, fold: int | None) -> l
         if not (number or "24").isdecimal() or number == "0":
             raise PointsError(f"got {dataset!r}; expected simulation, or simulation:N with a number of scans from 1")
         seeds = range(FIRST_SEED, FIRST_SEED + int(number or 24))
-        return [("simulated", _later(judge.record, judge.simulated, seed)) for seed in seeds]
+        return [("simulated", None, _later(judge.record, judge.simulated, seed)) for seed in seeds]
     root = Path(dataset)
     if (root / "training" / "label_2").is_dir():
         objects = KittiObjects(root)
         names = _names(objects, split, fold)
         read = objects.frame
-        scans = [("real", _later(judge.record, lambda n: judge.kitti(read(n)), name)) for name in names]
+        scans: list[_Scan] = [("real", None, _later(judge.record, lambda n: judge.kitti(read(n)), n)) for n in names]
     else:
         sequences = SemanticKitti(root)
         names = _names(sequences, split, fold)
         of = sequences.frame
-        scans = [("semantickitti", _later(judge.record, lambda n: judge.semantickitti(of(n)), name)) for name in names]
+        scans = [("semantickitti", None, _later(judge.record, lambda n: judge.semantickitti(of(n)), n)) for n in names]
     if not scans:
         raise PointsError(f"{dataset} has no scans of the {split} drives (fold: {fold}); pass another split, or 'all'")
     return scans

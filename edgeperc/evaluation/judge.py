@@ -49,7 +49,7 @@ class Judge:
     models : sequence of str or Path
         Names of shipped models, or paths. Range-image models are evaluated by points, top-view models by boxes and
         cells.
-    provider, precision : str
+    provider, precision, n_threads
         As in `Perceiver`.
     road_by : str, Path or None
         A top-view model that supplies the true road of KITTI frames, because KITTI's labels have no road. SSADNet
@@ -88,12 +88,15 @@ class Judge:
         rules: Collection[str] = RULES,
         mounted: Mounting | None = None,
         sensor: SensorProfile | None = None,
+        n_threads: int | None = None,
     ) -> None:
         mounting = MODEL_MOUNTING if mounted is None else Mounting()
         if sensor is None:
-            self.perceive = _perceiver(models, provider, precision, boxes_from, rules, mounting)
+            self.perceive = _perceiver(models, provider, precision, n_threads, boxes_from, rules, mounting)
         else:
-            self.perceive = _perceiver(models, provider, precision, boxes_from, rules, sensor.mounting, sensor)
+            self.perceive = _perceiver(
+                models, provider, precision, n_threads, boxes_from, rules, sensor.mounting, sensor
+            )
         self.mounted = None if mounted is None else ModelFrame(mounted)
         self.as_recorded = mounted is None and sensor is None
         self.point_classes: tuple[str, ...] = POINT_CLASSES
@@ -110,7 +113,7 @@ class Judge:
             assert isinstance(self.from_above.card.view, TopViewGeometry)
             self.view = self.from_above.card.view
             self.cell_range_m = np.hypot(*np.broadcast_arrays(*self.view.cell_centers()))
-        self.draw_road = None if road_by is None else _perceiver([road_by], provider, precision)
+        self.draw_road = None if road_by is None else _perceiver([road_by], provider, precision, n_threads)
         cards = [*self.perceive.cards]
         if self.draw_road is not None:
             (card,) = self.draw_road.cards
@@ -346,6 +349,7 @@ def _perceiver(
     models: Sequence[str | Path],
     provider: str,
     precision: str,
+    n_threads: int | None,
     boxes_from: BoxesFrom = "network",
     rules: Collection[str] = (),
     mounting: Mounting = MODEL_MOUNTING,  # the truth of cells is in the frame of the scan
@@ -360,6 +364,7 @@ def _perceiver(
         mounting=mounting,
         provider=provider,
         precision=precision,
+        n_threads=n_threads,
         on_mismatch="ignore",
         boxes_from=boxes_from,
         agree=bool(rules),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import signal
@@ -10,10 +9,8 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict
-from typing import Any, cast
 
-from edgeperc.errors import MissingExtraError
+from edgeperc.engine import Lost, map_on_ray
 
 from ..roads import DatabaseError
 from .scenes import Job, Plan, SceneBuilder
@@ -85,39 +82,8 @@ def _make_scene(job: Job) -> str:
     return _builder(job)
 
 
-class RayWorker:
-    """`SceneBuilder` for ``ray.data``, which maps rows to rows. Jobs are JSON, because their shapes differ."""
-
-    def __init__(self, plan: Plan) -> None:
-        self.builder = SceneBuilder(plan)
-
-    def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
-        """Make one scene."""
-        job = Job(**json.loads(row["job"]))
-        return {"scene": job.name, "reason": self.builder(job)}
-
-
 def _run_on_ray(plan: Plan, jobs: list[Job], workers: int) -> Iterator[tuple[str, str]]:
-    try:
-        import ray
-        import ray.data
-    except ModuleNotFoundError as exc:
-        raise MissingExtraError(exc.name or "ray", "ray", "--engine ray") from exc
-
-    started = not ray.is_initialized()
-    if started:
-        cores = None if "RAY_ADDRESS" in os.environ else workers
-        ray.init(num_cpus=cores, include_dashboard=False, log_to_driver=False, configure_logging=False)
-    try:
-        ray.data.DataContext.get_current().enable_progress_bars = False
-        rows = ray.data.from_items(
-            [{"job": json.dumps(asdict(job))} for job in jobs], override_num_blocks=min(len(jobs), 16 * workers)
-        )
-        done = rows.map(
-            cast(Any, RayWorker), fn_constructor_args=(plan,), num_cpus=1, concurrency=min(workers, len(jobs))
-        )
-        for row in done.iter_rows():
-            yield str(row["scene"]), str(row["reason"])
-    finally:
-        if started:
-            ray.shutdown()
+    for job, reason in zip(jobs, map_on_ray(SceneBuilder, (plan,), jobs, workers=min(workers, len(jobs))), strict=True):
+        if isinstance(reason, Lost):
+            raise DatabaseError(f"scene {job.name}: {reason.reason}")
+        yield job.name, reason
