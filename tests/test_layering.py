@@ -104,7 +104,7 @@ FLOORS = {
         accuracy start
         measure
         peers.__init__ peers.arithmetic peers.rounds
-        peers.engines peers.ground peers.projection peers.tracking
+        peers.engines peers.ground peers.projection peers.slam peers.tracking
         peers.camera peers.numpy_pipeline peers.networks
         peers.contenders
         peers.tables

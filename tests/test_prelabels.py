@@ -385,3 +385,40 @@ def test_the_commands_choices_are_the_kinds() -> None:
     parser = build_parser()
     for kind in KINDS:
         assert parser.parse_args(["run", "x.bin", "--labels-for", kind]).labels_for == kind
+
+
+def test_corrected_labels_train_a_network(tmp_path: Path) -> None:
+    """From the scans of a drive: pre-labels, one correction, the description, and two steps of a training."""
+    pytest.importorskip("torch")
+    from edgeperc.simulation.drawn import random_scene
+    from edgeperc.simulation.scene import simulate
+    from edgeperc_export import cli as export
+
+    mine = tmp_path / "mine"
+    (mine / "velodyne").mkdir(parents=True)
+    scans = []
+    for seed in (3, 4):
+        scan = simulate(random_scene(seed, "urban"), "hdl-64e", seed=seed)
+        path = mine / f"velodyne/{seed}.bin"
+        scan.points.tofile(path)
+        cars = tuple(box for box, n in zip(scan.boxes, scan.box_points, strict=True) if box.label == "car" and n > 50)
+        perception = Perception(len(scan.points), 0, None, None, cars, {}, {}, (), None)
+        scans.append(PerceivedScan(str(path), 0.1 * seed, scan.points, perception, None, get_sensor("hdl-64e")))
+    written(mine, "labelcloud", *scans)
+    path = mine / "labels/3.json"
+    document = json.loads(path.read_text())
+    corrected = document["objects"][0]
+    corrected["name"], corrected["centroid"]["x"] = "truck", round(corrected["centroid"]["x"] + 0.25, 3)
+    path.write_text(json.dumps(document))
+    classes = {"car": "car", "van": "van", "truck": "truck", "pedestrian": "pedestrian", "cyclist": "cyclist"}
+    description = {"schema": 1, "name": "mine", "sensor": "hdl-64e", "box_format": "labelcloud", "boxes": classes}
+    (mine / "scans.json").write_text(json.dumps(description))
+    (first, *_) = ScanFolder(mine).frame("3").boxes or ()
+    assert first.label == "truck"
+    assert first.center[0] == pytest.approx(corrected["centroid"]["x"])
+    assert np.count_nonzero(ScanFolder(mine).frame("4").labels() == 1) > 50
+    run_of = ["train", "pointseg", str(tmp_path / "run"), "--scans", str(mine), "--steps", "2", "--batch", "1"]
+    assert export.main([*run_of, "--threads", "1", "--workers", "0"]) == 0
+    lines = (tmp_path / "run/log.jsonl").read_text().splitlines()
+    assert json.loads(lines[-1])["step"] == 2
+    assert (tmp_path / "run/checkpoint.pt").exists()

@@ -1,0 +1,382 @@
+"""Measure KISS-ICP's trajectory and map with and without what moves, and the time of both.
+
+This module is a command of its own: ``python -m edgeperc_bench.peers.slam [ROOT] [--drive DRIVE]``. It needs the extra
+``slam``.
+
+ROOT is a KITTI object set; its drives with at least ``--least`` scans are used, one after the other (``--drive``
+selects some). Without ROOT, streets with traffic are drawn from seeds; their poses and moving objects are known. Their
+ground is left out for KISS-ICP: it is so smooth that the scan lines on it, which move with the sensor, hold the
+estimate back (in one street 11.2 m of 14.4 m; without the ground 14.4 m).
+
+Each drive is perceived and tracked once, with a full turn of labels. KISS-ICP then gets all points, those that do not
+move (`edgeperc.moving_points`), and those that could not move (`edgeperc.movable_points`). It runs without motion
+compensation, in one thread. The table has, by drive and variant:
+
+- error: root of the mean squared distance of the poses from the true ones, after the best rigid alignment; only of
+  drawn streets
+- closure: the drive is run forward and then backward; distance of the last pose from the first one
+- map: share of the map's cells of ``CELL_M`` that hold a point of an object that moves. Objects and their motion are
+  known from drawn scenes; on real drives from labels, tracked with KISS-ICP's poses of all points. There only the
+  camera's field of view counts, because other objects have no labels
+- lost: share of the points that were left out although they are not on a moving object
+- time of a scan: perception and tracking; KISS-ICP
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeperc import Box, Perceiver, Tracker, movable_points, moving_points
+from edgeperc.errors import SplitError
+from edgeperc.evaluation.datasets import KittiCalibration, KittiObjects, read_objects
+from edgeperc.evaluation.unseen import check_unseen, training_scans_of
+from edgeperc.extras import require
+from edgeperc.geometry import inside
+from edgeperc.moving import moving_tracks
+from edgeperc.readers.files import read_points
+from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.scene import simulate_sequence
+
+from ..render import Section, number, text
+from .rounds import elapsed_ms, versions
+
+__all__ = ["Drive", "ghost_share", "main", "moving_boxes", "trajectory_error"]
+
+RATE_HZ = 10.0
+CELL_M = 0.2
+FARTHEST_CELL = 2**20  # from the origin; 200 km
+VARIANTS = ("all points", "without moving", "without movable")
+# Streets with traffic, and the speed of the sensor in them [m/s]. No model was trained on these seeds.
+STREETS = (("urban", 2_100_000_001, 6.0), ("residential", 2_100_000_001, 5.0), ("junction", 2_100_000_002, 6.0))
+MOVING_AROUND = 10  # scans around one in which an object moves for which it counts as moving too
+GROUND_M = 0.2  # points so near to the bottom of a label may be of the ground
+
+Points = NDArray[np.float32]
+Poses = NDArray[np.float64]
+Odometry = Callable[[Sequence[Points]], Poses]
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """Consecutive scans.
+
+    Attributes
+    ----------
+    name : str
+    scans : list of (n, 4) float32
+    poses : (k, 4, 4) float64 or None
+        True poses of the sensor.
+    moving : list of (n,) bool, or None
+        Points on objects that move; None: from ``labels``.
+    usable : list of (n,) bool
+        Points for KISS-ICP.
+    known : list of (n,) bool
+        Points of which it is known whether they move.
+    labels : list of list of Box
+        True boxes of each scan, of all objects; empty if ``moving`` is known.
+    trained : bool
+        Whether a model was trained on one of the scans.
+    """
+
+    name: str
+    scans: list[Points]
+    poses: Poses | None
+    moving: list[NDArray[np.bool_]] | None
+    usable: list[NDArray[np.bool_]]
+    known: list[NDArray[np.bool_]]
+    labels: list[list[Box]]
+    trained: bool = False
+
+
+def drawn_streets(n_scans: int) -> Iterator[Drive]:
+    """The streets of `STREETS`, with true poses and moving objects."""
+    for place, seed, speed in STREETS:
+        scans, poses, moving, usable = [], [], [], []
+        scene = random_scene(seed, place)
+        moves = np.array([*(abs(each.speed_mps) > 0.5 for each in scene.objects), False])  # -1 is the background
+        for _, pose, scan in simulate_sequence(scene, "hdl-64e", n_scans, RATE_HZ, speed, seed):
+            scans.append(scan.points)
+            poses.append(pose)
+            moving.append(moves[scan.objects])
+            usable.append(scan.surfaces >= 0)
+        known = [np.ones(len(points), np.bool_) for points in scans]
+        yield Drive(f"drawn {place}, {speed:.0f} m/s", scans, np.array(poses), moving, usable, known, [])
+
+
+def real_drives(
+    root: Path, wanted: Sequence[str], least: int, most: int, trained_on: dict[str, set[str]]
+) -> Iterator[Drive]:
+    """The drives of a KITTI object set with enough scans, in the order of their names."""
+    data = KittiObjects(root)
+    for drive in sorted({*data.drives.values()}):
+        names = [name for name, of in data.drives.items() if of == drive][:most]
+        if len(names) < least or (wanted and not any(drive.endswith(each) for each in wanted)):
+            continue
+        scans, known, labels, trained = [], [], [], False
+        for name in names:
+            points = read_points(root / "training/velodyne" / f"{name}.bin")
+            calibration = KittiCalibration.read(root / "training/calib" / f"{name}.txt")
+            path = root / "training/label_2" / f"{name}.txt"
+            boxes, unlabeled = read_objects(path, calibration) if path.exists() else ((), np.zeros((0, 4)))
+            seen = calibration.labeled_at(points, unlabeled) if path.exists() else np.zeros(len(points), np.bool_)
+            try:
+                check_unseen(trained_on, name, drive, points)
+            except SplitError:
+                trained = True
+            scans.append(points)
+            known.append(seen)
+            labels.append(list(boxes))
+        usable = [np.asarray(np.isfinite(points).all(axis=1)) for points in scans]
+        yield Drive(drive.removeprefix("2011_"), scans, None, None, usable, known, labels, trained)
+
+
+def moving_boxes(labels: Sequence[Sequence[Box]], poses: Poses) -> list[list[Box]]:
+    """The boxes of objects that move, by scan: labels tracked with known poses of the sensor.
+
+    An object moves in a scan if its track moves in this one or in one of `MOVING_AROUND` before or after it.
+    """
+    tracker = Tracker()
+    numbers: list[dict[int, int]] = []  # index of a box -> its track
+    moves: dict[int, list[int]] = {}  # track -> scans in which it moves
+    for k, boxes in enumerate(labels):
+        sure = [replace(box, score=0.99) for box in boxes]
+        tracks = tracker.update(sure, k / RATE_HZ, poses[k])
+        numbers.append({int(source): int(each) for source, each in zip(tracks.sources, tracks.ids, strict=True)})
+        for track in moving_tracks(tracks):
+            moves.setdefault(track.id, []).append(k)
+    return [
+        [
+            box
+            for index, box in enumerate(boxes)
+            if any(abs(k - at) <= MOVING_AROUND for at in moves.get(numbers[k].get(index, -1), []))
+        ]
+        for k, boxes in enumerate(labels)
+    ]
+
+
+def trajectory_error(true: Poses, found: Poses) -> float:
+    """Root of the mean squared distance of positions [m], after the best rigid alignment.
+
+    Parameters
+    ----------
+    true, found : (k, 4, 4) float64
+    """
+    a, b = (poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0) for poses in (true, found))
+    u, _, v = np.linalg.svd(b.T @ a)
+    turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
+    return float(np.sqrt(((b @ turn - a) ** 2).sum(axis=1).mean()))
+
+
+def closure(odometry: Odometry, scans: Sequence[Points]) -> tuple[Poses, float]:
+    """Poses of the scans, and how far from the first pose the last one is after the way back [m]."""
+    poses = odometry([*scans, *scans[-2::-1]])
+    return poses[: len(scans)], float(math.dist(poses[0][:3, 3], poses[-1][:3, 3]))
+
+
+def ghost_share(
+    scans: Sequence[Points],
+    kept: Sequence[NDArray[np.bool_]],
+    moving: Sequence[NDArray[np.bool_]],
+    poses: Poses,
+) -> float:
+    """Share of the map's cells that hold a kept point of a moving object.
+
+    Parameters
+    ----------
+    scans : sequence of (n, 4) float32
+    kept, moving : sequence of (n,) bool
+    poses : (k, 4, 4) float64
+    """
+    cells: list[list[NDArray[np.int64]]] = [[], []]
+    for points, stays, moves, pose in zip(scans, kept, moving, poses, strict=True):
+        places = np.floor((points[:, :3] @ pose[:3, :3].T + pose[:3, 3]) / CELL_M).astype(np.int64)
+        numbers = (places + FARTHEST_CELL) @ [4 * FARTHEST_CELL**2, 2 * FARTHEST_CELL, 1]
+        for k, mask in enumerate((stays, stays & moves)):
+            cells[k].append(np.unique(numbers[mask]))
+    whole, ghosts = (len(np.unique(np.concatenate(each))) for each in cells)
+    return ghosts / max(whole, 1)
+
+
+def kiss_icp(scans: Sequence[Points]) -> Poses:
+    """Poses (k, 4, 4) of KISS-ICP, the first one at the origin."""
+    module, config = require("kiss_icp.kiss_icp", "slam", "KISS-ICP"), require("kiss_icp.config", "slam", "KISS-ICP")
+    settings = config.load_config(None)
+    settings.data.deskew = False
+    settings.registration.max_num_threads = 1
+    odometry, poses = module.KissICP(settings), []
+    for points in scans:
+        odometry.register_frame(points[:, :3].astype(np.float64), np.zeros(0))
+        poses.append(odometry.last_pose)
+    return np.array(poses)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What is left out of the scans of a drive, and the median time of a scan.
+
+    Attributes
+    ----------
+    kept : dict of str to list of (n,) bool
+        By variant.
+    ms : float
+    """
+
+    kept: dict[str, list[NDArray[np.bool_]]]
+    ms: float
+
+
+def look(perceive: Callable[..., Any], drive: Drive) -> Seen:
+    """Perceive and track a drive, without its poses."""
+    tracker, ms = Tracker(), []
+    kept: dict[str, list[NDArray[np.bool_]]] = {name: [] for name in VARIANTS}
+    for k, points in enumerate(drive.scans):
+
+        def both(points: Points = points, k: int = k) -> None:
+            perception = perceive(points, k / RATE_HZ)
+            moving = moving_points(tracker(perception), points)
+            kept["without moving"].append(~moving)
+            kept["without movable"].append(~(moving | movable_points(perception, points)))
+
+        ms.append(elapsed_ms(both))
+        kept["all points"].append(np.ones(len(points), np.bool_))
+    return Seen(kept, float(np.median(ms)))
+
+
+def compared(drive: Drive, seen: Seen, odometry: Odometry) -> list[list[str]]:
+    """The rows of a drive in the table, one for each variant."""
+    rows, moving = [], drive.moving
+    for name in VARIANTS:
+        kept = seen.kept[name]
+        scans = chosen(drive, kept)
+        started = time.perf_counter()
+        poses, gap = closure(odometry, scans)
+        ms = 1e3 * (time.perf_counter() - started) / (2 * len(scans) - 1)
+        if moving is None:  # the first variant has all points
+            moving = [
+                on_objects(points, boxes)
+                for points, boxes in zip(drive.scans, moving_boxes(drive.labels, poses), strict=True)
+            ]
+        counted = [np.logical_and.reduce(masks) for masks in zip(kept, drive.known, drive.usable, strict=True)]
+        n_still = sum(int(np.count_nonzero(known & ~moves)) for known, moves in zip(drive.known, moving, strict=True))
+        n_lost = sum(
+            int(np.count_nonzero(known & ~moves & ~mask))
+            for known, moves, mask in zip(drive.known, moving, kept, strict=True)
+        )
+        way_m = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+        known = any(mask.any() for mask in drive.known)
+        rows.append(
+            [
+                f"{drive.name}{' (trained on)' if drive.trained else ''}" if name == VARIANTS[0] else "",
+                name,
+                f"{len(scans)}, {way_m:.0f} m",
+                "-" if drive.poses is None else f"{trajectory_error(drive.poses, poses):.3f} m",
+                f"{gap:.3f} m",
+                per_cent(ghost_share(drive.scans, counted, moving, poses)) if known else "-",
+                per_cent(n_lost / max(n_still, 1)) if known else "-",
+                "-" if name == VARIANTS[0] else number(seen.ms, 0),
+                number(ms, 0),
+            ]
+        )
+    return rows
+
+
+def chosen(drive: Drive, kept: Sequence[NDArray[np.bool_]]) -> list[Points]:
+    """The kept points of each scan that KISS-ICP can use."""
+    return [points[mask & usable] for points, mask, usable in zip(drive.scans, kept, drive.usable, strict=True)]
+
+
+def per_cent(value: float) -> str:
+    return f"{100.0 * value:.2f} %"
+
+
+def on_objects(points: Points, boxes: Sequence[Box]) -> NDArray[np.bool_]:
+    """The points (n, 4) inside boxes, above the ground, (n,) bool."""
+    found = np.zeros(len(points), np.bool_)
+    for box in boxes:
+        bottom = box.center[2] - box.size[2] / 2.0
+        found |= inside(box, points, 0.1) & (points[:, 2] > bottom + GROUND_M)
+    return found
+
+
+def draw_maps(drive: Drive, seen: Seen, odometry: Odometry, path: Path) -> None:
+    """Draw the maps of all points and of those that do not move, from above; truly moving points are red."""
+    pyplot = require("matplotlib.pyplot", "view", "Drawing a picture")
+    figure, axes = pyplot.subplots(2, 1, figsize=(10.0, 6.4), dpi=100, sharex=True, sharey=True)
+    assert drive.moving is not None
+    for axis, name in zip(axes, VARIANTS[:2], strict=True):
+        kept = seen.kept[name]
+        poses = odometry(chosen(drive, kept))
+        still, ghosts = [], []
+        for points, stays, moves, pose in zip(drive.scans, kept, drive.moving, poses, strict=True):
+            placed = points[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+            standing = stays & (points[:, 2] > -1.4)
+            still.append(placed[standing & ~moves][::7])
+            ghosts.append(placed[standing & moves][::3])
+        for parts, color in ((still, "#44505c"), (ghosts, "#e03131")):
+            x, y, _ = np.concatenate(parts).T
+            axis.scatter(x, y, s=0.12, c=color, linewidths=0, rasterized=True)
+        axis.set_title(f"Map of {name}", loc="left", fontsize=10)
+        axis.set_aspect("equal")
+        axis.set_xlim(-30.0, 75.0)
+        axis.set_ylim(-16.0, 16.0)
+        axis.set_ylabel("m")
+    axes[-1].set_xlabel("m")
+    figure.tight_layout()
+    figure.savefig(path)
+    pyplot.close(figure)
+
+
+def main() -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m edgeperc_bench.peers.slam", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("root", nargs="?", type=Path, help="a KITTI object set (default: drawn streets)")
+    parser.add_argument("--drive", nargs="+", default=[], metavar="DRIVE", help="only drives that end so, such as 0001")
+    parser.add_argument(
+        "--least", type=int, default=20, metavar="N", help="drives with at least N scans (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--scans", type=int, default=0, metavar="N", help="the first N scans of each drive (default: all; drawn: 60)"
+    )
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the maps of the first drawn street")
+    arguments = parser.parse_args()
+    require("kiss_icp", "slam", "The comparison with KISS-ICP", package="kiss-icp")
+    if arguments.picture and arguments.root is not None:
+        parser.error("--picture is of a drawn street; leave ROOT out")
+    perceive = Perceiver(sensor="hdl-64e", full_turn=True)
+    drives = (
+        drawn_streets(arguments.scans or 60)
+        if arguments.root is None
+        else real_drives(
+            arguments.root,
+            arguments.drive,
+            arguments.least,
+            arguments.scans or 10**9,
+            training_scans_of(perceive.cards),
+        )
+    )
+    rows = [["drive", "map of", "scans", "error", "closure", "map", "lost", "edgeperc, ms", "KISS-ICP, ms"]]
+    for k, drive in enumerate(drives):
+        seen = look(perceive, drive)
+        rows += compared(drive, seen, kiss_icp)
+        if arguments.picture and k == 0:
+            draw_maps(drive, seen, kiss_icp, arguments.picture)
+    if len(rows) == 1:
+        parser.error(f"{arguments.root} has no such drive of {arguments.least} scans or more")
+    version = importlib.metadata.version("kiss-icp")
+    print(text([Section("KISS-ICP", [f"one thread; {versions(**{'KISS-ICP': version})}"], rows)]))
+
+
+if __name__ == "__main__":
+    main()
