@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from .output import print_line
 
 if TYPE_CHECKING:
     from ..sinks import Sink
@@ -12,6 +15,10 @@ if TYPE_CHECKING:
 __all__ = ["SINKS", "add_sinks", "open_sinks", "wanted_sinks"]
 
 SINKS: tuple[str, ...] = (
+    "mcap",
+    "serve",
+    "rrd",
+    "play",
     "static",
     "labels_for",
     "bag",
@@ -22,6 +29,31 @@ SINKS: tuple[str, ...] = (
 def add_sinks(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     group = parser.add_argument_group("files of the whole run")
+    group.add_argument(
+        "--mcap",
+        type=Path,
+        metavar="FILE",
+        help="write points, boxes, tracks, drivable cells and stage times to an MCAP file for Foxglove and other "
+        "viewers (needs the extra 'foxglove')",
+    )
+    group.add_argument(
+        "--serve",
+        type=_address,
+        nargs="?",
+        const=("127.0.0.1", 8765),
+        metavar="HOST:PORT",
+        help="stream the same to viewers while it runs, over Foxglove's WebSocket protocol; anyone who reaches "
+        "HOST:PORT can watch (default without a value: 127.0.0.1:8765, this computer only; needs the extra 'foxglove')",
+    )
+    group.add_argument(
+        "--rrd", type=Path, metavar="FILE", help="write a recording for the Rerun viewer (needs the extra 'rerun')"
+    )
+    group.add_argument(
+        "--play",
+        type=Path,
+        metavar="FILE",
+        help="write one HTML page that plays all scans of the drive in 3-D, of at most 48 MB: scans are thinned",
+    )
     group.add_argument(
         "--static",
         type=Path,
@@ -58,6 +90,14 @@ def add_sinks(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _address(text: str) -> tuple[str, int]:
+    """``HOST:PORT`` or ``PORT``."""
+    host, _, port = text.rpartition(":")
+    if not (port.isdecimal() and int(port) < 2**16):
+        raise argparse.ArgumentTypeError(f"got {text!r}; expected HOST:PORT or PORT; write --serve after PATH")
+    return host.strip("[]") or "127.0.0.1", int(port)
+
+
 def wanted_sinks(arguments: argparse.Namespace) -> list[str]:
     """Names of the passed options, in the order of `SINKS`."""
     return [name for name in SINKS if getattr(arguments, name) is not None]
@@ -66,6 +106,24 @@ def wanted_sinks(arguments: argparse.Namespace) -> list[str]:
 def open_sinks(arguments: argparse.Namespace) -> list[Sink]:
     """Make the sinks of the passed options; errors of options and missing extras come here, before the first scan."""
     sinks: list[Sink] = []
+    if arguments.mcap is not None:
+        from ..sinks.foxglove import McapSink
+
+        sinks.append(McapSink(arguments.mcap))
+    if arguments.serve is not None:
+        from ..sinks.foxglove import ServeSink
+
+        served = ServeSink(*arguments.serve)
+        print_line(f"open {served.url} in Foxglove", sys.stderr)
+        sinks.append(served)
+    if arguments.rrd is not None:
+        from ..sinks.rerun import RerunSink
+
+        sinks.append(RerunSink(arguments.rrd))
+    if arguments.play is not None:
+        from ..sinks.page import PageSink
+
+        sinks.append(PageSink(arguments.play))
     if arguments.static is not None:
         from ..sinks.static import StaticSink
 

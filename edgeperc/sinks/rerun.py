@@ -60,6 +60,7 @@ class RerunSink:
 
     def __init__(self, path: str | Path) -> None:
         self._rr: Any = require("rerun", "rerun", "Writing a recording for Rerun", package="rerun-sdk")
+        require("rerun.blueprint", "rerun", "Writing a recording for Rerun", package="rerun-sdk")
         self._path = checked_target(path)
         self._open = ExitStack()
         self._recording: Any = None
@@ -70,8 +71,12 @@ class RerunSink:
     def _start(self) -> None:
         """Open the file: with the first scan, so that a run without answers replaces no file."""
         file = self._open.enter_context(open_atomic(self._path))
-        self._recording = self._rr.RecordingStream("edgeperc")
-        self._recording.save(file.name)
+        rr, views = self._rr, self._rr.blueprint
+        self._recording = rr.RecordingStream("edgeperc")
+        shown = views.Spatial3DView(origin="/world"), views.TimeSeriesView(origin="/status")
+        layout = views.Blueprint(views.Vertical(*shown, row_shares=[4, 1]), collapse_panels=True)
+        self._recording.save(file.name, default_blueprint=layout)
+        self._recording.set_log_time_enabled(False)
         self._recording.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def write(self, scan: PerceivedScan) -> None:
