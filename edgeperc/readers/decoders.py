@@ -6,7 +6,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 import numpy as np
@@ -320,19 +320,14 @@ def _clouds(path: Path, kind: str, topic: str | None, alive: Callable[[], None])
     """Topic, message and stamp [s] of each point cloud."""
     highlevel = require("rosbags.highlevel", "ros", "Reading a bag")
     typesys = require("rosbags.typesys", "ros", "Reading a bag")
-    rosbag2 = require("rosbags.rosbag2", "ros", "Reading a bag")
     humble = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    packed, files = False, [path] if kind == ".mcap" else []
     if kind == "ros2":
-        path = _unpacked_files(path, rosbag2.Reader(path), alive)
-    files = [path] if kind == ".mcap" else _mcap_files(rosbag2.Reader(path)) if kind == "ros2" else []
+        path, packed, files = _plain_bag(path, alive)
     opened = _McapBag(files, humble) if files else highlevel.AnyReader([path], default_typestore=humble)
     with opened as bag:
-        packed = False
         for reader in getattr(bag, "readers", []):
             _limit_chunks(reader)
-            if getattr(reader, "compression_mode", None) == "message":
-                packed = True
-                reader.metadata["compression_mode"] = ""  # unpacked below, within limits
         clouds = [c for c in bag.connections if c.msgtype == _CLOUD]
         others = sorted({f"{c.topic} ({c.msgtype})" for c in bag.connections if c.msgtype != _CLOUD})
         names = sorted({c.topic for c in clouds})
@@ -349,29 +344,39 @@ def _clouds(path: Path, kind: str, topic: str | None, alive: Callable[[], None])
             raise PointsError(f"topic {chosen} has no message; expected point clouds")
 
 
-def _unpacked_files(folder: Path, bag: Any, alive: Callable[[], None]) -> Path:
-    """A ROS 2 bag's folder whose files are not compressed: the folder itself, or a copy in a temporary one."""
-    if bag.compression_mode != "file":
-        return folder
+def _plain_bag(folder: Path, alive: Callable[[], None]) -> tuple[Path, bool, list[Path]]:
+    """A ROS 2 bag without compression, for readers that would unpack without limits.
+
+    Returns
+    -------
+    folder : Path
+        The bag's own; or a temporary one, whose files are unpacked, or links to those with compressed messages.
+    packed : bool
+        Whether its messages are compressed all the same.
+    files : list of Path
+        Its MCAP files, if nothing in it is compressed; empty if it has files of another format.
+    """
+    yaml = require("ruamel.yaml", "ros", "Reading a bag", package="ruamel.yaml")
+    information = yaml.YAML(typ="safe").load(folder / "metadata.yaml")["rosbag2_bagfile_information"]
+    files = [folder / PurePath(name).name for name in information["relative_file_paths"]]
+    mode = str(information.get("compression_mode") or "none").lower()
+    if mode not in ("file", "message"):
+        return folder, False, files if information["storage_identifier"] == "mcap" else []
     target = Path(tempfile.mkdtemp())
-    left = min(most_bytes(sum(file.stat().st_size for file in bag.paths)), shutil.disk_usage(target).free // 2)
-    for file in bag.paths:
-        left -= inflate_file(file, target / file.stem, left, alive)
-    information = {
-        **bag.metadata,
-        "compression_mode": "",
-        "compression_format": "",
-        "relative_file_paths": [file.stem for file in bag.paths],
-    }
-    text = json.dumps({"rosbag2_bagfile_information": information}, default=str)  # JSON is YAML
+    names = [file.stem if mode == "file" else file.name for file in files]
+    left = min(most_bytes(sum(file.stat().st_size for file in files)), shutil.disk_usage(target).free // 2)
+    for file, name in zip(files, names, strict=True):
+        if mode == "file":
+            left -= inflate_file(file, target / name, left, alive)
+            continue
+        try:
+            (target / name).symlink_to(file.absolute())
+        except OSError:  # Windows allows links to few users
+            shutil.copy(file, target / name)
+    plain = {**information, "compression_mode": "", "compression_format": "", "relative_file_paths": names}
+    text = json.dumps({"rosbag2_bagfile_information": plain}, default=str)  # JSON is YAML
     (target / "metadata.yaml").write_text(text, encoding="utf-8")
-    return target
-
-
-def _mcap_files(bag: Any) -> list[Path]:
-    """The MCAP files of a ROS 2 bag's folder, none if it holds others or packs them once more."""
-    plain = bag.metadata["storage_identifier"] == "mcap" and not bag.compression_mode
-    return [*bag.paths] if plain else []
+    return target, mode == "message", []
 
 
 def _limit_chunks(reader: Any) -> None:
