@@ -153,8 +153,9 @@ def test_boxes_around_points_match_the_twin(given: list, boxes: list[Box]) -> No
     scores, names = np.empty(len(scene.points), np.float32), np.empty(len(scene.points), np.uint8)
     arrays = map_read_only((scene.points, scene.height, scene.on_ground))
     among = read_only(scene.in_view & ~scene.on_ground, np.bool_)
-    fill_support(*arrays[:2], among, as_rows, of_box, scores, names)
-    right_scores, right_names = twins.agreement.support(*arrays[:2], ~among, as_rows, of_box)
+    labels = read_only(scene.labels, np.uint8)
+    fill_support(*arrays[:2], among, labels, ROLES, as_rows, of_box, scores, names)
+    right_scores, right_names = twins.agreement.support(*arrays[:2], ~among, labels, ROLES, as_rows, of_box)
     np.testing.assert_array_equal(scores, right_scores)
     np.testing.assert_array_equal(names, right_names)
     counts = np.empty((len(boxes), 3), np.int64)
@@ -256,8 +257,9 @@ def test_a_forest_is_not_searched_because_of_a_few_labels() -> None:
 def test_cleared_ground_matches_the_twin(given: list) -> None:
     scene = Scene([(round(x) if abs(x) < 99 else x, 0.1, *rest) for x, _, *rest in given])  # many in one cell
     found = scene.labels.copy()
-    clear_ground(scene.points, read_only(scene.on_ground, np.bool_), ROLES, found)
-    np.testing.assert_array_equal(found, twins.agreement.ground(scene.points, scene.on_ground, ROLES, scene.labels))
+    arrays = map_read_only((scene.points, scene.height, scene.on_ground))
+    clear_ground(*arrays, ROLES, found)
+    np.testing.assert_array_equal(found, twins.agreement.ground(*arrays, ROLES, scene.labels))
 
 
 @patient
@@ -331,7 +333,7 @@ def test_only_uncertain_boxes_without_labels_are_dropped(given: list, boxes: lis
 
 @pytest.mark.parametrize("n", [0, 1])
 def test_no_points_and_one_point(n: int) -> None:
-    scene = Scene([(5.0, 0.0, 1.0, False, True, 1, 0)][:n])
+    scene = Scene([(5.0, 0.0, 1.2, False, True, 1, 0)][:n])
     box = Box("car", 0.9, (5.0, 0.0, -1.0), (4.0, 1.6, 1.5), 0.0)
     agreed = agree_on_points(scene.points, scene.found, scene.ground, scene.clusters, [box])
     assert agreed.labels.tolist() == [1] * n
@@ -439,6 +441,32 @@ def test_kerb_is_no_car_and_ground_is_car_only_below_cars() -> None:
     rows, labels = agreed_scene(kerb, car, below)
     assert labels[-3:].tolist() == [1, 0, 0]
     assert not labels[rows[:, 0] < 5.0].any()
+
+
+def test_road_beside_a_near_car_is_no_car() -> None:
+    near, far = block(4.0, 3.0, CAR, 1), block(9.0, -3.0, CAR, 1)
+    below = np.array([(4.0, 2.15, 0.0, 1), (9.0, -3.85, 0.0, 1)])
+    rows, labels = agreed_scene(near, far, below)
+    assert labels[-2:].tolist() == [0, 1]
+    assert (labels[rows[:, 2] > 0.0] == 1).all()
+
+
+def test_near_table_is_no_car() -> None:
+    tables = [block(x, 3.0, (2.5, 1.5, 0.95), 1) for x in (10.0, 45.0)]
+    rows, labels = agreed_scene(*tables)
+    is_near = (rows[:, 2] > 0.0) & (rows[:, 0] < 20.0)
+    assert not labels[is_near].any()
+    assert (labels[(rows[:, 2] > 0.0) & ~is_near] == 1).all()
+
+
+def test_box_that_the_labels_contradict_labels_nothing() -> None:
+    wall = block(12.0, 3.0, (14.0, 0.3, 2.5), 0)
+    box = Box("van", 0.9, (12.0, 3.0, -1.0), (4.9, 1.9, 2.1), 0.0)
+    assert not agreed_scene(wall, boxes=(box,))[1].any()
+    own = np.abs(wall[:, 0] - 12.0) < 2.4
+    wall[np.flatnonzero(own)[::8], 3] = 1
+    labels = agreed_scene(wall, boxes=(box,))[1]
+    assert (labels[-len(wall) :][own & (wall[:, 2] < 2.3)] == 1).all()
 
 
 def test_cyclist_is_one_object() -> None:

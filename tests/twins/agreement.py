@@ -59,11 +59,14 @@ def inside(points, height, on_ground, box):
         )
 
 
-def support(points, height, on_ground, boxes, of_box):
+def support(points, height, on_ground, labels, roles, boxes, of_box):
     """Twin of `edgeperc.agreement.fill_support`."""
     scores, names = np.zeros(len(points), np.float32), np.zeros(len(points), np.uint8)
     for box, name in zip(boxes, of_box, strict=True):
-        better = inside(points, height, on_ground, box) & (box[7] > scores)
+        own = inside(points, height, on_ground, box)
+        if np.count_nonzero(roles[labels[own]] == 1) < 0.1 * np.count_nonzero(own):
+            continue
+        better = own & (box[7] > scores)
         scores[better], names[better] = box[7], name
     return scores, names
 
@@ -105,7 +108,11 @@ def verdict_table(counts, bounds, roles, parts, by_share, by_height, is_filled):
     vehicle_share, person_share = counts[:, vehicles].sum(axis=1) / seen, counts[:, persons].sum(axis=1) / seen
     length, top = np.hypot(*(bounds[:, 2:4].astype(np.float64) - bounds[:, :2]).T), bounds[:, 4]
     large = (length > 10.0) | (top > 4.0)
-    no_vehicle = by_share & (vehicle_share < np.where(large, 0.75, 0.6)) | by_height & (top < 0.5)
+    low, high = bounds[:, :2].astype(np.float64), bounds[:, 2:4].astype(np.float64)
+    is_near = np.hypot(*np.maximum(np.maximum(low, -high), 0.0).T) < 30.0  # nearest place of the bounds
+    no_vehicle = by_share & (vehicle_share < np.where(large, 0.75, 0.6)) | by_height & (
+        top < np.where(is_near, 1.0, 0.5)
+    )
     no_person = by_share & (person_share < 0.1) | by_height & (top < 1.0)
     table = np.tile(np.arange(len(roles), dtype=np.uint8), (len(counts), 1))
     table[np.ix_(no_vehicle, vehicles)] = 0
@@ -122,15 +129,16 @@ def verdict_table(counts, bounds, roles, parts, by_share, by_height, is_filled):
     return table
 
 
-def ground(points, on_ground, roles, labels):
+def ground(points, height, on_ground, roles, labels):
     """Twin of `edgeperc.agreement.clear_ground`."""
     row, col, known = cells_of(points, 0.2, 1024)
     cleared = labels.copy()
     for role in (1, 2):
         own = roles[labels] == role
         standing = {*zip(row[own & ~on_ground & known], col[own & ~on_ground & known], strict=True)}
+        is_road = (height < 0.06) & ((points[:, :2].astype(np.float64) ** 2).sum(axis=1) < 36.0)
         for i in np.flatnonzero(own & on_ground):
-            if not known[i] or (row[i], col[i]) not in standing:
+            if is_road[i] or not known[i] or (row[i], col[i]) not in standing:
                 cleared[i] = 0
     return cleared
 
