@@ -220,6 +220,8 @@ def occupancy_grid(
     The heights are above the ground that `find_ground` finds. Returns more than 2 m above it, such as those of a tree's
     crown, are no obstacles. Returns and rays decide what is unknown, not the network's labels.
 
+    Its kernel is compiled in the first call, not when a `Perceiver` is made; later processes load it from the cache.
+
     Examples
     --------
     >>> grid = edgeperc.occupancy_grid(found, points)       # doctest: +SKIP

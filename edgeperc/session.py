@@ -38,7 +38,7 @@ from .printable import printable
 from .tuning import compiled_folder, cpu_features, fingerprint, read_setting, settings_path
 from .zoo import Variant, choose, digest, resolve
 
-__all__ = ["PRECISIONS", "PROVIDERS", "Session", "available_providers", "devices", "golden_input"]
+__all__ = ["PRECISIONS", "PROVIDERS", "Session", "available_providers", "devices", "golden_input", "runtime_version"]
 
 logger = logging.getLogger(__name__)
 
@@ -121,6 +121,17 @@ def available_providers() -> tuple[str, ...]:
     ort = _onnxruntime()
     stock = ort.get_available_providers()
     return tuple(s for s, name in PROVIDERS.items() if name in stock or (s in PLUGINS and _plugin_devices(ort, s)))
+
+
+def runtime_version() -> str:
+    """The version of the installed onnxruntime.
+
+    Raises
+    ------
+    MissingExtraError
+        onnxruntime cannot be imported; the cause says why.
+    """
+    return str(_onnxruntime().__version__)
 
 
 def devices() -> tuple[str, ...]:

@@ -29,7 +29,7 @@ SMOKE: dict[str, tuple[list[str], list[str]]] = {
     "peers": (["openvino", "stonesoup", "torch"], ["tests/test_peers.py"]),
     "progress": (["tqdm"], ["tests/test_cli.py", "-k", "progress"]),
     "ray": (["ray.data"], ["tests/test_database.py", "-k", "ray"]),
-    "remote": (["fsspec"], ["tests/test_remote.py"]),
+    "remote": (["fsspec"], ["tests/test_engine.py", "-k", "memory or fetched or protocol"]),
     "rerun": (["rerun"], ["tests/test_viewers.py", "-k", "rerun or rrd"]),
     "ros": (["lz4", "rosbags", "zstandard"], ["tests/test_captures.py", "tests/test_times.py", "-k", "bag or mcap"]),
     "ros2": (["rosbags", "zenoh"], ["tests/test_ros2_messages.py", "tests/test_ros2_node.py"]),

@@ -719,8 +719,8 @@ def test_live_names_the_scans_of_a_capture(capture: Path, capsys: pytest.Capture
 # --- help and renamed words ------------------------------------------------------------------------------------------
 
 COMMANDS = (
-    *("demo", "run", "info", "models", "sensors", "providers", "eval", "eval-sensors", "eval-tracking"),
-    *("eval-painting", "fit-sensor", "completion"),
+    *("demo", "run", "ros2", "info", "doctor", "models", "sensors", "providers", "eval", "eval-sensors"),
+    *("eval-tracking", "eval-painting", "fit-sensor", "completion"),
 )
 
 

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("tqdm")
 
 from edgeperc.card import TopViewGeometry
-from edgeperc.errors import CalibrationError, PointsError
+from edgeperc.errors import CalibrationError, OptionError, PointsError
 from edgeperc.evaluation.datasets import (
     Frame,
     KittiCalibration,
@@ -284,9 +284,9 @@ def test_every_named_drive_has_one_place() -> None:
         assert [in_split(drive, s) for s in ("train", "validation", "test", "all")] == [False, True, False, True]
         assert not in_split(drive, "validation", 0)
     assert [in_split("mine", s) for s in ("train", "validation", "test", "all")] == [True, False, True, True]
-    with pytest.raises(ValueError, match="expected train, validation, test or all"):
+    with pytest.raises(OptionError, match="expected train, validation, test or all"):
         in_split("mine", "both")
-    with pytest.raises(ValueError, match="expected 0 to 2"):
+    with pytest.raises(OptionError, match="expected 0 to 2"):
         in_split("mine", "train", 3)
 
 

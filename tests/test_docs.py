@@ -95,6 +95,8 @@ def test_python_runs(page: Path, place: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.chdir(place)
     if "draw(" in page.read_text("utf-8"):
         pytest.importorskip("matplotlib")
+    if "McapSink(" in page.read_text("utf-8"):
+        pytest.importorskip("foxglove")
     names: dict[str, object] = {"__name__": "page"}
     for block in blocks_of(page, "python"):
         if block.excuse.startswith("not run:") or not has_model(block):
@@ -115,6 +117,11 @@ def test_commands_run(block: Block, line: str, place: Path, monkeypatch: pytest.
     elif program == "make":
         targets = re.findall(r"^([\w-]+):", (REPOSITORY / "Makefile").read_text("utf-8"), flags=re.M)
         assert {word for word in arguments if "=" not in word} <= {*targets}
+    elif program == "podman":
+        if arguments[0] == "run":  # what follows the image's name is for edgeperc
+            parse("edgeperc", arguments[len(arguments) - arguments[::-1].index("edgeperc") :])
+        else:
+            assert (REPOSITORY / "Containerfile").is_file()
     elif program == "git":
         assert arguments[0] == "clone"
     elif program == "python":
@@ -129,6 +136,8 @@ def test_commands_run(block: Block, line: str, place: Path, monkeypatch: pytest.
     else:
         if {"--png", "--gif", "demo"} & {*arguments}:
             pytest.importorskip("matplotlib")
+        for option in {"--mcap", "--rrd"} & {*arguments}:
+            pytest.importorskip({"--mcap": "foxglove", "--rrd": "rerun"}[option])
         if sys.platform == "win32" and "models/research" in line:
             pytest.skip("no symbolic links")
         with contextlib.redirect_stdout(io.StringIO()) as printed:

@@ -10,13 +10,12 @@ import subprocess
 import sys
 from email.message import Message
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from cli_helpers import run
-from edgeperc import listing, zoo
+from edgeperc import listing, session, zoo
 from edgeperc.cli import doctor
 from edgeperc.errors import ProviderError
 from edgeperc.kernel_cache import KernelCache
@@ -112,7 +111,7 @@ def test_no_onnxruntime(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.
 def test_builds_of_onnxruntime(
     versions: dict[str, str], features: tuple[str, ...], state: str, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "onnxruntime", SimpleNamespace(__version__=versions["onnxruntime"]))
+    monkeypatch.setattr(session, "runtime_version", lambda: versions["onnxruntime"])
     monkeypatch.setattr(doctor, "_installed", lambda prefix="": versions)
     monkeypatch.setattr(doctor, "_has_sme", lambda: "sme" in features)
     found = {finding.name: finding for finding in doctor._packages()}
@@ -124,7 +123,7 @@ def test_builds_of_onnxruntime(
     ("value", "state", "text"), [("1", "ok", "off"), ("0", "note", "=0"), ("", "note", "imported")]
 )
 def test_telemetry(value: str, state: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "onnxruntime", SimpleNamespace(__version__="1.31.1"))
+    monkeypatch.setattr(session, "runtime_version", lambda: "1.31.1")
     monkeypatch.setenv("ORT_DISABLE_TELEMETRY", value)
     if not value:
         monkeypatch.delenv("ORT_DISABLE_TELEMETRY")

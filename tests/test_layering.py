@@ -30,7 +30,8 @@ FLOORS = {
         adapt cluster decode drivable fitness ground image motion observed projection refine sensor_fit session
         voting
         agreement level network_input occupancy painting remission
-        readers.__init__ readers.tables
+        readers.__init__ readers.times
+        readers.tables
         readers.inflate readers.packets
         readers.pcd readers.ply
         readers.files readers.images readers.mcap readers.ouster
@@ -65,12 +66,13 @@ FLOORS = {
         view.canvas view.content
         view.files view.mistakes view.page view.painted view.picture view.tracks
         view.__init__
-        ros2.__init__ ros2.graph ros2.messages
-        ros2.node ros2.rclpy_graph ros2.zenoh_graph sinks.rosbag
+        ros2.__init__ ros2.graph ros2.messages sinks.scene
+        ros2.node ros2.rclpy_graph ros2.zenoh_graph sinks.foxglove sinks.page sinks.rerun sinks.rosbag
         cli.arguments cli.output
         cli.report cli.scans cli.sinks
         cli.engine
-        cli.completion cli.fit_sensor cli.info cli.program cli.run
+        cli.straighten
+        cli.completion cli.doctor cli.fit_sensor cli.info cli.program cli.run
         cli.ros2
         cli.demo cli.eval cli.eval_painting cli.eval_sensors cli.eval_tracking cli.lists
         cli.main
@@ -78,7 +80,8 @@ FLOORS = {
         __init__ __main__
     """,
     "edgeperc_export": """
-        __init__ processes targets
+        __init__ processes ranks targets triton_model
+        triton
         networks.pointseg networks.ssadnet recipe scans
         augment cards losses networks.camseg networks.edge networks.lodnn networks.segnet networks.squeezesegv2
         networks.unet roads simulate

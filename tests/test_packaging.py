@@ -61,23 +61,6 @@ def test_messages_name_extras_that_exist() -> None:
     assert "io" not in {extra for _, extra in found}, "a message names the extra of one library"
 
 
-def test_documents_name_extras_that_exist() -> None:
-    pages = [
-        *REPOSITORY.glob("*.md"),
-        *(REPOSITORY / "docs").glob("*.md"),
-        *(REPOSITORY / "docs" / "howto").glob("*.md"),
-    ]
-    texts = [page.read_text("utf-8") for page in pages if page.name != "CHANGELOG.md"]
-    named = {
-        extra
-        for text in texts
-        for group in re.findall(r"(?:edgeperc|'\.)\[([\w,]+)\]", text)
-        for extra in group.split(",")
-    }
-    assert len(named) > 5
-    assert named <= EXTRAS
-
-
 def test_every_extra_is_tried_alone() -> None:
     assert {*SMOKE} == ALONE
     jobs = yaml.safe_load((REPOSITORY / ".github" / "workflows" / "ci.yml").read_text("utf-8"))["jobs"]

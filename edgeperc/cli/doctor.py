@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .. import __version__
-from ..errors import EdgepercError
-from ..extras import without_telemetry
+from ..errors import EdgepercError, MissingExtraError
 from .arguments import DEFAULT, Commands, add_command
 from .output import many, one_line, print_columns, print_line
 
@@ -153,19 +152,17 @@ def _packages() -> Iterator[Finding]:
             yield Finding(name, "ok", str(import_module(name).__version__))
         except Exception as exc:  # a wheel for another processor or numpy raises other errors than ImportError
             yield _broken(name, exc, f"pip install --force-reinstall {name}")
-    without_telemetry()
+    from ..session import runtime_version
+
     versions = _installed("onnxruntime")
     builds = [name for name in _BUILDS if name in versions]
     try:
-        version = str(import_module("onnxruntime").__version__)
-    except ImportError as exc:
-        missing = isinstance(exc, ModuleNotFoundError) and not builds
-        reinstall = f"pip install --force-reinstall {builds[0] if builds else 'onnxruntime'}"
-        yield (
-            Finding("onnxruntime", "broken", "not installed", "pip install 'edgeperc[cpu]'")
-            if missing
-            else _broken("onnxruntime", exc, reinstall)
-        )
+        version = runtime_version()
+    except MissingExtraError as exc:
+        if builds and exc.__cause__ is not None:
+            yield _broken("onnxruntime", exc.__cause__, f"pip install --force-reinstall {builds[0]}")
+        else:
+            yield Finding("onnxruntime", "broken", "not installed", "pip install 'edgeperc[cpu]'")
         return
     shown = ", ".join(f"{name} {versions[name]}" for name in sorted(versions)) or version
     if len(builds) > 1:
@@ -308,16 +305,14 @@ def _models() -> Iterator[Finding]:
 
 def _runs(found: set[str]) -> Iterator[Finding]:
     """Whether the default models open and answer their golden inputs, with the provider that is chosen here."""
-    try:
-        import_module("onnxruntime")
-    except ImportError:  # `_packages` reports it
-        return
     from ..session import Session
 
     for name in DEFAULT:
         if name in found:
             try:
                 yield Finding(f"runs {name}", "ok", Session(name).description)
+            except MissingExtraError:  # `_packages` reports it
+                return
             except EdgepercError as exc:
                 yield _broken(f"runs {name}", exc)
 

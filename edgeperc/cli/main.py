@@ -16,7 +16,20 @@ from collections.abc import Sequence
 # Commands import numpy, numba, onnxruntime and matplotlib inside functions, so that --help is fast.
 from .. import __version__
 from ..errors import EdgepercError
-from . import completion, demo, eval, eval_painting, eval_sensors, eval_tracking, fit_sensor, info, lists, ros2, run
+from . import (
+    completion,
+    demo,
+    doctor,
+    eval,
+    eval_painting,
+    eval_sensors,
+    eval_tracking,
+    fit_sensor,
+    info,
+    lists,
+    ros2,
+    run,
+)
 from .program import Parser, run_program
 
 __all__ = ["build_parser", "in_options", "main"]
@@ -97,7 +110,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     evaluations = (eval, eval_sensors, eval_tracking, eval_painting)
-    for module in (demo, run, ros2, info, lists, *evaluations, fit_sensor, completion):
+    for module in (demo, run, ros2, info, doctor, lists, *evaluations, fit_sensor, completion):
         module.add_parser(commands)
     return parser
 

@@ -88,8 +88,9 @@ def add_parser(commands: Commands) -> None:
         type=location,
         metavar="PATH",
         help="scan files (.bin, .pcd, .ply, .npy, .npz); folders of them; the root of a KITTI object set, of "
-        "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .osf, .bag, .mcap, a ROS 2 bag's folder (extra 'io'); "
-        "or images (.jpg, .png, .webp, .bmp, .ppm) and folders of them (extra 'camera')",
+        "SemanticKITTI or of a KITTI raw drive; captures: .pcap, .osf, .bag, .mcap, a ROS 2 bag's folder "
+        "(extras 'velodyne', 'ouster', 'ros'); or images (.jpg, .png, .webp, .bmp, .ppm) and folders of them (extra "
+        "'camera')",
     )
     reading.add_argument(
         "--scan",
@@ -109,6 +110,19 @@ def add_parser(commands: Commands) -> None:
     add_sensor(reading, of_capture=True)
     add_mounting(reading)
     add_topic(reading)
+    reading.add_argument(
+        "--deskew",
+        action="store_true",
+        help="straighten scans by the times of their points and the motion of the sensor: that of --poses, or with "
+        "--track the tracker's own estimate from the scans before",
+    )
+    reading.add_argument(
+        "--poses",
+        type=Path,
+        metavar="FILE",
+        help="poses of the sensor on the clock of the scans, for --deskew: lines of time [s], x, y, z [m] and the "
+        "quaternion x, y, z, w, TUM's format (default: the tracker's estimate)",
+    )
     reading.add_argument(
         "--on-mismatch",
         choices=("refuse", "warn", "raise", "ignore"),
@@ -263,12 +277,17 @@ def run_command(arguments: argparse.Namespace) -> int:
 def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
     """Check for contradictory options and missing extras before any work."""
     check_engine(arguments, wanted_sinks(arguments))
-    if arguments.live and (kinds or arguments.gif or len(arguments.paths) > 1):
-        arguments.usage_error("--live replays one PATH and writes no files")
+    if arguments.live and len(arguments.paths) > 1:
+        shown = ", ".join(map(str, arguments.paths[:3]))
+        arguments.usage_error(f"--live replays one path, got {len(arguments.paths)}: {shown}")
+    if arguments.live and (kinds or arguments.gif):
+        arguments.usage_error(f"--live writes no files; leave out --{[*kinds, 'gif'][0]}")
     if (kinds or arguments.gif) and arguments.out is None:
         arguments.usage_error(f"--{[*kinds, 'gif'][0]} writes files; add --out DIR")
     if arguments.labels_for is not None and arguments.out is None:
         arguments.usage_error("--labels-for writes files; add --out DIR")
+    if arguments.labels_for is not None and isinstance(arguments.out, Remote):
+        arguments.usage_error(f"--labels-for writes to a folder of this computer, not to {arguments.out}")
     if arguments.out is not None and not kinds and not arguments.gif and arguments.labels_for is None:
         arguments.usage_error(
             "--out DIR has nothing to write; add --png, --html, --labels, --ply, --gif or --labels-for"
@@ -279,6 +298,10 @@ def _check_usage(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
         arguments.usage_error("--movable is of --static DIR; add it")
     if arguments.gif and not arguments.track:
         arguments.usage_error("--gif shows tracks; add --track")
+    if arguments.deskew and (arguments.live or not (arguments.track or arguments.poses)):
+        arguments.usage_error("--deskew needs --poses FILE or --track, and no --live")
+    if arguments.poses is not None and not arguments.deskew:
+        arguments.usage_error("--poses is of --deskew; add it")
     if arguments.png:
         require("matplotlib", "view", "Drawing a picture")
     if arguments.gif:
@@ -299,8 +322,9 @@ def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, P
         read_kitti_calibration(arguments.calib)  # errors of the file come before the first image
     if not images:
         return {}
-    if arguments.live:
-        arguments.usage_error("--live replays scans, not images")
+    if arguments.live or arguments.deskew:
+        option = "--live" if arguments.live else "--deskew"
+        arguments.usage_error(f"{option} is of scans, and {next(iter(images))} is an image; leave it out")
     of_scans = [kind for kind in (*kinds, *(["track"] if arguments.track else [])) if kind != "png"]
     of_scans += [name.replace("_", "-") for name in wanted_sinks(arguments)]
     if of_scans and not scans:
@@ -394,6 +418,11 @@ class _Run:
         self._kinds = kinds
         self._sinks = sinks
         self._tracker = Tracker() if arguments.track else None
+        self._straightener = None
+        if arguments.deskew:
+            from .straighten import Straightener
+
+            self._straightener = Straightener(arguments.poses)
         self._n = 0
 
     def scans(self, path: Path, target: Path, shown: Path | None = None) -> Iterator[Outcome]:
@@ -407,7 +436,8 @@ class _Run:
         try:
             perceive = self._perceivers.of(self._perceivers.sensor_of(path))
             numbered = is_capture(path)
-            for k, (stamp_s, points) in enumerate(read_scans(path, topic=self._arguments.topic)):
+            read = read_scans if self._straightener is None else self._straightener.scans
+            for k, (stamp_s, points) in enumerate(read(path, topic=self._arguments.topic)):
                 name, file = (shown / f"{k:06d}", target / f"{k:06d}") if numbered else (shown, target)
                 try:
                     perception = perceive(points, stamp_s)
@@ -500,6 +530,8 @@ class _Run:
         """Track the boxes and write everything about a scan."""
         stamp_s = self._stamp_s(perception)
         tracks = None if self._tracker is None else self._tracker.update(perception.boxes, stamp_s)
+        if self._straightener is not None and tracks is not None:
+            self._straightener.follow(tracks)
         _write(points, perception, wanted, title=title or str(name))
         self._sink(PerceivedScan(str(name), stamp_s, points, perception, tracks, sensor))
         return name, perception, tracks, _under(points, perception) if self._arguments.gif else None

@@ -8,6 +8,8 @@ Shipped models are compared on the validation drives.
 
 from __future__ import annotations
 
+from ..errors import OptionError
+
 __all__ = ["FOLDS", "TEST_DRIVES", "VALIDATION_DRIVES", "fold_of", "in_split"]
 
 # Three object drives with cars, vans, trucks, pedestrians and cyclists, and all of SemanticKITTI's sequence 00.
@@ -80,13 +82,13 @@ def in_split(drive: str, split: str, fold: int | None = None) -> bool:
 
     Raises
     ------
-    ValueError
+    OptionError
         ``split`` or ``fold`` is unknown.
     """
     if split not in ("train", "validation", "test", "all"):
-        raise ValueError(f"split is {split!r}; expected train, validation, test or all")
+        raise OptionError(f"split is {split!r}; expected train, validation, test or all")
     if fold is not None and fold not in range(len(FOLDS)):
-        raise ValueError(f"fold is {fold}; expected 0 to {len(FOLDS) - 1}")
+        raise OptionError(f"fold is {fold!r:.80}; expected 0 to {len(FOLDS) - 1}")
     own = fold_of(drive)
     if drive in VALIDATION_DRIVES:
         return split == "all" or (split == "validation" and fold is None)
