@@ -27,6 +27,8 @@ __all__ = ["RerunSink"]
 # takes 20 bytes; the rest of a scan less than 8 MB.
 _POINT_BYTES, _ROOM_BYTES = 20, 8 * 2**20
 _PATIENCE_S = 60.0
+_RADIUS = -1.2  # a negative one is in points of the screen
+_BACKGROUND = [11, 15, 20]
 
 
 class RerunSink:
@@ -73,8 +75,13 @@ class RerunSink:
         file = self._open.enter_context(open_atomic(self._path))
         rr, views = self._rr, self._rr.blueprint
         self._recording = rr.RecordingStream("edgeperc")
-        shown = views.Spatial3DView(origin="/world"), views.TimeSeriesView(origin="/status")
-        layout = views.Blueprint(views.Vertical(*shown, row_shares=[4, 1]), collapse_panels=True)
+        # The view moves with the sensor and looks ahead from behind and above it.
+        eye = views.EyeControls3D(position=(-14.0, 0.0, 9.0), look_target=(12.0, 0.0, -1.7), eye_up=(0.0, 0.0, 1.0))
+        seen = views.Spatial3DView(
+            origin="/world/lidar", contents="/world/**", background=_BACKGROUND, eye_controls=eye, name="scan"
+        )
+        times = views.TimeSeriesView(origin="/status", name="stages [ms]")
+        layout = views.Blueprint(views.Vertical(seen, times, row_shares=[4, 1]), collapse_panels=True)
         self._recording.save(file.name, default_blueprint=layout)
         self._recording.set_log_time_enabled(False)
         self._recording.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -101,9 +108,10 @@ class RerunSink:
         self._annotate([*classes, *(view.classes if view is not None else ()), *(box.label for box in boxes)])
         shown = np.isfinite(points[:, :3]).all(axis=1)
         ids = np.array([self._classes[name] for name in classes], np.uint16)[labels[shown]]
-        log("world/lidar/points", rr.Points3D(points[shown, :3], colors=colors[shown], class_ids=ids))
+        log("world/lidar/points", rr.Points3D(points[shown, :3], colors=colors[shown], class_ids=ids, radii=_RADIUS))
         log("world/lidar/points", rr.AnyValues(remission=points[shown, 3]))
-        log("world/lidar/boxes", self._boxes(scan.perception.boxes, [box_text(box) for box in scan.perception.boxes]))
+        texts = [box_text(box) for box in scan.perception.boxes]
+        log("world/lidar/boxes", self._boxes(scan.perception.boxes, texts, show=tracks is None))
         if view is not None:
             log("world/lidar/drivable", self._drivable(view, *base_pose(scan)))
         if tracks is not None:
@@ -111,7 +119,7 @@ class RerunSink:
             log("world/lidar", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
             trails = self._trails.update(tracks)
             found = [track.world_box for track in tracks]
-            log("world/tracks", self._boxes(found, [track_text(track) for track in tracks]))
+            log("world/tracks", self._boxes(found, [track_text(track) for track in tracks], show=True))
             log(
                 "world/trails",
                 rr.LineStrips3D([trails[track.id] for track in tracks], class_ids=self._ids(found)),
@@ -136,7 +144,7 @@ class RerunSink:
     def _ids(self, boxes: Any) -> NDArray[np.uint16]:
         return np.array([self._classes[box.label] for box in boxes], np.uint16)
 
-    def _boxes(self, boxes: Any, texts: list[str]) -> Any:
+    def _boxes(self, boxes: Any, texts: list[str], *, show: bool) -> Any:
         found: list[Box] = list(boxes)
         yaws = np.array([box.yaw for box in found]) / 2.0
         turns = np.column_stack([np.zeros((len(found), 2)), np.sin(yaws), np.cos(yaws)])
@@ -146,6 +154,7 @@ class RerunSink:
             quaternions=turns,
             class_ids=self._ids(found),
             labels=texts,
+            show_labels=show,
         )
 
     def _drivable(self, view: TopView, R: NDArray[np.float64], t: NDArray[np.float64]) -> Any:
