@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..extras import require
-from ..frame import ModelFrame
+from ..frame import ModelFrame, quaternion
 from ..mounting import MODEL_HEIGHT_M
 from ..occupancy import OCCUPIED, occupancy_grid
 from ..points import as_points
@@ -67,7 +67,15 @@ _EDGES = np.array([[a, b] for a in range(8) for b in range(a) if (a ^ b).bit_cou
 
 
 def nanoseconds(stamp_s: float) -> int:
-    """A time [s] in whole nanoseconds; times of today are exact to 0.2 us in a float."""
+    """A time [s] in whole nanoseconds; times of today are exact to 0.2 us in a float.
+
+    Raises
+    ------
+    PointsError
+        It is not finite.
+    """
+    if not math.isfinite(stamp_s):
+        raise PointsError(f"the scan's time is {stamp_s} s; expected a finite number")
     return round(stamp_s * 1e9)
 
 
@@ -243,7 +251,7 @@ class RosMessages:
         corner = np.array([grid.x_range_m[0], grid.y_range_m[0], -MODEL_HEIGHT_M])
         if self.grid_frame_id is None:
             frame = ModelFrame(grid.mounting)
-            pose = self._pose(center=frame.R.T @ (corner - frame.t), quaternion=_quaternion(frame.R.T))
+            pose = self._pose(center=frame.R.T @ (corner - frame.t), turned=quaternion(frame.R.T))
         else:
             pose = self._pose(center=(corner[0], corner[1], 0.0))
         info = self._make(
@@ -409,26 +417,9 @@ class RosMessages:
         box: Box | None = None,
         *,
         center: Any = (0.0, 0.0, 0.0),
-        quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0),
+        turned: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0),
     ) -> Any:
         if box is not None:
-            center, quaternion = box.center, (0.0, 0.0, math.sin(box.yaw / 2.0), math.cos(box.yaw / 2.0))
-        x, y, z, w = quaternion
-        turned = self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
-        return self._make("geometry_msgs/msg/Pose", position=self._point(center), orientation=turned)
-
-
-def _quaternion(R: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """x, y, z, w of a rotation; w >= 0."""
-    # Of these four rows, each the quaternion times four of its entries, the longest is the most exact.
-    rows = np.array(
-        [
-            [1 + R[0, 0] - R[1, 1] - R[2, 2], R[1, 0] + R[0, 1], R[2, 0] + R[0, 2], R[2, 1] - R[1, 2]],
-            [R[1, 0] + R[0, 1], 1 - R[0, 0] + R[1, 1] - R[2, 2], R[2, 1] + R[1, 2], R[0, 2] - R[2, 0]],
-            [R[2, 0] + R[0, 2], R[2, 1] + R[1, 2], 1 - R[0, 0] - R[1, 1] + R[2, 2], R[1, 0] - R[0, 1]],
-            [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1 + R[0, 0] + R[1, 1] + R[2, 2]],
-        ]
-    )
-    row = rows[np.argmax(np.diag(rows))]
-    x, y, z, w = (math.copysign(1.0, row[3]) * row / np.linalg.norm(row)).tolist()
-    return x, y, z, w
+            center, turned = box.center, (0.0, 0.0, math.sin(box.yaw / 2.0), math.cos(box.yaw / 2.0))
+        orientation = self._make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", turned, strict=True)))
+        return self._make("geometry_msgs/msg/Pose", position=self._point(center), orientation=orientation)

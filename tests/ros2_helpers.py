@@ -1,0 +1,67 @@
+"""Clouds, and what stands in place of a perceiver, for the tests of ROS 2; they need rosbags."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from edgeperc import Perception, PointLabels
+from edgeperc.ros2.messages import CLOUD, RosMessages
+from edgeperc.sensor import get_sensor
+
+__all__ = ["FIELDS", "MESSAGES", "TIMEOUT_S", "Perceive", "cloud", "until"]
+
+TIMEOUT_S = 120.0  # nothing here takes long; a test that waits this long has failed
+MESSAGES = RosMessages()
+FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")]
+
+
+def cloud(points: np.ndarray, stamp_ns: int = 10**9, frame_id: str = "velodyne", **changes: Any) -> bytes:
+    """The bytes of a PointCloud2 with x, y, z and intensity; some of its fields replaced by impossible ones."""
+    make = MESSAGES.types
+    header = make["std_msgs/msg/Header"](
+        stamp=make["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9), frame_id=frame_id
+    )
+    order = ">" if changes.get("is_bigendian") else "<"
+    rows = np.ascontiguousarray(points, f"{order}f4")
+    fields = [
+        make["sensor_msgs/msg/PointField"](name=name, offset=4 * k, datatype=7, count=1)
+        for k, (name, _) in enumerate(FIELDS)
+    ]
+    usual = {
+        "header": header,
+        "height": 1,
+        "width": len(points),
+        "fields": fields,
+        "is_bigendian": False,
+        "point_step": 16,
+        "row_step": 16 * len(points),
+        "data": rows.view(np.uint8).reshape(-1),
+        "is_dense": True,
+    }
+    return MESSAGES.encode(make[CLOUD](**{**usual, **changes}))
+
+
+def until(condition: Callable[[], Any]) -> None:
+    """Wait for what another thread or process brings about."""
+    end = time.monotonic() + TIMEOUT_S
+    while not condition():
+        assert time.monotonic() < end, "it never came about"
+        time.sleep(0.01)
+
+
+class Perceive:
+    """In place of a perceiver: every point is a car."""
+
+    sensor = get_sensor("hdl-64e")
+
+    def __init__(self) -> None:
+        self.stamps: list[float] = []
+
+    def __call__(self, points: np.ndarray, *, stamp_s: float) -> Perception:
+        self.stamps.append(stamp_s)
+        labels = PointLabels(np.ones(len(points), np.uint8), np.ones(len(points), np.bool_), ("background", "car"))
+        return Perception(len(points), 0, labels, None, (), {"infer": 1.0}, {"m": "cpu"}, (), stamp_s)

@@ -1,0 +1,339 @@
+"""The live node: bad clouds, newest first, stamps, diagnostics; over Zenoh between processes, and by rclpy's calls."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+pytest.importorskip("rosbags")
+
+from ros2_helpers import FIELDS, MESSAGES, TIMEOUT_S, Perceive, cloud, until
+
+from edgeperc import ModelFileError, OptionError, Perception, PointsError, Tracker
+from edgeperc.readers.decoders import cloud_points
+from edgeperc.ros2 import node as node_module
+from edgeperc.ros2.graph import RELIABLE, Qos, full_name
+from edgeperc.ros2.messages import CLOUD, DIAGNOSTICS, OUTPUTS
+from edgeperc.ros2.node import PerceptionNode
+from edgeperc.sinks import PerceivedScan
+
+SLOW_HZ = 0.01  # no answer is late
+
+
+class FakeGraph:
+    """A graph in this process: what is published is kept by topic, and clouds are given by hand."""
+
+    def __init__(self, missing: str = "") -> None:
+        self.name, self.closed, self.missing = "/here/edgeperc", 0, missing
+        self.published: dict[str, list[bytes]] = {}
+        self.types: dict[str, tuple[str, Qos]] = {}
+        self.wanted = True
+        self.give: Callable[[bytes], None]
+
+    def parameter(self, name: str, default: Any) -> Any:
+        return default
+
+    def advertise(self, topic: str, message_type: str, qos: Qos) -> Any:
+        if self.missing and self.missing in message_type:
+            raise OptionError(f"{self.missing} is not installed")
+        self.types[topic] = message_type, qos
+        kept, graph = self.published.setdefault(topic, []), self
+
+        class Output:
+            is_wanted = property(lambda _: graph.wanted)
+
+            def publish(self, data: bytes) -> None:
+                kept.append(data)
+
+        return Output()
+
+    def subscribe(self, topic: str, message_type: str, receive: Callable[[bytes], None]) -> None:
+        assert message_type == CLOUD
+        self.give = receive
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Diagnostics come often, so that no test waits a second."""
+    monkeypatch.setattr(node_module, "_REPORT_EVERY_S", 0.02)
+
+
+@pytest.fixture(autouse=True)
+def no_thread_is_left() -> Iterator[None]:
+    yield
+    names = ("edgeperc-source", "edgeperc-diagnostics", "edgeperc-rclpy")
+    until(lambda: not [t for t in threading.enumerate() if t.name in names])
+
+
+POINTS = np.array([[10.0, 1.0, -1.0, 0.5], [np.nan, 0.0, 0.0, 0.1], [5.0, -2.0, 0.25, 1.0]], np.float32)
+
+
+def last_status(graph: FakeGraph) -> Any:
+    return MESSAGES.decode(graph.published["/diagnostics"][-1], DIAGNOSTICS).status[0]
+
+
+# --- the node --------------------------------------------------------------------------------------------------------
+
+
+def test_a_cloud_is_answered_with_its_stamp_and_frame() -> None:
+    graph, perceive, described = FakeGraph(), Perceive(), []
+
+    def perceiver_for(found: Mapping[str, Any]) -> Any:
+        described.append(found)
+        return perceive
+
+    with PerceptionNode(graph, perceiver_for, topic="/lidar/points", rate_hz=SLOW_HZ) as node:
+        outcomes = iter(node)
+        for k in range(2):
+            graph.give(cloud(POINTS, 1_700_000_000_123_456_789 + k))
+            scan = next(outcomes)
+            assert isinstance(scan, PerceivedScan)
+            np.testing.assert_array_equal(scan.points, POINTS)
+            assert (scan.name, scan.health, scan.sensor.name) == (f"/lidar/points/{k:06d}", "OK", "hdl-64e")
+    assert described == [
+        {"topic": "/lidar/points", "frame": "velodyne", "fields": [n for n, _ in FIELDS], "elevations_deg": []}
+    ]
+    assert graph.closed == 1
+    answer = MESSAGES.decode(graph.published["/edgeperc/points"][0], CLOUD)
+    stamp = answer.header.stamp
+    assert (stamp.sec, stamp.nanosec, answer.header.frame_id) == (1_700_000_000, 123_456_789, "velodyne")
+    np.testing.assert_array_equal(cloud_points(answer), POINTS)
+    assert graph.types == {
+        "/diagnostics": (DIAGNOSTICS, RELIABLE),
+        **{f"/edgeperc/{name}": (kind, RELIABLE) for name, kind in OUTPUTS.items() if name != "diagnostics"},
+    }
+
+
+def test_frames_and_names_of_ones_own() -> None:
+    graph = FakeGraph()
+    options: dict[str, Any] = {"frame_id": "base", "grid_frame_id": "ground", "prefix": "/a/", "outputs": ["occupancy"]}
+    with PerceptionNode(graph, lambda _: Perceive(), **options) as node:
+        graph.give(cloud(POINTS))
+        next(iter(node))
+    assert graph.types.keys() == {"/a/occupancy"}
+    (grid,) = (MESSAGES.decode(raw, OUTPUTS["occupancy"]) for raw in graph.published["/a/occupancy"])
+    assert grid.header.frame_id == "ground"
+
+
+def test_nothing_is_made_that_nobody_wants() -> None:
+    graph = FakeGraph()
+    graph.wanted = False
+    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
+        graph.give(cloud(POINTS))
+        next(iter(node))
+    assert not any(kept for topic, kept in graph.published.items() if topic != "/diagnostics")
+
+
+HOSTILE = {
+    "not CDR": (b"garbage", "no sensor_msgs/msg/PointCloud2"),
+    "nothing": (b"", "no sensor_msgs/msg/PointCloud2"),
+    "half": (cloud(POINTS)[:60], "no sensor_msgs/msg/PointCloud2"),
+    "no fields": (cloud(POINTS, fields=[]), "layout is impossible|no numeric field"),
+    "steps too small": (cloud(POINTS, point_step=3), "layout is impossible"),
+    "step of 0": (cloud(POINTS, point_step=0), "layout is impossible"),
+    "rows that overlap": (cloud(POINTS, height=3, width=1, row_step=4), "declares 3 x 1 points"),
+    "more points than bytes": (cloud(POINTS, width=1000), "declares 1 x 1000 points"),
+    "huge": (cloud(POINTS, width=2**32 - 1, height=2**32 - 1), "declares 4,294,967,295 x 4,294,967,295 points"),
+    "a huge step": (cloud(POINTS, point_step=2**32 - 1), "layout is impossible"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_bad_cloud_is_an_error_and_the_next_is_perceived(name: str, quick: None) -> None:
+    data, said = HOSTILE[name]
+    graph = FakeGraph()
+    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
+        outcomes = iter(node)
+        graph.give(data)
+        error = next(outcomes)
+        assert isinstance(error, PointsError)
+        assert re.search(said, str(error))
+        until(lambda: graph.published["/diagnostics"] and last_status(graph).level == 2)
+        status = last_status(graph)
+        assert status.message == f"PointsError: {error}"
+        assert {v.key: v.value for v in status.values}["clouds failed"] == "1"
+        graph.give(cloud(POINTS))
+        assert isinstance(next(outcomes), PerceivedScan)
+        until(lambda: last_status(graph).level == 0)
+        assert (node.n_scans, node.n_failed, node.n_dropped) == (2, 1, 0)
+
+
+def test_a_cloud_of_16_million_points_in_few_bytes_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three coordinates may share one byte, so bytes alone limit nothing."""
+    monkeypatch.setattr(node_module, "MAX_SCAN_BYTES", 1600)
+    one = MESSAGES.types["sensor_msgs/msg/PointField"]
+    fields = [one(name=axis, offset=0, datatype=1, count=1) for axis in "xyz"]
+    graph = FakeGraph()
+    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
+        outcomes = iter(node)
+        graph.give(cloud(POINTS, fields=fields, width=101, point_step=1, data=np.zeros(101, np.uint8)))
+        assert "expected at most 100" in str(next(outcomes))
+        graph.give(cloud(np.zeros((101, 4))))
+        assert "expected at most 1,600" in str(next(outcomes))
+
+
+def test_big_endian_empty_and_nan_clouds_are_clouds() -> None:
+    graph = FakeGraph()
+    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
+        outcomes = iter(node)
+        for data, expected in (
+            (cloud(POINTS, is_bigendian=True), POINTS),
+            (cloud(POINTS[:0]), POINTS[:0]),
+            (cloud(np.full((4, 4), np.nan)), np.full((4, 4), np.nan, np.float32)),
+        ):
+            graph.give(data)
+            scan = next(outcomes)
+            assert isinstance(scan, PerceivedScan), scan
+            np.testing.assert_array_equal(scan.points, expected)
+
+
+def test_damaged_bytes_never_end_the_node() -> None:
+    graph = FakeGraph()
+    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ, outputs=("points", "markers")) as node:
+        outcomes = iter(node)
+
+        @given(st.data())
+        def check(data: st.DataObject) -> None:
+            damaged = bytearray(cloud(POINTS))
+            for _ in range(data.draw(st.integers(0, 6))):
+                damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+            graph.give(bytes(damaged[: data.draw(st.integers(0, len(damaged)))]))
+            assert isinstance(next(outcomes), PerceivedScan | PointsError)
+            graph.give(bytes(damaged))
+            assert isinstance(next(outcomes), PerceivedScan | PointsError)
+            graph.give(cloud(POINTS))
+            assert isinstance(next(outcomes), PerceivedScan)
+
+        check()
+
+
+def test_the_newest_cloud_wins() -> None:
+    graph, began, go_on = FakeGraph(), threading.Event(), threading.Event()
+
+    class Slow(Perceive):
+        def __call__(self, points: np.ndarray, *, stamp_s: float) -> Perception:
+            began.set()
+            assert go_on.wait(TIMEOUT_S)
+            return super().__call__(points, stamp_s=stamp_s)
+
+    with PerceptionNode(graph, lambda _: Slow()) as node:
+        got: list[Any] = []
+        worker = threading.Thread(target=lambda: got.extend(next(outcomes) for _ in range(2)))
+        outcomes = iter(node)
+        worker.start()
+        graph.give(cloud(POINTS, 10**9))
+        assert began.wait(TIMEOUT_S)
+        for k in range(1, 6):
+            graph.give(cloud(POINTS, 10**9 + k * 10**8))
+        until(lambda: node.n_scans == 6)
+        go_on.set()
+        worker.join(TIMEOUT_S)
+        assert [scan.stamp_s for scan in got] == [1.0, 1.5]
+        assert (node.n_scans, node.n_dropped) == (6, 4)
+
+
+def test_tracking_begins_anew_when_stamps_jump_back() -> None:
+    graph, tracker, resets = FakeGraph(), Tracker(), []
+    reset = tracker.reset
+    tracker.reset = lambda: resets.append(reset())  # type: ignore[method-assign, func-returns-value]
+    with PerceptionNode(graph, lambda _: Perceive(), tracker=tracker) as node:
+        outcomes = iter(node)
+        kinds = []
+        for stamp_s in (100, 101, 101, 50, 51):
+            graph.give(cloud(POINTS, stamp_s * 10**9))
+            kinds.append(type(next(outcomes)).__name__)
+    assert kinds == ["PerceivedScan", "PerceivedScan", "StampError", "PerceivedScan", "PerceivedScan"]
+    assert len(resets) == 1
+
+
+def test_a_cloud_without_a_stamp_has_that_of_its_arrival() -> None:
+    graph, perceive = FakeGraph(), Perceive()
+    before = time.time()
+    with PerceptionNode(graph, lambda _: perceive) as node:
+        graph.give(cloud(POINTS, 0))
+        next(iter(node))
+    assert before - 1e-3 <= perceive.stamps[0] <= time.time() + 1e-3
+
+
+def test_what_no_cloud_heals_is_raised() -> None:
+    graph = FakeGraph()
+
+    def fails(_: Mapping[str, Any]) -> Any:
+        raise ModelFileError("no such model")
+
+    with PerceptionNode(graph, fails) as node:
+        graph.give(cloud(POINTS))
+        with pytest.raises(ModelFileError):
+            next(iter(node))
+
+
+def test_closing_ends_the_iteration() -> None:
+    graph = FakeGraph()
+    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=SLOW_HZ) as node:
+        worker = threading.Thread(target=lambda: [*node])
+        worker.start()
+    worker.join(TIMEOUT_S)
+    assert not worker.is_alive()
+    assert [*node] == []
+
+
+def test_diagnostics_tell_of_silence(quick: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = FakeGraph()
+    with PerceptionNode(graph, lambda _: Perceive(), rate_hz=100.0) as node:
+        until(lambda: graph.published["/diagnostics"])
+        assert (last_status(graph).level, last_status(graph).message) == (3, "no scan yet")
+        graph.give(cloud(POINTS))
+        next(iter(node))
+        until(lambda: last_status(graph).level == 3 and last_status(graph).message != "no scan yet")
+        status = last_status(graph)
+        assert (status.name, status.message) == ("edgeperc: perception", "STALE: no answer of late")
+        values = {v.key: v.value for v in status.values}
+        assert (values["clouds received"], values["clouds dropped"], values["answers"]) == ("1", "0", "1")
+        assert (values["infer [ms]"], values["provider of m"], values["labels"]) == (
+            "1.0",
+            "cpu",
+            "0 background, 1 car",
+        )
+
+
+def test_without_vision_msgs_there_are_no_detections_and_a_warning() -> None:
+    graph = FakeGraph(missing="vision_msgs")
+    with pytest.warns(UserWarning, match="no detections are published"):
+        PerceptionNode(graph, lambda _: Perceive()).close()
+    assert "/edgeperc/detections" not in graph.types
+    assert "/edgeperc/markers" in graph.types
+
+
+def test_unknown_outputs() -> None:
+    with pytest.raises(OptionError, match="expected some of points"):
+        PerceptionNode(FakeGraph(), lambda _: Perceive(), outputs=("boxes",))
+
+
+@pytest.mark.parametrize(
+    ("name", "namespace", "full"),
+    [
+        ("/points", "/", "/points"),
+        ("points", "/", "/points"),
+        ("points", "/front", "/front/points"),
+        ("/a/b_1", "/x", "/a/b_1"),
+    ],
+)
+def test_names_are_resolved(name: str, namespace: str, full: str) -> None:
+    assert full_name(name, namespace) == full
+
+
+@pytest.mark.parametrize("name", ["", "/", "/a/", "a b", "/1st", "a__b", "/a//b", "/a/*", "~/points"])
+def test_names_that_ros_does_not_allow(name: str) -> None:
+    with pytest.raises(OptionError, match="no name of ROS 2"):
+        full_name(name)
