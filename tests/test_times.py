@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import struct
 from collections.abc import Callable, Sequence
@@ -349,34 +350,45 @@ def test_scans_are_straightened_by_poses(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.bag", [1700.0, 1700.1])
     times = 1699.5 + 0.1 * np.arange(10)
     poses = write_tum(tmp_path / "poses.txt", times, [pose_at(t - 1699.5) for t in times])
-    scans = list(Straightener(poses).scans(path))
-    assert [stamp for stamp, _ in scans] == pytest.approx([1700.0, 1700.1])
-    for _, points in scans:
-        assert off_the_walls(points) < 1e-3
+    straightener = Straightener(poses)
+    for scan in read_timed_scans(path):
+        assert off_the_walls(straightener.straighten(*scan)) < 1e-3
     write_tum(poses, times + 5.0, [pose_at(t) for t in 0.1 * np.arange(10)])
     with pytest.raises(edgeperc.StampError, match="poses around it"):
-        next(Straightener(poses).scans(path))
+        Straightener(poses).straighten(*scan)
 
 
 def test_scans_are_straightened_by_the_tracks_before(tmp_path: Path) -> None:
     """The tracker knows the motion from the second scan on."""
     straightener, straight = Straightener(None), []
-    scans = straightener.scans(drive(tmp_path / "drive.bag", [1700.0, 1700.1, 1700.2, 1700.3]))
-    with pytest.warns(UserWarning, match="first two scans stay"):
-        found = next(scans)
-    for k in range(4):
-        stamp_s, points = found
+    for k, scan in enumerate(read_timed_scans(drive(tmp_path / "drive.bag", [1700.0, 1700.1, 1700.2, 1700.3]))):
+        if k == 0:
+            with pytest.warns(UserWarning, match="first two scans stay"):
+                points = straightener.straighten(*scan)
+        else:
+            points = straightener.straighten(*scan)
         straight.append(off_the_walls(points) < 1e-3)
-        tracks: Any = SimpleNamespace(T_world_sensor=pose_at(0.1 * k), stamp_s=stamp_s)
+        tracks: Any = SimpleNamespace(T_world_sensor=pose_at(0.1 * k), stamp_s=scan.stamp_s)
         straightener.follow(tracks)
-        found = next(scans, found)
     assert straight == [False, False, True, True]
 
 
-def test_scans_without_times_are_not_straightened(tmp_path: Path) -> None:
-    np.zeros((8, 4), np.float32).tofile(tmp_path / "scan.bin")
-    with pytest.raises(edgeperc.PointsError, match=r"scan\.bin: the scan has no times of points; leave out --deskew"):
-        next(Straightener(None).scans(tmp_path / "scan.bin"))
+def test_scans_without_times_are_not_straightened() -> None:
+    with pytest.raises(edgeperc.PointsError, match="the scan has no times of points; leave out --deskew"):
+        Straightener(None).straighten(1.0, np.zeros((8, 4), np.float32), None)
+    points = np.zeros((8, 4), np.float32)
+    assert Straightener(None).straighten(1.0, points, np.full(8, np.nan)) is points
+
+
+def test_a_scan_that_the_poses_do_not_cover_fails_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("onnxruntime")
+    path = drive(tmp_path / "drive.bag", [1700.0, 1800.0, 1700.2])
+    times = 1699.5 + 0.1 * np.arange(10)
+    write_tum(tmp_path / "poses.txt", times, [pose_at(t - 1699.5) for t in times])
+    options = ["--sensor", "hdl-64e", "--on-mismatch", "ignore", "--model", "pointseg", "--json"]
+    assert run("run", path, "--deskew", "--poses", tmp_path / "poses.txt", *options) == 1
+    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert ["error" in answer for answer in answers] == [False, False, True]  # the bag's messages come by time
 
 
 @pytest.mark.filterwarnings("default:--deskew")

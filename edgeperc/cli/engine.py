@@ -73,6 +73,8 @@ def check_engine(arguments: argparse.Namespace, sinks: Sequence[str]) -> None:
         arguments.usage_error(
             f"{in_order[0]} needs the scans in their order, and --engine ray perceives them side by side; leave out one"
         )
+    if arguments.engine == "ray" and arguments.deskew:
+        arguments.usage_error("--deskew works with --engine local, not with ray; leave out one")
     local = [name for name in in_order if name in ("--live", "--gif", "--labels-for")]
     urls = [path for path in (*arguments.paths, arguments.out) if isinstance(path, Remote)]
     if urls and local:
@@ -195,9 +197,11 @@ class _ScanWorker:
         if len(outcomes) != 1:
             raise EdgepercError(f"{name} holds {many(len(outcomes), 'scan')}; --engine ray takes files of one")
         ((_, outcome, _, _),) = outcomes
+        if isinstance(outcome, EdgepercError):  # it names the absolute path
+            outcome.args = (str(outcome).replace(str(path), str(name)),)
         text, said = self._report.text(name, outcome), tuple(dict.fromkeys(str(each.message) for each in caught))
         if isinstance(outcome, Exception):
-            return _Answer(text, str(outcome).removeprefix(f"{name}: ").removeprefix(f"{path}: "), (), said)
+            return _Answer(text, str(outcome).removeprefix(f"{name}: "), (), said)
         answer = _Answer(text, None, tuple(map(str, outcome.fitness)), said)
         if files:
             sizes = {file.name: stamp[0] for file in files if (stamp := _stamp(file)) is not None}

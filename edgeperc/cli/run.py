@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import EdgepercError, ImageError, ModelError, PointsError
 from ..extras import require
@@ -427,7 +427,7 @@ class _Run:
 
     def scans(self, path: Path, target: Path, shown: Path | None = None) -> Iterator[Outcome]:
         """Perceive each scan of a file or capture; ``shown`` is printed in place of its path."""
-        from ..readers.captures import is_capture, read_scans
+        from ..readers.captures import is_capture, read_scans, read_timed_scans
 
         if isinstance(path, Remote) or isinstance(target, Remote):
             yield from through_temporary(self.scans, path, target)
@@ -436,10 +436,12 @@ class _Run:
         try:
             perceive = self._perceivers.of(self._perceivers.sensor_of(path))
             numbered = is_capture(path)
-            read = read_scans if self._straightener is None else self._straightener.scans
-            for k, (stamp_s, points) in enumerate(read(path, topic=self._arguments.topic)):
+            read: Callable[..., Iterator[tuple[Any, ...]]] = read_timed_scans if self._straightener else read_scans
+            for k, (stamp_s, points, *times_s) in enumerate(read(path, topic=self._arguments.topic)):
                 name, file = (shown / f"{k:06d}", target / f"{k:06d}") if numbered else (shown, target)
                 try:
+                    if self._straightener is not None:
+                        points = self._straightener.straighten(stamp_s, points, *times_s)
                     perception = perceive(points, stamp_s)
                     if self._kinds and numbered:
                         target.mkdir(exist_ok=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,17 +11,15 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..motion import Motion, Trajectory, deskew
-from ..readers.captures import read_timed_scans
 
 if TYPE_CHECKING:
-    from ..readers.times import TimedScan
     from ..tracking.tracks import Tracks
 
 __all__ = ["Straightener"]
 
 
 class Straightener:
-    """Reads scans and straightens them, by poses or by what the tracker found of the scans before.
+    """Straightens scans, by poses or by what the tracker found of the scans before.
 
     Parameters
     ----------
@@ -40,37 +37,35 @@ class Straightener:
         self._trajectory = None if poses is None else Trajectory.from_tum(poses)
         self._tracked: list[Tracks] = []
 
-    def scans(self, path: Path, *, topic: str | None = None) -> Iterator[tuple[float | None, NDArray[np.float32]]]:
-        """As `edgeperc.read_scans`, in the sensor's frame at the scan's stamp.
+    def straighten(
+        self, stamp_s: float | None, points: NDArray[np.float32], times_s: NDArray[np.float64] | None
+    ) -> NDArray[np.float32]:
+        """Points in the sensor's frame at the scan's stamp, or at its last point if it has none.
+
+        Parameters
+        ----------
+        stamp_s, points, times_s
+            A `edgeperc.TimedScan`.
 
         Raises
         ------
         PointsError
-            A scan has no times of points.
+            The scan has no times of points.
         TrackingError
-            The poses do not cover a scan.
+            The poses do not cover the scan, or the tracker's are half a turn apart.
 
         Warns
         -----
         UserWarning
             Without poses: the tracker does not know the motion during the first two scans, which stay as they are.
         """
-        for scan in read_timed_scans(path, topic=topic):
-            yield scan.stamp_s, self._straight(path, scan)
-
-    def follow(self, tracks: Tracks) -> None:
-        """Take the tracks of the last scan, for the motion during the next one."""
-        self._tracked = [*self._tracked[-1:], tracks]
-
-    def _straight(self, path: Path, scan: TimedScan) -> NDArray[np.float32]:
-        if scan.times_s is None:
+        if times_s is None:
             raise PointsError(
-                f"{path}: the scan has no times of points; leave out --deskew, or record them: a field t, time or "
-                "timestamp"
+                "the scan has no times of points; leave out --deskew, or record them: a field t, time or timestamp"
             )
-        known = scan.times_s[np.isfinite(scan.times_s)]
+        known = times_s[np.isfinite(times_s)]
         if not len(known):
-            return scan.points
+            return points
         first_s, last_s = float(known.min()), float(known.max())
         if self._trajectory is not None:
             motion = self._trajectory.motion(first_s, last_s)
@@ -84,6 +79,10 @@ class Straightener:
                     "straightens them too",
                     stacklevel=2,
                 )
-            return scan.points
-        at_s = scan.stamp_s if scan.stamp_s is not None and first_s <= scan.stamp_s <= last_s else last_s
-        return deskew(scan.points, scan.times_s, motion, at_s=at_s)
+            return points
+        at_s = stamp_s if stamp_s is not None and first_s <= stamp_s <= last_s else last_s
+        return deskew(points, times_s, motion, at_s=at_s)
+
+    def follow(self, tracks: Tracks) -> None:
+        """Take the tracks of the last scan, for the motion during the next one."""
+        self._tracked = [*self._tracked[-1:], tracks]
