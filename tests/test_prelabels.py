@@ -376,9 +376,10 @@ def test_the_command_writes_labels(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     calib.write_text(CALIBRATION)
     assert run("run", tmp_path / "drive", "--labels-for", "kitti", "--calib", calib, "--out", tmp_path / "k") == 0
     assert (tmp_path / "k/calib/000002.txt").read_text() == CALIBRATION
-    with pytest.raises(SystemExit) as left:
-        run("run", tmp_path / "drive", "--labels-for", "kitti")
-    assert left.value.code == 2
+    for out in ([], ["--out", "s3://bucket/labels"]):
+        with pytest.raises(SystemExit) as left:
+            run("run", tmp_path / "drive", "--labels-for", "kitti", *out)
+        assert left.value.code == 2
 
 
 def test_the_commands_choices_are_the_kinds() -> None:

@@ -133,7 +133,9 @@ def test_the_rows_of_a_drive() -> None:
     assert whole[7] == "-"
     assert float(still[7]) >= 0.0
     unknown = Drive("r", drive.scans, None, None, drive.usable, drive.known, drive.labels)
-    (labeled, *_) = compared(unknown, seen, lambda scans: poses)
+    (labeled, first, second, _) = compared(unknown, seen, lambda scans: poses, second_pass=True)
+    assert [first[1], second[1]] == ["without moving", "same, second pass"]
+    assert 0.0 < float(second[5].removesuffix(" %")) <= shares[1]  # known poses leave less doubt
     assert labeled[3] == "-"
     assert labeled[5] == whole[5]  # the labels say the same as the points
 
