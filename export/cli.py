@@ -157,7 +157,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--scans", type=Path, nargs="*", default=[], help="scans, or folders of .bin, to calibrate on"
     )
     quantize.add_argument(
-        "--kitti", type=Path, help=f"{KITTI}; calibrates on training drives, evaluates on test drives"
+        "--kitti", type=Path, help=f"{KITTI}; calibrates on training drives, compares on validation drives"
     )
     quantize.add_argument(
         "--simulated", type=int, default=64, metavar="N", help="simulated scans to calibrate on (default 64)"
@@ -248,6 +248,17 @@ def build_parser() -> argparse.ArgumentParser:
     ablate.set_defaults(run=_ablate)
 
     add_database_commands(commands)
+
+    triton = commands.add_parser("triton", help="write a model repository for NVIDIA's Triton Inference Server")
+    triton.add_argument("out", type=Path, help="folder of the repository; models of the same names are replaced")
+    triton.add_argument(
+        "--model",
+        action="append",
+        metavar="MODEL",
+        help="name or file of a network of scans; may be repeated (default: ssadnet and pointseg)",
+    )
+    triton.add_argument("--sensor", default="hdl-64e", help="sensor of the scans (default hdl-64e)")
+    triton.set_defaults(run=_triton)
 
     models = commands.add_parser("models", help="write MODELS.md from the cards of a folder's models")
     models.add_argument("folder", type=Path, help="folder of .onnx models")
@@ -542,6 +553,16 @@ def _ablate_camvid(args: argparse.Namespace) -> int:
         plot_camvid(rows, args.out)
         show_camvid(args.out / "camvid.npz", args.out / "predictions.png")
         show_camvid(args.out / "camvid.npz", args.out / "segmentations.png", args.camvid)
+    return 0
+
+
+def _triton(args: argparse.Namespace) -> int:
+    from edgeperc.zoo import DEFAULT
+
+    from .triton import write_repository
+
+    for folder in write_repository(args.out, args.model or DEFAULT, sensor=args.sensor):
+        print_line(str(folder))
     return 0
 
 

@@ -23,6 +23,7 @@ from edgeperc.simulation.scene import POINT_CLASSES
 
 from .augment import NEGATIVES, ObjectBank, augmented, swapped, with_ground_ahead
 from .processes import CONTEXT
+from .ranks import Ranks
 from .recipe import Recipe
 from .roads import drawn_roads, sure_surface, with_road
 from .scan_sets import seen_by_network
@@ -193,9 +194,11 @@ class Samples:
 
 
 def loaded(
-    samples: Samples, start: int, stop: int, n_workers: int, device: torch.device | None = None
+    samples: Samples, start: int, stop: int, n_workers: int, ranks: Ranks | None = None
 ) -> Iterator[list[Tensor]]:
     """The batches of the steps from ``start`` to ``stop``, made by ``n_workers`` processes ahead of their use.
+
+    With several ranks, each makes some of the batches and sends them to the others.
 
     At multiples of the recipe's ``redraw_every``, the processes start anew, so that they see the new odds. With 0
     workers each batch is made when it is asked for; the batches are the same.
@@ -204,21 +207,27 @@ def loaded(
     samples, which stay on the device.
     """
     recipe = samples.recipe
-    every, device = recipe.redraw_every or stop, device or torch.device("cpu")
+    every, ranks = recipe.redraw_every or stop, ranks or Ranks()
+    device = ranks.device
     recent = Recent(RECENT_SAMPLES)
     while start < stop:
         end = min(stop, start - start % every + every)
+        steps = range(start, end, recipe.reuse)
         new: DataLoader[list[Tensor]] = DataLoader(
             samples,  # type: ignore[arg-type]  # it has __getitem__, which is all that is needed
             batch_size=None,
-            sampler=range(start, end, recipe.reuse),
+            sampler=steps[ranks.rank :: ranks.world],
             num_workers=n_workers,
             prefetch_factor=4 if n_workers else None,
             multiprocessing_context=CONTEXT if n_workers else None,
             pin_memory=device.type == "cuda",
         )
-        for step, batch in zip(range(start, end, recipe.reuse), new, strict=True):
-            batch = [part.to(device, non_blocking=True) for part in batch]
+        own = iter(new)
+        for number, step in enumerate(steps):
+            maker, batch = number % ranks.world, None
+            if maker == ranks.rank:
+                batch = [part.to(device, non_blocking=True) for part in next(own)]
+            batch = ranks.from_rank(maker, batch)
             yield batch
             if recipe.reuse > 1:
                 recent.add(batch)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import os
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -30,6 +31,7 @@ from .camera import Camera
 from .checkpoint import build_network, read_checkpoint
 from .images import ImageSamples, ImageWatch, camvid_samples
 from .networks import build
+from .ranks import Ranks
 from .recipe import Recipe
 from .samples import RealScans, Samples, loaded, real_scans
 from .scan_sets import read_scan_set
@@ -69,6 +71,9 @@ def train(
     save_every_s: float = 0.0,
 ) -> Path:
     """Train the network of a recipe, or resume its training.
+
+    Under ``torchrun`` the processes share each batch (`edgeperc_export.ranks`): the samples are the same, and the
+    weights equal those of one process up to rounding. The first process writes the files; all read the checkpoint.
 
     Parameters
     ----------
@@ -119,11 +124,56 @@ def train(
         unused.
     FloatingPointError
         The loss is not finite.
+    RankError
+        Another process of ``torchrun`` stopped, or the processes cannot share a batch.
     """
+    ranks = Ranks()
+    ranks.check(recipe.batch, recipe.accumulate, compiled)
+    with ranks.together():
+        return _train(
+            recipe,
+            out,
+            ranks,
+            kitti=kitti,
+            simulated=simulated,
+            camvid=camvid,
+            scan_sets=scan_sets,
+            given=given,
+            fold=fold,
+            start_from=start_from,
+            teacher=teacher,
+            n_threads=n_threads,
+            n_workers=n_workers,
+            compiled=compiled,
+            checkpoint_every=checkpoint_every,
+            save_every_s=save_every_s,
+        )
+
+
+def _train(
+    recipe: Recipe,
+    out: Path,
+    ranks: Ranks,
+    *,
+    kitti: Path | None,
+    simulated: Path | None,
+    camvid: Path | None,
+    scan_sets: Sequence[ScanFolder],
+    given: RealScans | None,
+    fold: int | None,
+    start_from: Path | None,
+    teacher: Path | None,
+    n_threads: int | None,
+    n_workers: int,
+    compiled: bool,
+    checkpoint_every: int,
+    save_every_s: float,
+) -> Path:
+    """`train` in one of the ranks."""
     out.mkdir(parents=True, exist_ok=True)
     if n_threads is not None:
         torch.set_num_threads(n_threads)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = ranks.device
     torch.backends.cudnn.benchmark = True  # inputs have one size
     if recipe.task == "camera":
         data = _image_data(recipe, camvid, device)
@@ -147,6 +197,7 @@ def train(
         before, frames = start(network, recipe, start_from, images)
         hashes = frames | hashes
     network = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in its stubs
+    ranks.share(network)
     averaged = copy.deepcopy(network).eval()
     optimizer = _optimizer(recipe, network)
     best, since_best, halvings = None, 0, 0
@@ -187,14 +238,14 @@ def train(
 
     # The compiled network shares its weights with the original, which is averaged and saved.
     forward = torch.compile(network) if compiled else network
-    progress = tqdm(total=recipe.steps, initial=step, desc=recipe.network, unit="step")
+    progress = tqdm(total=recipe.steps, initial=step, desc=recipe.network, unit="step", disable=not ranks.is_first)
     losses: list[float] = []
     saved_s = time.monotonic()
-    with (out / "log.jsonl").open("a") as log, progress:
+    with (out / "log.jsonl" if ranks.is_first else Path(os.devnull)).open("a") as log, progress:
         if isinstance(samples, ImageSamples):
             batches: Iterator[Sequence[Tensor]] = samples.batches(step, _last(recipe, curve, epoch))
         else:
-            batches = loaded(samples, step, recipe.steps, n_workers, device)
+            batches = loaded(samples, step, recipe.steps, n_workers, ranks)
         for arrays in batches:
             for group in optimizer.param_groups:
                 group["lr"] = recipe.learning_rate * _schedule(recipe, step) * 0.5**halvings
@@ -205,19 +256,20 @@ def train(
             optimizer.zero_grad(set_to_none=True)
             total = torch.zeros((), device=device)
             for inputs, *others in zip(*(array.chunk(recipe.accumulate) for array in arrays), strict=True):
-                x = inputs.contiguous(memory_format=torch.channels_last)
+                x = ranks.part(inputs).contiguous(memory_format=torch.channels_last)
                 y = others[: samples.n_targets]
                 taught: tuple[Any, ...] = tuple(others[samples.n_targets :])
                 with torch.autocast(device.type, torch.bfloat16):
-                    outputs = forward(x)
+                    outputs = ranks.whole(forward(x))
                 loss = task.loss(outputs, y)
                 if teacher_network is not None and recipe.distil > 0.0:
-                    taught = teach(teacher_network, x, task.input, mirror=recipe.seen_twice)
+                    taught = ranks.whole(teach(teacher_network, x, task.input, mirror=recipe.seen_twice))
                 if taught and isinstance(task, Task):
                     loss = loss + recipe.distil * task.distillation(outputs, *taught)
                 loss = loss * (len(inputs) / len(arrays[0]))
                 torch.autograd.backward(loss)
                 total += loss.detach()
+            ranks.add_gradients(network)
             losses.append(total.item())
             if not math.isfinite(losses[-1]):
                 raise FloatingPointError(f"the loss is {losses[-1]} at step {step}; lower --learning-rate")
@@ -228,13 +280,16 @@ def train(
             progress.update()
             progress.set_postfix(loss=f"{losses[-1]:.3f}")
             if isinstance(samples, Samples) and recipe.redraw_every and step % recipe.redraw_every == 0:
-                samples.redraw(averaged, step)
+                if ranks.is_first:
+                    samples.redraw(averaged, step)
+                samples.odds = ranks.from_first(samples.odds)
             if step % checkpoint_every == 0 or step == recipe.steps:
                 line: dict[str, Any] = {"step": step, "samples": step * recipe.batch}
                 line["loss"] = round(float(np.mean(losses)), 5)
                 losses.clear()
                 if watch is not None:
-                    figure, watched_loss, figures = watch.validate(averaged)
+                    validated = watch.validate(averaged) if ranks.is_first else None
+                    figure, watched_loss, figures = ranks.from_first(validated) or (0.0, 0.0, {})
                     line |= {"validation_loss": round(watched_loss, 5), "validation": figures}
                     if figure > best_figure and stops:
                         best_figure, best = figure, copy.deepcopy(averaged.state_dict())
@@ -246,7 +301,7 @@ def train(
                 log.write(json.dumps(line) + "\n")
                 log.flush()
                 over = step >= _last(recipe, curve, epoch)
-                if over or time.monotonic() - saved_s >= save_every_s:
+                if ranks.is_first and (over or time.monotonic() - saved_s >= save_every_s):
                     save()
                     saved_s = time.monotonic()
                 if over:
