@@ -7,7 +7,7 @@ import hashlib
 import html
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import write_atomic
+from ..atomic import open_atomic
 from ..frame import ModelFrame
 from ..perception import Box, Perception, TopView
 from ..printable import printable
@@ -75,7 +75,15 @@ def write_html(perception: Perception, points: NDArray[np.float32], path: str | 
     scan |= {"xyz": _base64(xyz), "remission": _base64(remission), "label": _base64(label)}
     facts = f"{perception.n_points:,} points · {_escaped(timing_line(perception))}"
     facts += "".join(f"<br>{_escaped(line)}" for line in provider_lines(perception))
-    _fill_page(path, title or "A scan", facts, perception.fitness, classes, [json.dumps(scan, allow_nan=False)], [0.0])
+    _fill_page(
+        path,
+        title or "A scan",
+        facts,
+        perception.fitness,
+        classes,
+        [_in_script(json.dumps(scan, allow_nan=False))],
+        [0.0],
+    )
 
 
 class DrivePage:
@@ -153,7 +161,7 @@ class DrivePage:
         xyz, remission, label = xyz[near], remission[near], label[near]
         chosen = _sample(xyz, label, names, self.n_points)
         scan |= {"name": printable(name), "scale": _STEP_M}
-        text = json.dumps(scan, allow_nan=False)
+        text = _in_script(json.dumps(scan, allow_nan=False))
         cells = np.round(xyz[chosen] / _STEP_M).astype("<i2")
         self._scans.append(_Thin(text, stamp_s, cells, remission[chosen], label[chosen]))
         self._n_bytes += self._scans[-1].n_bytes
@@ -184,10 +192,8 @@ class DrivePage:
         times = np.concatenate([np.zeros(min(1, len(stamps))), np.cumsum(steps)])
         kept = f"every {self.every}. of {self._n:,}" if self.every > 1 else "all"
         facts = f"{len(self._scans):,} scans ({kept}), thinned to {self.n_points:,} points"
-        texts = [scan.to_json() for scan in self._scans]
-        _fill_page(
-            path, self._title or "A drive", facts, [*self._fitness], self._classes, texts, times.round(3).tolist()
-        )
+        texts = (scan.to_json() for scan in self._scans)
+        _fill_page(path, self._title or "A drive", facts, self._fitness, self._classes, texts, times.round(3).tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,31 +284,38 @@ def _fill_page(
     path: str | Path,
     title: str,
     facts: str,
-    warnings: Sequence[str],
-    classes: Mapping[str, int],
-    scans: Sequence[str],
+    warnings: Iterable[str],
+    classes: Iterable[str],
+    scans: Iterable[str],
     times_s: Sequence[float],
 ) -> None:
-    """Write the page: ``facts`` as HTML, ``scans`` as JSON, everything else as it came."""
+    """Write the page: ``facts`` as HTML, ``scans`` as JSON one after another, everything else as it came."""
     scene = {
         "classes": [{"name": printable(name), "color": color_of(name)} for name in classes],
         "low": LOW,
         "high": HIGH,
         "times": times_s,
     }
-    data = f'{json.dumps(scene, allow_nan=False)[:-1]}, "scans": [{", ".join(scans)}]}}'
     template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
     filled = {
         "@@POLICY@@": _policy(template),
         "@@TITLE@@": _escaped(title),
         "@@FACTS@@": facts,
         "@@FITNESS@@": "".join(f"<p class=warning>{_escaped(line)}</p>" for line in warnings),
-        # A class name with "</script>" or "<!--" must not end the script element.
-        "@@SCENE@@": data.replace("<", "\\u003c"),
     }
-    # One pass, so that a title such as "@@SCENE@@" is not replaced.
-    page = re.sub("|".join(filled), lambda match: filled[match.group()], template)
-    write_atomic(path, page.encode())
+    before, _, after = template.partition("@@SCENE@@")
+    # One pass, so that a title such as "@@FACTS@@" is not replaced.
+    before = re.sub("|".join(filled), lambda match: filled[match.group()], before)
+    with open_atomic(path) as file:
+        file.write((before + _in_script(json.dumps(scene, allow_nan=False)[:-1])).encode())
+        for k, scan in enumerate(scans):
+            file.write(((", " if k else ', "scans": [') + scan).encode())
+        file.write(f"]}}{after}".encode())
+
+
+def _in_script(data: str) -> str:
+    """JSON for a script element, which a class name with "</script>" or "<!--" must not end."""
+    return data.replace("<", "\\u003c")
 
 
 def _escaped(text: str) -> str:
