@@ -503,7 +503,7 @@ def test_int8_of_a_camera(trained: tuple[Path, Path], drawn: Path, tmp_path: Pat
         hashes=hashes,
         camvid=drawn,
         race=race,
-        max_disagreement=1.0,
+        max_noise=9.0,
     )
     assert card.precision == "int8"
     assert card.training["quantized"]["calibration"] == "6 images of CamVid"

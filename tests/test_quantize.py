@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +18,9 @@ from torch import Tensor, nn
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry
 from edgeperc.errors import ModelError, PointsError, SplitError
 from edgeperc.evaluation.datasets import KittiObjects
+from edgeperc.evaluation.metrics import Confusion
 from edgeperc.evaluation.splits import in_split
+from edgeperc.evaluation.tables import Record
 from edgeperc.session import Session
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import POINT_CLASSES
@@ -119,7 +122,7 @@ def convolutions(path: Path) -> dict[str, int]:
 def test_inner_layers_become_int8_and_the_card_says_so(tmp_path: Path, small: Path, scans: list[np.ndarray]) -> None:
     out = tmp_path / "small-int8.onnx"
     before = Session(small).card
-    card = quantize(small, out, scans=scans, hashes=["f" * 16], n_evaluated=1, max_disagreement=1.0, race=FASTER)
+    card = quantize(small, out, scans=scans, hashes=["f" * 16], n_evaluated=1, max_noise=9.0, race=FASTER)
     int8, fp32 = onnx.TensorProto.INT8, onnx.TensorProto.FLOAT
     assert convolutions(out) == {"stem": fp32, "down": int8, "context": int8, "merge": int8, "last": fp32}
     nodes = onnx.load(out).graph.node
@@ -148,7 +151,7 @@ def test_weights_have_seven_bits_on_request(
     tmp_path: Path, small: Path, scans: list[np.ndarray], seven_bits: bool, most: int
 ) -> None:
     out = tmp_path / "int8.onnx"
-    card = quantize(small, out, scans=scans, n_evaluated=1, max_disagreement=1.0, seven_bits=seven_bits, race=FASTER)
+    card = quantize(small, out, scans=scans, n_evaluated=1, max_noise=9.0, seven_bits=seven_bits, race=FASTER)
     weights = [onnx.numpy_helper.to_array(w) for w in onnx.load(out).graph.initializer]
     assert max(int(abs(w.astype(int)).max()) for w in weights if w.dtype == np.int8) == most
     assert card.training["quantized"]["weight_bits"] == (7 if seven_bits else 8)
@@ -166,7 +169,7 @@ def test_layers_that_rounding_harms_stay_in_fp32(tmp_path: Path, scans: list[np.
 def test_a_less_accurate_model_is_refused(tmp_path: Path, scans: list[np.ndarray]) -> None:
     path = written(Fragile(1e4), tmp_path / "spoilt.onnx")
     with pytest.raises(RefusedError, match=r"simulated car IoU 0\.\d+ to 0\.000"):
-        quantize(path, tmp_path / "int8.onnx", scans=scans, n_evaluated=1, max_disagreement=1.0, race=FASTER)
+        quantize(path, tmp_path / "int8.onnx", scans=scans, n_evaluated=1, max_noise=9.0, race=FASTER)
     assert [p.name for p in tmp_path.iterdir()] == ["spoilt.onnx"]
 
 
@@ -177,9 +180,46 @@ def test_a_model_that_is_not_faster_is_refused(
     out = tmp_path / "int8.onnx"
     out.write_bytes(b"of another day")
     with pytest.raises(RefusedError, match=rf"not faster here .* 10\.0 ms in fp32, {int8_ms:.1f} in int8"):
-        quantize(small, out, scans=scans, max_disagreement=1.0, race=timed(10.0, int8_ms))
+        quantize(small, out, scans=scans, max_noise=9.0, race=timed(10.0, int8_ms))
     assert out.read_bytes() == b"of another day"
     assert [p.name for p in tmp_path.iterdir()] == ["int8.onnx"]
+
+
+def test_the_interval_of_a_loss_is_over_drives() -> None:
+    def of(*shares: float) -> dict[str, list[Record]]:
+        records = []
+        for k, share in enumerate(shares):
+            counted = Confusion(("background", "car"))
+            counted.update((np.arange(100) < 100 * share).astype(np.uint8), np.ones(100, np.uint8))
+            records.append(
+                Record(f"{k}", f"drive {k // 2}", {("points", "all"): counted, ("objects", "all"): Counter()})
+            )
+        return {"real": records}
+
+    right = of(*[1.0] * 12)
+    one_drive = module._losses(right, of(*[1.0] * 11, 0.4))["real car IoU"]
+    assert one_drive[:2] == pytest.approx((1.0, 0.95))
+    assert one_drive[2] == 0.0 < one_drive[3]
+    every_drive = module._losses(right, of(*[0.8] * 12))["real car IoU"]
+    assert every_drive == pytest.approx((1.0, 0.8, 0.2, 0.2))
+    alone = module._losses(of(1.0, 1.0), of(0.9, 0.9))["real car IoU"]
+    assert alone == pytest.approx((1.0, 0.9, 0.1, 0.1))
+
+
+def test_a_range_clips_what_costs_less_than_it_saves() -> None:
+    values = np.abs(np.random.default_rng(0).normal(0.0, 1.0, 100_000)).astype(np.float32)
+    values[0] = 1000.0
+
+    def range_of(values: np.ndarray) -> tuple[float, float]:
+        bins = values.view(np.uint32) >> (32 - module.BIN_BITS)
+        return module._range(np.bincount(bins, minlength=1 << module.BIN_BITS))
+
+    low, high = range_of(values[1:])
+    assert low == 0.0
+    assert 3.0 < high < 5.0
+    assert range_of(values)[1] > 500.0  # a single value of a million squares is no outlier to clip
+    assert range_of(-values[1:])[1] == 0.0
+    assert range_of(np.zeros(9, np.float32)) == (0.0, 0.0)
 
 
 def test_the_race_runs_both_models_equally_often(small: Path) -> None:
@@ -192,7 +232,7 @@ def test_the_race_runs_both_models_equally_often(small: Path) -> None:
 def test_excluded_nodes_stay_in_fp32(tmp_path: Path, small: Path, scans: list[np.ndarray]) -> None:
     out = tmp_path / "int8.onnx"
     name = next(n.name for n in onnx.load(small).graph.node if "down.weight" in n.input)
-    quantize(small, out, scans=scans, exclude=[name], n_evaluated=1, max_disagreement=1.0, race=FASTER)
+    quantize(small, out, scans=scans, exclude=[name], n_evaluated=1, max_noise=9.0, race=FASTER)
     assert convolutions(out)["down"] == onnx.TensorProto.FLOAT
     with pytest.raises(ValueError, match="no node is called nothing"):
         quantize(small, out, scans=scans, exclude=["nothing"], race=FASTER)
@@ -214,7 +254,7 @@ def test_unpooling_is_not_rounded_on_one_side(tmp_path: Path, scans: list[np.nda
     torch.manual_seed(0)
     path = written(Unpooling(), tmp_path / "unpooling.onnx")
     fp32 = module._Calibrated.on(path, Session(path).card, scans)
-    assert fp32.loss([n.name for n in fp32.model.graph.node if "inner.weight" in n.input]) < 0.1
+    assert fp32.noise([n.name for n in fp32.model.graph.node if "inner.weight" in n.input]) < 0.1
 
 
 def test_no_scans_is_an_error(tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -275,7 +315,7 @@ def test_the_command_exits_with_1_if_it_refuses_and_0_if_it_writes(
     assert cli.main(arguments) == 1
     assert "not faster here" in capsys.readouterr().err
     assert not out.exists()
-    settings = {**quantize.__kwdefaults__, "race": FASTER, "max_disagreement": 1.0}
+    settings = {**quantize.__kwdefaults__, "race": FASTER, "max_noise": 9.0}
     monkeypatch.setattr(module.quantize, "__kwdefaults__", settings)
     assert cli.main(arguments) == 0
     printed = capsys.readouterr().out.splitlines()
