@@ -1,7 +1,9 @@
-"""Clouds, and what stands in place of a perceiver, for the tests of ROS 2; they need rosbags."""
+"""Clouds, what stands in place of a perceiver, and a process that publishes scans, for the tests of ROS 2."""
 
 from __future__ import annotations
 
+import sys
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -9,10 +11,14 @@ from typing import Any
 import numpy as np
 
 from edgeperc import Perception, PointLabels
+from edgeperc.ros2.graph import SENSOR_DATA
 from edgeperc.ros2.messages import CLOUD, RosMessages
+from edgeperc.ros2.zenoh_graph import ZenohGraph
 from edgeperc.sensor import get_sensor
+from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.scene import simulate
 
-__all__ = ["FIELDS", "MESSAGES", "TIMEOUT_S", "Perceive", "cloud", "until"]
+__all__ = ["FIELDS", "MESSAGES", "TIMEOUT_S", "Perceive", "cloud", "publish", "scans", "until"]
 
 TIMEOUT_S = 120.0  # nothing here takes long; a test that waits this long has failed
 MESSAGES = RosMessages()
@@ -65,3 +71,32 @@ class Perceive:
         self.stamps.append(stamp_s)
         labels = PointLabels(np.ones(len(points), np.uint8), np.ones(len(points), np.bool_), ("background", "car"))
         return Perception(len(points), 0, labels, None, (), {"infer": 1.0}, {"m": "cpu"}, (), stamp_s)
+
+
+def scans(n: int) -> list[np.ndarray]:
+    """Simulated scans of an HDL-64E, with the remission 0..255 that its driver writes."""
+    found = [simulate(random_scene(3, "urban"), "hdl-64e", seed=3 + k).points.copy() for k in range(n)]
+    for points in found:
+        points[:, 3] *= 255.0
+    return found
+
+
+def publish(n: int) -> None:
+    """Publish scans on /points, each after the answer to the one before, then bytes that are no cloud."""
+    answered = threading.Semaphore(0)
+    graph = ZenohGraph("lidar", messages=MESSAGES)
+    try:
+        graph.subscribe("/edgeperc/points", CLOUD, lambda _: answered.release())
+        output = graph.advertise("/points", CLOUD, SENSOR_DATA)
+        until(lambda: output.is_wanted)
+        for k, points in enumerate(scans(n)):
+            output.publish(cloud(points, 10**18 + k * 10**8, "velodyne_hdl64e"))
+            assert answered.acquire(timeout=TIMEOUT_S), f"no answer to scan {k}"
+        output.publish(b"no cloud")
+        time.sleep(1.0)
+    finally:
+        graph.close()
+
+
+if __name__ == "__main__":
+    publish(int(sys.argv[1]))

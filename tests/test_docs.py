@@ -136,8 +136,8 @@ def test_commands_run(block: Block, line: str, place: Path, monkeypatch: pytest.
     else:
         if {"--png", "--gif", "demo"} & {*arguments}:
             pytest.importorskip("matplotlib")
-        for option in {"--mcap", "--rrd"} & {*arguments}:
-            pytest.importorskip({"--mcap": "foxglove", "--rrd": "rerun"}[option])
+        for option in {"--bag", "--mcap", "--rrd"} & {*arguments}:
+            pytest.importorskip({"--bag": "rosbags", "--mcap": "foxglove", "--rrd": "rerun"}[option])
         if sys.platform == "win32" and "models/research" in line:
             pytest.skip("no symbolic links")
         with contextlib.redirect_stdout(io.StringIO()) as printed:

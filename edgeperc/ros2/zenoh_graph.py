@@ -34,6 +34,7 @@ __all__ = ["ROUTER", "ZenohGraph", "attachment", "qos_key", "type_key"]
 ROUTER = "tcp/localhost:7447"
 """Where rmw_zenoh's router listens."""
 CONFIG_VARIABLE = "ZENOH_SESSION_CONFIG_URI"
+_PATIENCE = "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments"  # [us]
 _DEFAULT_DEPTH = 42
 _ATTACHMENT = struct.Struct("<qqB16s")
 
@@ -116,6 +117,8 @@ class ZenohGraph:
         config.insert_json5("connect/endpoints", f'["{connect or ROUTER}"]')
         config.insert_json5("listen/endpoints", '["tcp/localhost:0"]')
         config.insert_json5("scouting/multicast/enabled", "false")
+        # Zenoh drops a message of several packets after 50 ms of congestion; a cloud has 2 MB.
+        config.insert_json5(_PATIENCE, "500000")
         return config
 
     def _declare(self, kind: str, *more: str) -> str:
