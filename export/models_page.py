@@ -51,12 +51,12 @@ def models_page(folder: Path) -> str:
         "## Figures of the shipped models",
         "",
         *_prose(
-            f"On the test drives ({', '.join(sorted(TEST_DRIVES))}), on which nothing was trained or chosen, and on "
-            "simulated scans. All figures are percentages. In brackets: 95 % bootstrap intervals over drives (over "
-            "scenes for simulation), if two or more have the class. Do not average tables of real and simulated scans. "
-            "The figures are of each network alone, before the agreement of points, boxes and cells. Simulated scans "
-            "are of the streets at the time of the model's export. AP of boxes below still counts true boxes as missed "
-            "whose center lies where nothing is labeled: 1 of 57 on the test drives."
+            f"Figures of scans are on the test drives ({', '.join(sorted(TEST_DRIVES))}), on which nothing was trained "
+            "or chosen, and on simulated scans. All figures are percentages. In brackets: 95 % bootstrap intervals "
+            "over drives (over scenes for simulation), if two or more have the class. Do not average tables of real "
+            "and simulated scans. The figures are of each network alone, before the agreement of points, boxes and "
+            "cells. Simulated scans are of the streets at the time of the model's export. AP of boxes below still "
+            "counts true boxes as missed whose center lies where nothing is labeled: 1 of 57 on the test drives."
         ),
     ]
     for variant in shipped:
@@ -121,7 +121,7 @@ def _view(card: ModelCard) -> str:
 def _precisions(variants: Sequence[Variant]) -> Iterable[str]:
     yield from ("", "## Precision", "")
     yield from _prose(
-        "Agreement of each precision with fp32, after post-processing, on labeled real scans. "
+        "Agreement of each precision with fp32, after post-processing, on labeled real scans or images. "
         "`precision=auto` takes a reduced precision only if its loss (of mean IoU or of AP, whichever is larger) is "
         f"at most {MAX_LOSS} points and the processor has instructions for it: int8 on the CPU provider and OpenVINO "
         "(VNNI, AMX, or Arm's dot product), bf16 on OpenVINO (AMX or AVX-512). `precision=fp32` forbids it. "
@@ -139,7 +139,7 @@ def _precisions(variants: Sequence[Variant]) -> Iterable[str]:
     commands = sorted({record["command"] for v in variants for record in v.card.precisions.values()})
     yield ""
     yield from _prose(
-        "Mean IoU is of points without background, or of vehicles and road. Made by "
+        "Mean IoU is of points without background, of vehicles and road, or of the eleven classes of images. Made by "
         f"{', '.join(f'`{command}`' for command in commands)}. Scans of SemanticKITTI are of a test drive; they serve "
         "here only to compare precisions of one network."
     )
@@ -158,8 +158,8 @@ def _free(research: Sequence[Variant]) -> Iterable[str]:
     yield from ("", f"    edgeperc run PATH {options}", "")
     size = sum(variant.path.stat().st_size for variant in free) / 1e6
     yield from _prose(
-        f"They are less accurate ({', '.join(variant.name for variant in free)} below). At {size:.1f} MB they are "
-        "larger than all shipped models together, so the wheel leaves them out."
+        f"They are less accurate ({', '.join(variant.name for variant in free)} below). The wheel "
+        f"leaves out their {size:.1f} MB."
     )
 
 
@@ -234,12 +234,25 @@ def _alone(command: str) -> str:
 
 
 def _figures_of(card: ModelCard, bands: Sequence[str]) -> Iterable[str]:
-    if "command" in card.metrics:
+    if "images" in card.metrics:
+        yield f"- Figures made by `{card.metrics['command']}`"
+        yield from _image_figures(card.metrics["images"])
+    elif "command" in card.metrics:
         yield f"- Figures made by `{_alone(card.metrics['command'])}`"
     for source, title in SOURCES.items():
         if source in card.metrics:
             of = card.metrics[source]
             yield from _figures(of, f"{of['n_frames']} {title} scans", bands if source != "simulated" else ALL_RANGES)
+
+
+def _image_figures(figures: Mapping[str, Any]) -> Iterable[str]:
+    n_images = max(row["n_images"] for row in figures["classes"].values())
+    head = ["precision", "recall", "IoU", "pixels"]
+    yield from _head(f"pixels, {n_images} validation images, intervals over images", head)
+    yield _row("all, mean", "-", "-", _percent(figures["all"], "mean_iou"), f"{figures['all']['n_pixels']:,}")
+    for name, row in figures["classes"].items():
+        rates = [_percent(row, key) for key in ("precision", "recall", "iou")]
+        yield _row(name, *rates, f"{row['n_pixels']:,}")
 
 
 def _figures(figures: Mapping[str, Any], scans: str, bands: Sequence[str]) -> Iterable[str]:

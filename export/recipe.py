@@ -348,9 +348,9 @@ PUBLISHED = Recipe(
 
 CAMSEG = Recipe(
     "camseg",
-    steps=30_000,
-    batch=16,
-    learning_rate=3e-3,
+    steps=7000,
+    batch=8,
+    learning_rate=2e-3,
     weight_decay=0.02,
     cooldown=0.8,
     ema=0.999,

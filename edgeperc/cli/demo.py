@@ -151,7 +151,7 @@ def _camera_rows(
     road = camera_road(perception, scan.points, calibration)
     rows.append(("road", f"{road.drivable_area_m2:.0f} m2 of the image's road lie on the ground that the scan shows"))
     try:
-        title = f"edgeperc demo: a simulated street, {source}"
+        title = f"edgeperc demo, {source.partition(',')[0]}"  # what does not fit into the picture is cut
         view.draw_painted(perception, drawn.rgb, scan.points, calibration, picture, title=title)
         rows.append(("picture", str(picture)))
     except MissingExtraError as exc:
