@@ -41,7 +41,7 @@ def add_parser(commands: Commands) -> None:
         "(RMW_IMPLEMENTATION=rmw_zenoh_cpp), through their router.",
         examples=[
             "edgeperc ros2 --topic /points",
-            "edgeperc ros2 --topic /ouster/points --sensor os1-64 --connect tcp/192.168.1.10:7447",
+            "edgeperc ros2 --topic /ouster/points --connect tcp/192.168.1.10:7447",
             "edgeperc ros2 --rclpy --topic /points --ros-args -r __ns:=/front",
         ],
     )

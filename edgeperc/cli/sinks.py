@@ -77,7 +77,7 @@ def add_sinks(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="DIR",
         help="write a ROS 2 bag, a folder that must not exist: points with classes, markers, grid, detections, "
-        "diagnostics (extra 'ros')",
+        "diagnostics (needs the extra 'ros'; default: no bag)",
     )
     group.add_argument(
         "--bag-storage",
