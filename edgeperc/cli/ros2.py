@@ -107,7 +107,7 @@ def add_parser(commands: Commands) -> None:
         default=[],
         metavar="ARGUMENT",
         help="with --rclpy, last: remappings, and parameters in place of the options above: topic, sensor, model, "
-        "frame, grid_frame, prefix, rate (such as -p sensor:=os1-64)",
+        "frame, grid_frame, prefix, rate; such as -p sensor:=os1-64 (default: none)",
     )
     graph.add_argument(
         "--scans", type=positive, metavar="N", help="end after N perceived scans (default: when it is stopped)"
