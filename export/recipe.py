@@ -392,8 +392,20 @@ MODELS = {
     ),
     "pointseg": Stage(CONTINUED, "pointseg-start"),
     "lodnn": Stage(LODNN, teacher="ssadnet"),
-    "ssadnet-start": Stage(EDGE),
-    "ssadnet": Stage(DISTILLED, "ssadnet-start", "ssadnet-full"),
+    "ssadnet-first-start": Stage(EDGE),
+    "ssadnet-start": Stage(DISTILLED, "ssadnet-first-start", "ssadnet-full"),
+    "ssadnet": Stage(
+        replace(
+            CONTINUED,
+            network="ssadnet",
+            height_above_ground=False,
+            front=True,
+            drawn_roads=True,
+            n_pasted=3.0,
+            steps=2400,
+        ),
+        "ssadnet-start",
+    ),
     "camseg": Stage(CAMSEG),
 }
 """The training run of every model, by name; names that end in ``-start`` are intermediate results."""

@@ -27,7 +27,7 @@ def variants(**losses: float) -> tuple[Variant, Variant]:
 
 
 def test_every_name_has_one_file_per_variant() -> None:
-    assert shipped_models() == ("lodnn", "pointseg", "ssadnet")
+    assert shipped_models() == ("camseg", "lodnn", "pointseg", "ssadnet")
     assert set(DEFAULT) <= set(shipped_models())
     names = [str(variant) for variant in listed()]
     assert len(names) == len(set(names))
@@ -56,7 +56,7 @@ def test_the_wheels_models_are_small() -> None:
         ("ssadnet-edge", "now called 'ssadnet:fp32'"),
         ("pointseg-sim", "models/research/pointseg-sim\\.onnx"),
         ("pointseg:bf16", "pointseg:fp32 and pointseg:int8.*ask for precision 'bf16'"),
-        ("pointnet", "no model is called 'pointnet'. Shipped: lodnn, pointseg, ssadnet"),
+        ("pointnet", "no model is called 'pointnet'. Shipped: camseg, lodnn, pointseg, ssadnet"),
         ("", "no model is called ''"),
         ("nowhere.onnx", "nowhere.onnx"),
     ],
