@@ -626,8 +626,8 @@ ALLOCATES = """
 import numpy as np
 from edgeperc.readers import decoders, worker
 def scans(*_):
-    yield None, np.zeros((1, 4), "f4")
-    yield None, np.zeros((1 << 28, 4), "f4")
+    yield None, np.zeros((1, 4), "f4"), None
+    yield None, np.zeros((1 << 28, 4), "f4"), None
 decoders._packet_scans = scans
 worker.main()
 """

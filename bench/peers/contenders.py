@@ -235,7 +235,8 @@ def _one_or_two(variant: Variant, folder: Path) -> list[Contender]:
         classes, boxes = sorted(card.outputs, key=lambda output: output.kind.startswith("box_"))
         onnx.save(extractor.extract_model([card.input.name], [classes.name]), segmentation)
         onnx.save(extractor.extract_model([card.input.name], [boxes.name]), detection)
-        onnx.save(to_graph(DenseHead(len(card.input.channels)), replace(card, outputs=(classes,))), lean)
+        head = DenseHead(len(card.input.channels), front=boxes.front)
+        onnx.save(to_graph(head, replace(card, outputs=(classes,))), lean)
     parts = {
         "one network": (path,),
         "two networks": (segmentation, detection),

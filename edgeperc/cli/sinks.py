@@ -34,7 +34,7 @@ def add_sinks(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="write points, boxes, tracks, drivable cells and stage times to an MCAP file for Foxglove and other "
-        "viewers (needs the extra 'foxglove')",
+        "viewers (needs the extra 'foxglove'; default: none)",
     )
     group.add_argument(
         "--serve",
@@ -43,23 +43,28 @@ def add_sinks(parser: argparse.ArgumentParser) -> None:
         const=("127.0.0.1", 8765),
         metavar="HOST:PORT",
         help="stream the same to viewers while it runs, over Foxglove's WebSocket protocol; anyone who reaches "
-        "HOST:PORT can watch (default without a value: 127.0.0.1:8765, this computer only; needs the extra 'foxglove')",
+        "HOST:PORT can watch (needs the extra 'foxglove'; without a value: 127.0.0.1:8765, this computer only; "
+        "default: none)",
     )
     group.add_argument(
-        "--rrd", type=Path, metavar="FILE", help="write a recording for the Rerun viewer (needs the extra 'rerun')"
+        "--rrd",
+        type=Path,
+        metavar="FILE",
+        help="write a recording for the Rerun viewer (needs the extra 'rerun'; default: none)",
     )
     group.add_argument(
         "--play",
         type=Path,
         metavar="FILE",
-        help="write one HTML page that plays all scans of the drive in 3-D, of at most 48 MB: scans are thinned",
+        help="write one HTML page that plays all scans of the drive in 3-D, of at most 48 MB: scans are thinned "
+        "(default: none)",
     )
     group.add_argument(
         "--static",
         type=Path,
         metavar="DIR",
         help="write every scan without its points on moving objects, as DIR/NAME in the format of the scan; scans of "
-        "captures become .bin. Needs --track, or --movable",
+        "captures become .bin. Needs --track, or --movable (default: no scans)",
     )
     group.add_argument(
         "--movable",
@@ -70,7 +75,7 @@ def add_sinks(parser: argparse.ArgumentParser) -> None:
         "--labels-for",
         choices=("labelcloud", "cvat", "kitti", "sustechpoints"),
         help="write the boxes to --out as labels for an annotation tool; with --track with the ids of tracks. kitti "
-        "takes the camera of --calib (a file, or a folder with one for each scan), or a nominal one",
+        "takes the camera of --calib (a file, or a folder with one for each scan), or a nominal one (default: none)",
     )
     group.add_argument(
         "--bag",
