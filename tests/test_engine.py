@@ -22,12 +22,8 @@ from edgeperc.perceiver import Perceiver
 from edgeperc.remote import Remote, location
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
-from edgeperc.zoo import DEFAULT, shipped_models
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore"),  # of Ray, boto and aiohttp
-    pytest.mark.skipif(not {*DEFAULT} <= {*shipped_models()}, reason="the default models are not installed"),
-]
+pytestmark = pytest.mark.filterwarnings("ignore")  # of Ray, boto and aiohttp
 
 N_SCANS = 9
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 
 from cli_helpers import POINTSEG, run
 from edgeperc import Box, OptionError, Perception, PointLabels, PointsError, Tracker, Tracks, read_points
+from edgeperc.cli.main import build_parser
+from edgeperc.cli.sinks import open_sinks
 from edgeperc.sensor import get_sensor
 from edgeperc.sinks import PerceivedScan
 from edgeperc.sinks.static import StaticSink
@@ -150,3 +153,16 @@ def test_the_command_writes_every_scan(tmp_path: Path, monkeypatch: pytest.Monke
         with pytest.raises(SystemExit) as left:
             run("run", tmp_path / "drive", *wrong)
         assert left.value.code == 2
+
+
+def test_a_sink_made_before_one_that_cannot_be_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    closed = []
+    monkeypatch.setattr("edgeperc.sinks.page.PageSink.close", lambda self: closed.append(self))
+    (tmp_path / "file").write_bytes(b"")
+    options = ["--play", str(tmp_path / "play.html"), "--static", str(tmp_path / "file"), "--movable"]
+    arguments = build_parser().parse_args(["run", str(tmp_path), *options])
+    with ExitStack() as stack:
+        with pytest.raises(OSError, match="file"):
+            open_sinks(arguments, stack)
+        assert not closed
+    assert len(closed) == 1

@@ -18,11 +18,9 @@ from edgeperc.errors import ModelError, SensorError
 from edgeperc.records import scan_record
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
-from edgeperc.zoo import DEFAULT, model_path, shipped_models
+from edgeperc.zoo import DEFAULT, model_path
 from edgeperc_export import cli
 from edgeperc_export.triton import write_repository
-
-pytestmark = pytest.mark.skipif(not {*DEFAULT} <= {*shipped_models()}, reason="the default models are not installed")
 
 
 @pytest.fixture(scope="module")

@@ -37,6 +37,7 @@ __all__ = ["add_engine", "check_engine", "perceive_on_ray", "through_temporary"]
 MOST_FIRST = 20
 # Options that do not change what is written about a scan.
 _OTHERS = ("engine", "live", "out", "paths", "rate", "threads", "typed", "workers")
+# What the parser adds to the arguments; it cannot be pickled.
 _OF_PARSER = ("command", "parser", "usage_error")
 
 Outcome = tuple[Any, Any, Any, Any]  # `edgeperc.cli.run.Outcome`
@@ -119,9 +120,7 @@ def perceive_on_ray(
             "--engine local would go on learning, and may give other results; pass --mount-height or --extrinsic",
             stacklevel=2,
         )
-    options = {
-        name: value for name, value in vars(arguments).items() if name not in ("command", "parser", "usage_error")
-    }
+    options = {name: value for name, value in vars(arguments).items() if name not in _OF_PARSER}
     options["threads"] = n_threads = arguments.threads or 1
     options["model"] = arguments.model and [_absolute_if_there(model) for model in arguments.model]
     options |= {name: _absolute_if_there(options.get(name)) for name in ("sensor", "extrinsic", "poses", "out")}

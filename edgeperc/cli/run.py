@@ -247,10 +247,7 @@ def run_command(arguments: argparse.Namespace) -> int:
         report.add(folder, PointsError("no scan in this folder; expected scans, captures or a ROS 2 bag's folder"))
     started = time.perf_counter()
     with progress("file") as show, ExitStack() as stack:
-        sinks = open_sinks(arguments)
-        for sink in sinks:
-            stack.callback(sink.close)
-        run = _Run(arguments, perceivers, kinds, sinks)
+        run = _Run(arguments, perceivers, kinds, open_sinks(arguments, stack))
         if arguments.engine == "ray":
             perceive_on_ray(arguments, _alone, perceivers, scans, targets, report, show)
         for done, (scan, target) in enumerate(zip(scans, targets, strict=True) if arguments.engine == "local" else ()):

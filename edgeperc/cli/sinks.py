@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -108,37 +109,45 @@ def wanted_sinks(arguments: argparse.Namespace) -> list[str]:
     return [name for name in SINKS if getattr(arguments, name) is not None]
 
 
-def open_sinks(arguments: argparse.Namespace) -> list[Sink]:
-    """Make the sinks of the passed options; errors of options and missing extras come here, before the first scan."""
+def open_sinks(arguments: argparse.Namespace, stack: ExitStack) -> list[Sink]:
+    """Make the sinks of the passed options; errors of options and missing extras come here, before the first scan.
+
+    The stack closes them, also those that were made before one that cannot be.
+    """
     sinks: list[Sink] = []
+
+    def add(sink: Sink) -> None:
+        stack.callback(sink.close)
+        sinks.append(sink)
+
     if arguments.mcap is not None:
         from ..sinks.foxglove import McapSink
 
-        sinks.append(McapSink(arguments.mcap))
+        add(McapSink(arguments.mcap))
     if arguments.serve is not None:
         from ..sinks.foxglove import ServeSink
 
         served = ServeSink(*arguments.serve)
         print_line(f"open {served.url} in Foxglove", sys.stderr)
-        sinks.append(served)
+        add(served)
     if arguments.rrd is not None:
         from ..sinks.rerun import RerunSink
 
-        sinks.append(RerunSink(arguments.rrd))
+        add(RerunSink(arguments.rrd))
     if arguments.play is not None:
         from ..sinks.page import PageSink
 
-        sinks.append(PageSink(arguments.play))
+        add(PageSink(arguments.play))
     if arguments.static is not None:
         from ..sinks.static import StaticSink
 
-        sinks.append(StaticSink(arguments.static, without="movable" if arguments.movable else "moving"))
+        add(StaticSink(arguments.static, without="movable" if arguments.movable else "moving"))
     if arguments.labels_for is not None:
         from ..sinks.prelabels import PrelabelSink
 
-        sinks.append(PrelabelSink(arguments.out, arguments.labels_for, calib=arguments.calib))
+        add(PrelabelSink(arguments.out, arguments.labels_for, calib=arguments.calib))
     if arguments.bag is not None:
         from ..sinks.rosbag import BagSink
 
-        sinks.append(BagSink(arguments.bag, storage=arguments.bag_storage, frame_id=arguments.bag_frame))
+        add(BagSink(arguments.bag, storage=arguments.bag_storage, frame_id=arguments.bag_frame))
     return sinks
