@@ -13,7 +13,11 @@ from typing import Any
 
 from .extras import require
 
-__all__ = ["Lost", "map_on_ray"]
+__all__ = ["MOST_FIRST", "Lost", "map_on_ray"]
+
+MOST_FIRST = 20
+"""Scans that the driver perceives at most, until its perceiver has learned what workers start from. Usually five are
+enough; a scan that shows no ground does not count."""
 
 # Items of a block, the unit that a worker is given. Few, because all are done again if its process dies. Many, because
 # the driver keeps some kilobytes for each block.

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from .. import __version__
 from ..atomic import write_atomic
-from ..engine import Lost, map_on_ray
+from ..engine import MOST_FIRST, Lost, map_on_ray
 from ..errors import EdgepercError
 from ..remote import Remote
 from .arguments import positive
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 __all__ = ["add_engine", "check_engine", "perceive_on_ray", "through_temporary"]
 
-# Scans that the driver perceives at most. Usually five are enough; a scan that shows no ground does not count.
-MOST_FIRST = 20
 # Options that do not change what is written about a scan.
 _OTHERS = ("engine", "live", "out", "paths", "rate", "threads", "typed", "workers")
 # What the parser adds to the arguments; it cannot be pickled.

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..agreement import RULES
-from ..engine import Lost, map_on_ray
+from ..engine import MOST_FIRST, Lost, map_on_ray
 from ..errors import EdgepercError, OptionError, PointsError
 from ..mounting import Mounting
 from ..perceiver import BoxesFrom, Learned, Perceiver
@@ -29,7 +29,6 @@ from .tables import Record, figures
 __all__ = ["evaluate"]
 
 N_WORST = 20
-MOST_FIRST = 20  # scans that are evaluated before the workers start; usually five
 KINDS, OF_FOLDER = ("real", "semantickitti", "simulated"), "folder "
 
 _Figures = tuple[Record, Mistakes | None]

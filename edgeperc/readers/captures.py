@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import PointsError, SensorError
 from ..sensor import SensorProfile
 from .apart import decode_apart, describe_apart
-from .files import read_timed_file
+from .files import read_points, read_timed_file
 from .identify import KnownSensor, of_cloud, of_metadata, of_packets
 from .packets import PCAP_MAGIC
 from .times import TimedScan
@@ -124,7 +124,9 @@ def _scans(path: Path, topic: str | None, remission_field: str | None, times: bo
     if kind == "folder":
         return _folder(path, topic, remission_field, times)
     if kind == "scan":
-        return iter([read_timed_file(path, remission_field)])
+        if times:
+            return iter([read_timed_file(path, remission_field)])
+        return iter([TimedScan(None, read_points(path, remission_field=remission_field), None)])
     return decode_apart(path, kind, topic, remission_field, times)
 
 

@@ -43,6 +43,8 @@ def decode(
     remission_field: str | None,
     warn: Callable[[str], None],
     alive: Callable[[], None],
+    *,
+    times: bool = True,
 ) -> Iterator[TimedScan]:
     """The scans of a capture, decoded in this process.
 
@@ -56,6 +58,8 @@ def decode(
         Called with a sentence about what was left out.
     alive : callable
         Called now and then while a large file is checked before its first scan.
+    times : bool
+        False leaves out the times of points.
 
     Raises
     ------
@@ -66,9 +70,10 @@ def decode(
     scans = (
         _packet_scans(path, kind, topic, remission_field, warn, alive)
         if kind in (".pcap", ".osf")
-        else _bag_scans(path, kind, topic, remission_field, alive)
+        else _bag_scans(path, kind, topic, remission_field, alive, times)
     )
-    yield from _with_typed_errors(path, scans)
+    for stamp_s, points, times_s in _with_typed_errors(path, scans):
+        yield TimedScan(stamp_s, points, times_s if times else None)
 
 
 def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]) -> dict[str, Any]:
@@ -309,11 +314,12 @@ def _ouster_scans(frames: Any, topic: str | None, remission_field: str | None) -
 
 
 def _bag_scans(
-    path: Path, kind: str, topic: str | None, remission_field: str | None, alive: Callable[[], None]
+    path: Path, kind: str, topic: str | None, remission_field: str | None, alive: Callable[[], None], times: bool
 ) -> Iterator[TimedScan]:
     for _, message, stamp_s in _clouds(path, kind, topic, alive):
         points = cloud_points(message, remission_field=remission_field)
-        yield TimedScan(stamp_s, points, point_times(table_columns(_as_table(message)), points, stamp_s))
+        times_s = point_times(table_columns(_as_table(message)), points, stamp_s) if times else None
+        yield TimedScan(stamp_s, points, times_s)
 
 
 def _clouds(path: Path, kind: str, topic: str | None, alive: Callable[[], None]) -> Iterator[tuple[str, Any, float]]:

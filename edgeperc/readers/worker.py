@@ -54,13 +54,14 @@ def main() -> None:
                 request["remission_field"],
                 lambda text: reply(WARNING, text.encode("utf-8", "replace")),
                 lambda: reply(ALIVE),
+                times=request["times"],
             ):
                 if points.nbytes > MAX_SCAN_BYTES:
                     raise PointsError(
                         f"{request['path']}: a scan of {len(points):,} points is too large; expected at most "
                         f"{MAX_SCAN_BYTES // 16:,}"
                     )
-                if request["times"] and times_s is not None:
+                if times_s is not None:
                     reply(TIMES, np.ascontiguousarray(times_s, "<f8").data.cast("B") if times_s.size else b"")
                 content = np.ascontiguousarray(points, "<f4").data.cast("B") if points.size else b""
                 reply(SCAN, content, np.nan if stamp_s is None else stamp_s)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from ..mounting import MODEL_HEIGHT_M
 from ..occupancy import OCCUPIED, occupancy_grid
 from ..points import as_points
 from ..view.colors import color_of, rgb
+from ..view.content import EDGES, box_corners
 
 if TYPE_CHECKING:
     from ..perception import Box
@@ -61,9 +63,6 @@ _ARROW, _CUBE, _LINE_LIST, _TEXT = 0, 1, 5, 9
 _ADD, _DELETE_ALL = 0, 3
 _LEVELS = {None: 0, "OK": 0, "LATE": 1, "STALE": 3}  # of DiagnosticStatus, by the health of an answer
 _MOVING_MPS = 0.5  # slower tracks get no arrow
-# The twelve edges of a box with corners at -0.5 and 0.5: pairs of corners that differ in one coordinate.
-_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-_EDGES = np.array([[a, b] for a in range(8) for b in range(a) if (a ^ b).bit_count() == 1])
 
 
 def nanoseconds(stamp_s: float) -> int:
@@ -217,7 +216,7 @@ class RosMessages:
         for track in scan.tracks or ():
             box, color = track.box, (track.label, 0.4 if track.coasting else 1.0)
             number = track.id % 2**31
-            edges = (_CORNERS * box.size)[_EDGES].reshape(-1, 3)
+            edges = box_corners(replace(box, center=(0.0, 0.0, 0.0), yaw=0.0))[np.ravel(EDGES)]  # in the marker's pose
             thin: dict[str, Any] = {"scale": (0.08, 0.0, 0.0), "color": color}
             markers.append(
                 self._marker(header, "tracks", number, _LINE_LIST, pose=self._pose(box), points=edges, **thin)

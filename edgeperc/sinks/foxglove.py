@@ -33,7 +33,7 @@ from ..frame import quaternion
 from ..mounting import MODEL_HEIGHT_M
 from ..perception import Box, TopView
 from ..printable import printable
-from ..view.content import box_text, track_text
+from ..view.content import EDGES, box_corners, box_text, track_text
 from . import PerceivedScan
 from .scene import (
     BASE,
@@ -58,10 +58,6 @@ _TYPES = {"<f4": "Float32", "|u1": "Uint8"}
 
 # Messages that wait for a slow viewer; then the oldest are dropped. A scan has at most 6 messages, up to 3 MB in all.
 _BACKLOG = 60
-
-# The edges of a box from -0.5 to 0.5, as pairs of corners.
-_CORNERS = np.array([[x, y, z] for z in (-0.5, 0.5) for x, y in ((0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5))])
-_EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
 
 STATUS_SCHEMA: dict[str, Any] = {
     "title": "edgeperc.Status",
@@ -180,9 +176,7 @@ class _Channels:
             box, color = track.world_box, self._color(track.label, 1.0)
             dx, dy, _ = R @ [*track.velocity, 0.0]
             speed = math.hypot(dx, dy)
-            cos, sin = math.cos(box.yaw), math.sin(box.yaw)
-            edges = (_CORNERS * box.size) @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]) + box.center
-            lines = [self._line("LineList", edges[_EDGES].reshape(-1, 3), color)]
+            lines = [self._line("LineList", box_corners(box)[np.ravel(EDGES)], color)]
             lines.append(self._line("LineStrip", trails[track.id], color))
             ahead = self._pose(box.center, math.atan2(dy, dx))
             entity = make.SceneEntity(
