@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +27,15 @@ __all__ = [
     "rectangles",
     "shared_area",
     "suppress_overlaps",
+    "wrapped",
 ]
+
+Angle = TypeVar("Angle", float, NDArray[np.float64])
+
+
+def wrapped(angle: Angle) -> Angle:
+    """Wrap an angle, or each of an array, to -pi..pi [rad]."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def draw_footprints(

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry import wrapped
 from ..perception import Box
 from .tracking_metrics import box_iou, fill_assignment
 
@@ -100,7 +101,7 @@ class Ab3dmot:
         self._n_scans += 1
         given = np.array([(*box.center, *box.size, box.yaw) for box in boxes], np.float64).reshape(-1, 7)
         states = self._states @ _F.T
-        states[:, 3] = _wrapped(states[:, 3])
+        states[:, 3] = wrapped(states[:, 3])
         covariances = _F @ self._covariances @ _F.T + _Q
         source = np.full(len(states), -1)
         for detection, track in self._pairs(given, states[:, _BACK]):
@@ -113,14 +114,14 @@ class Ab3dmot:
         # Headings are known up to half a turn; the state turns to the detection's direction.
         seen = given[source[found]][:, _ORDER]
         mine = states[found]
-        off = np.abs(_wrapped(seen[:, 3] - mine[:, 3])) > math.pi / 2.0
+        off = np.abs(wrapped(seen[:, 3] - mine[:, 3])) > math.pi / 2.0
         mine[off, 3] += math.pi
         innovation = seen - mine[:, :N_SEEN]
-        innovation[:, 3] = _wrapped(innovation[:, 3])
+        innovation[:, 3] = wrapped(innovation[:, 3])
         spread = covariances[found]
         gain = spread[:, :, :N_SEEN] @ np.linalg.inv(spread[:, :N_SEEN, :N_SEEN] + np.eye(N_SEEN))
         states[found] = mine + (gain @ innovation[:, :, None])[:, :, 0]
-        states[:, 3] = _wrapped(states[:, 3])
+        states[:, 3] = wrapped(states[:, 3])
         covariances[found] = spread - gain @ spread[:, :N_SEEN]
 
         new = np.setdiff1d(np.arange(len(given)), source)
@@ -214,7 +215,3 @@ def _hull_area(points: list[tuple[float, float]]) -> float:
             chain.append((x, y))
         area += 0.5 * sum(ax * by - bx * ay for (ax, ay), (bx, by) in itertools.pairwise(chain))
     return area
-
-
-def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray((angles + math.pi) % (2.0 * math.pi) - math.pi)

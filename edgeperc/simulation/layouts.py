@@ -7,10 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..geometry import wrapped
 from ..perception import Box
 from .raycast import LANE, SLOPE_X, SLOPE_Y
 from .roadside import add_beside_people, add_parked_bicycles, add_roadside
-from .scene import Scene, wrapped
+from .scene import Scene
 from .shapes import Row
 from .street import IN_BAYS, ROW_RANGE_M, SHAPES, Street, any_vehicle, random_terrain, strip_row
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..card import TopViewGeometry
 from ..errors import PointsError
-from ..geometry import draw_footprints
+from ..geometry import draw_footprints, wrapped
 from ..perception import Box
 from ..sensor import SensorProfile, get_sensor
 from .raycast import (
@@ -36,7 +36,6 @@ __all__ = [
     "sensor_pose",
     "simulate",
     "simulate_sequence",
-    "wrapped",
 ]
 
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
@@ -362,11 +361,6 @@ def simulate_sequence(
         x, y = chord * math.cos(heading + turn / 2.0), chord * math.sin(heading + turn / 2.0)
         T_world_sensor = sensor_pose(scene, sensor, x, y, yaw=heading + turn)
         yield stamp_s, T_world_sensor, simulate(scene.at(stamp_s), sensor, seed + k, T_world_sensor)
-
-
-def wrapped(angle: float) -> float:
-    """Wrap an angle [rad] to -pi..pi."""
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def _box_in_sensor(each: SceneObject, T_world_sensor: NDArray[np.float64]) -> Box:

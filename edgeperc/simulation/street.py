@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry import wrapped
 from .people import cyclist, pedestrian, person_sitting
 from .raycast import (
     ASPHALT,
@@ -44,7 +45,7 @@ from .raycast import (
     WEAR,
     ground_at,
 )
-from .scene import Scene, SceneObject, wrapped
+from .scene import Scene, SceneObject
 from .shapes import Row, Vector
 from .vehicles import bus, car, misc, truck, van
 

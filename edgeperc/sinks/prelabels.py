@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..atomic import open_atomic, write_atomic
 from ..calibration import read_kitti_calibration
 from ..errors import OptionError
+from ..geometry import wrapped
 from ..perception import Box
 from . import PerceivedScan
 from .names import ScanFiles, stem_of
@@ -137,7 +138,7 @@ class PrelabelSink:
                 "name": box.label,
                 "centroid": _named("xyz", box.center),
                 "dimensions": _named(("length", "width", "height"), box.size),
-                "rotations": _named("xyz", (0.0, 0.0, _wrapped(box.yaw))),
+                "rotations": _named("xyz", (0.0, 0.0, wrapped(box.yaw))),
             }
             for box, _ in boxes
         ]
@@ -151,7 +152,7 @@ class PrelabelSink:
                 "obj_type": _SUSTECH_CLASSES.get(box.label, _capital(box.label)),
                 "psr": {
                     "position": _named("xyz", box.center),
-                    "rotation": _named("xyz", (0.0, 0.0, _wrapped(box.yaw))),
+                    "rotation": _named("xyz", (0.0, 0.0, wrapped(box.yaw))),
                     "scale": _named("xyz", box.size),
                 },
             }
@@ -177,7 +178,7 @@ class PrelabelSink:
                     "group": 0,
                     "label_id": self._classes.index(box.label),
                     "position": _rounded(box.center),
-                    "rotation": [0.0, 0.0, *_rounded([_wrapped(box.yaw)])],
+                    "rotation": [0.0, 0.0, *_rounded([wrapped(box.yaw)])],
                     "scale": _rounded(box.size),
                 }
             )
@@ -229,7 +230,7 @@ def _kitti_line(box: Box, T_cam_sensor: NDArray[np.float64], P2: NDArray[np.floa
             rectangle = seen
             cut = 1.0 - float(np.prod(seen[2:] - seen[:2]) / np.prod(whole[2:] - whole[:2]))
     numbers = [*rectangle, height, width, length, x, y, z]
-    alpha = _wrapped(turn - math.atan2(x, z))
+    alpha = wrapped(turn - math.atan2(x, z))
     texts = [f"{cut:.2f} 3 {alpha:.4f}", *(f"{v:.2f}" for v in rectangle), *(f"{v:.4f}" for v in numbers[4:])]
     return f"{_capital(box.label)} {' '.join(texts)} {turn:.5f}\n"
 
@@ -238,10 +239,6 @@ def _capital(label: str) -> str:
     """KITTI's way to write a class: without blanks, with a capital."""
     text = "_".join(label.split())
     return text[:1].upper() + text[1:]
-
-
-def _wrapped(angle: float) -> float:
-    return (float(angle) + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def _rounded(values: Sequence[float]) -> list[float]:

@@ -10,6 +10,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry import wrapped
 from ..perception import Box
 from .lives import MOVED
 from .ukf import MODES
@@ -275,7 +276,7 @@ class Tracks(Sequence[Track]):
         boxes[:, :2], boxes[:, 2:6] = state[:, :2], shape
         odds = _front_odds(self._rows)
         turned = np.where(odds == 0.0, self._rows["fronts"][:, 2], odds) < 0.0
-        boxes[:, 6] = _wrap(state[:, 3] + math.pi * turned)
+        boxes[:, 6] = wrapped(state[:, 3] + math.pi * turned)
         return boxes
 
     @property
@@ -334,7 +335,3 @@ def _front_odds(tracks: NDArray[np.void]) -> NDArray[np.float64]:
     """Log odds (n,) that the heading points to the front; motion counts from the second scan in which a track moves."""
     moved = tracks["fronts"][:, 0]
     return np.asarray(np.where(np.abs(moved) >= 2.0 * MOVED, moved, 0.0) + tracks["fronts"][:, 1])
-
-
-def _wrap(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray((angles + math.pi) % (2.0 * math.pi) - math.pi)
