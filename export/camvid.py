@@ -274,7 +274,8 @@ def plot_camvid(rows: Sequence[Mapping[str, Any]], folder: Path) -> list[Path]:
         axes.grid(axis="x", alpha=0.3)
         axes.set_axisbelow(True)
     axes.invert_yaxis()
-    figure.axes[FIGURES.index("miou")].legend(frameon=True, fontsize=7, loc="lower right")
+    marks = figure.axes[FIGURES.index("miou")].get_legend_handles_labels()
+    figure.legend(*marks, loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     paths = [folder / "figures.png", folder / "curves.png"]
     figure.savefig(paths[0], dpi=110, metadata={"Software": None})
 
