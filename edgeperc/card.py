@@ -40,6 +40,7 @@ MAX_TEXT = 100_000  # characters of one text of the free-form metadata
 MAX_NAME = 200
 MAX_ROWS, MAX_COLUMNS, MAX_PIXELS = 4096, 65_536, 16 * 10**6
 MAX_CHANNELS = 16
+MAX_BLOCK = 16
 MIN_SECTOR_DEG = 1.0
 MIN_GOLDEN_VALUES, MAX_GOLDEN_VALUES = 16, 100_000
 OUTPUT_KINDS = ("class_logits", "class_probabilities", "box_slots", "box_dense", "camera_logits")
@@ -272,11 +273,16 @@ class OutputSpec:
     front : bool
         Of kind ``"box_dense"``: it has two more channels, a vector towards the front of a box. Its component along a
         heading is the logit that the front is there.
+    block : (int, int)
+        Of a class output: rows and columns of the pixels whose values are channels of one position. Value of class c in
+        pixel (row, column): channel ``(c * rows + row % rows) * columns + column % columns``, at position
+        ``(row // rows, column // columns)``.
     """
 
     name: str
     kind: str
     front: bool = False
+    block: tuple[int, int] = (1, 1)
 
     def __post_init__(self) -> None:
         if self.kind not in OUTPUT_KINDS:
@@ -286,6 +292,12 @@ class OutputSpec:
             )
         if self.front and self.kind != "box_dense":
             raise CardError(f"output {reprlib.repr(self.name)} of kind {self.kind} has a front; only box_dense may")
+        if len(self.block) != 2 or not all(1 <= n <= MAX_BLOCK for n in self.block):
+            raise CardError(f"output.block is {reprlib.repr(self.block)}; expected two numbers from 1 to {MAX_BLOCK}")
+        if self.block != (1, 1) and not self.kind.startswith("class_"):
+            raise CardError(
+                f"output {reprlib.repr(self.name)} of kind {self.kind} has blocks; only outputs of classes may"
+            )
         _check_name("output.name", self.name)
 
 
@@ -431,6 +443,12 @@ class ModelCard:
             sum(k.startswith("class_") for k in kinds) != 1 or len(kinds) != len(set(kinds)) or "camera_logits" in kinds
         ):
             raise CardError(f"output kinds {kinds}; expected one class output and at most one of each box kind")
+        for rows, cols in (output.block for output in self.outputs):
+            if self.view.height % rows or self.view.width % cols:
+                raise CardError(
+                    f"output.block is {(rows, cols)}; expected divisors of the view's {self.view.height} rows and "
+                    f"{self.view.width} columns"
+                )
         if any(k.startswith("box_") for k in kinds):
             if self.view.kind != "top_view":
                 raise CardError(f"output kinds {kinds} in a {self.view.kind}; boxes need a top_view")
@@ -482,7 +500,8 @@ class ModelCard:
         if kind == "box_dense":
             n_channels = N_DENSE_CHANNELS + N_FRONT_CHANNELS * any(output.front for output in self.outputs)
             return (1, n_channels, self.view.height // 4, self.view.width // 4)
-        return (1, len(self.classes), self.view.height, self.view.width)
+        rows, cols = next((output.block for output in self.outputs if output.kind == kind), (1, 1))
+        return (1, len(self.classes) * rows * cols, self.view.height // rows, self.view.width // cols)
 
     def to_json(self) -> str:
         """Canonical JSON: sorted keys, no blanks, no NaN."""
@@ -593,7 +612,8 @@ def _card(document: dict[str, Any]) -> ModelCard:
             OutputSpec(
                 name=_text("output.name", o["name"]),
                 kind=_text("output.kind", o["kind"]),
-                front=_bool("output.front", o.get("front", False)),  # earlier cards lack it
+                front=_bool("output.front", o.get("front", False)),  # earlier cards lack it, and the block
+                block=_ints("output.block", o.get("block", [1, 1])),
             )
             for o in document["outputs"]
         ),
@@ -679,6 +699,11 @@ def _texts(field: str, values: Any) -> tuple[str, ...]:
 
 def _floats(field: str, values: Any) -> tuple[float, ...]:
     return tuple(_float(field, value) for value in _list(field, values))
+
+
+def _ints(field: str, values: Any) -> tuple[int, int]:
+    first, second = (_int(field, value) for value in _list(field, values))
+    return first, second
 
 
 def _sizes(field: str, document: dict[str, Any]) -> dict[str, tuple[float, float, float]]:

@@ -22,6 +22,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from .blocks import fill_pixels
 from .errors import (
     CardError,
     CardMismatchError,
@@ -209,7 +210,10 @@ class Session:
     input : (C, H, W) float32
         Write the network's input here, then `run`.
     outputs : mapping of str to ndarray
-        Raw outputs by output *kind*, without the batch axis; overwritten by every `run`.
+        Outputs by output *kind*, without the batch axis; overwritten by every `run`. Values of blocks are written to
+        their pixels (`edgeperc.card.OutputSpec`).
+    raw : mapping of str to ndarray
+        The same as the graph gives them.
     golden_deviation : float
         Deviation of the outputs for the card's golden input from the exporter's, in standard deviations of the output
         (90th percentile). NaN if the card has no golden record, which is logged as a warning.
@@ -412,6 +416,7 @@ class Session:
         batch = np.zeros((1, len(card.input.channels), card.view.height, card.view.width), np.float32)
         self.input: NDArray[np.float32] = batch[0]
         self._binding = self._session.io_binding()
+        self.raw: dict[str, NDArray[np.float32]] = {}
         self.outputs: dict[str, NDArray[np.float32]] = {}
         for output, shape in zip(card.outputs, self._shapes(batch, run_options), strict=True):
             if output.kind == "camera_logits" and (card.view.height % shape[2] or card.view.width % shape[3]):
@@ -421,7 +426,10 @@ class Session:
                 )
             buffer = np.zeros(shape, np.float32)
             self._binding.bind_output(output.name, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
-            self.outputs[output.kind] = buffer[0]
+            self.raw[output.kind] = self.outputs[output.kind] = buffer[0]
+            if output.block != (1, 1):
+                pixels = (len(card.classes), card.view.height, card.view.width)
+                self.outputs[output.kind] = np.zeros(pixels, np.float32)
         self._batch = batch  # the binding holds a bare pointer
         self._bound_input = (card.input.name, "cpu", 0, np.float32, batch.shape, batch.ctypes.data)
 
@@ -463,7 +471,7 @@ class Session:
         self.input[:] = 0.0
         deviation = 0.0
         for output in self.card.outputs:
-            known, here = golden.outputs.get(output.name), self.outputs[output.kind].reshape(-1)
+            known, here = golden.outputs.get(output.name), self.raw[output.kind].reshape(-1)
             if known is None:
                 raise CardMismatchError(f"{self.path}: the card's golden record lacks output {output.name!r}")
             try:
@@ -509,6 +517,12 @@ class Session:
             self._running_in = 0
         return self.outputs
 
+    def spread(self) -> None:
+        """Write the values of blocks in `raw` to their pixels in `outputs`; `run` does so."""
+        for output in self.card.outputs:
+            if output.block != (1, 1):
+                fill_pixels(self.raw[output.kind], *output.block, self.outputs[output.kind])
+
     def __reduce__(self) -> NoReturn:
         raise EdgepercError(
             f"a session of {self.path} cannot be pickled or copied; construct a Perceiver or Session in each process"
@@ -521,6 +535,7 @@ class Session:
             self._session.run_with_iobinding(self._binding, *run_options)
         except Exception as exc:  # onnxruntime's errors share no base but Exception
             raise InferenceError(f"{self.path}: a run on {self.provider} failed: {exc}") from exc
+        self.spread()
 
 
 @contextmanager

@@ -264,7 +264,8 @@ def _run_in_openvino(session: Session) -> str:
     def run() -> Mapping[str, NDArray[np.float32]]:
         request.infer()
         for output in session.card.outputs:
-            session.outputs[output.kind][...] = request.get_tensor(output.name).data[0]
+            session.raw[output.kind][...] = request.get_tensor(output.name).data[0]
+        session.spread()
         return session.outputs
 
     session.run = run  # type: ignore[method-assign]

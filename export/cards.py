@@ -9,7 +9,7 @@ from edgeperc.sensor import get_sensor
 from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES
 from edgeperc.simulation.street import CAMERA_CLASSES
 
-from .recipe import Recipe
+from .recipe import EDGE_BLOCKS, Recipe
 
 __all__ = [
     "CAMERA_INPUT",
@@ -54,6 +54,7 @@ def card_of(recipe: Recipe, **facts: Any) -> ModelCard:
     """The card of a recipe's network; ``facts`` are further arguments of `ModelCard`, at least ``version``."""
     facts = {"name": recipe.network, **facts}
     task = recipe.task
+    block = EDGE_BLOCKS.get(recipe.network, (1, 1)) if recipe.edge else (1, 1)
     if task == "camera":
         return ModelCard(
             view=CameraGeometry(recipe.image_width, recipe.image_height),
@@ -66,7 +67,7 @@ def card_of(recipe: Recipe, **facts: Any) -> ModelCard:
         return ModelCard(
             view=RANGE_IMAGE,
             input=HEIGHT_INPUT if recipe.height_above_ground else RANGE_IMAGE_INPUT,
-            outputs=(OutputSpec("logits", "class_logits"),),
+            outputs=(OutputSpec("logits", "class_logits", block=block),),
             classes=recipe.classes or POINT_CLASSES,
             **facts,
         )
@@ -77,7 +78,7 @@ def card_of(recipe: Recipe, **facts: Any) -> ModelCard:
     return ModelCard(
         view=TOP_VIEW,
         input=TOP_VIEW_INPUT,
-        outputs=(OutputSpec("segmentation", "class_logits"), boxes),
+        outputs=(OutputSpec("segmentation", "class_logits", block=block), boxes),
         classes=TOP_VIEW_CLASSES,
         box_classes=("car", "van", "truck"),
         # Length, width, height: geometric means, and standard deviations of the logarithms, of 28,963 labels of KITTI

@@ -103,12 +103,15 @@ def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
-    """The network as an ONNX graph with its weights, without paths of this computer and without a card."""
+    """The network as an ONNX graph with its weights, without paths of this computer and without a card.
+
+    If the card's outputs have blocks, the graph ends where the network's ``blocks`` do.
+    """
     example = torch.from_numpy(golden_input(0, (1, len(card.input.channels), card.view.height, card.view.width)))
     with warnings.catch_warnings():  # the exporter warns about its own future changes
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            network.eval(),
+            _Blocks(network).eval() if any(o.block != (1, 1) for o in card.outputs) else network.eval(),
             (example,),
             input_names=[card.input.name],
             output_names=[o.name for o in card.outputs],
@@ -130,6 +133,17 @@ def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
     if not isinstance(network, UNPOOLING):
         _halve(model.graph)
     return model
+
+
+class _Blocks(nn.Module):
+    """A network without its last step, which spreads the channels of a block to their pixels."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, x: torch.Tensor) -> Any:
+        return self.network.blocks(x)  # type: ignore[operator]  # a method of the networks in edge.py
 
 
 def _halve(graph: onnx.GraphProto) -> None:

@@ -49,7 +49,8 @@ class TritonPythonModel:
         if response.has_error():
             raise InferenceError(f"{card.name}: {response.error().message()}")
         for output in card.outputs:
-            session.outputs[output.kind][:] = triton.get_output_tensor_by_name(response, output.name).as_numpy()[0]
+            session.raw[output.kind][:] = triton.get_output_tensor_by_name(response, output.name).as_numpy()[0]
+        session.spread()
         return session.outputs
 
     def execute(self, requests: Sequence[Any]) -> list[Any]:

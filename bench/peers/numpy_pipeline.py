@@ -69,7 +69,7 @@ class NumpyPipeline:
             pixel = np.empty(len(points), np.int32)
             projector.fill(points, engine.input, index, pixel, _heights(projector, points))
             by_name = engine.run()
-            outputs = {o.kind: by_name[o.name] for o in card.outputs}
+            outputs = {o.kind: spread(by_name[o.name], o.block) for o in card.outputs}
             logits = next(v for kind, v in outputs.items() if kind.startswith("class_"))
             labels = logits.argmax(axis=0).astype(np.uint8)
             if isinstance(card.view, TopViewGeometry):
@@ -84,6 +84,13 @@ class NumpyPipeline:
                 found = vote(points, pixel, index, labels, len(card.classes))
                 labeled = PointLabels(found, pixel >= 0, card.classes)
         return Prediction(labeled, top_view, boxes)
+
+
+def spread(values: NDArray[np.float32], block: tuple[int, int]) -> NDArray[np.float32]:
+    """`edgeperc.blocks.fill_pixels` in numpy."""
+    (rows, cols), (n, height, width) = block, values.shape
+    parts = values.reshape(n // (rows * cols), rows, cols, height, width)
+    return parts.transpose(0, 3, 1, 4, 2).reshape(-1, height * rows, width * cols)
 
 
 def vote(

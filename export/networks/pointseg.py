@@ -35,10 +35,11 @@ ENLARGEMENT_RATES = (6, 9, 12)
 
 
 def conv_bn_relu(
-    c_in: int, c_out: int, kernel: int, *, stride: tuple[int, int] = (1, 1), dilation: int = 1
+    c_in: int, c_out: int, kernel: int | tuple[int, int], *, stride: tuple[int, int] = (1, 1), dilation: int = 1
 ) -> nn.Sequential:
     """A convolution without bias, batch norm and ReLU; with stride 1 it keeps the resolution."""
-    padding = dilation * (kernel // 2)
+    rows, cols = (kernel, kernel) if isinstance(kernel, int) else kernel
+    padding = (dilation * (rows // 2), dilation * (cols // 2))
     return nn.Sequential(
         nn.Conv2d(c_in, c_out, kernel, stride=stride, padding=padding, dilation=dilation, bias=False),
         nn.BatchNorm2d(c_out),
