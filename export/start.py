@@ -84,7 +84,8 @@ def start(
         raise ValueError(f"{path} has no weight in common with the network to train")
     network.load_state_dict(common, strict=False)
     if folded:
-        _unfold(network, {norm: given.get(f"{conv}.weight_bias") for conv, norm in pairs.items()}, images)
+        shared = {conv: norm for conv, norm in pairs.items() if f"{conv}.weight" in common}
+        _unfold(network, {norm: given.get(f"{conv}.weight_bias") for conv, norm in shared.items()}, images)
     return before, frames
 
 

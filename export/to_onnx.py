@@ -6,6 +6,7 @@ A file is written only if onnxruntime reproduces the torch network's outputs on 
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import warnings
@@ -107,11 +108,15 @@ def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
 
     If the card's outputs have blocks, the graph ends where the network's ``blocks`` do.
     """
+    exported = network
+    if any(output.block != (1, 1) for output in card.outputs):
+        exported = copy.copy(network)
+        exported.forward = network.blocks  # type: ignore[assignment]  # a method of the networks in edge.py
     example = torch.from_numpy(golden_input(0, (1, len(card.input.channels), card.view.height, card.view.width)))
     with warnings.catch_warnings():  # the exporter warns about its own future changes
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            _Blocks(network).eval() if any(o.block != (1, 1) for o in card.outputs) else network.eval(),
+            exported.eval(),
             (example,),
             input_names=[card.input.name],
             output_names=[o.name for o in card.outputs],
@@ -133,17 +138,6 @@ def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
     if not isinstance(network, UNPOOLING):
         _halve(model.graph)
     return model
-
-
-class _Blocks(nn.Module):
-    """A network without its last step, which spreads the channels of a block to their pixels."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, x: torch.Tensor) -> Any:
-        return self.network.blocks(x)  # type: ignore[operator]  # a method of the networks in edge.py
 
 
 def _halve(graph: onnx.GraphProto) -> None:

@@ -59,7 +59,7 @@ RENAMED = {
     "pointseg-edge": "pointseg:fp32",
     "pointseg-edge-int8": "pointseg:int8",
 }
-RESEARCH = ("kulseg", "pointseg-full", "pointseg-sim", "ssadnet-full", "ssadnet-paper", "ssadnet-sim")
+RESEARCH = ("kulseg", "lodnn-paper", "pointseg-full", "pointseg-sim", "ssadnet-full", "ssadnet-paper", "ssadnet-sim")
 
 
 @dataclass(frozen=True, slots=True)

@@ -244,7 +244,7 @@ SHIPPED_MODELS = Path(__file__).resolve().parent.parent / "models"
     ("model", "recipe"),
     [
         ("pointseg", Recipe("pointseg", edge=True, height_above_ground=True, batch=1)),
-        ("ssadnet", Recipe("ssadnet", edge=True, front=True, batch=1)),
+        ("ssadnet", Recipe("ssadnet", edge=True, front=True, width=0.75, batch=1)),
         ("lodnn", Recipe("lodnn", edge=True, batch=1)),
         ("research/kulseg", Recipe("kulseg", height_above_ground=True, batch=1)),
     ],

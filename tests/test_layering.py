@@ -108,7 +108,7 @@ FLOORS = {
         measure
         peers.__init__ peers.arithmetic peers.rounds
         peers.engines peers.ground peers.projection peers.slam peers.tracking
-        peers.camera peers.numpy_pipeline peers.networks
+        peers.camera peers.family peers.numpy_pipeline peers.networks
         peers.contenders
         peers.tables
         peers.turns

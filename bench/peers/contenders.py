@@ -236,7 +236,7 @@ def _one_or_two(variant: Variant, folder: Path) -> list[Contender]:
         onnx.save(extractor.extract_model([card.input.name], [classes.name]), segmentation)
         onnx.save(extractor.extract_model([card.input.name], [boxes.name]), detection)
         head = DenseHead(len(card.input.channels), front=boxes.front)
-        onnx.save(to_graph(head, replace(card, outputs=(classes,))), lean)
+        onnx.save(to_graph(head, replace(card, outputs=(replace(classes, block=(1, 1)),))), lean)
     parts = {
         "one network": (path,),
         "two networks": (segmentation, detection),
