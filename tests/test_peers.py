@@ -161,8 +161,8 @@ def test_ncnn_computes_the_network_or_says_that_it_cannot(name: str) -> None:
     image = np.random.default_rng(0).normal(size=ours.input.shape)
     theirs.input[:] = ours.input[:] = image
     expected = ours.run()
-    for name, output in theirs.run().items():
-        np.testing.assert_allclose(output, expected[name], atol=1e-4 * np.abs(expected[name]).max())
+    for each, output in theirs.run().items():
+        np.testing.assert_allclose(output, expected[each], atol=1e-4 * np.abs(expected[each]).max())
     with pytest.raises(ModelError, match="ncnn cannot run kulseg"):
         open_engine("ncnn", "fp32", model_path(name).parent / "research/kulseg.onnx", 1)
 
