@@ -36,7 +36,7 @@ from .errors import (
 from .extras import require, without_telemetry
 from .onnx_file import check_graph, read_model
 from .printable import printable
-from .tuning import compiled_folder, cpu_features, fingerprint, read_setting, settings_path
+from .tuning import compiled_folder, cpu_features, fingerprint, read_setting, settings_path, usable_cores
 from .zoo import Variant, choose, digest, resolve
 
 __all__ = ["PRECISIONS", "PROVIDERS", "Session", "available_providers", "devices", "golden_input", "runtime_version"]
@@ -187,6 +187,9 @@ class Session:
         (`edgeperc.zoo.choose`). Any other value is required.
     n_threads : int or None
         Threads inside one run; None leaves it to the provider.
+    at_once : int
+        Number of sessions that run at the same time. If it is above 1 and ``n_threads`` is None, the CPU provider gets
+        as large a part of the usable cores.
     trusted : bool
         Open graphs that are otherwise refused, because they could run without end or take all memory: with operators
         that are not in `edgeperc.onnx_file.OPERATORS`, functions, subgraphs or sizes beyond the limits. The first run
@@ -214,6 +217,8 @@ class Session:
         their pixels (`edgeperc.card.OutputSpec`).
     raw : mapping of str to ndarray
         The same as the graph gives them.
+    shares_cores : bool
+        Whether the session has a part of the cores (``at_once``).
     golden_deviation : float
         Deviation of the outputs for the card's golden input from the exporter's, in standard deviations of the output
         (90th percentile). NaN if the card has no golden record, which is logged as a warning.
@@ -244,12 +249,13 @@ class Session:
         *,
         precision: str = "auto",
         n_threads: int | None = None,
+        at_once: int = 1,
         trusted: bool = False,
     ) -> None:
         if n_threads is not None and n_threads < 1:
             raise OptionError(f"n_threads is {n_threads}; expected at least 1, or None")
         _check_names(provider, precision)
-        self._trusted = trusted
+        self._trusted, self._at_once = trusted, at_once
         self._made_in, self._running_in = os.getpid(), 0
         ort = _onnxruntime()
         variants = resolve(model)
@@ -319,6 +325,10 @@ class Session:
         blob = read_model(self.path)
         check_graph(blob, self.path, trusted=self._trusted)
         self.sha256 = hashlib.sha256(blob).hexdigest()
+        cores = usable_cores()
+        self.shares_cores = n_threads is None and short == "cpu" and 1 < self._at_once <= cores
+        if self.shares_cores:
+            n_threads = cores // self._at_once
         self._has_threads = short != "cpu" or n_threads != 1
         self._session = self._open(ort, blob, short, precision, n_threads)
         self._check_graph()

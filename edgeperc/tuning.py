@@ -30,6 +30,7 @@ __all__ = [
     "read_setting",
     "settings_path",
     "unsafe_because",
+    "usable_cores",
     "write_settings",
 ]
 
@@ -127,6 +128,11 @@ def cpu_features() -> frozenset[str]:
     if sys.platform == "darwin" and platform.machine() == "arm64":
         return frozenset({"asimddp"})  # every Apple processor multiplies bytes in dot products
     return frozenset(_cpuinfo("flags", "Features").split())
+
+
+def usable_cores() -> int:
+    """Number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _cpuinfo(*keys: str) -> str:

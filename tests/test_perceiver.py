@@ -19,6 +19,7 @@ import edgeperc
 from edgeperc import (
     Box,
     FitnessError,
+    InferenceError,
     ModelFileError,
     OptionError,
     Perceiver,
@@ -35,6 +36,7 @@ from edgeperc import (
     ground,
     projection,
     refine,
+    session,
 )
 from edgeperc.card import RangeImageGeometry, TopViewGeometry
 from edgeperc.geometry import inside, oriented_iou
@@ -123,6 +125,36 @@ def test_other_fields_of_the_perception(perception: Perception, perceive: Percei
 def test_result_is_the_same_for_any_thread_count(perception: Perception, scan: SimulatedScan) -> None:
     assert_same(perception, Perceiver(["ssadnet", "pointseg"], provider="cpu", n_threads=2)(scan.points))
     assert_same(perception, Perceiver(["pointseg", "ssadnet"], provider="cpu", n_threads=1)(scan.points))
+
+
+@pytest.mark.parametrize(("cores", "at_once"), [(1, False), (2, True), (5, True)])
+def test_networks_at_once_give_the_results_of_one_after_the_other(
+    monkeypatch: pytest.MonkeyPatch, perception: Perception, scan: SimulatedScan, cores: int, at_once: bool
+) -> None:
+    monkeypatch.setattr(session, "usable_cores", lambda: cores)
+    both = Perceiver(["pointseg", "ssadnet"], provider="cpu", on_mismatch="ignore")
+    assert [s.shares_cores for s in both.sessions] == [at_once] * 2
+    assert_same(perception, both(scan.points))
+    assert both(scan.points).stage_ms.keys() == perception.stage_ms.keys()
+    assert not Perceiver("pointseg", provider="cpu").sessions[0].shares_cores
+    assert not Perceiver(provider="cpu", n_threads=2).sessions[0].shares_cores
+
+
+@pytest.mark.parametrize("failing", [0, 1])
+def test_a_network_that_fails_beside_another_ends_the_call(
+    monkeypatch: pytest.MonkeyPatch, perception: Perception, scan: SimulatedScan, failing: int
+) -> None:
+    monkeypatch.setattr(session, "usable_cores", lambda: 2)
+    both = Perceiver(["ssadnet", "pointseg"], provider="cpu", on_mismatch="ignore")
+
+    def fail() -> None:
+        raise InferenceError("no memory left")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(both.sessions[failing], "run", fail)
+        with pytest.raises(InferenceError, match="no memory left"):
+            both(scan.points)
+    assert_same(perception, both(scan.points))
 
 
 def test_result_does_not_depend_on_earlier_scans(perceive: Perceiver, perception: Perception) -> None:

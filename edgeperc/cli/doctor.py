@@ -120,10 +120,9 @@ def _program() -> Iterator[Finding]:
 
 
 def _processor() -> Iterator[Finding]:
-    from ..tuning import cpu_features, cpu_model
+    from ..tuning import cpu_features, cpu_model, usable_cores
 
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    yield Finding("processor", "ok", f"{cpu_model()}, {usable} of {os.cpu_count()} cores usable")
+    yield Finding("processor", "ok", f"{cpu_model()}, {usable_cores()} of {os.cpu_count()} cores usable")
     from ..zoo import BF16_FEATURES, INT8_FEATURES
 
     present = cpu_features()
