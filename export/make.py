@@ -68,7 +68,7 @@ def make(
     n_threads : int or None
     n_workers : int
     compiled : bool
-        As for `edgeperc_export.train.train`; the shipped PointSegs were compiled, the SSADNets not.
+        As for `edgeperc_export.train.train`.
     version : str
         Version to write into the card.
 
