@@ -120,6 +120,14 @@ class Learned(NamedTuple):
     is_settled: bool
 
 
+def _view_kind(model: str | os.PathLike[str]) -> str | None:
+    """Kind of a model's view; None if its card cannot be read, which the model's session reports."""
+    try:
+        return resolve(model)[0].card.view.kind
+    except EdgepercError:
+        return None
+
+
 def _beside(function: Callable[[], _Result]) -> Callable[[], _Result]:
     """Call a function in a thread of its own; what is returned waits for its result, or raises what it raised."""
     answer: Future[_Result] = Future()
@@ -317,7 +325,7 @@ class Perceiver:
         gaps_deg = [upper - lower for upper, lower in pairwise(self.sensor.elevations_deg)]
         # Twice the spacing of beams or columns: points of one object are linked even if a return between is missing.
         self._distance_per_m = 2.0 * math.radians(max(np.median(gaps_deg or [0.0]), 360.0 / self.sensor.columns))
-        kinds = {resolve(model)[0].card.view.kind for model in wanted}
+        kinds = {_view_kind(model) for model in wanted}
         at_once = 2 if {"top_view", "range_image"} <= kinds else 1
         self.sessions = tuple(
             Session(model, provider, precision=precision, n_threads=n_threads, at_once=at_once, trusted=trusted)

@@ -104,6 +104,7 @@ class MadeUp:
         }  # fmt: skip
         self.outputs = {o.kind: np.zeros(shapes[o.kind], np.float32) for o in card.outputs}
         self.description = f"{card.name} made-up"
+        self.shares_cores = False  # one after the other: both draw from the case
         self.case: Case | None = None
         self.hostile = False
 
