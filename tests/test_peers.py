@@ -19,7 +19,7 @@ from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.zoo import model_path
 from edgeperc_bench import cli
 from edgeperc_bench.accuracy import agreement
-from edgeperc_bench.peers import arithmetic, turns
+from edgeperc_bench.peers import arithmetic, family, turns
 from edgeperc_bench.peers import contenders as peers
 from edgeperc_bench.peers.arithmetic import PRODUCT_SIZE, cost, matrix_product, n_taps_inside
 from edgeperc_bench.peers.camera import N_IMAGES, NumpyCamera, small_unet
@@ -185,6 +185,18 @@ def test_torch_has_the_very_network(name: str) -> None:
         assert np.median(apart) < 1e-3 * expected.std()
         assert np.quantile(apart, 0.9) < 1e-2 * expected.std()
     assert outputs == [spec.name for spec in session.card.outputs]
+
+
+def test_networks_of_several_sizes_are_timed_and_drawn() -> None:
+    for package in ("openvino", "matplotlib"):
+        pytest.importorskip(package)
+    paths = [model_path(name) for name in ("pointseg:fp32", "pointseg:int8", "ssadnet:int8")]
+    ms = family.times(paths, 2, 1)
+    assert ms.keys() == {f"{engine} {k}" for engine in family.ENGINES for k in range(len(paths))}
+    assert min(ms.values()) > 0.0
+    svg = family.draw(paths, [0.5, 0.4, 0.9], ms)
+    assert svg.startswith("<svg")
+    assert svg.count('id="axes_') == 2  # points and boxes
 
 
 def test_overlaps_are_those_of_the_reference() -> None:
