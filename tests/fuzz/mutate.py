@@ -186,7 +186,8 @@ def mutated_document(document: Any, case: Case, most: int = 3) -> Any:
         if way <= 5:
             holder[key] = copy.deepcopy(case.pick(VALUES))
         elif way == 6 and isinstance(holder[key], int | float) and not isinstance(holder[key], bool):
-            holder[key] = holder[key] * case.pick([-1, 0, 1e3, 1e-3, 1e30, 1e-30])
+            factor = case.pick([-1, 0, 1e3, 1e-3, 1e30, 1e-30])
+            holder[key] = holder[key] * (factor if abs(holder[key]) < 1e300 else -1)  # 10**400 is no float
         elif way == 7:
             del holder[key]
         elif way == 8 and isinstance(holder, list):
