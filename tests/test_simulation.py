@@ -17,10 +17,11 @@ from edgeperc.errors import PointsError
 from edgeperc.mounting import Mounting
 from edgeperc.perception import Box
 from edgeperc.sensor import SensorProfile
-from edgeperc.simulation import raycast
+from edgeperc.simulation import drawn, raycast
 from edgeperc.simulation.drawn import ENVIRONMENTS, random_scene
 from edgeperc.simulation.layouts import scene_from_boxes
 from edgeperc.simulation.raycast import BANK_SLOPE_LEFT, FACADE, GLASS, LEAVES, MATTE, PAINT, POROUS, ROUGH, ground_at
+from edgeperc.simulation.roadside import add_cafe
 from edgeperc.simulation.samples import IGNORE, labels_by_boxes, simulated_scan
 from edgeperc.simulation.scene import (
     POINT_CLASS_OF,
@@ -608,6 +609,23 @@ def test_roadside_stands_clear_of_objects_and_roads() -> None:
         for x, y in solid[:, 4:6]:
             assert not scene.on_road(x, y)
             assert all(math.hypot(x - o.center[0], y - o.center[1]) > 1.0 for o in scene.objects)
+
+
+def test_people_sit_at_tables_beside_the_road(monkeypatch: pytest.MonkeyPatch) -> None:
+    def seated(share: float) -> list[Scene]:
+        monkeypatch.setattr(drawn, "add_cafe", lambda street, _: add_cafe(street, share))
+        return [random_scene(seed, "urban") for seed in range(6)]
+
+    for bare, scene in zip(seated(0.0), seated(1.0), strict=True):
+        assert scene.objects[: len(bare.objects)] == bare.objects
+        people = scene.objects[len(bare.objects) :]
+        tables = scene.primitives[(scene.primitives[:, 19] == -1.0) & (scene.primitives[:, 1] == MATTE), 4:6]
+        for person in people:
+            assert person.label == "person_sitting"
+            assert not scene.on_road(*person.center[:2])
+            ahead = person.center[0] + 0.7 * math.cos(person.yaw), person.center[1] + 0.7 * math.sin(person.yaw)
+            assert np.hypot(*(tables - ahead).T).min() < 0.5  # faces a table
+    assert sum(len(scene.objects) for scene in seated(1.0)) > 20 + sum(len(scene.objects) for scene in seated(0.0))
 
 
 def test_objects_move_on() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import PointsError
 from .raycast import LANE, PAVEMENT
-from .roadside import add_beside_people, add_islands_poles, add_parked_bicycles, add_roadside
+from .roadside import add_beside_people, add_cafe, add_islands_poles, add_parked_bicycles, add_roadside
 from .scene import Scene
 from .shapes import Row
 from .street import IN_BAYS, ROW_RANGE_M, ROW_WIDTH_M, SIZES, Street, any_vehicle, random_terrain, strip_row
@@ -96,6 +96,7 @@ def random_scene(seed: int, environment: str | None = None) -> Scene:
     _add_traffic(street, place, lane, same, oncoming, ego_lane, sway, crossings)
     _add_parked(street, park_right > 0.0, park_left > 0.0, crossings, place)
     _add_people(street, place)
+    add_cafe(street, 0.15 if place in ("urban", "residential", "junction") else 0.0)
     add_roadside(street, place)
     return street.scene()
 

@@ -10,7 +10,7 @@ import numpy as np
 from ..geometry import wrapped
 from ..perception import Box
 from .raycast import LANE, SLOPE_X, SLOPE_Y
-from .roadside import add_beside_people, add_parked_bicycles, add_roadside
+from .roadside import add_beside_people, add_cafe, add_parked_bicycles, add_roadside
 from .scene import Scene
 from .shapes import Row
 from .street import IN_BAYS, ROW_RANGE_M, SHAPES, Street, any_vehicle, random_terrain, strip_row
@@ -113,6 +113,7 @@ def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float =
         if box.label in ("pedestrian", "person_sitting") and rng.random() < 0.3:
             add_beside_people(street, *box.center[:2], box.yaw)
     add_parked_bicycles(street, 0.6 if not fast else 0.0)
+    add_cafe(street, 0.0 if fast else 0.15)
     add_roadside(street, place)
     return street.scene()
 

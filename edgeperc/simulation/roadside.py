@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import numpy as np
@@ -12,6 +13,8 @@ from .raycast import (
     BANK_RISE_LEFT,
     BANK_SLOPE,
     BANK_SLOPE_LEFT,
+    BOX,
+    CYLINDER,
     FACADE,
     GLASS,
     LEAVES,
@@ -23,7 +26,7 @@ from .raycast import (
 from .shapes import Row, blob, block, post, rod
 from .street import Street
 
-__all__ = ["add_beside_people", "add_islands_poles", "add_parked_bicycles", "add_roadside"]
+__all__ = ["add_beside_people", "add_cafe", "add_islands_poles", "add_parked_bicycles", "add_roadside"]
 
 
 # --- poles and furniture ----------------------------------------------------------------------------------------------
@@ -452,6 +455,48 @@ def add_beside_people(street: Street, x: float, y: float, yaw: float) -> None:
         street.add_static(pram(rng), px, py, 0.8, 0.4, yaw, -20.0, of="Pedestrian")
     else:
         street.add_static(bicycle(1.75, 0.27, rng), px, py, 1.7, 0.4, yaw, 0.1, of="Bicyclist")
+
+
+def add_cafe(street: Street, share: float) -> None:
+    """Place, with the probability ``share``, rows of tables beside the first road, people and empty chairs at them."""
+    rng = street.rng
+    if copy.deepcopy(rng).random() >= share:  # a copy: streets without tables stay as they were
+        return
+    side, gap = float(rng.choice([-1.0, 1.0])), float(rng.uniform(2.0, 2.6))
+    first, u = float(rng.uniform(-12.0, 25.0)), street.edge(0, side) + float(rng.uniform(1.6, 3.0))
+    for k in range(int(rng.integers(2, 8)) * 2):  # two rows
+        x, y, yaw = street.on_strip(first + (k // 2) * gap, side * (u + (k % 2) * gap))
+        yaw += float(rng.uniform(-0.3, 0.3))
+        if not street.free(x, y, 1.9, 1.9, yaw):
+            continue
+        high, wide = float(rng.uniform(0.7, 0.78)), float(rng.uniform(0.55, 0.85))
+        cover, kind = float(rng.uniform(0.2, 0.6)), int(rng.choice([BOX, CYLINDER]))
+        table = [block(MATTE, cover, (0, 0, high), (wide, wide, 0.04), kind=kind), post(0.3, 0.0, 0.0, high, 0.04)]
+        if rng.random() < 0.2:  # a sunshade
+            table += [
+                post(0.4, 0, 0, 2.3, 0.025),
+                block(MATTE, 0.5, (0, 0, 2.4), (2.4, 2.4, 0.4), taper=(0.9, 0.9, 0.9)),
+            ]
+        if not street.add_static(table, x, y, wide, wide, yaw, 0.9):
+            continue
+        for turn in (0.0, math.pi / 2, math.pi, -math.pi / 2):
+            faces, away = yaw + turn + float(rng.normal(0.0, 0.15)), wide / 2 + float(rng.uniform(0.25, 0.45))
+            seat_x, seat_y = x - away * math.cos(faces), y - away * math.sin(faces)
+            if rng.random() < 0.5:
+                street.add_object("person_sitting", seat_x, seat_y, faces, force=True)
+            elif rng.random() < 0.7:
+                street.add_static(_chair(rng), seat_x, seat_y, 0.2, 0.2, faces, 0.3)
+
+
+def _chair(rng: np.random.Generator) -> list[Row]:
+    """An empty chair, to be sat on from the front (x)."""
+    seat, cover = float(rng.uniform(0.42, 0.48)), float(rng.uniform(0.15, 0.6))
+    rows = [block(MATTE, cover, (0, 0, seat), (0.42, 0.42, 0.04))]
+    rows += [post(cover, a * 0.18, b * 0.18, seat, 0.015) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
+    return [
+        *rows,
+        block(POROUS, cover, (-0.2, 0, seat + 0.25), (0.04, 0.42, 0.4), density=float(rng.uniform(0.4, 1.0))),
+    ]
 
 
 def add_parked_bicycles(street: Street, mean: float) -> None:
