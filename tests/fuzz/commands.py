@@ -14,6 +14,7 @@ import sys
 import time
 import traceback
 from contextlib import redirect_stderr, redirect_stdout
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -182,7 +183,16 @@ def _be_command(arguments: list[str], folder: Path, output: Path) -> None:
         os._exit(code & 0xFF if isinstance(code, int) else 98)
 
 
+# Imported before the processes are forked, which would each spend 0.1 s on them.
+IMPORTED = (
+    "edgeperc.evaluation.tracking", "edgeperc.listing", "edgeperc.readers.captures", "edgeperc.readers.images",
+    "edgeperc.simulation.samples", "numba.np.arraymath", "onnxruntime",
+)  # fmt: skip
+
+
 def make(seed: int) -> Commands:
+    for name in IMPORTED:
+        import_module(name)
     # The kernels are compiled once, not in each process; a network's threads would not survive the fork.
     for each in cards()[:8:5]:
         made_up = [MadeUp(card) for card in each]
