@@ -50,7 +50,7 @@ class RoadAhead:
         inside the road that the scan did not observe are not holes.
     tolerance_m : float
         The outline leaves out no road that is farther than this from the edges of the cells [m]. It is larger than the
-        tolerance that was asked for if that needs too many corners.
+        tolerance that was asked for if no outline within that was found that has few enough corners.
     y_m : (columns,) float64
         Middles of the top view's columns, leftmost first.
     free_m : (columns,) float64
@@ -110,8 +110,9 @@ def road_ahead(
         in the road narrower than twice the tolerance are closed, and road that is connected only over a narrower
         passage is left out. No cell of an object is ever inside.
     max_corners : int
-        Largest number of corners of the outline. If the tolerance needs more, more road is left out, up to 2, 4 or 8
-        times the tolerance from its edges or, at last, any distance (`RoadAhead.tolerance_m`). Nothing is added.
+        Largest number of corners of the outline. Corners of cells are used if so few suffice, otherwise some that lie
+        anywhere within the tolerance. Where these are too many, more road is left out, up to 1.25, 1.5, 2, 4 or 8 times
+        the tolerance from its edges or, at last, any distance (`RoadAhead.tolerance_m`). No more is added.
 
     Returns
     -------
@@ -191,7 +192,7 @@ def compile_kernels() -> None:
     fill_free(cells, np.empty(2, np.int64))
     fill_corridor(cells, 0.0, 2.0, np.empty((2, 2), np.int64))
     cells = np.ones((9, 9), np.bool_)
-    cells[4, 4] = False
+    cells[4, 4] = cells[:4, :4] = False  # a ring of six corners, too many
     outline_of(cells, (0.0, 0.0), ~cells, ~cells, tolerance=1.0, max_corners=4)
 
 

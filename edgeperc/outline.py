@@ -2,7 +2,8 @@
 
 The cells are smoothed by a disc and traced. Then corners are removed one by one. A corner may go only if the triangle
 that it forms with its two neighbors contains no other corner of any ring. Then no edge crosses that triangle, so the
-polygon is valid after every removal. The coordinates of corners are whole numbers, so these tests are exact.
+polygon is valid after every removal. If too many corners remain, two neighbors are replaced by one new corner where the
+new edges meet no other edge. The coordinates of corners are whole numbers, so these tests are exact.
 """
 
 from __future__ import annotations
@@ -21,13 +22,16 @@ __all__ = [
     "fill_rings",
     "mark_connected",
     "mark_needed",
+    "merge_corners",
     "nearest_part",
     "outline_of",
     "resolve_contacts",
 ]
 
-REACHES = (2.0, 4.0, 8.0, math.inf)
+REACHES = (1.0, 1.25, 1.5, 2.0, 4.0, 8.0)
 """Factors of the tolerance that are tried in turn if the outline has too many corners."""
+FARTHEST = 8
+"""Cells around two corners where one in their place is looked for, at most; time grows with its square."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,8 +76,8 @@ def outline_of(
     tolerance : float
         Largest distance between the outline and the edges of the cells, in cells. 0 keeps all corners, however many.
     max_corners : int
-        Largest number of corners of the outer ring, at least 4. Where the tolerance needs more, cells are left out
-        that are farther from the edges; none are added.
+        Largest number of corners of the outer ring, at least 4. If they do not suffice, cells are left out that are
+        farther from the edges; no more are added.
 
     Returns
     -------
@@ -85,7 +89,9 @@ def outline_of(
     Closing by a disc fills gaps narrower than twice the tolerance, opening removes what is as narrow. So cells that are
     connected only over a narrower passage are left out. Where two cells share only a corner, a cell between them is
     added, or else the one with the smaller row is left out. Corners are removed by growing area of their triangle
-    (Visvalingam and Whyatt, 1993), as long as all cells that the triangle touches are within the tolerance.
+    (Visvalingam and Whyatt, 1993), as long as all cells that the triangle touches are within the tolerance. If more
+    than ``max_corners`` remain, pairs of neighbors are replaced by one corner that may be anywhere on the grid, by
+    growing area between the old edges and the new ones, under the same condition.
     """
     # A kernel is compiled for arrays in C order.
     cells, obstacles, in_holes = (np.ascontiguousarray(mask, np.bool_) for mask in (cells, obstacles, in_holes))
@@ -102,19 +108,24 @@ def outline_of(
     if not rings:
         return Outline(np.empty((0, 2), np.int64), (), 1.0)
 
-    corners, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings], dtype=np.int64)
     outer = int(np.argmax([_area(ring) for ring in rings]))  # the only ring with a positive area
-    kept = np.ones(len(corners), np.bool_)
-    added = _sums(addable | closed)
-    mark_needed(corners, ends, added, _sums(beside), outer, 3, kept)
-    begin, factor = int(ends[outer]) - len(rings[outer]), 1.0
-    for more in REACHES:
-        if tolerance == 0.0 or np.count_nonzero(kept[begin : ends[outer]]) <= max_corners:
-            break
-        factor = more
-        removed = _grown(~closed, factor * tolerance) if math.isfinite(factor) else np.ones_like(closed)
-        mark_needed(corners, ends, added, _sums(removed), outer, max_corners, kept)
-    found = [ring[few] - 1 for ring, few in zip(rings, np.split(kept, ends[:-1]), strict=True)]
+    added = addable | closed
+    found = _needed(rings, _sums(added), _sums(beside), outer, 3)
+    factor = 1.0
+    if tolerance > 0.0 and len(found[outer]) > max_corners:
+        holes = [np.hstack([ring, np.roll(ring, -1, axis=0)]) for k, ring in enumerate(found) if k != outer]
+        edges, around = np.concatenate([*holes, np.empty((0, 4), np.int64)]), min(math.ceil(2.0 * tolerance), FARTHEST)
+        for factor in REACHES:
+            # Holes are not marked, as no cell of them may come outside.
+            band = np.where(smooth, _grown(~closed, factor * tolerance), added & ~_filled(smooth))
+            n = merge_corners(found[outer], edges, _sums(band), around, max_corners)
+            found[outer] = found[outer][:n]
+            if n <= max_corners:
+                break
+        else:
+            factor = math.inf
+            found = _needed(found, _sums(added), _sums(np.ones_like(closed)), outer, max_corners)
+    found = [ring - 1 for ring in found]
     return Outline(found[outer], tuple(ring for k, ring in enumerate(found) if k != outer), factor)
 
 
@@ -135,16 +146,21 @@ def _without_gaps(
     part = cells.copy()
     resolve_contacts(part, addable.copy())
     part = nearest_part(part, origin)
-    outside = np.empty_like(part)
-    mark_connected(~part, 0, 0, outside)  # the border is not marked
-    holes = ~part & ~outside
-    pending, hole = holes & wanted, outside
+    holes = _filled(part) & ~part
+    pending, hole = holes & wanted, np.empty_like(part)
     while pending.any():
         row, col = divmod(int(np.argmax(pending)), pending.shape[1])
         mark_connected(holes, row, col, hole)
         pending &= ~hole
         holes &= ~hole
     return part | holes
+
+
+def _filled(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The cells and their holes, in a grid whose border is not marked."""
+    outside = np.empty_like(cells)
+    mark_connected(~cells, 0, 0, outside)
+    return ~outside
 
 
 def _grown(cells: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
@@ -167,6 +183,20 @@ def _rings(cells: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
     corners, ends = np.empty((n_sides, 2), np.int64), np.empty(n_sides // 4 + 1, np.int64)
     n_rings = fill_rings(cells, corners, ends)
     return np.split(corners, ends[:n_rings])[:n_rings]
+
+
+def _needed(
+    rings: list[NDArray[np.int64]],
+    not_addable: NDArray[np.int32],
+    not_removable: NDArray[np.int32],
+    outer: int,
+    enough: int,
+) -> list[NDArray[np.int64]]:
+    """The rings with the corners that `mark_needed` keeps."""
+    corners, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings], dtype=np.int64)
+    kept = np.ones(len(corners), np.bool_)
+    mark_needed(corners, ends, not_addable, not_removable, outer, enough, kept)
+    return [ring[few] for ring, few in zip(rings, np.split(kept, ends[:-1]), strict=True)]
 
 
 def _area(ring: NDArray[np.int64]) -> int:
@@ -327,6 +357,175 @@ def fill_rings(cells: NDArray[np.bool_], corners: NDArray[np.int64], ends: NDArr
 
 
 @njit(cache=True, nogil=True)
+def may_change(ar: int, ac: int, br: int, bc: int, cr: int, cc: int, fixed: NDArray[np.int32]) -> bool:
+    """Whether all cells that a triangle touches may change sides.
+
+    Parameters
+    ----------
+    ar, ac, br, bc, cr, cc : int
+        Row and column of its corners.
+    fixed : (rows, columns + 1) int32
+        Number of cells of each row before each column that may not.
+
+    Returns
+    -------
+    may : bool
+    """
+    # In the strip of a row, its columns are bounded by its corners there and by the crossings of its edges with the
+    # strip's two lines.
+    for row in range(min(ar, br, cr), max(ar, br, cr)):
+        low, high = np.inf, -np.inf
+        for side in range(3):
+            pr, pc, qr, qc = ar, ac, br, bc
+            if side == 1:
+                pr, pc, qr, qc = br, bc, cr, cc
+            elif side == 2:
+                pr, pc, qr, qc = cr, cc, ar, ac
+            if max(pr, qr) < row or min(pr, qr) > row + 1:
+                continue
+            for line in range(2):
+                at = min(max(row + line, min(pr, qr)), max(pr, qr))
+                if pr != qr:
+                    x = pc + (qc - pc) * (at - pr) / (qr - pr)
+                    low, high = min(low, x), max(high, x)
+                else:
+                    low, high = min(low, pc, qc), max(high, pc, qc)
+        left, right = int(np.floor(low + 1e-9)), int(np.ceil(high - 1e-9))
+        if right > left and fixed[row, right] != fixed[row, left]:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def turn(ar: int, ac: int, br: int, bc: int, cr: int, cc: int) -> int:
+    """Twice the area of a triangle, by row and column of its corners; the sign is that of the turn at b."""
+    return (br - ar) * (cc - ac) - (bc - ac) * (cr - ar)
+
+
+@njit(cache=True, nogil=True)
+def meet(ar: int, ac: int, br: int, bc: int, cr: int, cc: int, dr: int, dc: int) -> bool:
+    """Whether the edges ab and cd have a point in common, by row and column of their ends."""
+    if max(ar, br) < min(cr, dr) or max(cr, dr) < min(ar, br) or max(ac, bc) < min(cc, dc) or max(cc, dc) < min(ac, bc):
+        return False
+    c, d = np.sign(turn(ar, ac, br, bc, cr, cc)), np.sign(turn(ar, ac, br, bc, dr, dc))
+    a, b = np.sign(turn(cr, cc, dr, dc, ar, ac)), np.sign(turn(cr, cc, dr, dc, br, bc))
+    return c * d <= 0 and a * b <= 0
+
+
+@njit(cache=True, nogil=True)
+def merge_corners(
+    ring: NDArray[np.int64], edges: NDArray[np.int64], fixed: NDArray[np.int32], around: int, enough: int
+) -> int:
+    """Replace two neighboring corners of a ring by one; smallest changes first.
+
+    Parameters
+    ----------
+    ring : (n, 2) int64, modified
+        Row and column of the corners of a ring that neither touches nor crosses itself.
+    edges : (m, 4) int64
+        Row and column of the two ends of other edges, which the ring may not touch.
+    fixed : (rows, columns + 1) int32
+        Number of cells of each row before each column that may not change sides.
+    around : int
+        How far the new corner may lie from the rectangle around the two [cells].
+    enough : int
+        The ring keeps at least so many corners, and at least 4.
+
+    Returns
+    -------
+    n_corners : int
+        The first so many rows of ``ring`` are the corners.
+
+    Notes
+    -----
+    Between the neighbors a and d, the corner p replaces b and c. What changes sides lies in the triangles pab, pbc and
+    pcd. No cell that they touch may be fixed, and of all such p, that with the smallest sum of their areas is taken.
+    The new edges may meet no other edge, so the ring stays valid.
+    """
+    n, height, width = ring.shape[0], fixed.shape[0], fixed.shape[1] - 1
+    tried = np.zeros(n, np.int64)  # the limit at which a corner and the next one were tried in vain
+    limit = 8  # of twice the areas together
+    while limit <= 8 * height * width:
+        changed = False
+        k = 0
+        while k < n:
+            if n <= max(enough, 4):
+                return n
+            if tried[k] == limit:
+                k += 1
+                continue
+            before, following, behind = (k - 1) % n, (k + 1) % n, (k + 2) % n
+            ar, ac, br, bc = ring[before, 0], ring[before, 1], ring[k, 0], ring[k, 1]
+            cr, cc, dr, dc = ring[following, 0], ring[following, 1], ring[behind, 0], ring[behind, 1]
+            least, best_r, best_c = limit + 1, -1, -1
+            for pr in range(max(0, min(br, cr) - around), min(height, max(br, cr) + around) + 1):
+                for pc in range(max(0, min(bc, cc) - around), min(width, max(bc, cc) + around) + 1):
+                    area = (
+                        abs(turn(pr, pc, ar, ac, br, bc))
+                        + abs(turn(pr, pc, br, bc, cr, cc))
+                        + abs(turn(pr, pc, cr, cc, dr, dc))
+                    )
+                    if area >= least or turn(ar, ac, pr, pc, dr, dc) == 0:
+                        continue
+                    up, left = max(pr - 1, 0), max(pc - 1, 0)
+                    down, right = min(pr + 1, height), min(pc + 1, width)
+                    room = False  # beside the corner
+                    for row in range(up, down):
+                        room |= fixed[row, right] - fixed[row, left] < right - left
+                    if not room:
+                        continue
+                    if not (
+                        may_change(pr, pc, ar, ac, br, bc, fixed)
+                        and may_change(pr, pc, br, bc, cr, cc, fixed)
+                        and may_change(pr, pc, cr, cc, dr, dc, fixed)
+                    ):
+                        continue
+                    apart = True
+                    for v in range(n):
+                        if v in (before, k, following):
+                            continue
+                        w = (v + 1) % n
+                        vr, vc, wr, wc = ring[v, 0], ring[v, 1], ring[w, 0], ring[w, 1]
+                        if w == before:  # has a in common with the edge ap
+                            back = (
+                                turn(vr, vc, ar, ac, pr, pc) == 0 and (vr - ar) * (pr - ar) + (vc - ac) * (pc - ac) > 0
+                            )
+                            apart = not back and not meet(pr, pc, dr, dc, vr, vc, wr, wc)
+                        elif v == behind:  # has d in common with the edge pd
+                            back = (
+                                turn(wr, wc, dr, dc, pr, pc) == 0 and (wr - dr) * (pr - dr) + (wc - dc) * (pc - dc) > 0
+                            )
+                            apart = not back and not meet(ar, ac, pr, pc, vr, vc, wr, wc)
+                        else:
+                            apart = not meet(ar, ac, pr, pc, vr, vc, wr, wc) and not meet(
+                                pr, pc, dr, dc, vr, vc, wr, wc
+                            )
+                        if not apart:
+                            break
+                    for e in range(edges.shape[0]):
+                        if not apart:
+                            break
+                        vr, vc, wr, wc = edges[e, 0], edges[e, 1], edges[e, 2], edges[e, 3]
+                        apart = not meet(ar, ac, pr, pc, vr, vc, wr, wc) and not meet(pr, pc, dr, dc, vr, vc, wr, wc)
+                    if apart:
+                        least, best_r, best_c = area, pr, pc
+            if best_r < 0:
+                tried[k] = limit
+                k += 1
+                continue
+            changed = True
+            ring[k, 0], ring[k, 1] = best_r, best_c
+            for v in range(following, n - 1):
+                ring[v, 0], ring[v, 1], tried[v] = ring[v + 1, 0], ring[v + 1, 1], tried[v + 1]
+            n -= 1
+            for near in range(-3, 3):
+                tried[(k + near) % n] = 0
+        if not changed:
+            limit *= 4
+    return n
+
+
+@njit(cache=True, nogil=True)
 def mark_needed(
     corners: NDArray[np.int64],
     ends: NDArray[np.int64],
@@ -394,31 +593,7 @@ def mark_needed(
                 d = after[c]
                 if (cr - ar) * (corners[d, 1] - ac) == (cc - ac) * (corners[d, 0] - ar):
                     continue
-            # All cells that the triangle touches may change sides. In the strip of a row, its columns are bounded by
-            # its corners there and by the crossings of its edges with the strip's two lines.
-            allowed = True
-            row = min(ar, br, cr)
-            while twice != 0 and allowed and row < max(ar, br, cr):
-                low, high = np.inf, -np.inf
-                for side in range(3):
-                    pr, pc, qr, qc = ar, ac, br, bc
-                    if side == 1:
-                        pr, pc, qr, qc = br, bc, cr, cc
-                    elif side == 2:
-                        pr, pc, qr, qc = cr, cc, ar, ac
-                    if max(pr, qr) < row or min(pr, qr) > row + 1:
-                        continue
-                    for line in range(2):
-                        at = min(max(row + line, min(pr, qr)), max(pr, qr))
-                        if pr != qr:
-                            x = pc + (qc - pc) * (at - pr) / (qr - pr)
-                            low, high = min(low, x), max(high, x)
-                        else:
-                            low, high = min(low, pc, qc), max(high, pc, qc)
-                left, right = int(np.floor(low + 1e-9)), int(np.ceil(high - 1e-9))
-                table = not_removable if twice > 0 else not_addable
-                allowed = right <= left or table[row, right] == table[row, left]
-                row += 1
+            allowed = twice == 0 or may_change(ar, ac, br, bc, cr, cc, not_removable if twice > 0 else not_addable)
             if not allowed:
                 continue
             low_r, high_r, low_c, high_c = min(ar, br, cr), max(ar, br, cr), min(ac, bc, cc), max(ac, bc, cc)

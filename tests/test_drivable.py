@@ -103,6 +103,28 @@ def test_a_simplified_polygon_stays_within_its_tolerance() -> None:
     assert {tuple(corner) for corner in road.outline} <= {tuple(corner) for corner in exact.outline}
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_corners_are_free_where_those_of_cells_are_too_many(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    rows = np.arange(400)
+    middle, half = 100 + 25 * np.sin(rows / 90.0 + seed), 35 + 6 * np.sin(rows / 31.0)
+    noise = np.repeat(random.integers(-1, 2, (2, 100)), 4, axis=1)
+    cols = np.arange(200)[None, :]
+    cells = (cols > (middle - half + noise[0])[:, None]) & (cols < (middle + half + noise[1])[:, None])
+    cells[180:200, 95:105] = False
+    road, exact = road_ahead(view(cells), max_corners=30), road_ahead(view(cells), tolerance_m=0.0)
+    loose = road_ahead(view(cells), max_corners=1000)
+    assert len(loose.outline) > 50  # of the cells' corners
+    assert len(road.outline) <= 30
+    assert road.tolerance_m == 0.2
+    polygon = Polygon(road.outline, road.holes)
+    assert polygon.is_valid
+    assert polygon.exterior.is_ccw
+    assert len(road.holes) == 1
+    assert polygon.boundary.hausdorff_distance(Polygon(exact.outline, exact.holes).boundary) <= 0.6
+    assert Polygon(exact.outline, exact.holes).boundary.buffer(0.2 + 1e-3).contains(polygon.boundary)
+
+
 def test_a_ragged_road_leaves_out_more() -> None:
     cells = ~blank()
     cells[:, 150:] = (np.arange(400) // 10 % 2 == 0)[:, None]  # 20 bays, 5 m deep and 1 m wide
@@ -123,11 +145,12 @@ def test_only_obstacles_are_holes() -> None:
     assert sorted(float(hole[:, 1].mean().round(6)) for hole in road.holes) == [0.5, 4.5]
 
 
-def check_real(top_view: TopView, boxes: tuple[Box, ...]) -> None:
+def check_real(top_view: TopView, boxes: tuple[Box, ...]) -> float:
     road = road_ahead(top_view, boxes)
     if len(road.outline):
         assert len(road.outline) <= 40
         assert Polygon(road.outline, road.holes).is_valid
+    return road.tolerance_m
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -137,10 +160,13 @@ def test_polygons_of_real_scans_are_valid(data_root: Callable[[str], Path]) -> N
         perceive = Perceiver(sensor=sensor, provider="cpu", on_mismatch="warn")
         files = sorted((data_root(group) / inside).glob("*.bin"))[::step]
         assert len(files) > 5
+        tolerances = []
         for file in files:
             found = perceive(read_points(file))
             assert found.top_view is not None
-            check_real(found.top_view, found.boxes)
+            tolerances.append(check_real(found.top_view, found.boxes))
+        assert np.median(tolerances) <= 0.4
+        assert max(tolerances) <= 0.8
 
 
 # --- what a planner asks ---------------------------------------------------------------------------------------------

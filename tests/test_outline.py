@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
-from shapely import Polygon, box, union_all
+from shapely import LineString, Polygon, box, union_all
 
 import twins.outline
 from edgeperc.outline import (
@@ -20,9 +20,13 @@ from edgeperc.outline import (
     fill_rings,
     mark_connected,
     mark_needed,
+    may_change,
+    meet,
+    merge_corners,
     nearest_part,
     outline_of,
     resolve_contacts,
+    turn,
 )
 
 MASKS = npst.arrays(np.bool_, npst.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9))
@@ -109,6 +113,44 @@ def test_corners_are_removed_as_by_the_twin(cells: NDArray[np.bool_], data: st.D
     found = [ring[few].tolist() for ring, few in zip(rings, np.split(kept, ends[:-1]), strict=True)]
     expected = twins.outline.needed([map(tuple, ring.tolist()) for ring in rings], addable, removable, outer, enough)
     assert found == [[list(corner) for corner in ring] for ring in expected]
+
+
+CORNERS = st.tuples(st.integers(0, 9), st.integers(0, 9))
+
+
+@given(st.tuples(CORNERS, CORNERS, CORNERS), npst.arrays(np.bool_, (9, 9)))
+def test_cells_that_a_triangle_touches(triangle: tuple[tuple[int, int], ...], fixed: NDArray[np.bool_]) -> None:
+    touched = Polygon(triangle).intersection(shape_of(fixed)).area > 1e-9
+    if Polygon(triangle).area > 0.0:
+        assert may_change(*np.ravel(triangle).tolist(), _sums(~fixed)) == (not touched)
+    assert abs(turn(*np.ravel(triangle).tolist())) == pytest.approx(2.0 * Polygon(triangle).area)
+
+
+@given(st.tuples(CORNERS, CORNERS, CORNERS, CORNERS))
+def test_edges_that_meet(ends: tuple[tuple[int, int], ...]) -> None:
+    a, b, c, d = ends
+    if a != b and c != d:
+        assert meet(*np.ravel(ends).tolist()) == LineString([a, b]).intersects(LineString([c, d]))
+
+
+@settings(max_examples=40)
+@given(streets(14), st.data())
+def test_corners_are_merged_as_by_the_twin(cells: NDArray[np.bool_], data: st.DataObject) -> None:
+    grid = np.pad(cells, 1)
+    rings = _rings(_without_gaps(grid, np.zeros_like(grid), (0.0, 0.0), ~np.zeros_like(grid)))
+    if not rings:
+        return
+    random = np.random.default_rng(data.draw(st.integers(0, 99)))
+    changeable = random.random(grid.shape) < data.draw(st.sampled_from([0.0, 0.7, 0.9, 1.0]))
+    around, enough = data.draw(st.integers(0, 4)), data.draw(st.integers(0, 12))
+    outer, *holes = sorted(rings, key=lambda ring: -Polygon(ring).area)
+    edges = np.concatenate([*(np.hstack([hole, np.roll(hole, -1, 0)]) for hole in holes), np.empty((0, 4), np.int64)])
+    ring = outer.copy()
+    few = ring[: merge_corners(ring, edges, _sums(changeable), around, enough)]
+    expected = twins.outline.merged(list(map(tuple, outer.tolist())), edges.tolist(), changeable, around, enough)
+    assert list(map(tuple, few.tolist())) == expected
+    assert Polygon(few, holes).is_valid
+    assert Polygon(few).symmetric_difference(Polygon(outer)).intersection(shape_of(~changeable)).area < 1e-9
 
 
 # --- the polygon -----------------------------------------------------------------------------------------------------

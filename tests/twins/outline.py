@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from shapely import LinearRing, Point, Polygon, box
+from shapely import LinearRing, LineString, Point, Polygon, box, union_all
 
 
 def grown(cells, radius):
@@ -89,3 +89,57 @@ def needed(rings, addable, removable, outer, enough):
         if not changed:
             limit = max(1, 2 * limit)
     return rings
+
+
+def merged(ring, edges, changeable, around, enough):
+    """Twin of `edgeperc.outline.merge_corners`: the same order, shapely's geometry; a ring of tuples."""
+    ring, limit, tried = list(ring), 8, {}
+    (height, width), others = changeable.shape, [LineString([edge[:2], edge[2:]]) for edge in edges]
+    fixed = union_all([box(row, col, row + 1, col + 1) for row, col in np.argwhere(~changeable).tolist()])
+    while limit <= 8 * height * width:
+        changed, k = False, 0
+        while k < len(ring):
+            n = len(ring)
+            if n <= max(enough, 4):
+                return ring
+            a, b, c, d = (ring[(k + step) % n] for step in (-1, 0, 1, 2))
+            if tried.get(b) == limit:
+                k += 1
+                continue
+            rest = [ring[(k + 2 + step) % n] for step in range(n - 2)]  # d to a
+            places = [
+                (row, col)
+                for row in range(max(0, min(b[0], c[0]) - around), min(height, max(b[0], c[0]) + around) + 1)
+                for col in range(max(0, min(b[1], c[1]) - around), min(width, max(b[1], c[1]) + around) + 1)
+            ]
+            areas = {p: sum(2.0 * Polygon([p, *side]).area for side in ((a, b), (b, c), (c, d))) for p in places}
+            best = None
+            for p in sorted((p for p in places if areas[p] <= limit), key=lambda p: (areas[p], p)):
+                triangles = [Polygon([p, *side]) for side in ((a, b), (b, c), (c, d))]
+                new = [LineString([a, p]), LineString([p, d])]
+                if Polygon([a, p, d]).area == 0 or any(each.intersection(fixed).area > 1e-9 for each in triangles):
+                    continue
+                around_p = [
+                    (row, col)
+                    for row in range(max(p[0] - 1, 0), min(p[0] + 1, height))
+                    for col in range(max(p[1] - 1, 0), min(p[1] + 1, width))
+                ]
+                if not any(changeable[cell] for cell in around_p):
+                    continue
+                if LinearRing([*rest, p]).is_simple and not any(
+                    each.intersects(edge) for each in new for edge in others
+                ):
+                    best = p
+                    break
+            if best is None:
+                tried[b] = limit
+                k += 1
+                continue
+            changed = True
+            ring[k] = best
+            del ring[(k + 1) % n]
+            for step in range(-3, 3):
+                tried.pop(ring[(k + step) % len(ring)], None)
+        if not changed:
+            limit *= 4
+    return ring
