@@ -302,7 +302,7 @@ class FakePlugins:
 def test_qualcomms_plugin_runs_int8_on_the_npu(monkeypatch: pytest.MonkeyPatch) -> None:
     name = PROVIDERS["qnn"]
     fake = FakePlugins(monkeypatch, [(name, "CPU"), (name, "GPU"), (name, "NPU")])
-    assert available_providers() == ("qnn", "cpu")
+    assert [name for name in available_providers() if name not in ("cuda", "tensorrt")] == ["qnn", "cpu"]
     assert fake.libraries == ["onnxruntime_qnn.so"]
     monkeypatch.setattr(session_module, "cpu_features", lambda: frozenset({"asimd"}))  # no int8 on the processor
     session = Session("pointseg", "qnn")
@@ -314,7 +314,7 @@ def test_qualcomms_plugin_runs_int8_on_the_npu(monkeypatch: pytest.MonkeyPatch) 
 
 def test_the_webgpu_plugin_runs_fp32(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = FakePlugins(monkeypatch, [(PROVIDERS["webgpu"], "GPU")])
-    assert available_providers() == ("webgpu", "cpu")
+    assert [name for name in available_providers() if name not in ("cuda", "tensorrt")] == ["webgpu", "cpu"]
     assert Session("pointseg", "webgpu").description == f"pointseg fp32, {PROVIDERS['webgpu']}"
     assert fake.chosen == [("GPU", {})]
     with pytest.raises(ProviderError, match="provider 'qnn' is not available"):
@@ -382,9 +382,9 @@ def test_auto_takes_the_setting_that_was_measured_here(
     assert Session(path, "auto").options["threads"] == "1"
     assert Session(path, "auto", n_threads=2).options["threads"] == "2"
     assert Session(path, "cpu").options["threads"] == "the provider's choice"
-    keep({sha: {"provider": "tensorrt", "precision": "fp32", "n_threads": 1}})
+    keep({sha: {"provider": "qnn", "precision": "fp32", "n_threads": 1}})
     assert Session(path, "auto").options["threads"] == "the provider's choice"
-    assert "pointseg on tensorrt, which was measured as the fastest: it is no longer available" in caplog.text
+    assert "pointseg on qnn, which was measured as the fastest: it is no longer available" in caplog.text
     monkeypatch.setattr(session_module, "cpu_features", frozenset)
     keep({digest(resolve("pointseg")): {"provider": "cpu", "precision": "int8", "n_threads": 1}})
     assert Session("pointseg").precision == "int8"  # though nothing is known of the processor
