@@ -1,7 +1,7 @@
 """Use one extra in an environment that has it alone: ``python tests/smoke.py EXTRA``.
 
-Imports what the extra installs, so that no test is skipped for want of it, installs the extras without which its tests
-do nothing, such as onnxruntime, and runs the tests that use it. They need filelock, hypothesis, pytest and
+Imports what the extra installs, so that no test is skipped for want of it, installs that without which its tests do
+nothing, such as onnxruntime, and runs the tests that use it. They need filelock, hypothesis, pytest and
 pytest-xdist.
 """
 
@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 # Modules that an extra brings, and arguments of pytest: tests that use them. The extras docs and test are whole jobs.
-# BESIDE has the extras that these tests want, too.
+# BESIDE has what these tests want, too.
 SMOKE: dict[str, tuple[list[str], list[str]]] = {
     "bench": (["psutil"], ["tests/test_bench_measure.py"]),
     "camera": (["PIL"], ["tests/test_camera.py"]),
@@ -42,7 +42,14 @@ SMOKE: dict[str, tuple[list[str], list[str]]] = {
     "velodyne": (["velodyne_decoder"], ["tests/test_captures.py", "tests/test_times.py", "-k", "velodyne"]),
     "view": (["matplotlib", "PIL"], ["tests/test_view.py"]),
 }
-BESIDE = {"camera": "cpu", "database": "cpu,export", "loadgen": "bench,cpu", "ray": "cpu", "remote": "cpu"}
+BESIDE = {
+    "camera": ["--editable", ".[cpu]"],
+    "database": ["--editable", ".[cpu,export]"],
+    "foxglove": ["mcap>=1.2", "protobuf>=4"],
+    "loadgen": ["--editable", ".[bench,cpu]"],
+    "ray": ["--editable", ".[cpu]"],
+    "remote": ["--editable", ".[cpu]"],
+}
 
 
 def main(extra: str) -> int:
@@ -51,7 +58,7 @@ def main(extra: str) -> int:
     for name in modules:
         importlib.import_module(name)
     if extra in BESIDE:
-        pip = [sys.executable, "-m", "pip", "install", "--quiet", "--editable", f".[{BESIDE[extra]}]"]
+        pip = [sys.executable, "-m", "pip", "install", "--quiet", *BESIDE[extra]]
         subprocess.run(pip, cwd=Path(__file__).parent.parent, check=True)
     # Newer packages below the lowest ones deprecate what these use; elsewhere every warning is an error.
     quiet = ["-W", "ignore::DeprecationWarning"]
