@@ -22,7 +22,7 @@ SCANS ?= 20000
 # Of make test-extra.
 EXTRA ?= ros
 
-.PHONY: help demo test check test-full test-kernels test-wheel test-minimal test-lowest test-extra docs fuzz soak release sbom clean
+.PHONY: help demo test check test-full test-kernels test-wheel test-minimal test-lowest test-extra test-arm docs fuzz soak release sbom clean
 
 help:
 	@echo "make demo          perceive the bundled scene: a table, and a picture in demo/"
@@ -34,6 +34,7 @@ help:
 	@echo "make test-minimal  pytest with nothing but the runtime: no torch, no onnx, no matplotlib"
 	@echo "make test-lowest   pytest with the lowest versions that pyproject.toml allows"
 	@echo "make test-extra    pytest with EXTRA=ros alone, or another extra"
+	@echo "make test-arm      edgeperc on aarch64 under qemu, compared with x86; skipped without qemu"
 	@echo "make docs          build the documentation into docs/_build/html; warnings are errors"
 	@echo "make fuzz          hostile scans, captures, models, boxes, commands, images; SECONDS=300 SEED=7 KINDS='scans models'"
 	@echo "make soak          whether memory grows over SCANS=20000 scans with stream, tracker and pictures"
@@ -78,6 +79,9 @@ test-extra: pyproject.toml
 	$(ALONE)/pip install --quiet --editable '.[$(EXTRA)]' filelock hypothesis pytest pytest-xdist
 	$(ALONE)/pip check
 	$(ALONE)/python tests/smoke.py $(EXTRA)
+
+test-arm: .venv-test/installed
+	$(TEST)/python -m tests.arm
 
 fuzz: .venv-test/installed
 	$(TEST)/python -m tests.fuzz $(KINDS) --jobs $(JOBS) --seconds $(SECONDS) $(if $(SEED),--seed $(SEED))

@@ -90,7 +90,8 @@ def machine() -> dict[str, Any]:
 
 def _has_hypervisor() -> bool | None:
     text = _read(Path("/proc/cpuinfo"))
-    return None if text is None else " hypervisor" in text
+    # Only x86 shows it.
+    return None if text is None or "flags" not in text else " hypervisor" in text
 
 
 def software() -> dict[str, Any]:

@@ -120,7 +120,7 @@ def compiled_folder(engine: str, sha256: str, precision: str) -> Path | None:
 
 def cpu_model() -> str:
     """The processor's name."""
-    return _cpuinfo("model name", "Hardware", "Model") or platform.processor() or platform.machine()
+    return _cpuinfo("model name", "Hardware", "Model") or _arm_cores() or platform.processor() or platform.machine()
 
 
 def cpu_features() -> frozenset[str]:
@@ -142,6 +142,15 @@ def _cpuinfo(*keys: str) -> str:
         if key.strip() in keys:
             return value.strip()
     return ""
+
+
+def _arm_cores() -> str:
+    """Numbers of the kinds of cores, which Linux shows on ARM in place of a name; empty on other processors."""
+    lines = [line.partition(":") for line in (_text(Path("/proc/cpuinfo")) or "").splitlines()]
+    makers, parts = ([v.strip() for k, _, v in lines if k.strip() == key] for key in ("CPU implementer", "CPU part"))
+    # A processor may have cores of several kinds.
+    kinds = sorted({*zip(makers, parts, strict=False)})
+    return ", ".join(f"ARM implementer {maker} part {part}" for maker, part in kinds)
 
 
 def fingerprint() -> str:

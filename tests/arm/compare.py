@@ -1,0 +1,111 @@
+"""Compare the answers of two computers (`answers.py`)."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Answers = tuple[dict[str, NDArray[Any]], dict[str, Any]]
+
+MIN_EQUAL = 0.999
+"""Smallest share of points, cells or pixels with the same class."""
+
+# Largest distance between two boxes that count as the same [m, rad, 1].
+CENTER_M, SIZE_M, YAW_RAD, SCORE = 0.1, 0.1, 0.05, 0.02
+
+
+def read(path: Path) -> Answers:
+    """The arrays and the document of a file that `answers.py` wrote."""
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    document: dict[str, Any] = json.loads(str(arrays.pop("document")))
+    return arrays, document
+
+
+def equal_share(one: Answers, other: Answers, start: str) -> tuple[float, int]:
+    """Share of equal values in the arrays of ``other`` whose name begins so, and their number.
+
+    The share is 0 if ``one`` lacks an array or has it in another shape, and if there is nothing to compare.
+    """
+    equal = total = 0
+    for name, array in other[0].items():
+        if name.startswith(start):
+            total += array.size
+            if name in one[0] and one[0][name].shape == array.shape:
+                equal += int((one[0][name] == array).sum())
+    return equal / max(total, 1), total
+
+
+def unlike_boxes(one: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]]) -> int:
+    """Number of boxes, of both lists, without a counterpart in the other one."""
+    left, unlike = [*other], 0
+    for box in one:
+        found = next((k for k, candidate in enumerate(left) if _is_same(box, candidate)), None)
+        if found is None:
+            unlike += 1
+        else:
+            del left[found]
+    return unlike + len(left)
+
+
+def _is_same(box: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    turned = abs(math.remainder(box["yaw"] - other["yaw"], 2.0 * math.pi))
+    return (
+        box["label"] == other["label"]
+        and math.dist(box["center"], other["center"]) <= CENTER_M
+        and math.dist(box["size"], other["size"]) <= SIZE_M
+        and turned <= YAW_RAD
+        and abs(box["score"] - other["score"]) <= SCORE
+    )
+
+
+def compare(
+    name: str, here: Answers, there: Answers, kind: str, auto: Mapping[str, str]
+) -> tuple[list[list[str]], list[str]]:
+    """Compare the answers of another processor with those of this one.
+
+    Parameters
+    ----------
+    name : str
+        Of the other processor.
+    here, there : tuple
+        From `read`.
+    kind : {"scans", "networks"}
+        What ``there`` holds.
+    auto : mapping
+        Network to the precision that ``"auto"`` should take on the other processor.
+
+    Returns
+    -------
+    rows : list of list of str
+        Of the table with the columns of `COLUMNS`.
+    faults : list of str
+        What differs more than it may; empty if nothing does.
+    """
+    rows, faults = [], []
+    for precision in ("fp32", "int8"):
+        for what in {"scans": ("points", "cells"), "networks": ("input",)}[kind]:
+            share, total = equal_share(there, here, f"{precision} {what} ")
+            rows.append([name, precision, PLACES[what], f"{total:,}", f"{100.0 * share:.4f} %"])
+            if share < MIN_EQUAL:
+                faults.append(f"{name}, {precision}: {share:.5f} of {total:,} {PLACES[what]} have the same class")
+        if kind == "scans":
+            boxes = {key: value for key, value in here[1]["boxes"].items() if key.startswith(precision)}
+            unlike = sum(unlike_boxes(value, there[1]["boxes"].get(key, [])) for key, value in boxes.items())
+            total = sum(map(len, boxes.values()))
+            rows.append([name, precision, "boxes", f"{total:,}", f"{unlike} differ"])
+            if unlike > (1.0 - MIN_EQUAL) * total:
+                faults.append(f"{name}, {precision}: {unlike} boxes differ, of {total}")
+    if kind == "networks" and there[1]["auto"] != dict(auto):
+        faults.append(f"{name}: precision auto took {there[1]['auto']}, expected {dict(auto)}")
+    return rows, faults
+
+
+COLUMNS = ("processor", "precision", "what", "number", "equal to x86")
+PLACES = {"points": "points", "cells": "cells", "input": "pixels"}
