@@ -20,6 +20,7 @@ from edgeperc_bench.peers.slam import (
     ghost_share,
     look,
     moving_boxes,
+    step_errors,
     trajectory_error,
 )
 
@@ -61,7 +62,15 @@ def test_the_way_back_closes() -> None:
     poses, gap = closure(drifting, [np.zeros((k + 1, 4), np.float32) for k in range(4)])
     assert given == [1, 2, 3, 4, 3, 2, 1]
     assert len(poses) == 4
-    assert gap == pytest.approx(0.6)
+    assert gap == pytest.approx(0.4)  # of the second scan: its poses are those of the second and the sixth
+
+
+def test_errors_of_steps_are_in_the_frame_of_the_sensor() -> None:
+    true = ways()
+    np.testing.assert_allclose(step_errors(true, turned(70.0, 5.0, -3.0, 1.0) @ true), 0.0, atol=1e-9)
+    wrong = true.copy()
+    wrong[10:, 1, 3] += 0.3  # one jump
+    np.testing.assert_allclose(step_errors(true, wrong), [0.0] * 9 + [0.3] + [0.0] * 9, atol=1e-9)
 
 
 def test_cells_of_a_map_with_a_moving_point_are_counted_once() -> None:
@@ -124,7 +133,10 @@ def test_the_rows_of_a_drive() -> None:
     assert seen.kept["without moving"][-1][:400].all()
     assert drive.poses is not None
     poses = np.concatenate([drive.poses, drive.poses[-2::-1]])
-    whole, still, parked = compared(drive, seen, lambda scans: poses)
+    (whole, still, parked), motion = compared(drive, seen, lambda scans: poses)
+    assert motion[:4] == ["d", "truth", "0.000 m", "0.000 m"]
+    assert 0.0 < float(motion[4].removesuffix(" m")) < 0.1  # the parked cars show the motion
+    assert float(motion[5].removesuffix(" m")) >= float(motion[4].removesuffix(" m"))
     assert whole[:5] == ["d", "all points", "16, 12 m", "0.000 m", "0.000 m"]
     shares = [float(row[5].removesuffix(" %")) for row in (whole, still, parked)]
     assert shares[0] > 2.0 * shares[1] > 0.0  # until the track is sure, the car is in the map
@@ -133,7 +145,8 @@ def test_the_rows_of_a_drive() -> None:
     assert whole[7] == "-"
     assert float(still[7]) >= 0.0
     unknown = Drive("r", drive.scans, None, None, drive.usable, drive.known, drive.labels)
-    (labeled, first, second, _) = compared(unknown, seen, lambda scans: poses, second_pass=True)
+    (labeled, first, second, _), motion = compared(unknown, seen, lambda scans: poses, second_pass=True)
+    assert motion[1:4] == ["KISS-ICP", "-", "-"]
     assert [first[1], second[1]] == ["without moving", "same, second pass"]
     assert 0.0 < float(second[5].removesuffix(" %")) <= shares[1]  # known poses leave less doubt
     assert labeled[3] == "-"
