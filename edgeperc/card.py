@@ -653,7 +653,7 @@ def _check_tree(document: Any) -> None:
             elif isinstance(value, str):
                 if len(value) > MAX_TEXT:
                     raise CardError(f"the card has a text of {len(value)} characters; expected at most {MAX_TEXT}")
-                if any("\ud800" <= character <= "\udfff" for character in value):
+                if not value.isascii() and any("\ud800" <= character <= "\udfff" for character in value):
                     raise CardError(f"the card has a text that is not valid Unicode: {reprlib.repr(value)}")
             elif isinstance(value, int | float) and not -1e300 <= value <= 1e300:
                 raise CardError(f"the card has the number {reprlib.repr(value)}; expected finite ones below 1e300")

@@ -18,12 +18,13 @@ import os
 import pickle
 import stat
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import llvmlite
+import llvmlite.binding
 import numba
 import numba.core.compiler
 import numba.core.config
@@ -41,6 +42,7 @@ __all__ = ["KernelCache", "njit"]
 logger = logging.getLogger(__name__)
 
 _numba: Any = numba.core  # internals, which have no types
+FORMAT = 2  # of the files
 _DIGEST_BYTES = hashlib.sha256().digest_size
 _reported: set[str] = set()
 
@@ -136,9 +138,9 @@ class KernelCache:
             file = folder / name
             try:
                 if _unusable(folder) is None and (content := _read(file)) is not None and content[0] == stamp:
-                    found, payload = pickle.loads(content[1])
+                    found, defined, payload = pickle.loads(content[1])
                     if found == known:
-                        return _numba.compiler.CompileResult._rebuild(target_context, *payload)
+                        return _rebuilt(target_context, defined, *payload)
             except Exception as exc:  # what a file holds, or what cannot be read, never stops the start
                 reason = f"{type(exc).__name__}: {exc}"
                 _report("damaged", "the compiled kernel %s cannot be used and is compiled again: %s", file, reason)
@@ -159,7 +161,9 @@ class KernelCache:
             reasons.append(f"{self._source} cannot be read")
         else:
             name, known = self._key(sig, result.codegen)
-            rest = stamp + _numba.serialize.dumps((known, result._reduce()))
+            module = result.library._get_module_for_linking()
+            defined = [each.name for each in (*module.functions, *module.global_variables) if not each.is_declaration]
+            rest = stamp + _numba.serialize.dumps((known, defined, result._reduce()))
             for folder in self._folders():
                 try:
                     # mkdir's mode, lessened by the umask, is that of the last folder only.
@@ -201,6 +205,34 @@ class KernelCache:
             return
 
 
+def _rebuilt(target_context: Any, defined: Iterable[str], library: tuple[str, str, Any], *rest: Any) -> Any:
+    """A compiled form from what ``CompileResult._reduce`` gave, and the names that its module defines.
+
+    Beside the machine code there is a module for kernels that call this one. It is parsed when such a kernel is
+    compiled; at a start that would take as long as everything else here.
+    """
+    name, kind, content = library
+    if kind != "object":
+        return _numba.compiler.CompileResult._rebuild(target_context, library, *rest)
+    code, for_callers = content
+    target_context.codegen()._engine._defined_symbols.update(defined)
+    result = _numba.compiler.CompileResult._rebuild(target_context, (name, kind, (code, _empty_module())), *rest)
+    loaded = result.library
+
+    def parsed() -> Any:
+        del loaded._get_module_for_linking
+        loaded._shared_module = llvmlite.binding.parse_bitcode(for_callers)
+        return loaded._shared_module
+
+    loaded._get_module_for_linking = parsed
+    return result
+
+
+@cache
+def _empty_module() -> bytes:
+    return bytes(llvmlite.binding.parse_assembly("").as_bitcode())
+
+
 def _read(file: Path) -> tuple[bytes, bytes] | None:
     """Stamp and content of a file; None if there is none. Raises ValueError or OSError."""
     try:
@@ -237,7 +269,7 @@ def _stamp(source: str) -> bytes | None:
         text = Path(source).read_bytes()
     except OSError:
         return None
-    versions = f"{numba.__version__} {llvmlite.__version__} {np.__version__} {sys.version}"
+    versions = f"{FORMAT} {numba.__version__} {llvmlite.__version__} {np.__version__} {sys.version}"
     return hashlib.sha256(versions.encode() + b"\n" + text).digest()
 
 

@@ -87,10 +87,11 @@ def fill_clusters(
     n_levels = 1
     while min_distance * LEVEL_STEP**n_levels <= 2.0 * distance_per_m * max_range:
         n_levels += 1
-    edges = min_distance * LEVEL_STEP ** np.arange(n_levels + 1)
-    limits = np.full(n_levels + 1, math.inf)  # squared ranges
-    if distance_per_m > 0.0:
-        limits = (edges / distance_per_m) ** 2
+    edges = np.empty(n_levels + 1)
+    limits = np.empty(n_levels + 1)  # squared ranges
+    for at in range(n_levels + 1):
+        edges[at] = min_distance * LEVEL_STEP**at
+        limits[at] = (edges[at] / distance_per_m) ** 2 if distance_per_m > 0.0 else math.inf
     grids = np.empty((n_levels, 3))  # lowest x and y, columns per meter
     n_rows = np.empty(n_levels, np.int64)
     n_cols = np.empty(n_levels, np.int64)
@@ -133,7 +134,7 @@ def fill_clusters(
     is_kept = np.zeros(n_seeds, np.bool_)
     queue = np.empty(m, np.int32)
     pairs = np.empty((MAX_PAIRS, 2), np.int32)
-    n_votes = np.empty(n_shares + 1, np.int64)
+    n_votes, n_none = np.empty(n_shares + 1, np.int64), np.zeros(n_shares + 1, np.int64)
     n_clusters = 0
     for seed in rows[:m]:
         if not seeds[seed]:
@@ -222,7 +223,6 @@ def fill_clusters(
         for k in range(n_done, n_queued):  # of a cluster that was dropped before it was complete
             for share in range(n_shares + 1):
                 n_left[share] -= run_votes[queue[k], share]
-        n_none = np.zeros_like(n_left)
         is_dropped = is_dropped or not may_reach(n_votes, n_none, min_shares)
         for k in range(n_queued):
             owner[queue[k]] = DROPPED if is_dropped else n_clusters
