@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from arm import answers
-from arm.compare import COLUMNS, MIN_EQUAL, compare, equal_share, read, unlike_boxes
+from arm.compare import COLUMNS, MAX_UNLIKE, compare, read, unlike_boxes, unlike_values
 from arm.environment import CPUS, cpuinfo
 
 from edgeperc import tuning
@@ -86,14 +86,14 @@ def test_boxes_have_a_counterpart(change: dict[str, Any], unlike: int) -> None:
     assert unlike_boxes([], [BOX]) == unlike_boxes([BOX], []) == 1
 
 
-def test_share_counts_all_that_is_expected() -> None:
+def test_what_is_missing_differs() -> None:
     here = {"fp32 points scan0": np.zeros(900, np.uint8), "fp32 points scan1": np.zeros(100, np.uint8)}
     changed = {**here, "fp32 points scan1": np.arange(100, dtype=np.uint8) % 2}
-    assert equal_share((here, {}), (here, {}), "fp32 points ") == (1.0, 1000)
-    assert equal_share((changed, {}), (here, {}), "fp32 points ") == (0.95, 1000)
-    assert equal_share(({"fp32 points scan0": np.zeros(900)}, {}), (here, {}), "fp32 points ") == (0.9, 1000)
-    assert equal_share(({"fp32 points scan0": np.zeros(9)}, {}), (here, {}), "fp32 points ") == (0.0, 1000)
-    assert equal_share((here, {}), (here, {}), "int8 points ") == (0.0, 0)
+    assert unlike_values((here, {}), (here, {}), "fp32 points ") == (0, 1000)
+    assert unlike_values((changed, {}), (here, {}), "fp32 points ") == (50, 1000)
+    assert unlike_values(({"fp32 points scan0": np.zeros(900)}, {}), (here, {}), "fp32 points ") == (100, 1000)
+    assert unlike_values(({"fp32 points scan0": np.zeros(9)}, {}), (here, {}), "fp32 points ") == (1000, 1000)
+    assert unlike_values((here, {}), (here, {}), "int8 points ") == (0, 0)
 
 
 def test_answers_of_one_computer_agree_and_changed_ones_do_not(tmp_path: Path) -> None:
@@ -111,13 +111,15 @@ def test_answers_of_one_computer_agree_and_changed_ones_do_not(tmp_path: Path) -
     assert [row[2] for row in rows + more] == 2 * ["points", "cells", "boxes"] + 2 * ["pixels"]
 
     changed = copy.deepcopy(seen)
-    changed[0]["int8 points scan0"][: int(len(changed[0]["int8 points scan0"]) * 2 * (1.0 - MIN_EQUAL))] += 1
+    labels = changed[0]["int8 points scan0"]
+    labels[: int(2 * MAX_UNLIKE * len(labels))] += 1
     del changed[1]["boxes"]["fp32 scan0"][0]
     faults = compare("x", seen, changed, "scans", auto)[1]
     assert [fault.split(":")[0] for fault in faults] == ["x, fp32", "x, int8"]
     assert "precision auto took" in compare("x", ran, ran, "networks", dict.fromkeys(auto, "bf16"))[1][0]
     empty: Any = {}, {"boxes": {}, "auto": auto}
     assert len(compare("x", seen, empty, "scans", auto)[1]) == 6
+    assert len(compare("x", empty, empty, "scans", auto)[1]) == 6  # nothing was compared
 
 
 def test_without_qemu_it_is_skipped_with_the_line_that_installs_it(tmp_path: Path) -> None:

@@ -30,11 +30,13 @@ def scans(given: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     for precision in PRECISIONS:
         started = time.perf_counter()
         # trusted: a first run is not stopped after 30 s, which an emulated processor may take.
-        perceive = edgeperc.Perceiver(provider="cpu", precision=precision, n_threads=1, trusted=True)
+        perceive = edgeperc.Perceiver(provider="cpu", precision=precision, trusted=True)
         document["seconds"][f"{precision} start"] = time.perf_counter() - started
         started = time.perf_counter()
         for name in given.files:
             seen = perceive(given[name])
+            assert seen.points is not None
+            assert seen.top_view is not None
             arrays[f"{precision} points {name}"] = seen.points.labels
             arrays[f"{precision} cells {name}"] = seen.top_view.labels
             document["boxes"][f"{precision} {name}"] = [box.to_dict() for box in seen.boxes]
@@ -57,7 +59,7 @@ def networks(given: Any) -> tuple[dict[str, Any], dict[str, Any]]:
             for name in inputs:
                 if name.split()[1] == model:
                     session.input[:] = given[name]
-                    arrays[f"{precision} {name}"] = session.run()["class_logits"].argmax(0).astype(np.uint8)
+                    arrays[f"{precision} pixels {name}"] = session.run()["class_logits"].argmax(0).astype(np.uint8)
     return arrays, document
 
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 Answers = tuple[dict[str, NDArray[Any]], dict[str, Any]]
 
-MIN_EQUAL = 0.999
-"""Smallest share of points, cells or pixels with the same class."""
+MAX_UNLIKE = 0.001
+"""Largest share of points, cells and pixels with another class, and of boxes without a counterpart."""
 
 # Largest distance between two boxes that count as the same [m, rad, 1].
 CENTER_M, SIZE_M, YAW_RAD, SCORE = 0.1, 0.1, 0.05, 0.02
@@ -28,18 +28,16 @@ def read(path: Path) -> Answers:
     return arrays, document
 
 
-def equal_share(one: Answers, other: Answers, start: str) -> tuple[float, int]:
-    """Share of equal values in the arrays of ``other`` whose name begins so, and their number.
-
-    The share is 0 if ``one`` lacks an array or has it in another shape, and if there is nothing to compare.
-    """
-    equal = total = 0
+def unlike_values(one: Answers, other: Answers, start: str) -> tuple[int, int]:
+    """Number of values of ``other`` that ``one`` lacks or has otherwise, and of all, in arrays whose name begins so."""
+    unlike = total = 0
     for name, array in other[0].items():
         if name.startswith(start):
             total += array.size
-            if name in one[0] and one[0][name].shape == array.shape:
-                equal += int((one[0][name] == array).sum())
-    return equal / max(total, 1), total
+            found = one[0].get(name)
+            is_comparable = found is not None and found.shape == array.shape
+            unlike += int(np.count_nonzero(found != array)) if is_comparable else array.size
+    return unlike, total
 
 
 def unlike_boxes(one: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]]) -> int:
@@ -90,22 +88,19 @@ def compare(
     """
     rows, faults = [], []
     for precision in ("fp32", "int8"):
-        for what in {"scans": ("points", "cells"), "networks": ("input",)}[kind]:
-            share, total = equal_share(there, here, f"{precision} {what} ")
-            rows.append([name, precision, PLACES[what], f"{total:,}", f"{100.0 * share:.4f} %"])
-            if share < MIN_EQUAL:
-                faults.append(f"{name}, {precision}: {share:.5f} of {total:,} {PLACES[what]} have the same class")
+        whats = {"scans": ("points", "cells"), "networks": ("pixels",)}[kind]
+        counts = {what: unlike_values(there, here, f"{precision} {what} ") for what in whats}
         if kind == "scans":
             boxes = {key: value for key, value in here[1]["boxes"].items() if key.startswith(precision)}
             unlike = sum(unlike_boxes(value, there[1]["boxes"].get(key, [])) for key, value in boxes.items())
-            total = sum(map(len, boxes.values()))
-            rows.append([name, precision, "boxes", f"{total:,}", f"{unlike} differ"])
-            if unlike > (1.0 - MIN_EQUAL) * total:
-                faults.append(f"{name}, {precision}: {unlike} boxes differ, of {total}")
+            counts["boxes"] = unlike, sum(map(len, boxes.values()))
+        for what, (unlike, total) in counts.items():
+            rows.append([name, precision, what, f"{total:,}", f"{unlike:,}"])
+            if total == 0 or unlike > MAX_UNLIKE * total:
+                faults.append(f"{name}, {precision}: {unlike:,} of {total:,} {what} differ")
     if kind == "networks" and there[1]["auto"] != dict(auto):
         faults.append(f"{name}: precision auto took {there[1]['auto']}, expected {dict(auto)}")
     return rows, faults
 
 
-COLUMNS = ("processor", "precision", "what", "number", "equal to x86")
-PLACES = {"points": "points", "cells": "cells", "input": "pixels"}
+COLUMNS = ("processor", "precision", "what", "number", "differ from x86")
