@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +54,9 @@ MAX_OCCLUSION, MAX_TRUNCATION, MIN_HEIGHT_PX, MIN_UNLABELED = 2, 0, 25.0, 0.5
 FRAME_S = 0.1
 
 # "edgeperc": a track's image box is the projection of its 3-D box, and scores are compared exactly.
-# "ab3dmot": as AB3DMOT's program. A track's image box is that of its last detection, sitting people are labeled as
-# nothing, and scores are rounded (`edgeperc.evaluation.tracking_metrics.evaluate_tracks`).
+# "ab3dmot": as AB3DMOT's program. Boxes are upright in the camera's frame, whose y axis is up to 1 degree off the
+# sensor's z axis. A track's image box is that of its last detection, sitting people are labeled as nothing, and scores
+# are rounded (`edgeperc.evaluation.tracking_metrics.evaluate_tracks`).
 RULES = ("edgeperc", "ab3dmot")
 
 
@@ -358,6 +359,23 @@ def ab3dmot_sequence(sequence: TrackingSequence, classes: Sequence[str] = CLASSE
     return results
 
 
+def _in_camera(boxes: NDArray[np.float64], calibration: KittiCalibration) -> NDArray[np.float64]:
+    """Convert boxes (n, 7) to x ahead, y left, z up in the camera's frame: undoes `KittiCalibration.sensor_boxes`."""
+    R, t = calibration.T_cam_velo[:3, :3], calibration.T_cam_velo[:3, 3]
+    right, down, ahead = R @ boxes[:, :3].T + t[:, None]
+    cos, sin = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
+    climb = -(R[1, 0] * cos + R[1, 1] * sin) / R[1, 2]  # of the heading that is level in the camera's frame
+    heading = R @ np.stack([cos, sin, climb])
+    return np.column_stack([ahead, -right, -down, boxes[:, 3:6], np.arctan2(-heading[0], heading[2])])
+
+
+def _frame_truth(sequence: TrackingSequence, of: str, rules: str) -> list[FrameTruth]:
+    """True boxes of one class for the metrics, by frame."""
+    if rules != "ab3dmot":
+        return [*sequence.truth[of]]
+    return [replace(frame, boxes=_in_camera(frame.boxes, sequence.calibration)) for frame in sequence.truth[of]]
+
+
 def _frame_tracks(sequence: TrackingSequence, results: Sequence[FrameResult], of: str, rules: str) -> list[FrameTracks]:
     """Convert the tracks of one class for the metrics, by frame."""
     frames = []
@@ -371,6 +389,7 @@ def _frame_tracks(sequence: TrackingSequence, results: Sequence[FrameResult], of
                 if source >= 0:
                     last[one] = seen[source]
                 shown[k] = last.get(one, shown[k])
+            boxes = _in_camera(boxes, sequence.calibration)
         frames.append(FrameTracks(ids, boxes, result.scores[mine], _excused(shown, unlabeled)))
     return frames
 
@@ -469,7 +488,9 @@ def evaluate_kitti(
             results["ab3dmot"] = ab3dmot_sequence(sequence, classes)
         for of in classes:
             for method, reported in results.items():
-                pairs[method][of].append((sequence.truth[of], _frame_tracks(sequence, reported, of, rules)))
+                pairs[method][of].append(
+                    (_frame_truth(sequence, of, rules), _frame_tracks(sequence, reported, of, rules))
+                )
             headings[of] += count_headings(sequence.truth[of], tracks, KINDS[of], iou_threshold)
         if on_sequence is not None:
             on_sequence(done, len(names))
