@@ -7,6 +7,7 @@ import io
 import json
 import os
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -210,7 +211,7 @@ def test_scans_in_memory(scans: Path, tmp_path: Path) -> None:
 def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A bucket of a local S3 server."""
     server = pytest.importorskip("moto.server")
-    pytest.importorskip("s3fs")
+    s3fs = pytest.importorskip("s3fs")
     import boto3
 
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
@@ -222,6 +223,7 @@ def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
     boto3.client("s3").create_bucket(Bucket="edgeperc")
     yield "s3://edgeperc"
+    s3fs.S3FileSystem.clear_instance_cache()  # they know this server
     s3.stop()
 
 
@@ -231,6 +233,33 @@ def test_scans_at_s3(bucket: str, scans: Path, tmp_path: Path) -> None:
         Remote(f"{bucket}/nothing.bin").fetch(tmp_path)
     with pytest.raises(OSError, match="nobody"):
         Remote("s3://nobody/scan.bin").read_bytes()
+
+
+def test_ray_reads_from_and_writes_to_s3(bucket: str, scans: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    pytest.importorskip("pyarrow")
+    for path in scans.iterdir():
+        Remote(f"{bucket}/scans/{path.name}").write_bytes(path.read_bytes())
+    code, records, _ = run(scans, "--out", tmp_path, "--labels", "--ply")
+    # Workers have the environment that the cluster was started with, so this one has its own.
+    arguments = [f"{bucket}/scans", "--out", f"{bucket}/out", "--labels", "--ply", "--json", "--threads", "1"]
+    command = [sys.executable, "-m", "edgeperc", "run", *arguments, "--engine", "ray", "--workers", "2"]
+    done = [subprocess.run(command, capture_output=True, text=True, timeout=300) for _ in range(2)]
+    for each in done:
+        assert each.returncode == code == 1, each.stderr
+        there = [json.loads(line) for line in each.stdout.splitlines()]
+        assert len(there) == len(records)
+        for record, other in zip(there, records, strict=True):
+            assert record.pop("scan") == f"{bucket}/scans/{Path(other['scan']).name}"
+            if "error" in record:
+                assert f"{bucket}/scans/6.bin" in record.pop("error")
+            expected = {key: value for key, value in other.items() if key not in ("scan", "error")}
+            assert {key: value for key, value in record.items() if key != "stage_ms"} == expected
+    assert "kept" not in done[0].stderr
+    assert "kept" in done[1].stderr
+    found = {name: Remote(f"{bucket}/out/{name}").read_bytes() for name in contents(tmp_path)}
+    assert found == contents(tmp_path)
+    assert len(found) == 2 * (N_SCANS - 1)
 
 
 def test_large_files_are_not_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
