@@ -173,6 +173,29 @@ def test_labels_are_read_as_the_tools_read_them(tmp_path: Path, kind: str) -> No
     check_rows(READERS[kind](folder, "000005"), expected)
 
 
+def test_datumaro_reads_cvats_labels(tmp_path: Path) -> None:
+    """By the library with which CVAT imports this format."""
+    Dataset = pytest.importorskip("datumaro").Dataset
+    tracker, scans = Tracker(), []
+    for k in range(6):
+        boxes = BOXES[:2] if k < 4 else BOXES[:1]
+        scans.append(perceived(f"{k:06d}.bin", boxes, tracker.update(boxes, 0.1 * k, np.eye(4))))
+    written(tmp_path, "cvat", *scans)
+    found = Dataset.import_from(str(tmp_path), "datumaro")
+    names = [each.name for each in found.categories()[next(iter(found.categories()))].items]
+    items = sorted(found, key=lambda item: item.attributes["frame"])
+    assert [item.id for item in items] == [f"{k:06d}" for k in range(6)]
+    assert [sum(not each.attributes["outside"] for each in item.annotations) for item in items] == [2] * 4 + [1] * 2
+    assert [sum(each.attributes["outside"] for each in item.annotations) for item in items] == [0] * 4 + [1, 0]
+    (car,) = items[-1].annotations
+    assert (car.type.name, names[car.label], car.attributes["track_id"]) == ("cuboid_3d", "car", 1)
+    check_rows([("car", [*car.position, *car.scale, car.rotation[2]])], rows_of(BOXES[:1]), 0.1)
+    plain = written(tmp_path / "plain", "cvat", perceived("000003.bin"))
+    (item,) = Dataset.import_from(str(plain), "datumaro")
+    rows = [[*each.position, *each.scale, each.rotation[2]] for each in item.annotations]
+    check_rows([(name, row) for (name, _), row in zip(rows_of(BOXES), rows, strict=True)], rows_of(BOXES))
+
+
 PLACES = st.tuples(*(st.floats(-60.0, 60.0) for _ in range(2)), st.floats(-3.0, 3.0))
 SIZES = st.tuples(*(st.floats(0.3, 15.0) for _ in range(3)))
 ANY_BOXES = st.lists(
