@@ -16,8 +16,9 @@ from arm.compare import COLUMNS, MAX_UNLIKE, compare, read, unlike_boxes, unlike
 from arm.environment import CPUS, cpuinfo
 
 from edgeperc import tuning
+from edgeperc.session import golden_input
 from edgeperc.simulation.samples import simulated_scan
-from edgeperc.zoo import DEFAULT, choose, resolve
+from edgeperc.zoo import DEFAULT, choose, model_path, resolve
 from edgeperc_bench import context
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -130,3 +131,22 @@ def test_without_qemu_it_is_skipped_with_the_line_that_installs_it(tmp_path: Pat
     assert done.stdout.startswith("SKIPPED: no qemu-aarch64")
     assert "apt-get install qemu-user" in done.stdout
     assert not (tmp_path / "arm").exists()
+
+
+def test_signed_activations_give_the_same_outputs(tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx")
+    import onnxruntime
+    from arm.instructions import write_signed
+
+    shipped, signed = model_path("pointseg:int8"), tmp_path / "signed.onnx"
+    write_signed(shipped, signed)
+    kinds = [{w.data_type for w in onnx.load(str(file)).graph.initializer} for file in (shipped, signed)]
+    assert kinds[0] - kinds[1] == {onnx.TensorProto.UINT8}
+    sessions = [
+        onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"]) for file in (shipped, signed)
+    ]
+    given = {each.name: golden_input(0, tuple(each.shape)) for each in sessions[0].get_inputs()}
+    one, other = (session.run(None, given)[0] for session in sessions)
+    assert one.std() > 0.1
+    # Kernels of the two kinds round otherwise: 0.03 here.
+    assert np.quantile(np.abs(one - other), 0.99) < 0.1 * one.std()

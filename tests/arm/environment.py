@@ -119,11 +119,11 @@ class Environment:
             if target.name != "__pycache__":
                 (self._package / name).symlink_to(target)
 
-    def run(self, cpu: str, arguments: Sequence[str]) -> int:
-        """Run Python on an emulated processor with these arguments, in the folder; return its exit code."""
+    def run(self, cpu: str, arguments: Sequence[str], options: Sequence[str] = ()) -> int:
+        """Run Python on an emulated processor, in the folder, with options of qemu; return the exit code."""
         (self._root / "proc/cpuinfo").write_text(cpuinfo(cpu))
         interpreter = self._root / f"usr/bin/python{self.python}"
-        command = ["qemu-aarch64", "-cpu", cpu, "-L", str(self._root), str(interpreter), *arguments]
+        command = ["qemu-aarch64", *options, "-cpu", cpu, "-L", str(self._root), str(interpreter), *arguments]
         return subprocess.run(command, cwd=self.folder, env=self._variables()).returncode
 
     def _variables(self) -> dict[str, str]:
