@@ -8,6 +8,7 @@ import os
 import threading
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
@@ -355,6 +356,9 @@ class Perceiver:
         # Each on its part of the cores, both networks take less time than one after the other on all cores, because the
         # steps around them use one core only: 10.2 in place of 13.3 ms on two cores.
         self._at_once = at_once == 2 and all(n.session.shares_cores for n in self._networks)
+        # Of a full turn, the top view's thread takes sectors when it is done with the top view.
+        ranged = self._network_of(RangeImageGeometry)
+        self._aside = self._load(ranged.session.second()) if full_turn and self._at_once and ranged else None
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
         self._locks = {os.getpid(): threading.Lock()}
         # Compile every kernel here, not in the first call, with an image of one pixel and a scan of two points. The
@@ -552,8 +556,11 @@ class Perceiver:
             ground = self._find_ground(scan)
             watch.lap("cluster")
             if ranged is not None:
-                label = self._label_full_turn if self.full_turn else self._label_sector
-                points = label(ranged, scan, None if ground is None else ground.height_m, watch, infer)
+                height_m = None if ground is None else ground.height_m
+                if self.full_turn:
+                    points = self._label_full_turn(ranged, scan, height_m, watch, infer, beside)
+                else:
+                    points = self._label_sector(ranged, scan, height_m, watch, infer)
         finally:
             if beside is not None:
                 top_view, boxes = beside()
@@ -668,19 +675,45 @@ class Perceiver:
         height_m: NDArray[np.float32] | None,
         watch: _Stopwatch,
         infer: bool,
+        beside: Callable[[], object] | None,
     ) -> PointLabels:
-        """Run the network once for each sector, on a turned scan; a point in two sectors keeps its first label."""
+        """Run the network once for each sector, on a turned scan; a point in two sectors keeps its first label.
+
+        Once ``beside`` has returned, a second thread takes sectors, too.
+        """
         view = network.session.card.view
         assert isinstance(view, RangeImageGeometry)
         width_deg = view.azimuth_left_deg - view.azimuth_right_deg
-        ahead = self._label_sector(network, scan, height_m, watch, infer)
-        labels, in_view = ahead.labels, ahead.in_view
-        for k in range(1, math.ceil(360.0 / width_deg)):
-            # What float32 cannot hold after the turn is not in view.
-            aside = self._label_sector(network, turned(scan, math.radians(k * width_deg)), height_m, watch, infer)
-            labels = np.where(in_view, labels, aside.labels)
-            in_view = in_view | aside.in_view
-        return PointLabels(labels, in_view, ahead.classes)
+        left = deque(range(math.ceil(360.0 / width_deg)))
+        sectors: dict[int, PointLabels] = {}
+
+        def label_sectors(by: _Network, watch: _Stopwatch) -> None:
+            while True:
+                try:
+                    k = left.popleft()
+                except IndexError:  # none is left
+                    return
+                # What float32 cannot hold after the turn is not in view.
+                seen = turned(scan, math.radians(k * width_deg)) if k else scan
+                sectors[k] = self._label_sector(by, seen, height_m, watch, infer)
+
+        def help_out(by: _Network, beside: Callable[[], object]) -> None:
+            beside()
+            label_sectors(by, _Stopwatch())
+
+        helper = None if beside is None or self._aside is None else _beside(partial(help_out, self._aside, beside))
+        try:
+            label_sectors(network, watch)
+        finally:
+            left.clear()
+            if helper is not None:
+                helper()
+                watch.lap("infer")
+        labels, in_view = sectors[0].labels, sectors[0].in_view
+        for k in range(1, len(sectors)):
+            labels = np.where(in_view, labels, sectors[k].labels)
+            in_view = in_view | sectors[k].in_view
+        return PointLabels(labels, in_view, sectors[0].classes)
 
     def _warm_up_objects(self) -> tuple[NDArray[np.float32], PointLabels]:
         """Nine points of a car and a person on a floor: enough to compile every kernel of `_combine`."""

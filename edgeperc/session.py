@@ -527,6 +527,17 @@ class Session:
             self._running_in = 0
         return self.outputs
 
+    def second(self) -> Session:
+        """The same network with buffers of its own: two threads may run both sessions at the same time.
+
+        Only for the CPU provider, which runs one graph in several threads.
+        """
+        twin = object.__new__(Session)
+        vars(twin).update(vars(self))
+        with _terminated(_onnxruntime(), None) as run_options:
+            twin._bind(run_options)
+        return twin
+
     def spread(self) -> None:
         """Write the values of blocks in `raw` to their pixels in `outputs`; `run` does so."""
         for output in self.card.outputs:

@@ -8,6 +8,7 @@ import threading
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +156,45 @@ def test_a_network_that_fails_beside_another_ends_the_call(
         with pytest.raises(InferenceError, match="no memory left"):
             both(scan.points)
     assert_same(perception, both(scan.points))
+
+
+@pytest.mark.parametrize("failing", ["aside", "top view", "sectors", None])
+def test_two_threads_share_the_sectors_of_a_full_turn(
+    monkeypatch: pytest.MonkeyPatch, scan: SimulatedScan, failing: str | None
+) -> None:
+    options: dict[str, Any] = {"provider": "cpu", "on_mismatch": "ignore", "full_turn": True}
+    alone = Perceiver(["ssadnet", "pointseg"], n_threads=1, **options)
+    monkeypatch.setattr(session, "usable_cores", lambda: 2)
+    both = Perceiver(["ssadnet", "pointseg"], **options)
+    assert alone._aside is None
+    assert both._aside is not None
+    top, ranged = both.sessions
+    of = {"aside": both._aside.session, "top view": top, "sectors": ranged}
+    runs = dict.fromkeys(of, 0)
+
+    def run(name: str, run: Callable[[], object]) -> object:
+        runs[name] += 1
+        if name == "aside":
+            taken.set()
+        elif name == "sectors" and failing in ("aside", None):
+            taken.wait(60.0)  # until the other thread has a sector, too
+        if name == failing:
+            raise InferenceError("no memory left")
+        return run()
+
+    taken = threading.Event()
+    with monkeypatch.context() as counted:
+        for name, each in of.items():
+            counted.setattr(each, "run", partial(run, name, each.run))
+        if failing is None:
+            assert_same(alone(scan.points), both(scan.points))
+            assert runs["top view"] == 1
+            assert min(runs["aside"], runs["sectors"]) >= 1
+            assert runs["aside"] + runs["sectors"] == 4
+        else:
+            with pytest.raises(InferenceError, match="no memory left"):
+                both(scan.points)
+    assert_same(alone(scan.points), both(scan.points))
 
 
 def test_result_does_not_depend_on_earlier_scans(perceive: Perceiver, perception: Perception) -> None:
