@@ -38,7 +38,7 @@ from .voting import (
     fill_votes,
 )
 
-__all__ = ["RULES", "agree_on_boxes", "agree_on_cells", "agree_on_points", "find_voters"]
+__all__ = ["RULES", "agree_on_boxes", "agree_on_cells", "agree_on_points", "find_support", "find_voters"]
 
 RULES = frozenset({"column", "share", "height", "fill", "support", "ground", "boxes", "road"})
 """Names of the rules, for ablations.
@@ -78,6 +78,8 @@ N_BINS = 64
 N_FOOTPRINTS = 1024
 _NO_BOX = 255
 
+Support = tuple[NDArray[np.float32], NDArray[np.uint8]]
+
 
 def find_voters(
     points: NDArray[np.float32],
@@ -87,12 +89,13 @@ def find_voters(
     *,
     distance_per_m: float = 0.015,
     rules: Collection[str] = RULES,
+    support: Support | None = None,
 ) -> NDArray[np.int32]:
     """Find the clusters above the ground that hold labeled points, as far as it matters for `agree_on_points`.
 
     Parameters
     ----------
-    points, labels, ground, boxes, rules
+    points, labels, ground, boxes, rules, support
         As in `agree_on_points`.
     distance_per_m : float
         As in `edgeperc.cluster.find_clusters`.
@@ -113,7 +116,7 @@ def find_voters(
     _check(points, labels, ground)
     roles = _roles(labels.classes)
     in_view = read_only(labels.in_view, np.bool_)
-    scores, _ = _supported(points, labels, ground, boxes if "support" in rules else ())
+    scores, _ = support or find_support(points, labels, ground, boxes, rules=rules)
     votes = np.empty(len(points), np.uint8)
     fill_votes(in_view, read_only(labels.labels, np.uint8), roles, scores, votes)
     # A share of exactly the limit is enough. Labels that are neither vehicles nor persons are never lost.
@@ -138,6 +141,7 @@ def agree_on_points(
     boxes: Sequence[Box] = (),
     *,
     rules: Collection[str] = RULES,
+    support: Support | None = None,
 ) -> PointLabels:
     """Correct the labels of points by clusters, ground and boxes.
 
@@ -155,6 +159,8 @@ def agree_on_points(
         From a top-view model, with scores from 0.3.
     rules : collection of str
         Of `RULES`; others are left out.
+    support : tuple of two arrays, optional
+        From `find_support` with the same arguments, so that it is found once.
 
     Returns
     -------
@@ -193,8 +199,7 @@ def agree_on_points(
     bounds = np.empty((n, 5), np.float32)
     fill_tallies(rows, height, in_view, read_only(agreed, np.uint8), of, counts, bounds)
     verdicts = _verdicts(labels.classes, counts, bounds, rules)
-    support = boxes if "support" in rules else ()
-    scores, names = _supported(points, labels, ground, support)
+    scores, names = support or find_support(points, labels, ground, boxes, rules=rules)
     apply_verdicts(in_view, of, verdicts, roles, scores, names, agreed)
     if "ground" in rules:
         clear_ground(rows, height, on_ground, roles, agreed)
@@ -364,15 +369,36 @@ def _as_rows(boxes: Sequence[Box]) -> NDArray[np.float64]:
     return np.array(rows, np.float64).reshape(-1, 8)
 
 
-def _supported(
-    points: NDArray[np.float32], labels: PointLabels, ground: Ground, boxes: Sequence[Box]
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """For each point in view, the best score of a vehicle's box around it (0 for none), and the class of that box.
+def find_support(
+    points: NDArray[np.float32],
+    labels: PointLabels,
+    ground: Ground,
+    boxes: Sequence[Box],
+    *,
+    rules: Collection[str] = RULES,
+) -> Support:
+    """The best score of a vehicle's box around each point.
 
-    Boxes that the labels contradict (`MIN_BOX_SHARE`) do not count.
+    Parameters
+    ----------
+    points, labels, ground, boxes, rules
+        As in `agree_on_points`. Boxes that the labels contradict (`MIN_BOX_SHARE`) do not count.
+
+    Returns
+    -------
+    scores : (n,) float32
+        0 for points in no box, out of view or on the ground.
+    names : (n,) uint8
+        Class of that box; 0 in no box.
+
+    Raises
+    ------
+    PointsError
+        Arrays disagree in shape, or a label is not in the classes.
     """
+    _check(points, labels, ground)
     known = {name: labels.classes.index(name) for name in VEHICLES if name in labels.classes}
-    usable = [box for box in boxes if box.label in VEHICLES] if "car" in known else []
+    usable = [box for box in boxes if box.label in VEHICLES] if "car" in known and "support" in rules else []
     scores = np.empty(len(points), np.float32)
     names = np.empty(len(points), np.uint8)
     fill_support(

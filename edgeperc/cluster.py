@@ -201,7 +201,16 @@ def cluster_labels(
         raise PointsError(
             f"got labels of shape {labels.shape} for clusters of shape {clusters.shape}; expected the same"
         )
-    order, starts = _grouped(clusters)
+    return _labels_of_groups(*_grouped(clusters), labels, min_share, part_of)
+
+
+def _labels_of_groups(
+    order: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    labels: NDArray[np.uint8],
+    min_share: float,
+    part_of: Mapping[int, int],
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     classes = np.empty(len(starts) - 1, np.uint8)
     shares = np.empty(len(starts) - 1)
     parts = np.array([*part_of.items()], np.int64).reshape(-1, 2)
@@ -374,8 +383,10 @@ def objects_from_points(
         )
     number = {name: k for k, name in enumerate(classes)}
     part_of = {number[part]: number[whole] for part, whole in PART_OF.items() if part in number and whole in number}
-    found, shares = cluster_labels(clusters, labels, min_share=min_share, part_of=part_of)
+    if clusters.shape != labels.shape:
+        raise PointsError(f"got clusters of shape {clusters.shape} for {len(points)} points; expected one a point")
     order, starts = _grouped(clusters)
+    found, shares = _labels_of_groups(order, starts, labels, min_share, part_of)
     sizes = np.diff(starts)
     highest = np.where(
         (found > 0) & (sizes >= min_points), shares * sizes / (sizes + EVIDENCE), -math.inf

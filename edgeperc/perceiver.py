@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .adapt import Interpolator, condition, render
-from .agreement import RULES, agree_on_boxes, agree_on_cells, agree_on_points, find_voters
+from .agreement import RULES, agree_on_boxes, agree_on_cells, agree_on_points, find_support, find_voters
 from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, join_boxes, objects_from_points
 from .decode import decode_labels, decode_top_view
@@ -747,9 +747,11 @@ class Perceiver:
         clusters = None
         dropped: list[Box] = []
         if points is not None and self._rules:
-            clusters = find_voters(scan, points, ground, boxes, distance_per_m=self._distance_per_m, rules=self._rules)
+            rules, by_angle = self._rules, self._distance_per_m
+            held = find_support(scan, points, ground, boxes, rules=rules)
+            clusters = find_voters(scan, points, ground, boxes, distance_per_m=by_angle, rules=rules, support=held)
             watch.lap("cluster")
-            points = agree_on_points(scan, points, ground, clusters, boxes, rules=self._rules)
+            points = agree_on_points(scan, points, ground, clusters, boxes, rules=rules, support=held)
             kept = agree_on_boxes(boxes, scan, points, ground, rules=self._rules)
             dropped = [box for box in boxes if box not in kept]
             boxes = kept

@@ -24,6 +24,7 @@ from edgeperc.agreement import (
     clear_road,
     count_inside,
     fill_support,
+    find_support,
     find_voters,
 )
 from edgeperc.card import TopViewGeometry
@@ -229,6 +230,10 @@ def test_voters_give_the_results_of_complete_clusters(seed: int, rules: frozense
     voters = find_voters(points, labels, ground, boxes, rules=rules)
     expected = agree_on_points(points, labels, ground, complete, boxes, rules=rules)
     agreed = agree_on_points(points, labels, ground, voters, boxes, rules=rules)
+    support = find_support(points, labels, ground, boxes, rules=rules)
+    np.testing.assert_array_equal(find_voters(points, labels, ground, boxes, rules=rules, support=support), voters)
+    again = agree_on_points(points, labels, ground, voters, boxes, rules=rules, support=support)
+    np.testing.assert_array_equal(again.labels, agreed.labels)
     np.testing.assert_array_equal(agreed.labels, expected.labels)
     found = [
         objects_from_points(points, agreed.labels, CLASSES, height_m=ground.height_m, clusters=clusters)
