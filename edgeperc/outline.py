@@ -440,7 +440,7 @@ def merge_corners(
     -----
     Between the neighbors a and d, the corner p replaces b and c. What changes sides lies in the triangles pab, pbc and
     pcd. No cell that they touch may be fixed, and of all such p, that with the smallest sum of their areas is taken.
-    The new edges may meet no other edge, so the ring stays valid.
+    The new edges may meet no other edge, so the ring stays valid. Holes stay inside if none of their cells may change.
     """
     n, height, width = ring.shape[0], fixed.shape[0], fixed.shape[1] - 1
     tried = np.zeros(n, np.int64)  # the limit at which a corner and the next one were tried in vain
