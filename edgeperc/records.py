@@ -61,6 +61,7 @@ def _road_record(perception: Perception) -> dict[str, Any] | None:
     widths = {"free_ahead_m": road.free_ahead_m(), "lane_width_m": road.lane_width_m}
     return {
         "outline": [[round(float(v), 2) for v in corner] for corner in road.outline],
+        "tolerance_m": round(road.tolerance_m, 2) if math.isfinite(road.tolerance_m) else None,
         **{name: None if math.isnan(value) else round(value, 2) for name, value in widths.items()},
     }
 
