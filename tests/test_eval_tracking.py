@@ -154,7 +154,8 @@ def made_up_street(root: Path) -> None:
 def test_a_made_up_street_has_the_figures_of_ab3dmots_program(tmp_path: Path) -> None:
     """The numbers come from a run of scripts/KITTI/evaluate.py of xinshuoweng/AB3DMOT, commit 6a7fff5, Python 3.11.
 
-    The run had the program's text without plots and messages. It read the same labels, and the tracks of AB3DMOT's method in its result format, at 3-D IoU 0.25.
+    The run had the program's text without plots and messages. It read the same labels, and the tracks of AB3DMOT's
+    method in its result format, at 3-D IoU 0.25.
     """
     made_up_street(tmp_path)
     figures = evaluate_kitti(tmp_path, rules="ab3dmot", rival=True)["rival"]
