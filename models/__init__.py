@@ -83,21 +83,27 @@ class Variant:
         return f"{self.name}:{self.precision}"
 
 
-def listed() -> tuple[Variant, ...]:
+def listed(network: str = "") -> tuple[Variant, ...]:
     """Every model file in this installation, by name, fp32 before int8.
+
+    Parameters
+    ----------
+    network : str, optional
+        Read only files whose name begins so.
 
     Raises
     ------
     CardError, ModelFileError
         A model file is damaged.
     """
-    paths = [Path(str(entry)) for entry in resources.files(__name__).iterdir() if entry.name.endswith(".onnx")]
+    names = (str(entry) for entry in resources.files(__name__).iterdir() if entry.name.endswith(".onnx"))
+    paths = [path for path in map(Path, names) if path.name.startswith(network)]
     return tuple(sorted((Variant(path, _card(path, path.stat().st_mtime_ns)) for path in paths), key=str))
 
 
 @functools.cache
 def _card(path: Path, changed_ns: int) -> ModelCard:
-    """The card of a file, read once as long as the file does not change: every model's name asks for all cards."""
+    """The card of a file, read once as long as the file does not change."""
     return ModelCard.read(path)
 
 
@@ -131,7 +137,7 @@ def resolve(model: str | os.PathLike[str]) -> tuple[Variant, ...]:
         path = Path(model)
         return (Variant(path, ModelCard.read(path)),)
     name, _, precision = model.partition(":")
-    of_name = tuple(variant for variant in listed() if variant.name == name)
+    of_name = tuple(variant for variant in listed(name) if variant.name == name)
     if not of_name:
         raise ModelFileError(_unknown(name))
     chosen = tuple(variant for variant in of_name if precision in ("", variant.precision))

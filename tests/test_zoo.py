@@ -35,6 +35,7 @@ def test_every_name_has_one_file_per_variant() -> None:
         assert resolve(str(variant)) == (variant,)
         assert resolve(variant.path) == resolve(str(variant.path)) == (variant,)
         assert model_path(str(variant)) == variant.path
+        assert variant in listed(variant.name)  # by which a name is found without reading every card
 
 
 def test_name_gives_its_variants_fp32_first() -> None:
