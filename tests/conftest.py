@@ -79,8 +79,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_testnodedown(node: Any) -> None:
-    """Of pytest-xdist: what a worker process called."""
-    node.config.stash.setdefault(CALLED, set()).update(node.workeroutput.get("called", ()))
+    """Of pytest-xdist: what a worker process called. One that died has no output; pytest-xdist names its test."""
+    node.config.stash.setdefault(CALLED, set()).update(getattr(node, "workeroutput", {}).get("called", ()))
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

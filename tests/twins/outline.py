@@ -16,12 +16,13 @@ def grown(cells, radius):
 
 def without_contacts(cells, addable):
     """Twin of `edgeperc.outline.resolve_contacts`, in the same order."""
-    cells, addable, before = cells.copy(), addable.copy(), None
-    while before is None or (cells != before).any():
-        before = cells.copy()
+    cells, addable, changed = cells.copy(), addable.copy(), True
+    while changed:  # a cell may be added and removed again in one pass
+        changed = False
         for row, col in np.ndindex(len(cells) - 1, cells.shape[1] - 1):
             square, may = cells[row : row + 2, col : col + 2], addable[row : row + 2, col : col + 2]
             if square.sum() == 2 and square[0, 0] == square[1, 1]:
+                changed = True
                 between = [cell for cell in ((1, 0), (1, 1), (0, 0), (0, 1)) if may[cell] and not square[cell]]
                 if between:
                     square[between[0]] = True
