@@ -195,8 +195,11 @@ def mutated_document(document: Any, case: Case, most: int = 3) -> Any:
         elif way == 9 and isinstance(holder, dict):
             holder[case.pick(["", "x", key + " ", "schema", "golden"])] = copy.deepcopy(holder[key])
         elif way == 10:
-            for _ in range(int(rng.choice([1, 40, 400]))):
+            depth = int(rng.choice([1, 40, 400]))
+            for _ in range(depth):
                 holder[key] = [holder[key]]
+            if depth == 400:  # no more mutations: Python could not copy what is nested twice as deep
+                break
         else:
             other, name = case.pick(places)
             holder[key] = copy.deepcopy(other[name]) if len(json.dumps(other[name], default=str)) < 10**5 else None
