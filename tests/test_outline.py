@@ -44,6 +44,13 @@ def streets(draw: st.DrawFn, most: int = 40) -> NDArray[np.bool_]:
     return cells ^ (random.random(shape) < draw(st.sampled_from([0.0, 0.02, 0.1])))
 
 
+def traced(cells: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], list[NDArray[np.int64]]]:
+    """The nearest part of padded cells, and its rings."""
+    grid = np.pad(cells, 1)
+    part = _without_gaps(grid, np.zeros_like(grid), (0.0, 0.0), ~np.zeros_like(grid))
+    return part, _rings(part)
+
+
 # --- kernels against their twins -------------------------------------------------------------------------------------
 
 
@@ -102,9 +109,7 @@ def test_rings_trace_every_side_once_with_the_cells_on_the_left(cells: NDArray[n
 @settings(max_examples=40)
 @given(streets(14), st.data())
 def test_corners_are_removed_as_by_the_twin(cells: NDArray[np.bool_], data: st.DataObject) -> None:
-    grid = np.pad(cells, 1)
-    part = _without_gaps(grid, np.zeros_like(grid), (0.0, 0.0), ~np.zeros_like(grid))
-    rings = _rings(part)
+    part, rings = traced(cells)
     if not rings:
         return
     random = np.random.default_rng(data.draw(st.integers(0, 99)))
@@ -141,13 +146,11 @@ def test_edges_that_meet(ends: tuple[tuple[int, int], ...]) -> None:
 @settings(max_examples=40)
 @given(streets(14), st.data())
 def test_corners_are_merged_as_by_the_twin(cells: NDArray[np.bool_], data: st.DataObject) -> None:
-    grid = np.pad(cells, 1)
-    part = _without_gaps(grid, np.zeros_like(grid), (0.0, 0.0), ~np.zeros_like(grid))
-    rings = _rings(part)
+    part, rings = traced(cells)
     if not rings:
         return
     random = np.random.default_rng(data.draw(st.integers(0, 99)))
-    changeable = random.random(grid.shape) < data.draw(st.sampled_from([0.0, 0.7, 0.9, 1.0]))
+    changeable = random.random(part.shape) < data.draw(st.sampled_from([0.0, 0.7, 0.9, 1.0]))
     changeable &= part | ~_filled(part)  # otherwise a hole may come outside
     around, enough = data.draw(st.integers(0, 4)), data.draw(st.integers(0, 12))
     outer, *holes = sorted(rings, key=lambda ring: -Polygon(ring).area)
