@@ -43,7 +43,7 @@ __all__ = ["LIMIT_MB", "LIMIT_S", "Captures", "make"]
 
 LIMIT_S, LIMIT_MB = 65.0, 2700.0  # 60 s and 2 GiB of data for the process that decodes
 END_TO_END_EVERY = 200
-FORKED_LIMIT_S = 0.5  # in place of 60 s: some damaged .osf files never end in the library
+FORKED_LIMIT_S = 0.2  # in place of 60 s: some damaged .osf files never end in the library
 MOST_SCANS = 20
 REAL_SHARE, FILE_SHARE = 0.1, 0.2
 

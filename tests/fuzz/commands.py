@@ -1,22 +1,26 @@
-"""The command line: hostile names of files, values of options and contents, in a process forked for each case.
+"""The command line: hostile names of files, values of options and contents, in a process forked from this one.
 
-Allowed is a documented exit code with at most one line for each error; a traceback is a failure. Every 20th case starts
-a process of its own, as a shell does.
+Allowed is a documented exit code with at most one line for each error; a traceback is a failure. A forked process runs
+up to 100 commands, because a fork takes longer than most of them. They share the parser and the session of a model, and
+captures are decoded in a process forked from theirs. Every 1000th case starts a process as a shell does, and shares
+nothing.
 """
 
 from __future__ import annotations
 
+import functools
 import io
+import json
 import os
 import re
+import select
+import signal
 import subprocess
 import sys
-import time
 import traceback
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from importlib import import_module
-from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 from unittest import mock
 
 import numpy as np
@@ -24,11 +28,14 @@ import numpy as np
 import edgeperc.perceiver as perceiver_module
 from edgeperc import Perceiver
 from edgeperc.cli import main
+from edgeperc.readers import apart
 from edgeperc.sensor import SENSORS
+from edgeperc.session import Session
 
 from .arrays import base_scan
+from .captures import LIBRARIES, Forked
 from .mutate import mutated_bytes, mutated_json, noise
-from .running import Case, check
+from .running import Case, check, peak_mb, reset_peak
 from .scans import MadeUp, cards
 from .tiny import GRAPH, model
 
@@ -36,7 +43,14 @@ __all__ = ["LIMIT_MB", "LIMIT_S", "Commands", "make"]
 
 LIMIT_S, LIMIT_MB = 30.0, 2500.0
 CODES = {0, 1, 2, 130, 141, 143}
-NEW_PROCESS_EVERY = 20
+MODEL = "lodnn:int8"
+SHARES = {
+    "run": 50, "info": 30, "sensors": 20, "models": 20, "eval-tracking": 10, "fit-sensor": 10, "demo": 1, "": 10,
+    "--x": 10,
+}  # fmt: skip
+COMMANDS = [command for command, share in SHARES.items() for _ in range(share)]
+NEW_PROCESS_EVERY = 1000
+COMMANDS_OF_A_FORK = 100
 
 NAMES = [
     "scan.bin", "a b.bin", "-x.bin", "--json", "$(id).bin", ";ls.bin", "\n.bin", "\x1b[31m.bin", "ä☃.bin", "..bin",
@@ -66,6 +80,7 @@ class Commands:
     """The kind ``commands``."""
 
     name, limit_s, limit_mb = "commands", LIMIT_S, LIMIT_MB
+    process: Server | None = None
 
     def run(self, case: Case) -> str:
         files = [self.file(case) for _ in range(int(case.rng.integers(1, 3)))]
@@ -80,9 +95,7 @@ class Commands:
         check("Traceback" not in text, f"a traceback: {text[-1500:]}")
         check(code in CODES, f"exit code {code}: {text[-500:]}")
         check("\x1b" not in text, "an escape sequence is printed as it came")
-        return f"{arguments[0][:20] if arguments and arguments[0] in self.known else 'other'}: exit {code}"
-
-    known = ("run", "info", "sensors", "models", "demo", "eval-tracking", "fit-sensor")
+        return f"{arguments[0][:20] if arguments and arguments[0] in SHARES else 'other'}: exit {code}"
 
     def file(self, case: Case) -> str:
         """A file with such a name: a scan, a model, a profile, noise; or a folder, a pipe, nothing."""
@@ -109,12 +122,12 @@ class Commands:
         return str(path)
 
     def arguments(self, case: Case, files: list[str]) -> list[str]:
-        command = case.pick(["run", "run", "run", "run", "info", "info", "sensors", "models", *self.known, "", "--x"])
+        command = case.pick(COMMANDS)
         given = [command]
         if case.chance(0.9):
             given += files
         if command == "run" and case.chance(0.9):
-            given += ["--model", "lodnn:int8", "--provider", "cpu", *(["--anyway"] if case.chance(0.7) else [])]
+            given += ["--model", MODEL, "--provider", "cpu", *(["--anyway"] if case.chance(0.7) else [])]
         most = 4 if command == "run" or case.chance(0.1) else 1
         for _ in range(int(case.rng.integers(0, most))):
             option = case.pick(OPTIONS)
@@ -129,25 +142,21 @@ class Commands:
         return given
 
     def forked(self, case: Case, arguments: list[str]) -> tuple[int, str]:
-        output = case.folder.parent / f"{case.folder.name}.txt"
-        pid = os.fork()
-        if pid == 0:
-            _be_command(arguments, case.folder, output)
-        end = time.monotonic() + LIMIT_S - 5.0
-        status = 0
-        while True:
-            done, status, usage = os.wait4(pid, os.WNOHANG)
-            if done:
-                case.peak_mb = usage.ru_maxrss / 1e3
-                break
-            if time.monotonic() > end:
-                os.kill(pid, 9)
-                os.waitpid(pid, 0)
-                check(False, f"does not end: {arguments}")
-            time.sleep(0.002)
-        text = output.read_text("utf-8", "replace") if output.exists() else ""
-        output.unlink(missing_ok=True)
-        return os.waitstatus_to_exitcode(status), text
+        if self.process is None:
+            self.process = Server()
+        process = self.process
+        process.requests.write(json.dumps([arguments, str(case.folder)]).encode() + b"\n")
+        process.requests.flush()
+        ready, _, _ = select.select([process.replies], [], [], LIMIT_S - 5.0)
+        reply = process.replies.readline() if ready else b""
+        process.n_commands += 1
+        if not reply or process.n_commands == COMMANDS_OF_A_FORK:
+            code, self.process = process.end(), None
+            check(ready, f"does not end: {arguments}")
+            if not reply:
+                return code, ""
+        code, text, case.peak_mb = json.loads(reply)
+        return code, text
 
     def in_new_process(self, case: Case, arguments: list[str]) -> tuple[int, str]:
         try:
@@ -162,25 +171,59 @@ class Commands:
         return done.returncode, (done.stdout + done.stderr).decode("utf-8", "replace")
 
 
-def _be_command(arguments: list[str], folder: Path, output: Path) -> None:
-    """Run the command in this process and end it."""
-    code: Any = 99
-    text = io.StringIO()
+class Server:
+    """A process forked from this one, which runs commands."""
+
+    def __init__(self) -> None:
+        requests, self_out = os.pipe()
+        self_in, replies = os.pipe()
+        self.n_commands = 0
+        self.pid = os.fork()
+        if self.pid == 0:
+            os.close(self_in)
+            os.close(self_out)
+            _serve(requests, replies)
+        os.close(requests)
+        os.close(replies)
+        self.requests, self.replies = os.fdopen(self_out, "wb"), os.fdopen(self_in, "rb")
+
+    def end(self) -> int:
+        """Kill the process, unless it has ended by itself; its exit code."""
+        self.replies.close()
+        with suppress(BrokenPipeError):
+            self.requests.close()
+        os.kill(self.pid, signal.SIGKILL)
+        return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+
+
+def _serve(requests: int, replies: int) -> NoReturn:
+    """Run the commands that are asked for, until there are no more."""
     try:
-        os.chdir(folder)
         null = os.open(os.devnull, os.O_RDWR)
         for descriptor in range(3):
             os.dup2(null, descriptor)
-        with redirect_stdout(text), redirect_stderr(text):
-            try:
-                code = main(arguments)
-            except SystemExit as exc:
-                code = exc.code if isinstance(exc.code, int) else 0 if exc.code is None else 2
-            except BaseException:
-                text.write(traceback.format_exc())
-        output.write_bytes(re.sub(r"\s+$", "", text.getvalue()).encode("utf-8", "replace"))
+        with os.fdopen(requests, "rb") as lines, os.fdopen(replies, "wb", 0) as out:
+            for line in lines:
+                arguments, folder = json.loads(line)
+                os.chdir(folder)
+                reset_peak()
+                code, text = _run(arguments)
+                out.write(json.dumps([code, text, peak_mb()]).encode() + b"\n")
     finally:
-        os._exit(code & 0xFF if isinstance(code, int) else 98)
+        os._exit(98)
+
+
+def _run(arguments: list[str]) -> tuple[int, str]:
+    text = io.StringIO()
+    code: Any = 99
+    with redirect_stdout(text), redirect_stderr(text):
+        try:
+            code = main(arguments)
+        except SystemExit as exc:
+            code = exc.code if isinstance(exc.code, int) else 0 if exc.code is None else 2
+        except BaseException:
+            text.write(traceback.format_exc())
+    return code, re.sub(r"\s+$", "", text.getvalue())
 
 
 # Imported before the processes are forked, which would each spend 0.1 s on them.
@@ -191,11 +234,21 @@ IMPORTED = (
 
 
 def make(seed: int) -> Commands:
-    for name in IMPORTED:
+    for name in (*IMPORTED, *LIBRARIES):
         import_module(name)
     # The kernels are compiled once, not in each process; a network's threads would not survive the fork.
     for each in cards()[:8:5]:
         made_up = [MadeUp(card) for card in each]
         with mock.patch.object(perceiver_module, "Session", side_effect=made_up):
             Perceiver([card.name for card in each], on_mismatch="ignore")(np.zeros((3, 4), np.float32))
+    made_once = functools.cache(Session)
+
+    def session(model: str, *arguments: Any, **options: Any) -> Session:
+        return (made_once if model == MODEL else Session)(model, *arguments, **options)
+
+    # For the rest of this process: a parser takes 4 ms, a session 25 ms, a process that decodes captures 0.2 s.
+    main_module = import_module("edgeperc.cli.main")  # the package's name `main` is the function
+    mock.patch.object(main_module, "build_parser", functools.cache(main_module.build_parser)).start()
+    mock.patch.object(perceiver_module, "Session", session).start()
+    mock.patch.object(apart, "_start", Forked).start()
     return Commands()

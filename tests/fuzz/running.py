@@ -31,7 +31,10 @@ import numpy as np
 from edgeperc.atomic import write_atomic
 from edgeperc.errors import EdgepercError
 
-__all__ = ["Case", "Failure", "Kind", "State", "attempt", "check", "run_job", "summary_of", "supervise"]
+__all__ = [
+    "Case", "Failure", "Kind", "State", "attempt", "check", "peak_mb", "reset_peak", "run_job", "summary_of",
+    "supervise",
+]  # fmt: skip
 
 HANG_FACTOR = 6.0  # a case that takes this many times the limit is stopped from outside
 MAX_FAILURES = 200  # kept in a state file; all are counted
@@ -114,7 +117,7 @@ class State:
             self.failures.append(dict(record))
 
 
-def _reset_peak() -> None:
+def reset_peak() -> None:
     """Let the peak of this process's memory begin anew (Linux)."""
     try:
         with open("/proc/self/clear_refs", "w") as file:  # noqa: PTH123 - a thousand times a second
@@ -123,7 +126,7 @@ def _reset_peak() -> None:
         pass
 
 
-def _peak_mb() -> float:
+def peak_mb() -> float:
     status = Path("/proc/self/status")
     if status.exists():  # getrusage's peak is also that of the process which started this one, and cannot be reset
         line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
@@ -153,7 +156,7 @@ def attempt(kind: Kind, case: Case) -> tuple[str, dict[str, Any] | None, float, 
     mb : float
         Highest resident memory.
     """
-    _reset_peak()
+    reset_peak()
     start = time.perf_counter() - _waited_s()
     failure: dict[str, Any] | None = None
     try:
@@ -172,7 +175,7 @@ def attempt(kind: Kind, case: Case) -> tuple[str, dict[str, Any] | None, float, 
             "where": " < ".join(f"{Path(f.filename).name}:{f.lineno}" for f in reversed(frames[-6:])),
             "traceback": traceback.format_exc()[-4000:],
         }
-    seconds, mb = time.perf_counter() - _waited_s() - start, max(_peak_mb(), case.peak_mb)
+    seconds, mb = time.perf_counter() - _waited_s() - start, max(peak_mb(), case.peak_mb)
     if failure is None and seconds > kind.limit_s:
         failure = {"error": f"took {seconds:.1f} s; the limit is {kind.limit_s:g} s", "where": "", "traceback": ""}
     if failure is None and mb > kind.limit_mb:
