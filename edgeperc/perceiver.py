@@ -303,8 +303,8 @@ class Perceiver:
         _check_choice("agree", agree, (True, False))
         if score_threshold is not None and not (isinstance(score_threshold, Real) and 0.0 <= score_threshold <= 1.0):
             raise OptionError(f"score_threshold is {score_threshold!r}; expected a number in 0..1, or None")
-        if n_threads is not None and not (isinstance(n_threads, Integral) and n_threads >= 1):
-            raise OptionError(f"n_threads is {n_threads!r}; expected a whole number of at least 1, or None")
+        if not (n_threads is None or isinstance(n_threads, Integral)):
+            raise OptionError(f"n_threads is {n_threads!r}; expected a whole number, or None")
         for option, given in (("provider", provider), ("precision", precision)):
             if not isinstance(given, str):
                 raise OptionError(f"{option} is {given!r}; expected a str")

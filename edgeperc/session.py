@@ -36,7 +36,7 @@ from .errors import (
 from .extras import require, without_telemetry
 from .onnx_file import check_graph, read_model
 from .printable import printable
-from .tuning import compiled_folder, cpu_features, fingerprint, read_setting, settings_path, usable_cores
+from .tuning import MAX_THREADS, compiled_folder, cpu_features, fingerprint, read_setting, settings_path, usable_cores
 from .zoo import Variant, choose, digest, resolve
 
 __all__ = ["PRECISIONS", "PROVIDERS", "Session", "available_providers", "devices", "golden_input", "runtime_version"]
@@ -186,7 +186,7 @@ class Session:
         ``"auto"`` takes a reduced precision if the processor computes it natively and the card shows a small loss
         (`edgeperc.zoo.choose`). Any other value is required.
     n_threads : int or None
-        Threads inside one run; None leaves it to the provider.
+        Threads inside one run, at most 4096; None leaves it to the provider.
     at_once : int
         Number of sessions that run at the same time. If it is above 1 and ``n_threads`` is None, the CPU provider gets
         as large a part of the usable cores.
@@ -226,7 +226,7 @@ class Session:
     Raises
     ------
     OptionError
-        ``n_threads`` is below 1.
+        ``n_threads`` is below 1 or above 4096.
     ModelFileError, CardError, CardMismatchError
         The model cannot be read, or its graph or outputs do not agree with its card.
     ProviderError
@@ -252,8 +252,8 @@ class Session:
         at_once: int = 1,
         trusted: bool = False,
     ) -> None:
-        if n_threads is not None and n_threads < 1:
-            raise OptionError(f"n_threads is {n_threads}; expected at least 1, or None")
+        if n_threads is not None and not 1 <= n_threads <= MAX_THREADS:
+            raise OptionError(f"n_threads is {n_threads!r:.20}; expected 1 to {MAX_THREADS}, or None")
         _check_names(provider, precision)
         self._trusted, self._at_once = trusted, at_once
         self._made_in, self._running_in = os.getpid(), 0

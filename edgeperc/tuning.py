@@ -22,6 +22,7 @@ from .atomic import write_atomic
 from .errors import SettingsError
 
 __all__ = [
+    "MAX_THREADS",
     "cache_folder",
     "compiled_folder",
     "cpu_features",

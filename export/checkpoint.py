@@ -50,9 +50,9 @@ def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str,
     """
     try:
         state = torch.load(path, weights_only=True, map_location=device)
-    except OSError:
-        raise
     except Exception as exc:  # of torch, pickle, zipfile and struct
+        if isinstance(exc, OSError) and exc.filename is not None:
+            raise  # others are of a damaged file
         reason = " ".join(str(exc).split())[:200] or type(exc).__name__
         raise CheckpointError(f"{path} cannot be read as a checkpoint ({reason}); train again") from exc
     try:

@@ -455,6 +455,7 @@ def test_scans_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
         (["/00/velodyne/a.bin", "/01/velodyne/a.bin"], ["00/a", "01/a"]),
         (["/d/velodyne/a.bin", "/d/a.bin"], ["velodyne/a", "d/a"]),
         (["/d/.bin"], [".bin"]),
+        (["/d/..bin"], ["..bin"]),
         ([], []),
     ],
 )

@@ -252,7 +252,7 @@ CHANGES: list[Callable[[dict[str, Any]], Any]] = [
 ]
 
 
-@pytest.mark.parametrize("change", range(len(CHANGES) + 3))
+@pytest.mark.parametrize("change", range(len(CHANGES) + 4))
 def test_damaged_checkpoints(tmp_path: Path, change: int) -> None:
     torch = pytest.importorskip("torch")
     pytest.importorskip("onnx")
@@ -272,7 +272,8 @@ def test_damaged_checkpoints(tmp_path: Path, change: int) -> None:
         torch.save(state, path)
     else:
         content = path.read_bytes()
-        damaged = [content[:1000], b"PK\x03\x04" + content[40:], __import__("pickle").dumps({"recipe": os.system})]
+        call = __import__("pickle").dumps({"recipe": os.system})
+        damaged = [content[:1000], content[:30_000], b"PK\x03\x04" + content[40:], call]
         path.write_bytes(damaged[change - len(CHANGES)])
     with pytest.raises(CheckpointError, match=r"checkpoint\.pt"):
         load(path)

@@ -16,7 +16,15 @@ import pytest
 
 import edgeperc.session as session_module
 from edgeperc.card import CARD_KEY
-from edgeperc.errors import CardError, CardMismatchError, InferenceError, ModelError, ModelFileError, ProviderError
+from edgeperc.errors import (
+    CardError,
+    CardMismatchError,
+    InferenceError,
+    ModelError,
+    ModelFileError,
+    OptionError,
+    ProviderError,
+)
 from edgeperc.session import PROVIDERS, Session, available_providers, golden_input
 from edgeperc.tuning import fingerprint, settings_path, write_settings
 from edgeperc.zoo import Variant, digest, listed, model_path, resolve
@@ -394,6 +402,7 @@ def test_auto_takes_the_setting_that_was_measured_here(
     assert "auto cannot read the settings measured on this computer" in caplog.text
 
 
-def test_threads_must_be_positive() -> None:
-    with pytest.raises(ValueError, match="n_threads is 0"):
-        Session(model_path("pointseg"), "cpu", n_threads=0)
+@pytest.mark.parametrize("n_threads", [0, -1, 4097, 10**400])
+def test_the_number_of_threads_is_bounded(n_threads: int) -> None:
+    with pytest.raises(OptionError, match=f"n_threads is {n_threads!r:.20}; expected 1 to 4096"):
+        Session(model_path("pointseg"), "cpu", n_threads=n_threads)

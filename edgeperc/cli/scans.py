@@ -218,7 +218,7 @@ def output_names(scans: Sequence[Path], *, keep_folder: bool = False) -> list[Pa
     depths = range(min(2 if keep_folder else 1, deepest), deepest + 1)
     candidates = ([Path(*parts[-depth:]) for parts in kind] for kind in (short, whole) for depth in depths)
     names = next(filter(_all_differ, candidates), [Path(*parts) for parts in whole])
-    bare = [name.with_name(re.sub(r"(?i)(\.pcd)?\.[^.]+$", "", name.name) or name.name) for name in names]
+    bare = [name.with_name(re.sub(r"(?i)([^.])((\.pcd)?\.[^.]+)$", r"\1", name.name)) for name in names]
     return bare if _all_differ(bare) else names
 
 
