@@ -114,11 +114,11 @@ def find_ground(
     plane through the lowest returns of three cells. A cell whose lowest return is within 0.1 m of the plane votes for
     it; a cell whose lowest return is lower votes against it. There are no returns from below the ground, so a plane
     through hedges or a row of car roofs wins only if they hide more than two thirds of the cells. The first plane is
-    searched within 20 m of the sensor, near the mounting height. Each region of 8 x 8 m then starts from the mean of
-    its solved neighbors, may differ in slope by 0.12, and is refined by least squares with the neighbors' slope as a
-    weak prior, because a far region may hold a single ring of returns. Heights are interpolated between the middles of
-    regions. Last, the ground moves to the mean of the lowest returns within 0.3 m in 5 x 5 cells, so that it follows
-    kerbs and banks.
+    searched within 20 m of the sensor, near the mounting height. The four regions of 8 x 8 m around the vehicle start
+    from it; each of the others starts from the mean of its solved neighbors, may differ in slope by 0.12, and is
+    refined by least squares with the neighbors' slope as a weak prior, because a far region may hold a single ring of
+    returns. Heights are interpolated between the middles of regions. Last, the ground moves to the mean of the lowest
+    returns within 0.3 m in 5 x 5 cells, so that it follows kerbs and banks.
 
     Parameters were chosen on simulated HDL-64E and VLP-16 scans and on HDL-32E scans of nuScenes. On 16 scans of
     SemanticKITTI (ground: road, parking, pavement, other ground, terrain, lane marking; vegetation is left out, because
@@ -250,7 +250,8 @@ def fill_planes(
                 expected[:] = 0.0
                 for near_r in range(max(r - 1, 0), min(r + 2, N_REGIONS)):
                     for near_q in range(max(q - 1, 0), min(q + 2, N_REGIONS)):
-                        weight = solved[near_r, near_q]
+                        # The four in the middle do not start from each other: one of them may hold a ditch.
+                        weight = solved[near_r, near_q] if ring > 0 else 0.0
                         if weight > 0.0:
                             a, b, height = planes[near_r, near_q]
                             total += weight

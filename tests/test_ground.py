@@ -9,6 +9,7 @@ import twins.ground
 from edgeperc.errors import PointsError
 from edgeperc.ground import find_ground
 from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import simulate
 
 
@@ -161,6 +162,15 @@ def test_ground_of_a_simulated_street():
     mask = find_ground(scan.points).mask[some]
     assert mask[np.abs(above) < 0.03].mean() > 0.98
     assert not mask[above > 0.5].any()
+
+
+def test_the_ground_of_a_road_above_lower_land_is_the_road():
+    """The land on the right is 0.4 m lower, and as large."""
+    scan = simulated_scan(2_000_000_002, "os1-64")
+    near = np.hypot(*scan.points[:, :2].T) < 20.0
+    road = near & (scan.surfaces == -1) & (scan.points[:, 1] > 0.0)
+    assert road.sum() > 5000
+    assert find_ground(scan.points).mask[road].mean() > 0.95
 
 
 @pytest.mark.parametrize("points", [np.zeros((3, 2), np.float32), np.zeros(4, np.float32)])

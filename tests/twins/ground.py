@@ -89,7 +89,8 @@ def ground_heights(points, mount_height_m, regions=True):
     by_ring = sorted(np.ndindex(16, 16), key=lambda at: (max(abs(2 * at[0] - 15), abs(2 * at[1] - 15)), at))
     for r, q in by_ring:
         middle = middles[[r, q]]
-        around = [at for at in np.ndindex(16, 16) if max(abs(at[0] - r), abs(at[1] - q)) <= 1 and solved[at]]
+        near_by = [at for at in np.ndindex(16, 16) if max(abs(at[0] - r), abs(at[1] - q)) <= 1]
+        around = [] if {r, q} <= {7, 8} else [at for at in near_by if solved[at]]
         expected = np.array([*first[:2], first[2] + first[:2] @ middle])
         if around:
             moved = [[*planes[at][:2], planes[at][2] + planes[at][:2] @ (middle - middles[list(at)])] for at in around]
