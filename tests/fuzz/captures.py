@@ -1,8 +1,8 @@
 """Captures and scan files: damaged ones through `edgeperc.read_scans`.
 
-The process that decodes a capture is forked from this one, where the libraries are loaded already; otherwise it runs
+The process that decodes captures is forked from this one, where the libraries are loaded already; otherwise it runs
 what the product runs, `edgeperc.readers.worker.main` with its limits, and `edgeperc.readers.apart` reads its replies.
-Every 200th case starts the process as the product does. If that process dies, the answer is a `PointsError`, which is
+Every 1000th case starts the process as the product does. If that process dies, the answer is a `PointsError`, which is
 allowed; such deaths are counted by signal.
 """
 
@@ -14,18 +14,20 @@ import json
 import os
 import re
 import resource
+import select
 import signal
+import socket
 import struct
 import subprocess
 import sys
 import tempfile
-import time
+import threading
 import traceback
 import zlib
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, NoReturn
 from unittest import mock
 
 import numpy as np
@@ -36,15 +38,16 @@ from edgeperc.readers.captures import read_scans
 from edgeperc.readers.files import read_points
 
 from .mutate import mutated_bytes, mutated_json, noise
-from .running import Case, check
+from .running import Case, check, peak_mb, reset_peak
 from .seeds import Seed, data_root, pcap_records, real_seeds, scan_files, synthetic_seeds
 
 __all__ = ["LIMIT_MB", "LIMIT_S", "Captures", "make"]
 
 LIMIT_S, LIMIT_MB = 65.0, 2700.0  # 60 s and 2 GiB of data for the process that decodes
-END_TO_END_EVERY = 200
+END_TO_END_EVERY = 1000
 FORKED_LIMIT_S = 0.2  # in place of 60 s: some damaged .osf files never end in the library
 MOST_SCANS = 20
+CAPTURES_OF_A_FORK = 50
 REAL_SHARE, FILE_SHARE = 0.1, 0.2
 
 LIBRARIES = (
@@ -53,17 +56,42 @@ LIBRARIES = (
 )  # fmt: skip
 
 
+class Server:
+    """A process forked from this one, which runs `edgeperc.readers.worker.main` for up to 50 captures.
+
+    A fork takes as long as decoding a small capture.
+    """
+
+    def __init__(self) -> None:
+        self.socket, theirs = socket.socketpair()
+        self.n_captures = 0
+        self.pid = os.fork()
+        if self.pid == 0:
+            self.socket.close()
+            _serve(theirs)
+        theirs.close()
+
+    def end(self) -> tuple[int, float]:
+        """Wait for its end; its exit code and highest memory [MB]."""
+        self.socket.close()
+        _, status, usage = os.wait4(self.pid, 0)
+        return os.waitstatus_to_exitcode(status), usage.ru_maxrss / 1e3
+
+
 class Forked:
-    """A process as `subprocess.Popen`, forked from this one; runs `edgeperc.readers.worker.main`."""
+    """Decodes one capture, and can be used as a `subprocess.Popen`."""
+
+    server: ClassVar[Server | None] = None
 
     def __init__(self, folder: str) -> None:
+        if Forked.server is None:
+            Forked.server = Server()
+        self.process, self.lock = Forked.server, threading.Lock()
         requests, self_in = os.pipe()
         self_out, replies = os.pipe()
         self.returncode: int | None = None
         self.peak_mb = 0.0
-        self.pid = os.fork()
-        if self.pid == 0:
-            _be_worker(requests, replies, folder, (self_in, self_out))
+        socket.send_fds(self.process.socket, [folder.encode()], [requests, replies])
         os.close(requests)
         os.close(replies)
         self.stdin, self.stdout = os.fdopen(self_in, "wb"), os.fdopen(self_out, "rb")
@@ -78,44 +106,59 @@ class Forked:
         self.wait()
 
     def kill(self) -> None:
-        if self.poll() is None:
-            os.kill(self.pid, signal.SIGKILL)
+        """Kill the process, unless it is about to be done with the capture."""
+        self._look(0.01)
+        if self.returncode is None:
+            os.kill(self.process.pid, signal.SIGKILL)
 
     def poll(self) -> int | None:
-        if self.returncode is None:
-            self._reap(os.WNOHANG)
+        self._look(0.0)
         return self.returncode
 
     def wait(self, timeout: float | None = None) -> int:
-        end = None if timeout is None else time.monotonic() + timeout
-        while self.returncode is None:
-            self._reap(0 if end is None else os.WNOHANG)
-            if self.returncode is None and end is not None:
-                if time.monotonic() > end:
-                    raise subprocess.TimeoutExpired("worker", timeout or 0.0)
-                time.sleep(0.001)
+        self._look(timeout)
+        if self.returncode is None:
+            raise subprocess.TimeoutExpired("worker", timeout or 0.0)
         return self.returncode
 
-    def _reap(self, options: int) -> None:
-        pid, status, usage = os.wait4(self.pid, options)
-        if pid:
-            self.returncode, self.peak_mb = os.waitstatus_to_exitcode(status), usage.ru_maxrss / 1e3
+    def _look(self, timeout: float | None) -> None:
+        """See whether the process has reported the end of the capture, or has ended itself."""
+        with self.lock:
+            if self.returncode is not None or not select.select([self.process.socket], [], [], timeout)[0]:
+                return
+            report = self.process.socket.recv(100)
+            self.process.n_captures += 1
+            if report:
+                self.returncode, self.peak_mb = 0, float(report)
+            if not report or self.process.n_captures == CAPTURES_OF_A_FORK:
+                code, peak = self.process.end()
+                Forked.server = None
+                if not report:
+                    self.returncode, self.peak_mb = code, peak
 
 
-def _be_worker(requests: int, replies: int, folder: str, others: tuple[int, int]) -> None:
+def _serve(parent: socket.socket) -> NoReturn:
+    """Decode captures until nobody asks any more."""
     code = 1
     try:
         os.setsid()
-        quiet = os.open(os.devnull, os.O_WRONLY)
-        for source, target in ((requests, 0), (replies, 1), (quiet, 2)):
-            os.dup2(source, target)
-        for descriptor in (*others, requests, replies, quiet):
-            os.close(descriptor)
-        sys.stdin = os.fdopen(0)
-        os.environ.update(dict.fromkeys(("TMPDIR", "TEMP", "TMP"), folder))
-        tempfile.tempdir = None
-        worker.main()
-        code = 0
+        quiet = os.open(os.devnull, os.O_RDWR)
+        os.dup2(quiet, 2)
+        while True:
+            folder, descriptors, _, _ = socket.recv_fds(parent, 4096, 2)
+            if not folder:
+                os._exit(0)
+            reset_peak()
+            for source, target in zip(descriptors, (0, 1), strict=True):
+                os.dup2(source, target)
+                os.close(source)
+            sys.stdin = os.fdopen(0, closefd=False)
+            os.environ.update(dict.fromkeys(("TMPDIR", "TEMP", "TMP"), folder.decode()))
+            tempfile.tempdir = None
+            worker.main()
+            for target in (0, 1):
+                os.dup2(quiet, target)
+            parent.send(str(peak_mb()).encode())
     except BaseException:
         traceback.print_exc()
     finally:
@@ -140,7 +183,7 @@ class Captures:
         self.real = [] if root is None else real_seeds(root)
         self.files = scan_files()
         self.process: Forked | None = None
-        weights = {"ouster": 8, "osf": 2, "velodyne": 3}
+        weights = {"ouster": 8, "velodyne": 3}
         self.weighted = [seed for seed in self.seeds for _ in range(weights.get(seed.kind, 1))]
         # What forked processes share is not to be copied because a collector wrote to it.
         gc.collect()
