@@ -101,6 +101,7 @@ def test_version_and_usage(capsys: pytest.CaptureFixture[str]) -> None:
     assert usage_code() == 2
     assert usage_code("run") == 2
     assert usage_code("run", "x.bin", "--threads", "0") == 2
+    assert usage_code("run", "\0") == 2
     assert "1 or more" in capsys.readouterr().err
 
 

@@ -91,6 +91,8 @@ def _run(given: list[str]) -> int:
     before = " ".join(given[:2])
     if before in _RENAMED:
         parser.error(f"{before!r} is now {_RENAMED[before]!r}: edgeperc {_RENAMED[before]} {shlex.join(given[2:])}")
+    if any("\0" in each for each in given):  # from Python; no shell passes it on
+        parser.error("an argument has a null character, which no file name and no value can have")
     known = argparse.Namespace(typed=shlex.join(["edgeperc", *given]), parser=parser)
     arguments = parser.parse_args(given, known)
     code: int = arguments.command(arguments)
