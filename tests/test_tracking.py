@@ -533,7 +533,7 @@ def test_shapes_hiding_and_rivals_are_those_of_the_twins(n: int, m: int) -> None
     np.testing.assert_allclose(shares, twins.tracking.hidden(10.0 * state, shape, seen, sensor))
     strength, reported = rng.permutation(n).astype(float), rng.random(n) < 0.8
     wanted_rows = twins.tracking.rivals(state, shape, strength, reported)
-    mark_rivals(state, shape, strength, reported)
+    mark_rivals(state, shape, np.argsort(-strength, kind="stable"), reported)
     assert np.flatnonzero(reported).tolist() == wanted_rows
 
 

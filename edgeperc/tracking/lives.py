@@ -243,7 +243,7 @@ def fill_hidden(
 
 @njit(cache=True, nogil=True)
 def mark_rivals(
-    state: NDArray[np.float64], shape: NDArray[np.float64], strength: NDArray[np.float64], reported: NDArray[np.bool_]
+    state: NDArray[np.float64], shape: NDArray[np.float64], order: NDArray[np.int64], reported: NDArray[np.bool_]
 ) -> None:
     """Exclude a track from the report if its center lies in the footprint of a stronger track, or vice versa.
 
@@ -255,13 +255,12 @@ def mark_rivals(
         x, y [m], v [m/s], heading [rad], turn rate [rad/s].
     shape : (n, 4) float64
         Height of the center, length, width, height [m].
-    strength : (n,) float64
-        From `edgeperc.tracking.tracks.strength_of`. Among equal tracks, the first is reported.
+    order : (n,) int64
+        Rows of the tracks, strongest first (`edgeperc.tracking.tracks.strength_of`).
     reported : (n,) bool
         Set to False for these tracks.
     """
     # Strongest first, so the flags of all stronger tracks are final.
-    order = np.argsort(-strength, kind="mergesort")
     for b in range(len(order)):
         weak = order[b]
         for a in range(b):
@@ -403,7 +402,10 @@ def update_lives(
             # Likelihood ratio of a miss: the numerator assumes that the object exists; without an object it is 1.
             track["existence"] += math.log(1.0 - of["detection"] * (1.0 - MOST_HIDDEN * hidden[i]))
             continue
-        best = np.argmax(beta[i, 1:])
+        best = 0
+        for k in range(1, beta.shape[1] - 1):  # np.argmax would import scipy where the kernel is loaded
+            if beta[i, k + 1] > beta[i, best + 1]:
+                best = k
         track["misses"], track["missed_s"], track["source"] = 0, 0.0, best
         track["hits"] += 1
         track["chances"] += 1.0

@@ -290,7 +290,8 @@ class Tracker:
         self._twist, self._twist_variances = twist, twist_variances
         reported = tracks["existence"] > 0.0
         mark_out_of_view(tracks, pose, self._left, self._right, reported)
-        mark_rivals(tracks["state"].copy(), tracks["shape"].copy(), strength, reported)
+        strongest_first = np.argsort(-strength, kind="stable")
+        mark_rivals(tracks["state"].copy(), tracks["shape"].copy(), strongest_first, reported)
         n_tentative = int(len(tracks) - np.count_nonzero(reported))
         return Tracks(tracks[reported], self._labels, stamp_s, pose.copy(), n_tentative, n_approximated)
 
