@@ -29,10 +29,12 @@ from .cluster import MIN_SCORE, join_boxes, objects_from_points
 from .decode import decode_labels, decode_top_view
 from .drivable import compile_kernels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
+from .first_start import Helpers, car_and_person
 from .fitness import Finding, FitnessProfile, check_profiles
 from .frame import ModelFrame, turned
 from .ground import Ground, find_ground
 from .image import ImageScaler, as_image, label_pixels
+from .kernel_cache import fewer_collections
 from .level import MountingEstimate, MountingEstimator
 from .mounting import MODEL_HEIGHT_M, Mounting
 from .network_input import input_heights
@@ -371,19 +373,24 @@ class Perceiver:
     def _compile(self, views: Sequence[str]) -> None:
         """Compile every kernel of scans."""
         warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
-        render(warm_up, replace(self.sensor, remission=NO_REMISSION))
-        perception = self._perceive(warm_up, None, _Stopwatch(), self._to_check > 0, infer=False)
-        floor, labels = self._warm_up_objects()
-        ground = self._find_ground(floor)
-        if ground is not None:
-            unsure = (Box("car", 0.4, (5.0, 0.0, -1.0), (4.0, 1.6, 1.5), 0.0),)
-            seen = None if perception.points is None else labels
-            self._combine(floor, ground, seen, perception.top_view, unsure, _Stopwatch())
-        with suppress(MountingError):  # the floor has no street
-            self._estimator.add(floor)
-        ModelFrame(Mounting(0.0, 0.0, 0.0, 0.0)).move(floor)
+        parts = ["objects", "ground"] if self.agree and "range_image" in views else []
         if "top_view" in views:
-            compile_kernels()  # of `edgeperc.road_ahead`
+            parts.append("road")
+        with fewer_collections(), Helpers(parts) as helpers:
+            render(warm_up, replace(self.sensor, remission=NO_REMISSION))
+            perception = self._perceive(warm_up, None, _Stopwatch(), self._to_check > 0, infer=False)
+            floor, labels = car_and_person()
+            ground = self._find_ground(floor)
+            with suppress(MountingError):  # the floor has no street
+                self._estimator.add(floor)
+            ModelFrame(Mounting(0.0, 0.0, 0.0, 0.0)).move(floor)
+            helpers.wait()  # for what follows
+            if ground is not None:
+                unsure = (Box("car", 0.4, (5.0, 0.0, -1.0), (4.0, 1.6, 1.5), 0.0),)
+                seen = None if perception.points is None else labels
+                self._combine(floor, ground, seen, perception.top_view, unsure, _Stopwatch())
+            if "top_view" in views:
+                compile_kernels()  # of `edgeperc.road_ahead`
 
     def __setattr__(self, name: str, value: object) -> None:
         if not name.startswith("_") and "_locks" in vars(self):  # the last attribute of construction
@@ -565,7 +572,7 @@ class Perceiver:
             if beside is not None:
                 top_view, boxes = beside()
                 watch.lap("infer")
-        if ground is not None:
+        if ground is not None and infer:
             points, top_view, boxes = self._combine(scan, ground, points, top_view, boxes, watch)
         return Perception(
             n_points=len(scan),
@@ -714,16 +721,6 @@ class Perceiver:
             labels = np.where(in_view, labels, sectors[k].labels)
             in_view = in_view | sectors[k].in_view
         return PointLabels(labels, in_view, sectors[0].classes)
-
-    def _warm_up_objects(self) -> tuple[NDArray[np.float32], PointLabels]:
-        """Nine points of a car and a person on a floor: enough to compile every kernel of `_combine`."""
-        x, y = np.meshgrid(np.arange(-8.0, 8.0), np.arange(-8.0, 8.0))
-        scan = np.zeros((x.size + 9, 4), np.float32)
-        scan[:-9, 0], scan[:-9, 1], scan[:-9, 2] = x.ravel(), y.ravel(), -MODEL_HEIGHT_M
-        scan[-9:, 0], scan[-9:, 1] = 5.0, np.linspace(-0.2, 0.2, 9)
-        labels = (np.arange(len(scan)) >= x.size).astype(np.uint8)
-        labels[-1] = 2
-        return scan, PointLabels(labels, np.ones(len(scan), np.bool_), ("background", "car", "pedestrian"))
 
     def _find_ground(self, scan: NDArray[np.float32]) -> Ground | None:
         """The ground, once for all that needs it: the input of a network, and the clusters; None if nothing does."""
