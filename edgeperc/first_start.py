@@ -1,7 +1,7 @@
 """The first start: helper processes compile a part of the kernels while the process that needs them compiles the rest.
 
 numba compiles in one thread. Where the cache of kernels is empty and can be written, `Helpers` starts one process for
-each further core, two at most. A helper runs this package in a new interpreter and puts what it compiles into the
+each further core, three at most. A helper runs this package in a new interpreter and puts what it compiles into the
 cache; `edgeperc.kernel_cache` finds it there. It opens no model, writes nothing else, and never imports the caller's
 main module. It ends by itself when its part is compiled, when the process that started it has ended, or after two
 minutes, and is killed when construction ends. Everything that is not in the cache afterwards is compiled as without
@@ -23,13 +23,14 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from .agreement import agree_on_boxes, agree_on_cells, agree_on_points, find_support, find_voters
-from .cluster import join_boxes, objects_from_points
+from .agreement import agree_on_boxes, agree_on_cells, agree_on_points, clear_columns, find_support, find_voters
+from .cluster import fill_rectangle, join_boxes, objects_from_points
 from .drivable import compile_kernels
 from .ground import Ground, fill_planes, find_ground
 from .kernel_cache import KernelCache, fewer_collections
@@ -49,8 +50,14 @@ MIN_WAIT_S = 5.0
 START = "import sys; sys.path[:] = sys.argv[2:]; from edgeperc.first_start import main; main(sys.argv[1])"
 
 
-def car_and_person() -> tuple[np.ndarray[Any, np.dtype[np.float32]], PointLabels]:
-    """Nine points of a car and a person on a floor, and their labels: enough to compile every kernel of objects."""
+def car_and_person() -> tuple[NDArray[np.float32], PointLabels]:
+    """Nine points of a car and a person on a floor, and their labels: enough to compile every kernel of objects.
+
+    Returns
+    -------
+    points : (n, 4) float32
+    labels : PointLabels
+    """
     x, y = np.meshgrid(np.arange(-8.0, 8.0), np.arange(-8.0, 8.0))
     scan = np.zeros((x.size + 9, 4), np.float32)
     scan[:-9, 0], scan[:-9, 1], scan[:-9, 2] = x.ravel(), y.ravel(), -MODEL_HEIGHT_M
@@ -60,37 +67,70 @@ def car_and_person() -> tuple[np.ndarray[Any, np.dtype[np.float32]], PointLabels
     return scan, PointLabels(labels, np.ones(len(scan), np.bool_), ("background", "car", "pedestrian"))
 
 
-def _compile_objects() -> None:
-    """What combines labels, boxes and clusters. The ground is made up, so that its kernels are not needed here."""
+def _made_up() -> tuple[NDArray[np.float32], PointLabels, Ground, tuple[Box, ...]]:
+    """A scan, its labels, its ground and a network's box; no kernel is needed for these."""
     scan, points = car_and_person()
     mask = points.labels == 0
     ground = Ground(mask, np.where(mask, 0.0, MODEL_HEIGHT_M).astype(np.float32), (0.0, 0.0, -MODEL_HEIGHT_M))
-    boxes = (Box("car", 0.4, (5.0, 0.0, -1.0), (4.0, 1.6, 1.5), 0.0),)
+    return scan, points, ground, (Box("car", 0.4, (5.0, 0.0, -1.0), (4.0, 1.6, 1.5), 0.0),)
+
+
+def _compile_clusters() -> None:
+    scan, points, ground, _ = _made_up()
+    find_voters(scan, points, ground, support=(np.zeros(len(scan), np.float32), np.zeros(len(scan), np.uint8)))
+
+
+def _compile_boxes() -> None:
+    scan, points, ground, boxes = _made_up()
+    clusters = np.where(ground.mask, -1, 0).astype(np.int32)
+    found = objects_from_points(scan, points.labels, points.classes, height_m=ground.height_m, clusters=clusters)
+    join_boxes(boxes, found)
+
+
+def _compile_agreement() -> None:
+    scan, points, ground, boxes = _made_up()
     held = find_support(scan, points, ground, boxes)
-    clusters = find_voters(scan, points, ground, boxes, support=held)
+    clusters = np.where(ground.mask, -1, 0).astype(np.int32)
     points = agree_on_points(scan, points, ground, clusters, boxes, support=held)
-    kept = agree_on_boxes(boxes, scan, points, ground)
-    objects = objects_from_points(
-        scan, points.labels, points.classes, among=~mask, height_m=ground.height_m, clusters=clusters
-    )
+    agree_on_boxes(boxes, scan, points, ground)
     cells = np.zeros((400, 200), np.uint8)
     view = TopView(cells, ("background", "drivable"), 0.1, (6.0, 46.0), (-10.0, 10.0), np.ones(cells.shape, np.bool_))
-    agree_on_cells(view, scan, points, ground, join_boxes(kept, objects), boxes)
+    agree_on_cells(view, scan, points, ground, boxes, boxes)
 
 
 def _compile_ground() -> None:
     find_ground(car_and_person()[0], mount_height_m=MODEL_HEIGHT_M)
 
 
-# What a helper can compile, and of each the kernel that takes longest. With one helper, `ground` is left to the process
-# that needs it: of 27 s of compilation, `objects` are 10, `road` 3, `ground` 4.
-PARTS: Mapping[str, tuple[Callable[[], None], Any]] = MappingProxyType(
+class Part(NamedTuple):
+    """Kernels that a helper can compile.
+
+    Attributes
+    ----------
+    compile : callable
+        Compiles them, by calling what uses them.
+    largest : Dispatcher
+        The kernel that takes longest.
+    seconds : float
+        What all of them take on a core at 2.4 GHz.
+    """
+
+    compile: Callable[[], None]
+    largest: Any
+    seconds: float
+
+
+# The other kernels of a perceiver take 7 s.
+PARTS: Mapping[str, Part] = MappingProxyType(
     {
-        "objects": (_compile_objects, fill_clusters),
-        "road": (compile_kernels, merge_corners),
-        "ground": (_compile_ground, fill_planes),
+        "clusters": Part(_compile_clusters, fill_clusters, 4.3),
+        "agreement": Part(_compile_agreement, clear_columns, 3.4),
+        "road": Part(compile_kernels, merge_corners, 2.6),
+        "ground": Part(_compile_ground, fill_planes, 2.3),
+        "boxes": Part(_compile_boxes, fill_rectangle, 1.1),
     }
 )
+MAX_HELPERS = 3
 
 
 class Helpers:
@@ -99,13 +139,13 @@ class Helpers:
     Parameters
     ----------
     parts : collection of str
-        The parts that the caller needs: ``"objects"``, ``"road"``, ``"ground"``. Those in the cache are left out.
+        Those of `PARTS` that the caller needs. Those in the cache are left out.
     """
 
     def __init__(self, parts: Collection[str]) -> None:
         self._began_s = time.monotonic()
         self._running: list[subprocess.Popen[bytes]] = []
-        self._shares = _shares([part for part in PARTS if part in parts and _is_cold(PARTS[part][1])])
+        self._shares = _shares([part for part in PARTS if part in parts and _is_cold(PARTS[part].largest)])
 
     def __enter__(self) -> Helpers:
         for share in self._shares:
@@ -151,7 +191,7 @@ def compile_parts(parts: Sequence[str]) -> None:
     """
     with fewer_collections():
         for part in parts:
-            PARTS[part][0]()
+            PARTS[part].compile()
 
 
 def main(parts: str) -> None:
@@ -175,14 +215,16 @@ def _kill() -> None:
 
 
 def _shares(parts: Sequence[str]) -> list[list[str]]:
-    """What each helper compiles: with one further core all but the ground, with more the objects beside the rest."""
-    n_cores = usable_cores()
-    if n_cores < 2 or _interpreter() is None:
+    """What each helper compiles, about as long as the others; ``parts`` begin with the longest."""
+    n_helpers = min(usable_cores() - 1, MAX_HELPERS)
+    if n_helpers < 1 or _interpreter() is None:
         return []
-    objects, others = ([part for part in parts if (part == "objects") is of] for of in (True, False))
-    if n_cores == 2:
-        return [share] if (share := [part for part in parts if part != "ground"]) else []
-    return [share for share in (objects, others[::-1]) if share]  # the ground first: it is needed first
+    shares: list[list[str]] = [[] for _ in range(n_helpers)]
+    for part in parts:
+        # One helper leaves the ground, which is needed first, to the process that it helps.
+        if part != "ground" or n_helpers > 1:
+            min(shares, key=lambda share: sum(PARTS[each].seconds for each in share)).append(part)
+    return [sorted(share, key=lambda part: part != "ground") for share in shares if share]
 
 
 def _is_cold(kernel: Any) -> bool:

@@ -373,10 +373,16 @@ class Perceiver:
     def _compile(self, views: Sequence[str]) -> None:
         """Compile every kernel of scans."""
         warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
-        parts = ["objects", "ground"] if self.agree and "range_image" in views else []
-        if "top_view" in views:
-            parts.append("road")
-        with fewer_collections(), Helpers(parts) as helpers:
+        labels_points = "range_image" in views
+        boxes_points = labels_points and self.boxes_from != "network"
+        needed = {
+            "ground": self._needs_ground,
+            "clusters": boxes_points or (labels_points and self.agree),
+            "agreement": labels_points and self.agree,
+            "boxes": boxes_points,
+            "road": "top_view" in views,
+        }
+        with fewer_collections(), Helpers([part for part in needed if needed[part]]) as helpers:
             render(warm_up, replace(self.sensor, remission=NO_REMISSION))
             perception = self._perceive(warm_up, None, _Stopwatch(), self._to_check > 0, infer=False)
             floor, labels = car_and_person()

@@ -1,0 +1,313 @@
+"""Helper processes at the first start: they change how long it takes, and nothing else."""
+
+from __future__ import annotations
+
+import gc
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numba
+import pytest
+
+from edgeperc import first_start
+from edgeperc.first_start import PARTS, Helpers
+from edgeperc.kernel_cache import RARE, fewer_collections
+
+MOST_COMPILATIONS = 160
+
+pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled with the JIT off")
+
+FIRST = """
+import sys
+with open(sys.argv[1] + "/begun", "a") as begun:
+    begun.write("this module was run\\n")
+
+import hashlib, json
+import numpy as np
+from numba.core import event
+from edgeperc import Perceiver, first_start
+
+first_start.usable_cores = lambda: int(sys.argv[2])
+first_start.MIN_WAIT_S = 600.0  # however busy this computer is
+
+class Compilations(event.Listener):
+    def __init__(self):
+        self.names = []
+    def on_start(self, found):
+        function = found.data["dispatcher"].py_func
+        self.names.append(f"{function.__module__}.{function.__name__}")
+    def on_end(self, found):
+        pass
+
+compilations = Compilations()
+event.register("numba:compile", compilations)
+perceive = Perceiver(provider="cpu", n_threads=1, on_mismatch="warn")
+constructed = list(compilations.names)
+turn, down = np.meshgrid(np.linspace(-np.pi, np.pi, 600, endpoint=False), np.radians(np.linspace(1.2, 24.9, 40)))
+radius = 1.73 / np.tan(down)
+columns = radius * np.cos(turn), radius * np.sin(turn), np.full_like(turn, -1.73), 0.3 + 0.1 * np.sin(turn)
+found = perceive(np.stack(columns, -1).reshape(-1, 4))
+answer = hashlib.sha256(found.points.labels.tobytes() + found.top_view.labels.tobytes() + repr(found.boxes).encode())
+print(json.dumps([constructed, compilations.names[len(constructed):], answer.hexdigest()]))
+"""
+
+
+def start(folder: Path, n_cores: int) -> tuple[list[str], list[str], str]:
+    """What a process compiled when it constructed a perceiver, what it compiled in a call, and the call's result."""
+    folder.mkdir(exist_ok=True)
+    (folder / "main.py").write_text(FIRST)
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache"), "EDGEPERC_CACHE_DIR": str(folder / "user")}
+    command = [sys.executable, "-W", "ignore", str(folder / "main.py"), str(folder), str(n_cores)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert not done.stderr
+    constructed, called, answer = json.loads(done.stdout)
+    return constructed, called, answer
+
+
+def kernels(folder: Path) -> set[str]:
+    return {file.name for file in (folder / "cache").rglob("*.kernel")}
+
+
+def test_helpers_fill_the_same_cache_and_change_no_result(tmp_path: Path) -> None:
+    alone, called, answer = start(tmp_path / "alone", 1)
+    assert called == []
+    # Each takes 0.03 s at least. More than these are a sign of kernels that are compiled for several types.
+    assert len(alone) <= MOST_COMPILATIONS
+    own = [name for name in alone if name.startswith("edgeperc.")]
+    assert len(own) == len(set(own)), "a kernel is compiled for more than one set of types"
+    helped, called, same_answer = start(tmp_path / "helped", 2)
+    assert (called, same_answer) == ([], answer)
+    assert kernels(tmp_path / "helped") == kernels(tmp_path / "alone")
+    assert len(kernels(tmp_path / "alone")) == len(own)
+    left = {f"{part.largest.py_func.__module__}.{part.largest.py_func.__name__}" for part in PARTS.values()}
+    assert len(left & set(helped)) == 1, "one helper compiles all parts but the ground"
+    assert (tmp_path / "helped" / "begun").read_text().count("\n") == 1, "a helper ran the caller's main module"
+    assert not [*tmp_path.rglob("*.part")]
+    assert start(tmp_path / "helped", 2) == ([], [], answer)
+
+
+@pytest.fixture
+def cold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two cores, and nothing in the cache."""
+    monkeypatch.setattr(first_start, "_is_cold", lambda _: True)
+    monkeypatch.setattr(first_start, "usable_cores", lambda: 2)
+
+
+@pytest.fixture
+def helpers(cold: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Helpers]]:
+    """Helpers that run some code; none may be left after the test."""
+    made: list[Helpers] = []
+
+    def make(code: str) -> Helpers:
+        monkeypatch.setattr(first_start, "START", code)
+        made.append(Helpers(["road"]))
+        return made[-1]
+
+    yield make
+    assert all(not each._running for each in made)
+
+
+HANGS = "import time; time.sleep(600)"
+
+
+def test_a_helper_that_hangs_is_killed(helpers: Callable[[str], Helpers], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(first_start, "MIN_WAIT_S", 0.1)
+    with helpers(HANGS) as running:
+        (process,) = running._running
+        running.wait()
+        assert process.returncode is not None
+        assert process.returncode != 0
+
+
+def test_a_helper_that_fails_is_reported(helpers: Callable[[str], Helpers], caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", logger="edgeperc.first_start")
+    with helpers("raise SystemExit(3)") as running:
+        running.wait()
+    assert "ended with 3; they are compiled here" in caplog.text
+
+
+@pytest.mark.parametrize("raised", [KeyboardInterrupt, MemoryError, SystemExit])
+def test_no_helper_is_left_where_construction_is_interrupted(
+    helpers: Callable[[str], Helpers], raised: type[BaseException]
+) -> None:
+    processes = []
+
+    def interrupted() -> None:
+        with helpers(HANGS) as running:
+            processes.extend(running._running)
+            raise raised
+
+    with pytest.raises(raised):
+        interrupted()
+    (process,) = processes
+    assert process.returncode is not None
+    assert process.stdin is not None
+    assert process.stdin.closed
+
+
+def test_what_cannot_start_is_reported(
+    helpers: Callable[[str], Helpers], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", logger="edgeperc.first_start")
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python3"))
+    with helpers(HANGS) as running:
+        assert not running._running
+        running.wait()
+    assert "no helper process" in caplog.text
+
+
+@pytest.mark.parametrize("executable", ["/usr/bin/robot", "/opt/uwsgi", "", None])
+def test_an_application_that_embeds_python_is_not_started_again(
+    helpers: Callable[[str], Helpers], monkeypatch: pytest.MonkeyPatch, executable: str | None
+) -> None:
+    monkeypatch.setattr(sys, "executable", executable)
+    with helpers(HANGS) as running:
+        assert not running._running
+
+
+def test_a_frozen_application_is_not_started_again(
+    helpers: Callable[[str], Helpers], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "frozen", True, raising=False)
+    with helpers(HANGS) as running:
+        assert not running._running
+
+
+@pytest.mark.parametrize("n_cores", range(1, 7))
+def test_helpers_share_the_work(cold: None, monkeypatch: pytest.MonkeyPatch, n_cores: int) -> None:
+    monkeypatch.setattr(first_start, "usable_cores", lambda: n_cores)
+    shares = Helpers([*PARTS])._shares
+    assert len(shares) == min(n_cores - 1, 3)
+    parts = [part for share in shares for part in share]
+    expected = {1: set(), 2: {*PARTS} - {"ground"}}.get(n_cores, {*PARTS})
+    assert len(parts) == len(set(parts))
+    assert set(parts) == expected
+    if n_cores > 2:
+        seconds = [sum(PARTS[part].seconds for part in share) for share in shares]
+        assert max(seconds) < 1.5 * min(seconds)
+
+
+def test_no_helper_where_the_cache_cannot_be_written_or_holds_the_kernels(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(first_start, "usable_cores", lambda: 2)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "new" / "cache"))
+    cache = PARTS["road"].largest._cache
+    assert Helpers(["road"])._shares == [["road"]]
+    (tmp_path / "file").write_bytes(b"")
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "file"))
+    assert Helpers(["road"])._shares == []
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    folder = next(cache._folders())
+    folder.mkdir(0o755, parents=True)
+    file = folder / f"{cache._name}-0123456789abcdef.kernel"
+    for content, is_cold in ((b"", True), (bytes(64), True), (bytes(32) + cache._stamp, False)):
+        file.write_bytes(content)
+        assert bool(Helpers(["road"])._shares) is is_cold
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="/proc shows which files a process has open")
+def test_a_helper_inherits_no_files(helpers: Callable[[str], Helpers], tmp_path: Path) -> None:
+    with (tmp_path / "mine").open("wb") as mine:
+        os.set_inheritable(mine.fileno(), True)
+        with helpers(HANGS) as running:
+            (process,) = running._running
+            opened = [each.readlink() for each in Path(f"/proc/{process.pid}/fd").iterdir()]
+    assert len(opened) >= 3
+    assert not [path for path in opened if path.is_relative_to(tmp_path)]
+
+
+def _help_once() -> None:
+    first_start._is_cold = lambda _: True  # type: ignore[assignment]
+    first_start.usable_cores = lambda: 2
+    first_start.START = "raise SystemExit(0)"
+    with Helpers(["road"]) as running:
+        assert running._running
+        running.wait()
+
+
+def test_a_daemonic_process_has_helpers_too() -> None:
+    process = multiprocessing.get_context("spawn").Process(target=_help_once, daemon=True)
+    process.start()
+    process.join(120)
+    assert process.exitcode == 0
+
+
+PARENT = """
+import time
+from edgeperc import first_start
+first_start._is_cold = lambda _: True
+first_start.usable_cores = lambda: 2
+first_start.START = '''
+import sys, time
+sys.path[:] = sys.argv[2:]
+from edgeperc import first_start
+first_start.PARTS = {"road": first_start.Part(lambda: time.sleep(600), None, 1.0)}
+first_start.main(sys.argv[1])
+'''
+with first_start.Helpers(["road"]) as running:
+    print(running._running[0].pid, flush=True)
+    time.sleep(600)
+"""
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    state = Path(f"/proc/{pid}/stat")
+    return not state.exists() or state.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the test looks for processes as POSIX does")
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT] if os.name == "posix" else [])
+def test_no_helper_outlives_a_process_that_is_killed(how: signal.Signals) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", PARENT], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as parent:
+        assert parent.stdout is not None
+        helper = int(parent.stdout.readline())
+        assert _is_running(helper)
+        parent.send_signal(how)
+        parent.wait(60)
+    until = time.monotonic() + 60.0
+    while _is_running(helper) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not _is_running(helper)
+
+
+def test_a_helper_ends_in_any_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = """
+import sys, time
+from edgeperc import first_start
+first_start.MAX_S = 0.2
+first_start.PARTS = {"road": first_start.Part(lambda: time.sleep(600), None, 1.0)}
+first_start.main("road")
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE) as process:
+        assert process.wait(120) != 0
+
+
+def test_garbage_is_collected_as_before_afterwards() -> None:
+    before: Any = gc.get_threshold()
+    with fewer_collections():
+        with fewer_collections():
+            assert gc.get_threshold()[0] == RARE
+        assert gc.get_threshold()[0] == RARE
+    assert gc.get_threshold() == before
+    try:
+        gc.set_threshold(0)
+        with fewer_collections():
+            assert gc.get_threshold()[0] == 0
+    finally:
+        gc.set_threshold(*before)
