@@ -571,7 +571,7 @@ class ModelCard:
 
 
 def _card(document: dict[str, Any]) -> ModelCard:
-    view = dict(document["view"])
+    view = {**document["view"]}  # dict() would take a list of pairs, too
     kind = view.pop("kind")
     geometry: TopViewGeometry | RangeImageGeometry | CameraGeometry
     if kind == "top_view":
@@ -624,18 +624,18 @@ def _card(document: dict[str, Any]) -> ModelCard:
         score_threshold=_float("score_threshold", document["score_threshold"]),
         nms_iou=_float("nms_iou", document["nms_iou"]),
         mount_height_m=_float("mount_height_m", document["mount_height_m"]),
-        fitness=None if fitness is None else dict(fitness),
-        training=dict(document["training"]),
-        metrics=dict(document["metrics"]),
-        parity=dict(document["parity"]),
+        fitness=None if fitness is None else {**fitness},
+        training={**document["training"]},
+        metrics={**document["metrics"]},
+        parity={**document["parity"]},
         golden=None
         if golden is None
         else Golden(
             _int("golden.seed", golden["seed"]),
             _text("golden.input_sha256", golden["input_sha256"]),
-            {name: dict(record) for name, record in golden["outputs"].items()},
+            {name: {**record} for name, record in golden["outputs"].items()},
         ),
-        precisions={name: dict(entry) for name, entry in precisions.items()},
+        precisions={name: {**entry} for name, entry in precisions.items()},
     )
 
 

@@ -157,6 +157,7 @@ def test_missing_keys_are_refused(key: str) -> None:
         ({"schema": 4}, "schema 4.*upgrade edgeperc"),
         ({"precision": "fp8"}, "'fp8'; expected fp32 or int8"),
         ({"precisions": [1]}, "malformed"),
+        ({"precisions": {"int8": [["loss", 0.1]]}}, "malformed"),
         ({"schema": 0}, "schema 0.*export the model again"),
         ({"schema": "1"}, "no schema number"),
         ({"name": ""}, "name ''"),
