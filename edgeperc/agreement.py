@@ -19,7 +19,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from .cluster import PART_OF, find_clusters
+from .cluster import MIN_PERSON_SHARE, PART_OF, find_clusters
 from .errors import PointsError
 from .geometry import draw_footprints
 from .ground import Ground
@@ -28,7 +28,6 @@ from .perception import Box, PointLabels, TopView
 from .points import read_only
 from .voting import (
     COMPLETING_SCORE,
-    MIN_PERSON_SHARE,
     MIN_VEHICLE_SHARE,
     PERSON,
     VEHICLE,

@@ -7,8 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .cluster import MIN_OF_WHOLE
+from .cluster import MIN_PERSON_SHARE
 from .kernel_cache import njit
+from .persons import MIN_OF_WHOLE
 
 __all__ = ["apply_verdicts", "fill_tallies", "fill_verdicts", "fill_votes"]
 
@@ -20,7 +21,6 @@ MIN_VEHICLE_SHARE = 0.6
 # Of clusters larger than vehicles; trucks with trailers are kept if nearly all of their points are labeled.
 MIN_LARGE_SHARE = 0.75
 MAX_LENGTH_M, MAX_TOP_M = 10.0, 4.0
-MIN_PERSON_SHARE = 0.1  # persons stand near walls and cars: a larger share loses people
 MIN_VEHICLE_TOP_M, MIN_PERSON_TOP_M = 0.5, 1.0
 # Nearer vehicles show enough of themselves to be higher. With 0.5 m for all, 4,140 more points of tables, kerbs and
 # hedges on the folds are called car, and 298 fewer points of cars are missed. Some sports cars are lower than 1.2 m.

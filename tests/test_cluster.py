@@ -404,7 +404,7 @@ def test_at_most_1000_clusters_get_a_box():
     x, y = np.meshgrid(np.arange(-60.0, 60.0, 3.0), np.arange(-60.0, 60.0, 3.0))
     places = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     points = as_points((places[:, None] + person).reshape(-1, 3))
-    boxes = objects_from_points(points, np.full(len(points), 2, np.uint8), CLASSES)
+    boxes = objects_from_points(points, np.full(len(points), 2, np.uint8), CLASSES, min_score=0.0)
     assert find_clusters(points).max() + 1 == x.size > len(boxes) == cluster.MAX_OBJECTS == 1000
 
 

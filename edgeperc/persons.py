@@ -1,0 +1,325 @@
+"""The kernels of boxes around persons: which labeled points are one person, and how much room that person takes.
+
+`edgeperc.cluster.objects_from_points` calls them. A cluster of points is often more than one person: two people who
+walk side by side, or a person beside a wall. Groups of points are measured along their principal axis, seen from above.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .kernel_cache import njit
+
+__all__ = ["MIN_OF_WHOLE", "RIDES", "WALKS", "fill_person_groups", "fill_persons"]
+
+WALKS, RIDES = 1, 2  # roles of labels
+MIN_OF_WHOLE = 0.25  # a person rides if at least this share of the persons' points says so: many say "pedestrian"
+
+# A cluster with this share of persons' points is one group if it is not larger than a cyclist. Of larger clusters, only
+# the labeled points are grouped. With 0.3 and 0.5, 1 and 3 % fewer of the cyclists on the validation drives are found.
+MIN_GROUP_SHARE = 0.2
+MAX_LENGTH_M, MAX_TOP_M = 2.3, 2.2
+
+# The upper quarter of a person on the training drives is at most 0.6 m wide, that of two people side by side 0.9 m.
+UPPER = 0.75
+MAX_UPPER_M = 0.8
+MIN_PART_M = 0.3  # a cut is at least this far from both ends
+MAX_CUTS = 8  # one after another
+BIN_M = 0.1
+MAX_BINS = 1024
+
+# Feet that are a step of 0.8 m apart take 1.1 m. A bicycle takes 1.7 m, of which 1.0 to 1.8 m are seen on the training
+# drives.
+MAX_STRIDE_M = 1.1
+
+HEAD_M = 0.2  # heads are in the uppermost part of a group, shoulders are not
+HEAD_GAP_M, HEAD_GAP_PER_M = 0.2, 0.006  # a wider gap is between two heads; 0.006: two beams of an HDL-64E
+MAX_FLAT_M = 0.35  # heads of several rows of people have no gaps; a board is flat
+
+NEAR_M = 0.2  # around a person's points
+
+
+@njit(cache=True, nogil=True)
+def measure(
+    points: NDArray[np.float32],
+    height: NDArray[np.float32],
+    members: NDArray[np.int32],
+    above: float,
+    found: NDArray[np.float64],
+) -> None:
+    """Measure the points of a group that are higher than a limit, along their principal axis.
+
+    Parameters
+    ----------
+    points : (n, 3 or more) float32, C-contiguous
+    height : (n,) float32
+    members : (k,) int32
+        Rows of the group.
+    above : float
+        [m] above the ground.
+    found : (7,) float64, overwritten
+        Cosine and sine of the axis, lowest and highest coordinate along and across it [m], greatest height of all
+        members [m]. Zeros before the height without a point above the limit.
+    """
+    n, x, y, top = 0, 0.0, 0.0, -math.inf
+    for i in members:
+        top = max(top, np.float64(height[i]))
+        if height[i] > above:
+            n += 1
+            x += np.float64(points[i, 0])
+            y += np.float64(points[i, 1])
+    found[:] = 0.0
+    found[6] = top
+    if n == 0:
+        return
+    x, y = x / n, y / n
+    xx, xy, yy = 0.0, 0.0, 0.0
+    for i in members:
+        if height[i] > above:
+            dx, dy = np.float64(points[i, 0]) - x, np.float64(points[i, 1]) - y
+            xx, xy, yy = xx + dx * dx, xy + dx * dy, yy + dy * dy
+    angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
+    cos, sin = math.cos(angle), math.sin(angle)
+    low_u, high_u, low_v, high_v = math.inf, -math.inf, math.inf, -math.inf
+    for i in members:
+        if height[i] > above:
+            u = cos * np.float64(points[i, 0]) + sin * np.float64(points[i, 1])
+            v = cos * np.float64(points[i, 1]) - sin * np.float64(points[i, 0])
+            low_u, high_u, low_v, high_v = min(low_u, u), max(high_u, u), min(low_v, v), max(high_v, v)
+    found[0], found[1], found[2], found[3], found[4], found[5] = cos, sin, low_u, high_u, low_v, high_v
+
+
+@njit(cache=True, nogil=True)
+def fill_person_groups(
+    points: NDArray[np.float32],
+    height: NDArray[np.float32],
+    labels: NDArray[np.uint8],
+    roles: NDArray[np.uint8],
+    order: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    groups: NDArray[np.int32],
+    group_starts: NDArray[np.int64],
+    loose: NDArray[np.int32],
+) -> tuple[int, int]:
+    """List the clusters that may be one or a few persons, and the persons' points of the others.
+
+    Parameters
+    ----------
+    points : (n, 3 or more) float32, C-contiguous
+    height : (n,) float32
+        [m] above the ground.
+    labels : (n,) uint8
+    roles : (256,) uint8
+        0 for labels that are no persons'.
+    order, starts : (m,) int32, (k + 1,) int64
+        Points by cluster, from `edgeperc.cluster.fill_groups`.
+    groups, group_starts : (m,) int32, (k + 1,) int64, overwritten
+        Points by group.
+    loose : (m,) int32, overwritten
+        Persons' points of clusters that are larger than a person or hold too few persons' points.
+
+    Returns
+    -------
+    n_groups, n_loose : int
+    """
+    found = np.empty(7)
+    n_groups, n_loose, n = 0, 0, 0
+    group_starts[0] = 0
+    for k in range(len(starts) - 1):
+        members = order[starts[k] : starts[k + 1]]
+        n_labeled = 0
+        for i in members:
+            n_labeled += 1 if roles[labels[i]] != 0 else 0
+        if n_labeled == 0:
+            continue
+        is_group = n_labeled >= MIN_GROUP_SHARE * len(members)
+        if is_group:
+            measure(points, height, members, -math.inf, found)
+            is_group = found[3] - found[2] <= MAX_LENGTH_M and found[6] <= MAX_TOP_M
+        for i in members:
+            if is_group:
+                groups[n] = i
+                n += 1
+            elif roles[labels[i]] != 0:
+                loose[n_loose] = i
+                n_loose += 1
+        if is_group:
+            n_groups += 1
+            group_starts[n_groups] = n
+    return n_groups, n_loose
+
+
+@njit(cache=True, nogil=True)
+def border_of(
+    points: NDArray[np.float32],
+    height: NDArray[np.float32],
+    members: NDArray[np.int32],
+    above: float,
+    found: NDArray[np.float64],
+) -> float:
+    """Where two persons meet along the axis of `measure`: at the fewest points, as near to the middle as possible."""
+    low, length = found[2], found[3] - found[2]
+    n_bins = int(min(length / BIN_M, MAX_BINS - 1.0)) + 1
+    edge = max(BIN_M, length / n_bins)
+    counts = np.zeros(n_bins + 2, np.int64)  # one more at each end
+    for i in members:
+        if height[i] > above:
+            u = found[0] * np.float64(points[i, 0]) + found[1] * np.float64(points[i, 1])
+            counts[min(max(int((u - low) / edge), 0), n_bins - 1) + 1] += 1
+    border, fewest, nearest = low + 0.5 * length, -1, math.inf
+    for b in range(n_bins):
+        place = (b + 0.5) * edge
+        if place < MIN_PART_M or place > length - MIN_PART_M:
+            continue
+        n = counts[b] + 2 * counts[b + 1] + counts[b + 2]
+        aside = abs(place - 0.5 * length)
+        if fewest < 0 or n < fewest or (n == fewest and aside < nearest):
+            border, fewest, nearest = low + place, n, aside
+    return border
+
+
+@njit(cache=True, nogil=True)
+def head_width(
+    points: NDArray[np.float32], height: NDArray[np.float32], members: NDArray[np.int32], found: NDArray[np.float64]
+) -> float:
+    """Width of the widest part without a gap at the height of heads [m], along the axis of `measure`; 0 if not flat."""
+    low, length = found[2], found[3] - found[2]
+    n_bins = int(min(length / BIN_M, MAX_BINS - 1.0)) + 1
+    edge = max(BIN_M, length / n_bins)
+    firsts, lasts = np.full(n_bins, math.inf), np.full(n_bins, -math.inf)
+    away, low_v, high_v = math.inf, math.inf, -math.inf
+    for i in members:
+        if height[i] > found[6] - HEAD_M:
+            x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
+            u, v = found[0] * x + found[1] * y, found[0] * y - found[1] * x
+            b = min(max(int((u - low) / edge), 0), n_bins - 1)
+            firsts[b], lasts[b] = min(firsts[b], u), max(lasts[b], u)
+            low_v, high_v = min(low_v, v), max(high_v, v)
+            away = min(away, math.hypot(x, y))
+    if high_v - low_v > MAX_FLAT_M:
+        return 0.0
+    gap = max(HEAD_GAP_M, HEAD_GAP_PER_M * away)
+    widest, start, last = 0.0, math.inf, -math.inf
+    for b in range(n_bins):
+        if firsts[b] > lasts[b]:
+            continue
+        if firsts[b] - last > gap:
+            start = firsts[b]
+        last = lasts[b]
+        widest = max(widest, last - start)
+    return widest
+
+
+@njit(cache=True, nogil=True)
+def fill_persons(
+    points: NDArray[np.float32],
+    height: NDArray[np.float32],
+    labels: NDArray[np.uint8],
+    roles: NDArray[np.uint8],
+    order: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    n_whole: int,
+    clusters: NDArray[np.int32],
+    cluster_order: NDArray[np.int32],
+    cluster_starts: NDArray[np.int64],
+    min_points: int,
+    persons: NDArray[np.float64],
+) -> int:
+    """Divide groups into persons, and measure them.
+
+    A group whose upper quarter is wider than 0.8 m is cut where the fewest points are, and its parts again. A part that
+    is longer than a stride rides, like one of which a quarter of the persons' points says so.
+
+    Parameters
+    ----------
+    points : (n, 3 or more) float32, C-contiguous
+    height : (n,) float32
+        [m] above the ground.
+    labels : (n,) uint8
+    roles : (256,) uint8
+        0 for labels that are no persons', `WALKS` or `RIDES` for others.
+    order : (m,) int32, modified
+    starts : (k + 1,) int64
+        Points by group. Those of a group are put in the order of its persons.
+    n_whole : int
+        Groups from this number on are labeled points of larger clusters. The share of the labels is counted among the
+        points of the cluster within 0.2 m of the person.
+    clusters, cluster_order, cluster_starts
+        Cluster of every point, and points by cluster.
+    min_points : int
+        Smaller parts are dropped.
+    persons : (p, 11) float64, overwritten
+        For each person: 1 if he or she rides, else 0; x, y of the middle, extent along and across the principal axis
+        [m], its angle [rad]; lowest and highest z [m], from the ground on; number of points; share of labeled ones;
+        `head_width` of the group [m].
+
+    Returns
+    -------
+    int
+        Number of persons. Those beyond p are left out, and groups with points that are not finite.
+    """
+    found, upper = np.empty(7), np.empty(7)
+    left = np.empty((MAX_CUTS + 1, 3), np.int64)  # parts: first and last place in `order`, number of cuts before
+    n_found = 0
+    for k in range(len(starts) - 1):
+        group = order[starts[k] : starts[k + 1]]
+        measure(points, height, group, -math.inf, found)
+        if not math.isfinite(found[2] + found[3] + found[4] + found[5] + found[6]):
+            continue
+        heads = head_width(points, height, group, found)
+        left[0, 0], left[0, 1], left[0, 2] = starts[k], starts[k + 1], 0
+        n_left = 1
+        while n_left > 0 and n_found < persons.shape[0]:
+            n_left -= 1
+            first, end, n_cuts = left[n_left]
+            members = order[first:end]
+            if len(members) < min_points:
+                continue
+            measure(points, height, members, -math.inf, found)
+            limit = UPPER * found[6]
+            measure(points, height, members, limit, upper)
+            if upper[3] - upper[2] > MAX_UPPER_M and n_cuts < MAX_CUTS:
+                border = border_of(points, height, members, limit, upper)
+                middle = first
+                for at in range(first, end):
+                    i = order[at]
+                    if upper[0] * np.float64(points[i, 0]) + upper[1] * np.float64(points[i, 1]) <= border:
+                        order[at], order[middle] = order[middle], i
+                        middle += 1
+                left[n_left, 0], left[n_left, 1], left[n_left, 2] = middle, end, n_cuts + 1
+                left[n_left + 1, 0], left[n_left + 1, 1], left[n_left + 1, 2] = first, middle, n_cuts + 1
+                n_left += 2
+                continue
+            n_labeled, n_riding, ground, highest = 0, 0, 0.0, -math.inf
+            for i in members:
+                role = roles[labels[i]]
+                n_labeled += 1 if role != 0 else 0
+                n_riding += 1 if role == RIDES else 0
+                ground += np.float64(points[i, 2]) - np.float64(height[i])
+                highest = max(highest, np.float64(points[i, 2]))
+            n_near = len(members)
+            if k >= n_whole:
+                n_near = 0
+                own = clusters[members[0]]
+                for i in cluster_order[cluster_starts[own] : cluster_starts[own + 1]]:
+                    u = found[0] * np.float64(points[i, 0]) + found[1] * np.float64(points[i, 1])
+                    v = found[0] * np.float64(points[i, 1]) - found[1] * np.float64(points[i, 0])
+                    along = found[2] - NEAR_M <= u <= found[3] + NEAR_M
+                    across = found[4] - NEAR_M <= v <= found[5] + NEAR_M
+                    n_near += 1 if along and across and height[i] <= MAX_TOP_M else 0
+            length, u, v = found[3] - found[2], 0.5 * (found[2] + found[3]), 0.5 * (found[4] + found[5])
+            rides = length > MAX_STRIDE_M or (n_riding > 0 and n_riding >= MIN_OF_WHOLE * n_labeled)
+            persons[n_found, 0] = 1.0 if rides else 0.0
+            persons[n_found, 1] = u * found[0] - v * found[1]
+            persons[n_found, 2] = u * found[1] + v * found[0]
+            persons[n_found, 3], persons[n_found, 4] = length, found[5] - found[4]
+            persons[n_found, 5] = math.atan2(found[1], found[0])
+            persons[n_found, 6], persons[n_found, 7] = ground / len(members), highest
+            persons[n_found, 8] = len(members)
+            persons[n_found, 9] = n_labeled / max(n_near, len(members))
+            persons[n_found, 10] = heads
+            n_found += 1
+    return n_found

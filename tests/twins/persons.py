@@ -1,0 +1,114 @@
+"""Slow twins of the kernels of persons."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edgeperc import persons
+
+
+def measured(points, height, members, above):
+    """Twin of `edgeperc.persons.measure`: the axis is the mean direction of squared offsets, as complex numbers."""
+    tall = height[members].astype(np.float64)
+    top = tall.max(initial=-np.inf)
+    xy = points[members, :2].astype(np.float64)[tall > above]
+    if len(xy) == 0:
+        return np.array([0, 0, 0, 0, 0, 0, top])
+    offsets = (xy - xy.mean(axis=0)) @ [1, 1j]
+    axis = np.exp(0.5j * np.angle((offsets**2).sum()))
+    u, v = along(points, members, axis.real, axis.imag)
+    u, v = u[tall > above], v[tall > above]
+    return np.array([axis.real, axis.imag, u.min(), u.max(), v.min(), v.max(), top])
+
+
+def along(points, members, cos, sin):
+    x, y = points[members, :2].astype(np.float64).T
+    return cos * x + sin * y, cos * y - sin * x
+
+
+def groups(points, height, labels, roles, clusters):
+    """Twin of `edgeperc.persons.fill_person_groups`: the groups, and the points outside of them."""
+    whole, loose = [], []
+    for k in range(clusters.max(initial=-1) + 1):
+        members = np.flatnonzero(clusters == k)
+        labeled = members[roles[labels[members]] > 0]
+        if len(labeled) == 0:
+            continue
+        found = measured(points, height, members, -np.inf)
+        small = found[3] - found[2] <= persons.MAX_LENGTH_M and found[6] <= persons.MAX_TOP_M
+        if small and len(labeled) >= persons.MIN_GROUP_SHARE * len(members):
+            whole.append(members)
+        else:
+            loose += labeled.tolist()
+    return whole, loose
+
+
+def border(points, height, members, above, found):
+    """Twin of `edgeperc.persons.border_of`: a smoothed histogram."""
+    length = found[3] - found[2]
+    n = int(min(length / persons.BIN_M, persons.MAX_BINS - 1)) + 1
+    edge = max(persons.BIN_M, length / n)
+    u, _ = along(points, members, found[0], found[1])
+    u = u[height[members].astype(np.float64) > above] - found[2]
+    counts = np.bincount(np.clip((u / edge).astype(int), 0, n - 1), minlength=n)
+    smooth = np.convolve(counts, [1, 2, 1])[1:-1]
+    places = (np.arange(n) + 0.5) * edge
+    free = [b for b in range(n) if persons.MIN_PART_M <= places[b] <= length - persons.MIN_PART_M]
+    best = min(free, key=lambda b: (smooth[b], abs(places[b] - length / 2)), default=None)
+    return found[2] + (length / 2 if best is None else places[best])
+
+
+def heads(points, height, members, found):
+    """Twin of `edgeperc.persons.head_width`: sorted places, cut at gaps."""
+    upper = members[height[members].astype(np.float64) > found[6] - persons.HEAD_M]
+    u, v = along(points, upper, found[0], found[1])
+    if np.ptp(v) > persons.MAX_FLAT_M:
+        return 0.0
+    gap = max(persons.HEAD_GAP_M, persons.HEAD_GAP_PER_M * np.hypot(*points[upper, :2].astype(np.float64).T).min())
+    u = np.sort(u)
+    parts = np.split(u, np.flatnonzero(np.diff(u) > gap) + 1)
+    return max(np.ptp(part) for part in parts)
+
+
+def divided(points, height, members, n_cuts=0):
+    """The parts of a group, each one person."""
+    found = measured(points, height, members, -np.inf)
+    limit = persons.UPPER * found[6]
+    upper = measured(points, height, members, limit)
+    if upper[3] - upper[2] <= persons.MAX_UPPER_M or n_cuts == persons.MAX_CUTS:
+        return [members]
+    u, _ = along(points, members, upper[0], upper[1])
+    first = u <= border(points, height, members, limit, upper)
+    parts = [part for part in (members[first], members[~first]) if len(part)]
+    return [own for part in parts for own in divided(points, height, part, n_cuts + 1)]
+
+
+def rows(points, height, labels, roles, groups, n_whole, clusters, min_points):
+    """Twin of `edgeperc.persons.fill_persons`: a row for each part that is large enough."""
+    found = []
+    for k, group in enumerate(groups):
+        box = measured(points, height, group, -np.inf)
+        if not np.isfinite(box).all():
+            continue
+        width = heads(points, height, group, box)
+        for part in divided(points, height, group):
+            if len(part) < min_points:
+                continue
+            box = measured(points, height, part, -np.inf)
+            of = roles[labels[part]]
+            n_near = len(part)
+            if k >= n_whole:
+                near = np.flatnonzero((clusters == clusters[part[0]]) & (height <= persons.MAX_TOP_M))
+                u, v = along(points, near, box[0], box[1])
+                inside = (u >= box[2] - persons.NEAR_M) & (u <= box[3] + persons.NEAR_M)
+                inside &= (v >= box[4] - persons.NEAR_M) & (v <= box[5] + persons.NEAR_M)
+                n_near = max(n_near, inside.sum())
+            u, v = (box[2] + box[3]) / 2, (box[4] + box[5]) / 2
+            n, n_riding = (of > 0).sum(), (of == persons.RIDES).sum()
+            rides = box[3] - box[2] > persons.MAX_STRIDE_M or (n_riding > 0 and n_riding >= 0.25 * n)
+            z = points[part, 2].astype(np.float64)
+            middle = u * box[0] - v * box[1], u * box[1] + v * box[0]
+            extent = box[3] - box[2], box[5] - box[4], np.arctan2(box[1], box[0])
+            levels = (z - height[part].astype(np.float64)).mean(), z.max()
+            found.append([rides, *middle, *extent, *levels, len(part), n / n_near, width])
+    return np.array(found).reshape(-1, 11)
