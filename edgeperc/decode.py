@@ -623,8 +623,8 @@ def fill_footprint_sums(
     for i in range(rectangles.shape[0]):
         for c in range(n_classes):
             sums[i, c] = 0.0
-        x, y, length, across, yaw = rectangles[i]
-        cos, sin = math.cos(yaw), math.sin(yaw)
+        x, y, length, across = rectangles[i, 0], rectangles[i, 1], rectangles[i, 2], rectangles[i, 3]
+        cos, sin = math.cos(rectangles[i, 4]), math.sin(rectangles[i, 4])
         reach = 0.5 * math.hypot(length, across)
         first_row = max(math.floor((x_far - x - reach) / cell), 0)
         last_row = min(math.ceil((x_far - x + reach) / cell), height)

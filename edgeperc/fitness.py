@@ -77,8 +77,10 @@ def fill_scan_sums(
     heights[:] = 0
     n_rows[:] = 0
     sums[:] = 0.0
-    seen = np.zeros(64, np.bool_)
-    far = np.zeros(64)
+    seen = np.empty(64)  # 1 in sectors with points
+    far = np.empty(64)
+    seen[:] = 0.0
+    far[:] = 0.0
     lowest = math.inf
     highest = -math.inf
     for i in range(0, n, step):
@@ -104,7 +106,7 @@ def fill_scan_sums(
         if x < 0.0:
             azimuth = 2.0 - azimuth if y >= 0.0 else -2.0 - azimuth
         sector = min(int((azimuth + 2.0) * 16.0), 63)
-        seen[sector] = True
+        seen[sector] = 1.0
         if view_right <= azimuth <= view_left:
             sums[1] += 1.0
         horizontal = math.sqrt(x * x + y * y)
@@ -115,14 +117,15 @@ def fill_scan_sums(
             elevations[min(int((math.atan(z / horizontal) * (180.0 / math.pi) + 90.0) * 2.0), 359)] += 1
         if 9.0 < square < 625.0:
             sums[7] += 1.0
-            for axis, value in enumerate((x, y, z)):
+            for axis in range(3):
+                value = x if axis == 0 else y if axis == 1 else z
                 if -10.0 <= value < 10.0:
                     heights[axis, min(int((value + 10.0) * 5.0), 99)] += 1
     sums[5] = lowest
     sums[6] = highest
 
     in_view = 0
-    in_view_seen = 0
+    in_view_seen = 0.0
     for sector in range(64):
         sums[2] += seen[sector]
         middle = (sector + 0.5) / 16.0 - 2.0
@@ -145,9 +148,12 @@ def fill_scan_sums(
     for k in range(1, heights.shape[1]):
         highest_bin = k if heights[2, k] > heights[2, highest_bin] else highest_bin
     ground = highest_bin * 0.2 - 9.9
-    ways = np.zeros(4)
-    along_x = np.zeros(120)
-    along_y = np.zeros(120)
+    ways = np.empty(4)
+    along_x = np.empty(120)
+    along_y = np.empty(120)
+    ways[:] = 0.0
+    along_x[:] = 0.0
+    along_y[:] = 0.0
     for i in range(0, n, step):
         x = np.float64(points[i, 0])
         y = np.float64(points[i, 1])

@@ -208,10 +208,11 @@ def fill_footprints(
         x of the far edge, y of the left edge, edge of a cell [m].
     labels : (rows, columns) uint8, modified
     """
-    x_far, y_left, cell_m = grid
+    x_far, y_left, cell_m = grid[0], grid[1], grid[2]
     n_rows, n_cols = labels.shape
     for k in range(boxes.shape[0]):
-        x, y, half_length, half_width, cos, sin = boxes[k]
+        x, y, half_length, half_width = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3]
+        cos, sin = boxes[k, 4], boxes[k, 5]
         reach_x = abs(cos) * half_length + abs(sin) * half_width
         reach_y = abs(sin) * half_length + abs(cos) * half_width
         # A cell more on each side; the view's size bounds them before they become whole numbers.

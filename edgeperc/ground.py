@@ -170,7 +170,8 @@ def fill_lowest(points: NDArray[np.float32], cell: NDArray[np.int32], lowest: ND
     # Smallest of `bits of z << 32 | row of points`, without a branch; the bits of z are in the order of z. Points out
     # of the grid go to an entry of their own. A first loop without branches compiles to vector instructions. Both
     # together halve the time.
-    best = np.full(N_CELLS * N_CELLS + 1, EMPTY, np.int64)
+    best = np.empty(N_CELLS * N_CELLS + 1, np.int64)
+    best[:] = EMPTY
     ordered = np.empty(BLOCK, np.int32)
     unused = np.empty(BLOCK, np.float32)  # a gap in the loads would prevent vector instructions
     for start in range(0, points.shape[0], BLOCK):
@@ -234,7 +235,8 @@ def fill_planes(
     planes : (N_REGIONS, N_REGIONS, 3) float64, overwritten
         Slopes along x and y, and height in the region's middle [m]; the expected plane if too few cells agree.
     """
-    solved = np.zeros((N_REGIONS, N_REGIONS))  # 1 and the cells that agree
+    solved = np.empty((N_REGIONS, N_REGIONS))  # 1 and the cells that agree
+    solved[:] = 0.0
     residuals = np.empty((3, CELLS_A_REGION * CELLS_A_REGION))
     expected = np.empty(3)
     fitted = np.empty(3)
@@ -253,7 +255,8 @@ def fill_planes(
                         # The four in the middle do not start from each other: one of them may hold a ditch.
                         weight = solved[near_r, near_q] if ring > 0 else 0.0
                         if weight > 0.0:
-                            a, b, height = planes[near_r, near_q]
+                            a, b = planes[near_r, near_q, 0], planes[near_r, near_q, 1]
+                            height = planes[near_r, near_q, 2]
                             total += weight
                             expected[0] += weight * a
                             expected[1] += weight * b
@@ -417,8 +420,10 @@ def fill_levels(
         z [m]; NaN without a point.
     """
     # Padded with zeros, so that the sums below need no bounds checks: this halves the time.
-    step = np.zeros((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), np.float32)
-    counts = np.zeros((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), np.float32)
+    step = np.empty((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), np.float32)
+    counts = np.empty((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), np.float32)
+    step[:] = 0.0
+    counts[:] = 0.0
     for row in range(N_CELLS):
         u = min(max((row + 0.5) / CELLS_A_REGION - 0.5, 0.0), N_REGIONS - 1.0)
         r = min(int(u), N_REGIONS - 2)
@@ -439,7 +444,8 @@ def fill_levels(
             for near_r in range(r, r + 2):
                 for near_q in range(q, q + 2):
                     weight = (u if near_r > r else 1.0 - u) * (v if near_q > q else 1.0 - v)
-                    a, b, height = planes[near_r, near_q]
+                    a, b = planes[near_r, near_q, 0], planes[near_r, near_q, 1]
+                    height = planes[near_r, near_q, 2]
                     dx = x - ((near_r + 0.5) * REGION_M - REACH_M)
                     dy = y - ((near_q + 0.5) * REGION_M - REACH_M)
                     ground += weight * (height + a * dx + b * dy)

@@ -63,7 +63,8 @@ def fill_clusters(
     clusters[:] = FREE
     work[:] = 0
     n_shares = len(min_shares)
-    n_left = np.zeros(n_shares + 1, np.int64)  # votes of points in no cluster yet
+    n_left = np.empty(n_shares + 1, np.int64)  # votes of points in no cluster yet
+    n_left[:] = 0
     rows = np.empty(points.shape[0], np.int32)  # of the points that take part
     m = 0
     n_seeds = 0
@@ -78,24 +79,31 @@ def fill_clusters(
             low_y, high_y = min(low_y, y), max(high_y, y)
     if n_seeds == 0:
         return
-    for i in rows[:m]:
+    for k in range(m):  # compiles faster than `for i in rows[:m]`
+        i = rows[k]
         if votes[i] > 1:
             add_votes(votes[i], n_left)
 
     # The reach of a point is the distance up to which it is linked. Points of a level have a reach from its edge up to
     # the next one, and columns in proportion: a point has few columns within its reach at any range.
     n_levels = 1
-    while min_distance * LEVEL_STEP**n_levels <= 2.0 * distance_per_m * max_range:
+    power = LEVEL_STEP  # exact: there are fewer than 33 levels
+    while min_distance * power <= 2.0 * distance_per_m * max_range:
         n_levels += 1
+        power *= LEVEL_STEP
     edges = np.empty(n_levels + 1)
     limits = np.empty(n_levels + 1)  # squared ranges
+    power = 1.0
     for at in range(n_levels + 1):
-        edges[at] = min_distance * LEVEL_STEP**at
-        limits[at] = (edges[at] / distance_per_m) ** 2 if distance_per_m > 0.0 else math.inf
+        edges[at] = min_distance * power
+        power *= LEVEL_STEP
+        ratio = edges[at] / distance_per_m if distance_per_m > 0.0 else math.inf
+        limits[at] = ratio * ratio
     grids = np.empty((n_levels, 3))  # lowest x and y, columns per meter
     n_rows = np.empty(n_levels, np.int64)
     n_cols = np.empty(n_levels, np.int64)
-    offsets = np.zeros(n_levels + 1, np.int64)  # the first strip of every level
+    offsets = np.empty(n_levels + 1, np.int64)  # the first strip of every level
+    offsets[0] = 0
     for at in range(n_levels):
         farthest = math.sqrt(limits[at + 1])
         grids[at, 0], grids[at, 1] = max(low_x, -farthest), max(low_y, -farthest)
@@ -106,9 +114,11 @@ def fill_clusters(
 
     # Points are kept by strips: `STRIP` columns of one row. The points of a strip are a chain: its head, then for every
     # point the next one.
-    heads = np.full(offsets[n_levels], -1, np.int32)
+    heads = np.empty(offsets[n_levels], np.int32)
+    heads[:] = -1
     chain = np.empty(points.shape[0], np.int32)
-    for i in rows[:m]:
+    for k in range(m):
+        i = rows[k]
         strip = strip_of(points, i, limits, grids, n_cols, offsets)
         chain[i] = heads[strip]
         heads[strip] = i
@@ -122,21 +132,25 @@ def fill_clusters(
     n_parts = m + m // 2 + 64
     parts = np.empty((n_parts, 3), np.int32)  # first point, end, first child or 0
     bounds = np.empty((n_parts, 8))
-    run_level = np.empty(m, np.int8)
+    run_level = np.empty(m, np.int32)
     run_votes = np.empty((m, n_shares + 1), np.int32)
     run_of = np.empty(points.shape[0], np.int32)
     firsts = np.empty((m, STRIP + 1), np.int32)  # of opened strips: the first run of every column, and the end
     owner = np.empty(m, np.int32)
     # First of the smaller parts, tests left, the reserve of tests, points in opened strips, runs, opened strips.
-    state = np.array([n_parts, 2 * TESTS_PER_POINT * m, TESTS_PER_POINT * m, 0, 0, 0])
+    state = np.empty(6, np.int64)
+    state[0], state[1], state[2] = n_parts, 2 * TESTS_PER_POINT * m, TESTS_PER_POINT * m
+    state[3], state[4], state[5] = 0, 0, 0
 
     # Clusters grow from seeds, run by run. A run of another cluster is not linked with this one, which was complete.
-    is_kept = np.zeros(n_seeds, np.bool_)
+    is_kept = np.empty(n_seeds, np.int32)  # 0 or 1, of every cluster that was not dropped
     queue = np.empty(m, np.int32)
     pairs = np.empty((MAX_PAIRS, 2), np.int32)
-    n_votes, n_none = np.empty(n_shares + 1, np.int64), np.zeros(n_shares + 1, np.int64)
+    n_votes, n_none = np.empty(n_shares + 1, np.int64), np.empty(n_shares + 1, np.int64)
+    n_none[:] = 0
     n_clusters = 0
-    for seed in rows[:m]:
+    for nth in range(m):
+        seed = rows[nth]
         if not seeds[seed]:
             continue
         strip = strip_of(points, seed, limits, grids, n_cols, offsets)
@@ -229,17 +243,18 @@ def fill_clusters(
             for place in range(parts[queue[k], 0], parts[queue[k], 1]):
                 clusters[order[place]] = owner[queue[k]]
         if not is_dropped:
-            is_kept[n_clusters] = size >= min_points
+            is_kept[n_clusters] = 1 if size >= min_points else 0
             n_clusters += 1
     work[1] = 2 * TESTS_PER_POINT * m - state[1]
 
-    renumbered = np.full(n_clusters, FREE, np.int32)
+    renumbered = np.empty(n_clusters, np.int32)
+    renumbered[:] = FREE
     n_kept = 0
     for i in range(points.shape[0]):
         found = clusters[i]
         if found < 0:
             continue
-        if is_kept[found] and renumbered[found] < 0:
+        if is_kept[found] != 0 and renumbered[found] < 0:
             renumbered[found] = n_kept
             n_kept += 1
         clusters[i] = renumbered[found]
@@ -305,7 +320,7 @@ def open_strip(
     reach: NDArray[np.float64],
     parts: NDArray[np.int32],
     bounds: NDArray[np.float64],
-    run_level: NDArray[np.int8],
+    run_level: NDArray[np.int32],
     run_votes: NDArray[np.int32],
     run_of: NDArray[np.int32],
     firsts: NDArray[np.int32],

@@ -323,7 +323,8 @@ def fill_rings(cells: NDArray[np.bool_], corners: NDArray[np.int64], ends: NDArr
     n_rings : int
     """
     height, width = cells.shape
-    walked = np.zeros((height, width), np.bool_)  # lower sides
+    walked = np.empty((height, width), np.bool_)  # lower sides
+    walked[:] = False
     n_corners, n_rings = 0, 0
     for top in range(height - 1):
         for left in range(width):
@@ -389,7 +390,7 @@ def may_change(ar: int, ac: int, br: int, bc: int, cr: int, cc: int, fixed: NDAr
                     x = pc + (qc - pc) * (at - pr) / (qr - pr)
                     low, high = min(low, x), max(high, x)
                 else:
-                    low, high = min(low, pc, qc), max(high, pc, qc)
+                    low, high = min(low, np.float64(min(pc, qc))), max(high, np.float64(max(pc, qc)))
         left, right = int(np.floor(low + 1e-9)), int(np.ceil(high - 1e-9))
         if right > left and fixed[row, right] != fixed[row, left]:
             return False
@@ -443,7 +444,8 @@ def merge_corners(
     The new edges may meet no other edge, so the ring stays valid. Holes stay inside if none of their cells may change.
     """
     n, height, width = ring.shape[0], fixed.shape[0], fixed.shape[1] - 1
-    tried = np.zeros(n, np.int64)  # the limit at which a corner and the next one were tried in vain
+    tried = np.empty(n, np.int64)  # the limit at which a corner and the next one were tried in vain
+    tried[:] = 0
     limit = 8  # of twice the areas together
     while limit <= 8 * height * width:
         changed = False
@@ -554,7 +556,8 @@ def mark_needed(
     """
     n = corners.shape[0]
     before, after, ring_of = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    size = np.zeros(ends.shape[0], np.int64)
+    size = np.empty(ends.shape[0], np.int64)
+    size[:] = 0
     largest = 1
     begin = 0
     for ring in range(ends.shape[0]):

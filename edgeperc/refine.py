@@ -195,8 +195,10 @@ def fill_without_outliers(
     for row in range(height):
         for col in range(width):
             cleaned[row, col] = labels[row, col]
-    seen = np.zeros((height, width), np.bool_)
-    rim = np.full((height, width), -1, np.int32)  # the component that has an object near this pixel
+    seen = np.empty((height, width), np.bool_)
+    seen[:] = False
+    rim = np.empty((height, width), np.int32)  # the component that has an object near this pixel
+    rim[:] = -1
     rows = np.empty(height * width, np.int32)
     cols = np.empty(height * width, np.int32)
     ground = np.empty((height * width, 2))  # x, y of every member
@@ -349,9 +351,11 @@ def fill_point_labels(
     point_labels : (n,) uint8, overwritten
     """
     height, width = labels.shape
-    ranges = np.full((height, width), -1.0)  # of each pixel's point [m], computed when needed
+    ranges = np.empty((height, width))  # of each pixel's point [m], computed when needed
     # Most hidden points have only background around them and need no vote: 0.5 ms a scan instead of 1.0.
-    contested = np.zeros((height, width), np.bool_)
+    contested = np.empty((height, width), np.bool_)
+    contested[:] = False
+    ranges[:] = -1.0
     for row in range(height):
         for col in range(width):
             if labels[row, col] == 0:
