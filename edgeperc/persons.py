@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .kernel_cache import njit
 
-__all__ = ["MIN_OF_WHOLE", "RIDES", "WALKS", "fill_person_groups", "fill_persons"]
+__all__ = ["MIN_OF_WHOLE", "RIDES", "WALKS", "fill_person_groups", "fill_persons", "let_ride"]
 
 WALKS, RIDES = 1, 2  # roles of labels
 MIN_OF_WHOLE = 0.25  # a person rides if at least this share of the persons' points says so: many say "pedestrian"
@@ -34,6 +34,7 @@ MAX_BINS = 1024
 # Feet that are a step of 0.8 m apart take 1.1 m. A bicycle takes 1.7 m, of which 1.0 to 1.8 m are seen on the training
 # drives.
 MAX_STRIDE_M = 1.1
+MIN_RIDER_POINTS = 5  # labeled ones
 
 HEAD_M = 0.2  # heads are in the uppermost part of a group, shoulders are not
 HEAD_GAP_M, HEAD_GAP_PER_M = 0.2, 0.006  # a wider gap is between two heads; 0.006: two beams of an HDL-64E
@@ -153,6 +154,73 @@ def fill_person_groups(
 
 
 @njit(cache=True, nogil=True)
+def let_ride(
+    points: NDArray[np.float32],
+    height: NDArray[np.float32],
+    in_view: NDArray[np.bool_],
+    clusters: NDArray[np.int32],
+    bounds: NDArray[np.float32],
+    walks: int,
+    rides: int,
+    labels: NDArray[np.uint8],
+) -> None:
+    """Make the points of a person who is longer than a stride points of a rider.
+
+    Parameters
+    ----------
+    points : (n, 3 or more) float32, C-contiguous
+    height : (n,) float32
+        [m] above the ground.
+    in_view : (n,) bool
+    clusters : (n,) int32
+        Negative for none.
+    bounds : (k, 5) float32
+        Of each cluster, from `edgeperc.voting.fill_tallies`.
+    walks, rides : int
+        The labels of persons on foot and of those who ride.
+    labels : (n,) uint8, modified
+    """
+    slots = np.full(bounds.shape[0], -1, np.int64)  # of clusters whose size may be a rider's
+    n_slots = 0
+    for k in range(bounds.shape[0]):
+        x, y = bounds[k, 2] - bounds[k, 0], bounds[k, 3] - bounds[k, 1]
+        is_small = max(x, y) <= 2.0 * MAX_LENGTH_M and bounds[k, 4] <= MAX_TOP_M
+        if is_small and math.hypot(np.float64(x), np.float64(y)) > MAX_STRIDE_M:
+            slots[k] = n_slots
+            n_slots += 1
+    if n_slots == 0:
+        return
+    ends = np.zeros(n_slots + 1, np.int64)
+    for i in range(len(clusters)):
+        if clusters[i] >= 0 and slots[clusters[i]] >= 0:
+            ends[slots[clusters[i]] + 1] += 1
+    for slot in range(n_slots):
+        ends[slot + 1] += ends[slot]
+    starts = ends.copy()
+    order = np.empty(ends[n_slots], np.int32)
+    for i in range(len(clusters)):
+        if clusters[i] >= 0 and slots[clusters[i]] >= 0:
+            order[ends[slots[clusters[i]]]] = i
+            ends[slots[clusters[i]]] += 1
+    found = np.empty(7)
+    for slot in range(n_slots):
+        members = order[starts[slot] : starts[slot + 1]]
+        n_walking, n_riding = 0, 0
+        for i in members:
+            n_walking += 1 if labels[i] == walks else 0
+            n_riding += 1 if labels[i] == rides else 0
+        if n_walking == 0 or n_walking + n_riding < max(MIN_GROUP_SHARE * len(members), MIN_RIDER_POINTS):
+            continue
+        measure(points, height, members, -math.inf, found)
+        length = found[3] - found[2]
+        measure(points, height, members, UPPER * found[6], found)
+        if MAX_STRIDE_M < length <= MAX_LENGTH_M and found[3] - found[2] <= MAX_UPPER_M:
+            for i in members:
+                if in_view[i] and labels[i] == walks:
+                    labels[i] = rides
+
+
+@njit(cache=True, nogil=True)
 def border_of(
     points: NDArray[np.float32],
     height: NDArray[np.float32],
@@ -230,8 +298,8 @@ def fill_persons(
 ) -> int:
     """Divide groups into persons, and measure them.
 
-    A group whose upper quarter is wider than 0.8 m is cut where the fewest points are, and its parts again. A part that
-    is longer than a stride rides, like one of which a quarter of the persons' points says so.
+    A group whose upper quarter is wider than 0.8 m is cut where the fewest points are, and its parts again. A person
+    rides if a quarter of the persons' points says so.
 
     Parameters
     ----------
@@ -311,7 +379,7 @@ def fill_persons(
                     across = found[4] - NEAR_M <= v <= found[5] + NEAR_M
                     n_near += 1 if along and across and height[i] <= MAX_TOP_M else 0
             length, u, v = found[3] - found[2], 0.5 * (found[2] + found[3]), 0.5 * (found[4] + found[5])
-            rides = length > MAX_STRIDE_M or (n_riding > 0 and n_riding >= MIN_OF_WHOLE * n_labeled)
+            rides = n_riding > 0 and n_riding >= MIN_OF_WHOLE * n_labeled
             persons[n_found, 0] = 1.0 if rides else 0.0
             persons[n_found, 1] = u * found[0] - v * found[1]
             persons[n_found, 2] = u * found[1] + v * found[0]

@@ -11,9 +11,12 @@ from hypothesis import strategies as st
 
 import twins.persons
 from edgeperc import persons
+from edgeperc.agreement import RULES, agree_on_points, find_voters
 from edgeperc.cluster import OBJECT_SIZE_M, fill_groups, find_clusters, join_boxes, objects_from_points
 from edgeperc.geometry import oriented_iou
-from edgeperc.perception import Box
+from edgeperc.ground import Ground
+from edgeperc.perception import Box, PointLabels
+from edgeperc.voting import fill_tallies
 
 CLASSES = ("background", "car", "pedestrian", "cyclist")
 GROUND_Z = -1.73
@@ -118,12 +121,26 @@ def test_a_person_of_whom_a_part_is_labeled_gets_a_whole_box():
 
 
 @pytest.mark.parametrize("away", [10.0, 20.0])
-def test_a_rider_labeled_pedestrian_is_a_cyclist(away):
+@pytest.mark.parametrize("alike", [True, False])
+def test_a_pedestrian_longer_than_a_stride_is_a_cyclist(away, alike):
     bicycle = upright(away, 0.0, 1.7, 0.1, z=(0.15, 0.9))
     rider = upright(away, 0.1, 0.45, 0.2, z=(0.9, 1.65))
-    (box,) = boxes_of(bicycle, rider)
-    assert box.label == "cyclist"
-    assert iou(box, away, 0.0, OBJECT_SIZE_M["cyclist"][:2], math.pi / 2) > 0.6
+    walking, pair = person(away, -8.0), [person(away, 8.0), person(away, 8.6)]
+    xyz = np.concatenate([walking, *pair, bicycle, rider])
+    points = np.column_stack([xyz, np.zeros(len(xyz))]).astype(np.float32)
+    is_rider = np.arange(len(xyz)) >= len(xyz) - len(bicycle) - len(rider)
+    labels = np.where(is_rider & (np.arange(len(xyz)) % 5 == 0), 0 if alike else 3, 2).astype(np.uint8)
+    found = PointLabels(labels, np.ones(len(labels), np.bool_), CLASSES)
+    ground = Ground(np.zeros(len(labels), np.bool_), points[:, 2] - np.float32(GROUND_Z), (0.0, 0.0, GROUND_Z))
+    clusters = find_voters(points, found, ground)
+    agreed = agree_on_points(points, found, ground, clusters)
+    assert (agreed.labels == np.where(is_rider, 3, 2)).all()
+    without = agree_on_points(points, found, ground, clusters, rules=RULES - {"stride", "fill"})
+    assert without.labels.tolist() == labels.tolist()
+    boxes = objects_from_points(points, agreed.labels, CLASSES, height_m=ground.height_m, clusters=clusters)
+    (cyclist,) = (box for box in boxes if box.label == "cyclist")
+    assert iou(cyclist, away, 0.0, OBJECT_SIZE_M["cyclist"][:2], math.pi / 2) > 0.6
+    assert len(boxes) == 4
 
 
 def test_a_board_is_no_row_of_people():
@@ -184,14 +201,14 @@ def test_without_clusters_and_heights_the_boxes_are_the_same():
 # --- the kernels
 
 
-def crowd(seed, n_people):
+def crowd(seed, n_people, per_cluster=3, depth=0.15):
     """People at random places, with labels, heights and clusters; the rows are shuffled."""
     rng = np.random.default_rng(seed)
-    middles = rng.uniform(-20, 20, (max(n_people // 3, 1), 2))
+    middles = rng.uniform(-20, 20, (max(n_people // per_cluster, 1), 2))
     parts, of = [np.zeros((0, 3))], []
     for k in range(n_people):
         x, y = middles[k % len(middles)] + rng.uniform(-1.5, 1.5, 2)
-        parts.append(rng.normal(0, 1, (int(rng.integers(1, 90)), 3)) * [0.15, 0.15, 0.5] + (x, y, 1.0))
+        parts.append(rng.normal(0, 1, (int(rng.integers(1, 90)), 3)) * [depth, 0.15, 0.4] + (x, y, 1.0))
         of += [k % len(middles)] * len(parts[-1])
     xyz = np.concatenate(parts)
     shuffled = rng.permutation(len(xyz))
@@ -243,6 +260,19 @@ def test_persons_agree_with_the_twin(seed, n_people, min_points):
     np.testing.assert_allclose(found[:n, 6:], expected[:, 6:], atol=1e-6)
     turns = np.abs(found[:n, 5] - expected[:, 5])
     assert (np.minimum(turns, math.pi - turns) < 1e-4)[found[:n, 3] > found[:n, 4] + 1e-3].all()
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.integers(0, 2**31), st.integers(0, 14))
+def test_riders_agree_with_the_twin(seed, n_people):
+    points, height, labels, clusters = crowd(seed, n_people, per_cluster=1, depth=0.4)
+    in_view = np.random.default_rng(seed).random(len(points)) < 0.9
+    n = clusters.max(initial=-1) + 1
+    counts, bounds = np.empty((n, 5), np.int32), np.empty((n, 5), np.float32)
+    fill_tallies(points, height, in_view, labels, clusters, counts, bounds)
+    expected = twins.persons.ridden(points, height, in_view, clusters, 2, 3, labels)
+    persons.let_ride(points, height, in_view, clusters, bounds, 2, 3, labels)
+    np.testing.assert_array_equal(labels, expected)
 
 
 @pytest.mark.parametrize("n", [0, 1, 3, 200])

@@ -105,10 +105,28 @@ def rows(points, height, labels, roles, groups, n_whole, clusters, min_points):
                 n_near = max(n_near, inside.sum())
             u, v = (box[2] + box[3]) / 2, (box[4] + box[5]) / 2
             n, n_riding = (of > 0).sum(), (of == persons.RIDES).sum()
-            rides = box[3] - box[2] > persons.MAX_STRIDE_M or (n_riding > 0 and n_riding >= 0.25 * n)
+            rides = n_riding > 0 and n_riding >= 0.25 * n
             z = points[part, 2].astype(np.float64)
             middle = u * box[0] - v * box[1], u * box[1] + v * box[0]
             extent = box[3] - box[2], box[5] - box[4], np.arctan2(box[1], box[0])
             levels = (z - height[part].astype(np.float64)).mean(), z.max()
             found.append([rides, *middle, *extent, *levels, len(part), n / n_near, width])
     return np.array(found).reshape(-1, 11)
+
+
+def ridden(points, height, in_view, clusters, walks, rides, labels):
+    """Twin of `edgeperc.persons.let_ride`."""
+    labels = labels.copy()
+    for k in range(clusters.max(initial=-1) + 1):
+        members = np.flatnonzero(clusters == k)
+        labeled = np.isin(labels[members], (walks, rides)).sum()
+        if len(members) == 0 or np.ptp(points[members, :2], axis=0).max() > 2 * persons.MAX_LENGTH_M:
+            continue
+        if labeled < 5 or labeled < persons.MIN_GROUP_SHARE * len(members):
+            continue
+        box = measured(points, height, members, -np.inf)
+        upper = measured(points, height, members, persons.UPPER * box[6])
+        is_long = persons.MAX_STRIDE_M < box[3] - box[2] <= persons.MAX_LENGTH_M
+        if is_long and box[6] <= persons.MAX_TOP_M and upper[3] - upper[2] <= persons.MAX_UPPER_M:
+            labels[members[in_view[members] & (labels[members] == walks)]] = rides
+    return labels
