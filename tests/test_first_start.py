@@ -77,7 +77,7 @@ def kernels(folder: Path) -> set[str]:
     return {file.name for file in (folder / "cache").rglob("*.kernel")}
 
 
-def test_helpers_fill_the_same_cache_and_change_no_result(tmp_path: Path) -> None:
+def test_helpers_fill_the_same_cache_and_change_no_result(cold: None, tmp_path: Path) -> None:
     alone, called, answer = start(tmp_path / "alone", 1)
     assert called == []
     # Each takes 0.03 s at least. More than these are a sign of kernels that are compiled for several types.
@@ -88,8 +88,9 @@ def test_helpers_fill_the_same_cache_and_change_no_result(tmp_path: Path) -> Non
     assert (called, same_answer) == ([], answer)
     assert kernels(tmp_path / "helped") == kernels(tmp_path / "alone")
     assert len(kernels(tmp_path / "alone")) == len(own)
-    left = {f"{part.largest.py_func.__module__}.{part.largest.py_func.__name__}" for part in PARTS.values()}
-    assert len(left & set(helped)) == 1, "one helper compiles all parts but the ground"
+    own = {f"{part.largest.py_func.__module__}.{part.largest.py_func.__name__}": name for name, part in PARTS.items()}
+    # Both may begin with the ground at once.
+    assert {own[name] for name in helped if name in own} - {"ground"} == set(Helpers([*PARTS])._own) - {"ground"}
     assert (tmp_path / "helped" / "begun").read_text().count("\n") == 1, "a helper ran the caller's main module"
     assert not [*tmp_path.rglob("*.part")]
     assert start(tmp_path / "helped", 2) == ([], [], answer)
@@ -185,15 +186,13 @@ def test_a_frozen_application_is_not_started_again(
 @pytest.mark.parametrize("n_cores", range(1, 7))
 def test_helpers_share_the_work(cold: None, monkeypatch: pytest.MonkeyPatch, n_cores: int) -> None:
     monkeypatch.setattr(first_start, "usable_cores", lambda: n_cores)
-    shares = Helpers([*PARTS])._shares
-    assert len(shares) == min(n_cores - 1, 3)
-    parts = [part for share in shares for part in share]
-    expected = {1: set(), 2: {*PARTS} - {"ground"}}.get(n_cores, {*PARTS})
-    assert len(parts) == len(set(parts))
-    assert set(parts) == expected
-    if n_cores > 2:
-        seconds = [sum(PARTS[part].seconds for part in share) for share in shares]
-        assert max(seconds) < 1.5 * min(seconds)
+    helpers = Helpers([*PARTS])
+    assert len(helpers._shares) == min(n_cores - 1, 3)
+    parts = [*helpers._own, *(part for share in helpers._shares for part in share)]
+    assert sorted(parts) == sorted(PARTS)
+    seconds = [sum(PARTS[part].seconds for part in share) for share in (helpers._own, *helpers._shares)]
+    seconds[0] += first_start.OTHERS_S
+    assert max(seconds) <= {1: 23.0, 2: 12.0, 3: 9.0}.get(n_cores, 7.0)
 
 
 def test_no_helper_where_the_cache_cannot_be_written_or_holds_the_kernels(
