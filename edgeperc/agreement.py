@@ -25,7 +25,7 @@ from .geometry import draw_footprints
 from .ground import Ground
 from .kernel_cache import njit
 from .perception import Box, PointLabels, TopView
-from .persons import let_ride
+from .persons import complete_persons
 from .points import read_only
 from .voting import (
     COMPLETING_SCORE,
@@ -40,17 +40,17 @@ from .voting import (
 
 __all__ = ["RULES", "agree_on_boxes", "agree_on_cells", "agree_on_points", "find_support", "find_voters"]
 
-RULES = frozenset({"column", "share", "height", "fill", "stride", "support", "ground", "boxes", "road"})
+RULES = frozenset({"column", "share", "height", "fill", "person", "support", "ground", "boxes", "road"})
 """Names of the rules, for ablations.
 
 ``"column"``: a person whose column of points goes on above a person's height is a pole. ``"share"``: a cluster loses a
 class that too few of its points have. ``"height"``: a cluster that is too low loses its class. ``"fill"``: a cluster
-gets the class that most of its points have. ``"stride"``: a pedestrian who is longer than a stride is a cyclist.
-``"support"``: boxes of the top view keep and add labels. ``"ground"``: a point on the ground is labeled only below an
-object. ``"boxes"``: uncertain boxes without labeled points are dropped. ``"road"``: cells below boxes, labeled points
-and obstacles are not drivable.
+gets the class that most of its points have. ``"person"``: a cluster of a person's size and shape is one person, a
+cyclist if longer than a stride. ``"support"``: boxes of the top view keep and add labels. ``"ground"``: a point on the
+ground is labeled only below an object. ``"boxes"``: uncertain boxes without labeled points are dropped. ``"road"``:
+cells below boxes, labeled points and obstacles are not drivable.
 """
-_NEED_GROUND = frozenset({"column", "height", "stride", "ground", "road"})
+_NEED_GROUND = frozenset({"column", "height", "person", "ground", "road"})
 
 VEHICLES = frozenset({"car", "van", "truck"})
 # Height [m] above the ground up to which the column of points at a person may reach. At 2.2 and 2.4 m instead of 2.0 m,
@@ -180,11 +180,12 @@ def agree_on_points(
     vehicle labels if less than 0.6 of its points have them (0.75 if it is longer than 10 m or higher than 4 m), or if
     it is lower than 0.5 m (1.0 m within 30 m); labels in a box with a score of 0.3 stay. It loses its person labels
     below a share of 0.1 or a height of 1.0 m. A share of 0.6 gives the class to all of its points in view; persons are
-    cyclists if a quarter of them is labeled so. A cluster between 1.1 m, more than a stride, and 2.3 m long makes its
-    pedestrians cyclists, if a fifth of its points is a person's and its upper quarter is at most 0.8 m wide. A box with
-    a score of 0.5 makes the points above the ground in it vehicle points, except persons. Boxes count only if a tenth
-    of their points in view have a vehicle's label. Last, points on the ground keep a label only in cells of 0.2 m in
-    which an object of their kind stands; within 6 m, points lower than 0.06 m lose it.
+    cyclists if a quarter of them is labeled so. A cluster up to 2.3 m long whose upper quarter is at most 0.8 m wide is
+    one person from a share of 0.2 on: a cyclist if longer than 1.1 m, more than a stride; from a share of 0.3 and with
+    a height from 1.3 to 2.0 m, with all of its points in view. A box with a score of 0.5 makes the points above the
+    ground in it vehicle points, except persons. Boxes count only if a tenth of their points in view have a vehicle's
+    label. Last, points on the ground keep a label only in cells of 0.2 m in which an object of their kind stands;
+    within 6 m, points lower than 0.06 m lose it.
     """
     _check(points, labels, ground)
     if clusters.shape != labels.labels.shape:
@@ -203,12 +204,11 @@ def agree_on_points(
     verdicts = _verdicts(labels.classes, counts, bounds, rules)
     scores, names = support or find_support(points, labels, ground, boxes, rules=rules)
     apply_verdicts(in_view, of, verdicts, roles, scores, names, agreed)
-    if "stride" in rules:
+    if "person" in rules:
         for part, whole in PART_OF.items():
             if part in labels.classes and whole in labels.classes:
-                let_ride(
-                    rows, height, in_view, of, bounds, labels.classes.index(part), labels.classes.index(whole), agreed
-                )
+                walks, rides = labels.classes.index(part), labels.classes.index(whole)
+                complete_persons(rows, height, in_view, of, counts, bounds, walks, rides, agreed)
     if "ground" in rules:
         clear_ground(rows, height, on_ground, roles, agreed)
     return PointLabels(agreed, labels.in_view, labels.classes)

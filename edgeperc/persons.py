@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .kernel_cache import njit
 
-__all__ = ["MIN_OF_WHOLE", "RIDES", "WALKS", "fill_person_groups", "fill_persons", "let_ride"]
+__all__ = ["MIN_OF_WHOLE", "RIDES", "WALKS", "complete_persons", "fill_person_groups", "fill_persons"]
 
 WALKS, RIDES = 1, 2  # roles of labels
 MIN_OF_WHOLE = 0.25  # a person rides if at least this share of the persons' points says so: many say "pedestrian"
@@ -34,7 +34,11 @@ MAX_BINS = 1024
 # Feet that are a step of 0.8 m apart take 1.1 m. A bicycle takes 1.7 m, of which 1.0 to 1.8 m are seen on the training
 # drives.
 MAX_STRIDE_M = 1.1
-MIN_RIDER_POINTS = 5  # labeled ones
+
+# A cluster of a person's size and shape is completed. With 0.2, 0.3, 0.4 and 0.6, pedestrians' points on the validation
+# drives have an IoU of 58.6, 58.6, 57.8 and 57.1 %, and cyclists' 74.0, 74.2, 74.2 and 73.4 %.
+MIN_WHOLE_SHARE, MIN_LABELED = 0.3, 5
+WHOLE_TOP_M = (1.3, 2.0)
 
 HEAD_M = 0.2  # heads are in the uppermost part of a group, shoulders are not
 HEAD_GAP_M, HEAD_GAP_PER_M = 0.2, 0.006  # a wider gap is between two heads; 0.006: two beams of an HDL-64E
@@ -154,17 +158,18 @@ def fill_person_groups(
 
 
 @njit(cache=True, nogil=True)
-def let_ride(
+def complete_persons(
     points: NDArray[np.float32],
     height: NDArray[np.float32],
     in_view: NDArray[np.bool_],
     clusters: NDArray[np.int32],
+    counts: NDArray[np.int32],
     bounds: NDArray[np.float32],
     walks: int,
     rides: int,
     labels: NDArray[np.uint8],
 ) -> None:
-    """Make the points of a person who is longer than a stride points of a rider.
+    """Give the points of a cluster that has a person's size and shape one label.
 
     Parameters
     ----------
@@ -174,18 +179,22 @@ def let_ride(
     in_view : (n,) bool
     clusters : (n,) int32
         Negative for none.
-    bounds : (k, 5) float32
+    counts, bounds : (k, classes + 1) int32, (k, 5) float32
         Of each cluster, from `edgeperc.voting.fill_tallies`.
     walks, rides : int
         The labels of persons on foot and of those who ride.
     labels : (n,) uint8, modified
+        A cluster up to 2.3 m long, whose upper quarter is at most 0.8 m wide, and of which a fifth is labeled as
+        persons, is one person. He or she rides if longer than a stride, or if a quarter of the persons' points says so.
+        The persons' points of one who is longer than a stride, or all points of one who is 1.3 to 2.0 m high and of
+        whom at least 0.3 is labeled, get the label.
     """
-    slots = np.full(bounds.shape[0], -1, np.int64)  # of clusters whose size may be a rider's
+    slots = np.full(bounds.shape[0], -1, np.int64)  # of clusters whose size may be a person's
     n_slots = 0
     for k in range(bounds.shape[0]):
-        x, y = bounds[k, 2] - bounds[k, 0], bounds[k, 3] - bounds[k, 1]
-        is_small = max(x, y) <= 2.0 * MAX_LENGTH_M and bounds[k, 4] <= MAX_TOP_M
-        if is_small and math.hypot(np.float64(x), np.float64(y)) > MAX_STRIDE_M:
+        edge = max(bounds[k, 2] - bounds[k, 0], bounds[k, 3] - bounds[k, 1])
+        is_small = edge <= 2.0 * MAX_LENGTH_M and bounds[k, 4] <= MAX_TOP_M
+        if is_small and counts[k, walks] + counts[k, rides] > 0:
             slots[k] = n_slots
             n_slots += 1
     if n_slots == 0:
@@ -209,15 +218,21 @@ def let_ride(
         for i in members:
             n_walking += 1 if labels[i] == walks else 0
             n_riding += 1 if labels[i] == rides else 0
-        if n_walking == 0 or n_walking + n_riding < max(MIN_GROUP_SHARE * len(members), MIN_RIDER_POINTS):
+        n_labeled = n_walking + n_riding
+        if n_labeled < max(MIN_GROUP_SHARE * len(members), MIN_LABELED):
             continue
         measure(points, height, members, -math.inf, found)
-        length = found[3] - found[2]
-        measure(points, height, members, UPPER * found[6], found)
-        if MAX_STRIDE_M < length <= MAX_LENGTH_M and found[3] - found[2] <= MAX_UPPER_M:
-            for i in members:
-                if in_view[i] and labels[i] == walks:
-                    labels[i] = rides
+        length, top = found[3] - found[2], found[6]
+        measure(points, height, members, UPPER * top, found)
+        if not (length <= MAX_LENGTH_M and found[3] - found[2] <= MAX_UPPER_M):
+            continue
+        is_whole = n_labeled >= MIN_WHOLE_SHARE * len(members) and WHOLE_TOP_M[0] <= top <= WHOLE_TOP_M[1]
+        if not is_whole and length <= MAX_STRIDE_M:
+            continue
+        new = rides if length > MAX_STRIDE_M or (n_riding > 0 and n_riding >= MIN_OF_WHOLE * n_labeled) else walks
+        for i in members:
+            if in_view[i] and (labels[i] == walks or labels[i] == rides or (is_whole and labels[i] == 0)):
+                labels[i] = new
 
 
 @njit(cache=True, nogil=True)

@@ -135,7 +135,7 @@ def test_a_pedestrian_longer_than_a_stride_is_a_cyclist(away, alike):
     clusters = find_voters(points, found, ground)
     agreed = agree_on_points(points, found, ground, clusters)
     assert (agreed.labels == np.where(is_rider, 3, 2)).all()
-    without = agree_on_points(points, found, ground, clusters, rules=RULES - {"stride", "fill"})
+    without = agree_on_points(points, found, ground, clusters, rules=RULES - {"person", "fill"})
     assert without.labels.tolist() == labels.tolist()
     boxes = objects_from_points(points, agreed.labels, CLASSES, height_m=ground.height_m, clusters=clusters)
     (cyclist,) = (box for box in boxes if box.label == "cyclist")
@@ -264,14 +264,14 @@ def test_persons_agree_with_the_twin(seed, n_people, min_points):
 
 @settings(max_examples=80, deadline=None)
 @given(st.integers(0, 2**31), st.integers(0, 14))
-def test_riders_agree_with_the_twin(seed, n_people):
+def test_completed_persons_agree_with_the_twin(seed, n_people):
     points, height, labels, clusters = crowd(seed, n_people, per_cluster=1, depth=0.4)
     in_view = np.random.default_rng(seed).random(len(points)) < 0.9
     n = clusters.max(initial=-1) + 1
     counts, bounds = np.empty((n, 5), np.int32), np.empty((n, 5), np.float32)
     fill_tallies(points, height, in_view, labels, clusters, counts, bounds)
-    expected = twins.persons.ridden(points, height, in_view, clusters, 2, 3, labels)
-    persons.let_ride(points, height, in_view, clusters, bounds, 2, 3, labels)
+    expected = twins.persons.completed(points, height, in_view, clusters, 2, 3, labels)
+    persons.complete_persons(points, height, in_view, clusters, counts, bounds, 2, 3, labels)
     np.testing.assert_array_equal(labels, expected)
 
 

@@ -114,19 +114,24 @@ def rows(points, height, labels, roles, groups, n_whole, clusters, min_points):
     return np.array(found).reshape(-1, 11)
 
 
-def ridden(points, height, in_view, clusters, walks, rides, labels):
-    """Twin of `edgeperc.persons.let_ride`."""
+def completed(points, height, in_view, clusters, walks, rides, labels):
+    """Twin of `edgeperc.persons.complete_persons`."""
     labels = labels.copy()
     for k in range(clusters.max(initial=-1) + 1):
         members = np.flatnonzero(clusters == k)
-        labeled = np.isin(labels[members], (walks, rides)).sum()
-        if len(members) == 0 or np.ptp(points[members, :2], axis=0).max() > 2 * persons.MAX_LENGTH_M:
-            continue
-        if labeled < 5 or labeled < persons.MIN_GROUP_SHARE * len(members):
+        own = labels[members]
+        n, n_riding = np.isin(own, (walks, rides)).sum(), (own == rides).sum()
+        if n < 5 or n < persons.MIN_GROUP_SHARE * len(own) or np.ptp(points[members, :2], axis=0).max() > 4.6:
             continue
         box = measured(points, height, members, -np.inf)
         upper = measured(points, height, members, persons.UPPER * box[6])
-        is_long = persons.MAX_STRIDE_M < box[3] - box[2] <= persons.MAX_LENGTH_M
-        if is_long and box[6] <= persons.MAX_TOP_M and upper[3] - upper[2] <= persons.MAX_UPPER_M:
-            labels[members[in_view[members] & (labels[members] == walks)]] = rides
+        length, top = box[3] - box[2], box[6]
+        if length > persons.MAX_LENGTH_M or top > persons.MAX_TOP_M or upper[3] - upper[2] > persons.MAX_UPPER_M:
+            continue
+        whole = n >= 0.3 * len(own) and 1.3 <= top <= 2.0
+        changed = in_view[members] & (np.isin(own, (walks, rides)) | (whole & (own == 0)))
+        if length > persons.MAX_STRIDE_M:
+            labels[members[changed]] = rides
+        elif whole:
+            labels[members[changed]] = rides if n_riding > 0 and n_riding >= 0.25 * n else walks
     return labels
