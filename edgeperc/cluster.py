@@ -375,8 +375,8 @@ def objects_from_points(
     group. A group whose upper quarter is wider than 0.8 m is cut where the fewest points are: people side by side. A
     person is a cyclist if a quarter of the persons' points is cyclist. The box has the principal axis of the points and
     their middle: its sides are extended to the usual ones at both ends, because a person is thin enough to be seen from
-    side to side. Two persons are one if their boxes overlap by more than 0.3, or if more than half of one footprint lies
-    in the other.
+    side to side. Two persons are one if their boxes overlap by more than 0.3, or if more than half of one footprint
+    lies in the other.
 
     Parameters were chosen on KITTI's training drives (`edgeperc.evaluation.splits.FOLDS`), with labels of networks that
     were not trained on them. ``bench/RESULTS.md`` has the results on the test drives.
