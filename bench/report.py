@@ -99,7 +99,10 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
             [each["start"], *(number(each[step], 3) for step in steps), number(each["peak_rss_mb"], 0)]
             for each in setting["cold_start"]
         ]
-        sentences = ["seconds from starting a process to its first result; the first start finds no compiled kernels"]
+        sentences = [
+            "seconds from starting a process to its first result; the first start finds no compiled kernels; the peak "
+            "RSS is without the helper processes that compile a part of them"
+        ]
         parts.append(Section("Cold start", sentences, [head, *rows]))
     if setting.get("loadgen"):
         summary = setting["loadgen"]

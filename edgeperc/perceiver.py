@@ -184,9 +184,10 @@ def _listed(models: object) -> list[str | os.PathLike[str]]:
 class Perceiver:
     """Turn a LiDAR scan into drivable area, boxes and a class for every point, and a camera's image into its classes.
 
-    Construction loads the models, checks them against their cards and compiles every kernel. Results own their
-    arrays; internal buffers are reused between calls. One instance processes one call at a time, and other threads
-    wait; for parallel calls use one instance per thread. Options cannot be changed after construction.
+    Construction loads the models, checks them against their cards and compiles every kernel; at the first start, helper
+    processes compile a part of them into the cache (`edgeperc.first_start`). Results own their arrays; internal buffers
+    are reused between calls. One instance processes one call at a time, and other threads wait; for parallel calls use
+    one instance per thread. Options cannot be changed after construction.
 
     Parameters
     ----------
