@@ -39,6 +39,7 @@ MAX_STRIDE_M = 1.1
 # drives have an IoU of 58.6, 58.6, 57.8 and 57.1 %, and cyclists' 74.0, 74.2, 74.2 and 73.4 %.
 MIN_WHOLE_SHARE, MIN_LABELED = 0.3, 5
 WHOLE_TOP_M = (1.3, 2.0)
+MAX_WALKING_WIDTH_M, MAX_RIDING_WIDTH_M = 0.7, 0.8  # across the axis; at most 0.67 and 0.76 m on the training drives
 
 HEAD_M = 0.2  # heads are in the uppermost part of a group, shoulders are not
 HEAD_GAP_M, HEAD_GAP_PER_M = 0.2, 0.006  # a wider gap is between two heads; 0.006: two beams of an HDL-64E
@@ -184,8 +185,9 @@ def complete_persons(
     walks, rides : int
         The labels of persons on foot and of those who ride.
     labels : (n,) uint8, modified
-        A cluster up to 2.3 m long, whose upper quarter is at most 0.8 m wide, and of which a fifth is labeled as
-        persons, is one person. He or she rides if longer than a stride, or if a quarter of the persons' points says so.
+        A cluster up to 2.3 m long and 0.7 m wide (0.8 m if the person rides), whose upper quarter is at most 0.8 m
+        wide, and of which a fifth is labeled as persons, is one person, who rides if longer than a stride, or if a
+        quarter of the persons' points says so.
         The persons' points of one who is longer than a stride, or all points of one who is 1.3 to 2.0 m high and of
         whom at least 0.3 is labeled, get the label.
     """
@@ -222,17 +224,18 @@ def complete_persons(
         if n_labeled < max(MIN_GROUP_SHARE * len(members), MIN_LABELED):
             continue
         measure(points, height, members, -math.inf, found)
-        length, top = found[3] - found[2], found[6]
+        length, width, top = found[3] - found[2], found[5] - found[4], found[6]
         measure(points, height, members, UPPER * top, found)
-        if not (length <= MAX_LENGTH_M and found[3] - found[2] <= MAX_UPPER_M):
+        is_riding = length > MAX_STRIDE_M or (n_riding > 0 and n_riding >= MIN_OF_WHOLE * n_labeled)
+        max_width = MAX_RIDING_WIDTH_M if is_riding else MAX_WALKING_WIDTH_M
+        if not (length <= MAX_LENGTH_M and width <= max_width and found[3] - found[2] <= MAX_UPPER_M):
             continue
         is_whole = n_labeled >= MIN_WHOLE_SHARE * len(members) and WHOLE_TOP_M[0] <= top <= WHOLE_TOP_M[1]
         if not is_whole and length <= MAX_STRIDE_M:
             continue
-        new = rides if length > MAX_STRIDE_M or (n_riding > 0 and n_riding >= MIN_OF_WHOLE * n_labeled) else walks
         for i in members:
             if in_view[i] and (labels[i] == walks or labels[i] == rides or (is_whole and labels[i] == 0)):
-                labels[i] = new
+                labels[i] = rides if is_riding else walks
 
 
 @njit(cache=True, nogil=True)

@@ -126,12 +126,13 @@ def completed(points, height, in_view, clusters, walks, rides, labels):
         box = measured(points, height, members, -np.inf)
         upper = measured(points, height, members, persons.UPPER * box[6])
         length, top = box[3] - box[2], box[6]
+        riding = length > persons.MAX_STRIDE_M or (n_riding > 0 and n_riding >= 0.25 * n)
+        if box[5] - box[4] > (0.8 if riding else 0.7):
+            continue
         if length > persons.MAX_LENGTH_M or top > persons.MAX_TOP_M or upper[3] - upper[2] > persons.MAX_UPPER_M:
             continue
         whole = n >= 0.3 * len(own) and 1.3 <= top <= 2.0
         changed = in_view[members] & (np.isin(own, (walks, rides)) | (whole & (own == 0)))
-        if length > persons.MAX_STRIDE_M:
-            labels[members[changed]] = rides
-        elif whole:
-            labels[members[changed]] = rides if n_riding > 0 and n_riding >= 0.25 * n else walks
+        if whole or length > persons.MAX_STRIDE_M:
+            labels[members[changed]] = rides if riding else walks
     return labels
