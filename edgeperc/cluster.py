@@ -440,6 +440,8 @@ def objects_from_points(
 
 def _distinct(boxes: Sequence[Box], max_overlap: float) -> list[Box]:
     """Of boxes that overlap, the one with the better score; best score first."""
+    if len(boxes) < 2:
+        return [*boxes]
     best = suppress_overlaps(rectangles(boxes), [box.score for box in boxes], max_overlap, max_inside=MAX_INSIDE)
     return [boxes[row] for row in best]
 
@@ -521,8 +523,8 @@ def join_boxes(first: Sequence[Box], second: Sequence[Box]) -> tuple[Box, ...]:
     tuple of Box
         Best score first.
     """
-    same = _same_object(second, first)
-    others = []
+    others: list[Box] = []
+    same = _same_object(second, first) if first and second else np.zeros((len(second), 0), np.bool_)
     for row, box in enumerate(second):
         best = max((first[k].score for k in np.flatnonzero(same[row]).tolist()), default=-math.inf)
         if best == -math.inf or (box.label in PERSONS and box.score > best):
