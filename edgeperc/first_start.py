@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from .agreement import agree_on_boxes, agree_on_cells, agree_on_points, clear_columns, find_support, find_voters
 from .cluster import fill_rectangle, join_boxes, objects_from_points
 from .drivable import compile_kernels
+from .geometry import suppress_overlaps
 from .ground import Ground, fill_planes, find_ground
 from .kernel_cache import KernelCache, fewer_collections
 from .linkage import fill_clusters
@@ -92,6 +93,7 @@ def _compile_boxes() -> None:
         labels = np.where(ground.mask, 0, label).astype(np.uint8)
         found = objects_from_points(scan, labels, points.classes, height_m=ground.height_m, clusters=clusters)
     join_boxes(boxes, found)
+    suppress_overlaps(np.zeros((2, 5)), np.zeros(2), 0.0)
 
 
 def _compile_agreement() -> None:
@@ -129,11 +131,11 @@ class Part(NamedTuple):
 
 PARTS: Mapping[str, Part] = MappingProxyType(
     {
-        "clusters": Part(_compile_clusters, fill_clusters, 4.0),
-        "boxes": Part(_compile_boxes, fill_rectangle, 3.3),
-        "agreement": Part(_compile_agreement, clear_columns, 3.2),
-        "road": Part(compile_kernels, merge_corners, 2.5),
-        "ground": Part(_compile_ground, fill_planes, 2.3),
+        "clusters": Part(_compile_clusters, fill_clusters, 3.6),
+        "boxes": Part(_compile_boxes, fill_rectangle, 3.9),
+        "agreement": Part(_compile_agreement, clear_columns, 3.8),
+        "road": Part(compile_kernels, merge_corners, 2.2),
+        "ground": Part(_compile_ground, fill_planes, 2.0),
     }
 )
 OTHERS_S = 7.0  # what the other kernels of a perceiver take

@@ -32,6 +32,7 @@ from .errors import EdgepercError, FitnessError, ImageError, MountingError, Opti
 from .first_start import Helpers, car_and_person
 from .fitness import Finding, FitnessProfile, check_profiles
 from .frame import ModelFrame, turned
+from .geometry import suppress_overlaps
 from .ground import Ground, find_ground
 from .image import ImageScaler, as_image, label_pixels
 from .kernel_cache import fewer_collections
@@ -396,6 +397,8 @@ class Perceiver:
                 unsure = (Box("car", 0.4, (5.0, 0.0, -1.0), (4.0, 1.6, 1.5), 0.0),)
                 seen = None if perception.points is None else labels
                 self._combine(floor, ground, seen, perception.top_view, unsure, _Stopwatch())
+            if boxes_points:
+                suppress_overlaps(np.zeros((2, 5)), np.zeros(2), 0.0)  # which one box alone does not need
             if "top_view" in views:
                 compile_kernels()  # of `edgeperc.road_ahead`
 
