@@ -29,10 +29,9 @@ from .cluster import MIN_SCORE, join_boxes, objects_from_points
 from .decode import decode_labels, decode_top_view
 from .drivable import compile_kernels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
-from .first_start import Helpers, car_and_person
+from .first_start import Helpers, car_and_person, compile_parts
 from .fitness import Finding, FitnessProfile, check_profiles
 from .frame import ModelFrame, turned
-from .geometry import suppress_overlaps
 from .ground import Ground, find_ground
 from .image import ImageScaler, as_image, label_pixels
 from .kernel_cache import fewer_collections
@@ -229,7 +228,7 @@ class Perceiver:
         ``"network"``: boxes of a top-view model, vehicles ahead. ``"clusters"``: boxes around clusters of labeled
         points above the ground, of every class and everywhere in the range image
         (`edgeperc.cluster.objects_from_points`). ``"both"``: use both. A cluster's box is dropped if it overlaps a
-        network's box, or if the network detects its class there.
+        network's box, unless it is a person's with the better score, or if the network detects its class there.
     full_turn : bool
         Run a range-image model once for each sector, four times for the shipped models. Every point then has a class,
         and there are boxes beside and behind the vehicle.
@@ -398,7 +397,7 @@ class Perceiver:
                 seen = None if perception.points is None else labels
                 self._combine(floor, ground, seen, perception.top_view, unsure, _Stopwatch())
             if boxes_points:
-                suppress_overlaps(np.zeros((2, 5)), np.zeros(2), 0.0)  # which one box alone does not need
+                compile_parts(["boxes"])  # some only several boxes need
             if "top_view" in views:
                 compile_kernels()  # of `edgeperc.road_ahead`
 
