@@ -91,8 +91,8 @@ def _compile_boxes() -> None:
     clusters = np.where(ground.mask, -1, 0).astype(np.int32)
     for label in (1, 2):  # one cluster of a car; one of a person, without points beside it that would be clustered
         labels = np.where(ground.mask, 0, label).astype(np.uint8)
-        found = objects_from_points(scan, labels, points.classes, height_m=ground.height_m, clusters=clusters)
-    join_boxes(boxes, found)
+        objects_from_points(scan, labels, points.classes, height_m=ground.height_m, clusters=clusters)
+    join_boxes(boxes, boxes)
     suppress_overlaps(np.zeros((2, 5)), np.zeros(2), 0.0)
 
 
@@ -131,14 +131,14 @@ class Part(NamedTuple):
 
 PARTS: Mapping[str, Part] = MappingProxyType(
     {
-        "clusters": Part(_compile_clusters, fill_clusters, 3.6),
-        "boxes": Part(_compile_boxes, fill_rectangle, 3.9),
-        "agreement": Part(_compile_agreement, clear_columns, 3.8),
+        "clusters": Part(_compile_clusters, fill_clusters, 3.0),
+        "boxes": Part(_compile_boxes, fill_rectangle, 3.1),
+        "agreement": Part(_compile_agreement, clear_columns, 2.9),
         "road": Part(compile_kernels, merge_corners, 2.2),
         "ground": Part(_compile_ground, fill_planes, 2.0),
     }
 )
-OTHERS_S = 7.0  # what the other kernels of a perceiver take
+OTHERS_S = 8.3  # what the other kernels of a perceiver take
 MAX_HELPERS = 3
 
 
@@ -231,13 +231,13 @@ def _shares(parts: Sequence[str]) -> list[list[str]]:
     """Which parts the caller compiles, and which each helper, so that all are done soon."""
     n_helpers = min(usable_cores() - 1, MAX_HELPERS) if parts and _interpreter() is not None else 0
 
-    def slowest(owners: Sequence[int]) -> float:
+    def seconds(owners: Sequence[int]) -> list[float]:
         loads = [OTHERS_S, *[0.0] * n_helpers]
         for part, owner in zip(parts, owners, strict=True):
             loads[owner] += PARTS[part].seconds
-        return max(loads)
+        return sorted(loads, reverse=True)
 
-    owners = min(product(range(n_helpers + 1), repeat=len(parts)), key=slowest)
+    owners = min(product(range(n_helpers + 1), repeat=len(parts)), key=seconds)
     shares = [[part for part, of in zip(parts, owners, strict=True) if of == owner] for owner in range(n_helpers + 1)]
     # The ground first: it is needed first.
     return [shares[0], *(sorted(share, key=lambda part: part != "ground") for share in shares[1:] if share)]

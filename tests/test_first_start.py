@@ -21,7 +21,7 @@ from edgeperc import first_start
 from edgeperc.first_start import PARTS, Helpers
 from edgeperc.kernel_cache import RARE, fewer_collections
 
-MOST_COMPILATIONS = 160
+MOST_COMPILATIONS = 150
 
 pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled with the JIT off")
 
@@ -192,7 +192,7 @@ def test_helpers_share_the_work(cold: None, monkeypatch: pytest.MonkeyPatch, n_c
     assert sorted(parts) == sorted(PARTS)
     seconds = [sum(PARTS[part].seconds for part in share) for share in (helpers._own, *helpers._shares)]
     seconds[0] += first_start.OTHERS_S
-    assert max(seconds) <= {1: 23.0, 2: 12.0, 3: 9.0}.get(n_cores, 7.0)
+    assert max(seconds) <= {1: 23.0, 2: 12.0}.get(n_cores, 8.5)
 
 
 def test_no_helper_where_the_cache_cannot_be_written_or_holds_the_kernels(
