@@ -242,8 +242,9 @@ def test_a_daemonic_process_has_helpers_too() -> None:
 
 
 PARENT = """
-import time
+import signal, time
 from edgeperc import first_start
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 first_start._is_cold = lambda _: True
 first_start.usable_cores = lambda: 2
 first_start.START = '''
@@ -275,10 +276,13 @@ def test_no_helper_outlives_a_process_that_is_killed(how: signal.Signals) -> Non
         [sys.executable, "-c", PARENT], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     ) as parent:
         assert parent.stdout is not None
-        helper = int(parent.stdout.readline())
-        assert _is_running(helper)
-        parent.send_signal(how)
-        parent.wait(60)
+        try:
+            helper = int(parent.stdout.readline())
+            assert _is_running(helper)
+            parent.send_signal(how)
+            parent.wait(60)
+        finally:
+            parent.kill()
     until = time.monotonic() + 60.0
     while _is_running(helper) and time.monotonic() < until:
         time.sleep(0.05)
@@ -294,7 +298,10 @@ first_start.PARTS = {"road": first_start.Part(lambda: time.sleep(600), None, 1.0
 first_start.main("road")
 """
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE) as process:
-        assert process.wait(120) != 0
+        try:
+            assert process.wait(120) != 0
+        finally:
+            process.kill()
 
 
 def test_garbage_is_collected_as_before_afterwards() -> None:
