@@ -235,7 +235,8 @@ IMPORTED = (
 
 def make(seed: int) -> Commands:
     for name in (*IMPORTED, *LIBRARIES):
-        import_module(name)
+        with suppress(ModuleNotFoundError):  # of an extra
+            import_module(name)
     # The kernels are compiled once, not in each process; a network's threads would not survive the fork.
     for each in cards()[:8:5]:
         made_up = [MadeUp(card) for card in each]
