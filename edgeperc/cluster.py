@@ -404,7 +404,9 @@ def objects_from_points(
     if clusters.shape != labels.shape:
         raise PointsError(f"got clusters of shape {clusters.shape} for {len(points)} points; expected one a point")
     order, starts = _grouped(clusters)
-    persons = _persons(points, labels, classes, clusters, order, starts, height_m, distance_per_m, min_points, size_m)
+    persons = _persons(
+        points, labels, classes, roles, clusters, order, starts, height_m, distance_per_m, min_points, size_m
+    )
     found, shares = _labels_of_groups(order, starts, labels, min_share, {})
     found[roles[found] > 0] = 0
     sizes = np.diff(starts)
@@ -457,6 +459,7 @@ def _persons(
     points: NDArray[np.float32],
     labels: NDArray[np.uint8],
     classes: Sequence[str],
+    roles: NDArray[np.uint8],
     clusters: NDArray[np.int32],
     order: NDArray[np.int32],
     starts: NDArray[np.int64],
@@ -466,7 +469,7 @@ def _persons(
     size_m: Mapping[str, tuple[float, float, float]],
 ) -> list[Box]:
     """The boxes of persons, of any score; see `objects_from_points`."""
-    roles, order = _roles(classes), order[: starts[-1]]
+    order = order[: starts[-1]]
     if not roles.any() or not len(order):
         return []
     rows, numbers = read_only(points), read_only(labels, np.uint8)
