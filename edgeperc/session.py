@@ -62,6 +62,8 @@ PLUGINS = {
     "qnn": "onnxruntime_qnn",
     "webgpu": "onnxruntime_ep_webgpu",
 }
+# Providers that run on the processor's cores and take a number of threads.
+SHARING = ("cpu", "openvino")
 PRECISIONS = ("fp32", "bf16", "int8")
 # Largest accepted deviation, in standard deviations of an output. The same graph in fp32 differs by 1e-5 between
 # engines; tripled weights of one layer give 0.5.
@@ -149,7 +151,8 @@ def devices() -> tuple[str, ...]:
     found = ort.get_ep_devices() if hasattr(ort, "get_ep_devices") else ()
     names = {PROVIDERS[short]: short for short in present}
     listed = (
-        f"{names.get(each.ep_name, each.ep_name)}: {each.device.type.name} {each.device.vendor or each.ep_vendor}"
+        f"{names.get(each.ep_name.partition('.')[0], each.ep_name)}: "  # such as OpenVINOExecutionProvider.AUTO
+        f"{each.device.type.name} {each.device.vendor or each.ep_vendor}"
         for each in found
     )
     return tuple(dict.fromkeys(each.strip() for each in listed))
@@ -188,8 +191,8 @@ class Session:
     n_threads : int or None
         Threads inside one run, at most 4096; None leaves it to the provider.
     at_once : int
-        Number of sessions that run at the same time. If it is above 1 and ``n_threads`` is None, the CPU provider gets
-        as large a part of the usable cores.
+        Number of sessions that run at the same time. If it is above 1 and ``n_threads`` is None, the providers ``cpu``
+        and ``openvino`` get as large a part of the usable cores.
     trusted : bool
         Open graphs that are otherwise refused, because they could run without end or take all memory: with operators
         that are not in `edgeperc.onnx_file.OPERATORS`, functions, subgraphs or sizes beyond the limits. The first run
@@ -326,7 +329,7 @@ class Session:
         check_graph(blob, self.path, trusted=self._trusted)
         self.sha256 = hashlib.sha256(blob).hexdigest()
         cores = usable_cores()
-        self.shares_cores = n_threads is None and short == "cpu" and 1 < self._at_once <= cores
+        self.shares_cores = n_threads is None and short in SHARING and 1 < self._at_once <= cores
         if self.shares_cores:
             n_threads = cores // self._at_once
         self._has_threads = short != "cpu" or n_threads != 1
@@ -369,6 +372,8 @@ class Session:
                     cpu = {"INFERENCE_PRECISION_HINT": hint, "PERFORMANCE_HINT": "LATENCY"}
                     if n_threads is not None:
                         cpu["INFERENCE_NUM_THREADS"] = str(n_threads)
+                    if self.shares_cores:  # else the threads of both sessions are tied to the same cores
+                        cpu["ENABLE_CPU_PINNING"] = "NO"
                     engine = f"onnxruntime {ort.__version__}, {_version(PLUGINS[short])}"
                     compiled = compiled_folder(engine, self.sha256, precision)
                     if compiled is not None:
@@ -528,10 +533,10 @@ class Session:
         return self.outputs
 
     def second(self) -> Session:
-        """The same network with buffers of its own: two threads may run both sessions at the same time.
-
-        Only for the CPU provider, which runs one graph in several threads.
-        """
+        """The same network with buffers of its own: two threads may run both sessions at the same time."""
+        if self.short != "cpu":  # the others run one graph in one thread at a time
+            options = {"precision": self.precision, "at_once": self._at_once, "trusted": self._trusted}
+            return Session(self.path, self.short, **options)
         twin = object.__new__(Session)
         vars(twin).update(vars(self))
         with _terminated(_onnxruntime(), None) as run_options:

@@ -141,6 +141,22 @@ def test_networks_at_once_give_the_results_of_one_after_the_other(
     assert not Perceiver(provider="cpu", n_threads=2).sessions[0].shares_cores
 
 
+@pytest.mark.parametrize("full_turn", [False, True])
+def test_openvino_runs_both_networks_at_once_too(
+    monkeypatch: pytest.MonkeyPatch, scan: SimulatedScan, full_turn: bool
+) -> None:
+    if "openvino" not in session.available_providers():
+        pytest.skip("the OpenVINO plugin is absent, or finds no device of Intel's")
+    monkeypatch.setattr(session, "usable_cores", lambda: 2)
+    options: dict[str, Any] = {"provider": "openvino", "full_turn": full_turn, "on_mismatch": "ignore"}
+    both = Perceiver(["ssadnet", "pointseg"], **options)
+    assert [s.shares_cores for s in both.sessions] == [True] * 2
+    one_by_one = Perceiver(["ssadnet", "pointseg"], n_threads=2, **options)
+    assert not any(s.shares_cores for s in one_by_one.sessions)
+    for _ in range(3):
+        assert_same(one_by_one(scan.points), both(scan.points))
+
+
 @pytest.mark.parametrize("failing", [0, 1])
 def test_a_network_that_fails_beside_another_ends_the_call(
     monkeypatch: pytest.MonkeyPatch, perception: Perception, scan: SimulatedScan, failing: int

@@ -293,6 +293,9 @@ class FakePlugins:
             def __getattr__(self, name: str) -> object:
                 return getattr(ort, name)
 
+            def get_available_providers(self) -> list[str]:
+                return ["CPUExecutionProvider"]  # onnxruntime also lists the plugins that this process has loaded
+
             def get_ep_devices(self) -> list[SimpleNamespace]:
                 return fakes if plugins.libraries else []
 
@@ -310,7 +313,7 @@ class FakePlugins:
 def test_qualcomms_plugin_runs_int8_on_the_npu(monkeypatch: pytest.MonkeyPatch) -> None:
     name = PROVIDERS["qnn"]
     fake = FakePlugins(monkeypatch, [(name, "CPU"), (name, "GPU"), (name, "NPU")])
-    assert [name for name in available_providers() if name not in ("cuda", "tensorrt")] == ["qnn", "cpu"]
+    assert available_providers() == ("qnn", "cpu")
     assert fake.libraries == ["onnxruntime_qnn.so"]
     monkeypatch.setattr(session_module, "cpu_features", lambda: frozenset({"asimd"}))  # no int8 on the processor
     session = Session("pointseg", "qnn")
@@ -322,7 +325,7 @@ def test_qualcomms_plugin_runs_int8_on_the_npu(monkeypatch: pytest.MonkeyPatch) 
 
 def test_the_webgpu_plugin_runs_fp32(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = FakePlugins(monkeypatch, [(PROVIDERS["webgpu"], "GPU")])
-    assert [name for name in available_providers() if name not in ("cuda", "tensorrt")] == ["webgpu", "cpu"]
+    assert available_providers() == ("webgpu", "cpu")
     assert Session("pointseg", "webgpu").description == f"pointseg fp32, {PROVIDERS['webgpu']}"
     assert fake.chosen == [("GPU", {})]
     with pytest.raises(ProviderError, match="provider 'qnn' is not available"):
