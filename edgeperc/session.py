@@ -535,8 +535,8 @@ class Session:
     def second(self) -> Session:
         """The same network with buffers of its own: two threads may run both sessions at the same time."""
         if self.short != "cpu":  # the others run one graph in one thread at a time
-            options = {"precision": self.precision, "at_once": self._at_once, "trusted": self._trusted}
-            return Session(self.path, self.short, **options)
+            at_once, trusted = self._at_once, self._trusted
+            return Session(self.path, self.short, precision=self.precision, at_once=at_once, trusted=trusted)
         twin = object.__new__(Session)
         vars(twin).update(vars(self))
         with _terminated(_onnxruntime(), None) as run_options:
