@@ -84,6 +84,7 @@ def find_ground(
     mount_height_m: float = 1.73,
     max_height_m: float = 0.125,
     regions: bool = True,
+    rows: NDArray[np.int32] | None = None,
 ) -> Ground:
     """Separate the ground from what stands on it (KUL-Seg 5.2).
 
@@ -97,11 +98,14 @@ def find_ground(
         A point is ground if it is at most this far above the ground [m] and at most 0.5 m below it.
     regions : bool
         False fits only the plane around the vehicle.
+    rows : (m,) int32, optional
+        Rows of the points whose height is wanted, all by default. The ground is found with all points.
 
     Returns
     -------
     Ground
-        Deterministic. ``plane`` is None for an empty scan, or a scan without ground, such as that of a wall.
+        Of the wanted points. Deterministic. ``plane`` is None for an empty scan, or a scan without ground, such as that
+        of a wall.
 
     Raises
     ------
@@ -130,22 +134,23 @@ def find_ground(
         raise PointsError(
             f"got mount_height_m={mount_height_m} and max_height_m={max_height_m}; expected meters above 0"
         )
-    rows = read_only(points if points.shape[1] == 4 else np.pad(points[:, :3], ((0, 0), (0, 1))))
-    cell = np.empty(len(rows), np.int32)
+    scan = read_only(points if points.shape[1] == 4 else np.pad(points[:, :3], ((0, 0), (0, 1))))
+    cell = np.empty(len(scan), np.int32)
     lowest = np.empty((N_CELLS, N_CELLS), np.int32)
-    fill_lowest(rows, cell, lowest)
+    fill_lowest(scan, cell, lowest)
     plane = np.array([0.0, 0.0, -mount_height_m])
-    found = fit_first_plane(rows, lowest, FIRST_REACH_M, plane)
-    height = np.empty(len(rows), np.float32)
-    mask = np.empty(len(rows), np.bool_)
+    found = fit_first_plane(scan, lowest, FIRST_REACH_M, plane)
+    wanted = np.arange(len(scan), dtype=np.int32) if rows is None else rows
+    height = np.empty(len(wanted), np.float32)
+    mask = np.empty(len(wanted), np.bool_)
     if found and regions:
         planes = np.empty((N_REGIONS, N_REGIONS, 3))
-        fill_planes(rows, lowest, plane, planes)
+        fill_planes(scan, lowest, plane, planes)
         level = np.empty((N_CELLS, N_CELLS), np.float32)
-        fill_levels(rows, lowest, planes, level)
-        fill_heights(rows, cell, level, planes, max_height_m, height, mask)
+        fill_levels(scan, lowest, planes, level)
+        fill_heights(scan, wanted, cell, level, planes, max_height_m, height, mask)
     else:
-        fill_heights_above_plane(rows, plane, max_height_m, height, mask)
+        fill_heights_above_plane(scan, wanted, plane, max_height_m, height, mask)
         mask &= found
     return Ground(mask, height, (float(plane[0]), float(plane[1]), float(plane[2])) if found else None)
 
@@ -473,6 +478,7 @@ def fill_levels(
 @njit(cache=True, nogil=True)
 def fill_heights(
     points: NDArray[np.float32],
+    rows: NDArray[np.int32],
     cell: NDArray[np.int32],
     level: NDArray[np.float32],
     planes: NDArray[np.float64],
@@ -480,20 +486,23 @@ def fill_heights(
     height: NDArray[np.float32],
     mask: NDArray[np.bool_],
 ) -> None:
-    """Write every point's height above the ground, and whether it is on the ground.
+    """Write the heights of some points above the ground, and whether they are on the ground.
 
     Parameters
     ----------
     points : (n, 4) float32, C-contiguous
+    rows : (m,) int32
+        The points.
     cell : (n,) int32
     level : (N_CELLS, N_CELLS) float32
     planes : (N_REGIONS, N_REGIONS, 3) float64
-    height : (n,) float32, overwritten
+    height : (m,) float32, overwritten
         [m]; outside the grid, above the plane of the nearest region. NaN for points that are not finite.
-    mask : (n,) bool, overwritten
+    mask : (m,) bool, overwritten
     """
     levels, slopes = level.reshape(-1), planes.reshape(-1)
-    for i in range(points.shape[0]):
+    for k in range(rows.shape[0]):
+        i = rows[k]
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         if cell[i] >= 0:  # unsigned positions need no test for counting from the end: a third of the time
             at = np.uint32(cell[i])
@@ -502,30 +511,32 @@ def fill_heights(
             a, b = slopes[np.uint32(3) * region], slopes[np.uint32(3) * region + np.uint32(1)]
             dx = x - ((np.int32(row) + 0.5) * CELL_M - REACH_M)
             dy = y - ((np.int32(col) + 0.5) * CELL_M - REACH_M)
-            height[i] = z - levels[at] - a * dx - b * dy
+            height[k] = z - levels[at] - a * dx - b * dy
         elif abs(x) < math.inf and abs(y) < math.inf and abs(z) < math.inf:
             r = int(min(max((x + REACH_M) / REGION_M, 0.0), N_REGIONS - 1.0))
             q = int(min(max((y + REACH_M) / REGION_M, 0.0), N_REGIONS - 1.0))
             dx = x - ((r + 0.5) * REGION_M - REACH_M)
             dy = y - ((q + 0.5) * REGION_M - REACH_M)
-            height[i] = z - planes[r, q, 2] - planes[r, q, 0] * dx - planes[r, q, 1] * dy
+            height[k] = z - planes[r, q, 2] - planes[r, q, 0] * dx - planes[r, q, 1] * dy
         else:
-            height[i] = math.nan
-    for i in range(points.shape[0]):
-        mask[i] = (height[i] >= -MAX_DEPTH_M) & (height[i] <= max_height)
+            height[k] = math.nan
+    for k in range(rows.shape[0]):
+        mask[k] = (height[k] >= -MAX_DEPTH_M) & (height[k] <= max_height)
 
 
 @njit(cache=True, nogil=True)
 def fill_heights_above_plane(
     points: NDArray[np.float32],
+    rows: NDArray[np.int32],
     plane: NDArray[np.float64],
     max_height: float,
     height: NDArray[np.float32],
     mask: NDArray[np.bool_],
 ) -> None:
-    """Write every point's height above z = a x + b y + c (NaN if not finite), and whether it is on the ground."""
-    for i in range(points.shape[0]):
+    """Write the heights of some points above z = a x + b y + c (NaN if not finite), and whether they are on it."""
+    for k in range(rows.shape[0]):
+        i = rows[k]
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         above = z - plane[0] * x - plane[1] * y - plane[2]
-        height[i] = above if abs(x) < math.inf and abs(y) < math.inf and abs(z) < math.inf else math.nan
-        mask[i] = -MAX_DEPTH_M <= height[i] <= max_height
+        height[k] = above if abs(x) < math.inf and abs(y) < math.inf and abs(z) < math.inf else math.nan
+        mask[k] = -MAX_DEPTH_M <= height[k] <= max_height

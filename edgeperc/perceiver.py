@@ -26,6 +26,7 @@ from .adapt import Interpolator, condition, render
 from .agreement import RULES, agree_on_boxes, agree_on_cells, agree_on_points, find_support, find_voters
 from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, join_boxes, objects_from_points
+from .crop import Crop, spread
 from .decode import decode_labels, decode_top_view
 from .drivable import compile_kernels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
@@ -362,6 +363,8 @@ class Perceiver:
         # Of a full turn, the top view's thread takes sectors when it is done with the top view.
         ranged = self._network_of(RangeImageGeometry)
         self._aside = self._load(ranged.session.second()) if full_turn and self._at_once and ranged else None
+        # Half of the points of a full turn are near no view that looks ahead: 11 in place of 8 ms.
+        self._crop = Crop([] if full_turn else [n.session.card.view for n in self._networks])
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
         self._locks = {os.getpid(): threading.Lock()}
         # Compile every kernel here, not in the first call, with an image of one pixel and a scan of two points. The
@@ -562,27 +565,30 @@ class Perceiver:
         points: PointLabels | None = None
         top_view: TopView | None = None
         boxes: tuple[Box, ...] = ()
+        kept, rows = self._crop.select(scan)
         top, ranged = (self._network_of(kind) for kind in (TopViewGeometry, RangeImageGeometry))
         beside: Callable[[], tuple[TopView, tuple[Box, ...]]] | None = None
         if top is not None and self._at_once and infer:
-            beside = _beside(partial(self._label_cells, top, scan, _Stopwatch(), infer))
+            beside = _beside(partial(self._label_cells, top, kept, _Stopwatch(), infer))
         elif top is not None:
-            top_view, boxes = self._label_cells(top, scan, watch, infer)
+            top_view, boxes = self._label_cells(top, kept, watch, infer)
         try:
-            ground = self._find_ground(scan)
+            ground = self._find_ground(scan, rows)
             watch.lap("cluster")
             if ranged is not None:
                 height_m = None if ground is None else ground.height_m
                 if self.full_turn:
-                    points = self._label_full_turn(ranged, scan, height_m, watch, infer, beside)
+                    points = self._label_full_turn(ranged, kept, height_m, watch, infer, beside)
                 else:
-                    points = self._label_sector(ranged, scan, height_m, watch, infer)
+                    points = self._label_sector(ranged, kept, height_m, watch, infer)
         finally:
             if beside is not None:
                 top_view, boxes = beside()
                 watch.lap("infer")
         if ground is not None and infer:
-            points, top_view, boxes = self._combine(scan, ground, points, top_view, boxes, watch)
+            points, top_view, boxes = self._combine(kept, ground, points, top_view, boxes, watch)
+        if points is not None and rows is not None:
+            points = spread(points, rows, len(scan))
         return Perception(
             n_points=len(scan),
             n_dropped=n_dropped,
@@ -731,9 +737,9 @@ class Perceiver:
             in_view = in_view | sectors[k].in_view
         return PointLabels(labels, in_view, sectors[0].classes)
 
-    def _find_ground(self, scan: NDArray[np.float32]) -> Ground | None:
+    def _find_ground(self, scan: NDArray[np.float32], rows: NDArray[np.int32] | None = None) -> Ground | None:
         """The ground, once for all that needs it: the input of a network, and the clusters; None if nothing does."""
-        return find_ground(scan, mount_height_m=MODEL_HEIGHT_M) if self._needs_ground else None
+        return find_ground(scan, mount_height_m=MODEL_HEIGHT_M, rows=rows) if self._needs_ground else None
 
     def _combine(
         self,

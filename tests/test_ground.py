@@ -154,6 +154,19 @@ def test_ground_is_deterministic():
     assert first.plane == second.plane
 
 
+@pytest.mark.parametrize("regions", [False, True])
+def test_heights_of_some_points_are_those_of_all(regions):
+    points, _ = street(np.random.default_rng(8))
+    rows = np.arange(3, len(points), 7, dtype=np.int32)
+    every, some = find_ground(points, regions=regions), find_ground(points, regions=regions, rows=rows)
+    np.testing.assert_array_equal(some.height_m, every.height_m[rows])
+    np.testing.assert_array_equal(some.mask, every.mask[rows])
+    assert some.plane == every.plane
+    none = find_ground(points, regions=regions, rows=rows[:0])
+    assert none.plane == every.plane
+    assert none.mask.shape == none.height_m.shape == (0,)
+
+
 def test_ground_of_a_simulated_street():
     scan = simulate(random_scene(3), "hdl-64e", 0)
     world = scan.points[:, :3] @ scan.T_world_sensor[:3, :3].T + scan.T_world_sensor[:3, 3]

@@ -28,7 +28,7 @@ FLOORS = {
         kernel_cache perception zoo.__init__
         blocks calibration frame geometry linkage outline persons
         adapt cluster decode drivable fitness ground image motion observed projection refine sensor_fit session
-        voting
+        crop voting
         agreement level network_input occupancy painting remission
         first_start
         readers.__init__ readers.times

@@ -1,0 +1,140 @@
+"""Points near the views: the kernel against its twin, and the same answers as with all points."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import twins.crop
+from edgeperc import Perceiver
+from edgeperc.card import RangeImageGeometry, TopViewGeometry
+from edgeperc.crop import MARGIN_M, Crop, fill_rows
+from edgeperc.observed import Observer
+from edgeperc.projection import make_projector
+from edgeperc.sensor import get_sensor
+from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
+
+AHEAD = RangeImageGeometry((2.0, -10.0, -24.0))
+TOP = TopViewGeometry()
+View = RangeImageGeometry | TopViewGeometry
+# The first example compiles a kernel.
+patient = settings(deadline=None, max_examples=60)
+
+coordinates = st.floats(-80.0, 80.0, width=32) | st.sampled_from([0.0, -0.0, math.nan, math.inf, -math.inf, 3e38])
+clouds = st.lists(st.tuples(coordinates, coordinates), max_size=60).map(
+    lambda rows: np.array([(*row, -1.0, 0.5) for row in rows], np.float32).reshape(-1, 4)
+)
+sectors = st.tuples(st.integers(-180, 178), st.integers(2, 360)).map(
+    lambda edges: replace(AHEAD, azimuth_right_deg=edges[0], azimuth_left_deg=min(edges[0] + edges[1], 180))
+)
+low = st.integers(-40, 30)
+rectangles = st.tuples(low, st.integers(1, 60), low, st.integers(1, 60)).map(
+    lambda v: TopViewGeometry((v[0], v[0] + v[1]), (v[2], v[2] + v[3]), cell_m=0.5)
+)
+
+
+def rows_of(crop: Crop, points: NDArray[np.float32]) -> NDArray[np.int64]:
+    kept, rows = crop.select(points)
+    if rows is None:
+        assert kept is points
+        return np.arange(len(points))
+    np.testing.assert_array_equal(kept, points[rows])
+    return rows.astype(np.int64)
+
+
+@pytest.mark.kernel
+@patient
+@given(clouds, st.lists(sectors | rectangles, min_size=1, max_size=3))
+def test_rows_match_the_slow_twin(
+    points: NDArray[np.float32], views: list[RangeImageGeometry | TopViewGeometry]
+) -> None:
+    crop = Crop(views)
+    rows, kept = np.full(len(points), -1, np.int32), np.full(points.shape, -1.0, np.float32)
+    n = fill_rows(points, crop._regions, rows, kept)
+    if crop._regions.shape[1]:
+        expected = twins.crop.kept_rows(points, crop._regions)
+        np.testing.assert_array_equal(rows[:n], expected)
+        np.testing.assert_array_equal(kept[:n], points[expected])
+    assert (rows[n:] == -1).all()
+
+
+@patient
+@given(clouds, sectors)
+def test_a_sector_and_what_is_beside_it_are_kept(points: NDArray[np.float32], view: RangeImageGeometry) -> None:
+    x, y = points[:, :2].T.astype(np.float64)
+    turned = np.degrees(np.arctan2(y, x))
+    finite = np.isfinite(x) & np.isfinite(y)
+    in_sector = finite & (turned <= view.azimuth_left_deg) & (turned >= view.azimuth_right_deg)
+    rows = rows_of(Crop([view]), points)
+    assert set(np.flatnonzero(in_sector)) <= set(rows)
+    near = finite & (np.hypot(x, y) < MARGIN_M)
+    assert set(np.flatnonzero(near)) <= set(rows)
+    if view.azimuth_left_deg - view.azimuth_right_deg <= 180:  # no more than the margin
+        for row in rows[finite[rows]]:
+            rays = np.radians([view.azimuth_left_deg, view.azimuth_right_deg])
+            beside = [abs(math.sin(ray) * x[row] - math.cos(ray) * y[row]) for ray in rays]
+            assert in_sector[row] or min(beside) <= MARGIN_M + 1e-3
+
+
+@patient
+@given(clouds, rectangles)
+def test_what_an_observer_uses_is_kept(points: NDArray[np.float32], view: TopViewGeometry) -> None:
+    points[:, 2] = -1.73
+    index = np.full((view.height, view.width), -1, np.int32)
+    of_all = Observer(view, get_sensor("hdl-64e")).observe(points, index)
+    kept = points[rows_of(Crop([view]), points)]
+    np.testing.assert_array_equal(Observer(view, get_sensor("hdl-64e")).observe(kept, index), of_all)
+    _, _, inside = view.cells(points[:, 0].astype(np.float64), points[:, 1].astype(np.float64))
+    assert set(np.flatnonzero(inside)) <= set(rows_of(Crop([view]), points))
+
+
+def test_a_full_turn_and_no_view_keep_everything() -> None:
+    points = np.ones((3, 4), np.float32)
+    turn = replace(AHEAD, azimuth_left_deg=180.0, azimuth_right_deg=-180.0)
+    for views in ([], [turn], [turn, TOP]):
+        kept, rows = Crop(views).select(points)
+        assert kept is points
+        assert rows is None
+
+
+def test_buffers_grow_and_empty_scans_stay_empty() -> None:
+    crop = Crop([AHEAD, TOP])
+    for n in (0, 1, 1000, 3, 0):
+        points = np.zeros((n, 4), np.float32)
+        points[:, 0] = np.where(np.arange(n) % 2, -50.0, 30.0)
+        np.testing.assert_array_equal(rows_of(crop, points), np.arange(0, n, 2))
+
+
+@pytest.mark.parametrize("models", [["ssadnet", "pointseg"], ["pointseg"], ["ssadnet"]])
+def test_answers_are_those_with_all_points(models: list[str]) -> None:
+    cropping, whole = (Perceiver(models, provider="cpu", n_threads=1, on_mismatch="ignore") for _ in range(2))
+    whole._crop = Crop([])
+    for seed in range(3):
+        points = simulated_scan(FIRST_SEED + seed).points
+        assert 0.2 < len(rows_of(cropping._crop, points)) / len(points) < 0.8
+        seen, expected = cropping(points), whole(points)
+        assert seen.boxes == expected.boxes
+        assert seen.n_points == expected.n_points
+        if seen.points is not None and expected.points is not None:
+            np.testing.assert_array_equal(seen.points.labels, expected.points.labels)
+            np.testing.assert_array_equal(seen.points.in_view, expected.points.in_view)
+        if seen.top_view is not None and expected.top_view is not None:
+            np.testing.assert_array_equal(seen.top_view.labels, expected.top_view.labels)
+            np.testing.assert_array_equal(seen.top_view.observed, expected.top_view.observed)
+
+
+def test_every_point_that_a_network_sees_is_kept() -> None:
+    points = simulated_scan(FIRST_SEED).points
+    perceive = Perceiver(provider="cpu", n_threads=1, on_mismatch="ignore")
+    for card in perceive.cards:
+        index = np.empty((card.view.height, card.view.width), np.int32)
+        pixel = np.empty(len(points), np.int32)
+        values = np.empty((len(card.input.channels), *index.shape), np.float32)
+        make_projector(card.view, card.input).fill(points, values, index, pixel, points[:, 2].copy())
+        assert set(np.flatnonzero(pixel >= 0)) <= set(rows_of(perceive._crop, points))
