@@ -127,7 +127,10 @@ class Forked:
         with self.lock:
             if self.returncode is not None or not select.select([self.process.socket], [], [], timeout)[0]:
                 return
-            report = self.process.socket.recv(100)
+            try:
+                report = self.process.socket.recv(100)
+            except ConnectionResetError:  # it was killed before it read the request
+                report = b""
             self.process.n_captures += 1
             if report:
                 self.returncode, self.peak_mb = 0, float(report)
