@@ -59,12 +59,11 @@ def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True
             scan = given.copy()
             with np.errstate(over="ignore", invalid="ignore"):
                 scan[:, 3] = (scan[:, 3] + offset) * scale
+    finite = np.isfinite(scan)
     n_dropped = 0
-    with np.errstate(over="ignore", invalid="ignore"):
-        # A value that is not finite makes the sum so, which takes a fifth of the time of isfinite.
-        may_drop = not math.isfinite(scan.sum())
-    if may_drop:
-        dropped = ~np.isfinite(scan).all(axis=1)
+    # First the whole array: all(axis=1) takes ten times as long, and nearly every scan is entirely finite.
+    if not finite.all():
+        dropped = ~finite.all(axis=1)
         n_dropped = int(np.count_nonzero(dropped))
         scan = given.copy() if scan is given else scan
         scan[dropped] = np.nan

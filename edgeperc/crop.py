@@ -18,18 +18,14 @@ from .observed import FARTHER
 from .perception import PointLabels
 from .points import read_only
 
-__all__ = ["MARGIN_M", "Crop", "fill_rows", "spread"]
+__all__ = ["MARGIN_M", "Crop", "fill_rows", "fill_spread"]
 
 MARGIN_M = 5.0
 """Points up to this far beside a range image are kept [m]: a car at its edge is clustered as a whole."""
 
-HalfPlane = tuple[float, float, float]
-"""a, b and c: points with a x + b y >= c are kept."""
-_EVERYTHING = (0.0, 0.0, -math.inf)
-
 
 class Crop:
-    """Select the points that matter for some views.
+    """Select the points that matter for some views: those between two lines, left and right.
 
     The selected points are kept in buffers that are used again, so use one instance per thread.
 
@@ -37,18 +33,21 @@ class Crop:
     ----------
     views : sequence of RangeImageGeometry or TopViewGeometry
         Of a range image, the sector and `MARGIN_M` beside it are kept. Of a top view, what `edgeperc.observed.Observer`
-        uses: up to 1.4 times as far as the view, between the directions of its sides. Without a view, all is kept.
+        uses: up to 1.4 times as far as the view, between the directions of its sides. Everything is kept without a
+        view, for a sector of more than 180 degrees, and for a top view alone that is not ahead of the sensor.
     """
 
     def __init__(self, views: Sequence[RangeImageGeometry | TopViewGeometry]) -> None:
-        regions: list[list[HalfPlane]] = []
-        for view in views:
-            regions += _sector(view) if isinstance(view, RangeImageGeometry) else [_ahead(view)]
-        most = max(map(len, regions), default=0)
-        padded = [[*region, *[_EVERYTHING] * (most - len(region))] for region in regions]
-        self._regions = np.array(padded, np.float64).reshape(len(regions), most, 3)
-        self._keeps_all = most == 0 or not all(map(len, regions))
+        self._lines: NDArray[np.float64] | None = None
         self._rows, self._kept = np.empty(0, np.int32), np.empty((0, 4), np.float32)
+        ahead = [_ahead(view) for view in views if isinstance(view, TopViewGeometry)]
+        sectors = [_sector(view) for view in views if isinstance(view, RangeImageGeometry)] or ahead
+        left = max((sector[0] for sector in sectors), default=math.inf)
+        right = min((sector[1] for sector in sectors), default=0.0)
+        if left - right <= math.pi:
+            inward = np.array([(math.sin(left), -math.cos(left)), (-math.sin(right), math.cos(right))])
+            nearest = [(inward @ corners.T).min(axis=1) - margin_m for corners, margin_m in map(_hull, views)]
+            self._lines = np.column_stack([inward, np.min(nearest, axis=0)])
 
     def select(self, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32] | None]:
         """The points that matter, in their order.
@@ -65,79 +64,97 @@ class Crop:
         rows : (m,) int32 or None
             Their rows in ``points``. None if all points matter; ``kept`` is then ``points``.
         """
-        if self._keeps_all:
+        if self._lines is None:
             return points, None
-        if len(points) > len(self._rows):
-            self._rows, self._kept = np.empty(len(points), np.int32), np.empty((len(points), 4), np.float32)
-        n = fill_rows(read_only(points), self._regions, self._rows, self._kept)
+        if len(points) >= len(self._rows):
+            room = len(points) + 1  # the kernel writes every point, then decides whether to keep it
+            self._rows, self._kept = np.empty(room, np.int32), np.empty((room, 4), np.float32)
+        n = fill_rows(read_only(points), self._lines, self._rows, self._kept)
         return read_only(self._kept[:n]), self._rows[:n]
 
-
-def spread(points: PointLabels, rows: NDArray[np.int32], n: int) -> PointLabels:
-    """Labels of a whole scan of ``n`` points, from those of its ``rows``; the others are out of view."""
-    labels, in_view = np.zeros(n, np.uint8), np.zeros(n, np.bool_)
-    labels[rows], in_view[rows] = points.labels, points.in_view
-    return PointLabels(labels, in_view, points.classes)
-
-
-def _sector(view: RangeImageGeometry) -> list[list[HalfPlane]]:
-    """The regions that a range image and its margin consist of; a region without half planes is everything."""
-    left, right = math.radians(view.azimuth_left_deg), math.radians(view.azimuth_right_deg)
-    if left - right >= 2.0 * math.pi:
-        return [[]]
-    within_left = math.sin(left), -math.cos(left), -MARGIN_M
-    within_right = -math.sin(right), math.cos(right), -MARGIN_M
-    return [[within_left, within_right]] if left - right <= math.pi else [[within_left], [within_right]]
+    def spread(self, points: PointLabels, rows: NDArray[np.int32], n: int) -> PointLabels:
+        """Labels of a whole scan of ``n`` points, from those of its ``rows``; the others are out of view."""
+        labels, in_view = np.empty(n, np.uint8), np.empty(n, np.bool_)
+        fill_spread(rows, read_only(points.labels, np.uint8), read_only(points.in_view, np.bool_), labels, in_view)
+        return PointLabels(labels, in_view, points.classes)
 
 
-def _ahead(view: TopViewGeometry) -> list[HalfPlane]:
-    """The region that the rays to a top view's cells cross, and the cells behind them."""
-    (near, far), (low, high) = view.x_range_m, view.y_range_m
-    bounds = [
-        (1.0, 0.0, FARTHER * min(near, 0.0)),
-        (-1.0, 0.0, -FARTHER * max(far, 0.0)),
-        (0.0, 1.0, FARTHER * min(low, 0.0)),
-        (0.0, -1.0, -FARTHER * max(high, 0.0)),
-    ]
-    if near <= 0.0:  # rays in all directions, or backwards
-        return bounds
-    left, right = (math.atan2(y, near if y * side > 0.0 else far) for y, side in ((high, 1.0), (low, -1.0)))
-    edge = -view.cell_m  # against rounding
-    return [*bounds, (math.sin(left), -math.cos(left), edge), (-math.sin(right), math.cos(right), edge)]
+def _sector(view: RangeImageGeometry) -> tuple[float, float]:
+    """Azimuths of the left and right edge [rad]."""
+    return math.radians(view.azimuth_left_deg), math.radians(view.azimuth_right_deg)
+
+
+def _ahead(view: TopViewGeometry) -> tuple[float, float]:
+    """Azimuths between which all cells lie [rad]; the full turn for a view that is not ahead."""
+    if view.x_range_m[0] <= 0.0:
+        return math.pi, -math.pi
+    azimuths = [math.atan2(y, x) for x in view.x_range_m for y in view.y_range_m]
+    return max(azimuths), min(azimuths)
+
+
+def _hull(view: RangeImageGeometry | TopViewGeometry) -> tuple[NDArray[np.float64], float]:
+    """Corners of the least region that must be kept between two lines, and the margin around it [m]."""
+    if isinstance(view, RangeImageGeometry):
+        return np.zeros((1, 2)), MARGIN_M  # the sector's own edges are the directions of the lines
+    x, y = view.x_range_m, view.y_range_m
+    if x[0] <= 0.0:
+        x, y = (x[0], max(x[1], 0.0)), (min(y[0], 0.0), max(y[1], 0.0))
+    corners = [(0.0, 0.0), *((FARTHER * each_x, FARTHER * each_y) for each_x in x for each_y in y)]
+    return np.array(corners), view.cell_m
 
 
 @njit(cache=True, nogil=True)
 def fill_rows(
-    points: NDArray[np.float32], regions: NDArray[np.float64], rows: NDArray[np.int32], kept: NDArray[np.float32]
+    points: NDArray[np.float32], lines: NDArray[np.float64], rows: NDArray[np.int32], kept: NDArray[np.float32]
 ) -> int:
-    """Copy the points that lie in a region.
+    """Copy the points between two lines.
 
     Parameters
     ----------
     points : (n, 4) float32, C-contiguous
-    regions : (k, half planes, 3) float64
-        a, b and c of the half planes a x + b y >= c. A point lies in a region if it lies in all of its half planes.
-    rows : (n or more,) int32, overwritten
-        Rows of the points that lie in a region.
-    kept : (n or more, 4) float32, overwritten
-        Those points.
+    lines : (2, 3) float64
+        a, b and c; points with a x + b y >= c for both lines are kept.
+    rows : (more than n,) int32, overwritten
+        Rows of these points.
+    kept : (more than n, 4) float32, overwritten
+        These points.
 
     Returns
     -------
     int
         Number of these points.
     """
+    a, b, c = lines[0]
+    d, e, f = lines[1]
     n = 0
-    for i in range(points.shape[0]):
+    for i in range(points.shape[0]):  # without a branch: a third of the time
         x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
-        for k in range(regions.shape[0]):
-            is_inside = True
-            for h in range(regions.shape[1]):
-                is_inside &= regions[k, h, 0] * x + regions[k, h, 1] * y >= regions[k, h, 2]
-            if is_inside:
-                rows[n] = i
-                for c in range(4):
-                    kept[n, c] = points[i, c]
-                n += 1
-                break
+        rows[n] = i
+        kept[n, 0], kept[n, 1], kept[n, 2], kept[n, 3] = points[i, 0], points[i, 1], points[i, 2], points[i, 3]
+        n += 1 if (a * x + b * y >= c) & (d * x + e * y >= f) else 0
     return n
+
+
+@njit(cache=True, nogil=True)
+def fill_spread(
+    rows: NDArray[np.int32],
+    labels: NDArray[np.uint8],
+    in_view: NDArray[np.bool_],
+    all_labels: NDArray[np.uint8],
+    all_in_view: NDArray[np.bool_],
+) -> None:
+    """Write labels and ``in_view`` of points to their rows in a whole scan; of the other points, 0 and False.
+
+    Parameters
+    ----------
+    rows : (m,) int32
+    labels : (m,) uint8
+    in_view : (m,) bool
+    all_labels : (n,) uint8, overwritten
+    all_in_view : (n,) bool, overwritten
+    """
+    all_labels[:] = 0
+    all_in_view[:] = False
+    for k in range(rows.shape[0]):
+        all_labels[rows[k]] = labels[k]
+        all_in_view[rows[k]] = in_view[k]

@@ -26,7 +26,7 @@ from .adapt import Interpolator, condition, render
 from .agreement import RULES, agree_on_boxes, agree_on_cells, agree_on_points, find_support, find_voters
 from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, join_boxes, objects_from_points
-from .crop import Crop, spread
+from .crop import Crop
 from .decode import decode_labels, decode_top_view
 from .drivable import compile_kernels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
@@ -588,7 +588,7 @@ class Perceiver:
         if ground is not None and infer:
             points, top_view, boxes = self._combine(kept, ground, points, top_view, boxes, watch)
         if points is not None and rows is not None:
-            points = spread(points, rows, len(scan))
+            points = self._crop.spread(points, rows, len(scan))
         return Perception(
             n_points=len(scan),
             n_dropped=n_dropped,

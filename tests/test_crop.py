@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import twins.crop
 from edgeperc import Perceiver
 from edgeperc.card import RangeImageGeometry, TopViewGeometry
-from edgeperc.crop import MARGIN_M, Crop, fill_rows
+from edgeperc.crop import MARGIN_M, Crop, fill_rows, fill_spread
 from edgeperc.observed import Observer
 from edgeperc.projection import make_projector
 from edgeperc.sensor import get_sensor
@@ -50,18 +50,27 @@ def rows_of(crop: Crop, points: NDArray[np.float32]) -> NDArray[np.int64]:
 
 @pytest.mark.kernel
 @patient
-@given(clouds, st.lists(sectors | rectangles, min_size=1, max_size=3))
-def test_rows_match_the_slow_twin(
-    points: NDArray[np.float32], views: list[RangeImageGeometry | TopViewGeometry]
-) -> None:
-    crop = Crop(views)
-    rows, kept = np.full(len(points), -1, np.int32), np.full(points.shape, -1.0, np.float32)
-    n = fill_rows(points, crop._regions, rows, kept)
-    if crop._regions.shape[1]:
-        expected = twins.crop.kept_rows(points, crop._regions)
-        np.testing.assert_array_equal(rows[:n], expected)
-        np.testing.assert_array_equal(kept[:n], points[expected])
-    assert (rows[n:] == -1).all()
+@given(clouds, st.lists(st.tuples(*[st.floats(-20.0, 20.0)] * 3), min_size=2, max_size=2))
+def test_rows_match_the_slow_twin(points: NDArray[np.float32], lines: list[tuple[float, float, float]]) -> None:
+    rows, kept = np.empty(len(points) + 1, np.int32), np.empty((len(points) + 1, 4), np.float32)
+    n = fill_rows(points, np.array(lines), rows, kept)
+    expected = twins.crop.kept_rows(points, lines)
+    np.testing.assert_array_equal(rows[:n], expected)
+    np.testing.assert_array_equal(kept[:n], points[expected])
+
+
+@pytest.mark.kernel
+@patient
+@given(st.lists(st.booleans(), max_size=40), st.integers(0, 2**32 - 1))
+def test_spread_labels_match_the_slow_twin(is_kept: list[bool], seed: int) -> None:
+    rows = np.flatnonzero(is_kept).astype(np.int32)
+    rng = np.random.default_rng(seed)
+    labels, in_view = rng.integers(0, 5, len(rows)).astype(np.uint8), rng.random(len(rows)) < 0.5
+    all_labels, all_in_view = np.full(len(is_kept), 9, np.uint8), np.ones(len(is_kept), np.bool_)
+    fill_spread(rows, labels, in_view, all_labels, all_in_view)
+    expected = twins.crop.spread(rows, labels, in_view, len(is_kept))
+    np.testing.assert_array_equal(all_labels, expected[0])
+    np.testing.assert_array_equal(all_in_view, expected[1])
 
 
 @patient
@@ -97,7 +106,8 @@ def test_what_an_observer_uses_is_kept(points: NDArray[np.float32], view: TopVie
 def test_a_full_turn_and_no_view_keep_everything() -> None:
     points = np.ones((3, 4), np.float32)
     turn = replace(AHEAD, azimuth_left_deg=180.0, azimuth_right_deg=-180.0)
-    for views in ([], [turn], [turn, TOP]):
+    half = replace(AHEAD, azimuth_left_deg=100.0, azimuth_right_deg=-100.0)
+    for views in ([], [turn], [turn, TOP], [half], [TopViewGeometry((-8.0, 8.0), cell_m=0.5)]):
         kept, rows = Crop(views).select(points)
         assert kept is points
         assert rows is None
