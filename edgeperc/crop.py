@@ -18,7 +18,7 @@ from .observed import FARTHER
 from .perception import PointLabels
 from .points import read_only
 
-__all__ = ["MARGIN_M", "Crop", "fill_rows", "fill_spread"]
+__all__ = ["MARGIN_M", "Crop", "fill_rows", "fill_spread", "spread"]
 
 MARGIN_M = 5.0
 """Points up to this far beside a range image are kept [m]: a car at its edge is clustered as a whole."""
@@ -35,9 +35,19 @@ class Crop:
         Of a range image, the sector and `MARGIN_M` beside it are kept. Of a top view, what `edgeperc.observed.Observer`
         uses: up to 1.4 times as far as the view, between the directions of its sides. Everything is kept without a
         view, for a sector of more than 180 degrees, and for a top view alone that is not ahead of the sensor.
+    margin_m : float
+        In place of `MARGIN_M`.
+    turn_rad : float
+        By this angle the views are turned to the left.
     """
 
-    def __init__(self, views: Sequence[RangeImageGeometry | TopViewGeometry]) -> None:
+    def __init__(
+        self,
+        views: Sequence[RangeImageGeometry | TopViewGeometry],
+        *,
+        margin_m: float = MARGIN_M,
+        turn_rad: float = 0.0,
+    ) -> None:
         self._lines: NDArray[np.float64] | None = None
         self._rows, self._kept = np.empty(0, np.int32), np.empty((0, 4), np.float32)
         ahead = [_ahead(view) for view in views if isinstance(view, TopViewGeometry)]
@@ -46,8 +56,10 @@ class Crop:
         right = min((sector[1] for sector in sectors), default=0.0)
         if left - right <= math.pi:
             inward = np.array([(math.sin(left), -math.cos(left)), (-math.sin(right), math.cos(right))])
-            nearest = [(inward @ corners.T).min(axis=1) - margin_m for corners, margin_m in map(_hull, views)]
-            self._lines = np.column_stack([inward, np.min(nearest, axis=0)])
+            hulls = [_hull(view, margin_m) for view in views]
+            nearest = [(inward @ corners.T).min(axis=1) - beside for corners, beside in hulls]
+            cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+            self._lines = np.column_stack([inward @ np.array([(cos, sin), (-sin, cos)]), np.min(nearest, axis=0)])
 
     def select(self, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32] | None]:
         """The points that matter, in their order.
@@ -72,11 +84,26 @@ class Crop:
         n = fill_rows(read_only(points), self._lines, self._rows, self._kept)
         return read_only(self._kept[:n]), self._rows[:n]
 
-    def spread(self, points: PointLabels, rows: NDArray[np.int32], n: int) -> PointLabels:
-        """Labels of a whole scan of ``n`` points, from those of its ``rows``; the others are out of view."""
-        labels, in_view = np.empty(n, np.uint8), np.empty(n, np.bool_)
-        fill_spread(rows, read_only(points.labels, np.uint8), read_only(points.in_view, np.bool_), labels, in_view)
-        return PointLabels(labels, in_view, points.classes)
+
+def spread(parts: Sequence[tuple[PointLabels, NDArray[np.int32] | None]], n: int) -> PointLabels:
+    """Labels of a whole scan from those of parts of it.
+
+    Parameters
+    ----------
+    parts : sequence of tuple
+        Labels of a part, and the rows of its points from `Crop.select`. Of a point in view of several parts, the label
+        is that of the first one. Points in no part are out of view.
+    n : int
+        Number of points of the scan.
+    """
+    first, all_rows = parts[0]
+    if all_rows is None:
+        return first
+    labels, in_view = np.zeros(n, np.uint8), np.zeros(n, np.bool_)
+    for part, rows in reversed(parts):
+        assert rows is not None
+        fill_spread(rows, read_only(part.labels, np.uint8), read_only(part.in_view, np.bool_), labels, in_view)
+    return PointLabels(labels, in_view, first.classes)
 
 
 def _sector(view: RangeImageGeometry) -> tuple[float, float]:
@@ -92,10 +119,10 @@ def _ahead(view: TopViewGeometry) -> tuple[float, float]:
     return max(azimuths), min(azimuths)
 
 
-def _hull(view: RangeImageGeometry | TopViewGeometry) -> tuple[NDArray[np.float64], float]:
+def _hull(view: RangeImageGeometry | TopViewGeometry, margin_m: float) -> tuple[NDArray[np.float64], float]:
     """Corners of the least region that must be kept between two lines, and the margin around it [m]."""
     if isinstance(view, RangeImageGeometry):
-        return np.zeros((1, 2)), MARGIN_M  # the sector's own edges are the directions of the lines
+        return np.zeros((1, 2)), margin_m  # the sector's own edges are the directions of the lines
     x, y = view.x_range_m, view.y_range_m
     if x[0] <= 0.0:
         x, y = (x[0], max(x[1], 0.0)), (min(y[0], 0.0), max(y[1], 0.0))
@@ -143,18 +170,18 @@ def fill_spread(
     all_labels: NDArray[np.uint8],
     all_in_view: NDArray[np.bool_],
 ) -> None:
-    """Write labels and ``in_view`` of points to their rows in a whole scan; of the other points, 0 and False.
+    """Write the labels of points in view to their rows in a whole scan.
 
     Parameters
     ----------
     rows : (m,) int32
     labels : (m,) uint8
     in_view : (m,) bool
-    all_labels : (n,) uint8, overwritten
-    all_in_view : (n,) bool, overwritten
+    all_labels : (n,) uint8, modified
+    all_in_view : (n,) bool, modified
+        True at these rows.
     """
-    all_labels[:] = 0
-    all_in_view[:] = False
     for k in range(rows.shape[0]):
-        all_labels[rows[k]] = labels[k]
-        all_in_view[rows[k]] = in_view[k]
+        if in_view[k]:
+            all_labels[rows[k]] = labels[k]
+            all_in_view[rows[k]] = True

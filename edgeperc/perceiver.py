@@ -26,7 +26,7 @@ from .adapt import Interpolator, condition, render
 from .agreement import RULES, agree_on_boxes, agree_on_cells, agree_on_points, find_support, find_voters
 from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, join_boxes, objects_from_points
-from .crop import Crop
+from .crop import Crop, spread
 from .decode import decode_labels, decode_top_view
 from .drivable import compile_kernels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
@@ -60,6 +60,7 @@ ADAPTATIONS: tuple[Adaptation, ...] = ("none", "remission", "interpolation", "bo
 # A wrong set-up shows in any scan. Several are checked, because one may have been taken in a tunnel or a depot.
 # A refused scan does not count.
 CHECKED_SCANS = 5
+ROUNDING_M = 0.01  # of a point, when its scan is turned
 
 _P = ParamSpec("_P")
 _Result = TypeVar("_Result")
@@ -130,6 +131,13 @@ def _view_kind(model: str | os.PathLike[str]) -> str | None:
         return resolve(model)[0].card.view.kind
     except EdgepercError:
         return None
+
+
+def _sectors(view: RangeImageGeometry) -> list[tuple[float, Crop]]:
+    """The sectors of a full turn: the angle by which each lies to the left of the first [rad], and its points."""
+    width_deg = view.azimuth_left_deg - view.azimuth_right_deg
+    turns_rad = [math.radians(k * width_deg) for k in range(math.ceil(360.0 / width_deg))]
+    return [(turn_rad, Crop([view], margin_m=ROUNDING_M, turn_rad=turn_rad)) for turn_rad in turns_rad]
 
 
 def _beside(function: Callable[[], _Result]) -> Callable[[], _Result]:
@@ -364,6 +372,7 @@ class Perceiver:
         ranged = self._network_of(RangeImageGeometry)
         self._aside = self._load(ranged.session.second()) if full_turn and self._at_once and ranged else None
         # Half of the points of a full turn are near no view that looks ahead: 11 in place of 8 ms.
+        self._sectors = [] if ranged is None else _sectors(ranged.session.card.view)
         self._crop = Crop([] if full_turn else [n.session.card.view for n in self._networks])
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
         self._locks = {os.getpid(): threading.Lock()}
@@ -587,8 +596,8 @@ class Perceiver:
                 watch.lap("infer")
         if ground is not None and infer:
             points, top_view, boxes = self._combine(kept, ground, points, top_view, boxes, watch)
-        if points is not None and rows is not None:
-            points = self._crop.spread(points, rows, len(scan))
+        if points is not None:
+            points = spread([(points, rows)], len(scan))
         return Perception(
             n_points=len(scan),
             n_dropped=n_dropped,
@@ -703,11 +712,8 @@ class Perceiver:
 
         Once ``beside`` has returned, a second thread takes sectors, too.
         """
-        view = network.session.card.view
-        assert isinstance(view, RangeImageGeometry)
-        width_deg = view.azimuth_left_deg - view.azimuth_right_deg
-        left = deque(range(math.ceil(360.0 / width_deg)))
-        sectors: dict[int, PointLabels] = {}
+        left = deque(range(len(self._sectors)))
+        sectors: dict[int, tuple[PointLabels, NDArray[np.int32] | None]] = {}
 
         def label_sectors(by: _Network, watch: _Stopwatch) -> None:
             while True:
@@ -715,9 +721,12 @@ class Perceiver:
                     k = left.popleft()
                 except IndexError:  # none is left
                     return
+                turn_rad, crop = self._sectors[k]
+                seen, rows = crop.select(scan)
+                heights = height_m if height_m is None or rows is None else height_m[rows]
                 # What float32 cannot hold after the turn is not in view.
-                seen = turned(scan, math.radians(k * width_deg)) if k else scan
-                sectors[k] = self._label_sector(by, seen, height_m, watch, infer)
+                seen = turned(seen, turn_rad) if k else seen
+                sectors[k] = self._label_sector(by, seen, heights, watch, infer), rows
 
         def help_out(by: _Network, beside: Callable[[], object]) -> None:
             beside()
@@ -731,11 +740,7 @@ class Perceiver:
             if helper is not None:
                 helper()
                 watch.lap("infer")
-        labels, in_view = sectors[0].labels, sectors[0].in_view
-        for k in range(1, len(sectors)):
-            labels = np.where(in_view, labels, sectors[k].labels)
-            in_view = in_view | sectors[k].in_view
-        return PointLabels(labels, in_view, sectors[0].classes)
+        return spread([sectors[k] for k in range(len(sectors))], len(scan))
 
     def _find_ground(self, scan: NDArray[np.float32], rows: NDArray[np.int32] | None = None) -> Ground | None:
         """The ground, once for all that needs it: the input of a network, and the clusters; None if nothing does."""

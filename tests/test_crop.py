@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +15,9 @@ from numpy.typing import NDArray
 import twins.crop
 from edgeperc import Perceiver
 from edgeperc.card import RangeImageGeometry, TopViewGeometry
-from edgeperc.crop import MARGIN_M, Crop, fill_rows, fill_spread
+from edgeperc.crop import MARGIN_M, Crop, fill_rows, spread
 from edgeperc.observed import Observer
+from edgeperc.perception import PointLabels
 from edgeperc.projection import make_projector
 from edgeperc.sensor import get_sensor
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
@@ -61,16 +63,19 @@ def test_rows_match_the_slow_twin(points: NDArray[np.float32], lines: list[tuple
 
 @pytest.mark.kernel
 @patient
-@given(st.lists(st.booleans(), max_size=40), st.integers(0, 2**32 - 1))
-def test_spread_labels_match_the_slow_twin(is_kept: list[bool], seed: int) -> None:
-    rows = np.flatnonzero(is_kept).astype(np.int32)
+@given(st.lists(st.lists(st.booleans(), min_size=20, max_size=20), min_size=1, max_size=4), st.integers(0, 2**32 - 1))
+def test_spread_labels_match_the_slow_twin(parts: list[list[bool]], seed: int) -> None:
     rng = np.random.default_rng(seed)
-    labels, in_view = rng.integers(0, 5, len(rows)).astype(np.uint8), rng.random(len(rows)) < 0.5
-    all_labels, all_in_view = np.full(len(is_kept), 9, np.uint8), np.ones(len(is_kept), np.bool_)
-    fill_spread(rows, labels, in_view, all_labels, all_in_view)
-    expected = twins.crop.spread(rows, labels, in_view, len(is_kept))
-    np.testing.assert_array_equal(all_labels, expected[0])
-    np.testing.assert_array_equal(all_in_view, expected[1])
+    given_parts = []
+    for is_kept in parts:
+        rows = np.flatnonzero(is_kept).astype(np.int32)
+        labels, in_view = rng.integers(0, 5, len(rows)).astype(np.uint8), rng.random(len(rows)) < 0.5
+        given_parts.append((PointLabels(labels, in_view, ("background", "car", "van", "truck", "person")), rows))
+    found = spread(given_parts, 20)
+    labels, in_view = twins.crop.spread(given_parts, 20)
+    np.testing.assert_array_equal(found.labels, labels)
+    np.testing.assert_array_equal(found.in_view, in_view)
+    assert spread([(given_parts[0][0], None)], 20) is given_parts[0][0]
 
 
 @patient
@@ -89,6 +94,19 @@ def test_a_sector_and_what_is_beside_it_are_kept(points: NDArray[np.float32], vi
             rays = np.radians([view.azimuth_left_deg, view.azimuth_right_deg])
             beside = [abs(math.sin(ray) * x[row] - math.cos(ray) * y[row]) for ray in rays]
             assert in_sector[row] or min(beside) <= MARGIN_M + 1e-3
+
+
+@patient
+@given(clouds, sectors, st.floats(-7.0, 7.0))
+def test_a_turned_view_keeps_what_it_sees_of_the_turned_scan(
+    points: NDArray[np.float32], view: RangeImageGeometry, turn_rad: float
+) -> None:
+    points = points[np.hypot(points[:, 0], points[:, 1]) < 1e3]
+    rows = rows_of(Crop([view], turn_rad=turn_rad), points)
+    x, y = points[:, :2].T.astype(np.float64)
+    azimuth = np.degrees(np.angle((x + 1j * y) * np.exp(-1j * turn_rad)))
+    seen = (azimuth <= view.azimuth_left_deg) & (azimuth >= view.azimuth_right_deg)
+    assert set(np.flatnonzero(seen)) <= set(rows)
 
 
 @patient
@@ -137,6 +155,23 @@ def test_answers_are_those_with_all_points(models: list[str]) -> None:
         if seen.top_view is not None and expected.top_view is not None:
             np.testing.assert_array_equal(seen.top_view.labels, expected.top_view.labels)
             np.testing.assert_array_equal(seen.top_view.observed, expected.top_view.observed)
+
+
+def test_answers_of_a_full_turn_are_those_of_sectors_with_all_points() -> None:
+    options: dict[str, Any] = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore", "full_turn": True}
+    cropping, whole = Perceiver("pointseg", **options), Perceiver("pointseg", **options)
+    everything = Crop([])
+    whole._sectors = [(turn_rad, everything) for turn_rad, _ in whole._sectors]
+    whole._sectors[0][1].select = lambda points: (points, np.arange(len(points), dtype=np.int32))  # type: ignore[method-assign]
+    for seed in range(2):
+        points = simulated_scan(FIRST_SEED + seed).points
+        seen, expected = cropping(points), whole(points)
+        assert seen.boxes == expected.boxes
+        assert seen.points is not None
+        assert expected.points is not None
+        assert seen.points.in_view.mean() > 0.9
+        np.testing.assert_array_equal(seen.points.labels, expected.points.labels)
+        np.testing.assert_array_equal(seen.points.in_view, expected.points.in_view)
 
 
 def test_every_point_that_a_network_sees_is_kept() -> None:

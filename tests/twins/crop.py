@@ -12,8 +12,11 @@ def kept_rows(points, lines):
         return np.flatnonzero(np.all([a * x + b * y >= c for a, b, c in lines], axis=0))
 
 
-def spread(rows, labels, in_view, n):
-    """Twin of `edgeperc.crop.fill_spread`."""
-    all_labels, all_in_view = np.zeros(n, np.uint8), np.zeros(n, bool)
-    all_labels[rows], all_in_view[rows] = labels, in_view
-    return all_labels, all_in_view
+def spread(parts, n):
+    """Twin of `edgeperc.crop.spread`: the first part in whose view a point is."""
+    labels, in_view = np.zeros(n, np.uint8), np.zeros(n, bool)
+    for part, rows in parts:
+        for k, row in enumerate(rows):
+            if part.in_view[k] and not in_view[row]:
+                labels[row], in_view[row] = part.labels[k], True
+    return labels, in_view
