@@ -371,7 +371,7 @@ class Perceiver:
         # Of a full turn, the top view's thread takes sectors when it is done with the top view.
         ranged = self._network_of(RangeImageGeometry)
         self._aside = self._load(ranged.session.second()) if full_turn and self._at_once and ranged else None
-        # Half of the points of a full turn are near no view that looks ahead: 11 in place of 8 ms.
+        # Half of the points of a scan are near no view that looks ahead: 16.1 in place of 17.5 ms.
         self._sectors = [] if ranged is None else _sectors(ranged.session.card.view)
         self._crop = Crop([] if full_turn else [n.session.card.view for n in self._networks])
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
