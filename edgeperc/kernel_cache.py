@@ -21,7 +21,7 @@ import stat
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -140,8 +140,10 @@ class KernelCache:
 
     @property
     def cache_path(self) -> str | None:
-        """The first folder that can be used; None if there is none."""
-        return next((str(folder) for folder in self._folders() if _unusable(folder) is None), None)
+        """The first folder that can be written, or holds this kernel already; None if there is none."""
+        usable = [folder for folder in self._folders() if _unusable(folder) is None]
+        kept = (folder for folder in usable if _can_be_written(folder) or self._is_in(folder))
+        return next(map(str, kept), None)
 
     def is_missing(self) -> bool:
         """Whether no folder holds a compiled form of this source, for any types, and one of them can be written."""
@@ -149,11 +151,14 @@ class KernelCache:
         for folder in self._folders() if self._enabled and self._stamp is not None else ():
             if _unusable(folder) is not None:
                 continue
-            if any(_stamp_of(file) == self._stamp for file in folder.glob(f"{self._name}-*.kernel")):
+            if self._is_in(folder):
                 return False
-            with suppress(OSError):
-                can_write |= os.access(next(each for each in (folder, *folder.parents) if each.exists()), os.W_OK)
+            can_write |= _can_be_written(folder)
         return can_write
+
+    def _is_in(self, folder: Path) -> bool:
+        """Whether a folder holds a compiled form of this source, for any types."""
+        return any(_stamp_of(file) == self._stamp for file in folder.glob(f"{self._name}-*.kernel"))
 
     def enable(self) -> None:
         """Load and save from now on."""
@@ -314,6 +319,14 @@ def _stamp_of(file: Path) -> bytes:
             return opened.read(2 * _DIGEST_BYTES)[_DIGEST_BYTES:]
     except OSError:
         return b""
+
+
+def _can_be_written(folder: Path) -> bool:
+    """Whether files can be put into a folder, which may not exist yet."""
+    try:
+        return os.access(next(each for each in (folder, *folder.parents) if each.exists()), os.W_OK)
+    except OSError:
+        return False
 
 
 def _unusable(folder: Path) -> str | None:

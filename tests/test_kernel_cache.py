@@ -358,6 +358,23 @@ def test_users_folder_is_used_if_the_packages_cannot_be(without_setting: Place, 
     assert len([*(tmp_path / "user" / "kernels").glob("package-*/*.kernel")]) == 2
 
 
+def test_a_read_only_package_is_named_only_if_it_holds_the_kernel(
+    without_setting: Place, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    folder = without_setting.source.parent / "__pycache__"
+    without_setting.start()
+    cache = sys.modules["some_kernels"].total._cache
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != folder and access(path, mode))
+    assert cache.cache_path == str(folder)
+    for file in folder.glob("*.kernel"):
+        file.unlink()
+    assert cache.cache_path is not None
+    assert Path(cache.cache_path).is_relative_to(tmp_path / "user")
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert cache.cache_path is None
+
+
 def test_read_only_package_and_home_are_reported(without_setting: Place, tmp_path: Path) -> None:
     (without_setting.source.parent / "__pycache__").write_bytes(b"")
     (tmp_path / "user").write_bytes(b"")
