@@ -23,8 +23,8 @@ __all__ = ["MARGIN_M", "Crop", "fill_rows", "fill_spread", "spread"]
 MARGIN_M = 5.0
 """Points up to this far beside a range image are kept [m]: a car at its edge is clustered as a whole.
 
-With it, no answer to 61 scans of KITTI changes, nor a figure of `edgeperc eval` on PandaSet, Argoverse 2, View of Delft and
-DDAD.
+With it, no answer to 61 scans of KITTI changes, nor a figure of `edgeperc eval` on PandaSet, Argoverse 2, View of Delft
+and DDAD.
 """
 
 
