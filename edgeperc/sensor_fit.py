@@ -227,15 +227,16 @@ def stratify(
     if scan.ndim != 2 or scan.shape[1] != 4:
         raise PointsError(f"got an array of shape {scan.shape}; expected (n, 4): x, y, z, remission")
     with np.errstate(over="ignore", invalid="ignore"):
-        square = np.square(scan[:, :3]).sum(axis=1)
-        known = (square >= RANGE_EDGES_M[0] ** 2) & (square < RANGE_EDGES_M[-1] ** 2) & np.isfinite(scan[:, 3])
-    kept = scan[known]
-    every = 1 if n_points is None else len(kept) // max(n_points, 1)
-    if every > 1:
-        # Consecutive products of odd numbers, in int32 with overflow, spread neighboring cells evenly.
-        cells = np.floor(kept[:, :3] / np.float32(cell_m)).astype(np.int32)
-        spread = cells @ np.array([73856093, 19349663, 83492791], np.int32)
-        kept = kept[(spread >> 8) % every == 0]
+        x, y, z = scan[:, :3].T
+        square = x * x + y * y + z * z  # an eighth of the time of sum(axis=1)
+        used = (square >= RANGE_EDGES_M[0] ** 2) & (square < RANGE_EDGES_M[-1] ** 2) & np.isfinite(scan[:, 3])
+        every = 1 if n_points is None else np.count_nonzero(used) // max(n_points, 1)
+        if every > 1:
+            # Consecutive products of odd numbers, in int32 with overflow, spread neighboring cells evenly.
+            cells = np.floor(scan[:, :3] / np.float32(cell_m)).astype(np.int32)
+            spread = cells @ np.array([73856093, 19349663, 83492791], np.int32)
+            used &= (spread >> 8) % every == 0
+    kept = scan[used]
     range_m = np.sqrt(np.square(kept[:, :3].astype(np.float64)).sum(axis=1))
     cosine = np.nan_to_num(incidences(kept, cell_m), nan=np.inf)
     by_range = np.clip(np.searchsorted(RANGE_EDGES_M, range_m, side="right") - 1, 0, len(RANGE_EDGES_M) - 2)
