@@ -101,7 +101,7 @@ def test_a_sector_and_what_is_beside_it_are_kept(points: NDArray[np.float32], vi
 def test_a_turned_view_keeps_what_it_sees_of_the_turned_scan(
     points: NDArray[np.float32], view: RangeImageGeometry, turn_rad: float
 ) -> None:
-    points = points[np.hypot(points[:, 0], points[:, 1]) < 1e3]
+    points = points[(np.abs(points[:, :2]) < 1e3).all(axis=1)]
     rows = rows_of(Crop([view], turn_rad=turn_rad), points)
     x, y = points[:, :2].T.astype(np.float64)
     azimuth = np.degrees(np.angle((x + 1j * y) * np.exp(-1j * turn_rad)))
