@@ -18,7 +18,7 @@ from .observed import FARTHER
 from .perception import PointLabels
 from .points import read_only
 
-__all__ = ["MARGIN_M", "Crop", "fill_rows", "fill_spread", "spread"]
+__all__ = ["MARGIN_M", "Crop", "fill_rows", "fill_spread", "sectors_of_turn", "spread"]
 
 MARGIN_M = 5.0
 """Points up to this far beside a range image are kept [m]: a car at its edge is clustered as a whole.
@@ -26,6 +26,7 @@ MARGIN_M = 5.0
 With it, no answer to 61 scans of KITTI changes, nor a figure of `edgeperc eval` on PandaSet, Argoverse 2, View of Delft
 and DDAD.
 """
+ROUNDING_M = 0.01  # of a point, when its scan is turned
 
 
 class Crop:
@@ -89,24 +90,45 @@ class Crop:
         return read_only(self._kept[:n]), self._rows[:n]
 
 
+def sectors_of_turn(view: RangeImageGeometry, *, whole: bool) -> list[tuple[float, Crop]]:
+    """The sectors of a full turn.
+
+    Parameters
+    ----------
+    view : RangeImageGeometry
+        Of the first sector.
+    whole : bool
+        Each sector gets all points, not only its own.
+
+    Returns
+    -------
+    list of (float, Crop)
+        The angle by which each lies to the left of the first one [rad], and what selects its points.
+    """
+    width_deg = view.azimuth_left_deg - view.azimuth_right_deg
+    turns_rad = [math.radians(k * width_deg) for k in range(math.ceil(360.0 / width_deg))]
+    seen = [] if whole else [view]
+    return [(turn_rad, Crop(seen, margin_m=ROUNDING_M, turn_rad=turn_rad)) for turn_rad in turns_rad]
+
+
 def spread(parts: Sequence[tuple[PointLabels, NDArray[np.int32] | None]], n: int) -> PointLabels:
     """Labels of a whole scan from those of parts of it.
 
     Parameters
     ----------
     parts : sequence of tuple
-        Labels of a part, and the rows of its points from `Crop.select`. Of a point in view of several parts, the label
-        is that of the first one. Points in no part are out of view.
+        Labels of a part, and the rows of its points from `Crop.select`; None for all points. Of a point in view of
+        several parts, the label is that of the first one. Points in no part are out of view.
     n : int
         Number of points of the scan.
     """
-    first, all_rows = parts[0]
-    if all_rows is None:
+    first, first_rows = parts[0]
+    if len(parts) == 1 and first_rows is None:
         return first
     labels, in_view = np.zeros(n, np.uint8), np.zeros(n, np.bool_)
     for part, rows in reversed(parts):
-        assert rows is not None
-        fill_spread(rows, read_only(part.labels, np.uint8), read_only(part.in_view, np.bool_), labels, in_view)
+        every = np.arange(n, dtype=np.int32) if rows is None else rows
+        fill_spread(every, read_only(part.labels, np.uint8), read_only(part.in_view, np.bool_), labels, in_view)
     return PointLabels(labels, in_view, first.classes)
 
 

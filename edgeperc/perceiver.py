@@ -26,7 +26,7 @@ from .adapt import Interpolator, condition, render
 from .agreement import RULES, agree_on_boxes, agree_on_cells, agree_on_points, find_support, find_voters
 from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, join_boxes, objects_from_points
-from .crop import Crop, spread
+from .crop import Crop, sectors_of_turn, spread
 from .decode import decode_labels, decode_top_view
 from .drivable import compile_kernels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
@@ -60,7 +60,6 @@ ADAPTATIONS: tuple[Adaptation, ...] = ("none", "remission", "interpolation", "bo
 # A wrong set-up shows in any scan. Several are checked, because one may have been taken in a tunnel or a depot.
 # A refused scan does not count.
 CHECKED_SCANS = 5
-ROUNDING_M = 0.01  # of a point, when its scan is turned
 
 _P = ParamSpec("_P")
 _Result = TypeVar("_Result")
@@ -131,13 +130,6 @@ def _view_kind(model: str | os.PathLike[str]) -> str | None:
         return resolve(model)[0].card.view.kind
     except EdgepercError:
         return None
-
-
-def _sectors(view: RangeImageGeometry) -> list[tuple[float, Crop]]:
-    """The sectors of a full turn: the angle by which each lies to the left of the first [rad], and its points."""
-    width_deg = view.azimuth_left_deg - view.azimuth_right_deg
-    turns_rad = [math.radians(k * width_deg) for k in range(math.ceil(360.0 / width_deg))]
-    return [(turn_rad, Crop([view], margin_m=ROUNDING_M, turn_rad=turn_rad)) for turn_rad in turns_rad]
 
 
 def _beside(function: Callable[[], _Result]) -> Callable[[], _Result]:
@@ -371,9 +363,11 @@ class Perceiver:
         # Of a full turn, the top view's thread takes sectors when it is done with the top view.
         ranged = self._network_of(RangeImageGeometry)
         self._aside = self._load(ranged.session.second()) if full_turn and self._at_once and ranged else None
-        # Half of the points of a scan are near no view that looks ahead: 16.1 in place of 17.5 ms.
-        self._sectors = [] if ranged is None else _sectors(ranged.session.card.view)
-        self._crop = Crop([] if full_turn else [n.session.card.view for n in self._networks])
+        # Half of the points of a scan are near no view that looks ahead: 16.1 in place of 17.5 ms. Between points, the
+        # ground is found anew, with all points.
+        interpolates = ranged is not None and ranged.interpolator is not None
+        self._sectors = [] if ranged is None else sectors_of_turn(ranged.session.card.view, whole=interpolates)
+        self._crop = Crop([] if full_turn or interpolates else [n.session.card.view for n in self._networks])
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
         self._locks = {os.getpid(): threading.Lock()}
         # Compile every kernel here, not in the first call, with an image of one pixel and a scan of two points. The

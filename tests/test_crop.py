@@ -174,6 +174,20 @@ def test_answers_of_a_full_turn_are_those_of_sectors_with_all_points() -> None:
         np.testing.assert_array_equal(seen.points.in_view, expected.points.in_view)
 
 
+@pytest.mark.parametrize("full_turn", [False, True])
+def test_between_points_the_ground_is_found_with_all_of_them(full_turn: bool) -> None:
+    options: dict[str, Any] = {"provider": "cpu", "sensor": "vlp-16", "on_mismatch": "ignore"}
+    perceive = Perceiver("pointseg", adapt="interpolation", full_turn=full_turn, **options)
+    points = np.ones((3, 4), np.float32)
+    for crop in (perceive._crop, *(crop for _, crop in perceive._sectors)):
+        assert crop.select(points)[1] is None
+    points = simulated_scan(FIRST_SEED, "vlp-16").points
+    seen = perceive(points).points
+    assert seen is not None
+    assert seen.labels.shape == (len(points),)
+    assert seen.in_view.mean() > (0.5 if full_turn else 0.1)
+
+
 def test_every_point_that_a_network_sees_is_kept() -> None:
     points = simulated_scan(FIRST_SEED).points
     perceive = Perceiver(provider="cpu", n_threads=1, on_mismatch="ignore")
