@@ -1,7 +1,7 @@
 """Leave out the points of a scan that no view shows and that belong to no object in a view.
 
-A network that looks ahead sees a quarter of the turn. The ground is found with all points. What follows takes half the
-time without the points behind and beside the vehicle.
+A network that looks ahead sees a quarter of the turn. The ground is found with all points. What follows has half as
+many: none behind the vehicle or far beside it.
 """
 
 from __future__ import annotations
