@@ -366,7 +366,7 @@ class Perceiver:
         # Half of the points of a scan are near no view that looks ahead: 16.1 in place of 17.5 ms. Between points, the
         # ground is found anew, with all points.
         interpolates = ranged is not None and ranged.interpolator is not None
-        self._sectors = [] if ranged is None else sectors_of_turn(ranged.session.card.view, whole=interpolates)
+        self._sectors = sectors_of_turn(ranged.session.card.view, whole=interpolates) if full_turn and ranged else []
         self._crop = Crop([] if full_turn or interpolates else [n.session.card.view for n in self._networks])
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
         self._locks = {os.getpid(): threading.Lock()}
