@@ -464,6 +464,17 @@ def test_near_table_is_no_car() -> None:
     assert (labels[(rows[:, 2] > 0.0) & ~is_near] == 1).all()
 
 
+def test_doors_of_the_own_vehicle_are_no_cars_and_a_person_beside_it_stays() -> None:
+    doors = [block(1.0, y, (1.0, 0.1, 1.4), 1) for y in (-1.4, 1.4)]
+    van, person = block(1.0, 3.6, (5.0, 1.9, 2.0), 1), block(0.5, -2.2, (0.4, 0.4, 1.75), 2, 0.1)
+    person[::2, 3] = 1  # doubtful
+    rows, labels = agreed_scene(*doors, van, person)
+    above = rows[:, 2] > 0.3
+    assert not labels[above & (rows[:, 3] == 1) & (np.abs(rows[:, 1]) < 1.5)].any()
+    assert (labels[above & (rows[:, 1] > 2.0)] == 1).all()
+    assert labels[above & (rows[:, 1] < -1.9)].all()
+
+
 def test_box_that_the_labels_contradict_labels_nothing() -> None:
     wall = block(12.0, 3.0, (14.0, 0.3, 2.5), 0)
     box = Box("van", 0.9, (12.0, 3.0, -1.0), (4.9, 1.9, 2.1), 0.0)

@@ -110,9 +110,9 @@ def verdict_table(counts, bounds, roles, parts, by_share, by_height, is_filled):
     large = (length > 10.0) | (top > 4.0)
     low, high = bounds[:, :2].astype(np.float64), bounds[:, 2:4].astype(np.float64)
     is_near = np.hypot(*np.maximum(np.maximum(low, -high), 0.0).T) < 30.0  # nearest place of the bounds
-    no_vehicle = by_share & (vehicle_share < np.where(large, 0.75, 0.6)) | by_height & (
-        top < np.where(is_near, 1.0, 0.5)
-    )
+    is_own = (np.hypot(*np.maximum(np.abs(low), np.abs(high)).T) < 2.6) & (person_share < 0.1)
+    is_low = top < np.where(is_near, 1.0, 0.5)
+    no_vehicle = by_share & (vehicle_share < np.where(large, 0.75, 0.6)) | by_height & (is_low | is_own)
     no_person = by_share & (person_share < 0.1) | by_height & (top < 1.0)
     table = np.tile(np.arange(len(roles), dtype=np.uint8), (len(counts), 1))
     table[np.ix_(no_vehicle, vehicles)] = 0
