@@ -319,12 +319,14 @@ def agree_on_cells(
         np.zeros(cells.shape, np.uint8),
         cells,
     )
-    covered = _footprints(view, boxes)
-    under = (cells == drivable) & (covered != _NO_BOX)
-    cells[under] = np.where(covered < len(view.classes), covered, 0)[under]
+    covered, flat = _footprints(view, boxes).reshape(-1), cells.reshape(-1)
+    below = np.flatnonzero(covered != _NO_BOX)
+    below = below[flat[below] == drivable]
+    flat[below] = np.where(covered[below] < len(view.classes), covered[below], 0)
     if dropped:
         is_vehicle = np.array([name in VEHICLES for name in view.classes])
-        cells[(_footprints(view, dropped) != _NO_BOX) & (covered == _NO_BOX) & is_vehicle[cells]] = 0
+        freed = np.flatnonzero((_footprints(view, dropped).reshape(-1) != _NO_BOX) & (covered == _NO_BOX))
+        flat[freed[is_vehicle[flat[freed]]]] = 0
     return replace(view, labels=cells)
 
 

@@ -28,9 +28,20 @@ def fill_pixels(blocks: NDArray[np.float32], rows: int, cols: int, pixels: NDArr
     _, height, width = blocks.shape
     for c in range(pixels.shape[0]):
         for i in range(rows):
-            for j in range(cols):
-                channel = blocks[(c * rows + i) * cols + j]
-                for row in range(height):
-                    into = pixels[c, row * rows + i]
+            first = (c * rows + i) * cols
+            for row in range(height):
+                into = pixels[c, row * rows + i]
+                if cols == 4:  # that of the shipped networks: two thirds of the time
+                    a, b = blocks[first, row], blocks[first + 1, row]
+                    d, e = blocks[first + 2, row], blocks[first + 3, row]
                     for col in range(width):
-                        into[col * cols + j] = channel[row, col]
+                        into[4 * col], into[4 * col + 1], into[4 * col + 2], into[4 * col + 3] = (
+                            a[col],
+                            b[col],
+                            d[col],
+                            e[col],
+                        )
+                else:
+                    for j in range(cols):
+                        for col in range(width):
+                            into[col * cols + j] = blocks[first + j, row, col]
