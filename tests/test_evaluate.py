@@ -272,6 +272,20 @@ def test_boxes_all_round_by_hand(world: World) -> None:
     assert not {"all_round", "heading"} & {*evaluated(Judge(["pointseg"]), one)}
 
 
+def test_people_who_sit_are_left_out_of_a_second_figure(world: World) -> None:
+    person, seated = (
+        replace(box(20, y, name), size=(0.8, 0.6, 1.7)) for y, name in ((-5, "pedestrian"), (5, "person_sitting"))
+    )
+    given = hits(person, 3, 2) + hits(person, 1, label=0) + hits(seated, 1, 2) + hits(seated, 5, label=0)
+    one = frame(person, seated, points=given + hits(box(10, 0), 2, 2))
+    result = evaluated(Judge(["pointseg"]), one)
+    row, on_foot = result["points"]["all"]["pedestrian"], result["on_foot"]["all"]["pedestrian"]
+    assert (row["iou"], row["n_points"], row["n_objects"]) == (pytest.approx(4 / 12, abs=1e-4), 10, 2)
+    assert (on_foot["iou"], on_foot["n_points"], on_foot["n_objects"]) == (0.5, 4, 1)
+    assert result["on_foot"]["15-30 m"]["pedestrian"]["recall"] == 0.75
+    assert [*result["on_foot"]["all"]] == ["pedestrian"]
+
+
 def test_boxes_at_unknown_places_do_not_count(world: World) -> None:
     seen, dont_care = box(10, 0), box(20, 0)
     points = [p for each in (seen, dont_care) for p in hits(each, 3)]
@@ -759,6 +773,7 @@ def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFi
     groups = {
         "labeled",
         "points",
+        "on_foot",
         "pixels",
         "boxes",
         "all_round",

@@ -32,7 +32,7 @@ from .datasets import Frame, RoadFrame
 from .metrics import FEWEST_RETURNS, BoxEvaluator, ProbabilitySweep, boxes_to_find, object_key
 from .mistakes import Mistakes
 from .scan_folder import ScanFrame, class_number
-from .tables import ALL_ROUND, BANDS, VEHICLES, Record, banded, within
+from .tables import ALL_ROUND, BANDS, SITTING, VEHICLES, Record, banded, within
 from .truth import Truth, folder_truth, kitti_truth, semantickitti_truth, simulated_truth
 from .unseen import check_unseen, training_scans_of
 
@@ -268,6 +268,11 @@ class Judge:
         range_m = np.hypot(truth.points[:, 0], truth.points[:, 1])
         labels = _renamed(found.labels, found.classes, self.point_classes)
         tallies |= banded(("points",), self.point_classes, labels, right, range_m)
+        on_foot = right.copy()
+        for box in truth.boxes:
+            if box.label == SITTING:
+                on_foot[inside(box, truth.points)] = IGNORE
+        tallies |= banded(("on_foot",), self.point_classes, labels, on_foot, range_m)
         if self.as_recorded:
             pixels = _renamed(self.from_sensor.point_labels(truth.points), found.classes, POINT_CLASSES)
             tallies |= banded(("pixels",), POINT_CLASSES, pixels, right, range_m)

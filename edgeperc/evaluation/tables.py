@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from .causes import BUMPER, CAUSES, FLOOR
 from .metrics import BoxEvaluator, BoxScores, Confusion, ObjectKey, ProbabilitySweep, mean
 
-__all__ = ["ALL_ROUND", "BANDS", "FEWEST_OBJECTS", "VEHICLES", "Record", "banded", "figures", "within"]
+__all__ = ["ALL_ROUND", "BANDS", "FEWEST_OBJECTS", "SITTING", "VEHICLES", "Record", "banded", "figures", "within"]
 
 VEHICLES = ("car", "van", "truck")
 
@@ -28,6 +28,7 @@ VEHICLES = ("car", "van", "truck")
 # match. A person's box is hardly larger than the spacing of the points on it, so it is matched at 0.25.
 ALL_ROUND = {"vehicle": (VEHICLES, 0.5), "person": (("pedestrian", "cyclist"), 0.25)}
 
+SITTING = "person_sitting"  # label of people who sit; their points count as pedestrians'
 FEWEST_OBJECTS = 10  # figures of fewer distinct objects are marked: they say little
 
 # Ranges of the horizontal distance [m] of points, cell centers and box centers.
@@ -117,6 +118,7 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
         - ``"labeled"``: the labeled objects with at least three returns, by class.
         - ``"points"``, ``"pixels"``: by band and class. ``"iou_by_drive"``: the IoU if each drive counts as one scan,
           its mean scan, so that a long drive does not count for more than a single scan of another street.
+        - ``"on_foot"``: by band, pedestrians if points of people who sit do not count, as in KITTI's own evaluation.
         - ``"boxes"``: by kind (``"upright"``, ``"oriented"``), band and class, where the models detect the class.
         - ``"all_round"``: by band and class, oriented boxes of vehicles (AP50) and people (AP25) wherever the truth is
           known, detected or not. ``"heading"``: of those that were matched, whose heading is right within 45 degrees.
@@ -163,6 +165,10 @@ def _figures(tallies: Tallies) -> dict[str, Any]:
             found[group] = _labeled_rows(tally)
         elif group in ("points", "pixels"):
             found.setdefault(group, {})[band] = _point_rows(tally, tallies["objects", band])
+        elif group == "on_foot" and "pedestrian" in tally.classes:
+            objects = tallies["objects", band]
+            others = Counter({key: n for key, n in objects.items() if key[1][1] != SITTING})
+            found.setdefault(group, {})[band] = {"pedestrian": _point_rows(tally, others)["pedestrian"]}
         elif group == "mean_scan":
             for name, iou in zip(tally.classes, tally.iou().tolist(), strict=True):
                 found["points"][band][name]["iou_by_drive"] = iou
