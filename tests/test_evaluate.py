@@ -272,18 +272,23 @@ def test_boxes_all_round_by_hand(world: World) -> None:
     assert not {"all_round", "heading"} & {*evaluated(Judge(["pointseg"]), one)}
 
 
-def test_people_who_sit_are_left_out_of_a_second_figure(world: World) -> None:
+def test_the_ground_in_boxes_and_people_who_sit_are_left_out_of_a_second_figure(world: World) -> None:
+    car = box(10, 0)
     person, seated = (
         replace(box(20, y, name), size=(0.8, 0.6, 1.7)) for y, name in ((-5, "pedestrian"), (5, "person_sitting"))
     )
+    lot = [[x, y, -1.73, 0.0] for x in np.arange(-20.0, 40.0, 0.5) for y in np.arange(-15.0, 15.0, 0.5)]
+    below = [[10.0 + 0.1 * k, 0.0, -1.73, 1.0 if k < 4 else 0.0] for k in range(6)]
     given = hits(person, 3, 2) + hits(person, 1, label=0) + hits(seated, 1, 2) + hits(seated, 5, label=0)
-    one = frame(person, seated, points=given + hits(box(10, 0), 2, 2))
+    one = frame(replace(car, size=(4.0, 2.0, 2.0)), person, seated, points=[*lot, *below, *given, *hits(car, 3)])
     result = evaluated(Judge(["pointseg"]), one)
-    row, on_foot = result["points"]["all"]["pedestrian"], result["on_foot"]["all"]["pedestrian"]
-    assert (row["iou"], row["n_points"], row["n_objects"]) == (pytest.approx(4 / 12, abs=1e-4), 10, 2)
-    assert (on_foot["iou"], on_foot["n_points"], on_foot["n_objects"]) == (0.5, 4, 1)
-    assert result["on_foot"]["15-30 m"]["pedestrian"]["recall"] == 0.75
-    assert [*result["on_foot"]["all"]] == ["pedestrian"]
+    row, sure = (result[kind]["all"]["pedestrian"] for kind in ("points", "sure"))
+    assert (row["iou"], row["n_points"], row["n_objects"]) == (pytest.approx(1 / 3, abs=1e-4), 12, 2)
+    assert (sure["iou"], sure["n_points"], sure["n_objects"]) == (0.75, 4, 1)
+    row, sure = (result[kind]["all"]["car"] for kind in ("points", "sure"))
+    assert row["recall"] < 0.5 < sure["recall"] == 1.0
+    assert (row["n_points"] > 9, sure["n_points"]) == (True, 3)
+    assert result["sure"]["15-30 m"]["pedestrian"]["recall"] == 0.75
 
 
 def test_boxes_at_unknown_places_do_not_count(world: World) -> None:
@@ -343,16 +348,19 @@ def test_causes_of_missed_points_by_hand() -> None:
     objects += [([35.0, 0.1 * k, -1.0], 0, 1) for k in range(4)]
     objects += [([33.0, 6.0, -1.0 + 0.1 * k], 2, 1) for k in range(5)] + [([28.0, 6.0, -1.0], 0, 1)]
     objects += [([12.0, -6.0, -1.0], 2, 3)] * 2 + [([12.0, -6.1, -1.0], 0, 3)]
+    objects += [([10.0, 0.1 * k, -1.73], 0, 1) for k in range(2)]  # the road below the car
     found = counted(objects, (car, far, truck, rider))
-    assert found["missed car"] == {"all": 3 + 4 + 5 + 1, "in vans and trucks": 5, "beyond 30 m": 4 + 5}
+    assert found["missed car"] == {
+        **{"all": 3 + 4 + 5 + 1 + 2, "in vans and trucks": 5, "beyond 30 m": 4 + 5, "on the ground": 2}
+    }
     assert found["missed cyclist"] == {"all": 3, "of other objects": 2, "beyond 30 m": 0}
     assert found["missed pedestrian"] == {"all": 0, "of other objects": 0, "beyond 30 m": 0}
     rows = found["rows"]
     assert (rows["missed car"]["all"]["share"], rows["missed car"]["all"]["n_of"]) == (
-        pytest.approx(13 / 15, abs=1e-4),
-        15,
+        pytest.approx(15 / 17, abs=1e-4),
+        17,
     )
-    assert rows["missed car"]["beyond 30 m"]["share"] == pytest.approx(9 / 13, abs=1e-4)
+    assert rows["missed car"]["beyond 30 m"]["share"] == pytest.approx(9 / 15, abs=1e-4)
     # Both cars have one size, so they are one object; the truck is another.
     assert [rows["missed car"][c]["n_objects"] for c in ("all", "in vans and trucks", "beyond 30 m")] == [2, 1, 2]
     assert rows["missed pedestrian"]["all"]["share"] is None
@@ -773,7 +781,7 @@ def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFi
     groups = {
         "labeled",
         "points",
-        "on_foot",
+        "sure",
         "pixels",
         "boxes",
         "all_round",

@@ -271,11 +271,9 @@ def _point_lines(of_block: Mapping[str, Any]) -> list[str]:
     lines = []
     for kind, title in (
         ("points", "points; IoU by drive: each drive counts as one scan"),
-        ("on_foot", "points of people, those who sit left out, as in KITTI's own evaluation"),
+        ("sure", "points without the ground in the boxes of objects, and without people who sit"),
         ("pixels", "points with the class of their pixel, before refinement"),
     ):
-        if kind == "on_foot" and "person_sitting" not in of_block.get("labeled", {}):
-            continue
         columns = [column for column in _POINT_COLUMNS if kind == "points" or "iou_by_drive" not in column[1]]
         lines += table_lines(title, columns, _class_rows(of_block.get(kind, {}), "n_points"))
     return lines

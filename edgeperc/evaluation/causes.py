@@ -25,7 +25,7 @@ NEAR, LARGE, FLOOR, POLE = "within 0.4 m of an object", "on large structures", "
 
 # The causes that are counted for each error. A point may have several of them, or none.
 CAUSES: dict[str, tuple[str, ...]] = {
-    "missed car": (VANS, FAR),
+    "missed car": (VANS, FAR, FLOOR),
     "missed pedestrian": (OTHER, FAR),
     "missed cyclist": (OTHER, FAR),
     "false car": (OTHER, NEAR, LARGE, FLOOR),
@@ -87,6 +87,7 @@ def count_causes(
         of_false = {"of": predicted, "all": false, OTHER: false & ~background, NEAR: scan.near_objects(background)}
         if name == "car":
             of_missed[VANS] = scan.within(missed, [box for box in boxes if box.label in ("van", "truck")])
+            of_missed[FLOOR] = missed & scan.ground.mask  # KITTI's boxes hold the road below a car
             of_false |= {LARGE: scan.on_large_structures(background), FLOOR: background & scan.ground.mask}
         else:
             of_missed[OTHER] = missed & (labels > 0)

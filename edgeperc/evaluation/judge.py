@@ -18,6 +18,7 @@ from ..decode import decode_classes
 from ..errors import ModelError, OptionError
 from ..frame import ModelFrame
 from ..geometry import inside
+from ..ground import find_ground
 from ..mounting import MODEL_MOUNTING, Mounting
 from ..network_input import project
 from ..perceiver import BoxesFrom, Perceiver
@@ -268,11 +269,11 @@ class Judge:
         range_m = np.hypot(truth.points[:, 0], truth.points[:, 1])
         labels = _renamed(found.labels, found.classes, self.point_classes)
         tallies |= banded(("points",), self.point_classes, labels, right, range_m)
-        on_foot = right.copy()
+        sure = np.where((right > 0) & find_ground(truth.points).mask, IGNORE, right).astype(np.uint8)
         for box in truth.boxes:
             if box.label == SITTING:
-                on_foot[inside(box, truth.points)] = IGNORE
-        tallies |= banded(("on_foot",), self.point_classes, labels, on_foot, range_m)
+                sure[inside(box, truth.points)] = IGNORE
+        tallies |= banded(("sure",), self.point_classes, labels, sure, range_m)
         if self.as_recorded:
             pixels = _renamed(self.from_sensor.point_labels(truth.points), found.classes, POINT_CLASSES)
             tallies |= banded(("pixels",), POINT_CLASSES, pixels, right, range_m)

@@ -118,7 +118,8 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
         - ``"labeled"``: the labeled objects with at least three returns, by class.
         - ``"points"``, ``"pixels"``: by band and class. ``"iou_by_drive"``: the IoU if each drive counts as one scan,
           its mean scan, so that a long drive does not count for more than a single scan of another street.
-        - ``"on_foot"``: by band, pedestrians if points of people who sit do not count, as in KITTI's own evaluation.
+        - ``"sure"``: as ``"points"``, without points of which boxes say little: the ground in the boxes of objects
+          (`edgeperc.ground.find_ground`), and people who sit, whom KITTI's own evaluation leaves out.
         - ``"boxes"``: by kind (``"upright"``, ``"oriented"``), band and class, where the models detect the class.
         - ``"all_round"``: by band and class, oriented boxes of vehicles (AP50) and people (AP25) wherever the truth is
           known, detected or not. ``"heading"``: of those that were matched, whose heading is right within 45 degrees.
@@ -165,10 +166,10 @@ def _figures(tallies: Tallies) -> dict[str, Any]:
             found[group] = _labeled_rows(tally)
         elif group in ("points", "pixels"):
             found.setdefault(group, {})[band] = _point_rows(tally, tallies["objects", band])
-        elif group == "on_foot" and "pedestrian" in tally.classes:
+        elif group == "sure":
             objects = tallies["objects", band]
             others = Counter({key: n for key, n in objects.items() if key[1][1] != SITTING})
-            found.setdefault(group, {})[band] = {"pedestrian": _point_rows(tally, others)["pedestrian"]}
+            found.setdefault(group, {})[band] = _point_rows(tally, others)
         elif group == "mean_scan":
             for name, iou in zip(tally.classes, tally.iou().tolist(), strict=True):
                 found["points"][band][name]["iou_by_drive"] = iou
