@@ -57,7 +57,8 @@ class Contender:
     kind : str
         A key of `turns.MAKERS`.
     engine : str
-        A provider for the kinds ``"edgeperc"`` and ``"session"``, else as `open_engine` or `matrix_product` take it.
+        A provider for the kinds ``"edgeperc"``, ``"default"`` and ``"session"``, else as `open_engine` or
+        `matrix_product` take it.
     precision : str
         As the provider or the engine takes it; empty if it has no choice.
     paths : tuple of Path
@@ -103,7 +104,7 @@ class Measured:
 
 def why_missing(contender: Contender) -> str:
     """Why a contender cannot run here; empty if it can."""
-    if contender.kind in ("edgeperc", "session"):
+    if contender.kind in ("edgeperc", "default", "session"):
         known = contender.engine in ("auto", *available_providers())
         return "" if known else "onnxruntime offers no such provider on this computer"
     needed = NEEDS.get(contender.engine, ())
@@ -168,10 +169,12 @@ def groups(
         if images:
             pipelines = [replace(each, inputs=images) for each in (*pipelines, *_small_unet(variant))]
         tables[f"{'Image' if images else 'Scan'} to result: {variant}"] = [
-            *pipelines, *_full_network(variant), *alone, *peaks
+            *pipelines, *_full_networks([variant]), *alone, *peaks
         ]  # fmt: skip
     for pair in zip(views["range_image"], views["top_view"], strict=False):
-        tables[f"Scan to result: {pair[0]} and {pair[1]}"] = _pipelines(pair, provider, precision)
+        at_once = Contender("edgeperc, both at once, as by default", "default", provider, precision, _paths(pair))
+        pipelines = [*_pipelines(pair, provider, precision), at_once, *_full_networks(pair)]
+        tables[f"Scan to result: {pair[0]} and {pair[1]}"] = pipelines
     for view in ("range image", "top view") if views["range_image"] or views["top_view"] else ():
         rows = ("edgeperc, numba", view), ("numpy", f"{view}, numpy")
         tables[f"Projection: {view}"] = [Contender(name, "projection", call) for name, call in rows]
@@ -183,7 +186,7 @@ def groups(
 
 def _pipelines(models: Sequence[Variant], provider: str, precision: str) -> list[Contender]:
     """All pipelines from scan to result. The first one is edgeperc's, the reference of the ratios."""
-    paths, cards = tuple(each.path for each in models), tuple(each.card.to_json() for each in models)
+    paths, cards = _paths(models), tuple(each.card.to_json() for each in models)
     int8 = any(each.precision == "int8" for each in models)
     own = dict.fromkeys(((provider, precision), ("cpu", "auto"), *([("openvino", "auto")] if int8 else OPENVINO)))
     if (provider, precision) == ("auto", "auto") and available_providers() == ("cpu",):
@@ -199,13 +202,17 @@ def _label(engine: str, precision: str) -> str:
     return f"{engine} {precision}".strip() if precision != "auto" else engine
 
 
-def _full_network(variant: Variant) -> list[Contender]:
-    """The full network that a shipped one was distilled from, in torch; only a source checkout has its file."""
-    path = variant.path.parent / "research" / f"{variant.name}-full.onnx"
-    if not path.exists():
+def _full_networks(models: Sequence[Variant]) -> list[Contender]:
+    """The papers' networks of the same tasks, in torch; only a source checkout has their files."""
+    paths = tuple(each.path.parent / "research" / f"{each.name}-full.onnx" for each in models)
+    if not all(path.exists() for path in paths):
         return []
-    name, card = f"numpy + torch fp32, {path.stem}", ModelCard.read(path).to_json()
-    return [Contender(name, "pipeline", "torch", "fp32", (path,), (card,))]
+    name, cards = " and ".join(path.stem for path in paths), tuple(ModelCard.read(path).to_json() for path in paths)
+    return [Contender(f"numpy + torch fp32, {name}", "pipeline", "torch", "fp32", paths, cards)]
+
+
+def _paths(models: Sequence[Variant]) -> tuple[Path, ...]:
+    return tuple(each.path for each in models)
 
 
 def _small_unet(variant: Variant) -> list[Contender]:

@@ -43,13 +43,13 @@ Calls = list[Callable[[], object]]
 
 
 def make_perceiver(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
-    """edgeperc itself."""
+    """edgeperc itself; as by default, without a number of threads, both networks run at once, with one thread each."""
     perceive = Perceiver(
         list(contender.paths),
         sensor=sensor,
         provider=contender.engine,
         precision=contender.precision,
-        n_threads=n_threads,
+        n_threads=None if contender.kind == "default" else n_threads,
         on_mismatch="ignore",
         boxes_from="network",  # as the numpy pipelines
         agree=False,
@@ -106,6 +106,7 @@ def make_peak(contender: Contender, scans: Sequence[NDArray[np.float32]], sensor
 
 MAKERS: Mapping[str, Callable[[Contender, Sequence[NDArray[np.float32]], str, int], Calls]] = {
     "edgeperc": make_perceiver,
+    "default": make_perceiver,
     "pipeline": make_pipeline,
     "unet": make_unet,
     "session": make_network,
