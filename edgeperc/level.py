@@ -228,11 +228,11 @@ def _ground_plane(scan: NDArray[np.float32]) -> tuple[tuple[float, float, float]
             f"expected at least {_MIN_CELLS}"
         )
     across, along = _CORRIDOR_M
-    x, y = scan[:, 0], scan[:, 1]
+    rows = np.flatnonzero((np.abs(scan[:, 1]) < across) & (np.abs(scan[:, 0]) < along))
+    x, y, z = scan[rows, :3].T
     with np.errstate(invalid="ignore", over="ignore"):
-        near = (np.abs(y) < across) & (np.hypot(x, y) < along)
-        near &= np.abs(scan[:, 2] - x * plane[0] - y * plane[1] - plane[2]) < _BAND_M
-    rows = np.flatnonzero(near)
+        on_road = np.abs(z - x * plane[0] - y * plane[1] - plane[2]) < _BAND_M
+    rows = rows[on_road & (np.hypot(x, y) < along)]
     rows = rows[np.unique(cell[rows], return_index=True)[1]]
     xyz = scan[rows, :3].astype(np.float64)
     design = np.column_stack([xyz[:, :2], np.ones(len(xyz))])

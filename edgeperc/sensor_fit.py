@@ -172,30 +172,31 @@ def incidences(points: NDArray[np.float32], cell_m: float = 0.8) -> NDArray[np.f
     (n,) float64
         0..1. NaN if the point's cell has fewer than six returns, or if these are not on a surface (leaves).
     """
-    xyz = np.asarray(points[:, :3], np.float64)
-    cosines = np.full(len(xyz), np.nan)
-    finite = np.flatnonzero(np.isfinite(xyz).all(axis=1) & (np.abs(xyz) < 1e5).all(axis=1))
+    # Column by column: over rows of three values, numpy takes several times as long.
+    x, y, z = np.ascontiguousarray(points[:, :3].T, np.float64)
+    cosines = np.full(len(points), np.nan)
+    finite = np.flatnonzero((np.abs(x) < 1e5) & (np.abs(y) < 1e5) & (np.abs(z) < 1e5))
     if not len(finite):
         return cosines
-    p = xyz[finite]
-    cells = np.floor(p / cell_m).astype(np.int64)
-    _, cell = np.unique(cells @ np.array([1 << 40, 1 << 20, 1]), return_inverse=True)
+    p = [axis[finite] for axis in (x, y, z)]
+    row, col, level = (np.floor(axis / cell_m).astype(np.int64) for axis in p)
+    _, cell = np.unique((row << 40) + (col << 20) + level, return_inverse=True)
     cell = cell.ravel()
     count = np.bincount(cell).astype(np.float64)
-    mean = np.stack([np.bincount(cell, p[:, k]) for k in range(3)], axis=1) / count[:, None]
-    off = p - mean[cell]
+    off = [axis - (np.bincount(cell, axis) / count)[cell] for axis in p]
     spread = np.empty((len(count), 3, 3))
     for i in range(3):
-        for j in range(3):
-            spread[:, i, j] = np.bincount(cell, off[:, i] * off[:, j]) / count
+        for j in range(i + 1):
+            spread[:, i, j] = spread[:, j, i] = np.bincount(cell, off[i] * off[j]) / count
     flat = count >= 6
     values, vectors = np.linalg.eigh(spread[flat])
     # The middle eigenvalue separates surfaces from the line of one beam, the smallest one separates them from leaves.
-    normals = np.full((len(count), 3), np.nan)
+    normals = np.full((3, len(count)), np.nan)
     on_surface = (values[:, 1] > 0.0025) & (values[:, 0] < 0.1 * values[:, 1])
-    normals[flat] = np.where(on_surface[:, None], vectors[:, :, 0], np.nan)
+    normals[:, flat] = np.where(on_surface, vectors[:, :, 0].T, np.nan)
+    along = sum(axis * normal[cell] for axis, normal in zip(p, normals, strict=True))
     with np.errstate(divide="ignore", invalid="ignore"):
-        cosines[finite] = np.abs((p * normals[cell]).sum(axis=1)) / np.linalg.norm(p, axis=1)
+        cosines[finite] = np.abs(along) / np.sqrt(sum(axis * axis for axis in p))
     return cosines
 
 
@@ -233,14 +234,16 @@ def stratify(
         every = 1 if n_points is None else np.count_nonzero(used) // max(n_points, 1)
         if every > 1:
             # Consecutive products of odd numbers, in int32 with overflow, spread neighboring cells evenly.
-            cells = np.floor(scan[:, :3] / np.float32(cell_m)).astype(np.int32)
-            spread = cells @ np.array([73856093, 19349663, 83492791], np.int32)
+            spread = np.zeros(len(scan), np.int32)
+            for axis, factor in ((x, 73856093), (y, 19349663), (z, 83492791)):
+                spread += np.floor(axis / np.float32(cell_m)).astype(np.int32) * np.int32(factor)
             used &= (spread >> 8) % every == 0
     kept = scan[used]
-    range_m = np.sqrt(np.square(kept[:, :3].astype(np.float64)).sum(axis=1))
+    x, y, z = kept[:, :3].T.astype(np.float64)
+    range_m = np.sqrt(x * x + y * y + z * z)
     cosine = np.nan_to_num(incidences(kept, cell_m), nan=np.inf)
-    by_range = np.clip(np.searchsorted(RANGE_EDGES_M, range_m, side="right") - 1, 0, len(RANGE_EDGES_M) - 2)
-    by_cosine = np.searchsorted(COSINE_EDGES[1:], cosine, side="left")
+    by_range = sum((range_m >= edge).astype(np.int64) for edge in RANGE_EDGES_M[1:-1])
+    by_cosine = sum((cosine > edge).astype(np.int64) for edge in COSINE_EDGES[1:])
     return by_range * len(COSINE_EDGES) + by_cosine, kept[:, 3].astype(np.float64)
 
 
@@ -276,10 +279,10 @@ def quantiles_by_stratum(
     shares = (np.arange(N_SHARES) + 0.5) / N_SHARES
     found: list[tuple[float, tuple[float, ...]]] = []
     for k in range(N_STRATA):
-        own = remission[stratum == k]
+        own = np.sort(remission[stratum == k])  # with this, a third of the time of np.quantile
         enough = len(own) >= MIN_POINTS
-        quantiles = tuple(float(v) for v in np.quantile(own, shares)) if enough else ()
-        found.append((len(own) / len(remission) if enough else 0.0, quantiles))
+        quantiles = np.interp(shares * (len(own) - 1), np.arange(len(own)), own).tolist() if enough else ()
+        found.append((len(own) / len(remission) if enough else 0.0, tuple(quantiles)))
     return found
 
 
