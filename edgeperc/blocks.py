@@ -31,16 +31,14 @@ def fill_pixels(blocks: NDArray[np.float32], rows: int, cols: int, pixels: NDArr
             first = (c * rows + i) * cols
             for row in range(height):
                 into = pixels[c, row * rows + i]
-                if cols == 4:  # that of the shipped networks: two thirds of the time
+                if cols == 4:  # as in the shipped networks: two thirds of the time
                     a, b = blocks[first, row], blocks[first + 1, row]
                     d, e = blocks[first + 2, row], blocks[first + 3, row]
                     for col in range(width):
-                        into[4 * col], into[4 * col + 1], into[4 * col + 2], into[4 * col + 3] = (
-                            a[col],
-                            b[col],
-                            d[col],
-                            e[col],
-                        )
+                        into[4 * col] = a[col]
+                        into[4 * col + 1] = b[col]
+                        into[4 * col + 2] = d[col]
+                        into[4 * col + 3] = e[col]
                 else:
                     for j in range(cols):
                         for col in range(width):
