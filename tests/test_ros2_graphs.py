@@ -204,6 +204,8 @@ def test_the_command_of_the_page_answers_another_process(router: str, watch: Wat
             [sys.executable, "-m", "edgeperc", *shlex.split(command)], env=environment, stdout=file, stderr=file
         )
     try:
+        # The watch hears every topic, so a publisher is wanted from the start; the node must be there before it.
+        assert len(_of(watch, "edgeperc", 7)) == 7, log.read_text()  # the node, five topics, one subscription
         publisher = [sys.executable, str(TESTS / "ros2_helpers.py"), "3"]
         done = subprocess.run(publisher, env=environment, capture_output=True, text=True, timeout=2.0 * TIMEOUT_S)
         assert done.returncode == 0, done.stderr + log.read_text()
@@ -219,7 +221,6 @@ def test_the_command_of_the_page_answers_another_process(router: str, watch: Wat
         assert "are no sensor_msgs/msg/PointCloud2" in status.message
         values = {v.key: v.value for v in status.values}
         assert (values["answers"], values["clouds failed"], values["clouds dropped"]) == ("3", "1", "0")
-        assert len(_of(watch, "edgeperc", 7)) == 7  # the node, five topics, one subscription
         node.send_signal(signal.SIGTERM)
         assert node.wait(60.0) == 143, log.read_text()
         until(lambda: not watch.tokens)
