@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
+import subprocess
+import sys
 import threading
 import warnings
 from collections.abc import Callable
@@ -172,6 +175,49 @@ def test_a_network_that_fails_beside_another_ends_the_call(
         with pytest.raises(InferenceError, match="no memory left"):
             both(scan.points)
     assert_same(perception, both(scan.points))
+
+
+@pytest.mark.parametrize("full_turn", [False, True])
+def test_networks_run_one_after_the_other_where_no_thread_can_be_started(
+    monkeypatch: pytest.MonkeyPatch, scan: SimulatedScan, full_turn: bool
+) -> None:
+    monkeypatch.setattr(session, "usable_cores", lambda: 2)
+    options: dict[str, Any] = {"provider": "cpu", "on_mismatch": "ignore", "full_turn": full_turn}
+    alone, both = (Perceiver(["ssadnet", "pointseg"], **more, **options) for more in ({"n_threads": 1}, {}))
+    known = alone(scan.points)
+
+    def refuse(_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as limited:
+        limited.setattr(threading.Thread, "start", refuse)
+        for _ in range(2):
+            assert_same(known, both(scan.points))
+    before = threading.active_count()
+    for _ in range(3):
+        assert_same(known, both(scan.points))
+    assert threading.active_count() == before + 1  # one thread, which is kept
+
+
+@pytest.mark.skipif(os.name != "posix", reason="forks")
+def test_a_forked_child_runs_both_networks_at_once() -> None:
+    code = """
+import os, edgeperc, numpy as np
+from edgeperc import session
+session.usable_cores = lambda: 2
+perceive = edgeperc.Perceiver(["ssadnet", "pointseg"], provider="cpu", on_mismatch="ignore")
+assert all(each.shares_cores for each in perceive.sessions)
+points = np.random.default_rng(0).uniform(-20, 20, (5000, 4)).astype(np.float32) * [1, 1, 0.1, 0]
+known = perceive(points)
+child = os.fork()
+if child == 0:
+    found = perceive(points)
+    equal = [(getattr(found, view).labels == getattr(known, view).labels).all() for view in ("points", "top_view")]
+    os._exit(0 if all(equal) else 1)
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300.0)
+    assert done.stdout == "0\n", done.stderr
 
 
 @pytest.mark.parametrize("failing", ["aside", "top view", "sectors", None])
