@@ -23,7 +23,15 @@ from .perception import Box
 from .persons import MIN_OF_WHOLE, RIDES, WALKS, fill_person_groups, fill_persons
 from .points import read_only
 
-__all__ = ["MIN_SCORE", "OBJECT_SIZE_M", "cluster_labels", "find_clusters", "join_boxes", "objects_from_points"]
+__all__ = [
+    "MIN_SCORE",
+    "OBJECT_SIZE_M",
+    "classes_of_boxes",
+    "cluster_labels",
+    "find_clusters",
+    "join_boxes",
+    "objects_from_points",
+]
 
 # Mean length, width and height [m] of KITTI's labeled objects.
 OBJECT_SIZE_M: Mapping[str, tuple[float, float, float]] = MappingProxyType(
@@ -36,6 +44,10 @@ OBJECT_SIZE_M: Mapping[str, tuple[float, float, float]] = MappingProxyType(
     }
 )
 L_SHAPED = frozenset({"car", "van", "truck"})
+# A cluster that is at least this high, or this long, is a van or a truck [m]. On the training drives, 100 % of 421 cars
+# on KITTI are lower and 80 % of 307 vans are higher; 91 % of 905 cars on PandaSet, with pickups, are lower.
+VAN_HEIGHT_M = 1.8
+TRUCK_HEIGHT_M, TRUCK_LENGTH_M = 2.4, 7.0
 # Networks label many of a cyclist's points as pedestrian.
 PART_OF = MappingProxyType({"pedestrian": "cyclist"})
 MIN_PERSON_SHARE = 0.1  # persons stand near walls and cars: a larger share loses people
@@ -45,6 +57,7 @@ N_ANGLES = 90
 MAX_FITTED = 256  # a rectangle's heading is fitted to at most this many points
 MAX_OBJECTS = 1000  # clusters that get a box; 40 KITTI scans have at most 16
 MIN_SIDE_M = 0.1
+MAX_END = 1.4  # a front or a rear is at most this many usual widths wide
 MAX_OVERLAP = 0.1  # IoU of two objects; the completed boxes of two pieces of one object overlap by more
 MAX_INSIDE = 0.5  # of the smaller of two footprints
 EVIDENCE = 10.0  # number of points for which this factor of the score is 0.5
@@ -362,13 +375,19 @@ def objects_from_points(
     -----
     The heading of cars, vans and trucks comes from an L-shape fit: most points lie near the sides of the rectangle
     (Zhang et al. 2017, closeness). Other classes get the heading of the smallest rectangle. The longer side is the
-    length. If both sides may be a front or a rear (at most 1.25 usual widths), the length is the side that differs more
-    from the usual width. A side that is shorter than usual was seen only in part: it is extended to the usual length,
-    away from the sensor, or at both ends if the sensor is beside it. The height is extended upwards in the same way.
-    Longer sides are kept. Two boxes are pieces of one object if they overlap by more than 0.1, or if more than half of
-    one footprint lies in the other; the box with the higher score is kept. Boxes are fitted to at most 1000 clusters,
-    those with the highest product of the first two factors, and to 1000 persons: no real scan has as many, and the time
-    stays bounded.
+    length. If both sides may be a front or a rear (at most 1.4 usual widths), the length is the side that points
+    towards the sensor, because a flank that faces the sensor is seen as a longer side. Of the boxes of vehicles on the
+    training drives, 710 of 911 on KITTI and 738 of 837 on PandaSet then have an IoU of 0.5; if it is the side that
+    differs more from the usual width, 674 and 679. A side that is shorter than usual was seen only in part: it is
+    extended to the usual length, away from the sensor, or at both ends if the sensor is beside it. The height is
+    extended upwards in the same way. Longer sides are kept.
+
+    If the labels know neither vans nor trucks, a car is a van from a height of 1.8 m on, and a truck from a height of
+    2.4 m or a length of 7 m on. Both are completed to the size of a van.
+
+    Two boxes are pieces of one object if they overlap by more than 0.1, or if more than half of one footprint lies in
+    the other; the box with the higher score is kept. Boxes are fitted to at most 1000 clusters, those with the highest
+    product of the first two factors, and to 1000 persons: no real scan has as many, and the time stays bounded.
 
     Persons get boxes of their own, wherever they stand. A cluster that is no larger than a cyclist, and of which a
     fifth of the points has a person's label, is one group; of other clusters, labeled points that are linked are one
@@ -415,6 +434,7 @@ def objects_from_points(
     )  # the box may reduce this score
     kept = np.argsort(-highest, kind="stable")[:MAX_OBJECTS]
     kept = np.sort(kept[(found[kept] > 0) & (highest[kept] >= min_score)])
+    named_by_size = {*classes_of_boxes(classes)} - {*classes}
     boxes = []
     for k in kept.tolist():
         name = classes[found[k]]
@@ -435,9 +455,25 @@ def objects_from_points(
             score *= min(max(top - bottom, 0.0) / height, 1.0) ** 2
             score *= min(1.0, float(max(rectangle[2:4])) / width)
         if score >= min_score:
-            boxes.append(_completed(name, score, rectangle, bottom, top, size_m.get(name, (0.0, 0.0, 0.0))))
+            usual = name
+            if named_by_size and name == "car":
+                name = _vehicle_of_size(float(max(rectangle[2:4])), top - bottom)
+                usual = "car" if name == "car" else "van"  # trucks differ too much in length
+            boxes.append(_completed(name, score, rectangle, bottom, top, size_m.get(usual, (0.0, 0.0, 0.0))))
     kept_persons = _distinct([box for box in persons if box.score >= min_score], MAX_PERSONS_OVERLAP)
     return join_boxes(_distinct(boxes, MAX_OVERLAP), kept_persons)
+
+
+def classes_of_boxes(classes: Sequence[str]) -> tuple[str, ...]:
+    """Classes that the boxes around labeled points can have: `objects_from_points` names vans and trucks by their size.
+
+    Parameters
+    ----------
+    classes : sequence of str
+        Of the labels; the first one is the background.
+    """
+    by_size = ("van", "truck") if "car" in classes and not {"van", "truck"} & {*classes} else ()
+    return (*classes[1:], *by_size)
 
 
 def _distinct(boxes: Sequence[Box], max_overlap: float) -> list[Box]:
@@ -544,6 +580,13 @@ def _same_object(first: Sequence[Box], second: Sequence[Box]) -> NDArray[np.bool
     return found
 
 
+def _vehicle_of_size(length: float, height: float) -> str:
+    """Car, van or truck, by the length and the height of its points."""
+    if length >= TRUCK_LENGTH_M or height >= TRUCK_HEIGHT_M:
+        return "truck"
+    return "van" if height >= VAN_HEIGHT_M else "car"
+
+
 def _completed(
     name: str,
     score: float,
@@ -556,9 +599,10 @@ def _completed(
     x, y, along, across, yaw = rectangle.tolist()
     if across > along:
         along, across, yaw = across, along, yaw + math.pi / 2.0
-    if along <= 1.25 * usual[1] < 1.25 * usual[0] and abs(along - usual[1]) <= abs(across - usual[1]):
-        along, across, yaw = across, along, yaw + math.pi / 2.0
     cos, sin = math.cos(yaw), math.sin(yaw)
+    may_be_end = along <= MAX_END * usual[1] < MAX_END * usual[0]
+    if may_be_end and abs(x * cos + y * sin) < abs(y * cos - x * sin):
+        along, across, yaw, cos, sin = across, along, yaw + math.pi / 2.0, -sin, cos
     sides = []
     for extent, typical, axis_x, axis_y in ((along, usual[0], cos, sin), (across, usual[1], -sin, cos)):
         size = max(extent, typical, MIN_SIDE_M)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import twins.cluster
 from edgeperc import cluster, linkage
-from edgeperc.cluster import OBJECT_SIZE_M, cluster_labels, find_clusters, objects_from_points
+from edgeperc.cluster import OBJECT_SIZE_M, classes_of_boxes, cluster_labels, find_clusters, objects_from_points
 from edgeperc.errors import PointsError
 from edgeperc.geometry import oriented_iou
 from edgeperc.points import read_only
@@ -354,6 +354,42 @@ def test_hidden_side_is_extended_to_the_usual_length(part, x):
     np.testing.assert_allclose(box.size[:2], OBJECT_SIZE_M["car"][:2], atol=0.06)
     np.testing.assert_allclose(box.center[:2], (x, 6.0), atol=0.06)
     assert abs(box.yaw) < 0.03
+
+
+@pytest.mark.parametrize("where", [(15.0, 2.0), (-40.0, -3.5), (1.0, 18.0)])
+@pytest.mark.parametrize(("width", "depth"), [(1.6, 1.4), (1.9, 1.75), (2.2, 1.5), (1.5, 2.0)])
+def test_what_is_seen_of_a_car_from_behind_is_its_width(where, width, depth):
+    """A broad rear and a part of a flank: the flank continues away from the sensor."""
+    x, y = where
+    heading = 0.0 if abs(x) > abs(y) else math.pi / 2
+    points = car_points(x, y, heading, size=(depth, width))
+    (box,) = objects_from_points(as_points(points), np.ones(len(points), np.uint8), CLASSES)
+    off = (box.yaw - heading + math.pi / 2) % math.pi - math.pi / 2
+    assert abs(off) < 0.05
+    np.testing.assert_allclose(box.size[:2], (OBJECT_SIZE_M["car"][0], max(width, OBJECT_SIZE_M["car"][1])), atol=0.06)
+    near, truth = (np.hypot(*at) - along / 2 for at, along in ((box.center[:2], box.size[0]), (where, depth)))
+    assert near == pytest.approx(truth, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("size", "height_m", "label", "completed"),
+    [
+        ((3.9, 1.6), 1.7, "car", (3.9, 1.63, 1.7)),
+        ((3.9, 1.6), 1.9, "van", (5.07, 1.91, 2.2)),
+        ((3.9, 1.6), 2.5, "truck", (5.07, 1.91, 2.5)),
+        ((11.0, 2.5), 1.7, "truck", (11.0, 2.5, 2.2)),
+    ],
+)
+def test_vans_and_trucks_are_known_by_their_size(size, height_m, label, completed):
+    x, y, _ = car_points(12.0, 6.0, 0.0, size=size).T
+    z = np.linspace(-1.73, height_m - 1.73, 40)
+    points = as_points(np.column_stack([np.repeat(x, 40), np.repeat(y, 40), np.tile(z, len(x))]))
+    for classes, expected in ((CLASSES, label), ((*CLASSES, "truck"), "car"), (("background", "bus"), "bus")):
+        (box,) = objects_from_points(points, np.ones(len(points), np.uint8), classes)
+        assert box.label == expected
+        assert box.label in classes_of_boxes(classes)
+        if classes is CLASSES:
+            np.testing.assert_allclose(box.size, completed, atol=0.1)
 
 
 def test_sides_longer_than_usual_are_kept():

@@ -210,11 +210,13 @@ def test_boxes_of_clusters_by_hand(world: World) -> None:
         box(30, -13, score=0.7),
         box(20, 4, score=0.6),
     )
-    # Point labels do not separate vans from cars: the box of a van is ignored.
+    # Boxes around clusters are named by their size: a van that is called a car is a false car and a missed van.
     table = evaluated(Judge(["pointseg"], boxes_from="clusters"), frame_of_all)["boxes"]["oriented"]["all"]
-    counts = {name: [table[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in ("car", "pedestrian")}
-    assert counts == {"car": [3, 2, 2], "pedestrian": [1, 1, 1]}
-    # Beside a top-view model's they are, within its view.
+    counts = {
+        name: [table[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in ("car", "van", "pedestrian")
+    }
+    assert counts == {"car": [3, 3, 2], "van": [1, 0, 0], "pedestrian": [1, 1, 1]}
+    # The same beside a top-view model, within its view.
     table = evaluated(Judge(["pointseg", "ssadnet"], boxes_from="both"), frame_of_all)["boxes"]["oriented"]["all"]
     counts = {
         name: [table[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in ("car", "van", "pedestrian")

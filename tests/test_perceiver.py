@@ -642,7 +642,8 @@ def test_boxes_of_labeled_points_are_around_them(scan: SimulatedScan) -> None:
     assert answer.boxes
     assert answer.stage_ms["cluster"] > 0.0
     for box in answer.boxes:
-        number = answer.points.classes.index(box.label)
+        label = "car" if box.label in ("van", "truck") else box.label  # the network's name of any vehicle
+        number = answer.points.classes.index(label)
         own = answer.points.labels[inside(box, scan.points, 0.05)]
         assert np.count_nonzero(own == number) >= 5
     assert answer.boxes == perceive(scan.points).boxes

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..agreement import RULES
 from ..card import TopViewGeometry
+from ..cluster import classes_of_boxes
 from ..decode import decode_classes
 from ..errors import ModelError, OptionError
 from ..frame import ModelFrame
@@ -108,7 +109,9 @@ class Judge:
         if sensor is not None and self.from_sensor is not None:
             self.point_classes = self.from_sensor.card.classes
         self.box_classes = self.from_above.card.box_classes if self.from_above and boxes_from != "clusters" else ()
-        self.cluster_classes = self.from_sensor.card.classes[1:] if self.from_sensor and boxes_from != "network" else ()
+        self.cluster_classes: tuple[str, ...] = ()
+        if self.from_sensor is not None and boxes_from != "network":
+            self.cluster_classes = classes_of_boxes(self.from_sensor.card.classes)
         self.view: TopViewGeometry | None = None
         if self.from_above is not None:
             assert isinstance(self.from_above.card.view, TopViewGeometry)
