@@ -57,6 +57,7 @@ N_ANGLES = 90
 MAX_FITTED = 256  # a rectangle's heading is fitted to at most this many points
 MAX_OBJECTS = 1000  # clusters that get a box; 40 KITTI scans have at most 16
 MIN_SIDE_M = 0.1
+MIN_SEEN = 0.7  # of a cluster's points; if fewer are in view, the missing ones count as background
 MAX_END = 1.4  # a front or a rear is at most this many usual widths wide
 MAX_OVERLAP = 0.1  # IoU of two objects; the completed boxes of two pieces of one object overlap by more
 MAX_INSIDE = 0.5  # of the smaller of two footprints
@@ -324,6 +325,7 @@ def objects_from_points(
     among: NDArray[np.bool_] | None = None,
     height_m: NDArray[np.float32] | None = None,
     clusters: NDArray[np.int32] | None = None,
+    in_view: NDArray[np.bool_] | None = None,
     min_share: float = 0.7,
     min_distance_m: float = 0.5,
     distance_per_m: float = 0.015,
@@ -348,8 +350,11 @@ def objects_from_points(
     clusters : (n,) int32, optional
         Cluster of every point, -1 for none, if they are known (`find_clusters` with labeled points as seeds). Otherwise
         they are found among ``among``.
+    in_view : (n,) bool, optional
+        Points in the network's view, all by default. The others have no label.
     min_share : float
-        A cluster is kept if more than this share of its points has one class (KUL-Seg 5.2). Persons need no share.
+        A cluster is kept if more than this share of its points in view has one class (KUL-Seg 5.2); if less than 70 %
+        of it is in view, of 70 % of its points. Persons need no share.
     min_distance_m, distance_per_m, min_points
         As in `find_clusters`.
     min_score : float
@@ -361,7 +366,8 @@ def objects_from_points(
     -------
     tuple of Box
         Best score first. The score is a product of four factors: the share of the class; n / (n + 10) for n points;
-        the square of height / usual height, at most 1; and longer side / usual width, at most 1. Of persons: the share
+        the square of height / usual height, at most 1; and longer side / usual width, at most 1. To the height and the
+        side, range * ``distance_per_m`` is added: so far apart may two returns of one object be. Of persons: the share
         of persons' points; n / (n + m), with m from 10 to 80, more for near persons; the square of height / usual
         height, inverted if too tall; and the square of the greatest width of heads / width of the heads, at most 1. The
         heading is known up to a half turn: yaw is in -pi/2..pi/2.
@@ -414,7 +420,7 @@ def objects_from_points(
             points,
             among=among,
             seeds=labels > 0,
-            votes=np.where(labels > 0, np.where(roles > 0, 7, 3)[labels], 1).astype(np.uint8),
+            votes=np.where(labels > 0, np.where(roles > 0, 7, 3)[labels], in_view is None or in_view).astype(np.uint8),
             min_share=(min_share, min(min_share, MIN_PERSON_SHARE)),
             min_distance_m=min_distance_m,
             distance_per_m=distance_per_m,
@@ -426,9 +432,12 @@ def objects_from_points(
     persons = _persons(
         points, labels, classes, roles, clusters, order, starts, height_m, distance_per_m, min_points, size_m
     )
-    found, shares = _labels_of_groups(order, starts, labels, min_share, {})
-    found[roles[found] > 0] = 0
     sizes = np.diff(starts)
+    found, shares = _labels_of_groups(order, starts, labels, 0.0, {})
+    if in_view is not None and len(sizes):
+        seen = np.add.reduceat(in_view[order[: starts[-1]]], starts[:-1], dtype=np.int64)
+        shares *= sizes / np.maximum(np.maximum(seen, MIN_SEEN * sizes), 1.0)
+    found[(shares <= min_share) | (roles[found] > 0)] = 0
     highest = np.where(
         (found > 0) & (sizes >= min_points), shares * sizes / (sizes + EVIDENCE), -math.inf
     )  # the box may reduce this score
@@ -452,8 +461,9 @@ def objects_from_points(
         if name in size_m:
             _, width, height = size_m[name]
             # Points below the ground are reflections. What is too tall for a car may be a van.
-            score *= min(max(top - bottom, 0.0) / height, 1.0) ** 2
-            score *= min(1.0, float(max(rectangle[2:4])) / width)
+            unseen = distance_per_m * math.hypot(rectangle[0], rectangle[1])  # between the last return and the edge
+            score *= min(max(top - bottom + unseen, 0.0) / height, 1.0) ** 2
+            score *= min(1.0, (float(max(rectangle[2:4])) + unseen) / width)
         if score >= min_score:
             usual = name
             if named_by_size and name == "car":

@@ -751,8 +751,7 @@ class Perceiver:
     ) -> tuple[PointLabels | None, TopView | None, tuple[Box, ...]]:
         """What the parts agree on, and boxes around clusters of points above the ground (KUL-Seg 5.2).
 
-        Points out of the network's view count as background for these boxes. An object cut by the view's edge
-        therefore gets either a box of the whole object or none.
+        An object cut by the view's edge gets either a box of the whole object, if about half of it is in view, or none.
         """
         above = ~ground.mask
         clusters = None
@@ -775,6 +774,7 @@ class Perceiver:
                 among=above,
                 height_m=ground.height_m,
                 clusters=clusters,
+                in_view=points.in_view,
                 distance_per_m=self._distance_per_m,
                 min_score=MIN_SCORE if self.score_threshold is None else self.score_threshold,
             )

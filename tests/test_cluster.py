@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -415,6 +416,43 @@ def test_ground_points_do_not_join_objects():
     labels = np.where(on_ground, 0, 1).astype(np.uint8)
     assert len(objects_from_points(points, labels, CLASSES, among=~on_ground)) == 2
     assert objects_from_points(points, labels, CLASSES) == ()
+
+
+def test_points_out_of_view_count_if_they_are_most_of_a_cluster():
+    points = as_points(car_points(12.0, 6.0, 0.0))
+    rank = np.argsort(np.argsort(points[:, 0], kind="stable"))
+
+    def boxes(seen, labeled=1.0):
+        in_view = rank < seen * len(points)
+        labels = (rank < seen * labeled * len(points)).astype(np.uint8)
+        return objects_from_points(points, labels, CLASSES, in_view=in_view)
+
+    (whole,) = boxes(1.0)
+    for seen in (0.9, 0.7, 0.5):
+        (box,) = boxes(seen)
+        assert replace(box, score=1.0) == replace(whole, score=1.0)
+        assert box.score == pytest.approx(whole.score * min(seen / 0.7, 1.0), rel=0.02)
+    assert boxes(0.8, 0.8) != ()
+    assert boxes(0.8, 0.6) == ()  # background in view
+    assert boxes(0.3) == ()
+    labels = np.ones(len(points), np.uint8)
+    apart = np.where(rank < 3, 0, 2).astype(np.int32)  # no point has number 1
+    assert len(objects_from_points(points, labels, CLASSES, clusters=apart, in_view=labels > 0)) == 1
+
+
+@pytest.mark.parametrize("x", [12.0, 40.0])
+def test_what_lies_between_returns_does_not_lower_the_score(x):
+    """Of a car 40 m away, two beams may meet 0.6 m of its height."""
+    points = car_points(x, 6.0, 0.0)
+    points = as_points(points[np.isin(points[:, 2].round(2), (-1.02, -0.78, -0.54))])
+    height = points[:, 2] + np.float32(1.73)
+    found = objects_from_points(points, np.ones(len(points), np.uint8), CLASSES, height_m=height)
+    closer = objects_from_points(points, np.ones(len(points), np.uint8), CLASSES, height_m=height, distance_per_m=0.0)
+    top = 1.73 - 0.54
+    n = len(points) / (len(points) + 10.0)
+    reach = 0.015 * math.hypot(x, 6.0)
+    assert found[0].score == pytest.approx(n * min((top + reach) / 1.53, 1.0) ** 2, rel=0.02)
+    assert closer[0].score == pytest.approx(n * (top / 1.53) ** 2, rel=0.02)
 
 
 def test_pieces_of_one_object_are_one_box():

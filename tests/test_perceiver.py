@@ -663,7 +663,7 @@ def test_clusters_do_not_repeat_boxes_of_the_network(scan: SimulatedScan) -> Non
         assert box.label in ("pedestrian", "cyclist") or not ahead
 
 
-@pytest.mark.parametrize(("seen", "n_boxes"), [(1.0, 1), (0.8, 1), (0.5, 0)])
+@pytest.mark.parametrize(("seen", "n_boxes"), [(1.0, 1), (0.8, 1), (0.5, 1), (0.3, 0)])
 def test_car_cut_by_the_views_edge_gets_a_full_box_or_none(seen: float, n_boxes: int) -> None:
     perceive = Perceiver("pointseg", provider="cpu", n_threads=1)
     x, y = (v.ravel() for v in np.meshgrid(np.arange(-20.0, 20.0, 0.4), np.arange(-20.0, 20.0, 0.4)))
