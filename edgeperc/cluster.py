@@ -367,7 +367,7 @@ def objects_from_points(
     tuple of Box
         Best score first. The score is a product of four factors: the share of the class; n / (n + 10) for n points;
         the square of height / usual height, at most 1; and longer side / usual width, at most 1. To the height and the
-        side, range * ``distance_per_m`` is added: so far apart may two returns of one object be. Of persons: the share
+        side, range * ``distance_per_m`` is added, the gap that two returns of an object may have. Of persons: the share
         of persons' points; n / (n + m), with m from 10 to 80, more for near persons; the square of height / usual
         height, inverted if too tall; and the square of the greatest width of heads / width of the heads, at most 1. The
         heading is known up to a half turn: yaw is in -pi/2..pi/2.
@@ -383,7 +383,7 @@ def objects_from_points(
     (Zhang et al. 2017, closeness). Other classes get the heading of the smallest rectangle. The longer side is the
     length. If both sides may be a front or a rear (at most 1.4 usual widths), the length is the side that points
     towards the sensor, because a flank that faces the sensor is seen as a longer side. Of the boxes of vehicles on the
-    training drives, 710 of 911 on KITTI and 738 of 837 on PandaSet then have an IoU of 0.5; if it is the side that
+    training drives, 710 of 911 on KITTI and 738 of 837 on PandaSet then have an IoU above 0.5; if it is the side that
     differs more from the usual width, 674 and 679. A side that is shorter than usual was seen only in part: it is
     extended to the usual length, away from the sensor, or at both ends if the sensor is beside it. The height is
     extended upwards in the same way. Longer sides are kept.
@@ -414,6 +414,8 @@ def objects_from_points(
         raise PointsError(
             f"got height_m of shape {height_m.shape} for {len(points)} points; expected one value a point"
         )
+    if in_view is not None and in_view.shape != labels.shape:
+        raise PointsError(f"got in_view of shape {in_view.shape} for {len(points)} points; expected one value a point")
     roles = _roles(classes)
     if clusters is None:
         clusters = find_clusters(

@@ -512,6 +512,7 @@ def test_class_without_usual_size_has_the_size_of_its_points():
     [
         (np.zeros(3, np.uint8), {}, "one a point"),
         (np.full(4, 9, np.uint8), {}, "label 9 for 4 classes"),
+        (np.zeros(4, np.uint8), {"in_view": np.ones(3, bool)}, "in_view of shape"),
         (np.zeros(4, np.uint8), {"among": np.zeros(3, bool)}, "among"),
         (np.zeros(4, np.uint8), {"height_m": np.zeros(5, np.float32)}, "height_m"),
     ],
