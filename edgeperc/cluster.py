@@ -459,17 +459,18 @@ def objects_from_points(
         else:
             levels = np.sort(xyz[:, 2] - height_m[members])
             bottom = 0.5 * float(levels[(len(levels) - 1) // 2] + levels[len(levels) // 2])  # the median
+        side = float(max(rectangle[2:4]))
         score = float(shares[k]) * len(members) / (len(members) + EVIDENCE)
         if name in size_m:
             _, width, height = size_m[name]
             # Points below the ground are reflections. What is too tall for a car may be a van.
             unseen = distance_per_m * math.hypot(rectangle[0], rectangle[1])  # between the last return and the edge
             score *= min(max(top - bottom + unseen, 0.0) / height, 1.0) ** 2
-            score *= min(1.0, (float(max(rectangle[2:4])) + unseen) / width)
+            score *= min(1.0, (side + unseen) / width)
         if score >= min_score:
             usual = name
             if named_by_size and name == "car":
-                name = _vehicle_of_size(float(max(rectangle[2:4])), top - bottom)
+                name = _vehicle_of_size(side, top - bottom)
                 usual = "car" if name == "car" else "van"  # trucks differ too much in length
             boxes.append(_completed(name, score, rectangle, bottom, top, size_m.get(usual, (0.0, 0.0, 0.0))))
     kept_persons = _distinct([box for box in persons if box.score >= min_score], MAX_PERSONS_OVERLAP)
