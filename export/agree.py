@@ -166,7 +166,7 @@ def _measure(
     n_scans: int | None,
     on_scan: Callable[[str], None],
 ) -> _Measured:
-    judge = Judge([variant.path])
+    judge = Judge([variant.path], boxes_from="network")
     (session,) = judge.perceive.sessions
     by = f"onnxruntime {onnxruntime.__version__}, {session.provider}"
     if precision == "bf16":

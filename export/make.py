@@ -182,7 +182,7 @@ def finish(
     learned_road = "drivable" in card.classes and kitti is not None and path != truth and truth.exists()
     road_by = truth if learned_road else None
     # The figures of a card are of its network alone.
-    figures, _ = evaluate([*datasets.values()], [path], fold=fold, road_by=road_by, rules=())
+    figures, _ = evaluate([*datasets.values()], [path], fold=fold, road_by=road_by, boxes_from="network", rules=())
     command = ["edgeperc eval", *datasets, f"--model {name}"]
     command += [f"--road-by {ROAD_TRUTH}"] if road_by else []
     command += [f"--fold {fold}"] if fold is not None else []

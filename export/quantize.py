@@ -408,7 +408,7 @@ def _compared(
     before: Path, after: Path, kitti: Path | None, semantickitti: Path | None, n_simulated: int
 ) -> list[dict[str, list[Record]]]:
     """Counts of both models on KITTI's validation drives, on SemanticKITTI's roads and on simulated scans, by set."""
-    judges = [Judge([path], rules=()) for path in (before, after)]
+    judges = [Judge([path], boxes_from="network", rules=()) for path in (before, after)]
     read = judges[1]  # it was also calibrated on scans, which must not be among these
     truths: list[tuple[str, Callable[[], Truth]]] = [
         ("simulated", partial(read.simulated, samples.FIRST_SEED + k)) for k in range(n_simulated)
@@ -587,7 +587,7 @@ def quantize(
             simulated = f"simulation:{n_evaluated}"
             given = {"KITTI": kitti, "SEMANTICKITTI": semantickitti, simulated: simulated}
             datasets = {name: root for name, root in given.items() if root is not None}
-            figures = evaluate([*datasets.values()], [trial], rules=())[0]
+            figures = evaluate([*datasets.values()], [trial], boxes_from="network", rules=())[0]
             command = " ".join(["edgeperc eval", *datasets, f"--model {out.name}", "--no-agreement"])
         lines = {
             name: f"{name} {score:.3f} to {own:.3f} (loss {low:.3f} to {high:.3f})"

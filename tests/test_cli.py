@@ -145,12 +145,13 @@ def test_eval_passes_its_options_on(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     monkeypatch.setitem(sys.modules, "edgeperc.evaluation.evaluate", SimpleNamespace(evaluate=evaluate))
     assert run("eval", "KITTI", "simulation:2") == 0
     assert (
-        run("eval", "x", "--model", "a", "--provider", "openvino", "--precision", "bf16", "--boxes-from", "both") == 0
+        run("eval", "x", "--model", "a", "--provider", "openvino", "--precision", "bf16", "--boxes-from", "network")
+        == 0
     )
     (datasets, models, first), (_, own, second) = asked
     assert (datasets, models, own) == (["KITTI", "simulation:2"], zoo.DEFAULT, ["a"])
-    assert [first[key] for key in ("provider", "precision", "boxes_from")] == ["cpu", "auto", "network"]
-    assert [second[key] for key in ("provider", "precision", "boxes_from")] == ["openvino", "bf16", "both"]
+    assert [first[key] for key in ("provider", "precision", "boxes_from")] == ["cpu", "auto", "both"]
+    assert [second[key] for key in ("provider", "precision", "boxes_from")] == ["openvino", "bf16", "network"]
     assert capsys.readouterr().out.splitlines()[1] == "ran as x fp32, cpu"
 
 

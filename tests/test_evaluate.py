@@ -216,14 +216,17 @@ def test_boxes_of_clusters_by_hand(world: World) -> None:
         name: [table[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in ("car", "van", "pedestrian")
     }
     assert counts == {"car": [3, 3, 2], "van": [1, 0, 0], "pedestrian": [1, 1, 1]}
-    # The same beside a top-view model, within its view.
-    table = evaluated(Judge(["pointseg", "ssadnet"], boxes_from="both"), frame_of_all)["boxes"]["oriented"]["all"]
-    counts = {
-        name: [table[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in ("car", "van", "pedestrian")
-    }
-    assert counts == {"car": [3, 3, 2], "van": [1, 0, 0], "pedestrian": [1, 1, 1]}
     assert [table["vehicle"][k] for k in ("n_truth", "n_predicted", "n_hits")] == [4, 3, 3]  # nobody on foot
-    assert "boxes" not in evaluated(Judge(["pointseg"]), frame_of_all)
+    # Beside a top-view model, only what it can detect: vehicles in its view. The others count wherever they are known.
+    result = evaluated(Judge(["pointseg", "ssadnet"]), frame_of_all)
+    table = result["boxes"]["oriented"]["all"]
+    counts = {
+        name: [table[name][k] for k in ("n_truth", "n_predicted", "n_hits")] for name in ("car", "van", "vehicle")
+    }
+    assert counts == {"car": [1, 2, 1], "van": [1, 0, 0], "vehicle": [2, 2, 2]}
+    assert "pedestrian" not in table
+    assert [result["all_round"]["all"][name]["n_hits"] for name in ("vehicle", "pedestrian")] == [3, 1]
+    assert "boxes" not in evaluated(Judge(["pointseg"], boxes_from="network"), frame_of_all)
 
 
 def test_boxes_all_round_by_hand(world: World) -> None:
@@ -259,7 +262,7 @@ def test_boxes_all_round_by_hand(world: World) -> None:
         assert rows["vehicle"]["ap"] == rows["pedestrian"]["ap"] == 1.0
         assert (rows["cyclist"]["ap"], rows["cyclist"]["precision"], rows["cyclist"]["few"]) == (0.0, None, True)
         assert "mean_ap" not in rows
-        heading = result["heading"]["all"]
+        heading = result["heading"]["all_round"]["all"]
         assert heading["vehicle"] == {
             **{"heading": pytest.approx(2 / 3, abs=1e-4), "heading_interval": None, "axis": 1.0, "axis_interval": None},
             **{"front_known": 0.0, "front_known_interval": None},
@@ -267,11 +270,11 @@ def test_boxes_all_round_by_hand(world: World) -> None:
         }
         assert heading["pedestrian"]["heading"] == 1.0
         assert heading["cyclist"]["heading"] is None
-        assert result["heading"]["0-15 m"]["car"]["heading"] == 0.0
+        assert result["heading"]["all_round"]["0-15 m"]["car"]["heading"] == 0.0
         # Labels are counted with those of other classes.
         assert result["labeled"]["car"] == {"n_boxes": 2, "n_objects": 1, "n_drives": 1, "few": True}
         assert set(result["labeled"]) == {"car", "van", "pedestrian", "cyclist", "person_sitting"}
-    assert not {"all_round", "heading"} & {*evaluated(Judge(["pointseg"]), one)}
+    assert not {"all_round", "heading"} & {*evaluated(Judge(["pointseg"], boxes_from="network"), one)}
 
 
 def test_the_ground_in_boxes_and_people_who_sit_are_left_out_of_a_second_figure(world: World) -> None:
@@ -312,7 +315,7 @@ def test_few_objects_are_marked() -> None:
         evaluator.update(boxes[:n], boxes[:n], drive="a")
         rows = figures([Record("", "a", {("all_round", "vehicle"): evaluator})])
         assert rows["all_round"]["all"]["vehicle"].get("few", False) is (n < FEWEST_OBJECTS)
-        assert rows["heading"]["all"]["vehicle"].get("few", False) is (n < FEWEST_OBJECTS)
+        assert rows["heading"]["all_round"]["all"]["vehicle"].get("few", False) is (n < FEWEST_OBJECTS)
         lines = [line for line in eval._box_lines(rows) if line.startswith("  all")]  # car, before vehicle
         assert [f"car{eval._FEW}" in line for line in lines] == [n < FEWEST_OBJECTS] * (2 if n else 0)
     assert f"n<{FEWEST_OBJECTS}" in eval._FEW
@@ -773,7 +776,12 @@ def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFi
     assert cli.main(["eval", "simulation:2", "--json", str(out), "--worst", str(picture)]) == 0
     printed = capsys.readouterr()
     assert printed.err == ""
-    for words in ("== simulated scans: 2 scans, 2 drives ==", "boxes, oriented", "top view, every cell", "MaxF"):
+    for words in (
+        "== simulated scans: 2 scans, 2 drives ==",
+        "boxes where they can be detected, oriented",
+        "top view, every cell",
+        "MaxF",
+    ):
         assert words in printed.out
     result = json.loads(out.read_text())
     assert result["command"].startswith("edgeperc eval simulation:2 --json ")

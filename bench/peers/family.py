@@ -34,7 +34,7 @@ ENGINES = {"onnxruntime": "fp32", "openvino": "bf16"}
 
 def accuracy(kitti: Path, path: Path) -> float:
     """Mean IoU of the points' classes without background, or AP50 of oriented vehicle boxes."""
-    figures = evaluate([kitti], [path], split="validation", rules=(), n_resamples=1)[0]["real"]
+    figures = evaluate([kitti], [path], split="validation", boxes_from="network", rules=(), n_resamples=1)[0]["real"]
     if ModelCard.read(path).view.kind == "range_image":
         return float(np.mean([row["iou"] for name, row in figures["points"]["all"].items() if name != "background"]))
     return float(figures["boxes"]["oriented"]["all"]["vehicle"]["ap"])

@@ -196,7 +196,7 @@ def add_network(group: Any) -> None:
         help="open models whose graphs have unusual operators, subgraphs or sizes; only for files whose "
         "origin you know (default: refuse them)",
     )
-    add_boxes_from(group, "both")
+    add_boxes_from(group)
     add_agreement(group)
     group.add_argument(
         "--full-turn",
@@ -209,12 +209,12 @@ def add_network(group: Any) -> None:
     )
 
 
-def add_boxes_from(group: Any, default: str) -> None:
+def add_boxes_from(group: Any) -> None:
     """Add ``--boxes-from``."""
     group.add_argument(
         "--boxes-from",
         choices=("both", "network", "clusters"),
-        default=default,
+        default="both",
         help="network: boxes of the top-view model (vehicles ahead); clusters: boxes around clusters of labeled "
         "points (every class, where points have a class); both: network boxes, and cluster boxes where there are no "
         "network boxes (default: %(default)s)",

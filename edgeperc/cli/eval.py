@@ -78,7 +78,7 @@ def add_parser(commands: Commands) -> None:
     models = parser.add_argument_group("models")
     add_model(models)
     add_provider(models, provider="cpu")
-    add_boxes_from(models, "network")
+    add_boxes_from(models)
     add_agreement(models)
     models.add_argument(
         "--without-rule",
@@ -289,17 +289,15 @@ def _box_lines(of_block: Mapping[str, Any]) -> list[str]:
         }
         rows = [*_class_rows(of_kind, "n_truth"), *_class_rows(means, "ap")]
         order = sorted(rows, key=lambda row: [*of_kind].index(row[0][0]))
-        lines += table_lines(f"boxes, {kind}", _BOX_COLUMNS, order)
+        lines += table_lines(f"boxes where they can be detected, {kind}", _BOX_COLUMNS, order)
     lines += table_lines(
         "boxes wherever the truth is known, oriented: AP50 of vehicles, AP25 of pedestrians and cyclists",
         _ALL_ROUND_COLUMNS,
         _class_rows(of_block.get("all_round", {}), "n_truth"),
     )
-    lines += table_lines(
-        "heading of these boxes within 45 degrees of the true one",
-        _HEADING_COLUMNS,
-        _class_rows(of_block.get("heading", {}), "n_hits"),
-    )
+    for kind, where in (("boxes", "where they can be detected"), ("all_round", "wherever the truth is known")):
+        rows = _class_rows(of_block.get("heading", {}).get(kind, {}), "n_hits")
+        lines += table_lines(f"heading of boxes {where}, within 45 degrees of the true one", _HEADING_COLUMNS, rows)
     return lines
 
 

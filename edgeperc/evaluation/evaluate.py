@@ -45,7 +45,7 @@ def evaluate(
     road_by: str | Path | None = None,
     provider: str = "cpu",
     precision: str = "auto",
-    boxes_from: BoxesFrom = "network",
+    boxes_from: BoxesFrom = "both",
     rules: Collection[str] = RULES,
     mounted: Mounting | None = None,
     n_resamples: int = 1000,

@@ -59,8 +59,8 @@ class Judge:
     training_scans : bool
         Also evaluate scans that a model was trained on.
     boxes_from : {"network", "clusters", "both"}
-        As in `Perceiver`. Cluster boxes are evaluated wherever the truth is known, boxes of a top-view model only in
-        its view.
+        As in `Perceiver`. The figures ``"boxes"`` are of the boxes that a top-view model detects, in its view; without
+        such a model, or with "clusters", of the boxes around clusters, wherever the truth is known.
     rules : collection of str
         Rules of the agreement of labels, boxes and cells; a part of `edgeperc.agreement.RULES` for an ablation.
     mounted : Mounting or None
@@ -86,7 +86,7 @@ class Judge:
         precision: str = "auto",
         road_by: str | Path | None = None,
         training_scans: bool = False,
-        boxes_from: BoxesFrom = "network",
+        boxes_from: BoxesFrom = "both",
         rules: Collection[str] = RULES,
         mounted: Mounting | None = None,
         sensor: SensorProfile | None = None,
@@ -108,15 +108,15 @@ class Judge:
         self.from_above = next((n for n in networks if n.card.view.kind == "top_view"), None)
         if sensor is not None and self.from_sensor is not None:
             self.point_classes = self.from_sensor.card.classes
-        self.box_classes = self.from_above.card.box_classes if self.from_above and boxes_from != "clusters" else ()
-        self.cluster_classes: tuple[str, ...] = ()
-        if self.from_sensor is not None and boxes_from != "network":
-            self.cluster_classes = classes_of_boxes(self.from_sensor.card.classes)
         self.view: TopViewGeometry | None = None
         if self.from_above is not None:
             assert isinstance(self.from_above.card.view, TopViewGeometry)
             self.view = self.from_above.card.view
             self.cell_range_m = np.hypot(*np.broadcast_arrays(*self.view.cell_centers()))
+        self.box_classes = self.from_above.card.box_classes if self.from_above and boxes_from != "clusters" else ()
+        self.detected_in = self.view if self.box_classes else None  # None: anywhere
+        if not self.box_classes and self.from_sensor is not None and boxes_from != "network":
+            self.box_classes = classes_of_boxes(self.from_sensor.card.classes)
         self.draw_road = None if road_by is None else _perceiver([road_by], provider, precision, n_threads)
         cards = [*self.perceive.cards]
         if self.draw_road is not None:
@@ -203,7 +203,7 @@ class Judge:
             if self.box_classes or found.points is not None:
                 seen = (box for box, n in zip(truth.boxes, truth.returns, strict=True) if n >= FEWEST_RETURNS)
                 tallies["labeled",] = Counter(object_key(truth.drive, box) for box in seen)
-            if self.box_classes or self.cluster_classes:
+            if self.box_classes:
                 mistakes = self._count_boxes(tallies, truth, found, mistakes)
             if found.points is not None:
                 mistakes = self._count_points(tallies, truth, found.points, mistakes, shown)
@@ -225,8 +225,8 @@ class Judge:
     ) -> Mistakes:
         """Match boxes where the truth is known; predicted and true ones with their center elsewhere count for nothing.
 
-        Boxes that the models detect are matched by axis-aligned and by oriented footprints, in the top-view model's
-        view. Vehicles, pedestrians and cyclists are matched all round, detected or not.
+        Boxes of the classes and in the view that are detected are matched by axis-aligned and by oriented footprints.
+        Vehicles, pedestrians and cyclists are matched all round, detected or not.
         """
 
         def known(box: Box) -> bool:
@@ -234,17 +234,17 @@ class Judge:
 
         predicted = [box for box in found.boxes if known(box)]
         returns = list(zip(truth.boxes, truth.returns, strict=True))
-        to_find, ignored = boxes_to_find(
-            returns, self.view, self.box_classes, classes_anywhere=self.cluster_classes, known=known
-        )
+        classes, view = self.box_classes, self.detected_in
+        detected = [b for b in predicted if b.label in classes and (view is None or view.holds(*b.center[:2]))]
+        to_find, ignored = boxes_to_find(returns, view, classes, known=known)
         for kind in ("upright", "oriented"):
             evaluator = tallies["boxes", kind] = BoxEvaluator(oriented=kind == "oriented", together=VEHICLES)
-            pairs = evaluator.update(predicted, to_find, ignored=ignored, drive=truth.drive)
+            pairs = evaluator.update(detected, to_find, ignored=ignored, drive=truth.drive)
         every = tuple(name for classes, _ in ALL_ROUND.values() for name in classes)
-        to_find, ignored = boxes_to_find(returns, None, (), classes_anywhere=every, known=known)
-        for group, (classes, least_iou) in ALL_ROUND.items():
-            evaluator = tallies["all_round", group] = BoxEvaluator(least_iou, together=classes)
-            guesses, rights = ([box for box in of if box.label in classes] for of in (predicted, to_find))
+        to_find, ignored = boxes_to_find(returns, None, every, known=known)
+        for group, (own, least_iou) in ALL_ROUND.items():
+            evaluator = tallies["all_round", group] = BoxEvaluator(least_iou, together=own)
+            guesses, rights = ([box for box in of if box.label in own] for of in (predicted, to_find))
             evaluator.update(guesses, rights, ignored=ignored, drive=truth.drive)
         returns_of = {id(box): n for box, n in returns}
         return replace(
@@ -312,7 +312,7 @@ class Judge:
         """Count the labels of cells for each table, and the probability of road if the true road is known."""
         assert self.from_above is not None
         for table, (classes, right) in truth.cells.items():
-            if not self.box_classes:
+            if not self.from_above.card.box_classes:
                 classes, right = _without_vehicles(classes, right)
             if len(classes) < 2:
                 continue

@@ -459,7 +459,6 @@ def boxes_to_find(
     view: TopViewGeometry | None,
     classes: Collection[str],
     *,
-    classes_anywhere: Collection[str] = (),
     known: Callable[[Box], bool] = lambda box: True,
 ) -> tuple[list[Box], list[Box]]:
     """Split true boxes into those that a detector must find, and those that it may find but need not.
@@ -469,11 +468,9 @@ def boxes_to_find(
     truth : iterable of (Box, int)
         True boxes, and the number of returns from each.
     view : TopViewGeometry or None
-        Boxes of ``classes`` count only if their center is in this view; None: anywhere.
+        Boxes count only if their center is in this view; None: anywhere.
     classes : collection of str
-        Classes that count in ``view``.
-    classes_anywhere : collection of str
-        Classes that count anywhere.
+        Classes that count.
     known : callable
         Whether the scan is labeled at the place of a box.
 
@@ -487,8 +484,7 @@ def boxes_to_find(
     to_find: list[Box] = []
     ignored: list[Box] = []
     for box, returns in truth:
-        counts = box.label in classes_anywhere
-        counts |= box.label in classes and (view is None or view.holds(*box.center[:2]))
+        counts = box.label in classes and (view is None or view.holds(*box.center[:2]))
         (to_find if counts and returns >= FEWEST_RETURNS and known(box) else ignored).append(box)
     return to_find, ignored
 

@@ -120,9 +120,12 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
           its mean scan, so that a long drive does not count for more than a single scan of another street.
         - ``"sure"``: as ``"points"``, without points of which boxes say little: the ground in the boxes of objects
           (`edgeperc.ground.find_ground`), and people who sit, whom KITTI's own evaluation leaves out.
-        - ``"boxes"``: by kind (``"upright"``, ``"oriented"``), band and class, where the models detect the class.
+        - ``"boxes"``: by kind (``"upright"``, ``"oriented"``), band and class, of the classes and in the view that the
+          models detect.
         - ``"all_round"``: by band and class, oriented boxes of vehicles (AP50) and people (AP25) wherever the truth is
-          known, detected or not. ``"heading"``: of those that were matched, whose heading is right within 45 degrees.
+          known, detected or not.
+        - ``"heading"``: of the matched boxes of ``"boxes"`` and ``"all_round"``, by band and class, those whose heading
+          is right within 45 degrees.
         - ``"errors"``: by error and cause (`causes.CAUSES`). ``"all"`` is a share of the true (missed) or predicted
           (false) points of the class, a cause a share of the error; ``"n_of"`` is the whole.
         - ``"bumper"``: points at the own bumper that are labeled car: all, and those on the ground. Where the truth is
@@ -174,15 +177,16 @@ def _figures(tallies: Tallies) -> dict[str, Any]:
             for name, iou in zip(tally.classes, tally.iou().tolist(), strict=True):
                 found["points"][band][name]["iou_by_drive"] = iou
         elif group == "boxes":
-            rows = {name: _box_rows(tally, within_m) for name, within_m in BANDS.items()}
-            found.setdefault(group, {})[key[1]] = rows
+            bands = {name: _of_all(tally, within_m, "vehicle") for name, within_m in BANDS.items()}
+            found.setdefault(group, {})[key[1]] = {name: _with_mean(scores) for name, scores in bands.items()}
+            if key[1] == "oriented":
+                found.setdefault("heading", {})[group] = {name: _heading_rows(scores) for name, scores in bands.items()}
         elif group == "all_round":
             for name, within_m in BANDS.items():
-                scores = {**tally.per_class(within_m), key[1]: tally.overall(within_m)}
-                rows = {label: _box_row(row) for label, row in scores.items()}
-                found.setdefault(group, {}).setdefault(name, {}).update(rows)
-                headings = {label: _heading_row(row) for label, row in scores.items()}
-                found.setdefault("heading", {}).setdefault(name, {}).update(headings)
+                scores = _of_all(tally, within_m, key[1])
+                found.setdefault(group, {}).setdefault(name, {}).update(_box_rows(scores))
+                headings = found.setdefault("heading", {}).setdefault(group, {})
+                headings.setdefault(name, {}).update(_heading_rows(scores))
         elif key == ("errors", "points"):
             scans, objects = tallies["errors", "scans"], tallies["errors", "objects"]
             found["errors"] = {error: _error_rows(error, tally, scans, objects) for error in CAUSES}
@@ -226,24 +230,33 @@ def _point_rows(confusion: Confusion, objects: Counter[tuple[str, ObjectKey]]) -
     return rows
 
 
-def _box_rows(evaluator: BoxEvaluator, within_m: tuple[float, float]) -> dict[str, Any]:
-    per_class = evaluator.per_class(within_m)
-    rows = {name: _box_row(row) for name, row in (per_class | {"vehicle": evaluator.overall(within_m)}).items()}
-    return {"mean_ap": mean([row.ap for row in per_class.values()])} | rows
+def _of_all(evaluator: BoxEvaluator, within_m: tuple[float, float], together: str) -> dict[str, BoxScores]:
+    """Scores of each class, and of the evaluator's group of classes under the name ``together``."""
+    return {**evaluator.per_class(within_m), together: evaluator.overall(within_m)}
 
 
-def _box_row(scores: BoxScores) -> dict[str, Any]:
-    row = {each.name: getattr(scores, each.name) for each in fields(BoxScores) if each.name not in _HEADING}
-    return row | _few(scores.n_objects)
+def _with_mean(scores_of: Mapping[str, BoxScores]) -> dict[str, Any]:
+    return {"mean_ap": mean([row.ap for name, row in scores_of.items() if name != "vehicle"])} | _box_rows(scores_of)
+
+
+def _box_rows(scores_of: Mapping[str, BoxScores]) -> dict[str, Any]:
+    names = [each.name for each in fields(BoxScores) if each.name not in _HEADING]
+    return {
+        label: {name: getattr(scores, name) for name in names} | _few(scores.n_objects)
+        for label, scores in scores_of.items()
+    }
 
 
 _HEADING = ("heading", "axis", "front_known", "n_found")
 
 
-def _heading_row(scores: BoxScores) -> dict[str, Any]:
+def _heading_rows(scores_of: Mapping[str, BoxScores]) -> dict[str, Any]:
     """Of the boxes that were matched: the share whose heading is right, over the full turn and modulo half a turn."""
-    shares = {"heading": scores.heading, "axis": scores.axis, "front_known": scores.front_known}
-    return shares | {"n_hits": scores.n_hits, "n_objects": scores.n_found} | _few(scores.n_found)
+    rows = {}
+    for name, scores in scores_of.items():
+        shares = {"heading": scores.heading, "axis": scores.axis, "front_known": scores.front_known}
+        rows[name] = shares | {"n_hits": scores.n_hits, "n_objects": scores.n_found} | _few(scores.n_found)
+    return rows
 
 
 def _error_rows(
