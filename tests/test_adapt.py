@@ -571,6 +571,12 @@ def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert simulated["n_scans"] == 1
     assert simulated["function"].startswith(("logarithm", "linear", "power"))
     assert (boxed["n_scans"], pictured["n_scans"]) == (1, 1)
+    near_cars = [b for b in scan.boxes if b.label in ("car", "van", "truck") and np.hypot(*b.center[:2]) < 40.0]
+    assert 0 < boxed["n_objects"]["car"] <= len(near_cars)
+    assert ("car" in boxed["few"]) == (boxed["n_objects"]["car"] < 10)
+    assert set(boxed["few"]) == {name for name, n in boxed["n_objects"].items() if 0 < n < 10}
+    assert (pictured["n_objects"], pictured["few"]) == (None, [])
+    assert all((f"{name} (n<10)" in printed) for found in (simulated, boxed) for name in found["few"])
     for found in (boxed, pictured):
         assert found["function"] is None
         assert found["both"] == found["none"] == found["remission"] == found["interpolation"]

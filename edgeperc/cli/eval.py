@@ -22,7 +22,7 @@ from .arguments import (
     finite_number,
 )
 from .engine import add_engine
-from .output import many, print_line, progress, table_lines, write_figures
+from .output import FEW, many, print_line, progress, table_lines, write_figures
 
 __all__ = ["add_parser", "eval_command"]
 
@@ -141,7 +141,7 @@ def eval_command(arguments: argparse.Namespace) -> int:
             on_scan=show,
         )
     for line in _figure_lines(figures):
-        print_line(line, gray=_FEW in line)
+        print_line(line, gray=FEW in line)
     write_figures(arguments, figures)
     if arguments.worst is not None:
         from ..view.mistakes import draw_mistakes
@@ -226,7 +226,6 @@ _IMAGE_COLUMNS = (
     *_with_intervals(("mIoU", "mean_iou"), ("accuracy", "accuracy"), ("mean recall", "mean_accuracy")),
     ("pixels", "n_pixels"),
 )
-_FEW = " (n<10)"  # `edgeperc.evaluation.tables.FEWEST_OBJECTS`
 _BLOCKS = {"real": "real scans with boxes", "semantickitti": "SemanticKITTI", "simulated": "simulated scans"}
 
 
@@ -355,4 +354,4 @@ def _class_rows(bands: Mapping[str, Any], count: str) -> list[tuple[tuple[str, s
 
 
 def _marked(name: str, row: Mapping[str, Any]) -> str:
-    return f"{name}{_FEW}" if row.get("few") else name
+    return f"{name}{FEW}" if row.get("few") else name

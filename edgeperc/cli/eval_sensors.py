@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from .arguments import Commands, add_command, add_figures_file, add_provider
-from .output import many, print_line, progress, table_lines, write_figures
+from .output import FEW, many, print_line, progress, table_lines, write_figures
 
 __all__ = ["add_parser", "eval_sensors_command"]
 
@@ -61,7 +61,10 @@ def eval_sensors_command(arguments: argparse.Namespace) -> int:
     for name, result in figures.items():
         rows = [((kind, ""), {**result[kind]["iou"], "mean": result[kind]["mean_iou"]}) for kind in ADAPTATIONS]
         counts = ", ".join(f"{count:,} {label}" for label, count in result["both"]["n_points"].items())
-        columns = [(label, label) for label in result["both"]["iou"] if label != "background"]
+        if result["n_objects"] is not None:
+            counts += "; objects: " + ", ".join(f"{n} {label}" for label, n in result["n_objects"].items())
+        labels = [label for label in result["both"]["iou"] if label != "background"]
+        columns = [(f"{label}{FEW * (label in result['few'])}", label) for label in labels]
         function = result["function"] or "no function"
         title = f"{name}: {many(result['n_scans'], 'scan')}, {counts}; remission: {function}"
         lines += table_lines(title, (*columns, ("mIoU", "mean")), rows)

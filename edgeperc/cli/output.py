@@ -17,6 +17,7 @@ from ..atomic import write_atomic
 from ..printable import printable
 
 __all__ = [
+    "FEW",
     "many",
     "one_line",
     "print_columns",
@@ -29,6 +30,9 @@ __all__ = [
     "without_nan",
     "write_figures",
 ]
+
+FEW = " (n<10)"  # `edgeperc.evaluation.tables.FEWEST_OBJECTS`
+"""Beside names of classes with few objects."""
 
 
 def one_line(text: object) -> str:

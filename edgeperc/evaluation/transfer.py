@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError, PointsError
 from ..perceiver import ADAPTATIONS, Perceiver
+from ..perception import Box
 from ..sensor import SensorProfile, get_sensor
 from ..sensor_fit import fit_sensor
 from ..simulation.samples import FIRST_SEED, IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASSES
-from .metrics import Confusion
-from .scan_folder import ScanFolder, ScanFrame
+from .metrics import FEWEST_RETURNS, Confusion, ObjectKey, object_key
+from .scan_folder import ScanFolder, ScanFrame, class_number
+from .tables import FEWEST_OBJECTS
 from .unseen import check_unseen, training_scans_of
 
 __all__ = ["Scan", "compare"]
@@ -50,11 +52,14 @@ class Scan:
         x, y, z [m] in the sensor frame, raw remission.
     labels : (n,) uint8
         Index into `POINT_CLASSES`, `IGNORE` where unknown.
+    objects : frozenset of (str, ObjectKey) or None
+        Labeled objects within 50 m, by the class of their points; None if only points or pixels are labeled.
     """
 
     name: str
     points: NDArray[np.float32]
     labels: NDArray[np.uint8]
+    objects: frozenset[tuple[str, ObjectKey]] | None
 
 
 def compare(
@@ -87,7 +92,9 @@ def compare(
     -------
     dict
         By dataset: ``"n_scans"``, ``"function"``, and by adaptation ``"iou"`` (class -> IoU, None for a class that does
-        not occur), ``"mean_iou"`` over the classes except the background, ``"n_points"`` (class -> count).
+        not occur), ``"mean_iou"`` over the classes except the background, ``"n_points"`` (class -> count). In
+        ``"n_objects"`` distinct objects by class, or None if only points are labeled, and in ``"few"`` the classes with
+        fewer than `tables.FEWEST_OBJECTS`: their figures say little.
 
     Raises
     ------
@@ -117,21 +124,31 @@ def compare(
         }
         counts = {adaptation: Confusion(POINT_CLASSES) for adaptation in ADAPTATIONS}
         trained_on = training_scans_of(perceivers["none"].cards)
+        objects: set[tuple[str, ObjectKey]] | None = set()
         for scan in read():
             check_unseen(trained_on, scan.name, scan.name, scan.points)
             for adaptation, perceive in perceivers.items():
                 _count(counts[adaptation], perceive, scan)
                 done += 1
                 on_scan(done, total)
+            objects = None if objects is None or scan.objects is None else objects | scan.objects
         function = sensor.remission
         result[name] = {
             "n_scans": n_scans,
             "function": None
             if function is None
             else f"{function.kind} {', '.join(f'{c:.4g}' for c in function.coefficients)}",
+            **_distinct(objects),
             **{adaptation: _row(confusion) for adaptation, confusion in counts.items()},
         }
     return result
+
+
+def _distinct(objects: set[tuple[str, ObjectKey]] | None) -> dict[str, Any]:
+    if objects is None:
+        return {"n_objects": None, "few": []}
+    n_objects = {name: sum(kind == name for kind, _ in objects) for name in POINT_CLASSES[1:]}
+    return {"n_objects": n_objects, "few": [name for name, n in n_objects.items() if 0 < n < FEWEST_OBJECTS]}
 
 
 def _count(confusion: Confusion, perceive: Perceiver, scan: Scan) -> None:
@@ -189,7 +206,20 @@ def _frames(folder: ScanFolder) -> Iterator[ScanFrame]:
 
 
 def _of_frame(frame: ScanFrame) -> Scan:
-    return Scan(frame.name, frame.points, frame.labels(by=None if frame.boxes is None else "boxes"))
+    if frame.boxes is None:
+        return Scan(frame.name, frame.points, frame.labels(), None)
+    objects = _objects(frame.drive, zip(frame.boxes, frame.returns, strict=True))
+    return Scan(frame.name, frame.points, frame.labels(by="boxes"), objects)
+
+
+def _objects(drive: str, boxes: Iterable[tuple[Box, int]]) -> frozenset[tuple[str, ObjectKey]]:
+    """Distinct objects of boxes and their numbers of returns."""
+    numbered = [(class_number(box.label, POINT_CLASSES), box, n) for box, n in boxes]
+    return frozenset(
+        (POINT_CLASSES[kind], object_key(drive, box))
+        for kind, box, n in numbered
+        if kind not in (0, IGNORE) and n >= FEWEST_RETURNS and np.hypot(*box.center[:2]) < FARTHEST_M
+    )
 
 
 def _raw_model(sensor: SensorProfile) -> tuple[float, tuple[float, ...], tuple[float, ...]]:
@@ -205,7 +235,8 @@ def _simulated(sensor: SensorProfile, seed: int) -> Scan:
     spread = points[:, 3] + rng.uniform(-0.005, 0.005, len(points))
     raw = np.interp(spread, remissions, raws) * rng.lognormal(0.0, 0.1, len(points))
     points[:, 3] = np.minimum(np.rint(raw), raws[-1])
-    return Scan(f"scene {seed}", points, labels_by_boxes(scan))
+    objects = _objects(f"scene {seed}", zip(scan.boxes, scan.box_points, strict=True))
+    return Scan(f"scene {seed}", points, labels_by_boxes(scan), objects)
 
 
 def _from_image(path: Path) -> Scan:
@@ -220,4 +251,4 @@ def _from_image(path: Path) -> Scan:
         raise PointsError(
             f"{path}: labels from {labels.min()} to {labels.max()}; expected 0 to {len(IMAGE_LABELS) - 1}"
         )
-    return Scan(path.stem, np.ascontiguousarray(pixels[:, :4], np.float32), IMAGE_LABELS[labels])
+    return Scan(path.stem, np.ascontiguousarray(pixels[:, :4], np.float32), IMAGE_LABELS[labels], None)
