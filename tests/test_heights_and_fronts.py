@@ -92,7 +92,14 @@ def test_from_training_to_the_vehicle(tmp_path: Path, scans: Sequence[NDArray[np
     if recipe.edge:
         rounded = tmp_path / "int8.onnx"
         with mock.patch.object(quantize_module, "evaluate", return_value=({}, {})):
-            quantize(path, rounded, scans=scans, max_noise=9.0, race=lambda *_: (10.0 + NOISE[0], 5.0 + NOISE[1]))
+            quantize(
+                path,
+                rounded,
+                scans=scans,
+                n_evaluated=2,
+                max_noise=9.0,
+                race=lambda *_: (10.0 + NOISE[0], 5.0 + NOISE[1]),
+            )
         session = Session(rounded, "cpu")
         assert (session.card.input, session.card.outputs) == (card.input, card.outputs)
         assert session.precision == "int8"

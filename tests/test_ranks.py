@@ -84,8 +84,16 @@ def distance(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> fl
     return float(torch.cat([(one[name].double() - other[name].double()).flatten() for name in names]).norm())
 
 
+SMALL = {"edge": True, "width": 0.25, "front": True}
+
+
 @pytest.mark.parametrize(
-    ("network", "changes"), [("pointseg", {"accumulate": 2}), ("ssadnet", {}), ("lodnn", {"learning_rate": 1e-3})]
+    ("network", "changes"),
+    [
+        ("pointseg", {"accumulate": 2}),
+        ("ssadnet", SMALL),
+        ("lodnn", {"learning_rate": 1e-3}),
+    ],
 )
 def test_two_ranks_train_what_one_trains(tmp_path: Path, simulated: Path, network: str, changes: dict) -> None:
     states = []
@@ -94,7 +102,9 @@ def test_two_ranks_train_what_one_trains(tmp_path: Path, simulated: Path, networ
         assert done.returncode == 0, done.stderr
         states.append(checkpoint(tmp_path / str(world)))
     one, two = states
-    start = trained(tmp_path / "train.py", network, tmp_path / "0", simulated, 1, **{**changes, "learning_rate": 0.0})
+    start = trained(
+        tmp_path / "train.py", network, tmp_path / "0", simulated, 1, **{**changes, "learning_rate": 0.0, "steps": 1}
+    )
     assert start.returncode == 0, start.stderr
     moved = distance(checkpoint(tmp_path / "0")["network"], one["network"])
     apart = distance(one["network"], two["network"])
@@ -109,13 +119,13 @@ def test_two_ranks_train_what_one_trains(tmp_path: Path, simulated: Path, networ
 
 def test_a_killed_rank_ends_the_run_and_it_resumes(tmp_path: Path, simulated: Path) -> None:
     script = tmp_path / "train.py"
-    whole = trained(script, "lodnn", tmp_path / "whole", simulated, 2)
+    whole = trained(script, "ssadnet", tmp_path / "whole", simulated, 2, **SMALL)
     assert whole.returncode == 0, whole.stderr
-    cut = trained(script, "lodnn", tmp_path / "cut", simulated, 2, dies="1")
+    cut = trained(script, "ssadnet", tmp_path / "cut", simulated, 2, dies="1", **SMALL)
     assert cut.returncode != 0
     assert "another rank" in cut.stderr or re.search("Signal 9|exitcode: -9", cut.stderr), cut.stderr
     assert checkpoint(tmp_path / "cut")["step"] == 2
-    resumed = trained(script, "lodnn", tmp_path / "cut", simulated, 2)
+    resumed = trained(script, "ssadnet", tmp_path / "cut", simulated, 2, **SMALL)
     assert resumed.returncode == 0, resumed.stderr
     one, other = (checkpoint(tmp_path / name)["network"] for name in ("whole", "cut"))
     assert all(torch.equal(one[name], other[name]) for name in one)
