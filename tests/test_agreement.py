@@ -440,6 +440,28 @@ def test_pole_is_no_person_and_a_person_under_foliage_is_one() -> None:
     assert not labels[~own].any()
 
 
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+def test_person_at_a_hedge_stays(yaw: float) -> None:
+    hedge, person = block(12.0, 4.0, (14.0, 0.4, 1.6), 0, 0.1), block(10.0, 3.5, (0.5, 0.4, 1.7), 2, 0.1)
+    for part in (hedge, person):
+        part[:, :2] @= np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+    rows, labels = agreed_scene(hedge, person)
+    assert (labels[rows[:, 3] == 2] == 2).all()
+    assert not labels[rows[:, 3] == 0].any()
+    assert not agreed_scene(hedge, person, rules=RULES - {"person"})[1].any()
+
+
+def test_parts_of_a_hedge_are_no_persons() -> None:
+    hedge = block(12.0, 4.0, (14.0, 0.4, 1.6), 0, 0.1)
+    sparse = block(10.0, 3.5, (0.4, 0.4, 1.7), 2, 0.4)[:20]
+    for other in (block(10.0, 3.5, (0.5, 0.4, 1.2), 2, 0.1), block(10.0, 3.5, (2.6, 0.4, 1.7), 2, 0.2), sparse):
+        rows, labels = agreed_scene(hedge, other)
+        assert (rows[:, 3] == 2).any()
+        assert not labels.any()
+    hedge[(np.abs(hedge[:, 0] - 10.0) < 0.25) & (np.arange(len(hedge)) % 2 == 0), 3] = 2
+    assert not agreed_scene(hedge)[1].any()
+
+
 def test_kerb_is_no_car_and_ground_is_car_only_below_cars() -> None:
     kerb, car = block(3.5, 0.0, (1.0, 4.0, 0.3), 1), block(12.0, 3.0, CAR, 1)
     below = np.array([(12.0, 2.15, 0.0, 1), (3.0, -2.0, 0.0, 1), (20.0, 2.0, 0.0, 1)])
