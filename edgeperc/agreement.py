@@ -261,7 +261,8 @@ def keep_persons(
             or not MIN_ALONE_TOP_M <= top <= MAX_TOP_M
         ):
             continue
-        u, v = points[:, 0] * cos + points[:, 1] * sin, points[:, 1] * cos - points[:, 0] * sin
+        with np.errstate(over="ignore", invalid="ignore"):  # other points may be far out
+            u, v = points[:, 0] * cos + points[:, 1] * sin, points[:, 1] * cos - points[:, 0] * sin
         here = (u >= u_low - MARGIN_M) & (u <= u_high + MARGIN_M) & (v >= v_low - MARGIN_M) & (v <= v_high + MARGIN_M)
         if np.count_nonzero(is_body[own]) >= MIN_ALONE_SHARE * np.count_nonzero(here & is_body):
             labels[own] = before[own]

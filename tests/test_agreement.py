@@ -26,6 +26,7 @@ from edgeperc.agreement import (
     fill_support,
     find_support,
     find_voters,
+    keep_persons,
 )
 from edgeperc.card import TopViewGeometry
 from edgeperc.cli import arguments
@@ -449,6 +450,22 @@ def test_person_at_a_hedge_stays(yaw: float) -> None:
     assert (labels[rows[:, 3] == 2] == 2).all()
     assert not labels[rows[:, 3] == 0].any()
     assert not agreed_scene(hedge, person, rules=RULES - {"person"})[1].any()
+
+
+def test_points_far_out_do_not_matter_to_a_person_at_a_hedge() -> None:
+    person = block(10.0, 3.5, (0.5, 0.4, 1.7), 2, 0.1)
+    far = np.array([(np.nan, 0.0, 1.0, 0), (3e38, 3e38, 1.0, 0), (-3e38, 3e38, np.inf, 0)])
+    rows = np.concatenate([person, far])
+    points, height = rows.astype(np.float32), rows[:, 2].astype(np.float32)
+    for yaw in (0.0, 0.7, 2.4):
+        points[: len(person), :2] = person[:, :2] @ [[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]]
+        labels = np.zeros(len(rows), np.uint8)
+        keep_persons(points, height, ROLES, rows[:, 3].astype(np.uint8), labels)
+        np.testing.assert_array_equal(labels, rows[:, 3])
+        for n in (0, 1, 29):
+            labels[:] = 0
+            keep_persons(points[:n], height[:n], ROLES, rows[:n, 3].astype(np.uint8), labels[:n])
+            assert not labels.any()
 
 
 def test_parts_of_a_hedge_are_no_persons() -> None:
