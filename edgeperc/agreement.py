@@ -25,7 +25,7 @@ from .geometry import draw_footprints
 from .ground import Ground
 from .kernel_cache import njit
 from .perception import Box, PointLabels, TopView
-from .persons import MAX_LENGTH_M, MAX_RIDING_WIDTH_M, MAX_TOP_M, complete_persons, measure
+from .persons import complete_persons
 from .points import read_only
 from .voting import (
     COMPLETING_SCORE,
@@ -36,6 +36,7 @@ from .voting import (
     fill_tallies,
     fill_verdicts,
     fill_votes,
+    find_persons_alone,
 )
 
 __all__ = ["RULES", "agree_on_boxes", "agree_on_cells", "agree_on_points", "find_support", "find_voters"]
@@ -59,12 +60,6 @@ VEHICLES = frozenset({"car", "van", "truck"})
 PERSON_TOP_M: Mapping[str, float] = MappingProxyType({"pedestrian": 2.0, "cyclist": 2.2})
 MIN_COLUMN_M = 0.2  # lower points are no part of a column
 COLUMN_GAP_M = 0.3  # a larger gap ends a column: a head and the foliage above it
-
-# A person linked with a hedge, a wall or a high pavement. The points of 43 pedestrians on the training drives are at
-# least 1.41 m high and 0.26 m wide; a piece of a wall is flat. With 15 points in place of 30, two groups on the folds
-# would stay that are no persons.
-MIN_ALONE, MIN_ALONE_TOP_M, MIN_ALONE_WIDTH_M, MIN_ALONE_SHARE = 30, 1.4, 0.15, 0.7
-BODY_M = 0.3  # lower points may be of grass or pavement
 
 MARGIN_M = 0.1  # by which boxes are grown for points
 ABOVE_BOX_M = 0.5
@@ -161,8 +156,8 @@ def agree_on_points(
         Of vehicles (car, van, truck) and persons (pedestrian, cyclist); other classes are not changed.
     ground : Ground
         If it has no plane, rules that need heights are skipped.
-    clusters : (n,) int32
-        From `find_voters`.
+    clusters : (n,) int32, writable
+        From `find_voters`. A person that stays in a cluster that loses the label gets a number of its own in it.
     boxes : sequence of Box
         From a top-view model, with scores from 0.3.
     rules : collection of str
@@ -199,6 +194,8 @@ def agree_on_points(
     _check(points, labels, ground)
     if clusters.shape != labels.labels.shape:
         raise PointsError(f"got clusters of shape {clusters.shape} for {len(points)} points; expected one a point")
+    if not clusters.flags.writeable:
+        raise PointsError("got read-only clusters; expected an array that can be written, such as a copy")
     rules = _applicable(rules, ground)
     rows, height, on_ground = read_only(points), read_only(ground.height_m), read_only(ground.mask, np.bool_)
     in_view, of = read_only(labels.in_view, np.bool_), read_only(clusters, np.int32)
@@ -215,57 +212,18 @@ def agree_on_points(
     before = agreed.copy()
     apply_verdicts(in_view, of, verdicts, roles, scores, names, agreed)
     if "person" in rules:
-        keep_persons(rows, height, roles, before, agreed)
+        alone = find_persons_alone(rows, height, roles, before, agreed)
+        for own in alone:
+            agreed[own] = before[own]
         for part, whole in PART_OF.items():
             if part in labels.classes and whole in labels.classes:
                 walks, rides = labels.classes.index(part), labels.classes.index(whole)
                 complete_persons(rows, height, in_view, of, counts, bounds, walks, rides, agreed)
+        for number, own in enumerate(alone, start=n):
+            clusters[own] = number
     if "ground" in rules:
         clear_ground(rows, height, on_ground, roles, agreed)
     return PointLabels(agreed, labels.in_view, labels.classes)
-
-
-def keep_persons(
-    points: NDArray[np.float32],
-    height: NDArray[np.float32],
-    roles: NDArray[np.uint8],
-    before: NDArray[np.uint8],
-    labels: NDArray[np.uint8],
-) -> None:
-    """Give labels back to groups of points that are a person by themselves, though linked with something large.
-
-    Parameters
-    ----------
-    points : (n, 4) float32, C-contiguous
-    height : (n,) float32
-        Height above the ground [m].
-    roles : (classes,) uint8
-    before : (n,) uint8
-        Labels before the clusters voted.
-    labels : (n,) uint8, overwritten
-    """
-    labeled = np.flatnonzero(before)
-    lost = labeled[(roles[before[labeled]] == PERSON) & (labels[labeled] == 0)].astype(np.int32)
-    if len(lost) < MIN_ALONE:
-        return
-    groups = find_clusters(points[lost], min_points=MIN_ALONE)
-    is_body = (height > BODY_M) & (height <= MAX_TOP_M)
-    shape = np.empty(7)
-    for k in range(int(groups.max()) + 1):
-        own = lost[groups == k]
-        measure(points, height, own, BODY_M, shape)
-        cos, sin, u_low, u_high, v_low, v_high, top = shape.tolist()
-        if (
-            u_high - u_low > MAX_LENGTH_M
-            or not MIN_ALONE_WIDTH_M <= v_high - v_low <= MAX_RIDING_WIDTH_M
-            or not MIN_ALONE_TOP_M <= top <= MAX_TOP_M
-        ):
-            continue
-        with np.errstate(over="ignore", invalid="ignore"):  # other points may be far out
-            u, v = points[:, 0] * cos + points[:, 1] * sin, points[:, 1] * cos - points[:, 0] * sin
-        here = (u >= u_low - MARGIN_M) & (u <= u_high + MARGIN_M) & (v >= v_low - MARGIN_M) & (v <= v_high + MARGIN_M)
-        if np.count_nonzero(is_body[own]) >= MIN_ALONE_SHARE * np.count_nonzero(here & is_body):
-            labels[own] = before[own]
 
 
 def agree_on_boxes(

@@ -26,7 +26,6 @@ from edgeperc.agreement import (
     fill_support,
     find_support,
     find_voters,
-    keep_persons,
 )
 from edgeperc.card import TopViewGeometry
 from edgeperc.cli import arguments
@@ -45,6 +44,7 @@ from edgeperc.voting import (
     fill_tallies,
     fill_verdicts,
     fill_votes,
+    find_persons_alone,
 )
 
 CLASSES = ("background", "car", "pedestrian", "cyclist")
@@ -452,6 +452,23 @@ def test_person_at_a_hedge_stays(yaw: float) -> None:
     assert not agreed_scene(hedge, person, rules=RULES - {"person"})[1].any()
 
 
+def test_person_at_a_hedge_has_a_box() -> None:
+    hedge, person = block(12.0, 4.0, (14.0, 0.4, 1.6), 0, 0.1), block(10.0, 3.5, (0.5, 0.4, 1.7), 2, 0.1)
+    rows = np.concatenate([hedge, person])
+    points = np.column_stack([rows[:, :2], rows[:, 2] + GROUND_Z, np.zeros(len(rows))]).astype(np.float32)
+    labels = PointLabels(rows[:, 3].astype(np.uint8), np.ones(len(rows), np.bool_), CLASSES)
+    ground = Ground(np.zeros(len(rows), np.bool_), rows[:, 2].astype(np.float32), (0.0, 0.0, GROUND_Z))
+    complete = find_clusters(points, seeds=labels.labels > 0, min_points=1)
+    for clusters in (find_voters(points, labels, ground), complete):
+        agreed = agree_on_points(points, labels, ground, clusters)
+        assert len({*clusters[rows[:, 3] == 2]} - {*clusters[rows[:, 3] == 0]}) == 1
+        (box,) = objects_from_points(points, agreed.labels, CLASSES, height_m=ground.height_m, clusters=clusters)
+        assert (box.label, np.hypot(box.center[0] - 10.0, box.center[1] - 3.5) < 0.2) == ("pedestrian", True)
+    complete.flags.writeable = False
+    with pytest.raises(PointsError, match="read-only clusters"):
+        agree_on_points(points, labels, ground, complete)
+
+
 def test_points_far_out_do_not_matter_to_a_person_at_a_hedge() -> None:
     person = block(10.0, 3.5, (0.5, 0.4, 1.7), 2, 0.1)
     far = np.array([(np.nan, 0.0, 1.0, 0), (3e38, 3e38, 1.0, 0), (-3e38, 3e38, np.inf, 0)])
@@ -459,13 +476,11 @@ def test_points_far_out_do_not_matter_to_a_person_at_a_hedge() -> None:
     points, height = rows.astype(np.float32), rows[:, 2].astype(np.float32)
     for yaw in (0.0, 0.7, 2.4):
         points[: len(person), :2] = person[:, :2] @ [[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]]
-        labels = np.zeros(len(rows), np.uint8)
-        keep_persons(points, height, ROLES, rows[:, 3].astype(np.uint8), labels)
-        np.testing.assert_array_equal(labels, rows[:, 3])
+        before, after = rows[:, 3].astype(np.uint8), np.zeros(len(rows), np.uint8)
+        (own,) = find_persons_alone(points, height, ROLES, before, after)
+        np.testing.assert_array_equal(own, np.arange(len(person)))
         for n in (0, 1, 29):
-            labels[:] = 0
-            keep_persons(points[:n], height[:n], ROLES, rows[:n, 3].astype(np.uint8), labels[:n])
-            assert not labels.any()
+            assert find_persons_alone(points[:n], height[:n], ROLES, before[:n], after[:n]) == []
 
 
 def test_parts_of_a_hedge_are_no_persons() -> None:
