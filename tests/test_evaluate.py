@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 import edgeperc.zoo
 from edgeperc import cli
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
-from edgeperc.cli import eval
+from edgeperc.cli import eval, output
 from edgeperc.cli.output import print_line
 from edgeperc.errors import ModelError, PointsError, SplitError
 from edgeperc.evaluation import evaluate
@@ -317,8 +317,8 @@ def test_few_objects_are_marked() -> None:
         assert rows["all_round"]["all"]["vehicle"].get("few", False) is (n < FEWEST_OBJECTS)
         assert rows["heading"]["all_round"]["all"]["vehicle"].get("few", False) is (n < FEWEST_OBJECTS)
         lines = [line for line in eval._box_lines(rows) if line.startswith("  all")]  # car, before vehicle
-        assert [f"car{eval._FEW}" in line for line in lines] == [n < FEWEST_OBJECTS] * (2 if n else 0)
-    assert f"n<{FEWEST_OBJECTS}" in eval._FEW
+        assert [f"car{output.FEW}" in line for line in lines] == [n < FEWEST_OBJECTS] * (2 if n else 0)
+    assert f"n<{FEWEST_OBJECTS}" in output.FEW
 
 
 # --- causes of errors ------------------------------------------------------------------------------------------------
