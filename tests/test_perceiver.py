@@ -677,7 +677,7 @@ def test_car_cut_by_the_views_edge_gets_a_full_box_or_none(seen: float, n_boxes:
     ground = perceive._find_ground(scan)
     assert ground is not None
     points = PointLabels(labels, labels > 0, ("background", "car", "pedestrian", "cyclist"))
-    _, _, boxes = perceive._combine(scan, ground, points, None, (), _Stopwatch())
+    _, _, boxes = perceive._combine(scan, ground, points, lambda: None, (), _Stopwatch())
     assert len(boxes) == n_boxes
     for box in boxes:
         np.testing.assert_allclose(box.center[0], 6.0, atol=0.05)
