@@ -402,7 +402,7 @@ def test_the_road_model_of_a_fold_is_not_trained_on_it(kitti: Path, tmp_path: Pa
     from edgeperc_export.recipe import Recipe
 
     torch.set_num_threads(1)
-    recipe = Recipe("ssadnet", edge=True, steps=1, batch=1, augment=False, n_pasted=0.0, weather=0.0)
+    recipe = Recipe("ssadnet", edge=True, width=0.25, steps=1, batch=1, augment=False, n_pasted=0.0, weather=0.0)
     path = tmp_path / "road.json"
     path.write_text(write_coco({"000000": [TRAPEZIUM], "000003": [TRAPEZIUM], "000007": [TRAPEZIUM]}))
     plan = plan_of(kitti, tmp_path / "out", "train", variations=0)
