@@ -256,7 +256,8 @@ first_start.main(sys.argv[1])
 '''
 with first_start.Helpers(["road"]) as running:
     print(running._running[0].pid, flush=True)
-    time.sleep(600)
+    while True:
+        time.sleep(0.1)  # a signal that arrives just before a sleep does not end it
 """
 
 
