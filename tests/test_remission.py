@@ -164,6 +164,31 @@ def test_the_training_sensor_is_converted_only_if_far_off(streets: list[np.ndarr
     assert "after scaling of the profile hdl-64e is unlike" in findings[0]
 
 
+def test_usual_remission_of_the_training_sensor_is_not_looked_at_further(
+    streets: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    far_off = [with_remission(scan, 0.1 * scan[:, 3]) for scan in streets]
+    matched, used = after([far_off[0], *streets], HDL)  # an unusual scan first: all are looked at
+    assert matched.n_scans == FROZEN_AFTER
+    assert matched.matched is None
+
+    looked_at = []
+
+    def counted(scan: np.ndarray, n_points: int) -> tuple[np.ndarray, np.ndarray]:
+        looked_at.append(scan)
+        return stratify(scan, n_points)
+
+    monkeypatch.setattr(remission, "stratify", counted)
+    for scans in (streets, [streets[0], *far_off]):  # one usual scan is enough: a sensor does not change
+        matcher, used = after(scans, HDL)
+        assert used is HDL
+        assert matcher.is_complete
+    assert not looked_at
+    for scan, sensor in ((far_off[0], HDL), (streets[0], replace(HDL, name="mine")), (streets[0][:900], HDL)):
+        after([scan], sensor)
+    assert len(looked_at) == 3
+
+
 def test_what_is_out_of_range_is_left_to_the_check(streets: list[np.ndarray]) -> None:
     """A wrong remission_range is reported as before; matching would hide it."""
     raw = as_bytes(streets[0])
