@@ -592,7 +592,7 @@ class Perceiver:
                 watch.lap("infer")
         cells: Callable[[], TopView | None] = partial(self._label_cells, top, kept, boxes)
         if found is not None:
-            cells = self._beside(cells)  # needed last: 18.5 in place of 19.3 ms
+            cells = self._beside(cells)  # needed last: 12.8 in place of 13.4 ms
         if ground is not None and infer:
             points, top_view, boxes = self._combine(kept, ground, points, cells, boxes, watch)
         else:

@@ -40,7 +40,7 @@ _FEWEST = 300  # points; fewer may have one remission by chance
 # remission of the training sensor itself is converted only if it is far off.
 _LIMIT, _LIMIT_OF_TRAINING_SENSOR = 0.08, 0.16
 _HYSTERESIS = 0.75  # of the limit, below which a matched function is dropped again
-# The same difference without strata, below which the training sensor's own remission is not looked at further: 0.3 in
+# The same difference without strata, below which the training sensor's own remission is not looked at further: 0.4 in
 # place of 7 ms a scan. It is at most 0.082 on single KITTI scans (121), and 0.015 in the median. Where it was below the
 # limit, the difference with strata was at most 0.078, also with changed remissions (eleven ways, 21 scans).
 _USUAL = 0.1
