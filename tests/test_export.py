@@ -652,7 +652,6 @@ def test_each_variant_of_an_ablation_changes_its_setting(tmp_path: Path, kitti: 
 
 
 @pytest.mark.usefixtures("small_views")
-@pytest.mark.usefixtures("small_views")
 def test_make_also_makes_the_models_that_it_starts_from(
     tmp_path: Path, kitti: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
