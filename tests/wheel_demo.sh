@@ -26,7 +26,7 @@ END
 
 "$python" -m venv "$away/venv"
 wheel=$(echo "$away"/dist/*.whl)
-"$away/venv/bin/pip" install --quiet --no-compile "${wheel}[cpu,view]"
+"$away/venv/bin/pip" install --quiet "${wheel}[cpu,view]"
 "$away/venv/bin/pip" check
 cd "$away"
 "$away/venv/bin/python" -c "import edgeperc; assert edgeperc.__file__.startswith('$away'), edgeperc.__file__"
