@@ -554,8 +554,7 @@ class Perceiver:
         if not self._frame.is_identity:
             scan = self._frame.move(scan)
             watch.lap("adapt")
-        trained_on = [n.fitness for n in self._networks if n.fitness is not None]
-        fitness = check_profiles(scan, trained_on, profile) if check else ()
+        fitness = check_profiles(scan, [n.fitness for n in self._networks if n.fitness], profile) if check else ()
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *hidden)
         if self.on_mismatch != "ignore":

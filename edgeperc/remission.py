@@ -12,12 +12,12 @@ from .errors import SensorError
 from .fitness import Finding
 from .sensor import RemissionFunction, SensorProfile
 from .sensor_fit import (
-    N_SHARES,
     RANGE_EDGES_M,
     REFERENCES,
     fit_functions,
     increasing,
     match_quantiles,
+    quantiles,
     quantiles_by_stratum,
     stratify,
 )
@@ -174,8 +174,7 @@ class RemissionMatcher:
             return False
         low, high = self.sensor.remission_range
         _, usual = match_quantiles(REFERENCES[self._to], REFERENCES[self._to])
-        found = np.quantile((raw - low) / (high - low), (np.arange(N_SHARES) + 0.5) / N_SHARES)
-        return float(np.abs(found - usual).mean()) <= _USUAL
+        return float(np.abs(quantiles((raw - low) / (high - low)) - usual).mean()) <= _USUAL
 
     def _match(self) -> RemissionFunction | None:
         """A function for the scans so far; None if the profile's gives the training sensor's distribution."""

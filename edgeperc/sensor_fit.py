@@ -22,6 +22,7 @@ __all__ = [
     "incidences",
     "increasing",
     "match_quantiles",
+    "quantiles",
     "quantiles_by_stratum",
     "remission_strata",
     "stratify",
@@ -276,14 +277,19 @@ def quantiles_by_stratum(
     """Compute what `remission_strata` does, from what `stratify` returned for each scan."""
     stratum = np.concatenate([np.empty(0, np.int64), *(strata for strata, _ in samples)])
     remission = np.concatenate([np.empty(0), *(remissions for _, remissions in samples)])
-    shares = (np.arange(N_SHARES) + 0.5) / N_SHARES
     found: list[tuple[float, tuple[float, ...]]] = []
     for k in range(N_STRATA):
-        own = np.sort(remission[stratum == k])  # with this, a third of the time of np.quantile
+        own = remission[stratum == k]
         enough = len(own) >= MIN_POINTS
-        quantiles = np.interp(shares * (len(own) - 1), np.arange(len(own)), own).tolist() if enough else ()
-        found.append((len(own) / len(remission) if enough else 0.0, tuple(quantiles)))
+        found.append((len(own) / len(remission), tuple(quantiles(own).tolist())) if enough else (0.0, ()))
     return found
+
+
+def quantiles(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`N_SHARES` quantiles of values, at least one, at the middles of equal shares, (N_SHARES,)."""
+    ordered = np.sort(values)  # with this, a third of the time of np.quantile
+    shares = (np.arange(N_SHARES) + 0.5) / N_SHARES
+    return np.interp(shares * (len(ordered) - 1), np.arange(len(ordered)), ordered)
 
 
 def match_quantiles(
