@@ -31,7 +31,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .agreement import agree_on_boxes, agree_on_cells, agree_on_points, clear_columns, find_support, find_voters
+from .agreement import agree_on_boxes, agree_on_points, clear_columns, find_support, find_voters
+from .cells import agree_on_cells
 from .cluster import fill_rectangle, join_boxes, objects_from_points
 from .drivable import compile_kernels
 from .geometry import suppress_overlaps

@@ -81,8 +81,12 @@ def fill_tallies(
     in_view: NDArray[np.bool_],
     labels: NDArray[np.uint8],
     clusters: NDArray[np.int32],
+    cells: NDArray[np.uint8],
+    is_vehicle: NDArray[np.bool_],
+    grid: NDArray[np.float64],
     counts: NDArray[np.int32],
     bounds: NDArray[np.float32],
+    above: NDArray[np.int32],
 ) -> None:
     """Count the labels of every cluster, and measure it.
 
@@ -93,12 +97,22 @@ def fill_tallies(
     in_view : (n,) bool
     labels : (n,) uint8
     clusters : (n,) int32
+    cells : (rows, columns) uint8, C-contiguous
+        Labels of the top view; no cells without one.
+    is_vehicle : (256,) bool
+        Which labels of cells are vehicles.
+    grid : (3,) float64
+        x of the far edge of the top view, y of its left edge, edge of a cell [m].
     counts : (k, classes + 1) int32, overwritten
         Points in view of each class; last, of all classes.
     bounds : (k, 5) float32, overwritten
         Lowest x and y, highest x and y, highest height [m] of all points.
+    above : (k, 2) int32, overwritten
+        Points in view that are in the top view too, and those of them in cells of vehicles.
     """
+    n_rows, n_cols = cells.shape
     counts[:] = 0
+    above[:] = 0
     last = counts.shape[1] - 1
     for k in range(bounds.shape[0]):
         bounds[k, 0], bounds[k, 1] = np.float32(math.inf), np.float32(math.inf)
@@ -111,6 +125,11 @@ def fill_tallies(
         if in_view[i]:
             counts[k, labels[i]] += 1
             counts[k, last] += 1
+            row = (grid[0] - np.float64(points[i, 0])) / grid[2]
+            col = (grid[1] - np.float64(points[i, 1])) / grid[2]
+            if (row >= 0.0) & (row < n_rows) & (col >= 0.0) & (col < n_cols):
+                above[k, 0] += 1
+                above[k, 1] += 1 if is_vehicle[cells[int(row), int(col)]] else 0
         bounds[k, 0], bounds[k, 1] = min(bounds[k, 0], points[i, 0]), min(bounds[k, 1], points[i, 1])
         bounds[k, 2], bounds[k, 3] = max(bounds[k, 2], points[i, 0]), max(bounds[k, 3], points[i, 1])
         bounds[k, 4] = max(bounds[k, 4], height[i])
@@ -120,6 +139,7 @@ def fill_tallies(
 def fill_verdicts(
     counts: NDArray[np.int32],
     bounds: NDArray[np.float32],
+    refused: NDArray[np.bool_],
     roles: NDArray[np.uint8],
     parts: NDArray[np.int64],
     by_share: bool,
@@ -134,6 +154,8 @@ def fill_verdicts(
     counts : (k, classes + 1) int32
     bounds : (k, 5) float32
         From `fill_tallies`.
+    refused : (k,) bool
+        Clusters that are no vehicles for another reason.
     roles : (classes,) uint8
         1 for vehicles, 2 for persons, 0 for others.
     parts : (p, 2) int64
@@ -158,7 +180,8 @@ def fill_verdicts(
         )
         top = bounds[k, 4]
         is_large = length > MAX_LENGTH_M or top > MAX_TOP_M
-        no_vehicle = by_share and vehicle_share < (MIN_LARGE_SHARE if is_large else MIN_VEHICLE_SHARE)
+        no_vehicle = refused[k]
+        no_vehicle |= by_share and vehicle_share < (MIN_LARGE_SHARE if is_large else MIN_VEHICLE_SHARE)
         no_person = by_share and person_share < MIN_PERSON_SHARE
         if by_height:
             ahead = max(np.float64(bounds[k, 0]), -np.float64(bounds[k, 2]), 0.0)

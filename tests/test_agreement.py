@@ -17,17 +17,16 @@ from edgeperc.agreement import (
     RULES,
     _as_rows,
     agree_on_boxes,
-    agree_on_cells,
     agree_on_points,
     clear_columns,
     clear_ground,
-    clear_road,
     count_inside,
     fill_support,
     find_support,
     find_voters,
 )
 from edgeperc.card import TopViewGeometry
+from edgeperc.cells import agree_on_cells, clear_cells
 from edgeperc.cli import arguments
 from edgeperc.cluster import find_clusters, objects_from_points
 from edgeperc.geometry import inside
@@ -132,15 +131,16 @@ def test_dense_columns_match_the_twin(seed: int) -> None:
 
 
 @patient
-@given(scenes)
-def test_tallies_match_the_twin(given: list) -> None:
+@given(scenes, st.sampled_from([(0, 0), (40, 40)]))
+def test_tallies_match_the_twin(given: list, shape: tuple[int, int]) -> None:
     scene = Scene(given)
-    counts, bounds = np.empty((6, 5), np.int32), np.empty((6, 5), np.float32)
-    args = scene.points, scene.height, scene.in_view, scene.labels, scene.clusters
-    fill_tallies(*map_read_only(args), counts, bounds)
-    right_counts, right_bounds = twins.agreement.tallies(*args, 6, 4)
-    np.testing.assert_array_equal(counts, right_counts)
-    np.testing.assert_array_equal(bounds, right_bounds)
+    found = np.empty((6, 5), np.int32), np.empty((6, 5), np.float32), np.empty((6, 2), np.int32)
+    cells = np.random.default_rng(len(given)).integers(0, 5, shape).astype(np.uint8)
+    args = scene.points, scene.height, scene.in_view, scene.labels, scene.clusters, cells, np.arange(256) % 5 > 1
+    grid = np.array([16.0, 8.0, 0.4])
+    fill_tallies(*map_read_only(args), grid, *found)
+    for own, right in zip(found, twins.agreement.tallies(*args, grid, 6, 4), strict=True):
+        np.testing.assert_array_equal(own, right)
 
 
 def map_read_only(arrays: tuple[NDArray, ...]) -> list[NDArray]:
@@ -195,9 +195,9 @@ def test_what_becomes_of_clusters_matches_the_twin(
     sides = rng.choice([0.5, 2.9, 3.1, 9.0, 11.0, np.inf], (n, 2))
     bounds = np.column_stack([-sides / 2, sides / 2, rng.choice([-np.inf, 0.4, 0.9, 1.5, 2.2, 4.5], n)])
     bounds = bounds.astype(np.float32)
-    parts, found = np.array([[2, 3]]), np.empty((n, 4), np.uint8)
-    fill_verdicts(counts, bounds, ROLES, parts, *rules, found)
-    np.testing.assert_array_equal(found, twins.agreement.verdict_table(counts, bounds, ROLES, parts, *rules))
+    parts, refused, found = np.array([[2, 3]]), rng.random(n) < 0.2, np.empty((n, 4), np.uint8)
+    fill_verdicts(counts, bounds, refused, ROLES, parts, *rules, found)
+    np.testing.assert_array_equal(found, twins.agreement.verdict_table(counts, bounds, refused, ROLES, parts, *rules))
 
 
 def crowded(seed: int) -> tuple[NDArray[np.float32], PointLabels, Ground, list[Box]]:
@@ -269,13 +269,16 @@ def test_cleared_ground_matches_the_twin(given: list) -> None:
 
 
 @patient
-@given(scenes, st.booleans())
-def test_cleared_road_matches_the_twin(given: list, by_height: bool) -> None:
+@given(scenes, st.booleans(), st.booleans(), st.booleans())
+def test_cleared_cells_match_the_twin(given: list, by_height: bool, of_road: bool, of_vehicles: bool) -> None:
     scene, cells = Scene(given), top_view().labels
     found, grid = cells.copy(), np.array([VIEW.x_range_m[1], VIEW.y_range_m[1], VIEW.cell_m])
-    arrays = map_read_only((scene.points, scene.height, scene.labels))
-    clear_road(*arrays, ROLES, by_height, grid, 1, np.zeros(cells.shape, np.uint8), found)
-    np.testing.assert_array_equal(found, twins.agreement.road(*arrays, ROLES, by_height, grid, 1, cells))
+    is_vehicle = (np.arange(256) > 1) & of_vehicles
+    in_box = np.random.default_rng(len(given)).random(cells.shape) < 0.3
+    arrays = map_read_only((scene.points, scene.height, scene.in_view, scene.labels))
+    args = *arrays, ROLES, by_height, grid, 1 if of_road else 255, is_vehicle, in_box
+    clear_cells(*args, np.zeros(cells.shape, np.uint8), found)
+    np.testing.assert_array_equal(found, twins.agreement.cells(*args, cells))
 
 
 # --- what always holds
@@ -384,7 +387,10 @@ def block(
 
 
 def agreed_scene(
-    *parts: NDArray[np.float64], boxes: tuple[Box, ...] = (), rules: frozenset[str] = RULES
+    *parts: NDArray[np.float64],
+    boxes: tuple[Box, ...] = (),
+    view: TopView | None = None,
+    rules: frozenset[str] = RULES,
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Rows x, y, height, label of parts on a floor, and their labels after the agreement."""
     x, y = (v.ravel() for v in np.meshgrid(np.arange(0.0, 30.0, 0.35), np.arange(-15.0, 15.0, 0.35)))
@@ -393,7 +399,7 @@ def agreed_scene(
     labels = PointLabels(rows[:, 3].astype(np.uint8), np.ones(len(rows), np.bool_), CLASSES)
     ground = find_ground(points)
     clusters = find_voters(points, labels, ground, boxes, rules=rules)
-    return rows, agree_on_points(points, labels, ground, clusters, boxes, rules=rules).labels
+    return rows, agree_on_points(points, labels, ground, clusters, boxes, view=view, rules=rules).labels
 
 
 CAR = (4.0, 1.7, 1.5)
@@ -429,6 +435,26 @@ def test_car_beside_a_hedge_is_kept_where_a_box_is() -> None:
     is_car = rows[:, 3] == 1
     assert (labels[is_car] == 1).all()
     assert not (labels[~is_car & (np.abs(rows[:, 1] - 4.3) < 0.21)]).any()
+
+
+def without_vehicles(nearest_m: float) -> TopView:
+    """A top view from this x on, all of it drivable."""
+    geometry = TopViewGeometry((nearest_m, 40.0), (-10.0, 10.0), cell_m=0.2)
+    return replace(top_view(view=geometry), labels=np.ones((geometry.height, geometry.width), np.uint8))
+
+
+def test_block_without_a_cell_of_a_vehicle_is_no_car() -> None:
+    """Where the top view has such a cell, a box, or not enough of the block to tell, the block stays a car."""
+    car, box = block(12.0, 3.0, CAR, 1), Box("car", 0.4, (12.0, 3.0, -1.0), CAR, 0.0)
+    empty = without_vehicles(6.0)
+    assert not agreed_scene(car, view=empty)[1].any()
+    touched = replace(empty, labels=empty.labels.copy())
+    touched.labels[139, 30:40] = 2  # x from 12.0 to 12.2
+    road_only = replace(empty, classes=("background", "drivable"))
+    for view in (None, touched, without_vehicles(11.0), road_only):
+        assert (agreed_scene(car, view=view)[1] == 1).sum() >= len(car)
+    assert (agreed_scene(car, view=empty, boxes=(box,))[1] == 1).sum() >= len(car)
+    assert (agreed_scene(car, view=empty, rules=RULES - {"cells"})[1] == 1).sum() >= len(car)
 
 
 def test_pole_is_no_person_and_a_person_under_foliage_is_one() -> None:

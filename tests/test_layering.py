@@ -30,6 +30,7 @@ FLOORS = {
         adapt cluster decode drivable fitness ground image motion observed projection refine sensor_fit session
         crop voting
         agreement level network_input occupancy painting remission
+        cells
         first_start
         readers.__init__ readers.times
         readers.tables

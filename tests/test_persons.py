@@ -269,7 +269,8 @@ def test_completed_persons_agree_with_the_twin(seed, n_people):
     in_view = np.random.default_rng(seed).random(len(points)) < 0.9
     n = clusters.max(initial=-1) + 1
     counts, bounds = np.empty((n, 5), np.int32), np.empty((n, 5), np.float32)
-    fill_tallies(points, height, in_view, labels, clusters, counts, bounds)
+    no_view = np.empty((0, 0), np.uint8), np.zeros(256, np.bool_), np.ones(3)
+    fill_tallies(points, height, in_view, labels, clusters, *no_view, counts, bounds, np.empty((n, 2), np.int32))
     expected = twins.persons.completed(points, height, in_view, clusters, 2, 3, labels)
     persons.complete_persons(points, height, in_view, clusters, counts, bounds, 2, 3, labels)
     np.testing.assert_array_equal(labels, expected)

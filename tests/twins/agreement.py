@@ -31,10 +31,15 @@ def columns(points, height, limits, labels):
     return cleared
 
 
-def tallies(points, height, in_view, labels, clusters, n, n_classes):
+def tallies(points, height, in_view, labels, clusters, cells, is_vehicle, grid, n, n_classes):
     """Twin of `edgeperc.voting.fill_tallies`."""
     counts = np.zeros((n, n_classes + 1), np.int32)
     bounds = np.empty((n, 5), np.float32)
+    above = np.zeros((n, 2), np.int32)
+    row, col = ((grid[k] - points[:, k].astype(np.float64)) / grid[2] for k in range(2))
+    is_held = (row >= 0) & (row < cells.shape[0]) & (col >= 0) & (col < cells.shape[1])
+    marked = np.zeros(len(points), np.bool_)
+    marked[is_held] = is_vehicle[cells[row[is_held].astype(int), col[is_held].astype(int)]]
     for k in range(n):
         own = clusters == k
         counts[k, :-1] = np.bincount(labels[own & in_view], minlength=n_classes)
@@ -43,7 +48,8 @@ def tallies(points, height, in_view, labels, clusters, n, n_classes):
         bounds[k, :2] = xy.min(axis=0, initial=np.inf)
         bounds[k, 2:4] = xy.max(axis=0, initial=-np.inf)
         bounds[k, 4] = height[own].max(initial=-np.inf)
-    return counts, bounds
+        above[k] = np.count_nonzero(own & in_view & is_held), np.count_nonzero(own & in_view & marked)
+    return counts, bounds, above
 
 
 def inside(points, height, on_ground, box):
@@ -101,7 +107,7 @@ def votes(in_view, labels, roles, scores):
     return np.where(in_view, 1 + 2 * ((role == 1) | (scores >= 0.5)) + 4 * (role == 2), 0)
 
 
-def verdict_table(counts, bounds, roles, parts, by_share, by_height, is_filled):
+def verdict_table(counts, bounds, refused, roles, parts, by_share, by_height, is_filled):
     """Twin of `edgeperc.voting.fill_verdicts`: all clusters at once."""
     vehicles, persons = np.flatnonzero(roles == 1), np.flatnonzero(roles == 2)
     seen = np.maximum(counts[:, -1], 1)
@@ -112,7 +118,7 @@ def verdict_table(counts, bounds, roles, parts, by_share, by_height, is_filled):
     is_near = np.hypot(*np.maximum(np.maximum(low, -high), 0.0).T) < 30.0  # nearest place of the bounds
     is_own = (np.hypot(*np.maximum(np.abs(low), np.abs(high)).T) < 2.6) & (person_share < 0.1)
     is_low = top < np.where(is_near, 1.0, 0.5)
-    no_vehicle = by_share & (vehicle_share < np.where(large, 0.75, 0.6)) | by_height & (is_low | is_own)
+    no_vehicle = refused | by_share & (vehicle_share < np.where(large, 0.75, 0.6)) | by_height & (is_low | is_own)
     no_person = by_share & (person_share < 0.1) | by_height & (top < 1.0)
     table = np.tile(np.arange(len(roles), dtype=np.uint8), (len(counts), 1))
     table[np.ix_(no_vehicle, vehicles)] = 0
@@ -143,10 +149,10 @@ def ground(points, height, on_ground, roles, labels):
     return cleared
 
 
-def road(points, height, labels, roles, by_height, grid, drivable, cells):
-    """Twin of `edgeperc.agreement.clear_road`."""
+def cells(points, height, in_view, labels, roles, by_height, grid, drivable, is_vehicle, in_box, cells):
+    """Twin of `edgeperc.cells.clear_cells`."""
     far, left, cell_m = grid
-    returns = np.zeros(cells.shape, int)
+    returns, vehicles, others = np.zeros(cells.shape, int), np.zeros(cells.shape, bool), np.zeros(cells.shape, bool)
     with np.errstate(invalid="ignore", over="ignore"):
         row = (far - points[:, 0].astype(np.float64)) / cell_m
         col = (left - points[:, 1].astype(np.float64)) / cell_m
@@ -157,8 +163,13 @@ def road(points, height, labels, roles, by_height, grid, drivable, cells):
         returns[int(row[i]), int(col[i])] += 1
     for i in np.flatnonzero(is_object):
         returns[int(row[i]), int(col[i])] = 2
+    for i in np.flatnonzero(known & in_view):
+        (vehicles if roles[labels[i]] == 1 else others)[int(row[i]), int(col[i])] = True
     cleared = cells.copy()
-    for r, c in np.argwhere((returns > 0) & (cells == drivable)):
-        if np.minimum(returns[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2], 2).sum() >= 2:
+    for r, c in np.ndindex(*cells.shape):
+        around = slice(max(r - 1, 0), r + 2), slice(max(c - 1, 0), c + 2)
+        blocked = returns[r, c] > 0 and np.minimum(returns[around], 2).sum() >= 2
+        contradicted = others[r, c] and not vehicles[around].any() and not in_box[r, c]
+        if (cells[r, c] == drivable and blocked) or (is_vehicle[cells[r, c]] and contradicted):
             cleared[r, c] = 0
     return cleared

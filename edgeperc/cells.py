@@ -1,0 +1,181 @@
+"""Make the cells of a top view agree with boxes and points: the last part of `edgeperc.agreement`."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .agreement import RULES, cells_of, check_scan, roles_of
+from .geometry import draw_footprints
+from .ground import Ground
+from .kernel_cache import njit
+from .perception import Box, PointLabels, TopView
+from .points import read_only
+from .voting import VEHICLE
+
+__all__ = ["agree_on_cells"]
+
+OBSTACLE_M = (0.3, 2.0)  # heights of returns that block a cell
+_NO_BOX = _NO_CLASS = 255
+
+
+def agree_on_cells(
+    view: TopView,
+    points: NDArray[np.float32],
+    labels: PointLabels | None,
+    ground: Ground,
+    boxes: Sequence[Box],
+    dropped: Sequence[Box] = (),
+    *,
+    rules: Collection[str] = RULES,
+) -> TopView:
+    """Correct the cells of a top view by boxes, points and obstacles.
+
+    Parameters
+    ----------
+    view : TopView
+    points, labels, ground, rules
+        As in `agree_on_points`; ``labels`` may be None.
+    boxes : sequence of Box
+        In the frame of the models.
+    dropped : sequence of Box
+        Boxes of the top-view model that `agree_on_boxes` dropped; their vehicle cells become background.
+
+    Returns
+    -------
+    TopView
+        Drivable cells whose center lies in a box get the class of the box, or background if the top view has no such
+        class. Drivable cells with a vehicle's or person's point become background, and those with a return 0.3 to 2 m
+        above the ground and another one in the 3 x 3 cells around it. So do vehicle cells out of the boxes with a point
+        in the range image's view, if none in the 3 x 3 cells has a vehicle's label.
+
+    Raises
+    ------
+    PointsError
+        Arrays disagree in shape, or a label is not in the classes.
+    """
+    of_road, of_vehicles = "road" in rules, "cells" in rules and labels is not None
+    if not (of_road or of_vehicles):
+        return view
+    check_scan(points, labels, ground)
+    drivable = view.classes.index("drivable") if of_road and "drivable" in view.classes else _NO_CLASS
+    _, is_vehicle, grid = cells_of(view)
+    cells = view.labels.copy()
+    if labels is None:
+        in_view, object_of, roles = (
+            np.zeros(len(points), np.bool_),
+            np.zeros(len(points), np.uint8),
+            np.zeros(1, np.uint8),
+        )
+    else:
+        in_view, object_of, roles = labels.in_view, labels.labels, roles_of(labels.classes)
+    covered = _footprints(view, boxes)
+    clear_cells(
+        read_only(points),
+        read_only(ground.height_m),
+        read_only(in_view, np.bool_),
+        read_only(object_of, np.uint8),
+        roles,
+        ground.plane is not None,
+        grid,
+        drivable,
+        is_vehicle & of_vehicles,
+        covered != _NO_BOX,
+        np.zeros(cells.shape, np.uint8),
+        cells,
+    )
+    covered, flat = covered.reshape(-1), cells.reshape(-1)
+    below = np.flatnonzero(covered != _NO_BOX)
+    below = below[flat[below] == drivable]
+    flat[below] = np.where(covered[below] < len(view.classes), covered[below], 0)
+    if dropped and of_road:
+        freed = np.flatnonzero((_footprints(view, dropped).reshape(-1) != _NO_BOX) & (covered == _NO_BOX))
+        flat[freed[is_vehicle[flat[freed]]]] = 0
+    return replace(view, labels=cells)
+
+
+def _footprints(view: TopView, boxes: Sequence[Box]) -> NDArray[np.uint8]:
+    """Class of the box over each cell; beyond those of the view if it has no such class; `_NO_BOX` without a box."""
+    names = (*view.classes, *sorted({box.label for box in boxes} - {*view.classes}))
+    drawn = np.full(view.labels.shape, _NO_BOX, np.uint8)
+    draw_footprints(drawn, boxes, view.geometry, names)
+    return drawn
+
+
+@njit(cache=True, nogil=True)
+def clear_cells(
+    points: NDArray[np.float32],
+    height: NDArray[np.float32],
+    in_view: NDArray[np.bool_],
+    labels: NDArray[np.uint8],
+    roles: NDArray[np.uint8],
+    by_height: bool,
+    grid: NDArray[np.float64],
+    drivable: int,
+    is_vehicle: NDArray[np.bool_],
+    in_box: NDArray[np.bool_],
+    seen: NDArray[np.uint8],
+    cells: NDArray[np.uint8],
+) -> None:
+    """Make background of drivable cells with objects or obstacles, and of vehicle cells that the points contradict.
+
+    Parameters
+    ----------
+    points : (n, 3 or more) float32, C-contiguous
+    height : (n,) float32
+    in_view : (n,) bool
+    labels : (n,) uint8
+    roles : (classes,) uint8
+        1 for vehicles, 2 for persons, 0 for classes that are no objects.
+    by_height : bool
+        Whether returns above the ground are obstacles, whatever their label.
+    grid : (3,) float64
+        x of the far edge, y of the left edge, edge of a cell [m].
+    drivable : int
+    is_vehicle : (256,) bool
+        Labels of cells that the points may contradict.
+    in_box : (rows, columns) bool
+        Cells of vehicles that stay.
+    seen : (rows, columns) uint8, modified
+        Scratch, zeros. Two bits for the number of obstacles, up to two; 4 with a vehicle's point, 8 with another one in
+        view.
+    cells : (rows, columns) uint8, modified
+    """
+    n_rows, n_cols = cells.shape
+    lowest, highest = OBSTACLE_M
+    least_x, least_y = grid[0] - (n_rows + 1) * grid[2], grid[1] - (n_cols + 1) * grid[2]
+    most_x, most_y = grid[0] + grid[2], grid[1] + grid[2]
+    for i in range(points.shape[0]):
+        x, y = points[i, 0], points[i, 1]
+        if not ((x >= least_x) & (x <= most_x) & (y >= least_y) & (y <= most_y)):  # saves divisions for most points
+            continue
+        row = (grid[0] - np.float64(points[i, 0])) / grid[2]
+        col = (grid[1] - np.float64(points[i, 1])) / grid[2]
+        if not ((row >= 0.0) & (row < n_rows) & (col >= 0.0) & (col < n_cols)):
+            continue
+        r, c = int(row), int(col)
+        role = roles[labels[i]]
+        n = seen[r, c] & 3
+        if role != 0:
+            n = 2
+        elif by_height and (height[i] >= lowest) & (height[i] <= highest):
+            n = min(n + 1, 2)
+        says = 0 if not in_view[i] else 4 if role == VEHICLE else 8
+        seen[r, c] = (seen[r, c] & 12) | n | says
+    for row in range(n_rows):
+        for col in range(n_cols):
+            own = seen[row, col]
+            is_road = cells[row, col] == drivable and own & 3 != 0
+            is_doubted = is_vehicle[cells[row, col]] and own & 12 == 8 and not in_box[row, col]
+            if not (is_road or is_doubted):
+                continue
+            n, votes = 0, 0
+            for r in range(max(row - 1, 0), min(row + 2, n_rows)):
+                for c in range(max(col - 1, 0), min(col + 2, n_cols)):
+                    n += seen[r, c] & 3
+                    votes |= seen[r, c] & 4
+            if (is_road and n >= 2) or (is_doubted and votes == 0):
+                cells[row, col] = 0
