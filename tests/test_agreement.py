@@ -324,7 +324,13 @@ def test_no_cell_below_an_object_is_drivable(given: list, boxes: list[Box]) -> N
     row, col, known = VIEW.cells(*scene.points[:, :2].T.astype(np.float64))
     assert not agreed.road[row[known & (scene.labels > 0)], col[known & (scene.labels > 0)]].any()
     assert not (agreed.road & ~view.road).any()
-    np.testing.assert_array_equal(agreed.labels[~view.road], view.labels[~view.road])
+    other = ~view.road & (agreed.labels != view.labels)  # vehicle cells in which the scan shows something else
+    assert not agreed.labels[other].any()
+    assert (view.labels[other] > 1).all()
+    hit = {*zip(row[known & scene.in_view], col[known & scene.in_view], strict=True)}
+    assert {*zip(*np.nonzero(other), strict=True)} <= hit
+    by_road_only = agree_on_cells(view, scene.points, scene.found, scene.ground, boxes, rules=RULES - {"cells"})
+    np.testing.assert_array_equal(by_road_only.labels[~view.road], view.labels[~view.road])
     np.testing.assert_array_equal(agreed.observed, view.observed)
 
 
