@@ -315,9 +315,9 @@ def cells_of(view: TopView | None) -> tuple[NDArray[np.uint8], NDArray[np.bool_]
     """
     classes = () if view is None else view.classes
     is_vehicle = np.array([name in VEHICLES for name in classes] + [False] * (256 - len(classes)), np.bool_)
-    if view is None:
-        return np.empty((0, 0), np.uint8), is_vehicle, np.ones(3)
-    return read_only(view.labels, np.uint8), is_vehicle, np.array([view.x_range_m[1], view.y_range_m[1], view.cell_m])
+    labels = np.empty((0, 0), np.uint8) if view is None else view.labels
+    grid = (1.0, 1.0, 1.0) if view is None else (view.x_range_m[1], view.y_range_m[1], view.cell_m)
+    return read_only(labels, np.uint8), is_vehicle, np.array(grid)
 
 
 def _as_rows(boxes: Sequence[Box]) -> NDArray[np.float64]:
