@@ -140,8 +140,8 @@ def clear_cells(
     in_box : (rows, columns) bool
         Cells of vehicles that stay.
     seen : (rows, columns) uint8, modified
-        Scratch, zeros. Two bits for the number of obstacles, up to two; 4 with a vehicle's point, 8 with another one in
-        view.
+        Scratch, zeros. Bits: 1 with an obstacle, 2 with a second one or an object, 4 with a vehicle's point, 8 with
+        another point in view in a vehicle's cell.
     cells : (rows, columns) uint8, modified
     """
     n_rows, n_cols = cells.shape
@@ -158,16 +158,17 @@ def clear_cells(
             continue
         r, c = int(row), int(col)
         role = roles[labels[i]]
-        n = seen[r, c] & 3
         if role != 0:
-            n = 2
+            seen[r, c] |= 6 if role == VEHICLE else 2
         elif by_height and (height[i] >= lowest) & (height[i] <= highest):
-            n = min(n + 1, 2)
-        says = 0 if not in_view[i] else 4 if role == VEHICLE else 8
-        seen[r, c] = (seen[r, c] & 12) | n | says
+            seen[r, c] |= 2 if seen[r, c] & 1 else 1
+        if role != VEHICLE and is_vehicle[cells[r, c]] and in_view[i]:
+            seen[r, c] |= 8
     for row in range(n_rows):
         for col in range(n_cols):
             own = seen[row, col]
+            if own == 0:
+                continue
             is_road = cells[row, col] == drivable and own & 3 != 0
             is_doubted = is_vehicle[cells[row, col]] and own & 12 == 8 and not in_box[row, col]
             if not (is_road or is_doubted):
@@ -175,7 +176,7 @@ def clear_cells(
             n, votes = 0, 0
             for r in range(max(row - 1, 0), min(row + 2, n_rows)):
                 for c in range(max(col - 1, 0), min(col + 2, n_cols)):
-                    n += seen[r, c] & 3
+                    n += min(seen[r, c] & 3, 2)
                     votes |= seen[r, c] & 4
             if (is_road and n >= 2) or (is_doubted and votes == 0):
                 cells[row, col] = 0
