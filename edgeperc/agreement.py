@@ -44,11 +44,12 @@ RULES = frozenset({"column", "share", "height", "cells", "fill", "person", "supp
 
 ``"column"``: a person whose column of points goes on above a person's height is a pole. ``"share"``: a cluster loses a
 class that too few of its points have. ``"height"``: a cluster that is too low, or a part of the own vehicle, loses its
-class. ``"cells"``: a cluster in the top view that no vehicle's cell touches is no vehicle. ``"fill"``: a cluster gets
-the class that most of its points have. ``"person"``: a cluster of a person's size and shape is one person, a cyclist if
-longer than a stride; labeled points of that size stay in any cluster. ``"support"``: boxes of the top view keep and add
-labels. ``"ground"``: a point on the ground is labeled only below an object. ``"boxes"``: uncertain boxes without
-labeled points are dropped. ``"road"``: cells below boxes, labeled points and obstacles are not drivable.
+class. ``"cells"``: a cluster in the top view that no vehicle's cell touches is no vehicle, and a vehicle's cell whose
+points say otherwise becomes background. ``"fill"``: a cluster gets the class that most of its points have.
+``"person"``: a cluster of a person's size and shape is one person, a cyclist if longer than a stride; labeled points of
+that size stay in any cluster. ``"support"``: boxes of the top view keep and add labels. ``"ground"``: a point on the
+ground is labeled only below an object. ``"boxes"``: uncertain boxes without labeled points are dropped. ``"road"``:
+cells below boxes, labeled points and obstacles are not drivable.
 """
 _NEED_GROUND = frozenset({"column", "height", "person", "ground", "road"})
 
