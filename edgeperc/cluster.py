@@ -446,18 +446,18 @@ def objects_from_points(
     kept = np.argsort(-highest, kind="stable")[:MAX_OBJECTS]
     kept = np.sort(kept[(found[kept] > 0) & (highest[kept] >= min_score)])
     named_by_size = {*classes_of_boxes(classes)} - {*classes}
+    rows = read_only(points)
+    above = read_only(np.zeros(len(points)) if height_m is None else height_m)
     boxes = []
     for k in kept.tolist():
         name = classes[found[k]]
         members = order[starts[k] : starts[k + 1]]
-        xyz = points[members, :3].astype(np.float64)
-        rectangle = np.empty(5)
-        fill_rectangle(xyz, name in L_SHAPED, rectangle)
-        top = float(xyz[:, 2].max())
+        rectangle, levels = np.empty(5), np.empty(len(members))
+        top = fill_rectangle(rows, above, members, name in L_SHAPED, rectangle, levels)
+        levels.sort()
         if height_m is None:
-            bottom = float(xyz[:, 2].min())
+            bottom = float(levels[0])
         else:
-            levels = np.sort(xyz[:, 2] - height_m[members])
             bottom = 0.5 * float(levels[(len(levels) - 1) // 2] + levels[len(levels) // 2])  # the median
         side = float(max(rectangle[2:4]))
         score = float(shares[k]) * len(members) / (len(members) + EVIDENCE)
@@ -634,53 +634,75 @@ def _completed(
 
 
 @njit(cache=True, nogil=True)
-def fill_rectangle(members: NDArray[np.float64], l_shaped: bool, rectangle: NDArray[np.float64]) -> None:
-    """Write the rectangle around points seen from above.
+def fill_rectangle(
+    points: NDArray[np.float32],
+    height: NDArray[np.float32],
+    members: NDArray[np.int32],
+    l_shaped: bool,
+    rectangle: NDArray[np.float64],
+    levels: NDArray[np.float64],
+) -> float:
+    """Write the rectangle around points seen from above, and what they stand on.
 
     Parameters
     ----------
-    members : (n, 2 or more) float64
-        x, y [m], at least one.
+    points : (n, 3 or more) float32
+        x, y, z [m].
+    height : (n,) float32
+        Height of every point above the ground [m].
+    members : (m,) int32
+        Rows of the points in the rectangle, at least one.
     l_shaped : bool
         True: the heading for which most points lie near a side. False: the heading of the smallest rectangle.
     rectangle : (5,) float64, overwritten
         x, y of the middle, extent along and across the heading [m], heading [rad] in 0..pi/2.
+    levels : (m,) float64, overwritten
+        z of the ground below each point [m].
+
+    Returns
+    -------
+    float
+        z of the highest point [m].
     """
-    step = (members.shape[0] + MAX_FITTED - 1) // MAX_FITTED
-    best = -math.inf
-    heading = 0.0
+    # All headings at once for each point: processors compare and divide eight at a time, which takes a third of the
+    # time of one heading after the other.
+    step = (len(members) + MAX_FITTED - 1) // MAX_FITTED
+    cos, sin, merit = np.empty(N_ANGLES), np.empty(N_ANGLES), np.empty(N_ANGLES)
+    low_u, high_u = np.empty(N_ANGLES), np.empty(N_ANGLES)
+    low_v, high_v = np.empty(N_ANGLES), np.empty(N_ANGLES)
     for k in range(N_ANGLES):
         angle = 0.5 * math.pi * k / N_ANGLES
-        cos, sin = math.cos(angle), math.sin(angle)
-        low_u, high_u, low_v, high_v = bounds_along(members, step, cos, sin)
-        merit = -(high_u - low_u) * (high_v - low_v)
-        if l_shaped:
-            merit = 0.0
-            for i in range(0, members.shape[0], step):
-                u = cos * members[i, 0] + sin * members[i, 1]
-                v = cos * members[i, 1] - sin * members[i, 0]
-                gap = min(min(u - low_u, high_u - u), min(v - low_v, high_v - v))
-                merit += 1.0 / max(gap, 0.05)
-        if merit > best:
-            best = merit
-            heading = angle
-    cos, sin = math.cos(heading), math.sin(heading)
-    low_u, high_u, low_v, high_v = bounds_along(members, np.int64(1), cos, sin)
-    u, v = 0.5 * (low_u + high_u), 0.5 * (low_v + high_v)
-    rectangle[0] = u * cos - v * sin
-    rectangle[1] = u * sin + v * cos
-    rectangle[2] = high_u - low_u
-    rectangle[3] = high_v - low_v
-    rectangle[4] = heading
-
-
-@njit(cache=True, nogil=True)
-def bounds_along(members: NDArray[np.float64], step: int, cos: float, sin: float) -> tuple[float, float, float, float]:
-    """Lowest and highest coordinate of the points along a heading, and across it."""
-    low_u, high_u, low_v, high_v = math.inf, -math.inf, math.inf, -math.inf
-    for i in range(0, members.shape[0], step):
-        u = cos * members[i, 0] + sin * members[i, 1]
-        v = cos * members[i, 1] - sin * members[i, 0]
-        low_u, high_u = min(low_u, u), max(high_u, u)
-        low_v, high_v = min(low_v, v), max(high_v, v)
-    return low_u, high_u, low_v, high_v
+        cos[k], sin[k] = math.cos(angle), math.sin(angle)
+        low_u[k], high_u[k], low_v[k], high_v[k] = math.inf, -math.inf, math.inf, -math.inf
+    for at in range(0, len(members), step):
+        x, y = np.float64(points[members[at], 0]), np.float64(points[members[at], 1])
+        for k in range(N_ANGLES):
+            u, v = cos[k] * x + sin[k] * y, cos[k] * y - sin[k] * x
+            low_u[k], high_u[k] = min(low_u[k], u), max(high_u[k], u)
+            low_v[k], high_v[k] = min(low_v[k], v), max(high_v[k], v)
+    for k in range(N_ANGLES):
+        merit[k] = 0.0 if l_shaped else -(high_u[k] - low_u[k]) * (high_v[k] - low_v[k])
+    for at in range(0, len(members) if l_shaped else 0, step):
+        x, y = np.float64(points[members[at], 0]), np.float64(points[members[at], 1])
+        for k in range(N_ANGLES):
+            u, v = cos[k] * x + sin[k] * y, cos[k] * y - sin[k] * x
+            gap = min(min(u - low_u[k], high_u[k] - u), min(v - low_v[k], high_v[k] - v))
+            merit[k] += 1.0 / max(gap, 0.05)
+    best = 0
+    for k in range(N_ANGLES):
+        best = k if merit[k] > merit[best] else best
+    least_u, most_u, least_v, most_v, top = math.inf, -math.inf, math.inf, -math.inf, -math.inf
+    for at in range(len(members)):
+        i = members[at]
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        u, v = cos[best] * x + sin[best] * y, cos[best] * y - sin[best] * x
+        least_u, most_u, least_v, most_v = min(least_u, u), max(most_u, u), min(least_v, v), max(most_v, v)
+        top = max(top, z)
+        levels[at] = z - height[i]
+    u, v = 0.5 * (least_u + most_u), 0.5 * (least_v + most_v)
+    rectangle[0] = u * cos[best] - v * sin[best]
+    rectangle[1] = u * sin[best] + v * cos[best]
+    rectangle[2] = most_u - least_u
+    rectangle[3] = most_v - least_v
+    rectangle[4] = 0.5 * math.pi * best / N_ANGLES
+    return top

@@ -330,10 +330,14 @@ def test_rectangles_agree_with_the_twin(n, seed, l_shaped):
         * [2.0, 0.8]
         @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     )
-    members += rng.uniform(-30, 30, 2)
-    rectangle = np.empty(5)
-    cluster.fill_rectangle(members, l_shaped, rectangle)
-    np.testing.assert_allclose(rectangle, twins.cluster.rectangle(members, l_shaped), atol=1e-8)
+    points = np.c_[members + rng.uniform(-30, 30, 2), rng.uniform(-2, 1, n)].astype(np.float32)
+    height, rows = rng.uniform(-1, 2, n).astype(np.float32), rng.permutation(n)[: rng.integers(1, n + 1)]
+    rectangle, levels = np.empty(5), np.empty(len(rows))
+    args = read_only(points), read_only(height), rows.astype(np.int32), l_shaped
+    assert cluster.fill_rectangle(*args, rectangle, levels) == points[rows, 2].max()
+    expected = twins.cluster.rectangle(points[rows, :2].astype(np.float64), l_shaped)
+    np.testing.assert_allclose(rectangle, expected, atol=1e-8)
+    np.testing.assert_array_equal(levels, points[rows, 2].astype(np.float64) - height[rows])
 
 
 @pytest.mark.parametrize("where", [(12.0, 5.0), (-9.0, 7.0), (-15.0, -4.0), (8.0, -20.0)])
