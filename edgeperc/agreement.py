@@ -37,7 +37,7 @@ from .voting import (
     find_persons_alone,
 )
 
-__all__ = ["RULES", "agree_on_boxes", "agree_on_points", "find_support", "find_voters"]
+__all__ = ["RULES", "agree_on_boxes", "agree_on_points", "find_support", "find_voters", "without_poles"]
 
 RULES = frozenset({"column", "share", "height", "cells", "fill", "person", "support", "ground", "boxes", "road"})
 """Names of the rules, for ablations.
@@ -145,6 +145,7 @@ def agree_on_points(
     view: TopView | None = None,
     rules: Collection[str] = RULES,
     support: Support | None = None,
+    upright: NDArray[np.uint8] | None = None,
 ) -> PointLabels:
     """Correct the labels of points by clusters, ground and boxes.
 
@@ -166,6 +167,8 @@ def agree_on_points(
         Of `RULES`; others are left out.
     support : tuple of two arrays, optional
         From `find_support` with the same arguments, so that it is found once.
+    upright : (n,) uint8, optional, modified
+        From `without_poles` with the same arguments, so that poles are found once.
 
     Returns
     -------
@@ -202,10 +205,8 @@ def agree_on_points(
     rules = _applicable(rules, ground)
     rows, height, on_ground = read_only(points), read_only(ground.height_m), read_only(ground.mask, np.bool_)
     in_view, of = read_only(labels.in_view, np.bool_), read_only(clusters, np.int32)
-    agreed = labels.labels.copy()
+    agreed = without_poles(points, labels, ground, rules=rules) if upright is None else upright
     roles = roles_of(labels.classes)
-    if "column" in rules:
-        clear_columns(rows, height, np.array([PERSON_TOP_M.get(name, 0.0) for name in labels.classes]), agreed)
     n = int(clusters.max(initial=-1)) + 1
     counts = np.empty((n, len(labels.classes) + 1), np.int32)
     bounds = np.empty((n, 5), np.float32)
@@ -231,6 +232,34 @@ def agree_on_points(
     if "ground" in rules:
         clear_ground(rows, height, on_ground, roles, agreed)
     return PointLabels(agreed, labels.in_view, labels.classes)
+
+
+def without_poles(
+    points: NDArray[np.float32], labels: PointLabels, ground: Ground, *, rules: Collection[str] = RULES
+) -> NDArray[np.uint8]:
+    """Labels of points without the persons whose column of points goes on above a person's height.
+
+    Parameters
+    ----------
+    points, labels, ground, rules
+        As in `agree_on_points`; without the rule ``"column"`` all labels stay.
+
+    Returns
+    -------
+    (n,) uint8
+        A new array.
+
+    Raises
+    ------
+    PointsError
+        Arrays disagree in shape, or a label is not in the classes.
+    """
+    check_scan(points, labels, ground)
+    upright = labels.labels.copy()
+    if "column" in _applicable(rules, ground):
+        limits = np.array([PERSON_TOP_M.get(name, 0.0) for name in labels.classes])
+        clear_columns(read_only(points), read_only(ground.height_m), limits, upright)
+    return upright
 
 
 def agree_on_boxes(

@@ -16,7 +16,7 @@ from .perception import Box, PointLabels, TopView
 from .points import read_only
 from .voting import VEHICLE
 
-__all__ = ["agree_on_cells"]
+__all__ = ["agree_on_cells", "mark_cells"]
 
 OBSTACLE_M = (0.3, 2.0)  # heights of returns that block a cell
 _NO_BOX = _NO_CLASS = 255
@@ -31,6 +31,7 @@ def agree_on_cells(
     dropped: Sequence[Box] = (),
     *,
     rules: Collection[str] = RULES,
+    marks: NDArray[np.uint8] | None = None,
 ) -> TopView:
     """Correct the cells of a top view by boxes, points and obstacles.
 
@@ -43,6 +44,8 @@ def agree_on_cells(
         In the frame of the models.
     dropped : sequence of Box
         Boxes of the top-view model that `agree_on_boxes` dropped; their vehicle cells become background.
+    marks : (rows, columns) uint8, optional
+        From `mark_cells` with the same arguments, so that they are found once.
 
     Returns
     -------
@@ -60,33 +63,13 @@ def agree_on_cells(
     of_road, of_vehicles = "road" in rules, "cells" in rules and labels is not None
     if not (of_road or of_vehicles):
         return view
-    check_scan(points, labels, ground)
+    if marks is None:
+        marks = mark_cells(view, points, labels, ground, rules=rules)
     drivable = view.classes.index("drivable") if of_road and "drivable" in view.classes else _NO_CLASS
-    _, is_vehicle, grid = cells_of(view)
+    _, is_vehicle, _ = cells_of(view)
     cells = view.labels.copy()
-    if labels is None:
-        in_view, object_of, roles = (
-            np.zeros(len(points), np.bool_),
-            np.zeros(len(points), np.uint8),
-            np.zeros(1, np.uint8),
-        )
-    else:
-        in_view, object_of, roles = labels.in_view, labels.labels, roles_of(labels.classes)
     covered = _footprints(view, boxes)
-    clear_cells(
-        read_only(points),
-        read_only(ground.height_m),
-        read_only(in_view, np.bool_),
-        read_only(object_of, np.uint8),
-        roles,
-        ground.plane is not None,
-        grid,
-        drivable,
-        is_vehicle & of_vehicles,
-        covered != _NO_BOX,
-        np.zeros(cells.shape, np.uint8),
-        cells,
-    )
+    clear_cells(marks, drivable, is_vehicle & of_vehicles, covered != _NO_BOX, cells)
     covered, flat = covered.reshape(-1), cells.reshape(-1)
     below = np.flatnonzero(covered != _NO_BOX)
     below = below[flat[below] == drivable]
@@ -95,6 +78,55 @@ def agree_on_cells(
         freed = np.flatnonzero((_footprints(view, dropped).reshape(-1) != _NO_BOX) & (covered == _NO_BOX))
         flat[freed[is_vehicle[flat[freed]]]] = 0
     return replace(view, labels=cells)
+
+
+def mark_cells(
+    view: TopView,
+    points: NDArray[np.float32],
+    labels: PointLabels | None,
+    ground: Ground,
+    *,
+    rules: Collection[str] = RULES,
+) -> NDArray[np.uint8]:
+    """What the points show in each cell of a top view; no boxes are needed for it.
+
+    Parameters
+    ----------
+    view, points, labels, ground, rules
+        As in `agree_on_cells`.
+
+    Returns
+    -------
+    (rows, columns) uint8
+        Bits: 1 with an obstacle, 2 with a second one or an object, 4 with a vehicle's point, 8 with another point in
+        view in a vehicle's cell.
+
+    Raises
+    ------
+    PointsError
+        Arrays disagree in shape, or a label is not in the classes.
+    """
+    check_scan(points, labels, ground)
+    if labels is None:
+        nothing = np.zeros(len(points), np.uint8)
+        in_view, object_of, roles = nothing.view(np.bool_), nothing, np.zeros(1, np.uint8)
+    else:
+        in_view, object_of, roles = labels.in_view, labels.labels, roles_of(labels.classes)
+    cells, is_vehicle, grid = cells_of(view)
+    marks = np.zeros(cells.shape, np.uint8)
+    fill_marks(
+        read_only(points),
+        read_only(ground.height_m),
+        read_only(in_view, np.bool_),
+        read_only(object_of, np.uint8),
+        roles,
+        ground.plane is not None,
+        grid,
+        is_vehicle & ("cells" in rules and labels is not None),
+        cells,
+        marks,
+    )
+    return marks
 
 
 def _footprints(view: TopView, boxes: Sequence[Box]) -> NDArray[np.uint8]:
@@ -106,7 +138,7 @@ def _footprints(view: TopView, boxes: Sequence[Box]) -> NDArray[np.uint8]:
 
 
 @njit(cache=True, nogil=True)
-def clear_cells(
+def fill_marks(
     points: NDArray[np.float32],
     height: NDArray[np.float32],
     in_view: NDArray[np.bool_],
@@ -114,13 +146,11 @@ def clear_cells(
     roles: NDArray[np.uint8],
     by_height: bool,
     grid: NDArray[np.float64],
-    drivable: int,
     is_vehicle: NDArray[np.bool_],
-    in_box: NDArray[np.bool_],
-    seen: NDArray[np.uint8],
     cells: NDArray[np.uint8],
+    marks: NDArray[np.uint8],
 ) -> None:
-    """Make background of drivable cells with objects or obstacles, and of vehicle cells that the points contradict.
+    """Write what the points show in each cell; see `mark_cells`.
 
     Parameters
     ----------
@@ -134,15 +164,11 @@ def clear_cells(
         Whether returns above the ground are obstacles, whatever their label.
     grid : (3,) float64
         x of the far edge, y of the left edge, edge of a cell [m].
-    drivable : int
     is_vehicle : (256,) bool
         Labels of cells that the points may contradict.
-    in_box : (rows, columns) bool
-        Cells of vehicles that stay.
-    seen : (rows, columns) uint8, modified
-        Scratch, zeros. Bits: 1 with an obstacle, 2 with a second one or an object, 4 with a vehicle's point, 8 with
-        another point in view in a vehicle's cell.
-    cells : (rows, columns) uint8, modified
+    cells : (rows, columns) uint8
+    marks : (rows, columns) uint8, modified
+        Zeros before.
     """
     n_rows, n_cols = cells.shape
     lowest, highest = OBSTACLE_M
@@ -159,14 +185,38 @@ def clear_cells(
         r, c = int(row), int(col)
         role = roles[labels[i]]
         if role != 0:
-            seen[r, c] |= 6 if role == VEHICLE else 2
+            marks[r, c] |= 6 if role == VEHICLE else 2
         elif by_height and (height[i] >= lowest) & (height[i] <= highest):
-            seen[r, c] |= 2 if seen[r, c] & 1 else 1
+            marks[r, c] |= 2 if marks[r, c] & 1 else 1
         if role != VEHICLE and is_vehicle[cells[r, c]] and in_view[i]:
-            seen[r, c] |= 8
+            marks[r, c] |= 8
+
+
+@njit(cache=True, nogil=True)
+def clear_cells(
+    marks: NDArray[np.uint8],
+    drivable: int,
+    is_vehicle: NDArray[np.bool_],
+    in_box: NDArray[np.bool_],
+    cells: NDArray[np.uint8],
+) -> None:
+    """Make background of drivable cells with objects or obstacles, and of vehicle cells that the points contradict.
+
+    Parameters
+    ----------
+    marks : (rows, columns) uint8
+        From `fill_marks`.
+    drivable : int
+    is_vehicle : (256,) bool
+        Labels of cells that the points may contradict.
+    in_box : (rows, columns) bool
+        Cells of vehicles that stay.
+    cells : (rows, columns) uint8, modified
+    """
+    n_rows, n_cols = cells.shape
     for row in range(n_rows):
         for col in range(n_cols):
-            own = seen[row, col]
+            own = marks[row, col]
             if own == 0:
                 continue
             is_road = cells[row, col] == drivable and own & 3 != 0
@@ -176,7 +226,7 @@ def clear_cells(
             n, votes = 0, 0
             for r in range(max(row - 1, 0), min(row + 2, n_rows)):
                 for c in range(max(col - 1, 0), min(col + 2, n_cols)):
-                    n += min(seen[r, c] & 3, 2)
-                    votes |= seen[r, c] & 4
+                    n += min(marks[r, c] & 3, 2)
+                    votes |= marks[r, c] & 4
             if (is_road and n >= 2) or (is_doubted and votes == 0):
                 cells[row, col] = 0

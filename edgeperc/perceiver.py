@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import os
 import threading
-import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial, wraps
 from itertools import pairwise
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Literal, NamedTuple, NoReturn, ParamSpec, TypeVar
+from typing import Literal, NamedTuple, NoReturn, ParamSpec
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .adapt import Interpolator, condition, render
-from .agreement import RULES, agree_on_boxes, agree_on_points, find_support, find_voters
+from .agreement import RULES
 from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
-from .cells import agree_on_cells
-from .cluster import MIN_SCORE, join_boxes, objects_from_points
+from .cluster import MIN_SCORE
+from .combine import BoxesFrom, combine
 from .crop import Crop, sectors_of_turn, spread
 from .decode import decode_boxes, decode_cells, decode_labels
 from .drivable import compile_kernels
@@ -48,13 +45,13 @@ from .refine import label_points, remove_outliers
 from .remission import NO_REMISSION, RemissionMatcher
 from .sensor import SensorProfile, get_sensor
 from .session import Session
+from .side_thread import SideThread
+from .stopwatch import Stopwatch
 from .zoo import CAMERA, DEFAULT, resolve
 
 __all__ = ["ADAPTATIONS", "BoxesFrom", "Learned", "Perceiver"]
 
-STAGES = ("check", "project", "infer", "decode", "refine", "cluster", "agree")
 Adaptation = Literal["both", "remission", "interpolation", "none"]
-BoxesFrom = Literal["both", "network", "clusters"]
 OnMismatch = Literal["refuse", "warn", "raise", "ignore"]
 ADAPTATIONS: tuple[Adaptation, ...] = ("none", "remission", "interpolation", "both")
 
@@ -63,20 +60,6 @@ ADAPTATIONS: tuple[Adaptation, ...] = ("none", "remission", "interpolation", "bo
 CHECKED_SCANS = 5
 
 _P = ParamSpec("_P")
-_Result = TypeVar("_Result")
-
-
-class _Stopwatch:
-    """Sum of the wall time of each stage [ms]."""
-
-    def __init__(self) -> None:
-        self.ms = dict.fromkeys(STAGES, 0.0)
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (now - self._last)
-        self._last = now
 
 
 @dataclass(frozen=True)
@@ -94,7 +77,7 @@ class _Camera:
     session: Session
     scaler: ImageScaler
 
-    def label(self, image: NDArray[np.uint8], watch: _Stopwatch, infer: bool = True) -> ImageLabels:
+    def label(self, image: NDArray[np.uint8], watch: Stopwatch, infer: bool = True) -> ImageLabels:
         """Class of every pixel of an image, at its own size."""
         card, (height, width, _) = self.session.card, image.shape
         self.scaler.fill(image, self.session.input)
@@ -137,7 +120,7 @@ def _renamed(**names: str) -> Callable[[Callable[_P, None]], Callable[_P, None]]
     """Refuse the old name of a keyword; the message gives the new name."""
 
     def decorate(function: Callable[_P, None]) -> Callable[_P, None]:
-        @functools.wraps(function)
+        @wraps(function)
         def checked(*args: _P.args, **kwargs: _P.kwargs) -> None:
             for old in names.keys() & kwargs.keys():
                 raise OptionError(f"{old}= was renamed; pass {names[old]}={kwargs[old]!r}")
@@ -356,12 +339,12 @@ class Perceiver:
         self._sectors = sectors_of_turn(ranged.session.card.view, whole=interpolates) if full_turn and ranged else []
         self._crop = Crop([] if full_turn or interpolates else [n.session.card.view for n in self._networks])
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
-        self._threads: dict[int, ThreadPoolExecutor] = {}
+        self._beside = SideThread()
         self._locks = {os.getpid(): threading.Lock()}
         # Compile every kernel here, not in the first call, with an image of one pixel and a scan of two points. The
         # networks have already run on their golden inputs, and those outputs are decoded.
         if self._camera is not None:
-            self._camera.label(as_image(np.zeros((1, 1, 3), np.uint8)), _Stopwatch(), infer=False)
+            self._camera.label(as_image(np.zeros((1, 1, 3), np.uint8)), Stopwatch(), infer=False)
         if self._networks:
             self._compile(views)
 
@@ -379,7 +362,7 @@ class Perceiver:
         }
         with fewer_collections(), Helpers([part for part in needed if needed[part]]) as helpers:
             render(warm_up, replace(self.sensor, remission=NO_REMISSION))
-            perception = self._perceive(warm_up, None, _Stopwatch(), self._to_check > 0, infer=False)
+            perception = self._perceive(warm_up, None, Stopwatch(), self._to_check > 0, infer=False)
             floor, labels = car_and_person()
             ground = self._find_ground(floor)
             with suppress(MountingError):  # the floor has no street
@@ -389,7 +372,7 @@ class Perceiver:
             if ground is not None:
                 unsure = (Box("car", 0.4, (5.0, 0.0, -1.0), (4.0, 1.6, 1.5), 0.0),)
                 seen = None if perception.points is None else labels
-                self._combine(floor, ground, seen, lambda: perception.top_view, unsure, _Stopwatch())
+                self._combine(floor, ground, seen, lambda: perception.top_view, unsure, Stopwatch(), False)
             if boxes_points:
                 compile_parts(["boxes"])  # some only several boxes need
             if "top_view" in views:
@@ -415,22 +398,6 @@ class Perceiver:
     def _lock(self) -> threading.Lock:
         """That of this process: after a fork, the one that held the parent's lock may be missing."""
         return self._locks.setdefault(os.getpid(), threading.Lock())
-
-    def _beside(self, function: Callable[[], _Result]) -> Callable[[], _Result]:
-        """Call a function in a second thread; what is returned waits for its result, or raises what it raised.
-
-        The thread is kept: to start one for each scan took 0.2 ms of the front and 1.3 ms of a full turn. It takes one
-        function after the other. A forked process has its own. Where no thread can be started, as while the interpreter
-        ends, the function is called when its result is asked for.
-        """
-        process = os.getpid()
-        if process not in self._threads:
-            self._threads[process] = ThreadPoolExecutor(1, thread_name_prefix="edgeperc-network")
-        try:
-            return self._threads[process].submit(function).result
-        except RuntimeError:
-            del self._threads[process]  # it would call the function later, too
-            return function
 
     def reset_mounting(self) -> None:
         """Estimate mounting and remission anew, for scans of another vehicle; the next five scans settle both."""
@@ -500,7 +467,7 @@ class Perceiver:
         scan = None if points is None else as_points(points)
         pixels = None if image is None else as_image(image)
         with self._lock:
-            watch = _Stopwatch()
+            watch = Stopwatch()
             if scan is None:
                 perception = self._nothing(stamp_s, watch)
             else:
@@ -532,12 +499,12 @@ class Perceiver:
                 f"got an image, and none of the models is of a camera ({loaded}); add one such as {CAMERA} to models="
             )
 
-    def _nothing(self, stamp_s: float | None, watch: _Stopwatch) -> Perception:
+    def _nothing(self, stamp_s: float | None, watch: Stopwatch) -> Perception:
         """The perception of no scan."""
         return Perception(0, 0, None, None, (), MappingProxyType(watch.ms), self.providers, (), stamp_s)
 
     def _perceive(
-        self, scan: NDArray[np.float32], stamp_s: float | None, watch: _Stopwatch, check: bool, infer: bool = True
+        self, scan: NDArray[np.float32], stamp_s: float | None, watch: Stopwatch, check: bool, infer: bool = True
     ) -> Perception:
         before, matcher, profile = self._estimator, self._remission, self.sensor
         hidden: tuple[Finding, ...] = ()
@@ -575,9 +542,10 @@ class Perceiver:
         found: Callable[[], list[Box]] | None = None
         cells: Callable[[], TopView | None] = partial(self._label_cells, top, kept, lambda: boxes)
         if top is not None and self._at_once and infer:
-            found = self._beside(partial(self._find_boxes, top, kept, _Stopwatch(), infer))
+            found = cache(self._beside(partial(self._find_boxes, top, kept, Stopwatch(), infer)))
+            cells = partial(self._label_cells, top, kept, found)
             if not self.full_turn:
-                cells = self._beside(partial(self._label_cells, top, kept, found))
+                cells = self._beside(cells)
         elif top is not None:
             boxes = self._find_boxes(top, kept, watch, infer)
         try:
@@ -586,17 +554,16 @@ class Perceiver:
             if ranged is not None:
                 height_m = None if ground is None else ground.height_m
                 if self.full_turn:
-                    points = self._label_full_turn(ranged, kept, height_m, watch, infer)
+                    cells = cache(cells)
+                    points = self._label_full_turn(ranged, kept, height_m, watch, infer, last=cells)
                 else:
                     points = self._label_sector(ranged, kept, height_m, watch, infer)
         finally:
             if found is not None:
                 boxes = found()
                 watch.lap("infer")
-        if found is not None and self.full_turn:
-            cells = self._beside(cells)  # after the sectors: 30.5 in place of 30.9 ms
         if ground is not None and infer:
-            points, top_view, boxes = self._combine(kept, ground, points, cells, boxes, watch)
+            points, top_view, boxes = self._combine(kept, ground, points, cells, boxes, watch, infer)
         else:
             top_view = cells()
         return Perception(
@@ -646,7 +613,7 @@ class Perceiver:
         network.projector.fill(scan, network.session.input, network.index, pixel, height_m)
         return pixel
 
-    def _find_boxes(self, network: _Network, scan: NDArray[np.float32], watch: _Stopwatch, infer: bool) -> list[Box]:
+    def _find_boxes(self, network: _Network, scan: NDArray[np.float32], watch: Stopwatch, infer: bool) -> list[Box]:
         """Run the network of the top view, and decode its boxes (SSADNet)."""
         self._project(network, scan)
         watch.lap("project")
@@ -677,7 +644,7 @@ class Perceiver:
         network: _Network,
         scan: NDArray[np.float32],
         height_m: NDArray[np.float32] | None,
-        watch: _Stopwatch,
+        watch: Stopwatch,
         infer: bool,
     ) -> PointLabels:
         """Class of every point in the range image: decode pixels, remove outliers, label points (PointSeg 5.2)."""
@@ -708,32 +675,41 @@ class Perceiver:
         network: _Network,
         scan: NDArray[np.float32],
         height_m: NDArray[np.float32] | None,
-        watch: _Stopwatch,
+        watch: Stopwatch,
         infer: bool,
+        last: Callable[[], object],
     ) -> PointLabels:
         """Run the network once for each sector, on a turned scan; a point in two sectors keeps its first label.
 
-        The second thread takes sectors, too, once it is done with the top view.
+        The second thread takes sectors, too, once it is done with the top view. The thread that finds none left calls
+        ``last``, while the other one is busy with its sector.
         """
-        left = deque(range(len(self._sectors)))
         sectors: dict[int, tuple[PointLabels, NDArray[np.int32] | None]] = {}
 
-        def label_sectors(by: _Network, watch: _Stopwatch) -> None:
+        def label(k: int, by: _Network, watch: Stopwatch) -> None:
+            turn_rad, crop = self._sectors[k]
+            seen, rows = crop.select(scan)
+            heights = height_m if height_m is None or rows is None else height_m[rows]
+            # What float32 cannot hold after the turn is not in view.
+            seen = turned(seen, turn_rad) if k else seen
+            sectors[k] = self._label_sector(by, seen, heights, watch, infer), rows
+
+        left: deque[Callable[[_Network, Stopwatch], object]] = deque(
+            partial(label, k) for k in range(len(self._sectors))
+        )
+        left.append(lambda by, watch: last())
+
+        def label_sectors(by: _Network, watch: Stopwatch) -> None:
             while True:
                 try:
-                    k = left.popleft()
+                    task = left.popleft()
                 except IndexError:  # none is left
                     return
-                turn_rad, crop = self._sectors[k]
-                seen, rows = crop.select(scan)
-                heights = height_m if height_m is None or rows is None else height_m[rows]
-                # What float32 cannot hold after the turn is not in view.
-                seen = turned(seen, turn_rad) if k else seen
-                sectors[k] = self._label_sector(by, seen, heights, watch, infer), rows
+                task(by, watch)
 
         helper = None
         if infer and self._aside is not None:
-            helper = self._beside(partial(label_sectors, self._aside, _Stopwatch()))
+            helper = self._beside(partial(label_sectors, self._aside, Stopwatch()))
         try:
             label_sectors(network, watch)
         finally:
@@ -754,47 +730,20 @@ class Perceiver:
         points: PointLabels | None,
         cells: Callable[[], TopView | None],
         boxes: Sequence[Box],
-        watch: _Stopwatch,
+        watch: Stopwatch,
+        infer: bool,
     ) -> tuple[PointLabels | None, TopView | None, Sequence[Box]]:
-        """What the parts agree on, and boxes around clusters of points above the ground (KUL-Seg 5.2).
-
-        An object cut by the view's edge gets either a box of the whole object, if about half of it is in view, or none.
-        """
-        rules, by_angle, clusters = self._rules, self._distance_per_m, None
-        dropped: list[Box] = []
-        if points is not None and rules:
-            held = find_support(scan, points, ground, boxes, rules=rules)
-            clusters = find_voters(scan, points, ground, boxes, distance_per_m=by_angle, rules=rules, support=held)
-            watch.lap("cluster")
-        top_view = cells()
-        watch.lap("decode")
-        if points is not None and clusters is not None:
-            points = agree_on_points(scan, points, ground, clusters, boxes, view=top_view, rules=rules, support=held)
-            kept = agree_on_boxes(boxes, scan, points, ground, rules=rules)
-            boxes, dropped = kept, [box for box in boxes if box not in kept]
-            watch.lap("agree")
-        if points is not None and self.boxes_from != "network":
-            clustered = objects_from_points(
-                scan,
-                points.labels,
-                points.classes,
-                among=~ground.mask,
-                height_m=ground.height_m,
-                clusters=clusters,
-                in_view=points.in_view,
-                distance_per_m=by_angle,
-                min_score=MIN_SCORE if self.score_threshold is None else self.score_threshold,
-            )
-            boxes = join_boxes(boxes, self._new_to_networks(clustered)) if self.boxes_from == "both" else clustered
-            watch.lap("cluster")
-        if top_view is not None and rules:
-            top_view = agree_on_cells(top_view, scan, points, ground, boxes, dropped, rules=rules)
-            watch.lap("agree")
-        return points, top_view, boxes
-
-    def _new_to_networks(self, boxes: tuple[Box, ...]) -> list[Box]:
-        """Boxes that no network can detect, because of their class or because they are out of its view."""
-        detectors = [(c.view, c.box_classes) for c in self.cards if isinstance(c.view, TopViewGeometry)]
-        return [
-            b for b in boxes if not any(b.label in classes and view.holds(*b.center[:2]) for view, classes in detectors)
-        ]
+        return combine(
+            scan,
+            ground,
+            points,
+            cells,
+            boxes,
+            watch,
+            cards=self.cards,
+            rules=self._rules,
+            boxes_from=self.boxes_from,
+            min_score=MIN_SCORE if self.score_threshold is None else self.score_threshold,
+            distance_per_m=self._distance_per_m,
+            beside=self._beside if self._at_once and infer else lambda function: function,
+        )

@@ -1,0 +1,118 @@
+"""One answer from the labels, the ground and the boxes of both views: the order of the steps of the agreement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .agreement import agree_on_boxes, agree_on_points, find_support, find_voters, without_poles
+from .card import ModelCard, TopViewGeometry
+from .cells import agree_on_cells, mark_cells
+from .cluster import join_boxes, objects_from_points
+from .ground import Ground
+from .perception import Box, PointLabels, TopView
+from .stopwatch import Stopwatch
+
+__all__ = ["BoxesFrom", "combine"]
+
+BoxesFrom = Literal["both", "network", "clusters"]
+
+
+def combine(
+    scan: NDArray[np.float32],
+    ground: Ground,
+    points: PointLabels | None,
+    cells: Callable[[], TopView | None],
+    boxes: Sequence[Box],
+    watch: Stopwatch,
+    *,
+    cards: Sequence[ModelCard],
+    rules: Collection[str],
+    boxes_from: BoxesFrom,
+    min_score: float,
+    distance_per_m: float,
+    beside: Callable[[Callable[[], Any]], Callable[[], Any]],
+) -> tuple[PointLabels | None, TopView | None, Sequence[Box]]:
+    """What the parts agree on, and boxes around clusters of points above the ground (KUL-Seg 5.2).
+
+    An object cut by the view's edge gets either a box of the whole object, if about half of it is in view, or none.
+
+    Parameters
+    ----------
+    scan : (n, 4) float32
+        x, y, z [m] in the frame of the models, remission.
+    ground : Ground
+    points : PointLabels or None
+        Without a range image, None.
+    cells : callable
+        Returns the top view, or None without one. It is called while the top view may still be labeled.
+    boxes : sequence of Box
+        Of the top view's network.
+    watch : Stopwatch
+    cards : sequence of ModelCard
+        Of the networks.
+    rules : collection of str
+        Of `edgeperc.agreement.RULES`.
+    boxes_from : {"both", "network", "clusters"}
+    min_score : float
+        Boxes around clusters with a lower score are dropped.
+    distance_per_m : float
+        As in `edgeperc.cluster.find_clusters`.
+    beside : callable
+        Calls a function, at once in another thread (`edgeperc.side_thread.SideThread`) or later in this one, and
+        returns what gives its result.
+
+    Returns
+    -------
+    tuple of PointLabels or None, TopView or None, and sequence of Box
+    """
+    clusters = None
+    dropped: list[Box] = []
+    if points is not None and rules:
+        upright = beside(partial(without_poles, scan, points, ground, rules=rules))
+        held = find_support(scan, points, ground, boxes, rules=rules)
+        clusters = find_voters(scan, points, ground, boxes, distance_per_m=distance_per_m, rules=rules, support=held)
+        watch.lap("cluster")
+    top_view = cells()
+    watch.lap("decode")
+    if points is not None and clusters is not None:
+        points = agree_on_points(
+            scan, points, ground, clusters, boxes, view=top_view, rules=rules, support=held, upright=upright()
+        )
+    marks = None
+    if top_view is not None and rules:
+        marks = beside(partial(mark_cells, top_view, scan, points, ground, rules=rules))
+    if points is not None and clusters is not None:
+        kept = agree_on_boxes(boxes, scan, points, ground, rules=rules)
+        boxes, dropped = kept, [box for box in boxes if box not in kept]
+        watch.lap("agree")
+    if points is not None and boxes_from != "network":
+        clustered = objects_from_points(
+            scan,
+            points.labels,
+            points.classes,
+            among=~ground.mask,
+            height_m=ground.height_m,
+            clusters=clusters,
+            in_view=points.in_view,
+            distance_per_m=distance_per_m,
+            min_score=min_score,
+        )
+        boxes = join_boxes(boxes, _new_to_networks(clustered, cards)) if boxes_from == "both" else clustered
+        watch.lap("cluster")
+    if top_view is not None and marks is not None:
+        top_view = agree_on_cells(top_view, scan, points, ground, boxes, dropped, rules=rules, marks=marks())
+        watch.lap("agree")
+    return points, top_view, boxes
+
+
+def _new_to_networks(boxes: tuple[Box, ...], cards: Sequence[ModelCard]) -> list[Box]:
+    """Boxes that no network can detect, because of their class or because they are out of its view."""
+    detectors = [(card.view, card.box_classes) for card in cards if isinstance(card.view, TopViewGeometry)]
+    return [
+        b for b in boxes if not any(b.label in classes and view.holds(*b.center[:2]) for view, classes in detectors)
+    ]
