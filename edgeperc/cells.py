@@ -69,7 +69,8 @@ def agree_on_cells(
     _, is_vehicle, _ = cells_of(view)
     cells = view.labels.copy()
     covered = _footprints(view, boxes)
-    clear_cells(marks, drivable, is_vehicle & of_vehicles, covered != _NO_BOX, cells)
+    marked = np.flatnonzero(marks != 0)  # of numbers, it takes five times as long
+    clear_cells(marks, marked, drivable, is_vehicle & of_vehicles, covered != _NO_BOX, cells)
     covered, flat = covered.reshape(-1), cells.reshape(-1)
     below = np.flatnonzero(covered != _NO_BOX)
     below = below[flat[below] == drivable]
@@ -195,6 +196,7 @@ def fill_marks(
 @njit(cache=True, nogil=True)
 def clear_cells(
     marks: NDArray[np.uint8],
+    marked: NDArray[np.int64],
     drivable: int,
     is_vehicle: NDArray[np.bool_],
     in_box: NDArray[np.bool_],
@@ -206,6 +208,8 @@ def clear_cells(
     ----------
     marks : (rows, columns) uint8
         From `fill_marks`.
+    marked : (m,) int64
+        Flat numbers of the cells with marks.
     drivable : int
     is_vehicle : (256,) bool
         Labels of cells that the points may contradict.
@@ -214,19 +218,17 @@ def clear_cells(
     cells : (rows, columns) uint8, modified
     """
     n_rows, n_cols = cells.shape
-    for row in range(n_rows):
-        for col in range(n_cols):
-            own = marks[row, col]
-            if own == 0:
-                continue
-            is_road = cells[row, col] == drivable and own & 3 != 0
-            is_doubted = is_vehicle[cells[row, col]] and own & 12 == 8 and not in_box[row, col]
-            if not (is_road or is_doubted):
-                continue
-            n, votes = 0, 0
-            for r in range(max(row - 1, 0), min(row + 2, n_rows)):
-                for c in range(max(col - 1, 0), min(col + 2, n_cols)):
-                    n += min(marks[r, c] & 3, 2)
-                    votes |= marks[r, c] & 4
-            if (is_road and n >= 2) or (is_doubted and votes == 0):
-                cells[row, col] = 0
+    for at in marked:
+        row, col = at // n_cols, at % n_cols
+        own = marks[row, col]
+        is_road = cells[row, col] == drivable and own & 3 != 0
+        is_doubted = is_vehicle[cells[row, col]] and own & 12 == 8 and not in_box[row, col]
+        if not (is_road or is_doubted):
+            continue
+        n, votes = 0, 0
+        for r in range(max(row - 1, 0), min(row + 2, n_rows)):
+            for c in range(max(col - 1, 0), min(col + 2, n_cols)):
+                n += min(marks[r, c] & 3, 2)
+                votes |= marks[r, c] & 4
+        if (is_road and n >= 2) or (is_doubted and votes == 0):
+            cells[row, col] = 0

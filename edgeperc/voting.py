@@ -272,8 +272,8 @@ def find_persons_alone(
     list of (k,) int32
         Rows of each person. Their labels were lost.
     """
-    labeled = np.flatnonzero(before != 0)  # of numbers, it takes five times as long
-    lost = labeled[(roles[before[labeled]] == PERSON) & (labels[labeled] == 0)].astype(np.int32)
+    changed = np.flatnonzero(before != labels)
+    lost = changed[(roles[before[changed]] == PERSON) & (labels[changed] == 0)].astype(np.int32)
     if len(lost) < MIN_ALONE:
         return []
     alone = []
