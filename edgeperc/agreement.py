@@ -22,6 +22,7 @@ from .cluster import MIN_PERSON_SHARE, PART_OF, find_clusters
 from .errors import PointsError
 from .ground import Ground
 from .kernel_cache import njit
+from .linkage import Strips
 from .perception import Box, PointLabels, TopView
 from .persons import complete_persons
 from .points import read_only
@@ -92,6 +93,7 @@ def find_voters(
     distance_per_m: float = 0.015,
     rules: Collection[str] = RULES,
     support: Support | None = None,
+    strips: Strips | None = None,
 ) -> NDArray[np.int32]:
     """Find the clusters above the ground that hold labeled points, as far as it matters for `agree_on_points`.
 
@@ -101,6 +103,8 @@ def find_voters(
         As in `agree_on_points`.
     distance_per_m : float
         As in `edgeperc.cluster.find_clusters`.
+    strips : Strips, optional
+        From `edgeperc.cluster.sort_points` among the points above the ground, with the same ``distance_per_m``.
 
     Returns
     -------
@@ -132,6 +136,7 @@ def find_voters(
         min_share=shares,
         distance_per_m=distance_per_m,
         min_points=1,
+        strips=strips,
     )
 
 

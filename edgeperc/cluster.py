@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from .errors import PointsError
 from .geometry import oriented_iou, rectangles, shared_area, suppress_overlaps
 from .kernel_cache import njit
-from .linkage import COLUMN_EDGE, MAX_COLUMNS, TESTS_PER_POINT, fill_clusters
+from .linkage import COLUMN_EDGE, MAX_COLUMNS, TESTS_PER_POINT, Strips, chain_points, fill_clusters, levels_of
 from .perception import Box
 from .persons import MIN_OF_WHOLE, RIDES, WALKS, fill_person_groups, fill_persons
 from .points import read_only
@@ -83,6 +83,7 @@ def find_clusters(
     distance_per_m: float = 0.015,
     max_range_m: float = 100.0,
     min_points: int = 5,
+    strips: Strips | None = None,
 ) -> NDArray[np.int32]:
     """Number the groups of linked points.
 
@@ -110,6 +111,8 @@ def find_clusters(
         Points with a larger x, y or z are in no cluster.
     min_points : int
         Smaller clusters are dropped.
+    strips : Strips, optional
+        From `sort_points` with the same arguments, so that the points are sorted once. They cannot be used again.
 
     Returns
     -------
@@ -142,33 +145,22 @@ def find_clusters(
     UserWarning
         The 64 tests a point were not enough.
     """
-    if points.ndim != 2 or points.shape[1] < 3:
-        raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
-    for name, mask in (("among", among), ("seeds", seeds), ("votes", votes)):
-        if mask is not None and mask.shape != (len(points),):
-            raise PointsError(f"got {name} of shape {mask.shape} for {len(points)} points; expected one value a point")
-    if not (
-        0.0 < min_distance_m < math.inf
-        and 0.0 <= distance_per_m <= 1.0
-        and max_range_m > 0.0
-        and (2.0 * max_range_m / (COLUMN_EDGE * min_distance_m) + 2.0) ** 2 <= MAX_COLUMNS
-    ):
-        raise PointsError(
-            f"got min_distance_m={min_distance_m}, distance_per_m={distance_per_m} and max_range_m={max_range_m}; "
-            "expected a distance above 0 and at least 1/2000 of the range, and distance_per_m in 0..1"
+    if strips is None:
+        strips = sort_points(
+            points, among, min_distance_m=min_distance_m, distance_per_m=distance_per_m, max_range_m=max_range_m
         )
-    rows = read_only(points)
-    every = np.ones(len(rows), np.bool_)
-    seeded = read_only(every if seeds is None else seeds, np.bool_)
-    clusters = np.empty(len(rows), np.int32)
+    for name, mask in (("seeds", seeds), ("votes", votes), ("strips", strips.chain)):
+        if mask is not None and mask.shape != points.shape[:1]:
+            raise PointsError(f"got {name} of shape {mask.shape} for {len(points)} points; expected one value a point")
+    seeded = read_only(np.ones(len(points), np.bool_) if seeds is None else seeds, np.bool_)
+    clusters = np.empty(len(points), np.int32)
     work = np.empty(3, np.int64)
     fill_clusters(
-        rows,
-        read_only(every if among is None else among, np.bool_),
+        read_only(points),
+        *strips,
         seeded,
         read_only(seeded.view(np.uint8) * 2 + 1 if votes is None else votes, np.uint8),
         np.array(min_share, np.float64).reshape(-1),
-        float(min_distance_m),
         float(distance_per_m),
         float(max_range_m),
         min_points,
@@ -184,6 +176,53 @@ def find_clusters(
     if votes is None:
         np.maximum(clusters, -1, out=clusters)
     return clusters
+
+
+def sort_points(
+    points: NDArray[np.float32],
+    among: NDArray[np.bool_] | None = None,
+    *,
+    min_distance_m: float = 0.5,
+    distance_per_m: float = 0.015,
+    max_range_m: float = 100.0,
+) -> Strips:
+    """The part of `find_clusters` that needs no labels, for a scan whose labels are not known yet.
+
+    Parameters
+    ----------
+    points, among, min_distance_m, distance_per_m, max_range_m
+        As in `find_clusters`.
+
+    Returns
+    -------
+    Strips
+
+    Raises
+    ------
+    PointsError
+        As in `find_clusters`.
+    """
+    if points.ndim != 2 or points.shape[1] < 3:
+        raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
+    n = len(points)
+    if among is not None and among.shape != (n,):
+        raise PointsError(f"got among of shape {among.shape} for {n} points; expected one value a point")
+    if not (
+        0.0 < min_distance_m < math.inf
+        and 0.0 <= distance_per_m <= 1.0
+        and max_range_m > 0.0
+        and (2.0 * max_range_m / (COLUMN_EDGE * min_distance_m) + 2.0) ** 2 <= MAX_COLUMNS
+    ):
+        raise PointsError(
+            f"got min_distance_m={min_distance_m}, distance_per_m={distance_per_m} and max_range_m={max_range_m}; "
+            "expected a distance above 0 and at least 1/2000 of the range, and distance_per_m in 0..1"
+        )
+    edges, limits = levels_of(float(min_distance_m), float(distance_per_m), float(max_range_m))
+    rows, chain = np.empty((2, n), np.int32)
+    grids, shapes = np.empty((len(edges) - 1, 3)), np.empty((len(edges) - 1, 3), np.int64)
+    used = read_only(np.ones(n, np.bool_) if among is None else among, np.bool_)
+    m, heads = chain_points(read_only(points), used, edges, limits, float(max_range_m), rows, chain, grids, shapes)
+    return Strips(rows[:m], heads, chain, edges, limits, grids, shapes)
 
 
 def cluster_labels(

@@ -14,6 +14,7 @@ from .card import ModelCard, TopViewGeometry
 from .cells import agree_on_cells, mark_cells
 from .cluster import join_boxes, objects_from_points
 from .ground import Ground
+from .linkage import Strips
 from .perception import Box, PointLabels, TopView
 from .stopwatch import Stopwatch
 
@@ -36,6 +37,7 @@ def combine(
     min_score: float,
     distance_per_m: float,
     beside: Callable[[Callable[[], Any]], Callable[[], Any]],
+    strips: Callable[[], Strips] | None = None,
 ) -> tuple[PointLabels | None, TopView | None, Sequence[Box]]:
     """What the parts agree on, and boxes around clusters of points above the ground (KUL-Seg 5.2).
 
@@ -65,6 +67,8 @@ def combine(
     beside : callable
         Calls a function, at once in another thread (`edgeperc.side_thread.SideThread`) or later in this one, and
         returns what gives its result.
+    strips : callable, optional
+        Returns the points above the ground, sorted by `edgeperc.cluster.sort_points`.
 
     Returns
     -------
@@ -75,7 +79,16 @@ def combine(
     if points is not None and rules:
         upright = beside(partial(without_poles, scan, points, ground, rules=rules))
         held = find_support(scan, points, ground, boxes, rules=rules)
-        clusters = find_voters(scan, points, ground, boxes, distance_per_m=distance_per_m, rules=rules, support=held)
+        clusters = find_voters(
+            scan,
+            points,
+            ground,
+            boxes,
+            distance_per_m=distance_per_m,
+            rules=rules,
+            support=held,
+            strips=None if strips is None else strips(),
+        )
         watch.lap("cluster")
     top_view = cells()
     watch.lap("decode")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .kernel_cache import njit
 
-__all__ = ["COLUMN_EDGE", "MAX_COLUMNS", "TESTS_PER_POINT", "fill_clusters"]
+__all__ = ["COLUMN_EDGE", "MAX_COLUMNS", "TESTS_PER_POINT", "Strips", "chain_points", "fill_clusters", "levels_of"]
 
 # A column's edge is slightly more than half the reach of its points. Points of one column are linked if their heights
 # differ by at most 0.7 of the reach: 2 * 0.50005^2 + 0.7^2 < 1.
@@ -27,14 +28,123 @@ TESTS_PER_POINT = 64  # 570 real scans of 10 sensors need at most 6
 FREE, DROPPED = -1, -2  # runs in no cluster; runs of clusters without a sufficient share
 
 
+class Strips(NamedTuple):
+    """The points of a scan by strips: `STRIP` columns of one row of a grid; no labels are needed for it.
+
+    Attributes
+    ----------
+    rows : (m,) int32
+        Of the points that take part, in input order.
+    heads : (strips,) int32
+        A point of each strip, -1 without one. `fill_clusters` overwrites them.
+    chain : (n,) int32
+        After each of the m points, the next one of its strip, or -1.
+    edges : (levels + 1,) float64
+        The reach of a point is the distance up to which it is linked. Points of a level have a reach from its edge up
+        to the next one [m], and columns in proportion: a point has few columns within its reach at any range.
+    limits : (levels + 1,) float64
+        Squared ranges with these reaches [m2].
+    grids : (levels, 3) float64
+        Lowest x and y of the columns, columns per meter.
+    shapes : (levels, 3) int64
+        Rows and columns, and the first strip.
+    """
+
+    rows: NDArray[np.int32]
+    heads: NDArray[np.int32]
+    chain: NDArray[np.int32]
+    edges: NDArray[np.float64]
+    limits: NDArray[np.float64]
+    grids: NDArray[np.float64]
+    shapes: NDArray[np.int64]
+
+
+def levels_of(
+    min_distance: float, distance_per_m: float, max_range: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """``edges`` and ``limits`` of `Strips`."""
+    edges = [min_distance]
+    power = LEVEL_STEP  # exact: there are fewer than 33 levels
+    while min_distance * power <= 2.0 * distance_per_m * max_range:
+        edges.append(min_distance * power)
+        power *= LEVEL_STEP
+    edges.append(min_distance * power)
+    ranges = [edge / distance_per_m if distance_per_m > 0.0 else math.inf for edge in edges]
+    return np.array(edges), np.array([each * each for each in ranges])
+
+
+@njit(cache=True, nogil=True)
+def chain_points(
+    points: NDArray[np.float32],
+    among: NDArray[np.bool_],
+    edges: NDArray[np.float64],
+    limits: NDArray[np.float64],
+    max_range: float,
+    rows: NDArray[np.int32],
+    chain: NDArray[np.int32],
+    grids: NDArray[np.float64],
+    shapes: NDArray[np.int64],
+) -> tuple[int, NDArray[np.int32]]:
+    """Write the points of every strip; see `Strips`.
+
+    Parameters
+    ----------
+    points : (n, 3 or more) float32, C-contiguous
+    among : (n,) bool
+    edges, limits : (levels + 1,) float64
+    max_range : float
+        Points with a larger x, y or z do not take part [m].
+    rows, chain : (n,) int32, overwritten
+    grids : (levels, 3) float64, overwritten
+    shapes : (levels, 3) int64, overwritten
+
+    Returns
+    -------
+    m : int
+        Number of points that take part.
+    heads : (strips,) int32
+    """
+    m = 0
+    low_x, low_y, high_x, high_y = math.inf, math.inf, -math.inf, -math.inf
+    for i in range(points.shape[0]):
+        x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
+        if among[i] and abs(x) <= max_range and abs(y) <= max_range and abs(points[i, 2]) <= max_range:
+            rows[m] = i
+            m += 1
+            low_x, high_x = min(low_x, x), max(high_x, x)
+            low_y, high_y = min(low_y, y), max(high_y, y)
+    n_strips = 0
+    for at in range(shapes.shape[0] if m > 0 else 0):
+        farthest = math.sqrt(limits[at + 1])
+        grids[at, 0], grids[at, 1] = max(low_x, -farthest), max(low_y, -farthest)
+        grids[at, 2] = 1.0 / (COLUMN_EDGE * edges[at])
+        shapes[at, 0] = max(int((min(high_x, farthest) - grids[at, 0]) * grids[at, 2]) + 1, 0)
+        shapes[at, 1] = max(int((min(high_y, farthest) - grids[at, 1]) * grids[at, 2]) + 1, 0)
+        shapes[at, 2] = n_strips
+        n_strips += shapes[at, 0] * ((shapes[at, 1] + STRIP - 1) // STRIP)
+    heads = np.empty(n_strips, np.int32)
+    heads[:] = -1
+    for k in range(m):
+        i = rows[k]
+        strip = strip_of(points, i, limits, grids, shapes)
+        chain[i] = heads[strip]
+        heads[strip] = i
+    return m, heads
+
+
 @njit(cache=True, nogil=True)
 def fill_clusters(
     points: NDArray[np.float32],
-    among: NDArray[np.bool_],
+    rows: NDArray[np.int32],
+    heads: NDArray[np.int32],
+    chain: NDArray[np.int32],
+    edges: NDArray[np.float64],
+    limits: NDArray[np.float64],
+    grids: NDArray[np.float64],
+    shapes: NDArray[np.int64],
     seeds: NDArray[np.bool_],
     votes: NDArray[np.uint8],
     min_shares: NDArray[np.float64],
-    min_distance: float,
     distance_per_m: float,
     max_range: float,
     min_points: int,
@@ -48,11 +158,13 @@ def fill_clusters(
     Parameters
     ----------
     points : (n, 3 or more) float32, C-contiguous
-    among, seeds : (n,) bool
+    rows, heads, chain, edges, limits, grids, shapes
+        Of `Strips`; ``heads`` is overwritten.
+    seeds : (n,) bool
     votes : (n,) uint8
         Bit 0: the point counts. Bit k + 1: it may count for share k.
     min_shares : (k,) float64, at most 7
-    min_distance, distance_per_m, max_range : float
+    distance_per_m, max_range : float
     min_points : int
     clusters : (n,) int32, overwritten
         -1 without a cluster; -2 for points of clusters without a sufficient share, as far as they were looked at.
@@ -62,66 +174,17 @@ def fill_clusters(
     """
     clusters[:] = FREE
     work[:] = 0
-    n_shares = len(min_shares)
+    n_shares, n_levels, m = len(min_shares), len(shapes), len(rows)
     n_left = np.empty(n_shares + 1, np.int64)  # votes of points in no cluster yet
     n_left[:] = 0
-    rows = np.empty(points.shape[0], np.int32)  # of the points that take part
-    m = 0
     n_seeds = 0
-    low_x, low_y, high_x, high_y = math.inf, math.inf, -math.inf, -math.inf
-    for i in range(points.shape[0]):
-        x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
-        if among[i] and abs(x) <= max_range and abs(y) <= max_range and abs(points[i, 2]) <= max_range:
-            rows[m] = i
-            m += 1
-            n_seeds += 1 if seeds[i] else 0
-            low_x, high_x = min(low_x, x), max(high_x, x)
-            low_y, high_y = min(low_y, y), max(high_y, y)
-    if n_seeds == 0:
-        return
-    for k in range(m):  # compiles faster than `for i in rows[:m]`
+    for k in range(m):  # compiles faster than `for i in rows`
         i = rows[k]
+        n_seeds += 1 if seeds[i] else 0
         if votes[i] > 1:
             add_votes(votes[i], n_left)
-
-    # The reach of a point is the distance up to which it is linked. Points of a level have a reach from its edge up to
-    # the next one, and columns in proportion: a point has few columns within its reach at any range.
-    n_levels = 1
-    power = LEVEL_STEP  # exact: there are fewer than 33 levels
-    while min_distance * power <= 2.0 * distance_per_m * max_range:
-        n_levels += 1
-        power *= LEVEL_STEP
-    edges = np.empty(n_levels + 1)
-    limits = np.empty(n_levels + 1)  # squared ranges
-    power = 1.0
-    for at in range(n_levels + 1):
-        edges[at] = min_distance * power
-        power *= LEVEL_STEP
-        ratio = edges[at] / distance_per_m if distance_per_m > 0.0 else math.inf
-        limits[at] = ratio * ratio
-    grids = np.empty((n_levels, 3))  # lowest x and y, columns per meter
-    n_rows = np.empty(n_levels, np.int64)
-    n_cols = np.empty(n_levels, np.int64)
-    offsets = np.empty(n_levels + 1, np.int64)  # the first strip of every level
-    offsets[0] = 0
-    for at in range(n_levels):
-        farthest = math.sqrt(limits[at + 1])
-        grids[at, 0], grids[at, 1] = max(low_x, -farthest), max(low_y, -farthest)
-        grids[at, 2] = 1.0 / (COLUMN_EDGE * edges[at])
-        n_rows[at] = max(int((min(high_x, farthest) - grids[at, 0]) * grids[at, 2]) + 1, 0)
-        n_cols[at] = max(int((min(high_y, farthest) - grids[at, 1]) * grids[at, 2]) + 1, 0)
-        offsets[at + 1] = offsets[at] + n_rows[at] * ((n_cols[at] + STRIP - 1) // STRIP)
-
-    # Points are kept by strips: `STRIP` columns of one row. The points of a strip are a chain: its head, then for every
-    # point the next one.
-    heads = np.empty(offsets[n_levels], np.int32)
-    heads[:] = -1
-    chain = np.empty(points.shape[0], np.int32)
-    for k in range(m):
-        i = rows[k]
-        strip = strip_of(points, i, limits, grids, n_cols, offsets)
-        chain[i] = heads[strip]
-        heads[strip] = i
+    if n_seeds == 0:
+        return
 
     # Runs: points of one column, each linked with the one before. Every run is the root of a tree of smaller parts,
     # which are made when they are needed (are_linked). Runs are numbered from 0, smaller parts from the end down.
@@ -153,7 +216,7 @@ def fill_clusters(
         seed = rows[nth]
         if not seeds[seed]:
             continue
-        strip = strip_of(points, seed, limits, grids, n_cols, offsets)
+        strip = strip_of(points, seed, limits, grids, shapes)
         if heads[strip] >= 0:
             open_strip(
                 points, votes, heads, chain, strip, limits, grids, edges, max_range, distance_per_m, keys, order, xyz,
@@ -184,13 +247,13 @@ def fill_clusters(
             for at in range(lowest, highest + 1):
                 scale = grids[at, 2]
                 first_row = int(max((bounds[run, 0] - far - grids[at, 0]) * scale, 0.0))
-                last_row = int(min((bounds[run, 3] + far - grids[at, 0]) * scale, n_rows[at] - 1.0))
+                last_row = int(min((bounds[run, 3] + far - grids[at, 0]) * scale, shapes[at, 0] - 1.0))
                 first_col = int(max((bounds[run, 1] - far - grids[at, 1]) * scale, 0.0))
-                last_col = int(min((bounds[run, 4] + far - grids[at, 1]) * scale, n_cols[at] - 1.0))
-                n_strips = (n_cols[at] + STRIP - 1) // STRIP
+                last_col = int(min((bounds[run, 4] + far - grids[at, 1]) * scale, shapes[at, 1] - 1.0))
+                n_strips = (shapes[at, 1] + STRIP - 1) // STRIP
                 for row in range(first_row, last_row + 1):
                     for number in range(first_col // STRIP, last_col // STRIP + 1):
-                        strip = offsets[at] + row * n_strips + number
+                        strip = shapes[at, 2] + row * n_strips + number
                         if heads[strip] == -1:
                             continue
                         if heads[strip] >= 0:
@@ -282,14 +345,13 @@ def strip_of(
     i: int,
     limits: NDArray[np.float64],
     grids: NDArray[np.float64],
-    n_cols: NDArray[np.int64],
-    offsets: NDArray[np.int64],
+    shapes: NDArray[np.int64],
 ) -> int:
     """The strip of columns that holds a point."""
     x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
     at = level_of(limits, x, y, z)
     row, col = int((x - grids[at, 0]) * grids[at, 2]), int((y - grids[at, 1]) * grids[at, 2])
-    return int(offsets[at] + row * ((n_cols[at] + STRIP - 1) // STRIP) + col // STRIP)
+    return int(shapes[at, 2] + row * ((shapes[at, 1] + STRIP - 1) // STRIP) + col // STRIP)
 
 
 @njit(cache=True, nogil=True)

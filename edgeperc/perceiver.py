@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from .adapt import Interpolator, condition, render
 from .agreement import RULES
 from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
-from .cluster import MIN_SCORE
+from .cluster import MIN_SCORE, sort_points
 from .combine import BoxesFrom, combine
 from .crop import Crop, sectors_of_turn, spread
 from .decode import decode_boxes, decode_cells, decode_labels
@@ -35,6 +35,7 @@ from .ground import Ground, find_ground
 from .image import ImageScaler, as_image, label_pixels
 from .kernel_cache import fewer_collections
 from .level import MountingEstimate, MountingEstimator
+from .linkage import Strips
 from .mounting import MODEL_HEIGHT_M, Mounting
 from .network_input import input_heights
 from .observed import Observer
@@ -540,22 +541,26 @@ class Perceiver:
         kept, rows = self._crop.select(scan)
         top, ranged = (self._network_of(kind) for kind in (TopViewGeometry, RangeImageGeometry))
         found: Callable[[], list[Box]] | None = None
+        strips: Callable[[], Strips] | None = None
         cells: Callable[[], TopView | None] = partial(self._label_cells, top, kept, lambda: boxes)
         if top is not None and self._at_once and infer:
             found = cache(self._beside(partial(self._find_boxes, top, kept, Stopwatch(), infer)))
             cells = partial(self._label_cells, top, kept, found)
-            if not self.full_turn:
-                cells = self._beside(cells)
         elif top is not None:
             boxes = self._find_boxes(top, kept, watch, infer)
         try:
             ground = self._find_ground(scan, rows)
             watch.lap("cluster")
+            if found is not None and ground is not None and self._rules:
+                strips = partial(sort_points, kept, ~ground.mask, distance_per_m=self._distance_per_m)
+            if found is not None and not self.full_turn:
+                strips, cells = None if strips is None else self._beside(strips), self._beside(cells)
             if ranged is not None:
                 height_m = None if ground is None else ground.height_m
                 if self.full_turn:
-                    cells = cache(cells)
-                    points = self._label_full_turn(ranged, kept, height_m, watch, infer, last=cells)
+                    strips, cells = None if strips is None else cache(strips), cache(cells)
+                    last = [cells] if strips is None else [strips, cells]
+                    points = self._label_full_turn(ranged, kept, height_m, watch, infer, last)
                 else:
                     points = self._label_sector(ranged, kept, height_m, watch, infer)
         finally:
@@ -563,7 +568,7 @@ class Perceiver:
                 boxes = found()
                 watch.lap("infer")
         if ground is not None and infer:
-            points, top_view, boxes = self._combine(kept, ground, points, cells, boxes, watch, infer)
+            points, top_view, boxes = self._combine(kept, ground, points, cells, boxes, watch, infer, strips)
         else:
             top_view = cells()
         return Perception(
@@ -677,12 +682,12 @@ class Perceiver:
         height_m: NDArray[np.float32] | None,
         watch: Stopwatch,
         infer: bool,
-        last: Callable[[], object],
+        last: Sequence[Callable[[], object]],
     ) -> PointLabels:
         """Run the network once for each sector, on a turned scan; a point in two sectors keeps its first label.
 
         The second thread takes sectors, too, once it is done with the top view. The thread that finds none left calls
-        ``last``, while the other one is busy with its sector.
+        what is ``last``, while the other one is busy with its sector.
         """
         sectors: dict[int, tuple[PointLabels, NDArray[np.int32] | None]] = {}
 
@@ -694,10 +699,13 @@ class Perceiver:
             seen = turned(seen, turn_rad) if k else seen
             sectors[k] = self._label_sector(by, seen, heights, watch, infer), rows
 
+        def call(function: Callable[[], object], by: _Network, watch: Stopwatch) -> None:
+            function()
+
         left: deque[Callable[[_Network, Stopwatch], object]] = deque(
             partial(label, k) for k in range(len(self._sectors))
         )
-        left.append(lambda by, watch: last())
+        left.extend(partial(call, each) for each in last)
 
         def label_sectors(by: _Network, watch: Stopwatch) -> None:
             while True:
@@ -732,6 +740,7 @@ class Perceiver:
         boxes: Sequence[Box],
         watch: Stopwatch,
         infer: bool,
+        strips: Callable[[], Strips] | None = None,
     ) -> tuple[PointLabels | None, TopView | None, Sequence[Box]]:
         return combine(
             scan,
@@ -746,4 +755,5 @@ class Perceiver:
             min_score=MIN_SCORE if self.score_threshold is None else self.score_threshold,
             distance_per_m=self._distance_per_m,
             beside=self._beside if self._at_once and infer else lambda function: function,
+            strips=strips,
         )

@@ -10,7 +10,14 @@ from hypothesis import strategies as st
 
 import twins.cluster
 from edgeperc import cluster, linkage
-from edgeperc.cluster import OBJECT_SIZE_M, classes_of_boxes, cluster_labels, find_clusters, objects_from_points
+from edgeperc.cluster import (
+    OBJECT_SIZE_M,
+    classes_of_boxes,
+    cluster_labels,
+    find_clusters,
+    objects_from_points,
+    sort_points,
+)
 from edgeperc.errors import PointsError
 from edgeperc.geometry import oriented_iou
 from edgeperc.points import read_only
@@ -138,12 +145,12 @@ def test_the_work_on_hostile_scans_is_bounded(kind, seed, per_m):
     points = read_only(as_points(hostile(kind, np.random.default_rng(seed), 20_000)))
     every = read_only(np.ones(len(points)), np.bool_)
     clusters, work = np.empty(len(points), np.int32), np.empty(3, np.int64)
-    options = every, every, read_only(np.full(len(points), 3), np.uint8), np.zeros(1), 0.5, per_m, 100.0, 1
-    linkage.fill_clusters(points, *options, clusters, work)
+    options = every, read_only(np.full(len(points), 3), np.uint8), np.zeros(1), per_m, 100.0, 1
+    linkage.fill_clusters(points, *sort_points(points, distance_per_m=per_m), *options, clusters, work)
     assert work[0] <= 100 * len(points)
     assert work[1] <= 2 * linkage.TESTS_PER_POINT * len(points)
     again = np.empty_like(clusters)
-    linkage.fill_clusters(points, *options, again, work)
+    linkage.fill_clusters(points, *sort_points(points, distance_per_m=per_m), *options, again, work)
     np.testing.assert_array_equal(again, clusters)
 
 
