@@ -640,7 +640,8 @@ class Perceiver:
         assert isinstance(grid, TopViewGeometry)
         assert network.observer is not None
         assert self._mounting.height_m is not None
-        labels = decode_cells(card, network.index >= 0, network.session.outputs, boxes())
+        found = boxes()  # first: where no thread can be started, this runs the network
+        labels = decode_cells(card, network.index >= 0, network.session.outputs, found)
         observed = network.observer.observe(scan, network.index, self._mounting.height_m)
         return TopView(labels, card.classes, grid.cell_m, grid.x_range_m, grid.y_range_m, observed, self._mounting)
 

@@ -24,11 +24,12 @@ from edgeperc.agreement import (
     fill_support,
     find_support,
     find_voters,
+    without_poles,
 )
 from edgeperc.card import TopViewGeometry
-from edgeperc.cells import agree_on_cells, clear_cells
+from edgeperc.cells import agree_on_cells, clear_cells, fill_marks, mark_cells
 from edgeperc.cli import arguments
-from edgeperc.cluster import find_clusters, objects_from_points
+from edgeperc.cluster import find_clusters, objects_from_points, sort_points
 from edgeperc.geometry import inside
 from edgeperc.ground import Ground, find_ground
 from edgeperc.points import read_only
@@ -232,9 +233,17 @@ def test_voters_give_the_results_of_complete_clusters(seed: int, rules: frozense
     expected = agree_on_points(points, labels, ground, complete, boxes, rules=rules)
     agreed = agree_on_points(points, labels, ground, voters, boxes, rules=rules)
     support = find_support(points, labels, ground, boxes, rules=rules)
-    np.testing.assert_array_equal(find_voters(points, labels, ground, boxes, rules=rules, support=support), voters)
-    again = agree_on_points(points, labels, ground, voters, boxes, rules=rules, support=support)
+    strips = sort_points(points, ~ground.mask)
+    once = find_voters(points, labels, ground, boxes, rules=rules, support=support, strips=strips)
+    np.testing.assert_array_equal(once, voters)
+    upright = without_poles(points, labels, ground, rules=rules)
+    again = agree_on_points(points, labels, ground, voters, boxes, rules=rules, support=support, upright=upright)
     np.testing.assert_array_equal(again.labels, agreed.labels)
+    view = top_view()
+    marks = mark_cells(view, points, agreed, ground, rules=rules)
+    cells = agree_on_cells(view, points, agreed, ground, boxes, rules=rules)
+    found_once = agree_on_cells(view, points, agreed, ground, boxes, rules=rules, marks=marks)
+    np.testing.assert_array_equal(found_once.labels, cells.labels)
     np.testing.assert_array_equal(agreed.labels, expected.labels)
     found = [
         objects_from_points(points, agreed.labels, CLASSES, height_m=ground.height_m, clusters=clusters)
@@ -276,9 +285,11 @@ def test_cleared_cells_match_the_twin(given: list, by_height: bool, of_road: boo
     is_vehicle = (np.arange(256) > 1) & of_vehicles
     in_box = np.random.default_rng(len(given)).random(cells.shape) < 0.3
     arrays = map_read_only((scene.points, scene.height, scene.in_view, scene.labels))
-    args = *arrays, ROLES, by_height, grid, 1 if of_road else 255, is_vehicle, in_box
-    clear_cells(*args, np.zeros(cells.shape, np.uint8), found)
-    np.testing.assert_array_equal(found, twins.agreement.cells(*args, cells))
+    drivable, marks = 1 if of_road else 255, np.zeros(cells.shape, np.uint8)
+    fill_marks(*arrays, ROLES, by_height, grid, is_vehicle, read_only(cells, np.uint8), marks)
+    clear_cells(marks, np.flatnonzero(marks), drivable, is_vehicle, in_box, found)
+    args = *arrays, ROLES, by_height, grid, drivable, is_vehicle, in_box, cells
+    np.testing.assert_array_equal(found, twins.agreement.cells(*args))
 
 
 # --- what always holds

@@ -22,7 +22,7 @@ PACKAGES = {
 # A module imports from the lines above its own, never from its own line. A new module gets its place here.
 FLOORS = {
     "edgeperc": """
-        errors atomic printable
+        errors atomic printable side_thread stopwatch
         extras mounting onnx_file
         card engine points remote sensor tuning
         kernel_cache perception zoo.__init__
@@ -31,7 +31,7 @@ FLOORS = {
         crop voting
         agreement level network_input occupancy painting remission
         cells
-        first_start
+        combine first_start
         readers.__init__ readers.times
         readers.tables
         readers.inflate readers.packets

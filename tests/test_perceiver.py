@@ -45,11 +45,11 @@ from edgeperc import (
 from edgeperc.card import RangeImageGeometry, TopViewGeometry
 from edgeperc.geometry import inside, oriented_iou
 from edgeperc.mounting import MODEL_MOUNTING
-from edgeperc.perceiver import _Stopwatch
 from edgeperc.perception import PointLabels
 from edgeperc.sensor import get_sensor
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import SimulatedScan, simulate
+from edgeperc.stopwatch import Stopwatch
 from edgeperc.zoo import model_path, shipped_models
 
 
@@ -195,7 +195,7 @@ def test_networks_run_one_after_the_other_where_no_thread_can_be_started(
             assert_same(known, both(scan.points))
     for _ in range(3):
         assert_same(known, both(scan.points))
-    (kept,) = both._threads.values()
+    (kept,) = both._beside._threads.values()
     assert len(kept._threads) == 1
 
 
@@ -677,7 +677,7 @@ def test_car_cut_by_the_views_edge_gets_a_full_box_or_none(seen: float, n_boxes:
     ground = perceive._find_ground(scan)
     assert ground is not None
     points = PointLabels(labels, labels > 0, ("background", "car", "pedestrian", "cyclist"))
-    _, _, boxes = perceive._combine(scan, ground, points, lambda: None, (), _Stopwatch())
+    _, _, boxes = perceive._combine(scan, ground, points, lambda: None, (), Stopwatch(), infer=False)
     assert len(boxes) == n_boxes
     for box in boxes:
         np.testing.assert_allclose(box.center[0], 6.0, atol=0.05)

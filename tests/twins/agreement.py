@@ -150,7 +150,7 @@ def ground(points, height, on_ground, roles, labels):
 
 
 def cells(points, height, in_view, labels, roles, by_height, grid, drivable, is_vehicle, in_box, cells):
-    """Twin of `edgeperc.cells.clear_cells`."""
+    """Twin of `edgeperc.cells.fill_marks` and `clear_cells`."""
     far, left, cell_m = grid
     returns, vehicles, others = np.zeros(cells.shape, int), np.zeros(cells.shape, bool), np.zeros(cells.shape, bool)
     with np.errstate(invalid="ignore", over="ignore"):
