@@ -50,9 +50,13 @@ def street(*boxes: Box, seed: int = 0) -> Scene:
 
 
 def flat(scene: Scene) -> Scene:
+    """The scene on a level street; what stood on the ground still does."""
     terrain = np.zeros_like(scene.terrain)
     terrain[15:BANK_SLOPE_LEFT] = scene.terrain[15:BANK_SLOPE_LEFT]
-    return replace(scene, terrain=terrain)
+    leveled = replace(scene, terrain=terrain)
+    rise = [leveled.ground_height(*o.center[:2]) - scene.ground_height(*o.center[:2]) for o in scene.objects]
+    moved = [replace(o, center=(*o.center[:2], o.center[2] + up)) for o, up in zip(scene.objects, rise, strict=True)]
+    return replace(leveled, objects=tuple(moved))
 
 
 def box(label: str, x: float, y: float, yaw: float = 0.0) -> Box:
@@ -323,6 +327,7 @@ def test_a_scan_is_consistent(environment: str) -> None:
 @settings(max_examples=25, deadline=None)
 @example("truck", 1.0, 0.0, 0.0, 0.25, 0)
 @example("person_sitting", 0.0, 0.0, 0.0, 1.0, 93)
+@example("cyclist", -1.0, -1.0, -1.0, -0.43247780315099105, 19)
 @given(
     st.sampled_from(LABELS),
     st.floats(-1, 1),
@@ -339,11 +344,10 @@ def test_shapes_fill_their_boxes(label: str, a: float, b: float, c: float, yaw: 
     scan = simulate(flat(street(each, seed=seed)), TALL, seed, noise=False)
     mine = scan.points[scan.objects == 0]
     assert len(mine) > 5
-    assert in_box(mine, scan.boxes[0], 0.03).all()  # handlebars stick out of the narrowest cyclists
-    # It reaches near its own top, and what shows is not a sliver of the box. Where the street was lower before it was
-    # made flat, a part of the object is below the ground.
-    above_ground = scan.boxes[0].center[2] + size[2] / 2 + 1.73
-    assert np.ptp(mine[:, 2]) > 0.6 * min(size[2], above_ground)
+    # Handlebars stick out of the narrowest cyclists by 4.3 cm, elbows out of pedestrians by 3.2 cm (of 1,500 shapes).
+    assert in_box(mine, scan.boxes[0], 0.05 if label in ("cyclist", "pedestrian") else 0.03).all()
+    # It reaches near its own top, and what shows is not a sliver of the box.
+    assert np.ptp(mine[:, 2]) > 0.6 * size[2]
     assert math.hypot(np.ptp(mine[:, 0]), np.ptp(mine[:, 1])) > 0.4 * min(size[0], size[1])
 
 
