@@ -473,7 +473,11 @@ class Perceiver:
                 perception = self._nothing(stamp_s, watch)
             else:
                 check = self._to_check > 0 and len(scan) > 0
-                perception = self._perceive(scan, stamp_s, watch, check)
+                try:
+                    perception = self._perceive(scan, stamp_s, watch, check)
+                except BaseException:
+                    self._beside.wait()  # the next call writes to what the second thread still reads
+                    raise
                 self._to_check -= check
             if pixels is not None and self._camera is not None:
                 perception = replace(perception, image=self._camera.label(pixels, watch))

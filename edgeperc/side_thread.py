@@ -36,3 +36,8 @@ class SideThread:
         except RuntimeError:
             del self._threads[process]  # it would call the function later, too
             return function
+
+    def wait(self) -> None:
+        """Wait until nothing is left to do in the thread."""
+        if os.getpid() in self._threads:
+            self(lambda: None)()

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -38,6 +39,7 @@ from edgeperc import (
     fitness,
     geometry,
     ground,
+    perceiver,
     projection,
     refine,
     session,
@@ -174,6 +176,32 @@ def test_a_network_that_fails_beside_another_ends_the_call(
         broken.setattr(both.sessions[failing], "run", fail)
         with pytest.raises(InferenceError, match="no memory left"):
             both(scan.points)
+    assert_same(perception, both(scan.points))
+
+
+@pytest.mark.parametrize("name", ["sort_points", "decode_cells"])
+def test_a_call_that_fails_leaves_nothing_running(
+    monkeypatch: pytest.MonkeyPatch, perception: Perception, scan: SimulatedScan, name: str
+) -> None:
+    monkeypatch.setattr(session, "usable_cores", lambda: 2)
+    both = Perceiver(["ssadnet", "pointseg"], provider="cpu", on_mismatch="ignore")
+    begun, ended = threading.Event(), threading.Event()
+
+    def slow(*_: object, **__: object) -> None:
+        begun.set()
+        time.sleep(0.3)
+        ended.set()
+
+    def fail(*_: object, **__: object) -> None:
+        assert begun.wait(10.0)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as broken:
+        broken.setattr(perceiver, name, slow)
+        broken.setattr(perceiver, "label_points", fail)
+        with pytest.raises(KeyboardInterrupt):
+            both(scan.points)
+        assert ended.is_set()
     assert_same(perception, both(scan.points))
 
 
