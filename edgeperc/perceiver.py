@@ -14,7 +14,7 @@ from functools import cache, partial, wraps
 from itertools import pairwise
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Literal, NamedTuple, NoReturn, ParamSpec
+from typing import Any, Literal, NamedTuple, NoReturn, ParamSpec
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -373,7 +373,7 @@ class Perceiver:
             if ground is not None:
                 unsure = (Box("car", 0.4, (5.0, 0.0, -1.0), (4.0, 1.6, 1.5), 0.0),)
                 seen = None if perception.points is None else labels
-                self._combine(floor, ground, seen, lambda: perception.top_view, unsure, Stopwatch(), False)
+                self._combine(floor, ground, seen, lambda: perception.top_view, unsure, Stopwatch(), infer=False)
             if boxes_points:
                 compile_parts(["boxes"])  # some only several boxes need
             if "top_view" in views:
@@ -572,7 +572,9 @@ class Perceiver:
                 boxes = found()
                 watch.lap("infer")
         if ground is not None and infer:
-            points, top_view, boxes = self._combine(kept, ground, points, cells, boxes, watch, infer, strips)
+            points, top_view, boxes = self._combine(
+                kept, ground, points, cells, boxes, watch, infer=infer, strips=strips
+            )
         else:
             top_view = cells()
         return Perception(
@@ -737,23 +739,11 @@ class Perceiver:
         return find_ground(scan, mount_height_m=MODEL_HEIGHT_M, rows=rows) if self._needs_ground else None
 
     def _combine(
-        self,
-        scan: NDArray[np.float32],
-        ground: Ground,
-        points: PointLabels | None,
-        cells: Callable[[], TopView | None],
-        boxes: Sequence[Box],
-        watch: Stopwatch,
-        infer: bool,
-        strips: Callable[[], Strips] | None = None,
+        self, *parts: Any, infer: bool, strips: Callable[[], Strips] | None = None
     ) -> tuple[PointLabels | None, TopView | None, Sequence[Box]]:
+        """`combine` with the options of this perceiver; ``parts`` are its arguments without a name."""
         return combine(
-            scan,
-            ground,
-            points,
-            cells,
-            boxes,
-            watch,
+            *parts,
             cards=self.cards,
             rules=self._rules,
             boxes_from=self.boxes_from,
