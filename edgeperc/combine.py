@@ -37,7 +37,7 @@ def combine(
     min_score: float,
     distance_per_m: float,
     beside: Callable[[Callable[[], Any]], Callable[[], Any]],
-    strips: Callable[[], Strips] | None = None,
+    strips: Callable[[], Strips | None],
 ) -> tuple[PointLabels | None, TopView | None, Sequence[Box]]:
     """What the parts agree on, and boxes around clusters of points above the ground (KUL-Seg 5.2).
 
@@ -67,8 +67,8 @@ def combine(
     beside : callable
         Calls a function, at once in another thread (`edgeperc.side_thread.SideThread`) or later in this one, and
         returns what gives its result.
-    strips : callable, optional
-        Returns the points above the ground, sorted by `edgeperc.cluster.sort_points`.
+    strips : callable
+        Returns the points above the ground, sorted by `edgeperc.cluster.sort_points`; None if they are not sorted yet.
 
     Returns
     -------
@@ -87,7 +87,7 @@ def combine(
             distance_per_m=distance_per_m,
             rules=rules,
             support=held,
-            strips=None if strips is None else strips(),
+            strips=strips(),
         )
         watch.lap("cluster")
     top_view = cells()

@@ -109,6 +109,10 @@ class Learned(NamedTuple):
     is_settled: bool
 
 
+def _not_sorted() -> None:
+    """No points were sorted for the clusters yet."""
+
+
 def _view_kind(model: str | os.PathLike[str]) -> str | None:
     """Kind of a model's view; None if its card cannot be read, which the model's session reports."""
     try:
@@ -545,7 +549,7 @@ class Perceiver:
         kept, rows = self._crop.select(scan)
         top, ranged = (self._network_of(kind) for kind in (TopViewGeometry, RangeImageGeometry))
         found: Callable[[], list[Box]] | None = None
-        strips: Callable[[], Strips] | None = None
+        strips: Callable[[], Strips | None] = _not_sorted
         cells: Callable[[], TopView | None] = partial(self._label_cells, top, kept, lambda: boxes)
         if top is not None and self._at_once and infer:
             found = cache(self._beside(partial(self._find_boxes, top, kept, Stopwatch(), infer)))
@@ -558,13 +562,12 @@ class Perceiver:
             if found is not None and ground is not None and self._rules:
                 strips = partial(sort_points, kept, ~ground.mask, distance_per_m=self._distance_per_m)
             if found is not None and not self.full_turn:
-                strips, cells = None if strips is None else self._beside(strips), self._beside(cells)
+                strips, cells = self._beside(strips), self._beside(cells)
             if ranged is not None:
                 height_m = None if ground is None else ground.height_m
                 if self.full_turn:
-                    strips, cells = None if strips is None else cache(strips), cache(cells)
-                    last = [cells] if strips is None else [strips, cells]
-                    points = self._label_full_turn(ranged, kept, height_m, watch, infer, last)
+                    strips, cells = cache(strips), cache(cells)
+                    points = self._label_full_turn(ranged, kept, height_m, watch, infer, last=(strips, cells))
                 else:
                     points = self._label_sector(ranged, kept, height_m, watch, infer)
         finally:
@@ -739,7 +742,7 @@ class Perceiver:
         return find_ground(scan, mount_height_m=MODEL_HEIGHT_M, rows=rows) if self._needs_ground else None
 
     def _combine(
-        self, *parts: Any, infer: bool, strips: Callable[[], Strips] | None = None
+        self, *parts: Any, infer: bool, strips: Callable[[], Strips | None] = _not_sorted
     ) -> tuple[PointLabels | None, TopView | None, Sequence[Box]]:
         """`combine` with the options of this perceiver; ``parts`` are its arguments without a name."""
         return combine(
