@@ -59,15 +59,14 @@ def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True
             scan = given.copy()
             with np.errstate(over="ignore", invalid="ignore"):
                 scan[:, 3] = (scan[:, 3] + offset) * scale
+    finite = np.isfinite(scan)
     n_dropped = 0
-    with np.errstate(over="ignore", invalid="ignore"):
-        total = float(scan.sum())  # not finite if one value is not; nearly every scan is entirely finite
-    if not math.isfinite(total):
-        dropped = ~np.isfinite(scan).all(axis=1)
+    # First the whole array: all(axis=1) takes ten times as long, and nearly every scan is entirely finite.
+    if not finite.all():
+        dropped = ~finite.all(axis=1)
         n_dropped = int(np.count_nonzero(dropped))
-        if n_dropped:
-            scan = given.copy() if scan is given else scan
-            scan[dropped] = np.nan
+        scan = given.copy() if scan is given else scan
+        scan[dropped] = np.nan
     return read_only(scan), n_dropped
 
 
