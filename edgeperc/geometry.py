@@ -122,7 +122,7 @@ def shared_area(iou: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.
 
 
 def suppress_overlaps(
-    rectangles: ArrayLike, scores: ArrayLike, iou_threshold: float, *, max_inside: float = math.inf
+    rectangles: ArrayLike, scores: ArrayLike, iou_threshold: ArrayLike, *, max_inside: float = math.inf
 ) -> NDArray[np.int64]:
     """Greedy non-maximum suppression of oriented rectangles.
 
@@ -131,8 +131,9 @@ def suppress_overlaps(
     rectangles : (n, 5) array_like
         x, y, length, width [m], yaw [rad].
     scores : (n,) array_like
-    iou_threshold : float
-        A rectangle is dropped if it overlaps a kept one with a better score by more than this.
+    iou_threshold : float or (n,) array_like
+        A rectangle is dropped if it overlaps a kept one with a better score by more than this; with one threshold a
+        rectangle, by more than the lower one of the two.
     max_inside : float
         It is also dropped if the area shared with a better one is more than this share of the smaller one's area.
 
@@ -145,15 +146,19 @@ def suppress_overlaps(
     Raises
     ------
     PointsError
-        ``rectangles`` is not an (n, 5) array, or ``scores`` has another length.
+        ``rectangles`` is not an (n, 5) array, or ``scores`` or ``iou_threshold`` has another length.
     """
     rows = _as_rectangles(rectangles)
     values = np.asarray(scores, dtype=np.float64)
     if values.shape != (len(rows),):
         raise PointsError(f"got scores of shape {values.shape} for {len(rows)} rectangles; pass one score a rectangle")
+    limits = np.asarray(iou_threshold, dtype=np.float64)
+    if limits.shape not in ((), values.shape):
+        raise PointsError(f"got thresholds of shape {limits.shape} for {len(rows)} rectangles; pass one, or one each")
+    limits = np.broadcast_to(limits, values.shape)
     order = np.argsort(-values, kind="stable")
     keep = np.empty(len(rows), np.bool_)
-    mark_nms(read_only(rows[order], np.float64), iou_threshold, max_inside, keep)
+    mark_nms(read_only(rows[order], np.float64), read_only(limits[order], np.float64), max_inside, keep)
     return order[keep]
 
 
@@ -245,14 +250,17 @@ def fill_oriented_iou(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArr
 
 
 @njit(cache=True, nogil=True)
-def mark_nms(rectangles: NDArray[np.float64], iou_threshold: float, max_inside: float, keep: NDArray[np.bool_]) -> None:
+def mark_nms(
+    rectangles: NDArray[np.float64], limits: NDArray[np.float64], max_inside: float, keep: NDArray[np.bool_]
+) -> None:
     """Mark the rectangles that overlap no better kept rectangle too much.
 
     Parameters
     ----------
     rectangles : (n, 5) float64, C-contiguous
         Best first.
-    iou_threshold : float
+    limits : (n,) float64, C-contiguous
+        Two may overlap by the lower one of their limits (IoU).
     max_inside : float
         Of the smaller area of two.
     keep : (n,) bool, overwritten
@@ -265,7 +273,8 @@ def mark_nms(rectangles: NDArray[np.float64], iou_threshold: float, max_inside: 
                 continue
             iou = pair_iou(rectangles[j], rectangles[i])
             other = rectangles[j, 2] * rectangles[j, 3]
-            if iou > iou_threshold or iou / (1.0 + iou) * (other + area) > max_inside * min(other, area):
+            limit = min(limits[i], limits[j])
+            if iou > limit or iou / (1.0 + iou) * (other + area) > max_inside * min(other, area):
                 keep[i] = False
                 break
 

@@ -19,7 +19,7 @@ from edgeperc.cluster import (
     sort_points,
 )
 from edgeperc.errors import PointsError
-from edgeperc.geometry import oriented_iou
+from edgeperc.geometry import oriented_iou, rectangles
 from edgeperc.points import read_only
 
 CLASSES = ("background", "car", "pedestrian", "cyclist")
@@ -408,6 +408,39 @@ def test_sides_longer_than_usual_are_kept():
     points = as_points(car_points(12.0, 6.0, 0.0, size=(11.0, 2.5)))
     (box,) = objects_from_points(points, np.ones(len(points), np.uint8), CLASSES)
     np.testing.assert_allclose(box.size[:2], (11.0, 2.5), atol=0.05)
+
+
+@pytest.mark.parametrize(("x", "y", "yaw"), [(14.0, 9.0, 0.4), (20.0, -6.0, 0.0), (5.0, 18.0, 1.2)])
+def test_what_stands_beside_a_vehicle_does_not_widen_its_box(x, y, yaw):
+    beside = np.array([-math.sin(yaw), math.cos(yaw)])
+    beside *= math.copysign(1.0, beside @ (x, y))  # away from the sensor
+    car = car_points(x, y, yaw, size=(5.07, 1.91))
+    stray = side((x, y) + 2.3 * beside, (x, y) + 3.3 * beside, z=(-1.5, -1.0))
+    points = as_points(np.concatenate([car, stray]))
+    labels = np.ones(len(points), np.uint8)
+    clusters = np.zeros(len(points), np.int32)
+    (alone,) = objects_from_points(as_points(car), labels[: len(car)], CLASSES, clusters=clusters[: len(car)])
+    (box,) = objects_from_points(points, labels, CLASSES, clusters=clusters)
+    assert min(cluster_extents(points, box.yaw)) > cluster.MAX_WIDTH_M
+    assert oriented_iou(rectangles([box]), rectangles([alone]))[0, 0] > 0.8
+    # A class that is no vehicle may be as wide as its points.
+    (wide,) = objects_from_points(points, labels, ("background", "shed"), clusters=clusters)
+    assert min(wide.size[:2]) > cluster.MAX_WIDTH_M
+
+
+def cluster_extents(points, yaw):
+    """How far points reach along and across a heading [m]."""
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return np.ptp(points[:, :2] @ np.array([[cos, -sin], [sin, cos]]), axis=0)
+
+
+@pytest.mark.parametrize("n", [2, 3, 500])
+def test_a_cluster_as_wide_as_a_street_gets_a_finite_box(n):
+    rng = np.random.default_rng(n)
+    points = as_points(rng.uniform([10.0, -20.0, -1.5], [50.0, 20.0, 0.0], (n, 3)))
+    clusters, labels = np.zeros(n, np.int32), np.ones(n, np.uint8)
+    for box in objects_from_points(points, labels, CLASSES, clusters=clusters, min_points=1, min_score=0.0):
+        assert np.isfinite([box.score, *box.center, *box.size, box.yaw]).all()
 
 
 def test_boxes_stand_on_the_ground():

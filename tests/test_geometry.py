@@ -95,17 +95,20 @@ def test_empty_and_misshapen():
         oriented_iou(np.zeros((3, 4)), [])
     with pytest.raises(PointsError, match="one score a rectangle"):
         suppress_overlaps(np.zeros((3, 5)), [0.1], 0.5)
+    with pytest.raises(PointsError, match=r"thresholds of shape \(2,\) for 3 rectangles; pass one, or one each"):
+        suppress_overlaps(np.zeros((3, 5)), [0.1, 0.2, 0.3], [0.5, 0.5])
 
 
 def test_suppression_agrees_with_the_twin():
     rng = np.random.default_rng(2)
     for n in (1, 2, 30):
         rectangles, scores = some_rectangles(rng, n), rng.integers(0, 5, n) / 5.0
-        for threshold in (0.0, 0.2, 1.0):
+        for threshold in (0.0, 0.2, 1.0, rng.choice([0.0, 0.1, 0.3], n)):
             order = np.argsort(-scores, kind="stable")
-            expected = order[twins.decode.nms(rectangles[order], threshold)]
+            ordered = np.broadcast_to(threshold, n)[order]
+            expected = order[twins.decode.nms(rectangles[order], ordered)]
             np.testing.assert_array_equal(suppress_overlaps(rectangles, scores, threshold), expected)
-            expected = order[twins.decode.nms(rectangles[order], threshold, 0.5)]
+            expected = order[twins.decode.nms(rectangles[order], ordered, 0.5)]
             np.testing.assert_array_equal(suppress_overlaps(rectangles, scores, threshold, max_inside=0.5), expected)
 
 
@@ -117,6 +120,9 @@ def test_suppression_keeps_the_earlier_of_equals_and_chains_greedily():
     assert suppress_overlaps(row, [0.5, 0.5, 0.5], 0.3).tolist() == [0, 2]
     assert suppress_overlaps(row, [0.5, 0.5, 0.5], 0.34).tolist() == [0, 1, 2]
     assert suppress_overlaps([row[0], row[0]], [0.5, 0.5], 0.99).tolist() == [0]
+    # The lower one of two thresholds counts.
+    assert suppress_overlaps(row, [0.9, 0.8, 0.7], [0.5, 0.5, 0.3]).tolist() == [0, 1]
+    assert suppress_overlaps(row, [0.9, 0.8, 0.7], [0.3, 0.5, 0.5]).tolist() == [0, 2]
 
 
 def test_suppression_of_small_rectangles_in_large_ones():

@@ -92,6 +92,14 @@ def test_people_side_by_side_have_a_box_each(away, apart, n):
     assert max(nearest) < 0.25
 
 
+@pytest.mark.parametrize(("apart", "n"), [(1.2, 1), (1.9, 2)])
+def test_boxes_of_cyclists_do_not_overlap(apart, n):
+    parts = [person(15.0, 0.0), person(15.0, apart)]
+    clusters = np.repeat(np.array([0, 1], np.int32), [len(part) for part in parts])
+    assert [box.label for box in boxes_of(*parts, labels=[3, 3], clusters=clusters)] == ["cyclist"] * n
+    assert [box.label for box in boxes_of(*parts, labels=[2, 2], clusters=clusters)] == ["pedestrian"] * 2
+
+
 def test_a_person_in_a_stride_is_one_person():
     foot = upright(10.0, 0.0, 1.0, 0.1, z=(0.15, 0.3))
     (box,) = boxes_of(np.concatenate([person(10.0, 0.0), foot]))

@@ -57,9 +57,10 @@ def oriented_iou(a, b):
 def nms(rectangles, iou_threshold, max_inside=np.inf):
     """Twin of `edgeperc.geometry.mark_nms`."""
     iou = oriented_iou(rectangles, rectangles)
+    limits = np.broadcast_to(iou_threshold, len(rectangles))
     area = rectangles[:, 2] * rectangles[:, 3]
     shared = iou / (1.0 + iou) * np.add.outer(area, area)
-    same = (iou > iou_threshold) | (shared > max_inside * np.minimum.outer(area, area))
+    same = (iou > np.minimum.outer(limits, limits)) | (shared > max_inside * np.minimum.outer(area, area))
     keep = np.ones(len(rectangles), dtype=bool)
     for i in range(len(rectangles)):
         keep[i] = not same[i, :i][keep[:i]].any()
