@@ -369,6 +369,7 @@ def objects_from_points(
     height_m: NDArray[np.float32] | None = None,
     clusters: NDArray[np.int32] | None = None,
     in_view: NDArray[np.bool_] | None = None,
+    others: Sequence[Box] = (),
     min_share: float = 0.7,
     min_distance_m: float = 0.5,
     distance_per_m: float = 0.015,
@@ -395,6 +396,8 @@ def objects_from_points(
         they are found among ``among``.
     in_view : (n,) bool, optional
         Points in the network's view, all by default. The others have no label.
+    others : sequence of Box
+        Boxes that are known, such as a network's. Points inside of them are no further object.
     min_share : float
         A cluster is kept if more than this share of its points in view has one class (KUL-Seg 5.2); if less than 70 %
         of it is in view, of 70 % of its points. Persons need no share.
@@ -436,8 +439,10 @@ def objects_from_points(
     2.4 m or a length of 7 m on. Both are completed to the size of a van.
 
     Two boxes are pieces of one object if they overlap by more than 0.1, or if more than half of one footprint lies in
-    the other; the box with the higher score is kept. Boxes are fitted to at most 1000 clusters, those with the highest
-    product of the first two factors, and to 1000 persons: no real scan has as many, and the time stays bounded.
+    the other; the box with the higher score is kept. What lies with more than half of the rectangle around its points
+    in a better box, of a cluster or of ``others``, is a part of that object. Boxes are fitted to at most 1000 clusters,
+    those with the highest product of the first two factors, and to 1000 persons: no real scan has as many, and the time
+    stays bounded.
 
     Persons get boxes of their own, wherever they stand. A cluster that is no larger than a cyclist, and of which a
     fifth of the points has a person's label, is one group; of other clusters, labeled points that are linked are one
@@ -492,7 +497,7 @@ def objects_from_points(
     named_by_size = {*classes_of_boxes(classes)} - {*classes}
     rows = read_only(points)
     above = read_only(np.zeros(len(points)) if height_m is None else height_m)
-    boxes = []
+    boxes, spans = [], []
     for k in kept.tolist():
         name = classes[found[k]]
         members = order[starts[k] : starts[k + 1]]
@@ -516,9 +521,27 @@ def objects_from_points(
                 name = _vehicle_of_size(side, top - bottom)
                 usual = "car" if name == "car" else "van"  # trucks differ too much in length
             boxes.append(_completed(name, score, rectangle, bottom, top, size_m.get(usual, (0.0, 0.0, 0.0))))
+            spans.append(rectangle)
+    boxes = _not_inside(boxes, spans, others)
     persons = [box for box in persons if box.score >= min_score]
     kept_persons = _distinct(persons, [MAX_PERSONS_OVERLAP[box.label] for box in persons])
     return join_boxes(_distinct(boxes, [MAX_OVERLAP] * len(boxes)), kept_persons)
+
+
+def _not_inside(boxes: list[Box], spans: Sequence[NDArray[np.float64]], others: Sequence[Box]) -> list[Box]:
+    """The boxes without those whose points lie mostly in a better one: glass, a mirror, the inside of a bus.
+
+    ``spans`` has the rectangle around the points of each box, which is smaller than the box.
+    """
+    if not boxes:
+        return boxes
+    every = [*boxes, *others]
+    a, b = np.array(spans), rectangles(every)
+    a[:, 2:4] = np.maximum(a[:, 2:4], MIN_SIDE_M)
+    scores = np.array([box.score for box in every])
+    inside = shared_area(oriented_iou(a, b), a, b) > MAX_INSIDE * (a[:, 2] * a[:, 3])[:, np.newaxis]
+    inside &= scores > scores[: len(boxes), np.newaxis]
+    return [boxes[row] for row in np.flatnonzero(~inside.any(axis=1)).tolist()]
 
 
 def _fitted(

@@ -112,6 +112,7 @@ def combine(
             height_m=ground.height_m,
             clusters=clusters,
             in_view=points.in_view,
+            others=boxes if boxes_from == "both" else (),
             distance_per_m=distance_per_m,
             min_score=min_score,
         )

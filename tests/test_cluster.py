@@ -15,6 +15,7 @@ from edgeperc.cluster import (
     classes_of_boxes,
     cluster_labels,
     find_clusters,
+    join_boxes,
     objects_from_points,
     sort_points,
 )
@@ -504,6 +505,26 @@ def test_pieces_of_one_object_are_one_box():
     points = as_points(points[(points[:, 0] < 19.6) | (points[:, 0] > 20.4)])  # a pole in front
     assert find_clusters(points).max() == 1
     assert len(objects_from_points(points, np.ones(len(points), np.uint8), CLASSES)) == 1
+
+
+def test_what_lies_inside_a_better_box_is_no_further_object():
+    """Returns from inside a car, seen through its windows: completed away from the sensor, they would reach beyond."""
+    shell = car_points(20.0, 6.0, 0.0)
+    inside = side((20.3, 6.2), (21.3, 6.2), z=(-1.4, -0.4))
+    points = as_points(np.concatenate([shell, inside]))
+    labels = np.ones(len(points), np.uint8)
+    clusters = np.repeat(np.array([0, 1], np.int32), [len(shell), len(inside)])
+    alone = as_points(inside), labels[len(shell) :], CLASSES
+    one = np.zeros(len(inside), np.int32)
+    (ghost,) = objects_from_points(*alone, clusters=one)
+    (car,) = objects_from_points(points, labels, CLASSES, clusters=clusters)
+    assert math.dist(car.center[:2], (20.0, 6.0)) < 0.1
+    assert len(join_boxes([car], [ghost])) == 2  # the boxes hardly overlap
+    # The same for a box of another source, if it has the better score.
+    assert objects_from_points(*alone, clusters=one, others=[replace(car, score=ghost.score + 0.01)]) == ()
+    assert objects_from_points(*alone, clusters=one, others=[replace(car, score=ghost.score)]) == (ghost,)
+    away = replace(car, center=(20.0, 16.0, 0.0))
+    assert objects_from_points(*alone, clusters=one, others=[away]) == (ghost,)
 
 
 def test_every_class_has_boxes_and_better_ones_come_first():
