@@ -18,7 +18,7 @@ from .errors import PointsError
 from .kernel_cache import njit
 from .points import read_only
 
-__all__ = ["Ground", "find_ground"]
+__all__ = ["Ground", "GroundFit", "find_ground", "fit_ground"]
 
 # 256 x 256 cells of half a meter, in 16 x 16 regions of 16 x 16 cells. Farther out, few rays meet the ground.
 CELL_M = 0.5
@@ -128,31 +128,71 @@ def find_ground(
     SemanticKITTI (ground: road, parking, pavement, other ground, terrain, lane marking; vegetation is left out, because
     its grass may be either) recall is 0.998 and precision 0.983; Patchwork++ has 0.996 and 0.977.
     """
+    return fit_ground(points, mount_height_m=mount_height_m, regions=regions).heights(rows, max_height_m=max_height_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroundFit:
+    """Planes of the ground below a scan, the first half of `find_ground`; `heights` is the second.
+
+    Attributes
+    ----------
+    points : (n, 4) float32
+        The scan; not a copy.
+    cell : (n,) int32
+        Cell of each point.
+    lowest : (N_CELLS, N_CELLS) int32
+        Row of the lowest point in each cell.
+    plane : (3,) float64
+        a, b, c around the vehicle.
+    planes : (N_REGIONS, N_REGIONS, 3) float64 or None
+        Of each region; None if there is the first plane only.
+    found : bool
+        Whether there is ground.
+    """
+
+    points: NDArray[np.float32]
+    cell: NDArray[np.int32]
+    lowest: NDArray[np.int32]
+    plane: NDArray[np.float64]
+    planes: NDArray[np.float64] | None
+    found: bool
+
+    def heights(self, rows: NDArray[np.int32] | None = None, *, max_height_m: float = 0.125) -> Ground:
+        """The ground of the points in some rows, or of all; parameters and errors as in `find_ground`."""
+        if not 0.0 < max_height_m < math.inf:
+            raise PointsError(f"got max_height_m={max_height_m}; expected meters above 0")
+        wanted = np.arange(len(self.points), dtype=np.int32) if rows is None else rows
+        height = np.empty(len(wanted), np.float32)
+        mask = np.empty(len(wanted), np.bool_)
+        if self.planes is not None:
+            level = np.empty((N_CELLS, N_CELLS), np.float32)
+            fill_levels(self.points, self.lowest, self.planes, wanted, self.cell, level)
+            fill_heights(self.points, wanted, self.cell, level, self.planes, max_height_m, height, mask)
+        else:
+            fill_heights_above_plane(self.points, wanted, self.plane, max_height_m, height, mask)
+            mask &= self.found
+        a, b, c = self.plane.tolist()
+        return Ground(mask, height, (a, b, c) if self.found else None)
+
+
+def fit_ground(points: NDArray[np.float32], *, mount_height_m: float = 1.73, regions: bool = True) -> GroundFit:
+    """Fit the planes of the ground; parameters and errors as in `find_ground`."""
     if points.ndim != 2 or points.shape[1] < 3:
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
-    if not (0.0 < mount_height_m < math.inf and 0.0 < max_height_m < math.inf):
-        raise PointsError(
-            f"got mount_height_m={mount_height_m} and max_height_m={max_height_m}; expected meters above 0"
-        )
+    if not 0.0 < mount_height_m < math.inf:
+        raise PointsError(f"got mount_height_m={mount_height_m}; expected meters above 0")
     scan = read_only(points if points.shape[1] == 4 else np.pad(points[:, :3], ((0, 0), (0, 1))))
     cell = np.empty(len(scan), np.int32)
     lowest = np.empty((N_CELLS, N_CELLS), np.int32)
     fill_lowest(scan, cell, lowest)
     plane = np.array([0.0, 0.0, -mount_height_m])
     found = fit_first_plane(scan, lowest, FIRST_REACH_M, plane)
-    wanted = np.arange(len(scan), dtype=np.int32) if rows is None else rows
-    height = np.empty(len(wanted), np.float32)
-    mask = np.empty(len(wanted), np.bool_)
+    planes = None
     if found and regions:
         planes = np.empty((N_REGIONS, N_REGIONS, 3))
         fill_planes(scan, lowest, plane, planes)
-        level = np.empty((N_CELLS, N_CELLS), np.float32)
-        fill_levels(scan, lowest, planes, level)
-        fill_heights(scan, wanted, cell, level, planes, max_height_m, height, mask)
-    else:
-        fill_heights_above_plane(scan, wanted, plane, max_height_m, height, mask)
-        mask &= found
-    return Ground(mask, height, (float(plane[0]), float(plane[1]), float(plane[2])) if found else None)
+    return GroundFit(scan, cell, lowest, plane, planes, found)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -412,24 +452,38 @@ def refine_plane(
 
 @njit(cache=True, nogil=True)
 def fill_levels(
-    points: NDArray[np.float32], lowest: NDArray[np.int32], planes: NDArray[np.float64], level: NDArray[np.float32]
+    points: NDArray[np.float32],
+    lowest: NDArray[np.int32],
+    planes: NDArray[np.float64],
+    rows: NDArray[np.int32],
+    cell: NDArray[np.int32],
+    level: NDArray[np.float32],
 ) -> None:
-    """Write the height of the ground in the middle of every cell that holds a point.
+    """Write the height of the ground in the middle of every cell that holds one of some points.
 
     Parameters
     ----------
     points : (n, 3 or more) float32, C-contiguous
     lowest : (N_CELLS, N_CELLS) int32
     planes : (N_REGIONS, N_REGIONS, 3) float64
+    rows : (m,) int32
+        The points.
+    cell : (n,) int32
     level : (N_CELLS, N_CELLS) float32, overwritten
-        z [m]; NaN without a point.
+        z [m]; NaN without a point, and anything in rows of cells that no point of ``rows`` is in or between.
     """
+    # Of the points ahead, the cells behind are not needed: half of the time.
+    first, last = N_CELLS - 1, 0
+    for k in range(rows.shape[0]):
+        row = cell[rows[k]] // N_CELLS
+        if row >= 0:
+            first, last = min(first, row), max(last, row)
     # Padded with zeros, so that the sums below need no bounds checks: this halves the time.
     step = np.empty((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), np.float32)
     counts = np.empty((N_CELLS + 2 * WINDOW, N_CELLS + 2 * WINDOW), np.float32)
     step[:] = 0.0
     counts[:] = 0.0
-    for row in range(N_CELLS):
+    for row in range(max(first - WINDOW, 0), min(last + WINDOW + 1, N_CELLS)):
         u = min(max((row + 0.5) / CELLS_A_REGION - 0.5, 0.0), N_REGIONS - 1.0)
         r = min(int(u), N_REGIONS - 2)
         u -= r
@@ -461,7 +515,7 @@ def fill_levels(
             if abs(off) <= MAX_STEP_M:
                 step[row + WINDOW, col + WINDOW] = off
                 counts[row + WINDOW, col + WINDOW] = 1.0
-    for row in range(N_CELLS):
+    for row in range(first, last + 1):
         for col in range(N_CELLS):
             if lowest[row, col] < 0:
                 continue

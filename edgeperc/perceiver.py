@@ -31,7 +31,7 @@ from .errors import EdgepercError, FitnessError, ImageError, MountingError, Opti
 from .first_start import Helpers, car_and_person, compile_parts
 from .fitness import Finding, FitnessProfile, check_profiles
 from .frame import ModelFrame, turned
-from .ground import Ground, find_ground
+from .ground import GroundFit, find_ground, fit_ground
 from .image import ImageScaler, as_image, label_pixels
 from .kernel_cache import fewer_collections
 from .level import MountingEstimate, MountingEstimator
@@ -369,7 +369,7 @@ class Perceiver:
             render(warm_up, replace(self.sensor, remission=NO_REMISSION))
             perception = self._perceive(warm_up, None, Stopwatch(), self._to_check > 0, infer=False)
             floor, labels = car_and_person()
-            ground = self._find_ground(floor)
+            ground = find_ground(floor, mount_height_m=MODEL_HEIGHT_M) if self._needs_ground else None
             with suppress(MountingError):  # the floor has no street
                 self._estimator.add(floor)
             ModelFrame(Mounting(0.0, 0.0, 0.0, 0.0)).move(floor)
@@ -546,18 +546,26 @@ class Perceiver:
         watch.lap("check")
         points: PointLabels | None = None
         boxes: Sequence[Box] = ()
-        kept, rows = self._crop.select(scan)
         top, ranged = (self._network_of(kind) for kind in (TopViewGeometry, RangeImageGeometry))
+        at_once = top is not None and self._at_once and infer
+        fit: Callable[[], GroundFit] | None = None  # once for all that needs it: the input of a network, the clusters
+        if self._needs_ground:
+            fit = partial(fit_ground, scan, mount_height_m=MODEL_HEIGHT_M)
+            fit = self._beside(fit) if at_once else fit
+        kept, rows = self._crop.select(scan)
         found: Callable[[], list[Box]] | None = None
         strips: Callable[[], Strips | None] = _not_sorted
         cells: Callable[[], TopView | None] = partial(self._label_cells, top, kept, lambda: boxes)
-        if top is not None and self._at_once and infer:
-            found = cache(self._beside(partial(self._find_boxes, top, kept, Stopwatch(), infer)))
+        if top is not None:
+            self._project(top, kept)
+            watch.lap("project")
+        if top is not None and at_once:
+            found = cache(self._beside(partial(self._find_boxes, top, Stopwatch(), infer)))
             cells = partial(self._label_cells, top, kept, found)
         elif top is not None:
-            boxes = self._find_boxes(top, kept, watch, infer)
+            boxes = self._find_boxes(top, watch, infer)
         try:
-            ground = self._find_ground(scan, rows)
+            ground = None if fit is None else fit().heights(rows)
             watch.lap("cluster")
             if found is not None and ground is not None and self._rules:
                 strips = partial(sort_points, kept, ~ground.mask, distance_per_m=self._distance_per_m)
@@ -627,10 +635,8 @@ class Perceiver:
         network.projector.fill(scan, network.session.input, network.index, pixel, height_m)
         return pixel
 
-    def _find_boxes(self, network: _Network, scan: NDArray[np.float32], watch: Stopwatch, infer: bool) -> list[Box]:
-        """Run the network of the top view, and decode its boxes (SSADNet)."""
-        self._project(network, scan)
-        watch.lap("project")
+    def _find_boxes(self, network: _Network, watch: Stopwatch, infer: bool) -> list[Box]:
+        """Run the network of the top view on what was projected, and decode its boxes (SSADNet)."""
         outputs = network.session.run() if infer else network.session.outputs
         watch.lap("infer")
         card = network.session.card
@@ -736,10 +742,6 @@ class Perceiver:
                 helper()
                 watch.lap("infer")
         return spread([sectors[k] for k in range(len(sectors))], len(scan))
-
-    def _find_ground(self, scan: NDArray[np.float32], rows: NDArray[np.int32] | None = None) -> Ground | None:
-        """The ground, once for all that needs it: the input of a network, and the clusters; None if nothing does."""
-        return find_ground(scan, mount_height_m=MODEL_HEIGHT_M, rows=rows) if self._needs_ground else None
 
     def _combine(
         self, *parts: Any, infer: bool, strips: Callable[[], Strips | None] = _not_sorted

@@ -374,10 +374,10 @@ def fill_point_labels(
         if pixel[i] < 0:
             continue
         at = np.uint32(pixel[i])
+        if not contested_of[at]:  # neither labeled nor near anything that is
+            continue
         if index_of[at] == i:
             point_labels[i] = label_of[at]
-            continue
-        if not contested_of[at]:
             continue
         row = pixel[i] // width
         col = pixel[i] - row * width

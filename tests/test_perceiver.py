@@ -46,6 +46,7 @@ from edgeperc import (
 )
 from edgeperc.card import RangeImageGeometry, TopViewGeometry
 from edgeperc.geometry import inside, oriented_iou
+from edgeperc.ground import find_ground
 from edgeperc.mounting import MODEL_MOUNTING
 from edgeperc.perception import PointLabels
 from edgeperc.sensor import get_sensor
@@ -702,7 +703,7 @@ def test_car_cut_by_the_views_edge_gets_a_full_box_or_none(seen: float, n_boxes:
     scan[:, :3] = np.concatenate([floor, flank])
     labels = np.zeros(len(scan), np.uint8)
     labels[len(floor) :] = along >= 4.0 * (1.0 - seen) - 0.01
-    ground = perceive._find_ground(scan)
+    ground = find_ground(scan)
     assert ground is not None
     points = PointLabels(labels, labels > 0, ("background", "car", "pedestrian", "cyclist"))
     _, _, boxes = perceive._combine(scan, ground, points, lambda: None, (), Stopwatch(), infer=False)
