@@ -5,6 +5,12 @@ fast kernels (u8u8 took twice as long). Nearly all of the noise is of activation
 int8 it is 32 dB below the outputs, with weights alone 44 dB. The range of a tensor is the one that makes least noise,
 clipping included; clipping one value in ten thousand instead gives 29 dB. The first and last convolutions stay in fp32,
 and also those that make most noise for the time they take.
+
+A top view is mostly empty, and all its empty cells have the same values, so rounding shifts them all in the same
+direction. Where the noise is above the limit, the bias of each convolution is corrected by the mean shift (Nagel et
+al., "Data-Free Quantization Through Weight Equalization and Bias Correction", 2019, section 4.2), and the channels of a
+tensor get the same size before (`equalize`). Together they lower ssadnet's noise from 29 to 34 dB with all inner
+convolutions in int8.
 """
 
 from __future__ import annotations
@@ -14,7 +20,7 @@ import platform
 import re
 import tempfile
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -45,6 +51,7 @@ from edgeperc.simulation.samples import simulated_scan
 from edgeperc.tuning import cpu_features
 from edgeperc.zoo import INT8_FEATURES
 
+from .int8_graph import equalize, repeat_pixels
 from .simulate import parity_images, parity_scans
 from .to_onnx import pixel_labels, views, with_golden, write_card
 
@@ -56,6 +63,9 @@ ROUNDED_OPS = (
 )
 FIRST_SEED = 3 * 10**9  # seeds of training start at 0, of parity scans at 10**9, of evaluation at 2 * 10**9
 N_PROBES = 8
+# Powers of the channels' sizes that are made equal before the shift is corrected; None: neither. The first that keeps
+# the noise below the limit is taken, else the one with least noise.
+STRENGTHS = (None, 0.0, 0.5, 1.0)
 N_IMAGES = 64
 # Limit of `_noise`, 33 dB below the outputs of the probes. ssadnet has 4.4e-4 with all inner convolutions in int8, and
 # loses 1 of 255 boxes on the validation drives.
@@ -171,21 +181,57 @@ class _Calibrated:
     model: onnx.ModelProto
     ranges: TensorsData
     images: Sequence[NDArray[np.float32]]
+    means: Mapping[str, NDArray[np.float64]]
+    probes: Sequence[NDArray[np.float32]]
     outputs: Sequence[Mapping[str, NDArray[np.float32]]]
     seven_bits: bool
+    corrects: bool
 
     @classmethod
-    def on(cls, path: Path, card: ModelCard, scans: Sequence[NDArray[Any]], seven_bits: bool = False) -> _Calibrated:
-        """Calibrate the model of a file on scans, or images."""
+    def on(
+        cls,
+        path: Path,
+        card: ModelCard,
+        scans: Sequence[NDArray[Any]],
+        seven_bits: bool = False,
+        strength: float | None = None,
+    ) -> _Calibrated:
+        """Calibrate the model of a file on scans, or images, with one of `STRENGTHS`."""
         model, images = _folded(path), [image[None] for image, _ in views(card, scans)]
         probes = images[:: max(1, len(images) // N_PROBES)][:N_PROBES]
-        return cls(card, model, _ranges(model, card, images), probes, _outputs(model, card, probes), seven_bits)
+        outputs = _outputs(model, card, probes)
+        names = [name for node in model.graph.node for name in node.output if name]
+        if strength:
+            sizes = {name: np.zeros(1) for name in names}
+            for tensors in _tensors(model, card, images, names):
+                sizes |= {name: np.maximum(sizes[name], _by_channel(abs(v)).max(1)) for name, v in tensors.items()}
+            equalize(model, {name: size**strength for name, size in sizes.items()})
+        made = [node.output[0] for node in model.graph.node if node.op_type == "Conv"]
+        means = _means(model, card, images, made)
+        ranges = _ranges(model, card, images)
+        return cls(card, model, ranges, images, means, probes, outputs, seven_bits, strength is not None)
 
     def rounded(self, convolutions: Collection[str]) -> onnx.ModelProto:
         """The network with these convolutions, and the operators between them, in int8."""
-        names = _between(self.model.graph, convolutions)
         model = onnx.ModelProto()
         model.CopyFrom(self.model)
+        biases = {each.name: each for each in model.graph.initializer}
+        with_bias = [node for node in model.graph.node if node.name in convolutions and len(node.input) > 2]
+        for node in with_bias if self.corrects else ():
+            rounded = self._rounded(model, convolutions)
+            (made,) = (each.output[0] for each in rounded.graph.node if each.name == node.name)
+            shift = _means(rounded, self.card, self.images, [made])[made] - self.means[node.output[0]]
+            bias = biases[node.input[2]]
+            values = onnx.numpy_helper.to_array(bias)
+            bias.CopyFrom(onnx.numpy_helper.from_array((values - shift).astype(values.dtype), bias.name))
+        rounded = self._rounded(model, convolutions)
+        repeat_pixels(rounded)
+        return rounded
+
+    def _rounded(self, fp32: onnx.ModelProto, convolutions: Collection[str]) -> onnx.ModelProto:
+        names = _between(fp32.graph, convolutions)
+        model = onnx.ModelProto()
+        model.CopyFrom(fp32)
         if not names:
             return model
         quantizer = QDQQuantizer(
@@ -207,27 +253,52 @@ class _Calibrated:
 
     def noise(self, convolutions: Collection[str]) -> float:
         """`_noise` of the outputs if these convolutions are in int8."""
-        return _noise(_outputs(self.rounded(convolutions), self.card, self.images), self.outputs)
+        return _noise(_outputs(self.rounded(convolutions), self.card, self.probes), self.outputs)
 
 
 def _ranges(model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]]) -> TensorsData:
     """The range of every tensor of a network, from a histogram of its values over all images."""
-    names = [name for node in model.graph.node for name in node.output if name]
-    augmented = onnx.ModelProto()
-    augmented.CopyFrom(model)
-    known = {output.name for output in model.graph.output}
-    augmented.graph.output.extend(onnx.helper.make_empty_tensor_value_info(name) for name in names if name not in known)
-    session = _session(augmented)
-    inputs = card.input.name
-    counts = {name: np.zeros(1 << BIN_BITS, np.int64) for name in (inputs, *names)}
-    for image in tqdm(images, desc="calibrating", unit="scan"):
-        for name, values in zip((inputs, *names), (image, *session.run(names, {inputs: image})), strict=True):
+    names = [card.input.name, *(name for node in model.graph.node for name in node.output if name)]
+    counts = {name: np.zeros(1 << BIN_BITS, np.int64) for name in names}
+    for tensors in tqdm(_tensors(model, card, images, names), desc="calibrating", total=len(images), unit="scan"):
+        for name, values in tensors.items():
             if values.dtype == np.float32:
                 bins = np.ascontiguousarray(values).view(np.uint32).ravel() >> (32 - BIN_BITS)
                 counts[name] += np.bincount(bins, minlength=1 << BIN_BITS)
     ranges = {name: _range(count) for name, count in counts.items()}
     data = {name: tuple(np.array(bound, np.float32) for bound in bounds) for name, bounds in ranges.items()}
     return TensorsData(CalibrationMethod.MinMax, data)
+
+
+def _tensors(
+    model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]], names: Sequence[str]
+) -> Iterator[dict[str, NDArray[Any]]]:
+    """Inner tensors of a network by their names, for one image after the other."""
+    augmented = onnx.ModelProto()
+    augmented.CopyFrom(model)
+    known = {each.name for each in (*model.graph.input, *model.graph.output)}
+    augmented.graph.output.extend(onnx.helper.make_empty_tensor_value_info(name) for name in names if name not in known)
+    session = _session(augmented)
+    inner = [name for name in names if name != card.input.name]
+    for image in images:
+        own = {card.input.name: image} if len(inner) < len(names) else {}
+        yield own | dict(zip(inner, session.run(inner, {card.input.name: image}), strict=True))
+
+
+def _by_channel(values: NDArray[Any]) -> NDArray[Any]:
+    """The values of a tensor (1, C, ...) as (C, n)."""
+    return values.reshape(values.shape[1], -1) if values.ndim > 1 else values.reshape(1, -1)
+
+
+def _means(
+    model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]], names: Sequence[str]
+) -> dict[str, NDArray[np.float64]]:
+    """Mean of each channel of some tensors (1, C, ...) over all images."""
+    sums: dict[str, NDArray[np.float64]] = {}
+    for tensors in _tensors(model, card, images, names):
+        for name, values in tensors.items():
+            sums[name] = sums.get(name, 0.0) + _by_channel(values).mean(axis=1, dtype=np.float64) / len(images)
+    return sums
 
 
 def _range(counts: NDArray[np.int64]) -> tuple[float, float]:
@@ -538,8 +609,14 @@ def quantize(
     if card.precision != "fp32":
         raise ModelError(f"{path} is in {card.precision}; quantize the model in fp32")
     seven_bits = _saturates() if seven_bits is None else seven_bits
-    fp32 = _Calibrated.on(path, card, scans, seven_bits)
-    candidates = _candidates(fp32.model.graph, exclude)
+    tried: list[tuple[float, _Calibrated]] = []
+    for strength in STRENGTHS:
+        fp32 = _Calibrated.on(path, card, scans, seven_bits, strength)
+        candidates = _candidates(fp32.model.graph, exclude)
+        tried.append((fp32.noise(candidates), fp32))
+        if tried[-1][0] <= max_noise:
+            break
+    _, fp32 = min(tried, key=lambda each: each[0])
     chosen, noise = _choose(fp32, candidates, max_noise)
     model = fp32.rounded(chosen)
     model.producer_name, model.producer_version = "edgeperc", ""

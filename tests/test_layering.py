@@ -93,7 +93,8 @@ FLOORS = {
         checkpoint samples
         start watch curve
         to_onnx train
-        agree camvid quantize ablation make
+        agree camvid int8_graph ablation make
+        quantize
         database.__init__ database.files
         database.coco database.torch
         database.label_page database.scenes database.folds

@@ -157,12 +157,18 @@ def test_weights_have_seven_bits_on_request(
     assert card.training["quantized"]["weight_bits"] == (7 if seven_bits else 8)
 
 
-def test_layers_that_rounding_harms_stay_in_fp32(tmp_path: Path, scans: list[np.ndarray]) -> None:
+@pytest.mark.parametrize("equalized", [False, True])
+def test_layers_that_rounding_harms_stay_in_fp32(
+    tmp_path: Path, scans: list[np.ndarray], monkeypatch: pytest.MonkeyPatch, equalized: bool
+) -> None:
+    """Unless equalized channels make the layer harmless."""
+    if not equalized:
+        monkeypatch.setattr(module, "STRENGTHS", (None,))
     path, out = written(Fragile(1e4), tmp_path / "spoilt.onnx"), tmp_path / "int8.onnx"
     card = quantize(path, out, scans=scans, n_evaluated=1, race=FASTER)
     types = convolutions(out)
     assert types["good"] == onnx.TensorProto.INT8
-    assert types["spoil"] == onnx.TensorProto.FLOAT
+    assert types["spoil"] == (onnx.TensorProto.INT8 if equalized else onnx.TensorProto.FLOAT)
     assert card.parity["label_agreement"] == 1.0
 
 
@@ -321,3 +327,35 @@ def test_the_command_exits_with_1_if_it_refuses_and_0_if_it_writes(
     printed = capsys.readouterr().out.splitlines()
     assert "small 1.0.0, kept in fp32: " in printed[0]
     assert json.loads(printed[1])["n_scans"] == 4
+
+
+def test_the_mean_of_every_channel_is_that_of_fp32(small: Path, scans: list[np.ndarray]) -> None:
+    card = Session(small).card
+    shifts = {}
+    for strength in (None, 0.0, 1.0):
+        fp32 = module._Calibrated.on(small, card, scans, strength=strength)
+        candidates = module._candidates(fp32.model.graph, ())
+        rounded = fp32.rounded(candidates)
+        made = {n.name: n.output[0] for n in rounded.graph.node if n.name in candidates}
+        means = module._means(rounded, card, fp32.images, [*made.values()])
+        own = {n.name: fp32.means[n.output[0]] for n in fp32.model.graph.node if n.name in candidates}
+        shifts[strength] = max(abs(means[made[name]] - own[name]).max() / own[name].std() for name in candidates)
+    assert shifts[0.0] < 0.2 * shifts[None]
+    assert shifts[1.0] < 0.2 * shifts[None]
+
+
+def test_the_shift_is_corrected_where_the_noise_is_above_the_limit(
+    tmp_path: Path, small: Path, scans: list[np.ndarray]
+) -> None:
+    card = Session(small).card
+    fp32 = module._Calibrated.on(small, card, scans)
+    noise = fp32.noise(module._candidates(fp32.model.graph, ()))
+    written = []
+    for limit in (1.01 * noise, 0.99 * noise):
+        quantized = quantize(
+            small, tmp_path / "int8.onnx", scans=scans, n_evaluated=1, max_noise=limit, race=FASTER
+        ).training["quantized"]
+        written.append(quantized)
+    assert written[0]["noise"] == pytest.approx(noise)
+    assert written[1]["noise"] < noise
+    assert len(written[1]["left_alone"]) == 2  # nothing was left out
