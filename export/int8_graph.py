@@ -35,6 +35,8 @@ def equalize(model: onnx.ModelProto, sizes: Mapping[str, NDArray[np.float64]]) -
     """
     weights = {each.name: each for each in model.graph.initializer}
     for tensors in _tied(model.graph):
+        if len({len(sizes[name]) for name in tensors}) > 1:  # one channel is added to all
+            continue
         size = np.max([sizes[name] for name in tensors], axis=0)
         factor = size.max() / np.where(size > 0.0, size, max(size.max(), 1.0))
         for node in (node for node in model.graph.node if node.op_type == "Conv"):

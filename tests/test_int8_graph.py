@@ -106,6 +106,9 @@ def between(*nodes: onnx.NodeProto, **more: np.ndarray) -> onnx.ModelProto:
         between(helper.make_node("Add", ["x", "one"], ["z"]), one=np.ones((1, 6, 1, 1), np.float32)),
         between(helper.make_node("Mul", ["x", "x"], ["z"])),
         between(conv("x", "b", "z", **SAME), b_w=CONSTANTS["c_w"][[0] * 6], b_b=CONSTANTS["b_b"]),
+        graph_of(  # one channel is added to six
+            *residual(), constants=CONSTANTS | {"b_w": CONSTANTS["b_w"][:1], "b_b": CONSTANTS["b_b"][:1]}
+        ),
         graph_of(*residual(group=6), constants=CONSTANTS | {"b_w": CONSTANTS["b_w"][:, :1]}),
         graph_of(*residual(made="image"), constants=CONSTANTS | weights("b", 3, 3) | weights("c", 4, 3)),
         graph_of(  # one weight for two convolutions
@@ -116,7 +119,7 @@ def between(*nodes: onnx.NodeProto, **more: np.ndarray) -> onnx.ModelProto:
             constants=CONSTANTS,
         ),
     ],
-    ids=["sigmoid", "constant", "product", "dense", "grouped", "input", "shared"],
+    ids=["sigmoid", "constant", "product", "dense", "one channel", "grouped", "input", "shared"],
 )
 def test_what_is_not_homogeneous_keeps_its_function(model: onnx.ModelProto) -> None:
     names = tuple(name for node in model.graph.node for name in node.output if name != "out")
