@@ -19,7 +19,7 @@ import edgeperc.perceiver as perceiver_module
 import edgeperc_export.quantize as quantize_module
 from edgeperc import Perceiver, SensorProfile
 from edgeperc.combine import BoxesFrom
-from edgeperc.ground import find_ground
+from edgeperc.ground import fit_ground
 from edgeperc.mounting import MODEL_MOUNTING
 from edgeperc.network_input import project
 from edgeperc.projection import make_projector
@@ -76,7 +76,7 @@ def test_from_training_to_the_vehicle(tmp_path: Path, scans: Sequence[NDArray[np
 
     boxes_from: BoxesFrom = "network" if top else "both"
     perceive = Perceiver(path, provider="cpu", mounting=MODEL_MOUNTING, on_mismatch="ignore", boxes_from=boxes_from)
-    with mock.patch.object(perceiver_module, "find_ground", side_effect=find_ground) as found:
+    with mock.patch.object(perceiver_module, "fit_ground", side_effect=fit_ground) as found:
         answer = perceive(scans[0])
     assert found.call_count == 1  # once for the network's input, the clusters and the agreement
     seen = project(make_projector(card.view, card.input), scans[0])
