@@ -157,11 +157,15 @@ def test_ground_is_deterministic():
 @pytest.mark.parametrize("regions", [False, True])
 def test_heights_of_some_points_are_those_of_all(regions):
     points, _ = street(np.random.default_rng(8))
-    rows = np.arange(3, len(points), 7, dtype=np.int32)
-    every, some = find_ground(points, regions=regions), find_ground(points, regions=regions, rows=rows)
-    np.testing.assert_array_equal(some.height_m, every.height_m[rows])
-    np.testing.assert_array_equal(some.mask, every.mask[rows])
-    assert some.plane == every.plane
+    every = find_ground(points, regions=regions)
+    x, y = points[:, 0], points[:, 1]
+    for wanted in (np.arange(len(points)) % 7 == 3, (x > 10.0) & (x < 25.0), (x > 0.0) & (abs(y) < x), x < -5.0):
+        rows = np.flatnonzero(wanted).astype(np.int32)
+        assert len(rows) > 100
+        some = find_ground(points, regions=regions, rows=rows)
+        np.testing.assert_array_equal(some.height_m, every.height_m[rows])
+        np.testing.assert_array_equal(some.mask, every.mask[rows])
+        assert some.plane == every.plane
     none = find_ground(points, regions=regions, rows=rows[:0])
     assert none.plane == every.plane
     assert none.mask.shape == none.height_m.shape == (0,)
