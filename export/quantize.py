@@ -175,7 +175,10 @@ def _folded(path: Path) -> onnx.ModelProto:
 
 @dataclass(frozen=True)
 class _Calibrated:
-    """A network in fp32, the range of each of its tensors, and its outputs for some images."""
+    """A network in fp32, the range of each of its tensors, and its outputs for some images.
+
+    ``means`` are those of the convolutions whose shift is corrected.
+    """
 
     card: ModelCard
     model: onnx.ModelProto
@@ -185,7 +188,6 @@ class _Calibrated:
     probes: Sequence[NDArray[np.float32]]
     outputs: Sequence[Mapping[str, NDArray[np.float32]]]
     seven_bits: bool
-    corrects: bool
 
     @classmethod
     def on(
@@ -207,17 +209,16 @@ class _Calibrated:
                 sizes |= {name: np.maximum(sizes[name], _by_channel(abs(v)).max(1)) for name, v in tensors.items()}
             equalize(model, {name: size**strength for name, size in sizes.items()})
         made = [node.output[0] for node in model.graph.node if node.op_type == "Conv"]
-        means = _means(model, card, images, made)
-        ranges = _ranges(model, card, images)
-        return cls(card, model, ranges, images, means, probes, outputs, seven_bits, strength is not None)
+        means = {} if strength is None else _means(model, card, images, made)
+        return cls(card, model, _ranges(model, card, images), images, means, probes, outputs, seven_bits)
 
     def rounded(self, convolutions: Collection[str]) -> onnx.ModelProto:
         """The network with these convolutions, and the operators between them, in int8."""
         model = onnx.ModelProto()
         model.CopyFrom(self.model)
         biases = {each.name: each for each in model.graph.initializer}
-        with_bias = [node for node in model.graph.node if node.name in convolutions and len(node.input) > 2]
-        for node in with_bias if self.corrects else ():
+        corrected = [node for node in model.graph.node if node.name in convolutions and node.output[0] in self.means]
+        for node in [node for node in corrected if len(node.input) > 2]:
             rounded = self._rounded(model, convolutions)
             (made,) = (each.output[0] for each in rounded.graph.node if each.name == node.name)
             shift = _means(rounded, self.card, self.images, [made])[made] - self.means[node.output[0]]
@@ -407,13 +408,12 @@ def _multiplications(model: onnx.ModelProto) -> dict[str, int]:
     return {node.name: int(np.prod(sizes[node.input[1]]) * np.prod(sizes[node.output[0]][2:])) for node in convolutions}
 
 
-def _choose(fp32: _Calibrated, candidates: Sequence[str], limit: float) -> tuple[list[str], float]:
-    """The convolutions to round, and their noise: all of them, or as many as the limit allows.
+def _choose(fp32: _Calibrated, candidates: Sequence[str], limit: float, noise: float) -> tuple[list[str], float]:
+    """The convolutions to round, and their noise: all of them, which make ``noise``, or as many as the limit allows.
 
     Those that make most noise for the time that they take, alone, are left out first. Takes at most n + log2(n) trials
     for n convolutions.
     """
-    noise = fp32.noise(candidates)
     if noise <= limit:
         return [*candidates], noise
     times = _multiplications(fp32.model)
@@ -616,8 +616,8 @@ def quantize(
         tried.append((fp32.noise(candidates), fp32))
         if tried[-1][0] <= max_noise:
             break
-    _, fp32 = min(tried, key=lambda each: each[0])
-    chosen, noise = _choose(fp32, candidates, max_noise)
+    noise, fp32 = min(tried, key=lambda each: each[0])
+    chosen, noise = _choose(fp32, candidates, max_noise, noise)
     model = fp32.rounded(chosen)
     model.producer_name, model.producer_version = "edgeperc", ""
     kept = [n.name for n in fp32.model.graph.node if n.op_type == "Conv" and n.name not in chosen]
