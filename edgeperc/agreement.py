@@ -14,18 +14,19 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .cluster import MIN_PERSON_SHARE, PART_OF, find_clusters
-from .errors import PointsError
 from .ground import Ground
 from .kernel_cache import njit
 from .linkage import Strips
 from .perception import Box, PointLabels, TopView
 from .persons import complete_persons
 from .points import read_only
+from .scan import Scan
 from .voting import (
     COMPLETING_SCORE,
     MIN_VEHICLE_SHARE,
@@ -81,56 +82,42 @@ BIN_M = 0.1
 N_BINS = 64
 N_FOOTPRINTS = 1024
 
-Support = tuple[NDArray[np.float32], NDArray[np.uint8]]
+
+class Support(NamedTuple):
+    """Of the best vehicle's box around each point: its score, 0 for points in no box, out of view or on the ground
+    ((n,) float32), and its class, 0 in no box ((n,) uint8).
+    """
+
+    scores: NDArray[np.float32]
+    names: NDArray[np.uint8]
 
 
 def find_voters(
-    points: NDArray[np.float32],
+    scan: Scan,
     labels: PointLabels,
-    ground: Ground,
-    boxes: Sequence[Box] = (),
+    support: Support,
+    strips: Strips | None = None,
     *,
     distance_per_m: float = 0.015,
     rules: Collection[str] = RULES,
-    support: Support | None = None,
-    strips: Strips | None = None,
 ) -> NDArray[np.int32]:
-    """Find the clusters above the ground that hold labeled points, as far as it matters for `agree_on_points`.
+    """Cluster of every point, as far as it matters for `agree_on_points`; -1 for none, (n,) int32.
 
-    Parameters
-    ----------
-    points, labels, ground, boxes, rules, support
-        As in `agree_on_points`.
-    distance_per_m : float
-        As in `edgeperc.cluster.find_clusters`.
-    strips : Strips, optional
-        From `edgeperc.cluster.sort_points` among the points above the ground, with the same ``distance_per_m``.
-
-    Returns
-    -------
-    (n,) int32
-        Cluster of every point, -1 for none, -2 for labeled points of clusters in which too few points can have a label.
-        Such a cluster is not searched further as soon as that is certain: a forest need not be searched because of a
-        few labels in it. The results of `agree_on_points` and of `edgeperc.cluster.objects_from_points` are those for
-        complete clusters.
-
-    Raises
-    ------
-    PointsError
-        Arrays disagree in shape, or a label is not in the classes.
+    Labeled points of clusters in which too few points can have a label are in cluster -2: such a cluster is not
+    searched further as soon as that is certain, so a forest is not searched because of a few labels in it. The results
+    of `agree_on_points` and of `edgeperc.cluster.objects_from_points` are those for complete clusters. ``strips`` are
+    the points above the ground from `edgeperc.cluster.sort_points`, with the same ``distance_per_m``.
     """
-    check_scan(points, labels, ground)
     roles = roles_of(labels.classes)
-    in_view = read_only(labels.in_view, np.bool_)
-    scores, _ = support or find_support(points, labels, ground, boxes, rules=rules)
-    votes = np.empty(len(points), np.uint8)
-    fill_votes(in_view, read_only(labels.labels, np.uint8), roles, scores, votes)
+    votes = np.empty(len(scan.points), np.uint8)
+    in_view, classes = read_only(labels.in_view, np.bool_), read_only(labels.labels, np.uint8)
+    fill_votes(in_view, classes, roles, support.scores, votes)
     # A share of exactly the limit is enough. Labels that are neither vehicles nor persons are never lost.
     is_searched = "share" not in rules or not roles[1:].all()
     shares = (-1.0, -1.0) if is_searched else np.nextafter((MIN_VEHICLE_SHARE, MIN_PERSON_SHARE), 0.0)
     return find_clusters(
-        points,
-        among=~ground.mask,
+        scan.points,
+        among=~scan.ground.mask,
         seeds=labels.labels > 0,
         votes=votes,
         min_share=shares,
@@ -141,49 +128,33 @@ def find_voters(
 
 
 def agree_on_points(
-    points: NDArray[np.float32],
+    scan: Scan,
     labels: PointLabels,
-    ground: Ground,
     clusters: NDArray[np.int32],
-    boxes: Sequence[Box] = (),
+    support: Support,
+    upright: NDArray[np.uint8],
     *,
     view: TopView | None = None,
     rules: Collection[str] = RULES,
-    support: Support | None = None,
-    upright: NDArray[np.uint8] | None = None,
 ) -> PointLabels:
     """Correct the labels of points by clusters, ground and boxes.
 
     Parameters
     ----------
-    points : (n, 4) float32
-        x, y, z [m] in the frame of the models, remission.
+    scan : Scan
+        If its ground has no plane, rules that need heights are skipped.
     labels : PointLabels
         Of vehicles (car, van, truck) and persons (pedestrian, cyclist); other classes are not changed.
-    ground : Ground
-        If it has no plane, rules that need heights are skipped.
-    clusters : (n,) int32, writable
-        From `find_voters`. A person that stays in a cluster that loses the label gets a number of its own in it.
-    boxes : sequence of Box
-        From a top-view model, with scores from 0.3.
+    clusters : (n,) int32, modified
+        From `find_voters`. A person that stays in a cluster that loses the label gets a number of its own.
+    support : Support
+        From `find_support`.
+    upright : (n,) uint8, modified
+        From `without_poles`.
     view : TopView, optional
-        From the same model; without it, or if it has no class of vehicles, the rule ``"cells"`` is skipped.
+        Without it, or if it has no class of vehicles, the rule ``"cells"`` is skipped.
     rules : collection of str
         Of `RULES`; others are left out.
-    support : tuple of two arrays, optional
-        From `find_support` with the same arguments, so that it is found once.
-    upright : (n,) uint8, optional, modified
-        From `without_poles` with the same arguments, so that poles are found once.
-
-    Returns
-    -------
-    PointLabels
-        The same view and classes.
-
-    Raises
-    ------
-    PointsError
-        Arrays disagree in shape, or a label is not in the classes.
 
     Notes
     -----
@@ -202,109 +173,62 @@ def agree_on_points(
     have a vehicle's label. Last, points on the ground keep a label only in cells of 0.2 m in which an object of their
     kind stands; within 6 m, points lower than 0.06 m lose it.
     """
-    check_scan(points, labels, ground)
-    if clusters.shape != labels.labels.shape:
-        raise PointsError(f"got clusters of shape {clusters.shape} for {len(points)} points; expected one a point")
-    if not clusters.flags.writeable:
-        raise PointsError("got read-only clusters; expected an array that can be written, such as a copy")
-    rules = _applicable(rules, ground)
-    rows, height, on_ground = read_only(points), read_only(ground.height_m), read_only(ground.mask, np.bool_)
+    rules = _applicable(rules, scan.ground)
+    points, height, on_ground = scan.points, scan.ground.height_m, scan.ground.mask
     in_view, of = read_only(labels.in_view, np.bool_), read_only(clusters, np.int32)
-    agreed = without_poles(points, labels, ground, rules=rules) if upright is None else upright
-    roles = roles_of(labels.classes)
+    agreed, roles = upright, roles_of(labels.classes)
     n = int(clusters.max(initial=-1)) + 1
     counts = np.empty((n, len(labels.classes) + 1), np.int32)
     bounds = np.empty((n, 5), np.float32)
     above = np.empty((n, 2), np.int32)
     votes = "cells" in rules and view is not None and not VEHICLES.isdisjoint(view.classes)
     cells = cells_of(view if votes else None)
-    fill_tallies(rows, height, in_view, read_only(agreed, np.uint8), of, *cells, counts, bounds, above)
+    fill_tallies(points, height, in_view, read_only(agreed, np.uint8), of, *cells, counts, bounds, above)
     refused = (above[:, 1] == 0) & (above[:, 0] >= MIN_IN_TOP_VIEW * counts[:, -1])
     verdicts = _verdicts(labels.classes, counts, bounds, refused, rules)
-    scores, names = support or find_support(points, labels, ground, boxes, rules=rules)
     before = agreed.copy()
-    apply_verdicts(in_view, of, verdicts, roles, scores, names, agreed)
+    apply_verdicts(in_view, of, verdicts, roles, support.scores, support.names, agreed)
     if "person" in rules:
-        alone = find_persons_alone(rows, height, roles, before, agreed)
+        alone = find_persons_alone(points, height, roles, before, agreed)
         for own in alone:
             agreed[own] = before[own]
         for part, whole in PART_OF.items():
             if part in labels.classes and whole in labels.classes:
                 walks, rides = labels.classes.index(part), labels.classes.index(whole)
-                complete_persons(rows, height, in_view, of, counts, bounds, walks, rides, agreed)
+                complete_persons(points, height, in_view, of, counts, bounds, walks, rides, agreed)
         for number, own in enumerate(alone, start=n):
             clusters[own] = number
     if "ground" in rules:
-        clear_ground(rows, height, on_ground, roles, agreed)
+        clear_ground(points, height, on_ground, roles, agreed)
     return PointLabels(agreed, labels.in_view, labels.classes)
 
 
-def without_poles(
-    points: NDArray[np.float32], labels: PointLabels, ground: Ground, *, rules: Collection[str] = RULES
-) -> NDArray[np.uint8]:
-    """Labels of points without the persons whose column of points goes on above a person's height.
-
-    Parameters
-    ----------
-    points, labels, ground, rules
-        As in `agree_on_points`; without the rule ``"column"`` all labels stay.
-
-    Returns
-    -------
-    (n,) uint8
-        A new array.
-
-    Raises
-    ------
-    PointsError
-        Arrays disagree in shape, or a label is not in the classes.
-    """
-    check_scan(points, labels, ground)
+def without_poles(scan: Scan, labels: PointLabels, rules: Collection[str] = RULES) -> NDArray[np.uint8]:
+    """Labels without the persons whose column of points goes on above a person's height: a new (n,) uint8."""
     upright = labels.labels.copy()
-    if "column" in _applicable(rules, ground):
+    if "column" in _applicable(rules, scan.ground):
         limits = np.array([PERSON_TOP_M.get(name, 0.0) for name in labels.classes])
-        clear_columns(read_only(points), read_only(ground.height_m), limits, upright)
+        clear_columns(scan.points, scan.ground.height_m, limits, upright)
     return upright
 
 
 def agree_on_boxes(
-    boxes: Sequence[Box],
-    points: NDArray[np.float32],
-    labels: PointLabels,
-    ground: Ground,
-    *,
-    rules: Collection[str] = RULES,
+    boxes: Sequence[Box], scan: Scan, labels: PointLabels, rules: Collection[str] = RULES
 ) -> tuple[Box, ...]:
-    """Drop the uncertain vehicle boxes of a top-view model that the labels of points contradict.
+    """Drop the uncertain vehicle boxes of a top-view network that the agreed labels of points contradict.
 
-    Parameters
-    ----------
-    boxes : sequence of Box
-        Best score first.
-    points, labels, ground, rules
-        As in `agree_on_points`, whose result ``labels`` should be.
-
-    Returns
-    -------
-    tuple of Box
-        Without boxes of vehicles with a score below 0.5 that hold no points above the ground, or of whose points in
-        view less than a tenth are vehicle points. Boxes whose points are all out of view are kept.
-
-    Raises
-    ------
-    PointsError
-        Arrays disagree in shape, or a label is not in the classes.
+    A box with a score below 0.5 goes if it holds no points above the ground, or if less than a tenth of its points in
+    view are vehicle points. Boxes whose points are all out of view stay.
     """
-    check_scan(points, labels, ground)
     roles = roles_of(labels.classes)
     doubted = [k for k, box in enumerate(boxes) if box.score < COMPLETING_SCORE and box.label in VEHICLES]
     if "boxes" not in rules or not doubted or not (roles == VEHICLE).any():
         return tuple(boxes)
     counts = np.empty((len(doubted), 3), np.int64)
     count_inside(
-        read_only(points),
-        read_only(ground.height_m),
-        read_only(ground.mask, np.bool_),
+        scan.points,
+        scan.ground.height_m,
+        scan.ground.mask,
         read_only(labels.in_view, np.bool_),
         read_only(labels.labels, np.uint8),
         roles,
@@ -315,22 +239,6 @@ def agree_on_boxes(
     wrong = (held == 0) | ((seen > 0) & (labeled < MIN_BOX_SHARE * seen))
     dropped = {k for k, is_wrong in zip(doubted, wrong, strict=True) if is_wrong}
     return tuple(box for k, box in enumerate(boxes) if k not in dropped)
-
-
-def check_scan(points: NDArray[np.float32], labels: PointLabels | None, ground: Ground) -> None:
-    if points.ndim != 2 or points.shape[1] < 3:
-        raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
-    n = len(points)
-    arrays = {"ground.height_m": ground.height_m, "ground.mask": ground.mask}
-    if labels is not None:
-        arrays |= {"labels.labels": labels.labels, "labels.in_view": labels.in_view}
-        if labels.labels.size and int(labels.labels.max()) >= len(labels.classes):
-            raise PointsError(
-                f"got label {int(labels.labels.max())} for {len(labels.classes)} classes; expected lower numbers"
-            )
-    for name, array in arrays.items():
-        if array.shape != (n,):
-            raise PointsError(f"got {name} of shape {array.shape} for {n} points; expected one value a point")
 
 
 def _applicable(rules: Collection[str], ground: Ground) -> frozenset[str]:
@@ -372,50 +280,22 @@ def _as_rows(boxes: Sequence[Box]) -> NDArray[np.float64]:
     return np.array(rows, np.float64).reshape(-1, 8)
 
 
-def find_support(
-    points: NDArray[np.float32],
-    labels: PointLabels,
-    ground: Ground,
-    boxes: Sequence[Box],
-    *,
-    rules: Collection[str] = RULES,
-) -> Support:
-    """The best score of a vehicle's box around each point.
-
-    Parameters
-    ----------
-    points, labels, ground, boxes, rules
-        As in `agree_on_points`. Boxes that the labels contradict (`MIN_BOX_SHARE`) do not count.
-
-    Returns
-    -------
-    scores : (n,) float32
-        0 for points in no box, out of view or on the ground.
-    names : (n,) uint8
-        Class of that box; 0 in no box.
-
-    Raises
-    ------
-    PointsError
-        Arrays disagree in shape, or a label is not in the classes.
-    """
-    check_scan(points, labels, ground)
+def find_support(scan: Scan, labels: PointLabels, boxes: Sequence[Box], rules: Collection[str] = RULES) -> Support:
+    """The best vehicle's box around each point; boxes that the labels contradict (`MIN_BOX_SHARE`) do not count."""
     known = {name: labels.classes.index(name) for name in VEHICLES if name in labels.classes}
     usable = [box for box in boxes if box.label in VEHICLES] if "car" in known and "support" in rules else []
-    scores = np.empty(len(points), np.float32)
-    names = np.empty(len(points), np.uint8)
+    support = Support(np.empty(len(scan.points), np.float32), np.empty(len(scan.points), np.uint8))
     fill_support(
-        read_only(points),
-        read_only(ground.height_m),
-        labels.in_view & ~ground.mask,
+        scan.points,
+        scan.ground.height_m,
+        labels.in_view & ~scan.ground.mask,
         read_only(labels.labels, np.uint8),
         roles_of(labels.classes),
         _as_rows(usable),
         np.array([known.get(box.label, known["car"]) for box in usable], np.uint8),
-        scores,
-        names,
+        *support,
     )
-    return scores, names
+    return support
 
 
 def _verdicts(

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .agreement import RULES, cells_of, check_scan, roles_of
+from .agreement import RULES, cells_of, roles_of
 from .geometry import draw_footprints
-from .ground import Ground
 from .kernel_cache import njit
 from .perception import Box, PointLabels, TopView
 from .points import read_only
+from .scan import Scan
 from .voting import VEHICLE
 
 __all__ = ["agree_on_cells", "mark_cells"]
@@ -24,52 +24,42 @@ _NO_BOX = _NO_CLASS = 255
 
 def agree_on_cells(
     view: TopView,
-    points: NDArray[np.float32],
     labels: PointLabels | None,
-    ground: Ground,
     boxes: Sequence[Box],
-    dropped: Sequence[Box] = (),
-    *,
+    dropped: Sequence[Box],
+    marks: NDArray[np.uint8],
     rules: Collection[str] = RULES,
-    marks: NDArray[np.uint8] | None = None,
 ) -> TopView:
     """Correct the cells of a top view by boxes, points and obstacles.
 
     Parameters
     ----------
     view : TopView
-    points, labels, ground, rules
-        As in `agree_on_points`; ``labels`` may be None.
+    labels : PointLabels or None
+        From `agree_on_points`.
     boxes : sequence of Box
         In the frame of the models.
     dropped : sequence of Box
-        Boxes of the top-view model that `agree_on_boxes` dropped; their vehicle cells become background.
-    marks : (rows, columns) uint8, optional
-        From `mark_cells` with the same arguments, so that they are found once.
+        Boxes of the top-view network that `agree_on_boxes` dropped; their vehicle cells become background.
+    marks : (rows, columns) uint8
+        From `mark_cells`.
+    rules : collection of str
 
-    Returns
-    -------
-    TopView
-        Drivable cells whose center lies in a box get the class of the box, or background if the top view has no such
-        class. Drivable cells with a vehicle's or person's point become background, and those with a return 0.3 to 2 m
-        above the ground and another one in the 3 x 3 cells around it. So do vehicle cells out of the boxes with a point
-        in the range image's view, if none in the 3 x 3 cells has a vehicle's label.
-
-    Raises
-    ------
-    PointsError
-        Arrays disagree in shape, or a label is not in the classes.
+    Notes
+    -----
+    Drivable cells whose center lies in a box get the class of the box, or background if the top view has no such
+    class. Drivable cells with a vehicle's or person's point become background, and those with a return 0.3 to 2 m
+    above the ground and another one in the 3 x 3 cells around it. So do vehicle cells out of the boxes with a point
+    in the range image's view, if none in the 3 x 3 cells has a vehicle's label.
     """
     of_road, of_vehicles = "road" in rules, "cells" in rules and labels is not None
     if not (of_road or of_vehicles):
         return view
-    if marks is None:
-        marks = mark_cells(view, points, labels, ground, rules=rules)
     drivable = view.classes.index("drivable") if of_road and "drivable" in view.classes else _NO_CLASS
     _, is_vehicle, _ = cells_of(view)
     cells = view.labels.copy()
     covered = _footprints(view, boxes)
-    marked = np.flatnonzero(marks != 0)  # of numbers, it takes five times as long
+    marked = np.flatnonzero(marks != 0)  # flatnonzero of a bool array is five times as fast as of uint8
     clear_cells(marks, marked, drivable, is_vehicle & of_vehicles, covered != _NO_BOX, cells)
     covered, flat = covered.reshape(-1), cells.reshape(-1)
     below = np.flatnonzero(covered != _NO_BOX)
@@ -82,46 +72,27 @@ def agree_on_cells(
 
 
 def mark_cells(
-    view: TopView,
-    points: NDArray[np.float32],
-    labels: PointLabels | None,
-    ground: Ground,
-    *,
-    rules: Collection[str] = RULES,
+    view: TopView, scan: Scan, labels: PointLabels | None, rules: Collection[str] = RULES
 ) -> NDArray[np.uint8]:
-    """What the points show in each cell of a top view; no boxes are needed for it.
+    """What the points show in each cell of a top view; it needs no boxes.
 
-    Parameters
-    ----------
-    view, points, labels, ground, rules
-        As in `agree_on_cells`.
-
-    Returns
-    -------
-    (rows, columns) uint8
-        Bits: 1 with an obstacle, 2 with a second one or an object, 4 with a vehicle's point, 8 with another point in
-        view in a vehicle's cell.
-
-    Raises
-    ------
-    PointsError
-        Arrays disagree in shape, or a label is not in the classes.
+    Bits of (rows, columns) uint8: 1 with an obstacle, 2 with a second one or an object, 4 with a vehicle's point, 8
+    with another point in view in a vehicle's cell.
     """
-    check_scan(points, labels, ground)
     if labels is None:
-        nothing = np.zeros(len(points), np.uint8)
+        nothing = np.zeros(len(scan.points), np.uint8)
         in_view, object_of, roles = nothing.view(np.bool_), nothing, np.zeros(1, np.uint8)
     else:
         in_view, object_of, roles = labels.in_view, labels.labels, roles_of(labels.classes)
     cells, is_vehicle, grid = cells_of(view)
     marks = np.zeros(cells.shape, np.uint8)
     fill_marks(
-        read_only(points),
-        read_only(ground.height_m),
+        scan.points,
+        scan.ground.height_m,
         read_only(in_view, np.bool_),
         read_only(object_of, np.uint8),
         roles,
-        ground.plane is not None,
+        scan.ground.plane is not None,
         grid,
         is_vehicle & ("cells" in rules and labels is not None),
         cells,

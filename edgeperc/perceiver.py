@@ -6,48 +6,35 @@ import math
 import os
 import threading
 import warnings
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache, partial, wraps
+from functools import wraps
 from itertools import pairwise
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, NoReturn, ParamSpec
+from typing import Literal, NamedTuple, NoReturn, ParamSpec
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .adapt import Interpolator, condition, render
+from .adapt import Interpolator, condition
 from .agreement import RULES
 from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
-from .cluster import MIN_SCORE, sort_points
-from .combine import BoxesFrom, combine
-from .crop import Crop, sectors_of_turn, spread
-from .decode import decode_boxes, decode_cells, decode_labels
-from .drivable import compile_kernels
+from .cluster import MIN_SCORE
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
-from .first_start import Helpers, car_and_person, compile_parts
 from .fitness import Finding, FitnessProfile, check_profiles
-from .frame import ModelFrame, turned
-from .ground import GroundFit, find_ground, fit_ground
+from .frame import ModelFrame
 from .image import ImageScaler, as_image, label_pixels
-from .kernel_cache import fewer_collections
+from .lanes import Lanes, Stopwatch
 from .level import MountingEstimate, MountingEstimator
-from .linkage import Strips
-from .mounting import MODEL_HEIGHT_M, Mounting
-from .network_input import input_heights
-from .observed import Observer
-from .perception import Box, ImageLabels, Perception, PointLabels, TopView
+from .mounting import Mounting
+from .perception import ImageLabels, Perception
+from .pipeline import BoxesFrom, Options, Pipeline, RangeImageNetwork, TopViewNetwork
 from .points import as_points
-from .projection import RangeImageProjector, TopViewProjector, make_projector
-from .refine import label_points, remove_outliers
-from .remission import NO_REMISSION, RemissionMatcher
+from .remission import RemissionMatcher
 from .sensor import SensorProfile, get_sensor
 from .session import Session
-from .side_thread import SideThread
-from .stopwatch import Stopwatch
+from .warm_up import Rehearsed, warm_up
 from .zoo import CAMERA, DEFAULT, resolve
 
 __all__ = ["ADAPTATIONS", "BoxesFrom", "Learned", "Perceiver"]
@@ -64,26 +51,16 @@ _P = ParamSpec("_P")
 
 
 @dataclass(frozen=True)
-class _Network:
-    session: Session
-    projector: TopViewProjector | RangeImageProjector
-    index: NDArray[np.int32]
-    fitness: FitnessProfile | None
-    interpolator: Interpolator | None
-    observer: Observer | None
-
-
-@dataclass(frozen=True)
 class _Camera:
     session: Session
     scaler: ImageScaler
 
-    def label(self, image: NDArray[np.uint8], watch: Stopwatch, infer: bool = True) -> ImageLabels:
+    def label(self, image: NDArray[np.uint8], watch: Stopwatch) -> ImageLabels:
         """Class of every pixel of an image, at its own size."""
         card, (height, width, _) = self.session.card, image.shape
         self.scaler.fill(image, self.session.input)
         watch.lap("project")
-        outputs = self.session.run() if infer else self.session.outputs
+        outputs = self.session.run()
         watch.lap("infer")
         labels = label_pixels(outputs["camera_logits"], height, width, model=card.name)
         watch.lap("decode")
@@ -107,10 +84,6 @@ class Learned(NamedTuple):
     remission: RemissionMatcher
     to_check: int
     is_settled: bool
-
-
-def _not_sorted() -> None:
-    """No points were sorted for the clusters yet."""
 
 
 def _view_kind(model: str | os.PathLike[str]) -> str | None:
@@ -161,7 +134,7 @@ class Perceiver:
     """Turn a LiDAR scan into drivable area, boxes and a class for every point, and a camera's image into its classes.
 
     Construction loads the models, checks them against their cards and compiles every kernel; at the first start, helper
-    processes compile a part of them into the cache (`edgeperc.first_start`). Results own their arrays; internal buffers
+    processes compile a part of them into the cache (`edgeperc.warm_up`). Results own their arrays; internal buffers
     are reused between calls. One instance processes one call at a time, and other threads wait; for parallel calls use
     one instance per thread. Options cannot be changed after construction.
 
@@ -301,10 +274,6 @@ class Perceiver:
         self.boxes_from = boxes_from
         self.full_turn = full_turn
         self.agree = agree
-        self._rules = RULES if agree else frozenset()  # an ablation leaves some of them out
-        gaps_deg = [upper - lower for upper, lower in pairwise(self.sensor.elevations_deg)]
-        # Twice the spacing of beams or columns: points of one object are linked even if a return between is missing.
-        self._distance_per_m = 2.0 * math.radians(max(np.median(gaps_deg or [0.0]), 360.0 / self.sensor.columns))
         kinds = {_view_kind(model) for model in wanted}
         at_once = 2 if {"top_view", "range_image"} <= kinds else 1
         self.sessions = tuple(
@@ -315,7 +284,6 @@ class Perceiver:
         views = [card.view.kind for card in self.cards]
         if len(views) != len(set(views)):
             raise OptionError(f"models {[str(m) for m in wanted]} have views {views}; expected at most one a view")
-        self._networks = [self._load(s) for s in self.sessions if not isinstance(s.card.view, CameraGeometry)]
         self._camera = next(
             (
                 _Camera(s, ImageScaler(s.card.view, s.card.input))
@@ -327,61 +295,48 @@ class Perceiver:
         if boxes_from == "clusters" and "range_image" not in views:
             raise OptionError("boxes_from is 'clusters', which needs a class for every point; add a range-image model")
         self.providers = MappingProxyType({s.card.name: s.description for s in self.sessions})
-        self._needs_ground = bool(self._networks) and (
-            agree
-            or any(n.projector.needs_ground for n in self._networks)
-            or (boxes_from != "network" and "range_image" in views)
-        )
-        # Each on its part of the cores, both networks take less time than one after the other on all cores, because the
-        # steps around them use one core only: 10.2 in place of 13.3 ms on two cores.
-        self._at_once = at_once == 2 and all(n.session.shares_cores for n in self._networks)
-        # Of a full turn, the top view's thread takes sectors when it is done with the top view.
-        ranged = self._network_of(RangeImageGeometry)
-        self._aside = self._load(ranged.session.second()) if full_turn and self._at_once and ranged else None
-        # Half of the points of a scan are near no view that looks ahead: 16.1 in place of 17.5 ms. Between points, the
-        # ground is found anew, with all points.
-        interpolates = ranged is not None and ranged.interpolator is not None
-        self._sectors = sectors_of_turn(ranged.session.card.view, whole=interpolates) if full_turn and ranged else []
-        self._crop = Crop([] if full_turn or interpolates else [n.session.card.view for n in self._networks])
+        self._fitness = [FitnessProfile.from_dict(card.fitness) for card in self.cards if card.fitness is not None]
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
-        self._beside = SideThread()
         self._locks = {os.getpid(): threading.Lock()}
-        # Compile every kernel here, not in the first call, with an image of one pixel and a scan of two points. The
-        # networks have already run on their golden inputs, and those outputs are decoded.
+        self._lanes = Lanes(2 if at_once == 2 and all(session.shares_cores for session in self.sessions) else 1)
+        self._pipeline = self._assemble()
+        # Compile every kernel here, not in the first call. The networks have already run on their golden inputs.
         if self._camera is not None:
-            self._camera.label(as_image(np.zeros((1, 1, 3), np.uint8)), Stopwatch(), infer=False)
-        if self._networks:
-            self._compile(views)
+            _Camera(Rehearsed(self._camera.session), self._camera.scaler).label(
+                as_image(np.zeros((1, 1, 3), np.uint8)), Stopwatch()
+            )
+        if self._pipeline is not None:
+            warm_up(self._pipeline, self.sensor, self._fitness if self._to_check else [], self._estimator)
 
-    def _compile(self, views: Sequence[str]) -> None:
-        """Compile every kernel of scans."""
-        warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
-        labels_points = "range_image" in views
-        boxes_points = labels_points and self.boxes_from != "network"
-        needed = {
-            "ground": self._needs_ground,
-            "clusters": boxes_points or (labels_points and self.agree),
-            "agreement": labels_points and self.agree,
-            "boxes": boxes_points,
-            "road": "top_view" in views,
-        }
-        with fewer_collections(), Helpers([part for part in needed if needed[part]]) as helpers:
-            render(warm_up, replace(self.sensor, remission=NO_REMISSION))
-            perception = self._perceive(warm_up, None, Stopwatch(), self._to_check > 0, infer=False)
-            floor, labels = car_and_person()
-            ground = find_ground(floor, mount_height_m=MODEL_HEIGHT_M) if self._needs_ground else None
-            with suppress(MountingError):  # the floor has no street
-                self._estimator.add(floor)
-            ModelFrame(Mounting(0.0, 0.0, 0.0, 0.0)).move(floor)
-            helpers.wait()  # for what follows
-            if ground is not None:
-                unsure = (Box("car", 0.4, (5.0, 0.0, -1.0), (4.0, 1.6, 1.5), 0.0),)
-                seen = None if perception.points is None else labels
-                self._combine(floor, ground, seen, lambda: perception.top_view, unsure, Stopwatch(), infer=False)
-            if boxes_points:
-                compile_parts(["boxes"])  # some only several boxes need
-            if "top_view" in views:
-                compile_kernels()  # of `edgeperc.road_ahead`
+    def _assemble(self) -> Pipeline | None:
+        """The pipeline of the LiDAR networks; None without any."""
+        top: TopViewNetwork | None = None
+        ranged: list[RangeImageNetwork] = []
+        for session in self.sessions:
+            if isinstance(session.card.view, TopViewGeometry):
+                top = TopViewNetwork(session, self.sensor)
+            elif isinstance(session.card.view, RangeImageGeometry):
+                interpolator = Interpolator(session.card.view, self.sensor) if self._interpolates else None
+                needed = interpolator if interpolator is not None and interpolator.needed else None
+                ranged = [RangeImageNetwork(session, needed)]
+        if top is None and not ranged:
+            return None
+        if self.full_turn and self._lanes.n == 2 and ranged:  # either lane may take a sector
+            ranged.append(ranged[0].second())
+        network_score = self.score_threshold
+        if network_score is None:
+            network_score = MIN_SCORE if top is None else top.card.score_threshold
+        gaps_deg = [upper - lower for upper, lower in pairwise(self.sensor.elevations_deg)]
+        options = Options(
+            rules=frozenset(RULES) if self.agree is True else frozenset(self.agree or ()),
+            boxes_from=self.boxes_from,
+            network_score=network_score,
+            cluster_score=MIN_SCORE if self.score_threshold is None else self.score_threshold,
+            # Twice the spacing of beams or columns: an object whose return between is missing stays linked.
+            distance_per_m=2.0 * math.radians(max(np.median(gaps_deg or [0.0]), 360.0 / self.sensor.columns)),
+            full_turn=self.full_turn,
+        )
+        return Pipeline(top, ranged, options, self._lanes)
 
     def __setattr__(self, name: str, value: object) -> None:
         if not name.startswith("_") and "_locks" in vars(self):  # the last attribute of construction
@@ -427,21 +382,6 @@ class Perceiver:
         self._mounting = estimator.mounting()
         self._frame = ModelFrame(self._mounting)
 
-    def _load(self, session: Session) -> _Network:
-        card = session.card
-        assert not isinstance(card.view, CameraGeometry)
-        interpolator = None
-        if self._interpolates and isinstance(card.view, RangeImageGeometry):
-            interpolator = Interpolator(card.view, self.sensor)
-        return _Network(
-            session=session,
-            projector=make_projector(card.view, card.input),
-            index=np.empty((card.view.height, card.view.width), np.int32),
-            fitness=None if card.fitness is None else FitnessProfile.from_dict(card.fitness),
-            interpolator=interpolator if interpolator is not None and interpolator.needed else None,
-            observer=Observer(card.view, self.sensor) if isinstance(card.view, TopViewGeometry) else None,
-        )
-
     def __call__(
         self, points: ArrayLike | None = None, stamp_s: float | None = None, *, image: ArrayLike | None = None
     ) -> Perception:
@@ -477,11 +417,7 @@ class Perceiver:
                 perception = self._nothing(stamp_s, watch)
             else:
                 check = self._to_check > 0 and len(scan) > 0
-                try:
-                    perception = self._perceive(scan, stamp_s, watch, check)
-                except BaseException:
-                    self._beside.wait()  # the next call writes to what the second thread still reads
-                    raise
+                perception = self._perceive(scan, stamp_s, watch, check)
                 self._to_check -= check
             if pixels is not None and self._camera is not None:
                 perception = replace(perception, image=self._camera.label(pixels, watch))
@@ -492,10 +428,10 @@ class Perceiver:
     def _check_given(self, points: ArrayLike | None, image: ArrayLike | None) -> None:
         """Raise `PointsError` or `ImageError` if there is no input for a model, or no model for an input."""
         loaded = ", ".join(card.name for card in self.cards)
-        if points is None and self._networks:
-            name = self._networks[0].session.card.name
+        if points is None and self._pipeline is not None:
+            name = next(card.name for card in self.cards if not isinstance(card.view, CameraGeometry))
             raise PointsError(f"got no points, and {name} needs a scan; pass points, (n, 4), or leave out {name}")
-        if points is not None and not self._networks:
+        if points is not None and self._pipeline is None:
             raise PointsError(
                 f"got points, and the only model is of a camera ({loaded}); pass image= alone, or add LiDAR models: "
                 f"Perceiver({[*DEFAULT, loaded]})"
@@ -512,9 +448,7 @@ class Perceiver:
         """The perception of no scan."""
         return Perception(0, 0, None, None, (), MappingProxyType(watch.ms), self.providers, (), stamp_s)
 
-    def _perceive(
-        self, scan: NDArray[np.float32], stamp_s: float | None, watch: Stopwatch, check: bool, infer: bool = True
-    ) -> Perception:
+    def _perceive(self, scan: NDArray[np.float32], stamp_s: float | None, watch: Stopwatch, check: bool) -> Perception:
         before, matcher, profile = self._estimator, self._remission, self.sensor
         hidden: tuple[Finding, ...] = ()
         matched: tuple[Finding, ...] = ()
@@ -522,7 +456,7 @@ class Perceiver:
             self._remission, profile, matched = matcher.add(scan)
         scan, n_dropped = condition(scan, profile, rendered=self._renders)
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
-        if infer and not before.is_complete and len(scan):
+        if not before.is_complete and len(scan):
             try:
                 self._set_mounting(before.add(scan))
             except MountingError as exc:
@@ -531,12 +465,12 @@ class Perceiver:
         if not self._frame.is_identity:
             scan = self._frame.move(scan)
             watch.lap("adapt")
-        fitness = check_profiles(scan, [n.fitness for n in self._networks if n.fitness], profile) if check else ()
+        fitness = check_profiles(scan, self._fitness, profile) if check else ()
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *hidden)
         if self.on_mismatch != "ignore":
             fitness = (*fitness, *matched)
-        if infer and check:
+        if check:
             try:
                 self._refuse(fitness)
             except FitnessError:
@@ -544,56 +478,14 @@ class Perceiver:
                 self._remission = matcher
                 raise
         watch.lap("check")
-        points: PointLabels | None = None
-        boxes: Sequence[Box] = ()
-        top, ranged = (self._network_of(kind) for kind in (TopViewGeometry, RangeImageGeometry))
-        at_once = top is not None and self._at_once and infer
-        fit: Callable[[], GroundFit] | None = None  # once for all that needs it: the input of a network, the clusters
-        if self._needs_ground:
-            fit = partial(fit_ground, scan, mount_height_m=MODEL_HEIGHT_M)
-            fit = self._beside(fit) if at_once else fit
-        kept, rows = self._crop.select(scan)
-        found: Callable[[], list[Box]] | None = None
-        strips: Callable[[], Strips | None] = _not_sorted
-        cells: Callable[[], TopView | None] = partial(self._label_cells, top, kept, lambda: boxes)
-        if top is not None:
-            self._project(top, kept)
-            watch.lap("project")
-        if top is not None and at_once:
-            found = cache(self._beside(partial(self._find_boxes, top, Stopwatch(), infer)))
-            cells = partial(self._label_cells, top, kept, found)
-        elif top is not None:
-            boxes = self._find_boxes(top, watch, infer)
-        try:
-            ground = None if fit is None else fit().heights(rows)
-            watch.lap("cluster")
-            if found is not None and ground is not None and self._rules:
-                strips = partial(sort_points, kept, ~ground.mask, distance_per_m=self._distance_per_m)
-            if found is not None and not self.full_turn:
-                strips, cells = self._beside(strips), self._beside(cells)
-            if ranged is not None:
-                height_m = None if ground is None else ground.height_m
-                if self.full_turn:
-                    strips, cells = cache(strips), cache(cells)
-                    points = self._label_full_turn(ranged, kept, height_m, watch, infer, last=(strips, cells))
-                else:
-                    points = self._label_sector(ranged, kept, height_m, watch, infer)
-        finally:
-            if found is not None:
-                boxes = found()
-                watch.lap("infer")
-        if ground is not None and infer:
-            points, top_view, boxes = self._combine(
-                kept, ground, points, cells, boxes, watch, infer=infer, strips=strips
-            )
-        else:
-            top_view = cells()
+        assert self._pipeline is not None
+        parts = self._pipeline(scan, self._mounting, watch)
         return Perception(
             n_points=len(scan),
             n_dropped=n_dropped,
-            points=None if points is None else spread([(points, rows)], len(scan)),
-            top_view=top_view,
-            boxes=self._frame.boxes_back(boxes),
+            points=parts.points,
+            top_view=parts.top_view,
+            boxes=self._frame.boxes_back(parts.boxes),
             stage_ms=MappingProxyType(watch.ms),
             providers=self.providers,
             fitness=fitness,
@@ -601,10 +493,6 @@ class Perceiver:
             mounting=self._mounting,
             remission=profile.remission if self._renders else None,
         )
-
-    def _network_of(self, kind: type) -> _Network | None:
-        """The network of a kind of view, or None."""
-        return next((n for n in self._networks if isinstance(n.session.card.view, kind)), None)
 
     def _without_ground(self, reason: MountingError) -> tuple[Finding, ...]:
         """What to say of a scan that does not show how the sensor is mounted, if no other scan has."""
@@ -627,133 +515,3 @@ class Perceiver:
                 f"{' '.join(fitness)} Results would be meaningless. To perceive it all the same, pass "
                 'on_mismatch="warn" (on the command line --anyway).'
             )
-
-    def _project(
-        self, network: _Network, scan: NDArray[np.float32], height_m: NDArray[np.float32] | None = None
-    ) -> NDArray[np.int32]:
-        pixel = np.empty(len(scan), np.int32)
-        network.projector.fill(scan, network.session.input, network.index, pixel, height_m)
-        return pixel
-
-    def _find_boxes(self, network: _Network, watch: Stopwatch, infer: bool) -> list[Box]:
-        """Run the network of the top view on what was projected, and decode its boxes (SSADNet)."""
-        outputs = network.session.run() if infer else network.session.outputs
-        watch.lap("infer")
-        card = network.session.card
-        threshold = card.score_threshold if self.score_threshold is None else self.score_threshold
-        boxes = decode_boxes(card, outputs, threshold)
-        watch.lap("decode")
-        return boxes
-
-    def _label_cells(
-        self, network: _Network | None, scan: NDArray[np.float32], boxes: Callable[[], Sequence[Box]]
-    ) -> TopView | None:
-        """Class of every cell of the top view, after `_find_boxes` (SSADNet)."""
-        if network is None:
-            return None
-        card, grid = network.session.card, network.session.card.view
-        assert isinstance(grid, TopViewGeometry)
-        assert network.observer is not None
-        assert self._mounting.height_m is not None
-        found = boxes()  # first: where no thread can be started, this runs the network
-        labels = decode_cells(card, network.index >= 0, network.session.outputs, found)
-        observed = network.observer.observe(scan, network.index, self._mounting.height_m)
-        return TopView(labels, card.classes, grid.cell_m, grid.x_range_m, grid.y_range_m, observed, self._mounting)
-
-    def _label_sector(
-        self,
-        network: _Network,
-        scan: NDArray[np.float32],
-        height_m: NDArray[np.float32] | None,
-        watch: Stopwatch,
-        infer: bool,
-    ) -> PointLabels:
-        """Class of every point in the range image: decode pixels, remove outliers, label points (PointSeg 5.2)."""
-        card = network.session.card
-        assert isinstance(card.view, RangeImageGeometry)
-        pixel = self._project(network, scan, height_m)
-        watch.lap("project")
-        if network.interpolator is not None:
-            assert isinstance(network.projector, RangeImageProjector)
-            # Interpolated points are in the image only; refinement uses the points of the scan.
-            dense, filled = network.interpolator.fill(scan, network.index)
-            height_m = input_heights(network.projector, dense)
-            network.projector.fill_image(dense, filled, network.session.input, height_m)
-            watch.lap("adapt")
-        outputs = network.session.run() if infer else network.session.outputs
-        watch.lap("infer")
-        ((kind, raw),) = outputs.items()
-        labels = decode_labels(raw, kind, model=card.name)
-        watch.lap("decode")
-        edges_meet = card.view.azimuth_left_deg - card.view.azimuth_right_deg == 360.0
-        cleaned = remove_outliers(scan, network.index, labels, card.classes, full_turn=edges_meet)
-        labeled = label_points(scan, pixel, network.index, cleaned, full_turn=edges_meet)
-        watch.lap("refine")
-        return PointLabels(labeled, pixel >= 0, card.classes)
-
-    def _label_full_turn(
-        self,
-        network: _Network,
-        scan: NDArray[np.float32],
-        height_m: NDArray[np.float32] | None,
-        watch: Stopwatch,
-        infer: bool,
-        last: Sequence[Callable[[], object]],
-    ) -> PointLabels:
-        """Run the network once for each sector, on a turned scan; a point in two sectors keeps its first label.
-
-        The second thread takes sectors, too, once it is done with the top view. The thread that finds none left calls
-        what is ``last``, while the other one is busy with its sector.
-        """
-        sectors: dict[int, tuple[PointLabels, NDArray[np.int32] | None]] = {}
-
-        def label(k: int, by: _Network, watch: Stopwatch) -> None:
-            turn_rad, crop = self._sectors[k]
-            seen, rows = crop.select(scan)
-            heights = height_m if height_m is None or rows is None else height_m[rows]
-            # What float32 cannot hold after the turn is not in view.
-            seen = turned(seen, turn_rad) if k else seen
-            sectors[k] = self._label_sector(by, seen, heights, watch, infer), rows
-
-        def call(function: Callable[[], object], by: _Network, watch: Stopwatch) -> None:
-            function()
-
-        left: deque[Callable[[_Network, Stopwatch], object]] = deque(
-            partial(label, k) for k in range(len(self._sectors))
-        )
-        left.extend(partial(call, each) for each in last)
-
-        def label_sectors(by: _Network, watch: Stopwatch) -> None:
-            while True:
-                try:
-                    task = left.popleft()
-                except IndexError:  # none is left
-                    return
-                task(by, watch)
-
-        helper = None
-        if infer and self._aside is not None:
-            helper = self._beside(partial(label_sectors, self._aside, Stopwatch()))
-        try:
-            label_sectors(network, watch)
-        finally:
-            left.clear()
-            if helper is not None:
-                helper()
-                watch.lap("infer")
-        return spread([sectors[k] for k in range(len(sectors))], len(scan))
-
-    def _combine(
-        self, *parts: Any, infer: bool, strips: Callable[[], Strips | None] = _not_sorted
-    ) -> tuple[PointLabels | None, TopView | None, Sequence[Box]]:
-        """`combine` with the options of this perceiver; ``parts`` are its arguments without a name."""
-        return combine(
-            *parts,
-            cards=self.cards,
-            rules=self._rules,
-            boxes_from=self.boxes_from,
-            min_score=MIN_SCORE if self.score_threshold is None else self.score_threshold,
-            distance_per_m=self._distance_per_m,
-            beside=self._beside if self._at_once and infer else lambda function: function,
-            strips=strips,
-        )

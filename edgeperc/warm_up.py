@@ -1,11 +1,12 @@
-"""The first start: helper processes compile a part of the kernels while the process that needs them compiles the rest.
+"""Compile every kernel of a perceiver before its first scan.
 
-numba compiles in one thread. Where the cache of kernels is empty and can be written, `Helpers` starts one process for
-each further core, three at most. A helper runs this package in a new interpreter and puts what it compiles into the
-cache; `edgeperc.kernel_cache` finds it there. It opens no model, writes nothing else, and never imports the caller's
-main module. It ends by itself when its part is compiled, when the process that started it has ended, or after two
-minutes, and is killed when construction ends. Everything that is not in the cache afterwards is compiled as without
-helpers: one that cannot start, fails or hangs costs time, and changes no result.
+`warm_up` runs the pipeline on small scans. At the first start, helper processes compile a part of the kernels while the
+process that needs them compiles the rest, because numba compiles in one thread. Where the cache of kernels is empty and
+can be written, `Helpers` starts one process for each further core, three at most. A helper runs this package in a new
+interpreter and puts what it compiles into the cache; `edgeperc.kernel_cache` finds it there. It opens no model, writes
+nothing else, and never imports the caller's main module. It ends by itself when its part is compiled, when the process
+that started it has ended, or after two minutes, and is killed when construction ends. Everything that is not in the
+cache afterwards is compiled as without helpers: one that cannot start, fails or hangs costs time, and changes no result.
 
 No helper starts in a frozen application, in a program that embeds Python (`sys.executable` is then no Python
 interpreter), on one core, without a cache that can be written, and at later starts.
@@ -22,6 +23,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from copy import copy
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -31,20 +35,32 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .agreement import agree_on_boxes, agree_on_points, clear_columns, find_support, find_voters
-from .cells import agree_on_cells
+from .adapt import render
+from .agreement import Support, agree_on_boxes, agree_on_points, clear_columns, find_support, find_voters, without_poles
+from .cells import agree_on_cells, mark_cells
 from .cluster import fill_rectangle, join_boxes, objects_from_points
 from .drivable import compile_kernels
+from .errors import MountingError
+from .fitness import FitnessProfile, check_profiles
+from .frame import ModelFrame
 from .geometry import suppress_overlaps
 from .ground import Ground, fill_planes, find_ground
 from .kernel_cache import KernelCache, fewer_collections
+from .lanes import Lanes, Stopwatch
+from .level import MountingEstimator
 from .linkage import fill_clusters
-from .mounting import MODEL_HEIGHT_M
+from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .outline import merge_corners
 from .perception import Box, PointLabels, TopView
+from .pipeline import Pipeline, RangeImageNetwork, TopViewNetwork, View
+from .points import read_only
+from .remission import NO_REMISSION
+from .scan import Scan
+from .sensor import SensorProfile
+from .session import Session
 from .tuning import usable_cores
 
-__all__ = ["Helpers", "car_and_person", "compile_parts"]
+__all__ = ["Helpers", "Rehearsed", "car_and_person", "compile_parts", "warm_up"]
 
 logger = logging.getLogger(__name__)
 
@@ -52,9 +68,7 @@ MAX_S = 120.0  # after which a helper ends in any case; one took 12 s on two cor
 MIN_WAIT_S = 5.0
 
 # At the end, nothing is collected or torn down, which would take a second.
-START = (
-    "import os, sys; sys.path[:] = sys.argv[2:]; from edgeperc.first_start import main; main(sys.argv[1]); os._exit(0)"
-)
+START = "import os, sys; sys.path[:] = sys.argv[2:]; from edgeperc.warm_up import main; main(sys.argv[1]); os._exit(0)"
 
 
 def car_and_person() -> tuple[NDArray[np.float32], PointLabels]:
@@ -74,38 +88,122 @@ def car_and_person() -> tuple[NDArray[np.float32], PointLabels]:
     return scan, PointLabels(labels, np.ones(len(scan), np.bool_), ("background", "car", "pedestrian", "cyclist"))
 
 
-def _made_up() -> tuple[NDArray[np.float32], PointLabels, Ground, tuple[Box, ...]]:
-    """A scan, its labels, its ground and a network's box; no kernel is needed for these."""
-    scan, points = car_and_person()
-    mask = points.labels == 0
+class Rehearsed(Session):
+    """A session whose runs give the outputs of its last one, at first those of the golden input."""
+
+    def __init__(self, session: Session) -> None:
+        vars(self).update(vars(session))
+
+    def run(self) -> Mapping[str, NDArray[np.float32]]:
+        """`Session.outputs`, without running the network."""
+        return self.outputs
+
+
+class _RehearsedTop(TopViewNetwork):
+    """Gives one uncertain box in place of what its network would."""
+
+    def __init__(self, network: TopViewNetwork) -> None:
+        vars(self).update(vars(network))
+
+    def find_boxes(self, projected: None, score_threshold: float) -> list[Box]:
+        return [UNCERTAIN]
+
+    def project(self, near: View) -> None:
+        self.index.fill(-1)
+
+
+class _RehearsedRange(RangeImageNetwork):
+    """Gives the labels that `car_and_person` wrote into the remission of the points."""
+
+    def __init__(self, network: RangeImageNetwork) -> None:
+        vars(self).update(vars(network))
+
+    def label(self, points: NDArray[np.float32], height_m: NDArray[np.float32] | None, watch: Stopwatch) -> PointLabels:
+        return PointLabels(points[:, 3].astype(np.uint8), np.ones(len(points), np.bool_), self.card.classes)
+
+
+def warm_up(
+    pipeline: Pipeline, sensor: SensorProfile, fitness: Sequence[FitnessProfile], estimator: MountingEstimator
+) -> None:
+    """Compile what a scan needs, and `edgeperc.road_ahead`."""
+    two_points = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
+    options, top, ranged = pipeline.options, pipeline.top, pipeline.ranged
+    boxes_points = bool(ranged) and options.boxes_from != "network"
+    needed = {
+        "ground": pipeline.needs_ground,
+        "clusters": boxes_points or bool(ranged and options.rules),
+        "agreement": bool(ranged and options.rules),
+        "boxes": boxes_points,
+        "road": top is not None,
+    }
+    alone = Lanes(1)
+    with fewer_collections(), Helpers([part for part in needed if needed[part]]) as helpers:
+        # The networks' own stages, with their outputs for the golden input
+        render(two_points, replace(sensor, remission=NO_REMISSION))
+        check_profiles(two_points, fitness, sensor)
+        golden_top, golden_ranged = copy(top), [copy(network) for network in ranged]
+        for network in (golden_top, *golden_ranged):
+            if network is not None:
+                network.session = Rehearsed(network.session)
+        apart = replace(options, rules=frozenset(), boxes_from="network")
+        Pipeline(golden_top, golden_ranged, apart, alone)(read_only(two_points), MODEL_MOUNTING, Stopwatch())
+        # What moves a scan
+        floor, labels = car_and_person()
+        with suppress(MountingError):  # the floor has no street
+            estimator.add(floor)
+        ModelFrame(Mounting(0.0, 0.0, 0.0, 0.0)).move(floor)
+        helpers.wait()  # for what follows
+        # Objects and agreement
+        floor[:, 3] = labels.labels
+        rehearsed_top = None if top is None else _RehearsedTop(top)
+        rehearsed = Pipeline(
+            rehearsed_top,
+            [_RehearsedRange(network) for network in ranged[:1]],
+            replace(options, full_turn=False),
+            alone,
+        )
+        rehearsed(read_only(floor), MODEL_MOUNTING, Stopwatch())
+        if boxes_points:
+            compile_parts(["boxes"])  # some only several boxes need
+        if top is not None:
+            compile_kernels()
+
+
+UNCERTAIN = Box("car", 0.4, (5.0, 0.0, -1.0), (4.0, 1.6, 1.5), 0.0)
+
+
+def _made_up() -> tuple[Scan, PointLabels]:
+    """A scan with its ground, and its labels; no kernel is needed for these."""
+    points, labels = car_and_person()
+    mask = labels.labels == 0
     ground = Ground(mask, np.where(mask, 0.0, MODEL_HEIGHT_M).astype(np.float32), (0.0, 0.0, -MODEL_HEIGHT_M))
-    return scan, points, ground, (Box("car", 0.4, (5.0, 0.0, -1.0), (4.0, 1.6, 1.5), 0.0),)
+    return Scan.of(points, ground, labels), labels
 
 
 def _compile_clusters() -> None:
-    scan, points, ground, _ = _made_up()
-    find_voters(scan, points, ground, support=(np.zeros(len(scan), np.float32), np.zeros(len(scan), np.uint8)))
+    scan, labels = _made_up()
+    find_voters(scan, labels, Support(np.zeros(len(scan.points), np.float32), np.zeros(len(scan.points), np.uint8)))
 
 
 def _compile_boxes() -> None:
-    scan, points, ground, boxes = _made_up()
-    clusters = np.where(ground.mask, -1, 0).astype(np.int32)
+    scan, labels = _made_up()
+    clusters = np.where(scan.ground.mask, -1, 0).astype(np.int32)
     for label in (1, 2):  # one cluster of a car; one of a person, without points beside it that would be clustered
-        labels = np.where(ground.mask, 0, label).astype(np.uint8)
-        objects_from_points(scan, labels, points.classes, height_m=ground.height_m, clusters=clusters)
-    join_boxes(boxes, boxes)
+        alike = np.where(scan.ground.mask, 0, label).astype(np.uint8)
+        objects_from_points(scan.points, alike, labels.classes, height_m=scan.ground.height_m, clusters=clusters)
+    join_boxes([UNCERTAIN], [UNCERTAIN])
     suppress_overlaps(np.zeros((2, 5)), np.zeros(2), 0.0)
 
 
 def _compile_agreement() -> None:
-    scan, points, ground, boxes = _made_up()
-    held = find_support(scan, points, ground, boxes)
-    clusters = np.where(ground.mask, -1, 0).astype(np.int32)
-    points = agree_on_points(scan, points, ground, clusters, boxes, support=held)
-    agree_on_boxes(boxes, scan, points, ground)
+    scan, labels = _made_up()
+    support = find_support(scan, labels, [UNCERTAIN])
+    clusters = np.where(scan.ground.mask, -1, 0).astype(np.int32)
+    agreed = agree_on_points(scan, labels, clusters, support, without_poles(scan, labels))
+    agree_on_boxes([UNCERTAIN], scan, agreed)
     cells = np.zeros((400, 200), np.uint8)
     view = TopView(cells, ("background", "drivable"), 0.1, (6.0, 46.0), (-10.0, 10.0), np.ones(cells.shape, np.bool_))
-    agree_on_cells(view, scan, points, ground, boxes, boxes)
+    agree_on_cells(view, agreed, [UNCERTAIN], [UNCERTAIN], mark_cells(view, scan, agreed))
 
 
 def _compile_ground() -> None:

@@ -1,0 +1,144 @@
+"""Values of one scan that are computed once, on one thread or two."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Generic, TypeVar
+
+__all__ = ["STAGES", "Lanes", "Once", "Stopwatch"]
+
+STAGES = ("check", "project", "infer", "decode", "refine", "cluster", "agree")
+
+_Value = TypeVar("_Value")
+
+
+class Stopwatch:
+    """Sum of the wall time of each stage [ms] in the thread that made it; other threads take no time of the answer.
+
+    Attributes
+    ----------
+    ms : dict of str to float
+    """
+
+    def __init__(self) -> None:
+        self.ms = dict.fromkeys(STAGES, 0.0)
+        self._thread, self._last = threading.get_ident(), time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """Add the time since the last lap to a stage."""
+        if threading.get_ident() == self._thread:
+            now = time.perf_counter()
+            self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (now - self._last)
+            self._last = now
+
+
+class Once(Generic[_Value]):
+    """A value that is computed when it is first asked for; another thread that asks waits for it, or gets its error.
+
+    Parameters
+    ----------
+    function : callable
+    *arguments, **options
+        Its arguments. Of one that is a `Once`, the function gets the value.
+    stage : str
+        Its time counts for this stage of the stopwatch.
+    watch : Stopwatch
+    """
+
+    __slots__ = ("_arguments", "_error", "_function", "_is_known", "_lock", "_options", "_stage", "_value", "_watch")
+
+    def __init__(
+        self, function: Callable[..., _Value], *arguments: object, stage: str, watch: Stopwatch, **options: object
+    ) -> None:
+        self._function, self._arguments, self._options = function, arguments, options
+        self._stage, self._watch = stage, watch
+        self._lock = threading.Lock()
+        self._is_known = False
+        self._error: Exception | None = None
+        self._value: Any = None
+
+    def __call__(self) -> _Value:
+        """The value."""
+        if not self._is_known:
+            with self._lock:
+                self._compute()
+            self._watch.lap(self._stage)
+        if self._error is not None:
+            raise self._error
+        return self._value
+
+    def start(self) -> None:
+        """Compute the value, unless it is known or another thread computes it."""
+        if not self._is_known and self._lock.acquire(blocking=False):
+            try:
+                self._compute()
+            finally:
+                self._lock.release()
+            self._watch.lap(self._stage)
+
+    def _compute(self) -> None:
+        if self._is_known:  # another thread had the lock
+            return
+        try:
+            self._value = self._function(
+                *(_value_of(argument) for argument in self._arguments),
+                **{name: _value_of(option) for name, option in self._options.items()},
+            )
+        except Exception as exc:
+            self._error = exc
+        self._is_known = True
+
+
+def _value_of(argument: object) -> object:
+    return argument() if isinstance(argument, Once) else argument
+
+
+class Lanes:
+    """The calling thread and, where ``n`` is 2, a second one: both compute the values of a scan.
+
+    The second thread is reused: starting one per scan took 0.2 ms of the front view and 1.3 ms of a full turn. It
+    starts with the first scan; a forked process has its own.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.n = min(n, 2)
+        self._threads: dict[int, ThreadPoolExecutor] = {}
+
+    def run(self, first: Sequence[Once[Any]], second: Sequence[Once[Any]]) -> None:
+        """Compute all values: each lane its own, in order, and the calling thread what is left of the second's.
+
+        The second lane is done when this returns or raises, so buffers may be overwritten afterwards.
+        """
+        stopped = threading.Event()
+        process = os.getpid()
+
+        def compute(values: Sequence[Once[Any]]) -> None:
+            for value in values:
+                if stopped.is_set():
+                    return
+                value.start()
+
+        waiting = None
+        if self.n == 2:
+            if process not in self._threads:
+                self._threads[process] = ThreadPoolExecutor(1, thread_name_prefix="edgeperc-lane")
+            try:
+                waiting = self._threads[process].submit(compute, second)
+            except RuntimeError:  # no thread can be started, as while the interpreter ends
+                del self._threads[process]  # it would compute them later, too
+        try:
+            compute(first)
+            if waiting is None:
+                compute(second)
+        except BaseException:
+            stopped.set()
+            raise
+        finally:
+            if waiting is not None:
+                waiting.result()
+        for value in (*first, *second):
+            value()
