@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+from checkout import REPOSITORY, files
+
 PACKAGES = {
     "edgeperc.zoo": REPOSITORY / "models",
     "edgeperc": REPOSITORY / "edgeperc",
@@ -131,7 +132,7 @@ def modules() -> dict[str, Path]:
     """Every module of the three packages by its dotted name; a package's own is called ``__init__``."""
     found = {}
     for package, folder in PACKAGES.items():
-        for path in sorted(folder.rglob("*.py")):
+        for path in files(".py", str(folder.relative_to(REPOSITORY))):
             found[".".join([package, *path.relative_to(folder).with_suffix("").parts])] = path
     return found
 
