@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-__all__ = ["SideThread"]
+__all__ = ["SideThread", "returns"]
 
 _Result = TypeVar("_Result")
 
@@ -41,3 +42,24 @@ class SideThread:
         """Wait until nothing is left to do in the thread."""
         if os.getpid() in self._threads:
             self(lambda: None)()
+
+
+def returns(call: Callable[[], object], limit_s: float) -> bool:
+    """Whether a call of a library, which may wait for others for ever, returns in time; else it is left behind.
+
+    Signals act while it runs. What it raises is raised here.
+    """
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            call()
+        except BaseException as exc:
+            errors.append(exc)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(limit_s)
+    if errors:
+        raise errors[0]
+    return not thread.is_alive()

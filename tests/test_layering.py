@@ -47,7 +47,7 @@ FLOORS = {
         tracking.tracks
         tracking.tracker
         tracking.__init__
-        listing moving perceiver records sinks.__init__ zones
+        listing moving perceiver records sinks.__init__ sinks.kept_file sinks.relay zones
         live sinks.names
         sinks.prelabels sinks.static
         simulation.raycast
