@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import PointsError
+from ..errors import OptionError, PointsError
 from ..extras import require
 from ..frame import ModelFrame, quaternion
 from ..mounting import MODEL_HEIGHT_M
+from ..names import check_text
 from ..occupancy import OCCUPIED, occupancy_grid
 from ..points import as_points
 from ..view.colors import color_of, rgb
@@ -106,6 +107,8 @@ class RosMessages:
     ------
     MissingExtraError
         rosbags is not installed.
+    OptionError
+        A frame's name is empty, too long or not printable.
     """
 
     def __init__(
@@ -117,6 +120,8 @@ class RosMessages:
         cell_m: float = 0.2,
         off_road: int = OCCUPIED,
     ) -> None:
+        for frame in (frame_id, frame_id if grid_frame_id is None else grid_frame_id):
+            check_text("the frame is", frame, OptionError)
         typesys = require("rosbags.typesys", "ros", "Making ROS 2 messages")
         self.typestore: Any = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         for name, text in _VISION.items():

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import MissingExtraError, ModelError, OptionError, PointsError, ProviderError
 from ..live import stream
+from ..names import check_text
 from ..readers.decoders import cloud_points, describe_cloud
 from ..readers.tables import MAX_SCAN_BYTES
 from ..sinks import PerceivedScan
@@ -98,6 +99,8 @@ class PerceptionNode:
         outputs: Sequence[str] = tuple(OUTPUTS),
     ) -> None:
         self._graph, self._perceiver_for, self._tracker = graph, perceiver_for, tracker
+        if frame_id is not None:
+            check_text("the frame is", frame_id, OptionError)
         self._topic, self._frame_id = topic, frame_id
         self._messages = RosMessages(grid_frame_id=grid_frame_id, lifetime_s=5.0 / rate_hz)
         self._perceiver: Perceiver | None = None
