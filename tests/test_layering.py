@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -128,6 +129,7 @@ ONLY_IN_FUNCTIONS = {"PIL", "matplotlib", "onnxruntime"}
 RIVALS = "edgeperc_bench.peers."
 
 
+@functools.cache
 def modules() -> dict[str, Path]:
     """Every module of the three packages by its dotted name; a package's own is called ``__init__``."""
     found = {}
