@@ -124,13 +124,14 @@ def test_the_viewers_are_bounded_and_a_place_becomes_free(relayed: Opener) -> No
 
 def test_who_says_nothing_or_reads_nothing_is_dropped(relayed: Opener, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(relay_module, "_GREETING_S", 0.1)
-    monkeypatch.setattr(relay_module, "_STALLED_S", 0.1)
     monkeypatch.setattr(relay_module, "_TICK_S", 0.05)
-    relay, connect = relayed(echo)
+    _, connect = relayed(echo)
     assert has_ended(connect())
     relay, connect = relayed(flood)
     deaf = connect()
-    time.sleep(0.2)
+    while not relay._viewers:
+        time.sleep(0.01)
+    monkeypatch.setattr(relay_module, "_STALLED_S", 0.1)
     while relay._viewers:
         time.sleep(0.05)
     assert has_ended(deaf)
