@@ -22,7 +22,7 @@ PACKAGES = {
 # A module imports from the lines above its own, never from its own line. A new module gets its place here.
 FLOORS = {
     "edgeperc": """
-        errors atomic printable side_thread stopwatch
+        clock errors atomic printable side_thread stopwatch
         extras mounting onnx_file
         card engine points remote sensor tuning
         kernel_cache perception zoo.__init__
