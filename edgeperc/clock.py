@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -60,10 +61,10 @@ class Clock:
         if self.last_s is None:
             return "next", begun
         step = step_between(self.last_s, stamp_s, self.gap_s)
-        if self.former_s is not None and step_between(self.former_s, stamp_s, self.gap_s) == "next":
-            # Of two sessions that a scan may continue, it continues the later one.
-            if step != "next" or self.former_s > self.last_s:
-                return "return", begun
+        former_s = -math.inf if self.former_s is None else self.former_s
+        may_return = step_between(former_s, stamp_s, self.gap_s) == "next"
+        if may_return and (step != "next" or former_s > self.last_s):  # of two sessions it continues the later one
+            return "return", begun
         if step == "next":
             return "next", begun
         if step == "late" and (self.n_late < MOST_LATE or stamp_s >= self.last_s):

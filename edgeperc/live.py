@@ -41,8 +41,8 @@ class Answer:
         The scan as the source supplied it; ``perception.points.labels`` holds a label for each of its points.
     perception : Perception
     tracks : object
-        Result of the tracker; None without a tracker, or if the tracker raises `StampError`: the scan's time is not finite
-        or out of its range.
+        Result of the tracker; None without a tracker, or if the tracker raises `StampError` because the scan's time is
+        not finite or out of its range.
     stamp_s : float
         Time stamp from the source [s]; without one, the arrival time on this computer's monotonic clock.
     age_s : float
@@ -156,8 +156,8 @@ class Stream:
 
     Only the newest scan is kept. Perceiver and tracker run in the caller's thread when the next answer is requested.
     Their errors are raised there, and the next scan can still be requested. A scan without a usable time, of which the
-    tracker raises `StampError`, is answered without tracks, and a warning says so once. An error of the source is raised after the
-    answer to the last scan, and ends the stream.
+    tracker raises `StampError`, is answered without tracks, and a warning says so once. An error of the source is
+    raised after the answer to the last scan, and ends the stream.
 
     Health depends on age only: ``"OK"`` up to ``late_after_s``, ``"LATE"`` up to ``stale_after_s``, then ``"STALE"``.
     The health of an answer refers to the moment when it was ready. The health of the stream refers to the present age

@@ -154,8 +154,8 @@ class Line:
 
     Notes
     -----
-    It belongs to one tracker and one run of it: make another one after `Tracker.reset`. If the clock of the scans jumps, it
-    goes on: objects get new ids, and count when they cross the line after the jump.
+    It belongs to one tracker and one run of it: make another one after `Tracker.reset`. If the clock of the scans
+    jumps, objects get new ids, and count when they cross the line after the jump.
     """
 
     def __init__(self, start: ArrayLike, end: ArrayLike, *, margin_m: float = 0.3, world: bool = True) -> None:

@@ -34,8 +34,8 @@ class StaticSink:
         Made if needed.
     without : {"moving", "movable"}
         ``"moving"``: points inside the boxes of tracks that move (`edgeperc.moving_points`). ``"movable"``: also those
-        on everything that could move (`edgeperc.movable_points`). Of a late or doubled scan nothing is known to stand, so
-        the movable points are left out in both cases.
+        on everything that could move (`edgeperc.movable_points`). Of a late or doubled scan it is not known what moves,
+        so both leave out what could.
 
     Attributes
     ----------

@@ -81,10 +81,10 @@ class Tracker:
 
     A clock that is wrong ends no tracking. A warning says so once for each of these cases:
 
-    - A late or doubled scan is up to 0.25 s earlier than the last one, or less than 1 us later. It changes no track, and
-      its tracks are empty and marked (`Tracks.is_late`). After two late scans in a row, an earlier stamp is a jump.
-    - After a jump, by more than 0.25 s back or 60 s forward (or the longest `ClassParameters.memory_s`, if it is longer),
-      tracking begins anew, with new ids (`Tracks.session`).
+    - A late or doubled scan is up to 0.25 s earlier than the last one, or less than 1 us later. It changes no track
+      and has none (`Tracks.is_late`). After two such scans in a row, an earlier stamp is a jump.
+    - After a jump, by more than 0.25 s back or 60 s forward (`ClassParameters.memory_s`, if that is longer), tracking
+      begins anew, with new ids (`Tracks.session`).
     - If the scan after a jump continues the times before the jump, the jump was the wrong stamp of one scan: the former
       tracks go on with their ids.
 
@@ -357,8 +357,8 @@ class Tracker:
                 self._groups.append(of.group)
             row = np.zeros(1, CLASS)
             row["group"] = self._groups.index(of.group)
-            for field in _SCALARS:
-                row[field] = getattr(of, field)
+            for scalar in _SCALARS:
+                row[scalar] = getattr(of, scalar)
             row["noise"] = of.acceleration_mps2, of.turn_acceleration_rps2, of.walk_m, of.wander_rad, of.still_mps
             row["sigmas"] = of.along_m, of.across_m, of.heading_rad
             row["shape"] = of.shape_m

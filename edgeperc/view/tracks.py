@@ -100,8 +100,8 @@ def draw_tracks(
     Parameters
     ----------
     scans : sequence of Tracks
-        In order, two or more. Each is shown until the stamp of the next, the last one for a second. Jumps of their clock
-        take no time.
+        In order, two or more. Each is shown until the stamp of the next, the last one for a second. A jump of
+        their clock takes no time.
     path : str or Path, optional
         File to write as well; an existing file is replaced atomically.
     under : sequence of bytes
