@@ -76,8 +76,8 @@ class Straightener:
         else:
             if not self._tracked:
                 warnings.warn(
-                    "--deskew: the first two scans stay as they are, also after a jump of the clock, for the tracker has "
-                    "no motion yet; --poses straightens them too",
+                    "--deskew: the first two scans stay as they are, also after a jump of the clock, for the tracker "
+                    "has no motion yet; --poses straightens them too",
                     stacklevel=2,
                 )
             return points
