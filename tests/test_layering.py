@@ -24,7 +24,7 @@ PACKAGES = {
 # A module imports from the lines above its own, never from its own line. A new module gets its place here.
 FLOORS = {
     "edgeperc": """
-        errors atomic names printable side_thread stopwatch
+        clock errors atomic names printable side_thread stopwatch
         extras mounting onnx_file
         card engine points remote sensor tuning
         kernel_cache perception zoo.__init__

@@ -109,7 +109,7 @@ class _Channels:
         self._write_frames(scan, now, stamp)
         self._write_points(scan, now, stamp)
         self._write_boxes(scan, now, stamp)
-        if scan.tracks is not None:
+        if scan.tracked is not None:
             self._write_tracks(scan, now, stamp)
         if scan.perception.top_view is not None:
             self._write_drivable(scan.perception.top_view, now, stamp)
