@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import CardError
+from .names import check_name, check_text
 from .onnx_file import read_metadata
 
 __all__ = [
@@ -37,7 +38,6 @@ SCHEMA = 3
 MAX_CHARACTERS = 16 * 10**6
 MAX_DEPTH = 32
 MAX_TEXT = 100_000  # characters of one text of the free-form metadata
-MAX_NAME = 200
 MAX_ROWS, MAX_COLUMNS, MAX_PIXELS = 4096, 65_536, 16 * 10**6
 MAX_CHANNELS = 16
 MAX_BLOCK = 16
@@ -61,11 +61,6 @@ def _check(field: str, value: float, low: float, high: float) -> None:
 def _check_each(field: str, values: Iterable[float], low: float, high: float) -> None:
     for index, value in enumerate(values):
         _check(f"{field}[{index}]", value, low, high)
-
-
-def _check_name(field: str, value: str) -> None:
-    if not 0 < len(value) <= MAX_NAME or not value.isprintable():
-        raise CardError(f"{field} {reprlib.repr(value)}; expected 1 to {MAX_NAME} printable characters")
 
 
 def _check_size(rows: int, columns: int) -> None:
@@ -255,7 +250,7 @@ class InputSpec:
                 "deviations; expected as many of each, at least one"
             )
         _check("the number of input channels", len(self.channels), 1, MAX_CHANNELS)
-        _check_name("input.name", self.name)
+        check_text("input.name", self.name, CardError)
         _check_each("input.mean", self.mean, -1e6, 1e6)
         _check_each("input.std", self.std, 1e-6, 1e6)
 
@@ -298,7 +293,7 @@ class OutputSpec:
             raise CardError(
                 f"output {reprlib.repr(self.name)} of kind {self.kind} has blocks; only outputs of classes may"
             )
-        _check_name("output.name", self.name)
+        check_text("output.name", self.name, CardError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -364,6 +359,7 @@ class ModelCard:
     Attributes
     ----------
     name, version : str
+        The name may become that of files and of models on a server: see `edgeperc.names.check_name`.
     precision : {"fp32", "int8"}
         Precision of the stored weights. ``"int8"``: weights and activations are 8-bit integers.
     view : TopViewGeometry, RangeImageGeometry or CameraGeometry
@@ -422,14 +418,14 @@ class ModelCard:
     def __post_init__(self) -> None:
         if self.precision not in ("fp32", "int8"):
             raise CardError(f"precision is {self.precision!r}; expected fp32 or int8, as the weights are stored")
-        _check_name("name", self.name)
-        _check_name("version", self.version)
+        check_name("name", self.name, CardError)
+        check_text("version", self.version, CardError)
         if not 2 <= len(self.classes) <= 255 or len(set(self.classes)) != len(self.classes):
             raise CardError(
                 f"classes {reprlib.repr(self.classes)}; expected 2 to 255 different names, the background first"
             )
         for each in self.classes:
-            _check_name("class", each)
+            check_text("class", each, CardError)
         unknown = [c for c in self.input.channels if c not in CHANNELS[self.view.kind]]
         if unknown:
             raise CardError(
@@ -472,7 +468,7 @@ class ModelCard:
         _check("nms_iou", self.nms_iou, 0.0, 1.0)
         _check("mount_height_m", self.mount_height_m, -100.0, 100.0)
         for name, record in self.precisions.items():
-            _check_name("the precision", name)
+            check_text("the precision", name, CardError)
             if "loss" in record:
                 _check(f"precisions.{name}.loss", _float(f"precisions.{name}.loss", record["loss"]), 0.0, 100.0)
         if self.golden is not None:

@@ -11,7 +11,7 @@
     ├── SettingsError (ValueError)    this computer's settings file cannot be read
     ├── SplitError (ValueError)       a model would be evaluated on a scan that it was trained on
     ├── TrackingError (ValueError)    boxes or a pose that cannot be tracked
-    │   └── StampError                a scan that is not later than the one before it
+    │   └── StampError                a time that is missing, not finite or out of its range
     ├── MountingError (ValueError)    scans do not show how the sensor is mounted
     ├── FitnessError                  a scan differs grossly from the training scans
     ├── ModelError
@@ -91,7 +91,7 @@ class TrackingError(EdgepercError, ValueError):
 
 
 class StampError(TrackingError):
-    """A scan's time is not finite, or not later than that of the scan before it."""
+    """A time is missing, not finite or out of its range, or two times do not rise where they have to."""
 
 
 class FitnessError(EdgepercError):

@@ -1,4 +1,4 @@
-"""Values of one scan that are computed once, on one thread or two."""
+"""Threads: values of one scan that are computed once, on one lane or two, and calls that are given a time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Generic, TypeVar
 
-__all__ = ["STAGES", "Lanes", "Once", "Stopwatch"]
+__all__ = ["STAGES", "Lanes", "Once", "Stopwatch", "returns"]
 
 STAGES = ("check", "project", "infer", "decode", "refine", "cluster", "agree")
 
@@ -142,3 +142,24 @@ class Lanes:
                 waiting.result()
         for value in (*first, *second):
             value()
+
+
+def returns(call: Callable[[], object], limit_s: float) -> bool:
+    """Whether a call of a library, which may wait for others for ever, returns in time; else it is left behind.
+
+    Signals act while it runs. What it raises is raised here.
+    """
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            call()
+        except BaseException as exc:
+            errors.append(exc)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(limit_s)
+    if errors:
+        raise errors[0]
+    return not thread.is_alive()

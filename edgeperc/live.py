@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from .errors import EdgepercError, OptionError, PointsError
+from .clock import LATEST_S, Clock
+from .errors import EdgepercError, OptionError, PointsError, StampError
 from .perception import Perception
 from .readers.captures import read_scans, sensor_of
 from .readers.identify import contradicts
@@ -26,6 +27,9 @@ Health = Literal["OK", "LATE", "STALE"]
 # Longest time that `Stream.close` waits for the reading thread.
 _PATIENCE_S = 1.0
 
+# Longest pause of a recording that is replayed as it is [s], or 5 periods of the sensor if these are longer.
+_PAUSE_S = 2.0
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
@@ -37,7 +41,8 @@ class Answer:
         The scan as the source supplied it; ``perception.points.labels`` holds a label for each of its points.
     perception : Perception
     tracks : object
-        Result of the tracker; None without a tracker.
+        Result of the tracker; None without a tracker, or if the tracker raises `StampError` because the scan's time is
+        not finite or out of its range.
     stamp_s : float
         Time stamp from the source [s]; without one, the arrival time on this computer's monotonic clock.
     age_s : float
@@ -77,7 +82,8 @@ def stream(
     source : iterable, str or path
         Either an iterable of scans, each as points or as a tuple (stamp_s, points). A thread reads it as fast as
         possible; the source must not change a scan afterwards. Or the path of a scan, a folder or a capture
-        (`edgeperc.read_scans`), replayed in real time: by its stamps or, without stamps, at ``rate_hz``.
+        (`edgeperc.read_scans`), replayed in real time: by its stamps or, without stamps, at ``rate_hz``. A step back in
+        its stamps, or a pause of more than 2 s or 5 periods of the sensor, is replayed as one period.
     perceiver : callable
         ``perceiver(points, stamp_s=stamp_s) -> Perception``, such as a `Perceiver`.
     tracker : callable, optional
@@ -104,7 +110,8 @@ def stream(
     Warns
     -----
     UserWarning
-        The source is a capture of another sensor than the perceiver's.
+        The source is a capture of another sensor than the perceiver's. While iterating, once: the tracker raised
+        `StampError`.
 
     Examples
     --------
@@ -148,8 +155,9 @@ class Stream:
     """An iterator of `Answer` that reads its source in a thread; made by `stream`.
 
     Only the newest scan is kept. Perceiver and tracker run in the caller's thread when the next answer is requested.
-    Their errors are raised there, and the next scan can still be requested. An error of the source is raised after the
-    answer to the last scan, and ends the stream.
+    Their errors are raised there, and the next scan can still be requested. A scan without a usable time, of which the
+    tracker raises `StampError`, is answered without tracks, and a warning says so once. An error of the source is
+    raised after the answer to the last scan, and ends the stream.
 
     Health depends on age only: ``"OK"`` up to ``late_after_s``, ``"LATE"`` up to ``stale_after_s``, then ``"STALE"``.
     The health of an answer refers to the moment when it was ready. The health of the stream refers to the present age
@@ -178,6 +186,7 @@ class Stream:
         self.late_after_s, self.stale_after_s = late_after_s, stale_after_s
         self._inbox, self._perceiver, self._tracker = inbox, perceiver, tracker
         self._newest_s = -math.inf
+        self._is_untimed_reported = False
         self._thread = threading.Thread(target=_read, args=(scans, inbox), name="edgeperc-source", daemon=True)
         weakref.finalize(self, inbox.stop)
         self._thread.start()
@@ -215,10 +224,22 @@ class Stream:
             return None
         (points, stamp_s, arrived_s), n_scans, n_dropped = taken
         perception = self._perceiver(points, stamp_s=stamp_s)
-        tracks = None if self._tracker is None else self._tracker(perception)
+        tracks = self._tracked(perception)
         self._newest_s = arrived_s
         age_s = time.monotonic() - arrived_s
         return Answer(points, perception, tracks, stamp_s, age_s, self._health_at(age_s), n_scans, n_dropped)
+
+    def _tracked(self, perception: Perception) -> Any:
+        """What the tracker returns; None if the scan has no usable time."""
+        if self._tracker is None:
+            return None
+        try:
+            return self._tracker(perception)
+        except StampError as exc:
+            if not self._is_untimed_reported:
+                self._is_untimed_reported = True
+                warnings.warn(f"a scan is answered without tracks: {exc} (said once)", stacklevel=3)
+            return None
 
     @property
     def age_s(self) -> float:
@@ -327,14 +348,24 @@ def _stamped(scan: Any) -> tuple[Any, float | None]:
 def _paced(
     scans: Iterator[tuple[float | None, Any]], rate_hz: float, stopped: threading.Event
 ) -> Iterator[tuple[float, Any]]:
-    """Yield recorded scans in real time, by their stamps or at the sensor's rate. Late scans come immediately."""
-    started_s = time.monotonic()
-    first_s: float | None = None
+    """Yield recorded scans in real time, by their stamps or at the sensor's rate. Late scans come immediately.
+
+    A scan without a usable time, or after a jump of the clock, comes one period after the one before.
+    """
+    period_s = 1.0 / rate_hz
+    clock = Clock(gap_s=max(_PAUSE_S, 5.0 * period_s))
+    due_s = -math.inf
     for k, (stamp_s, points) in enumerate(scans):
-        moment_s = k / rate_hz if stamp_s is None else stamp_s
-        if first_s is None:
-            # The clock starts after the first scan, because reading it may import libraries.
-            started_s, first_s = time.monotonic(), moment_s
-        if stopped.wait(max(0.0, started_s + moment_s - first_s - time.monotonic())):
+        moment_s = k * period_s if stamp_s is None else stamp_s
+        last_s, wait_s = clock.last_s, period_s
+        if abs(moment_s) <= LATEST_S:
+            step, clock = clock.after(moment_s)
+            if step == "late":
+                wait_s = 0.0
+            elif step == "next" and last_s is not None:
+                wait_s = moment_s - last_s
+        # The time starts after the first scan, because reading it may import libraries.
+        due_s = time.monotonic() if k == 0 else due_s + wait_s
+        if stopped.wait(max(0.0, due_s - time.monotonic())):
             return
         yield moment_s, points

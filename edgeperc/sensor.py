@@ -15,6 +15,7 @@ import numpy as np
 
 from .errors import SensorError
 from .mounting import MODEL_HEIGHT_M, UNKNOWN_MOUNTING, Mounting
+from .names import check_text
 
 __all__ = ["REMISSION_KINDS", "SENSORS", "RemissionFunction", "SensorProfile", "get_sensor"]
 
@@ -127,6 +128,7 @@ class SensorProfile:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise SensorError(f"a sensor's name is a non-empty str, got {self.name!r}")
+        check_text("a sensor's name is", self.name, SensorError)
         try:
             object.__setattr__(self, "elevations_deg", tuple(float(e) for e in self.elevations_deg))
             object.__setattr__(self, "remission_range", tuple(float(v) for v in self.remission_range))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .clock import elapsed_s
 from .errors import OptionError, PointsError
 from .kernel_cache import njit
 from .perception import Box
@@ -153,7 +154,8 @@ class Line:
 
     Notes
     -----
-    It belongs to one tracker and one run of it: make another one after `Tracker.reset`.
+    It belongs to one tracker and one run of it: make another one after `Tracker.reset`. If the clock of the scans
+    jumps, objects get new ids, and count when they cross the line after the jump.
     """
 
     def __init__(self, start: ArrayLike, end: ArrayLike, *, margin_m: float = 0.3, world: bool = True) -> None:
@@ -164,6 +166,8 @@ class Line:
             raise OptionError(f"margin_m is {margin_m}; expected 0 or more meters")
         self.margin_m, self.world = float(margin_m), world
         self.to_left = self.to_right = 0
+        # The time that has passed so far without jumps of the clock, and the stamp of the last scan.
+        self._now_s, self._stamp_s = 0.0, math.inf
         # Of each track: the last place beyond the margin, the directions counted so far, and the time it was seen.
         self._known: dict[int, tuple[NDArray[np.float64], frozenset[bool], float]] = {}
 
@@ -179,8 +183,12 @@ class Line:
         -------
         tuple of Crossing
             Those that were counted now. A track counts if its way between two places beyond the margin crosses the line
-            between its ends.
+            between its ends. A late scan (`Tracks.is_late`) counts nothing.
         """
+        if tracks.is_late:
+            return ()
+        self._now_s += elapsed_s(self._stamp_s, tracks.stamp_s)
+        self._stamp_s = tracks.stamp_s
         found = []
         for track in tracks:
             place = np.array((track.world_box if self.world else track.box).center[:2])
@@ -189,13 +197,13 @@ class Line:
             if abs(side) < self.margin_m:
                 # Near the line it keeps its last place, if it had one on a side.
                 if track.id in self._known:
-                    self._known[track.id] = last, counted, tracks.stamp_s
+                    self._known[track.id] = last, counted, self._now_s
                 continue
             if side * self._left_of(last) < 0.0 and (side > 0.0) not in counted and self._between(last, place):
                 counted |= {side > 0.0}
                 found.append(Crossing(track.id, track.label, side > 0.0, tracks.stamp_s))
-            self._known[track.id] = place, counted, tracks.stamp_s
-        self._known = {k: known for k, known in self._known.items() if tracks.stamp_s - known[2] <= FORGET_S}
+            self._known[track.id] = place, counted, self._now_s
+        self._known = {k: known for k, known in self._known.items() if self._now_s - known[2] <= FORGET_S}
         n_left = sum(crossing.to_left for crossing in found)
         self.to_left += n_left
         self.to_right += len(found) - n_left

@@ -6,7 +6,6 @@ Triton run the networks, and returns the labels and the record that ``edgeperc r
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -52,9 +51,9 @@ def write_repository(out: Path, models: Sequence[str | Path] = DEFAULT, *, senso
     files = [(ModelCard.read(path), path) for path in map(model_path, models)]
     taken = {PIPELINE}
     for card, path in files:
-        if card.name in taken or isinstance(card.view, CameraGeometry):
+        if card.name.lower() in taken or isinstance(card.view, CameraGeometry):
             raise ModelError(f"{path}: {card.name} is a camera's, or there are two; expected networks of scans")
-        taken.add(card.name)
+        taken.add(card.name.lower())  # one folder, where upper and lower case are the same
     version = out / PIPELINE / "1"
     version.mkdir(parents=True, exist_ok=True)
     for old in version.glob("*.onnx"):
@@ -101,15 +100,20 @@ def _config(
     outputs: Sequence[_Tensor],
     parameters: Mapping[str, str] = {},
 ) -> str:
-    """``config.pbtxt``, a ModelConfig in protobuf's text format; its strings are escaped as JSON's are."""
-    lines = [f"name: {json.dumps(name)}", f"backend: {json.dumps(backend)}", "max_batch_size: 0"]
+    """``config.pbtxt``, a ModelConfig in protobuf's text format."""
+    lines = [f"name: {_quoted(name)}", f"backend: {_quoted(backend)}", "max_batch_size: 0"]
     for field, tensors in (("input", inputs), ("output", outputs)):
         for tensor, kind, shape, optional in tensors:
             more = " optional: true" if optional else ""
             dims = f"dims: {[*shape]}"
-            lines.append(f"{field} {{ name: {json.dumps(tensor)} data_type: TYPE_{kind} {dims}{more} }}")
+            lines.append(f"{field} {{ name: {_quoted(tensor)} data_type: TYPE_{kind} {dims}{more} }}")
     lines += [
-        f"parameters {{ key: {json.dumps(key)} value {{ string_value: {json.dumps(value)} }} }}"
+        f"parameters {{ key: {_quoted(key)} value {{ string_value: {_quoted(value)} }} }}"
         for key, value in parameters.items()
     ]
     return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    """A string of protobuf's text format: bytes of UTF-8, escaped in octal where they are not plain."""
+    return '"' + "".join(chr(b) if 32 <= b < 127 and b not in b'"\\' else f"\\{b:03o}" for b in text.encode()) + '"'

@@ -19,7 +19,8 @@ import numba
 import pytest
 from hypothesis import HealthCheck, settings
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+from checkout import REPOSITORY, files
+
 ARCHIVES = REPOSITORY.parent / "shared" / "data"
 
 
@@ -99,7 +100,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 def kernels() -> Iterator[str]:
     """Every function under ``@njit``, as ``FILE:NAME``."""
-    for path in sorted(REPOSITORY.glob("[be]*/**/*.py")):
+    for path in files(".py", "edgeperc", "bench", "export"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.FunctionDef) and any("njit" in ast.unparse(d) for d in node.decorator_list):
                 yield f"{path}:{node.name}"

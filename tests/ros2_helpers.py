@@ -28,9 +28,9 @@ FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")]
 def cloud(points: np.ndarray, stamp_ns: int = 10**9, frame_id: str = "velodyne", **changes: Any) -> bytes:
     """The bytes of a PointCloud2 with x, y, z and intensity; some of its fields replaced by impossible ones."""
     make = MESSAGES.types
-    header = make["std_msgs/msg/Header"](
-        stamp=make["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9), frame_id=frame_id
-    )
+    seconds = min(stamp_ns // 10**9, 2**31 - 1)
+    stamp = make["builtin_interfaces/msg/Time"](sec=seconds, nanosec=stamp_ns - seconds * 10**9)
+    header = make["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id)
     order = ">" if changes.get("is_bigendian") else "<"
     rows = np.ascontiguousarray(points, f"{order}f4")
     fields = [

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_model import entry, field, varint
 
+from checkout import files
 from edgeperc.card import (
     CARD_KEY,
     CameraGeometry,
@@ -26,8 +27,6 @@ from edgeperc.card import (
     TopViewGeometry,
 )
 from edgeperc.errors import CardError, ModelFileError
-
-REPOSITORY = Path(__file__).resolve().parent.parent
 
 TOP_VIEW_CARD = ModelCard(
     name="network",
@@ -346,7 +345,7 @@ def test_any_bytes_are_a_card_or_an_error(data: st.DataObject) -> None:
         ModelCard.read(write(Path(folder), bytes(content)))
 
 
-@pytest.mark.parametrize("path", sorted((REPOSITORY / "models").rglob("*.onnx")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", files(".onnx", "models"), ids=lambda path: path.stem)
 def test_every_models_card_is_the_one_that_onnxruntime_finds(path: Path) -> None:
     onnxruntime = pytest.importorskip("onnxruntime")
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])

@@ -10,7 +10,7 @@ import shlex
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar
@@ -371,6 +371,46 @@ def test_the_scans_of_a_capture_are_numbered(capture: Path, tmp_path: Path, caps
     assert written == {"drive/000000.label": 10, "drive/000002.label": 12, "a.label": 40}
     assert run("info", capture) == 0
     assert "10, of which 0 are not finite" in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("always:got a scan at")
+@pytest.mark.parametrize("live", [False, True])
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda k: 100.0 + 0.1 * k - 2.0 * (k > 4), "the clock jumped"),
+        (lambda k: 100.0 + 0.1 * k - 0.121 * (k == 5), "late or doubled"),
+        (lambda k: 0.0 if k == 0 else 100.0 + 0.1 * k, "the clock jumped"),
+        (lambda k: 100.0 + 0.1 * (k % 5), "the clock jumped"),
+        (lambda k: 100.0 + 0.1 * (k // 2), "late or doubled"),
+        (lambda k: 2147483651.0 if k == 4 else 100.0 + 0.1 * k, "the stamp before was wrong"),
+    ],
+)
+def test_every_scan_is_answered_whatever_the_clock_does(
+    wrong: Callable[[int], float],
+    said: str,
+    live: bool,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = write_pcap(tmp_path / "drive.pcap", vlp16_packets(0.1))
+
+    def read(source: Path, topic: str | None = None) -> Iterator[tuple[float, np.ndarray]]:
+        return ((wrong(k), np.full((10, 4), 0.5, np.float32)) for k in range(10))
+
+    for module in ("edgeperc.readers.captures", "edgeperc.live"):
+        monkeypatch.setattr(f"{module}.read_scans", read)
+    options = ["--live", "--rate", 20] if live else []
+    assert run("run", path, "--track", *options) == 0
+    captured = capsys.readouterr()
+    answers = captured.out.splitlines()
+    assert len(answers) == 10 or (live and answers)
+    assert all("tracks: " in answer for answer in answers)
+    if not live:
+        assert captured.err.count(said) == 1
+        assert all("boxes: 1 car" in answer for answer in answers)
+        assert answers[-2 if said.startswith("late") else -1].endswith("tracks: 1 object")
 
 
 def test_a_missing_reader_is_said_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:

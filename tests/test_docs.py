@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from checkout import REPOSITORY, files
 from edgeperc import cli
 from edgeperc.cli.main import build_parser
 from edgeperc.simulation.camera import forward_camera, render
@@ -22,8 +23,7 @@ from edgeperc.simulation.scene import simulate
 if sys.version_info >= (3, 11):
     import tomllib
 
-REPOSITORY = Path(__file__).resolve().parent.parent
-PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
+PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *files(".md", "docs")]
 MODULES_WITH_PARSERS = {"edgeperc-bench": "edgeperc_bench.cli", "edgeperc-export": "edgeperc_export.cli"}
 
 

@@ -17,6 +17,8 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from checkout import REPOSITORY, files
+
 pytest.importorskip("resource")
 if not hasattr(os, "fork"):
     pytest.skip("this system has no fork", allow_module_level=True)
@@ -36,8 +38,7 @@ from edgeperc.sensor import get_sensor
 from edgeperc.session import Session
 from edgeperc.tuning import read_setting
 
-REPOSITORY = Path(__file__).resolve().parent.parent
-CORPUS = sorted((Path(__file__).parent / "fuzz" / "corpus").iterdir())
+CORPUS = files("", "tests/fuzz/corpus")
 
 
 def _round(kind: str, cases: int) -> State:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+from checkout import REPOSITORY, files
+
 PACKAGES = {
     "edgeperc.zoo": REPOSITORY / "models",
     "edgeperc": REPOSITORY / "edgeperc",
@@ -22,16 +24,18 @@ PACKAGES = {
 # A module imports from the lines above its own, never from its own line. A new module gets its place here.
 FLOORS = {
     "edgeperc": """
-        errors atomic printable side_thread stopwatch
+        clock errors atomic lanes names printable
         extras mounting onnx_file
         card engine points remote sensor tuning
         kernel_cache perception zoo.__init__
         blocks calibration frame geometry linkage outline persons
         adapt cluster decode drivable fitness ground image motion observed projection refine sensor_fit session
         crop voting
-        agreement level network_input occupancy painting remission
+        level network_input occupancy painting remission scan
+        agreement
         cells
-        combine first_start
+        pipeline
+        warm_up
         readers.__init__ readers.times
         readers.tables
         readers.inflate readers.packets
@@ -46,7 +50,7 @@ FLOORS = {
         tracking.tracks
         tracking.tracker
         tracking.__init__
-        listing moving perceiver records sinks.__init__ zones
+        listing moving perceiver records sinks.__init__ sinks.kept_file sinks.relay zones
         live sinks.names
         sinks.prelabels sinks.static
         simulation.raycast
@@ -127,11 +131,12 @@ ONLY_IN_FUNCTIONS = {"PIL", "matplotlib", "onnxruntime"}
 RIVALS = "edgeperc_bench.peers."
 
 
+@functools.cache
 def modules() -> dict[str, Path]:
     """Every module of the three packages by its dotted name; a package's own is called ``__init__``."""
     found = {}
     for package, folder in PACKAGES.items():
-        for path in sorted(folder.rglob("*.py")):
+        for path in files(".py", str(folder.relative_to(REPOSITORY))):
             found[".".join([package, *path.relative_to(folder).with_suffix("").parts])] = path
     return found
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import gc
+import math
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -372,6 +374,51 @@ def test_a_capture_is_replayed_by_its_stamps(monkeypatch: pytest.MonkeyPatch) ->
 
     assert [stamp for stamp, _ in live._paced(read(), 10.0, clock)] == [7.0, 7.1, 7.3, 7.4, 7.35, 9.0]
     assert clock.waits == pytest.approx([0.0, 0.1, 0.0, 0.05, 0.0, 1.6])
+
+
+@pytest.mark.parametrize(
+    ("stamps_s", "waits_s"),
+    [
+        ([100.0, 100.1, 1.7e9, 1.7e9 + 0.1, 1.7e9 + 0.2], [0.1] * 4),  # time since boot, then UTC
+        ([0.0, 0.1, 3.15e7, 0.2, 0.3], [0.1] * 4),  # one wrong stamp
+        ([0.0, 1e10, 1e300, math.nan, math.inf, 0.1, 0.2], [0.1] * 6),
+        ([math.nan, 5.0, 5.1], [0.1] * 2),
+        ([1e9, 1e9 + 0.1, 1.0, 1.1], [0.1] * 3),
+        ([0.0, 1.9, 60.0, 60.1], [1.9, 0.1, 0.1]),  # a pause that is too long
+        ([0.0, None, 0.2, None], [0.1] * 3),
+    ],
+)
+def test_no_jump_of_the_clock_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch, stamps_s: list[float | None], waits_s: list[float]
+) -> None:
+    clock = Waits(monkeypatch)
+    stamps = [stamp for stamp, _ in live._paced(((stamp, scan(1)) for stamp in stamps_s), 10.0, clock)]
+    np.testing.assert_equal(stamps, [0.1 * k if stamp is None else stamp for k, stamp in enumerate(stamps_s)])
+    assert clock.waits == pytest.approx([0.0, *waits_s], abs=1e-5)
+
+
+def test_scans_without_a_usable_time_are_answered_without_tracks() -> None:
+    def source() -> Iterator[Any]:
+        for stamp_s in (1.0, math.nan, math.inf, -1e300, 1.1, 1.1, 0.0, 1.2):
+            yield stamp_s, scan(1)
+            taken.acquire()
+
+    def empty(points: Any, stamp_s: float | None = None) -> Any:
+        return edgeperc.Perception(len(points), 0, None, None, (), {}, {}, (), stamp_s)
+
+    taken, answers = threading.Semaphore(0), []
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        with stream(source(), empty, edgeperc.Tracker()) as live_answers:
+            for answer in live_answers:
+                answers.append(answer.tracks)
+                taken.release()
+    assert [tracks is None for tracks in answers] == [False, True, True, True, *[False] * 4]
+    assert [tracks.is_late for tracks in answers[4:]] == [False, True, False, False]
+    assert [tracks.session for tracks in answers[4:]] == [0, 0, 1, 0]
+    texts = [str(warning.message) for warning in said]
+    assert sum("answered without tracks: got a scan at nan s" in text for text in texts) == 1
+    assert len(texts) == 4
 
 
 def test_a_replay_stops_while_it_waits(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,13 +15,14 @@ import pytest
 from smoke import SMOKE
 
 import edgeperc
+from checkout import FOLDERS, REPOSITORY, files, tracked
 
 tomllib = pytest.importorskip("tomllib")
 yaml = pytest.importorskip("yaml")
 packaging = pytest.importorskip("packaging.requirements")
 
-REPOSITORY = Path(__file__).parent.parent
-PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["project"]
+PYPROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))
+PROJECT, SETUPTOOLS = PYPROJECT["project"], PYPROJECT["tool"]["setuptools"]
 EXTRAS = {*PROJECT["optional-dependencies"]}
 ALONE = EXTRAS - {"docs", "test"}  # these are whole jobs of their own
 
@@ -46,12 +47,11 @@ def conda(texts: list[str]) -> dict[str, Any]:
 
 def wanted_extras() -> Iterator[tuple[str, str]]:
     """File and extra of each call of `edgeperc.extras.require`."""
-    for folder in ("edgeperc", "bench", "export"):
-        for file in sorted((REPOSITORY / folder).rglob("*.py")):
-            for node in ast.walk(ast.parse(file.read_text("utf-8"))):
-                named = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "require"
-                if named and len(node.args) > 1 and isinstance(node.args[1], ast.Constant):
-                    yield str(file.relative_to(REPOSITORY)), str(node.args[1].value)
+    for file in files(".py", "edgeperc", "bench", "export"):
+        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+            named = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "require"
+            if named and len(node.args) > 1 and isinstance(node.args[1], ast.Constant):
+                yield str(file.relative_to(REPOSITORY)), str(node.args[1].value)
 
 
 def test_messages_name_extras_that_exist() -> None:
@@ -148,8 +148,28 @@ def test_the_container_gets_all_that_the_wheel_is_built_from() -> None:
     lines = (REPOSITORY / ".containerignore").read_text("utf-8").splitlines()
     kept = {line[1:] for line in lines if line.startswith("!")}
     assert lines[1] == "*"
-    setuptools = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]
-    folders = {path.partition("/")[0] for path in setuptools["package-dir"].values()}
+    folders = {path.partition("/")[0] for path in SETUPTOOLS["package-dir"].values()}
     files = {"pyproject.toml", "MANIFEST.in", PROJECT["readme"], *PROJECT["license-files"]}
     assert kept == folders | files
     assert (REPOSITORY / ".dockerignore").read_text("utf-8") == "\n".join(lines) + "\n"
+
+
+# --- the checkout ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("is_repository", [True, False])
+def test_what_pip_and_people_leave_in_a_checkout_is_not_read(tmp_path: Path, is_repository: bool) -> None:
+    """``pip install .`` leaves a copy of the packages in ``build/``; an environment may be called ``env``."""
+    for name in ("edgeperc/a.py", "build/lib/edgeperc/a.py", "env/lib/b.py", "bench_old/c.py"):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).write_text("import os\n")
+    if is_repository:
+        for command in (["init", "-q"], ["add", "edgeperc"]):
+            subprocess.run(["git", *command], cwd=tmp_path, check=True)
+    assert tracked(tmp_path) == (tmp_path / "edgeperc" / "a.py",)
+
+
+def test_the_tools_read_the_same_folders_as_the_tests() -> None:
+    text = (REPOSITORY / "pyproject.toml").read_text("utf-8")
+    assert f'include = ["pyproject.toml", "{{{",".join(sorted(FOLDERS))}}}/**/*.py"]' in text
+    assert {path.partition("/")[0] for path in SETUPTOOLS["package-dir"].values()} <= {*FOLDERS}

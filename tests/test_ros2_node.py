@@ -6,6 +6,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ pytest.importorskip("rosbags")
 
 from ros2_helpers import FIELDS, MESSAGES, TIMEOUT_S, Perceive, cloud, until
 
-from edgeperc import ModelFileError, OptionError, Perception, PointsError, Tracker
+from edgeperc import Box, ModelFileError, OptionError, Perception, PointsError, Tracker
 from edgeperc.readers.decoders import cloud_points
 from edgeperc.ros2 import node as node_module
 from edgeperc.ros2.graph import RELIABLE, Qos, full_name
@@ -243,18 +244,44 @@ def test_the_newest_cloud_wins() -> None:
         assert (node.n_scans, node.n_dropped) == (6, 4)
 
 
-def test_tracking_begins_anew_when_stamps_jump_back() -> None:
-    graph, tracker, resets = FakeGraph(), Tracker(), []
-    reset = tracker.reset
-    tracker.reset = lambda: resets.append(reset())  # type: ignore[method-assign, func-returns-value]
-    with PerceptionNode(graph, lambda _: Perceive(), tracker=tracker) as node:
+@pytest.mark.filterwarnings("ignore:got a scan at")
+def test_stamps_that_repeat_or_jump_are_answered_and_tracked_anew() -> None:
+    graph, poison_ns = FakeGraph(), (2**31 - 1) * 10**9 + 4 * 10**9
+    stamps_ns = [s * 10**9 for s in (100, 101, 101, 50, 51)] + [poison_ns, 52 * 10**9, -(10**9), 53 * 10**9]
+    with PerceptionNode(graph, lambda _: Perceive(), tracker=Tracker()) as node:
+        outcomes, answers = iter(node), []
+        for stamp_ns in stamps_ns:
+            graph.give(cloud(POINTS, stamp_ns))
+            answers.append(next(outcomes))
+    sessions = []
+    for answer in answers:
+        assert isinstance(answer, PerceivedScan)
+        assert answer.tracks is not None
+        sessions.append((answer.tracks.session, answer.tracks.is_late))
+    assert sessions == [(0, False), (0, False), (0, True), *[(n, False) for n in (1, 1, 2, 1, 3, 1)]]
+    for raw, stamp_ns in zip(graph.published["/edgeperc/points"], stamps_ns, strict=True):
+        stamp = MESSAGES.decode(raw, CLOUD).header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == stamp_ns
+
+
+@pytest.mark.filterwarnings("ignore:got a scan at")
+def test_of_a_cloud_that_comes_twice_the_boxes_are_published() -> None:
+    class Car(Perceive):
+        def __call__(self, points: np.ndarray, *, stamp_s: float) -> Perception:
+            box = Box("car", 0.9, (10.0, 2.0, -0.9), (4.2, 1.8, 1.5), 0.0)
+            return replace(super().__call__(points, stamp_s=stamp_s), boxes=(box,))
+
+    graph = FakeGraph()
+    with PerceptionNode(graph, lambda _: Car(), tracker=Tracker()) as node:
         outcomes = iter(node)
-        kinds = []
-        for stamp_s in (100, 101, 101, 50, 51):
-            graph.give(cloud(POINTS, stamp_s * 10**9))
-            kinds.append(type(next(outcomes)).__name__)
-    assert kinds == ["PerceivedScan", "PerceivedScan", "StampError", "PerceivedScan", "PerceivedScan"]
-    assert len(resets) == 1
+        for stamp_ns in (10**9, 11 * 10**8, 11 * 10**8):
+            graph.give(cloud(POINTS, stamp_ns))
+            next(outcomes)
+    first, tracked, twice = (
+        MESSAGES.decode(raw, OUTPUTS["detections"]).detections for raw in graph.published["/edgeperc/detections"]
+    )
+    assert (len(first), len(tracked), len(twice)) == (0, 1, 1)
+    assert [found[0].id for found in (tracked, twice)] == ["1", ""]
 
 
 def test_a_cloud_without_a_stamp_has_that_of_its_arrival() -> None:

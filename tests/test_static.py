@@ -83,6 +83,16 @@ def test_what_could_move_goes_too_if_it_is_wished(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_points(tmp_path / "x.bin"), expected(AHEAD, BESIDE))
 
 
+def test_of_a_scan_that_came_twice_what_could_move_goes(tmp_path: Path) -> None:
+    tracker = Tracker()
+    tracker.update([], 1.0)
+    with pytest.warns(UserWarning, match="late or doubled"):
+        late = tracker.update([], 1.0)
+    for without, tracks in (("moving", late), ("movable", None)):
+        StaticSink(tmp_path / without, without=without).write(perceived("x.bin", tracks))  # type: ignore[arg-type]
+    assert (tmp_path / "moving" / "x.bin").read_bytes() == (tmp_path / "movable" / "x.bin").read_bytes()
+
+
 def test_scans_of_captures_and_of_images_become_raw_files(tmp_path: Path) -> None:
     sink = StaticSink(tmp_path)
     for name in ("drive.pcap/000003", "image_2/street.png"):

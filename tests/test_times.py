@@ -368,9 +368,31 @@ def test_scans_are_straightened_by_the_tracks_before(tmp_path: Path) -> None:
         else:
             points = straightener.straighten(*scan)
         straight.append(off_the_walls(points) < 1e-3)
-        tracks: Any = SimpleNamespace(T_world_sensor=pose_at(0.1 * k), stamp_s=scan.stamp_s)
-        straightener.follow(tracks)
+        straightener.follow(tracks_at(scan.stamp_s, pose_at(0.1 * k)))
     assert straight == [False, False, True, True]
+
+
+def tracks_at(stamp_s: float | None, pose: NDArray[np.float64], session: int = 0, *, is_late: bool = False) -> Any:
+    return SimpleNamespace(T_world_sensor=pose, stamp_s=stamp_s, session=session, is_late=is_late)
+
+
+@pytest.mark.filterwarnings("ignore:--deskew")
+def test_late_scans_and_those_of_another_session_give_no_motion(tmp_path: Path) -> None:
+    (scan,) = read_timed_scans(drive(tmp_path / "drive.bag", [1700.2]))
+    first, second = tracks_at(1700.0, pose_at(0.0)), tracks_at(1700.1, pose_at(0.1))
+    late, wrong = tracks_at(1700.0, np.eye(4), is_late=True), tracks_at(1e9, np.eye(4), 1)
+    for followed, is_straight in (
+        ([first, second], True),
+        ([first, late, second, late], True),
+        ([first, wrong], False),
+        ([first, second, wrong], False),
+        ([first, wrong, second], False),
+        ([first, second, wrong, first, second], True),
+    ):
+        straightener = Straightener(None)
+        for tracks in followed:
+            straightener.follow(tracks)
+        assert (off_the_walls(straightener.straighten(*scan)) < 1e-3) == is_straight
 
 
 def test_scans_without_times_are_not_straightened() -> None:

@@ -438,7 +438,7 @@ def test_errors_leave_the_tracker_as_it_was(posed: bool) -> None:
         for bad in BAD_BOXES:
             with pytest.raises(TrackingError, match="got"):
                 tracker.update([*boxes, bad], 0.1 * k + 0.05, given_pose)  # type: ignore[list-item]
-        for stamp_s in (0.1 * k, 0.1 * k - 0.05, -1.0, math.nan, math.inf):
+        for stamp_s in (math.nan, math.inf, -math.inf, 1.7e18):
             with pytest.raises(StampError, match="got a scan at"):
                 tracker.update(boxes, stamp_s, given_pose)
         with pytest.raises(TrackingError, match="unlike those before"):
@@ -464,7 +464,8 @@ def test_empty_scans_gaps_and_a_new_recording() -> None:
     for k in range(3):
         tracks = tracker.update([box("car", 10.0, 0.0)], 5.1 + 0.1 * k)
     assert len(tracks) == 1
-    assert len(tracker.update([], 1e6)) == 0  # days later
+    with pytest.warns(UserWarning, match="the clock jumped"):
+        assert len(tracker.update([], 1e6)) == 0  # days later
     assert len(tracker.update([box("car", 10.0, 0.0, score=0.99)], 1e6 + 1e-6)) == 1
     tracker.reset()
     (track,) = tracker.update([box("car", 10.0, 0.0, score=1.0)], 0.0, np.eye(4))

@@ -37,6 +37,7 @@ from tiny_model import (
 
 import edgeperc.onnx_file as onnx_file
 import edgeperc.session as session_module
+from checkout import files
 from edgeperc import Perceiver
 from edgeperc.card import Golden, ModelCard
 from edgeperc.errors import CardError, CardMismatchError, InferenceError, ModelError, ModelFileError
@@ -44,7 +45,6 @@ from edgeperc.onnx_file import check_graph, read_model
 from edgeperc.session import Session
 from edgeperc.zoo import digest, model_path, resolve
 
-REPOSITORY = Path(__file__).resolve().parent.parent
 TINY = model(graph(CONVOLUTION, INITIALIZER))
 
 
@@ -242,7 +242,7 @@ def test_a_tensor_has_the_content_of_its_shape(shape: tuple[int, ...]) -> None:
             check_graph(model(graph(field(5, content), CONVOLUTION, INITIALIZER)), "model.onnx")
 
 
-@pytest.mark.parametrize("path", sorted((REPOSITORY / "models").rglob("*.onnx")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", files(".onnx", "models"), ids=lambda path: path.stem)
 def test_every_model_of_this_project_passes(path: Path) -> None:
     check_graph(path.read_bytes(), path)
 

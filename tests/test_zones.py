@@ -122,6 +122,36 @@ def test_a_track_counts_once_for_each_direction() -> None:
     assert len(line._known) <= 1  # the others were not seen for 10 s
 
 
+@pytest.mark.filterwarnings("ignore:got a scan at")
+@pytest.mark.parametrize(
+    ("wrong", "n_left"),
+    [
+        (lambda k: 0.1 * k, 1),
+        (lambda k: 0.1 * (k - (k % 3 == 0)), 1),  # doubled
+        (lambda k: 1e9 if k % 7 == 3 else 0.1 * k, 1),  # wrong stamps of single scans
+        (lambda k: -5.0 if k % 7 == 3 else 0.1 * k, 1),
+        (lambda k: 0.1 * k - 50.0 * (k >= 5), 1),  # a jump before the line
+        (lambda k: 0.1 * k - 50.0 * (k >= 25), 1),  # and after it
+    ],
+)
+def test_jumps_of_the_clock_count_no_track_twice(wrong: Any, n_left: int) -> None:
+    tracker, line = Tracker(), Line((20, -10), (20, 10))
+    crossings = []
+    for k in range(30):
+        crossings += line.count(tracker.update([car(30.0 - 0.8 * k, 0.0)], wrong(k), np.eye(4)))
+    assert (line.to_left, line.to_right, len(crossings)) == (n_left, 0, n_left)
+    assert len({crossing.id for crossing in crossings}) == n_left
+
+
+@pytest.mark.filterwarnings("ignore:got a scan at")
+def test_a_line_remembers_tracks_by_the_time_that_passed() -> None:
+    tracker, line = Tracker(), Line((20, -10), (20, 10))
+    for k in range(400):  # a recording of 2 s that plays again and again
+        line.count(tracker.update([car(30.0 - 0.8 * (k % 20), 0.0)], 0.1 * (k % 20), np.eye(4)))
+    assert line.to_left == 20
+    assert len(line._known) <= 7
+
+
 def test_a_line_of_the_vehicle_counts_what_it_passes() -> None:
     def pose(t: float) -> NDArray[np.float64]:
         T = np.eye(4)

@@ -23,6 +23,8 @@ from .output import print_error, show_warning
 
 __all__ = ["Parser", "run_program"]
 
+_DELICATE = ("llvmlite.", "importlib._bootstrap", "edgeperc.sinks.kept_file", "logging")
+
 
 class Parser(argparse.ArgumentParser):
     """A parser whose error messages may quote any argument, such as the name of a file from elsewhere."""
@@ -146,13 +148,13 @@ def _signals_raise() -> Iterator[None]:
 
 
 def _is_delicate(frame: FrameType | None) -> bool:
-    """Whether LLVM or an import is at work in this program.
+    """Whether what native code called, or an import, is at work in this program.
 
-    LLVM calls Python back. An exception there is lost, and the process may crash. Native modules turn it into an
-    `ImportError`, which looks as if a package were missing.
+    LLVM, and libraries that write a file or a log, call Python back. An exception there is lost, and the process may
+    crash. Native modules turn it into an `ImportError`, which looks as if a package were missing.
     """
     while frame is not None and frame.f_code is not run_program.__code__:
-        if str(frame.f_globals.get("__name__")).startswith(("llvmlite.", "importlib._bootstrap")):
+        if str(frame.f_globals.get("__name__")).startswith(_DELICATE):
             return True
         frame = frame.f_back
     return False

@@ -50,7 +50,7 @@ class Report:
         """Print one scan's line or JSON object; print an error on stderr as well."""
         if isinstance(outcome, MissingExtraError):
             raise outcome
-        if tracks is not None and under is not None:
+        if tracks is not None and under is not None and not tracks.is_late:
             self.tracks.append(tracks)
             self.under.append(under)
         error = str(outcome).removeprefix(f"{source}: ") if isinstance(outcome, Exception) else None
@@ -88,7 +88,7 @@ class Report:
             parts.append("  ".join(f"{key} {value}" for key, value in timing.items()))
         parts.append(_summary(perception))
         if tracks is not None:
-            parts.append(f"tracks: {many(len(tracks), 'object')}")
+            parts.append(f"tracks: {'none, a late scan' if tracks.is_late else many(len(tracks), 'object')}")
         return "  ".join(parts)
 
     def _names(self, source: Path | Remote) -> dict[str, Any]:

@@ -166,7 +166,10 @@ def add_parser(commands: Commands) -> None:
     add_engine(parser)
     tracking = parser.add_argument_group("tracking")
     tracking.add_argument(
-        "--track", action="store_true", help="track the boxes from scan to scan; the scans must be one drive, in order"
+        "--track",
+        action="store_true",
+        help="track the boxes from scan to scan; the scans must be one drive, in order. Late scans have no tracks, and "
+        "after a jump of the clock tracking begins anew",
     )
     tracking.add_argument(
         "--gif",

@@ -112,9 +112,16 @@ def wanted_sinks(arguments: argparse.Namespace) -> list[str]:
 def open_sinks(arguments: argparse.Namespace, stack: ExitStack) -> list[Sink]:
     """Make the sinks of the passed options; errors of options and missing extras come here, before the first scan.
 
-    The stack closes them, also those that were made before one that cannot be.
+    The stack closes them, also those that were made before one that cannot be. What is served is closed last: the files
+    are finished, whatever viewers do.
     """
     sinks: list[Sink] = []
+    if arguments.serve is not None:
+        from ..sinks.foxglove import ServeSink
+
+        served = ServeSink(*arguments.serve)
+        stack.callback(served.close)
+        print_line(f"open {served.url} in Foxglove", sys.stderr)
 
     def add(sink: Sink) -> None:
         stack.callback(sink.close)
@@ -124,12 +131,6 @@ def open_sinks(arguments: argparse.Namespace, stack: ExitStack) -> list[Sink]:
         from ..sinks.foxglove import McapSink
 
         add(McapSink(arguments.mcap))
-    if arguments.serve is not None:
-        from ..sinks.foxglove import ServeSink
-
-        served = ServeSink(*arguments.serve)
-        print_line(f"open {served.url} in Foxglove", sys.stderr)
-        add(served)
     if arguments.rrd is not None:
         from ..sinks.rerun import RerunSink
 
@@ -150,4 +151,6 @@ def open_sinks(arguments: argparse.Namespace, stack: ExitStack) -> list[Sink]:
         from ..sinks.rosbag import BagSink
 
         add(BagSink(arguments.bag, storage=arguments.bag_storage, frame_id=arguments.bag_frame))
+    if arguments.serve is not None:
+        sinks.append(served)
     return sinks

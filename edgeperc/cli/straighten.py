@@ -57,7 +57,8 @@ class Straightener:
         Warns
         -----
         UserWarning
-            Without poses: the tracker does not know the motion during the first two scans, which stay as they are.
+            Without poses: the tracker does not know the motion during the first two scans of a session, which stay as
+            they are.
         """
         if times_s is None:
             raise PointsError(
@@ -75,8 +76,8 @@ class Straightener:
         else:
             if not self._tracked:
                 warnings.warn(
-                    "--deskew: the first two scans stay as they are, for the tracker has no motion yet; --poses "
-                    "straightens them too",
+                    "--deskew: the first two scans stay as they are, also after a jump of the clock, for the tracker "
+                    "has no motion yet; --poses straightens them too",
                     stacklevel=2,
                 )
             return points
@@ -84,5 +85,7 @@ class Straightener:
         return deskew(points, times_s, motion, at_s=at_s)
 
     def follow(self, tracks: Tracks) -> None:
-        """Take the tracks of the last scan, for the motion during the next one."""
-        self._tracked = [*self._tracked[-1:], tracks]
+        """Take the tracks of the last scan, for the motion during the next one. Motion needs two of one session."""
+        if tracks.is_late:
+            return
+        self._tracked = [*(before for before in self._tracked[-1:] if before.session == tracks.session), tracks]

@@ -20,6 +20,7 @@ from ..calibration import read_kitti_calibration
 from ..card import TopViewGeometry
 from ..errors import PointsError
 from ..geometry import inside
+from ..names import check_file
 from ..perception import Box
 from ..readers.files import read_points
 from ..simulation.samples import IGNORE
@@ -253,6 +254,8 @@ def _frame_rows(root: Path) -> list[dict[str, str]]:
         nowhere = next((row for row in rows if not (row.get("name") and row.get("drive"))), None)
         if nowhere is not None:
             raise PointsError(f"{table}: got {nowhere}; expected columns name and drive, both filled in every row")
+    for name in [row["name"] for row in rows]:
+        check_file(f"{root}: a scan in frames.csv is called", name, PointsError)
     return rows
 
 

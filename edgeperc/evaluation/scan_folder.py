@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from ..errors import PointsError, SensorError
 from ..geometry import inside
 from ..mounting import Mounting
+from ..names import check_name
 from ..perception import Box
 from ..readers.files import read_points
 from ..sensor import SensorProfile, get_sensor
@@ -181,6 +182,7 @@ class ScanLayout:
         name = given.get("name", "scans")
         if not isinstance(name, str) or not re.fullmatch(r"[\w.-]{1,40}", name):
             raise PointsError(f"name is {name!r:.60}; expected 1 to 40 letters, digits, '.', '_' or '-'")
+        check_name("name", name, PointsError)
         own: dict[str, Any] = {"name": name, "sensor": _sensor(given, folder), "boxes": boxes, "points": points}
         allowed = {"files": ("plain", "semantickitti"), "box_format": ("plain", *_BOX_FILES)}
         for key, choices in {**allowed, "drives": ("table", "scan", "one")}.items():

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import PointsError
+from ..errors import OptionError, PointsError
 from ..extras import require
 from ..frame import ModelFrame, quaternion
 from ..mounting import MODEL_HEIGHT_M
+from ..names import check_text
 from ..occupancy import OCCUPIED, occupancy_grid
 from ..points import as_points
 from ..view.colors import color_of, rgb
@@ -106,6 +107,8 @@ class RosMessages:
     ------
     MissingExtraError
         rosbags is not installed.
+    OptionError
+        A frame's name is empty, too long or not printable.
     """
 
     def __init__(
@@ -117,6 +120,8 @@ class RosMessages:
         cell_m: float = 0.2,
         off_road: int = OCCUPIED,
     ) -> None:
+        for frame in (frame_id, frame_id if grid_frame_id is None else grid_frame_id):
+            check_text("the frame is", frame, OptionError)
         typesys = require("rosbags.typesys", "ros", "Making ROS 2 messages")
         self.typestore: Any = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         for name, text in _VISION.items():
@@ -279,8 +284,8 @@ class RosMessages:
         """
         header = self._header(scan, stamp_ns)
         found = [(box, "") for box in scan.perception.boxes]
-        if scan.tracks is not None:
-            found = [(track.box, str(track.id)) for track in scan.tracks]
+        if scan.tracked is not None:
+            found = [(track.box, str(track.id)) for track in scan.tracked]
         detections = []
         for box, track_id in found:
             pose = self._make("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(box), covariance=np.zeros(36))
@@ -358,9 +363,13 @@ class RosMessages:
     def _header(self, scan: PerceivedScan | None, stamp_ns: int | None, frame_id: str | None = None) -> Any:
         if stamp_ns is None:
             stamp_ns = 0 if scan is None else nanoseconds(scan.stamp_s)
-        seconds, rest = divmod(stamp_ns, 10**9)
-        if not -(2**31) <= seconds < 2**31:
-            raise PointsError(f"the stamp is {seconds} s; expected a time that 32 bits hold, up to the year 2038")
+        # A stamp that a message held can be written again, one with more than a second of nanoseconds too.
+        seconds = min(stamp_ns // 10**9, 2**31 - 1)
+        rest = stamp_ns - seconds * 10**9
+        if seconds < -(2**31) or rest >= 2**32:
+            raise PointsError(
+                f"the stamp is {1e-9 * stamp_ns} s; expected a time that 32 bits hold, up to the year 2038"
+            )
         stamp = self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
         return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=self.frame_id if frame_id is None else frame_id)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import queue
 import threading
 import time
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import MissingExtraError, ModelError, OptionError, PointsError, ProviderError
 from ..live import stream
+from ..names import check_text
 from ..readers.decoders import cloud_points, describe_cloud
 from ..readers.tables import MAX_SCAN_BYTES
 from ..sinks import PerceivedScan
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from ..perceiver import Perceiver
     from ..perception import Perception
     from ..tracking.tracker import Tracker
-    from ..tracking.tracks import Tracks
 
 __all__ = ["PerceptionNode"]
 
@@ -40,7 +39,8 @@ class PerceptionNode:
 
     Iterate over it to run it. A cloud that cannot be read or perceived, however damaged, is an error in the diagnostics
     and an item of the iteration; the node goes on. Answers have the stamp of their cloud; if it is 0, that of this
-    computer's clock. If stamps jump back, as when a recording begins again, tracking begins anew.
+    computer's clock. Clouds that come late or twice are answered without tracks, and if the stamps jump, as when a
+    recording begins again, tracking begins anew (`edgeperc.Tracker`).
 
     It subscribes with the quality of service of sensor data. It publishes ``PREFIX/points``, ``PREFIX/markers``,
     ``PREFIX/occupancy`` and ``PREFIX/detections``, each only while somebody subscribes, and ``/diagnostics`` once a
@@ -97,7 +97,9 @@ class PerceptionNode:
         rate_hz: float = 10.0,
         outputs: Sequence[str] = tuple(OUTPUTS),
     ) -> None:
-        self._graph, self._perceiver_for, self._tracker = graph, perceiver_for, tracker
+        if frame_id is not None:
+            check_text("the frame is", frame_id, OptionError)
+        self._graph, self._perceiver_for = graph, perceiver_for
         self._topic, self._frame_id = topic, frame_id
         self._messages = RosMessages(grid_frame_id=grid_frame_id, lifetime_s=5.0 / rate_hz)
         self._perceiver: Perceiver | None = None
@@ -117,7 +119,7 @@ class PerceptionNode:
                 self._advertise(name, f"{prefix.rstrip('/')}/{name}")
         self._diagnostics = graph.advertise("/diagnostics", DIAGNOSTICS, RELIABLE) if "diagnostics" in outputs else None
         # The queue is empty nearly always: the stream's thread takes what comes, and keeps the newest.
-        self._stream = stream(iter(self._waiting.get, None), self._perceive, self._track, rate_hz=rate_hz)
+        self._stream = stream(iter(self._waiting.get, None), self._perceive, tracker, rate_hz=rate_hz)
         graph.subscribe(topic, CLOUD, self._waiting.put)
         self._reporter = threading.Thread(target=self._report_always, name="edgeperc-diagnostics", daemon=True)
         self._reporter.start()
@@ -195,15 +197,6 @@ class PerceptionNode:
         perception = self._perceiver(points, stamp_s=stamp_ns * 1e-9)
         self._points, self._stamp_ns = points, stamp_ns
         return perception
-
-    def _track(self, perception: Perception) -> Tracks | None:
-        if self._tracker is None:
-            return None
-        assert perception.stamp_s is not None
-        newest_s = -math.inf if self._newest is None else self._newest.stamp_s
-        if perception.stamp_s < newest_s:
-            self._tracker.reset()
-        return self._tracker(perception)
 
     def _publish(self, answer: Answer) -> PerceivedScan:
         assert self._points is not None

@@ -21,11 +21,13 @@ import os
 import struct
 import threading
 import time
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 from ..errors import OptionError
 from ..extras import require
+from ..lanes import returns
 from .graph import SENSOR_DATA, Qos, full_name
 from .messages import RosMessages
 
@@ -36,6 +38,7 @@ ROUTER = "tcp/localhost:7447"
 CONFIG_VARIABLE = "ZENOH_SESSION_CONFIG_URI"
 _PATIENCE = "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments"  # [us]
 _DEFAULT_DEPTH = 42
+_CLOSING_S = 5.0
 _ATTACHMENT = struct.Struct("<qqB16s")
 
 
@@ -165,10 +168,18 @@ class ZenohGraph:
         """Undeclare everything and close the session; more calls have no effect."""
         with self._closing:
             kept, self._kept = self._kept, []
-            for each in reversed(kept):
-                each.undeclare()
-            if kept:
-                self._session.close()
+            if not returns(lambda: self._undeclare(kept), _CLOSING_S):
+                warnings.warn(
+                    f"the Zenoh session did not close within {_CLOSING_S:.0f} s and was left behind",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+
+    def _undeclare(self, kept: list[Any]) -> None:
+        for each in reversed(kept):
+            each.undeclare()
+        if kept:
+            self._session.close()
 
 
 class _ZenohOutput:

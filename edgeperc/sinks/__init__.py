@@ -33,7 +33,7 @@ class PerceivedScan:
         x, y, z [m] in the sensor's frame; then remission, if the scan has it.
     perception : Perception
     tracks : Tracks or None
-        None without a tracker.
+        None without a tracker; empty for a late or doubled scan (`Tracks.is_late`).
     sensor : SensorProfile
     health : str or None
         ``"OK"``, ``"LATE"`` or ``"STALE"`` of a live answer; None for a scan that was read from a file.
@@ -46,6 +46,11 @@ class PerceivedScan:
     tracks: Tracks | None
     sensor: SensorProfile
     health: str | None = None
+
+    @property
+    def tracked(self) -> Tracks | None:
+        """The tracks; None without a tracker, and for a late or doubled scan, of which only the boxes are known."""
+        return None if self.tracks is None or self.tracks.is_late else self.tracks
 
 
 class Sink(Protocol):

@@ -19,6 +19,8 @@ from __future__ import annotations
 
 import json
 import math
+import socket
+import warnings
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -30,11 +32,14 @@ from ..atomic import open_atomic
 from ..errors import OptionError
 from ..extras import require
 from ..frame import quaternion
+from ..lanes import returns
 from ..mounting import MODEL_HEIGHT_M
 from ..perception import Box, TopView
 from ..printable import printable
 from ..view.content import EDGES, box_corners, box_text, track_text
 from . import PerceivedScan
+from .kept_file import KeptFile
+from .relay import MAX_VIEWERS, Relay
 from .scene import (
     BASE,
     LIDAR,
@@ -56,8 +61,10 @@ _POINT = np.dtype(
 _CELL = np.dtype([(name, "u1") for name in ("red", "green", "blue", "alpha", "class", "drivable")])
 _TYPES = {"<f4": "Float32", "|u1": "Uint8"}
 
-# Messages that wait for a slow viewer; then the oldest are dropped. A scan has at most 6 messages, up to 3 MB in all.
-_BACKLOG = 60
+# Messages that wait for a slow viewer, three scans; then the oldest are dropped. A scan has at most 6 messages, of 3 MB
+# for 130,000 points.
+_BACKLOG = 18
+_GRACE_S = 2.0  # for viewers to take what waits, when the run has ended
 
 STATUS_SCHEMA: dict[str, Any] = {
     "title": "edgeperc.Status",
@@ -102,7 +109,7 @@ class _Channels:
         self._write_frames(scan, now, stamp)
         self._write_points(scan, now, stamp)
         self._write_boxes(scan, now, stamp)
-        if scan.tracks is not None:
+        if scan.tracked is not None:
             self._write_tracks(scan, now, stamp)
         if scan.perception.top_view is not None:
             self._write_drivable(scan.perception.top_view, now, stamp)
@@ -315,7 +322,7 @@ class McapSink:
         """Open the file: with the first scan, so that a run without answers replaces no file."""
         sdk = require("foxglove", "foxglove", "Writing an MCAP file", package="foxglove-sdk")
         mcap = require("foxglove.mcap", "foxglove", "Writing an MCAP file", package="foxglove-sdk")
-        self._file = _Kept(self._open.enter_context(open_atomic(self._path)))
+        self._file = KeptFile(self._open.enter_context(open_atomic(self._path)))
         # Of a scan of 113,000 points, zstd's level 1 takes 10 ms and its default 30 ms for the same size.
         options = mcap.MCAPWriteOptions(compression_level=1, compression_threads=0)
         context = sdk.Context()
@@ -352,42 +359,12 @@ class McapSink:
                 self._file.check()
 
 
-class _Kept:
-    """A file that keeps its first error. The SDK only logs errors of a file, and a panic follows some."""
-
-    def __init__(self, file: Any) -> None:
-        self._file = file
-        self._error: OSError | None = None
-
-    def check(self) -> None:
-        """Raise the error, if there was one."""
-        if self._error is not None:
-            raise OSError(self._error.errno, self._error.strerror)
-
-    def write(self, data: bytes) -> int:
-        try:
-            if self._error is None:
-                self._file.write(data)
-        except OSError as exc:
-            self._error = exc
-        return len(data)
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        return int(self._file.seek(offset, whence))
-
-    def flush(self) -> None:
-        try:
-            if self._error is None:
-                self._file.flush()
-        except OSError as exc:
-            self._error = exc
-
-
 class ServeSink:
     """Streams a run to viewers over the WebSocket server of the SDK, with the topics of `McapSink`.
 
     Viewers only receive. The connection is neither encrypted nor protected by a password: whoever reaches the port sees
-    the scans. A slow viewer misses messages; it neither delays the run nor takes more than some 30 MB of memory.
+    the scans. A slow viewer misses messages; three scans wait for it at most, and it does not delay the run. There are
+    `edgeperc.sinks.relay.MAX_VIEWERS` viewers at most; others are refused, with one warning.
 
     Parameters
     ----------
@@ -414,14 +391,23 @@ class ServeSink:
         context = sdk.Context()
         self._channels = _Channels(context)
         try:
-            self._server = sdk.start_server(
-                name="edgeperc", host=host, port=port, context=context, message_backlog_size=_BACKLOG
-            )
-        except (RuntimeError, OverflowError) as exc:
+            family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+            listener = socket.create_server(address[:2], family=family)
+        except (OSError, OverflowError, UnicodeError) as exc:
             raise OptionError(
                 f"cannot listen on {host}:{port} ({exc}); expected an address of this computer and a free port"
             ) from exc
-        self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self._server.port}"
+        # The SDK's server accepts any number of viewers, and never stops while one of them is silent.
+        try:
+            self._server = sdk.start_server(
+                name="edgeperc", host="127.0.0.1", port=0, context=context, message_backlog_size=_BACKLOG
+            )
+        except RuntimeError as exc:
+            listener.close()
+            raise OptionError(f"cannot listen on 127.0.0.1 ({exc}); expected a loopback interface") from exc
+        self.url = f"ws://{f'[{host}]' if ':' in host else host}:{listener.getsockname()[1]}"
+        self._relay = Relay(listener, self._server.port)
+        self._has_warned = False
 
     def write(self, scan: PerceivedScan) -> None:
         """Send one scan to all viewers that are connected, without waiting for them.
@@ -432,7 +418,24 @@ class ServeSink:
             The points are not those that were perceived, or the scan's time is negative or not finite.
         """
         self._channels.write(scan)
+        if self._relay.n_refused and not self._has_warned:
+            self._has_warned = True
+            warnings.warn(
+                f"a viewer was refused: {MAX_VIEWERS} are connected to {self.url}, as many as are served",
+                RuntimeWarning,
+                stacklevel=2,
+            )
 
     def close(self) -> None:
-        """Close all connections."""
-        self._server.stop()
+        """Close all connections, within a few seconds whatever viewers do."""
+        try:
+            self._relay.end(_GRACE_S)
+            stopped = returns(self._server.stop, 2.0 * _GRACE_S)
+        finally:
+            self._relay.close()
+        if not stopped:
+            warnings.warn(
+                f"the server of {self.url} did not stop within {2.0 * _GRACE_S:.0f} s and was left behind",
+                RuntimeWarning,
+                stacklevel=2,
+            )

@@ -110,8 +110,8 @@ class PrelabelSink:
             The file cannot be written, or the calibration cannot be read.
         """
         boxes: list[Named] = [(box, None) for box in scan.perception.boxes]
-        if scan.tracks is not None:
-            boxes = [(track.box, track.id) for track in scan.tracks if not track.coasting]
+        if scan.tracked is not None:
+            boxes = [(track.box, track.id) for track in scan.tracked if not track.coasting]
         for box, _ in boxes:
             if box.label not in self._classes:
                 self._classes.append(box.label)

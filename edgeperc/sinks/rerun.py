@@ -103,7 +103,7 @@ class RerunSink:
         self._check_room(len(points) * _POINT_BYTES)
         rr, log = self._rr, self._recording.log
         self._recording.set_time("stamp", duration=np.timedelta64(stamp_ns, "ns"))
-        view, tracks = scan.perception.top_view, scan.tracks
+        view, tracks = scan.perception.top_view, scan.tracked
         boxes = [*scan.perception.boxes, *(track.box for track in tracks or ())]
         self._annotate([*classes, *(view.classes if view is not None else ()), *(box.label for box in boxes)])
         shown = np.isfinite(points[:, :3]).all(axis=1)

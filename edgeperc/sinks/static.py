@@ -34,7 +34,8 @@ class StaticSink:
         Made if needed.
     without : {"moving", "movable"}
         ``"moving"``: points inside the boxes of tracks that move (`edgeperc.moving_points`). ``"movable"``: also those
-        on everything that could move (`edgeperc.movable_points`).
+        on everything that could move (`edgeperc.movable_points`). Of a late or doubled scan it is not known what moves,
+        so both leave out what could.
 
     Attributes
     ----------
@@ -71,11 +72,11 @@ class StaticSink:
         """
         points = as_points(scan.points)
         gone = np.zeros(len(points), np.bool_)
-        if scan.tracks is not None:
-            gone |= moving_points(scan.tracks, points)
-        elif self._without == "moving":
+        if scan.tracked is not None:
+            gone |= moving_points(scan.tracked, points)
+        elif scan.tracks is None and self._without == "moving":
             raise OptionError("there are no tracks, so nothing is known to move; track the boxes (--track)")
-        if self._without == "movable":
+        if self._without == "movable" or (scan.tracks is not None and scan.tracks.is_late):
             gone |= movable_points(scan.perception, points)
         stem, suffix = stem_of(scan.name)
         name = Path(scan.name).name if suffix else f"{stem}.bin"

@@ -7,12 +7,14 @@ the latter case, `edgeperc.tracking.egomotion` estimates the sensor's motion.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..clock import GAP_S, LATEST_S, Clock, Step
 from ..errors import StampError, TrackingError
 from ..perception import Box, Perception
 from .egomotion import fit_motion
@@ -55,8 +57,20 @@ _SCALARS = (
 # Beyond these limits squares and differences of numbers lose their meaning, or overflow.
 FARTHEST_M = 1e8  # coordinates of boxes and poses; projected map coordinates are up to 1e7
 SIZES_M = (1e-6, 1e6)
-LATEST_S = 1e12  # a clock that counts nanoseconds since 1970 is at 1.7e18
-SHORTEST_STEP_S = 1e-6
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Session:
+    """Tracks from scan to scan without a jump of the clock, and the sensor's motion. An update makes a new one."""
+
+    number: int = 0
+    stamp_s: float = 0.0
+    posed: bool | None = None  # None before the first scan
+    tracks: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, TRACK))
+    T_world_sensor: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    # Without poses: the sensor's speed along x and y, turn rate, and their variances.
+    twist: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    twist_variances: NDArray[np.float64] = field(default_factory=lambda: FIRST_TWIST**2)
 
 
 class Tracker:
@@ -64,6 +78,17 @@ class Tracker:
 
     The boxes may come from any detector. Use one instance for each stream, in one thread. The caller owns the results.
     An error leaves the tracker unchanged.
+
+    A clock that is wrong ends no tracking. A warning says so once for each of these cases:
+
+    - A late or doubled scan is up to 0.25 s earlier than the last one, or less than 1 us later. It changes no track
+      and has none (`Tracks.is_late`). After two such scans in a row, an earlier stamp is a jump.
+    - After a jump, by more than 0.25 s back or 60 s forward (`ClassParameters.memory_s`, if that is longer), tracking
+      begins anew, with new ids (`Tracks.session`).
+    - If the scan after a jump continues the times before the jump, the jump was the wrong stamp of one scan: the former
+      tracks go on with their ids.
+
+    An id is not used again before `reset`.
 
     Parameters
     ----------
@@ -95,9 +120,11 @@ class Tracker:
         self._parameters: Mapping[str, ClassParameters] = PARAMETERS
         self._left, self._right = np.radians(field_of_view_deg)
         self._max_tracks = max_tracks
+        self._clock = Clock()
         self.reset()
         self._compile()
         self._parameters = {**PARAMETERS, **(parameters or {})}
+        self._clock = Clock(gap_s=max(GAP_S, *(of.memory_s for of in self._parameters.values())))
 
     def _compile(self) -> None:
         """Compile every kernel here, not in the first updates: a track begins, and is found again."""
@@ -106,18 +133,15 @@ class Tracker:
         self.reset()
 
     def reset(self) -> None:
-        """Delete all tracks, and reset the time and the pose."""
+        """Delete all tracks, and reset the time, the pose and the ids."""
         self._labels: list[str] = []
         self._groups: list[str] = []
-        self._tracks = np.zeros(0, TRACK)
-        self._next_id = 1
-        self._stamp_s = -math.inf
-        self._T_world_sensor = np.eye(4)
-        self._posed: bool | None = None
-        # Without poses: the sensor's speed along x and y, turn rate, and their variances.
-        self._twist = np.zeros(3)
-        self._twist_variances = FIRST_TWIST**2
         self._classes = np.zeros(0, CLASS)
+        self._next_id, self._n_sessions = 1, 1
+        self._session = _Session()
+        self._former: _Session | None = None  # that before a jump, until the next scan confirms the jump
+        self._clock = Clock(gap_s=self._clock.gap_s)
+        self._reported: set[str] = set()
 
     def __call__(self, perception: Perception, T_world_sensor: ArrayLike | None = None) -> Tracks:
         """Track the boxes of a perception, at the time ``perception.stamp_s``.
@@ -135,7 +159,7 @@ class Tracker:
         Raises
         ------
         StampError
-            The perception has no stamp, or its stamp is not later than that of the last scan.
+            The perception has no stamp, or one that is not finite or beyond 1e12 s.
         TrackingError
             As in `update`.
         """
@@ -151,7 +175,7 @@ class Tracker:
         boxes : iterable of Box
             From any detector, in the sensor frame; may be empty.
         stamp_s : float
-            Time of the scan [s], later than that of the last scan.
+            Time of the scan [s]. See `Tracker` for scans that are not later than the one before.
         T_world_sensor : (4, 4) array_like, optional
             Rigid pose of the sensor. Pass it with every scan or with none. Without poses, the sensor's motion on the
             ground is estimated from the static objects. With only one or two objects in view, their motion cannot be
@@ -161,36 +185,49 @@ class Tracker:
         -------
         Tracks
             Tracks that probably exist. A track without a detection coasts: for a few scans if it should be visible,
-            for longer if another track hides it.
+            for longer if another track hides it. Empty for a late or doubled scan.
 
         Raises
         ------
         StampError
-            ``stamp_s`` is not finite, beyond 1e12 s, or not at least 1 us later than that of the last scan.
+            ``stamp_s`` is not finite, or beyond 1e12 s.
         TrackingError
             A box or the pose is malformed, not finite or farther than 1e8 m, or only some scans have poses.
+
+        Warns
+        -----
+        UserWarning
+            A scan was late or doubled, or the clock jumped; once each.
         """
         stamp_s = float(stamp_s)
         if not abs(stamp_s) <= LATEST_S:
             raise StampError(f"got a scan at {stamp_s} s; expected a finite time in seconds, up to {LATEST_S:g}")
-        if stamp_s < self._stamp_s + SHORTEST_STEP_S:
-            raise StampError(
-                f"got a scan at {stamp_s} s after one at {self._stamp_s} s; pass scans in the order of their times, "
-                "each once, or call reset() before a new recording"
-            )
+        step, clock = self._clock.after(stamp_s)
+        session, former = self._session, self._former
+        if step == "jump":
+            session, former = _Session(self._n_sessions), former or session
+        elif step == "return":
+            assert former is not None
+            session = former
         posed = T_world_sensor is not None
-        if self._posed is not None and posed != self._posed:
+        if session.posed is not None and posed != session.posed:
             raise TrackingError(
                 f"got a scan {'with' if posed else 'without'} T_world_sensor, unlike those before it; pass it with all "
                 "scans or with none, or call reset() before a new recording"
             )
         given, told, names = _checked_boxes(boxes)
         pose = None if T_world_sensor is None else _checked_pose(T_world_sensor)
+        self._warn_of(step, stamp_s)
+        if step == "late":
+            self._clock = clock
+            nothing, pose = np.zeros(0, TRACK), session.T_world_sensor.copy()
+            return Tracks(nothing, self._labels, stamp_s, pose, len(session.tracks), 0, session.number, is_late=True)
         kinds = self._kinds(names)
         classes = self._classes[kinds]
 
-        dt = stamp_s - self._stamp_s if self._posed is not None else 0.0
-        tracks = self._tracks[self._tracks["missed_s"] + dt <= self._classes["memory_s"][self._tracks["label"]]]
+        dt = stamp_s - session.stamp_s if session.posed is not None else 0.0
+        tracks = session.tracks
+        tracks = tracks[tracks["missed_s"] + dt <= self._classes["memory_s"][tracks["label"]]]
         of = self._classes[tracks["label"]]
         n, m = len(tracks), len(given)
 
@@ -208,9 +245,10 @@ class Tracker:
         fill_predictions(mixed, mixed_covariances, of["noise"].copy(), dt, means, predicted)
         state, covariance = np.empty((n, 5)), np.empty((n, 5, 5))
         fill_combined(means, predicted, prior, state, covariance)
-        twist, twist_variances = self._twist, self._twist_variances
+        twist, twist_variances = session.twist, session.twist_variances
         if pose is None:
-            pose, twist, twist_variances = self._estimated_pose(tracks, state, covariance, given, classes, dt)
+            estimate = self._estimated_pose(session, tracks, state, covariance, given, classes, dt)
+            pose, twist, twist_variances = estimate
 
         # Data association.
         detections, heights = _in_world(given, pose)
@@ -285,15 +323,29 @@ class Tracker:
         tracks["score"] = strength + of["latest"] * (tracks["last_logit"] - strength)
         tracks["score"] += of["far_logit"] * away - of["coasting_logit"] * tracks["misses"]
 
-        self._posed, self._stamp_s, self._tracks, self._T_world_sensor = posed, stamp_s, tracks, pose
+        self._clock, self._former = clock, former if step == "jump" else None
+        self._session = _Session(session.number, stamp_s, posed, tracks, pose, twist, twist_variances)
+        self._n_sessions += step == "jump"
         self._next_id += len(own)
-        self._twist, self._twist_variances = twist, twist_variances
         reported = tracks["existence"] > 0.0
         mark_out_of_view(tracks, pose, self._left, self._right, reported)
         strongest_first = np.argsort(-strength, kind="stable")
         mark_rivals(tracks["state"].copy(), tracks["shape"].copy(), strongest_first, reported)
         n_tentative = int(len(tracks) - np.count_nonzero(reported))
-        return Tracks(tracks[reported], self._labels, stamp_s, pose.copy(), n_tentative, n_approximated)
+        return Tracks(tracks[reported], self._labels, stamp_s, pose.copy(), n_tentative, n_approximated, session.number)
+
+    def _warn_of(self, step: Step, stamp_s: float) -> None:
+        """Say once of each kind of step what it means."""
+        if step == "next" or step in self._reported:
+            return
+        self._reported.add(step)
+        meaning = {
+            "late": "a late or doubled scan has no tracks, and changes none",
+            "jump": "the clock jumped, and tracking begins anew, with new ids",
+            "return": "the stamp before was wrong, and the tracks before it go on",
+        }[step]
+        last_s = self._clock.last_s
+        warnings.warn(f"got a scan at {stamp_s} s after one at {last_s} s: {meaning} (said once)", stacklevel=3)
 
     def _kinds(self, names: Sequence[str]) -> NDArray[np.int64]:
         """Row in the table of classes for each label; new classes are added."""
@@ -305,8 +357,8 @@ class Tracker:
                 self._groups.append(of.group)
             row = np.zeros(1, CLASS)
             row["group"] = self._groups.index(of.group)
-            for field in _SCALARS:
-                row[field] = getattr(of, field)
+            for scalar in _SCALARS:
+                row[scalar] = getattr(of, scalar)
             row["noise"] = of.acceleration_mps2, of.turn_acceleration_rps2, of.walk_m, of.wander_rad, of.still_mps
             row["sigmas"] = of.along_m, of.across_m, of.heading_rad
             row["shape"] = of.shape_m
@@ -319,6 +371,7 @@ class Tracker:
 
     def _estimated_pose(
         self,
+        session: _Session,
         tracks: NDArray[np.void],
         state: NDArray[np.float64],
         covariance: NDArray[np.float64],
@@ -328,10 +381,10 @@ class Tracker:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Estimate the sensor's pose (4, 4), its motion (3,) [m/s, m/s, rad/s] and the variances of the motion."""
         if dt == 0.0:
-            return self._T_world_sensor, self._twist, self._twist_variances
+            return session.T_world_sensor, session.twist, session.twist_variances
         seen = np.flatnonzero(tracks["misses"] == 0)
         landmarks = np.empty((len(seen), 4))
-        landmarks[:, :2] = (state[seen, :2] - self._T_world_sensor[:2, 3]) @ self._T_world_sensor[:2, :2]
+        landmarks[:, :2] = (state[seen, :2] - session.T_world_sensor[:2, 3]) @ session.T_world_sensor[:2, :2]
         landmarks[:, 2] = 0.5 * (covariance[seen, 0, 0] + covariance[seen, 1, 1])
         landmarks[:, 3] = tracks["group"][seen]
         if len(landmarks) > MAX_LANDMARKS:
@@ -343,12 +396,12 @@ class Tracker:
         if len(detections) > 2 * MAX_LANDMARKS:
             detections = detections[np.argsort(detections[:, 2], kind="stable")[: 2 * MAX_LANDMARKS]]
         kept = np.array([1.0, 1.0, math.exp(-dt / TURN_MEMORY_S)])
-        prior_variances = (self._twist_variances * kept**2 + TWIST_WALK**2 * dt) * dt**2
+        prior_variances = (session.twist_variances * kept**2 + TWIST_WALK**2 * dt) * dt**2
         motion, spread = np.empty(3), np.empty((3, 3))
-        fit_motion(landmarks, detections, self._twist * kept * dt, prior_variances, motion, spread)
+        fit_motion(landmarks, detections, session.twist * kept * dt, prior_variances, motion, spread)
         cos, sin = math.cos(motion[2]), math.sin(motion[2])
         step = np.array([[cos, -sin, 0, motion[0]], [sin, cos, 0, motion[1]], [0, 0, 1, 0], [0, 0, 0, 1]])
-        return self._T_world_sensor @ step, motion / dt, np.minimum(np.diag(spread) / dt**2, FIRST_TWIST**2)
+        return session.T_world_sensor @ step, motion / dt, np.minimum(np.diag(spread) / dt**2, FIRST_TWIST**2)
 
     def _living(self, tracks: NDArray[np.void]) -> NDArray[np.void]:
         """Tracks to keep: above `LEAST_EXISTENCE`, and at most ``max_tracks`` of them."""

@@ -230,6 +230,12 @@ class Tracks(Sequence[Track]):
         track.
     n_approximated : int
         Number of tracks with an association from belief propagation.
+    session : int
+        Number of the session: 0 at first, another one after a jump of the scans' clock. Scans of one session share
+        their world frame, and no two sessions share an id.
+    is_late : bool
+        Whether the scan came late or twice, so that it was not tracked: there are no tracks, and ``T_world_sensor`` is
+        that of the last scan.
     """
 
     __slots__ = (
@@ -239,9 +245,11 @@ class Tracks(Sequence[Track]):
         "boxes",
         "fronts",
         "ids",
+        "is_late",
         "n_approximated",
         "n_tentative",
         "scores",
+        "session",
         "sources",
         "stamp_s",
     )
@@ -254,10 +262,14 @@ class Tracks(Sequence[Track]):
         T_world_sensor: NDArray[np.float64],
         n_tentative: int = 0,
         n_approximated: int = 0,
+        session: int = 0,
+        *,
+        is_late: bool = False,
     ) -> None:
         self._rows, self._labels = rows, labels
         self.stamp_s, self.T_world_sensor = stamp_s, T_world_sensor
         self.n_tentative, self.n_approximated = n_tentative, n_approximated
+        self.session, self.is_late = session, is_late
         self.ids: NDArray[np.int64] = rows["id"]
         self.sources: NDArray[np.int64] = rows["source"]
         self.scores: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-rows["score"]))

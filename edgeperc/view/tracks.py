@@ -6,6 +6,7 @@ import io
 import math
 import zlib
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic import write_atomic
+from ..clock import elapsed_s
 from ..errors import TrackingError
 from ..extras import require
 from ..frame import ModelFrame
@@ -98,7 +100,8 @@ def draw_tracks(
     Parameters
     ----------
     scans : sequence of Tracks
-        In order, two or more. Each is shown until the stamp of the next, the last one for a second.
+        In order, two or more. Each is shown until the stamp of the next, the last one for a second. A jump of
+        their clock takes no time.
     path : str or Path, optional
         File to write as well; an existing file is replaced atomically.
     under : sequence of bytes
@@ -135,7 +138,10 @@ def draw_tracks(
     palette = _palette(Image)
     trails: dict[int, list[tuple[float, float, float, float]]] = {}
     pictures: list[Any] = []
-    for k, tracks in enumerate(scans):
+    times_s = [0.0]
+    for before, after in pairwise(scans):
+        times_s.append(times_s[-1] + elapsed_s(before.stamp_s, after.stamp_s))
+    for k, (tracks, time_s) in enumerate(zip(scans, times_s, strict=True)):
         flat = np.frombuffer(zlib.decompress(under[k]), np.uint8).reshape(_HEIGHT, _WIDTH) if under else None
         layer = _layer_colors()[np.zeros((_HEIGHT, _WIDTH), np.uint8) if flat is None else flat]
         picture = Image.new("RGB", (_FINE * _WIDTH, _FINE * (_HEAD + _HEIGHT + _FOOT)), GROUND)
@@ -146,23 +152,22 @@ def draw_tracks(
         pen = ImageDraw.Draw(picture)
         _draw_rings(pen, fonts[13])
         here = {track.id for track in tracks}
-        begin_s = tracks.stamp_s - tail_s
+        begin_s = time_s - tail_s
         trails = {name: trail for name, trail in trails.items() if name in here or trail[-1][3] > begin_s}
         for track in tracks:
-            trail = [*trails.get(track.id, ()), (*track.world_box.center, tracks.stamp_s)]
+            trail = [*trails.get(track.id, ()), (*track.world_box.center, time_s)]
             trails[track.id] = [place for place in trail if place[3] > begin_s]
         R, t = tracks.T_world_sensor[:3, :3], tracks.T_world_sensor[:3, 3]
         drawn = [track for track in tracks if drawable_boxes([track.box])]
         for track in drawn:
             _draw_track(pen, track, (np.array(trails[track.id])[:, :3] - t) @ R)
         _write_names(pen, drawn, fonts[14])
-        facts = f"{tracks.stamp_s - scans[0].stamp_s:.1f} s · {len(tracks)} track{'s' * (len(tracks) != 1)}"
+        facts = f"{time_s:.1f} s · {len(tracks)} track{'s' * (len(tracks) != 1)}"
         _write_frame(
             pen, title or "Tracks", facts, sorted({label for of in scans for label in of.labels}), fonts, tail_s
         )
         pictures.append(picture.reduce(_FINE).quantize(palette=palette, dither=Image.Dither.NONE))
-    stamps = [tracks.stamp_s for tracks in scans]
-    lasted = [round(1e3 * (b - a)) for a, b in zip(stamps, [*stamps[1:], stamps[-1] + 1.0], strict=True)]
+    lasted = [round(1e3 * (after - before)) for before, after in pairwise([*times_s, times_s[-1] + 1.0])]
     stream = io.BytesIO()
     pictures[0].save(
         stream,

@@ -24,7 +24,7 @@ import io
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from edgeperc.geometry import draw_footprints, rectangles
+from edgeperc.names import check_file
 from edgeperc.perception import Box
 
 from ..roads import CELL_M, CLASSES, HEIGHT, VEHICLES, VIEW, WIDTH, X_RANGE_M, Y_RANGE_M, Z_RANGE_M, DatabaseError
@@ -263,11 +264,7 @@ class TopViewDatabase:
         rows = csv.DictReader(io.StringIO(content.decode()))
         self.rows = [row for row in rows if _belongs(row, split, fold)]
         for name in (row.get("scene") or "" for row in self.rows):
-            # The name becomes part of paths.
-            if name in ("", ".", "..") or PureWindowsPath(name).name != name or "\0" in name:
-                raise DatabaseError(
-                    f"{self.root / 'index.csv'} has a scene called {name!r}; expected a plain file name"
-                )
+            check_file(f"{self.root / 'index.csv'} has a scene called", name, DatabaseError)
         self._at = {row["scene"]: k for k, row in enumerate(self.rows)}
 
     @property

@@ -1,0 +1,72 @@
+"""The clock of scans: which scan continues a session of tracking, which one is late, and where the clock jumps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+__all__ = ["GAP_S", "LATEST_S", "LATE_S", "Clock", "Step", "elapsed_s", "step_between"]
+
+SHORTEST_STEP_S = 1e-6  # a stamp that is less than this later than the last one is of a doubled scan
+LATE_S = 0.25  # a stamp that is earlier by more than this is not of a late scan
+GAP_S = 60.0  # a stamp that is later by more than this does not continue the session
+MOST_LATE = 2  # late scans in a row; another one shows that the clock itself stepped back
+LATEST_S = 1e12  # a clock that counts nanoseconds since 1970 is at 1.7e18
+
+Step = Literal["next", "late", "jump", "return"]
+
+
+def step_between(last_s: float, stamp_s: float, gap_s: float = GAP_S) -> Literal["next", "late", "jump"]:
+    """What a scan at ``stamp_s`` is after one at ``last_s``: the next one, a late or doubled one, or after a jump."""
+    if last_s - LATE_S <= stamp_s <= last_s or last_s < stamp_s < last_s + SHORTEST_STEP_S:
+        return "late"
+    return "next" if last_s < stamp_s <= last_s + gap_s else "jump"
+
+
+def elapsed_s(last_s: float, stamp_s: float) -> float:
+    """Time between two scans [s]; 0 if the second one is late, or if the clock jumps between them."""
+    return stamp_s - last_s if step_between(last_s, stamp_s) == "next" else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """The times of the scans so far, as far as they decide about the next one.
+
+    A jump begins a new session, but the former one is remembered until the next scan: if that scan continues the former
+    session, the jump was the wrong stamp of a single scan, and the step is a ``"return"``. After `MOST_LATE` late scans
+    in a row, one that is earlier than the last tracked scan is a jump, so a clock that steps back by less than `LATE_S`
+    stops tracking for a few scans only.
+
+    Attributes
+    ----------
+    last_s : float or None
+        Time of the last scan of the session [s]; None before the first.
+    former_s : float or None
+        The same of the session before the last jump, until the next scan confirms the jump.
+    n_late : int
+        Number of late scans since the last scan of the session.
+    gap_s : float
+        Longest step forward within a session [s].
+    """
+
+    last_s: float | None = None
+    former_s: float | None = None
+    n_late: int = 0
+    gap_s: float = GAP_S
+
+    def after(self, stamp_s: float) -> tuple[Step, Clock]:
+        """What a scan at a finite time is, and the clock after it."""
+        begun = replace(self, last_s=stamp_s, former_s=None, n_late=0)
+        if self.last_s is None:
+            return "next", begun
+        step = step_between(self.last_s, stamp_s, self.gap_s)
+        former_s = -math.inf if self.former_s is None else self.former_s
+        may_return = step_between(former_s, stamp_s, self.gap_s) == "next"
+        if may_return and (step != "next" or former_s > self.last_s):  # of two sessions it continues the later one
+            return "return", begun
+        if step == "next":
+            return "next", begun
+        if step == "late" and (self.n_late < MOST_LATE or stamp_s >= self.last_s):
+            return "late", replace(self, n_late=self.n_late + 1)
+        return "jump", replace(begun, former_s=self.last_s if self.former_s is None else self.former_s)

@@ -1,0 +1,35 @@
+"""What a name from outside may be. Files, topics, messages and pages are made from names that passed here."""
+
+from __future__ import annotations
+
+import re
+import reprlib
+from pathlib import PureWindowsPath
+
+__all__ = ["MAX_NAME", "check_file", "check_name", "check_text"]
+
+MAX_NAME = 200
+_NAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9._+-]*[A-Za-z0-9_+-])?")
+_DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)  # Windows opens them, whatever the suffix
+
+
+def check_text(field: str, text: str, error: type[Exception]) -> None:
+    """Refuse a name that is only shown, if it is not one line that a terminal and a page can show."""
+    if not isinstance(text, str) or not 0 < len(text) <= MAX_NAME or not text.isprintable() or not text.strip():
+        raise error(f"{field} {reprlib.repr(text)}; expected 1 to {MAX_NAME} printable characters")
+
+
+def check_file(field: str, name: str, error: type[Exception]) -> None:
+    """Refuse the name of somebody's file, if it is a path or a device. It may hold what a page must escape."""
+    if name in ("", ".", "..") or PureWindowsPath(name).name != name or "\0" in name or _DEVICES.fullmatch(name):
+        raise error(f"{field} {reprlib.repr(name)}; expected a plain file name")
+
+
+def check_name(field: str, name: str, error: type[Exception]) -> None:
+    """Refuse a name that files are made from, if it is not that of one file, in its folder, on every system."""
+    check_text(field, name, error)
+    if not _NAME.fullmatch(name) or ".." in name or _DEVICES.fullmatch(name):
+        raise error(
+            f"{field} {reprlib.repr(name)}; expected a plain file name: letters a-z, digits, '_', '.', '+' and '-', "
+            "the first a letter, digit or '_', without '..', and none that Windows reserves, such as nul"
+        )
