@@ -6,7 +6,7 @@ import math
 import os
 import threading
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import wraps
 from itertools import pairwise
@@ -181,10 +181,11 @@ class Perceiver:
     full_turn : bool
         Run a range-image model once for each sector, four times for the shipped models. Every point then has a class,
         and there are boxes beside and behind the vehicle.
-    agree : bool
+    agree : bool or collection of str
         Correct the parts of the result by one another (`edgeperc.agreement`): the clusters of points above the ground
         vote on their class, boxes support or complete labels, and no cell below an object is drivable. Boxes below
-        ``score_threshold`` take no part. False, for comparisons: labels and cells are those of the networks.
+        ``score_threshold`` take no part. False, for comparisons: labels and cells are those of the networks. Of a
+        collection, the rules apply that it names (`edgeperc.agreement.RULES`).
     trusted : bool
         Open model files whose graphs are otherwise refused: with unusual operators, functions, subgraphs or sizes
         (`edgeperc.session.Session`). Only for files whose origin you know.
@@ -225,7 +226,7 @@ class Perceiver:
     adapt: Adaptation
     boxes_from: BoxesFrom
     full_turn: bool
-    agree: bool
+    agree: bool | frozenset[str]
     cards: tuple[ModelCard, ...]
     sessions: tuple[Session, ...]
     providers: Mapping[str, str]
@@ -245,14 +246,15 @@ class Perceiver:
         adapt: Adaptation = "both",
         boxes_from: BoxesFrom = "both",
         full_turn: bool = False,
-        agree: bool = True,
+        agree: bool | Collection[str] = True,
         trusted: bool = False,
     ) -> None:
         _check_choice("adapt", adapt, ADAPTATIONS, {"neither": "none"})
         _check_choice("on_mismatch", on_mismatch, ("refuse", "warn", "raise", "ignore"))
         _check_choice("boxes_from", boxes_from, ("both", "network", "clusters"))
         _check_choice("full_turn", full_turn, (True, False))
-        _check_choice("agree", agree, (True, False))
+        if not isinstance(agree, bool) and (isinstance(agree, str) or not {*agree} <= RULES):
+            raise OptionError(f"agree is {agree!r}; expected True, False or some of {', '.join(sorted(RULES))}")
         if score_threshold is not None and not (isinstance(score_threshold, Real) and 0.0 <= score_threshold <= 1.0):
             raise OptionError(f"score_threshold is {score_threshold!r}; expected a number in 0..1, or None")
         if not (n_threads is None or isinstance(n_threads, Integral)):
@@ -273,7 +275,7 @@ class Perceiver:
         self._renders = adapt in ("both", "remission")
         self.boxes_from = boxes_from
         self.full_turn = full_turn
-        self.agree = agree
+        self.agree = agree if isinstance(agree, bool) else frozenset(agree)
         kinds = {_view_kind(model) for model in wanted}
         at_once = 2 if {"top_view", "range_image"} <= kinds else 1
         self.sessions = tuple(
@@ -328,7 +330,7 @@ class Perceiver:
             network_score = MIN_SCORE if top is None else top.card.score_threshold
         gaps_deg = [upper - lower for upper, lower in pairwise(self.sensor.elevations_deg)]
         options = Options(
-            rules=frozenset(RULES) if self.agree is True else frozenset(self.agree or ()),
+            rules=frozenset(RULES if self.agree is True else self.agree or ()),
             boxes_from=self.boxes_from,
             network_score=network_score,
             cluster_score=MIN_SCORE if self.score_threshold is None else self.score_threshold,

@@ -6,7 +6,7 @@ can be written, `Helpers` starts one process for each further core, three at mos
 interpreter and puts what it compiles into the cache; `edgeperc.kernel_cache` finds it there. It opens no model, writes
 nothing else, and never imports the caller's main module. It ends by itself when its part is compiled, when the process
 that started it has ended, or after two minutes, and is killed when construction ends. Everything that is not in the
-cache afterwards is compiled as without helpers: one that cannot start, fails or hangs costs time, and changes no result.
+cache afterwards is compiled as without helpers: one that cannot start, fails or hangs costs time and changes nothing.
 
 No helper starts in a frozen application, in a program that embeds Python (`sys.executable` is then no Python
 interpreter), on one core, without a cache that can be written, and at later starts.

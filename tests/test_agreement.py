@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from agreeing import agreed_cells, agreed_points, voters_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -17,22 +18,21 @@ from edgeperc.agreement import (
     RULES,
     _as_rows,
     agree_on_boxes,
-    agree_on_points,
     clear_columns,
     clear_ground,
     count_inside,
     fill_support,
     find_support,
     find_voters,
-    without_poles,
 )
 from edgeperc.card import TopViewGeometry
-from edgeperc.cells import agree_on_cells, clear_cells, fill_marks, mark_cells
+from edgeperc.cells import clear_cells, fill_marks
 from edgeperc.cli import arguments
 from edgeperc.cluster import find_clusters, objects_from_points, sort_points
 from edgeperc.geometry import inside
 from edgeperc.ground import Ground, find_ground
 from edgeperc.points import read_only
+from edgeperc.scan import Scan
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
 from edgeperc.voting import (
@@ -229,21 +229,13 @@ def crowded(seed: int) -> tuple[NDArray[np.float32], PointLabels, Ground, list[B
 def test_voters_give_the_results_of_complete_clusters(seed: int, rules: frozenset[str]) -> None:
     points, labels, ground, boxes = crowded(seed)
     complete = find_clusters(points, among=~ground.mask, seeds=labels.labels > 0, min_points=1)
-    voters = find_voters(points, labels, ground, boxes, rules=rules)
-    expected = agree_on_points(points, labels, ground, complete, boxes, rules=rules)
-    agreed = agree_on_points(points, labels, ground, voters, boxes, rules=rules)
-    support = find_support(points, labels, ground, boxes, rules=rules)
+    voters = voters_of(points, labels, ground, boxes, rules)
+    expected = agreed_points(points, labels, ground, complete, boxes, rules=rules)
+    agreed = agreed_points(points, labels, ground, voters, boxes, rules=rules)
+    scan = Scan.of(points, ground, labels)
     strips = sort_points(points, ~ground.mask)
-    once = find_voters(points, labels, ground, boxes, rules=rules, support=support, strips=strips)
-    np.testing.assert_array_equal(once, voters)
-    upright = without_poles(points, labels, ground, rules=rules)
-    again = agree_on_points(points, labels, ground, voters, boxes, rules=rules, support=support, upright=upright)
-    np.testing.assert_array_equal(again.labels, agreed.labels)
-    view = top_view()
-    marks = mark_cells(view, points, agreed, ground, rules=rules)
-    cells = agree_on_cells(view, points, agreed, ground, boxes, rules=rules)
-    found_once = agree_on_cells(view, points, agreed, ground, boxes, rules=rules, marks=marks)
-    np.testing.assert_array_equal(found_once.labels, cells.labels)
+    sorted_first = find_voters(scan, labels, find_support(scan, labels, boxes, rules), strips, rules=rules)
+    np.testing.assert_array_equal(sorted_first, voters)
     np.testing.assert_array_equal(agreed.labels, expected.labels)
     found = [
         objects_from_points(points, agreed.labels, CLASSES, height_m=ground.height_m, clusters=clusters)
@@ -261,10 +253,10 @@ def test_a_forest_is_not_searched_because_of_a_few_labels() -> None:
     height = (points[:, 2] - np.float32(GROUND_Z)).astype(np.float32)
     ground = Ground(np.zeros(n, np.bool_), height, (0.0, 0.0, GROUND_Z))
     found = PointLabels(labels, np.ones(n, np.bool_), CLASSES)
-    voters = find_voters(points, found, ground)
+    voters = voters_of(points, found, ground)
     assert (voters[labels > 0] == -2).all()
     assert np.count_nonzero(voters != -1) < n // 3
-    assert not agree_on_points(points, found, ground, voters).labels.any()
+    assert not agreed_points(points, found, ground, voters).labels.any()
 
 
 @patient
@@ -299,7 +291,7 @@ def test_cleared_cells_match_the_twin(given: list, by_height: bool, of_road: boo
 @given(scenes, boxes_of)
 def test_points_keep_their_view_and_meet_the_rules(given: list, boxes: list[Box]) -> None:
     scene = Scene(given)
-    agreed = agree_on_points(scene.points, scene.found, scene.ground, scene.clusters, boxes)
+    agreed = agreed_points(scene.points, scene.found, scene.ground, scene.clusters, boxes)
     np.testing.assert_array_equal(scene.labels, scene.found.labels)  # the input is not modified
     assert agreed.classes == CLASSES
     assert agreed.labels.dtype == np.uint8
@@ -318,7 +310,7 @@ def test_points_keep_their_view_and_meet_the_rules(given: list, boxes: list[Box]
         is_large = length > MAX_LENGTH_M + 1e-3 or np.max(scene.height[own], initial=-np.inf) > MAX_TOP_M
         if share < (MIN_LARGE_SHARE if is_large else MIN_VEHICLE_SHARE):
             assert not (agreed.labels[own & ~boxed] == 1).any()
-    again = agree_on_points(scene.points, scene.found, scene.ground, scene.clusters, boxes)
+    again = agreed_points(scene.points, scene.found, scene.ground, scene.clusters, boxes)
     np.testing.assert_array_equal(agreed.labels, again.labels)
 
 
@@ -326,7 +318,7 @@ def test_points_keep_their_view_and_meet_the_rules(given: list, boxes: list[Box]
 @given(scenes, boxes_of)
 def test_no_cell_below_an_object_is_drivable(given: list, boxes: list[Box]) -> None:
     scene, view = Scene(given), top_view()
-    agreed = agree_on_cells(view, scene.points, scene.found, scene.ground, boxes)
+    agreed = agreed_cells(view, scene.points, scene.found, scene.ground, boxes)
     x, y = np.broadcast_arrays(*VIEW.cell_centers())
     centers = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
     for box in boxes:
@@ -340,7 +332,7 @@ def test_no_cell_below_an_object_is_drivable(given: list, boxes: list[Box]) -> N
     assert (view.labels[other] > 1).all()
     hit = {*zip(row[known & scene.in_view], col[known & scene.in_view], strict=True)}
     assert {*zip(*np.nonzero(other), strict=True)} <= hit
-    by_road_only = agree_on_cells(view, scene.points, scene.found, scene.ground, boxes, rules=RULES - {"cells"})
+    by_road_only = agreed_cells(view, scene.points, scene.found, scene.ground, boxes, rules=RULES - {"cells"})
     np.testing.assert_array_equal(by_road_only.labels[~view.road], view.labels[~view.road])
     np.testing.assert_array_equal(agreed.observed, view.observed)
 
@@ -349,7 +341,7 @@ def test_no_cell_below_an_object_is_drivable(given: list, boxes: list[Box]) -> N
 @given(scenes, boxes_of)
 def test_only_uncertain_boxes_without_labels_are_dropped(given: list, boxes: list[Box]) -> None:
     scene = Scene(given)
-    kept = agree_on_boxes(boxes, scene.points, scene.found, scene.ground)
+    kept = agree_on_boxes(boxes, Scan.of(scene.points, scene.ground), scene.found)
     assert [box for box in boxes if box in kept] == [*kept]
     for box in boxes:
         own = twins.agreement.inside(scene.points, scene.height, scene.on_ground, _as_rows([box])[0])
@@ -361,25 +353,24 @@ def test_only_uncertain_boxes_without_labels_are_dropped(given: list, boxes: lis
 def test_no_points_and_one_point(n: int) -> None:
     scene = Scene([(5.0, 0.0, 1.2, False, True, 1, 0)][:n])
     box = Box("car", 0.9, (5.0, 0.0, -1.0), (4.0, 1.6, 1.5), 0.0)
-    agreed = agree_on_points(scene.points, scene.found, scene.ground, scene.clusters, [box])
+    agreed = agreed_points(scene.points, scene.found, scene.ground, scene.clusters, [box])
     assert agreed.labels.tolist() == [1] * n
-    assert agree_on_boxes([box], scene.points, agreed, scene.ground) == (box,)
+    assert agree_on_boxes([box], Scan.of(scene.points, scene.ground), agreed) == (box,)
     unsure = replace(box, score=0.4)
-    assert agree_on_boxes([unsure], scene.points, agreed, scene.ground) == (unsure,) * n
-    assert agree_on_cells(top_view(), scene.points, agreed, scene.ground, [box]).drivable.any()
+    assert agree_on_boxes([unsure], Scan.of(scene.points, scene.ground), agreed) == (unsure,) * n
+    assert agreed_cells(top_view(), scene.points, agreed, scene.ground, [box]).drivable.any()
 
 
-def test_arrays_must_agree() -> None:
+def test_arrays_of_a_scan_must_agree() -> None:
     scene = Scene([(5.0, 0.0, 1.0, False, True, 1, 0)] * 3)
-    with pytest.raises(PointsError, match=r"clusters of shape \(2,\) for 3 points"):
-        agree_on_points(scene.points, scene.found, scene.ground, scene.clusters[:2])
-    with pytest.raises(PointsError, match=r"labels.in_view of shape \(3,\) for 2 points|ground.height_m of shape"):
-        agree_on_points(scene.points[:2], scene.found, scene.ground, scene.clusters[:2])
+    with pytest.raises(PointsError, match=r"ground.height_m of shape \(3,\) for 2 points"):
+        Scan.of(scene.points[:2], scene.ground)
     with pytest.raises(PointsError, match=r"got points of shape \(3,\)"):
-        agree_on_points(scene.points[:, 0], scene.found, scene.ground, scene.clusters)
-    few = PointLabels(scene.labels, scene.in_view, ("background",))
+        Scan.of(scene.points[:, 0], scene.ground)
+    with pytest.raises(PointsError, match=r"labels.in_view of shape \(2,\) for 3 points"):
+        Scan.of(scene.points, scene.ground, PointLabels(scene.labels, scene.in_view[:2], CLASSES))
     with pytest.raises(PointsError, match="got label 1 for 1 classes"):
-        agree_on_boxes([], scene.points, few, scene.ground)
+        Scan.of(scene.points, scene.ground, PointLabels(scene.labels, scene.in_view, ("background",)))
 
 
 def test_rules_are_those_of_the_command_line() -> None:
@@ -415,8 +406,8 @@ def agreed_scene(
     points = np.column_stack([rows[:, :2], rows[:, 2] + GROUND_Z, np.zeros(len(rows))]).astype(np.float32)
     labels = PointLabels(rows[:, 3].astype(np.uint8), np.ones(len(rows), np.bool_), CLASSES)
     ground = find_ground(points)
-    clusters = find_voters(points, labels, ground, boxes, rules=rules)
-    return rows, agree_on_points(points, labels, ground, clusters, boxes, view=view, rules=rules).labels
+    clusters = voters_of(points, labels, ground, boxes, rules)
+    return rows, agreed_points(points, labels, ground, clusters, boxes, view=view, rules=rules).labels
 
 
 CAR = (4.0, 1.7, 1.5)
@@ -502,14 +493,11 @@ def test_person_at_a_hedge_has_a_box() -> None:
     labels = PointLabels(rows[:, 3].astype(np.uint8), np.ones(len(rows), np.bool_), CLASSES)
     ground = Ground(np.zeros(len(rows), np.bool_), rows[:, 2].astype(np.float32), (0.0, 0.0, GROUND_Z))
     complete = find_clusters(points, seeds=labels.labels > 0, min_points=1)
-    for clusters in (find_voters(points, labels, ground), complete):
-        agreed = agree_on_points(points, labels, ground, clusters)
+    for clusters in (voters_of(points, labels, ground), complete):
+        agreed = agreed_points(points, labels, ground, clusters)
         assert len({*clusters[rows[:, 3] == 2]} - {*clusters[rows[:, 3] == 0]}) == 1
         (box,) = objects_from_points(points, agreed.labels, CLASSES, height_m=ground.height_m, clusters=clusters)
         assert (box.label, np.hypot(box.center[0] - 10.0, box.center[1] - 3.5) < 0.2) == ("pedestrian", True)
-    complete.flags.writeable = False
-    with pytest.raises(PointsError, match="read-only clusters"):
-        agree_on_points(points, labels, ground, complete)
 
 
 def test_points_far_out_do_not_matter_to_a_person_at_a_hedge() -> None:
@@ -592,7 +580,7 @@ def test_cyclist_is_one_object() -> None:
 def test_other_classes_are_not_changed() -> None:
     scene = Scene([(5.0, 0.0, 1.0, False, True, 2, 0)] * 9 + [(5.0, 0.0, 0.0, True, True, 2, -1)])
     found = PointLabels(scene.labels, scene.in_view, ("background", "sign", "road", "tree"))
-    agreed = agree_on_points(scene.points, found, scene.ground, scene.clusters)
+    agreed = agreed_points(scene.points, found, scene.ground, scene.clusters)
     np.testing.assert_array_equal(agreed.labels, scene.labels)
 
 
@@ -603,7 +591,7 @@ def test_cells_of_dropped_boxes_are_no_vehicles() -> None:
     ground = Ground(np.zeros(0, np.bool_), np.zeros(0, np.float32), (0.0, 0.0, GROUND_Z))
     kept = Box("car", 0.9, (5.0, 0.0, -1.0), (4.0, 2.0, 1.5), 0.0)
     dropped = replace(kept, center=(7.0, 0.0, -1.0))
-    cells = agree_on_cells(view, nothing, None, ground, [kept], [dropped]).labels
+    cells = agreed_cells(view, nothing, None, ground, [kept], [dropped]).labels
     assert cells[VIEW.cells(5.1, 0.1)[:2]] == 2
     assert cells[VIEW.cells(6.6, 0.1)[:2]] == 2  # in both
     assert cells[VIEW.cells(8.1, 0.1)[:2]] == 0

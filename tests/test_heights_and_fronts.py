@@ -18,10 +18,10 @@ pytest.importorskip("onnx")
 import edgeperc.perceiver as perceiver_module
 import edgeperc_export.quantize as quantize_module
 from edgeperc import Perceiver, SensorProfile
-from edgeperc.combine import BoxesFrom
 from edgeperc.ground import fit_ground
 from edgeperc.mounting import MODEL_MOUNTING
 from edgeperc.network_input import project
+from edgeperc.pipeline import BoxesFrom
 from edgeperc.projection import make_projector
 from edgeperc.session import Session
 from edgeperc.simulation.samples import simulated_scan

@@ -39,20 +39,19 @@ from edgeperc import (
     fitness,
     geometry,
     ground,
-    perceiver,
+    pipeline,
     projection,
     refine,
     session,
 )
 from edgeperc.card import RangeImageGeometry, TopViewGeometry
 from edgeperc.geometry import inside, oriented_iou
-from edgeperc.ground import find_ground
+from edgeperc.lanes import Stopwatch
 from edgeperc.mounting import MODEL_MOUNTING
 from edgeperc.perception import PointLabels
 from edgeperc.sensor import get_sensor
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import SimulatedScan, simulate
-from edgeperc.stopwatch import Stopwatch
 from edgeperc.zoo import model_path, shipped_models
 
 
@@ -198,8 +197,8 @@ def test_a_call_that_fails_leaves_nothing_running(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as broken:
-        broken.setattr(perceiver, name, slow)
-        broken.setattr(perceiver, "label_points", fail)
+        broken.setattr(pipeline, name, slow)
+        broken.setattr(pipeline, "label_points", fail)
         with pytest.raises(KeyboardInterrupt):
             both(scan.points)
         assert ended.is_set()
@@ -212,6 +211,7 @@ def test_networks_run_one_after_the_other_where_no_thread_can_be_started(
 ) -> None:
     monkeypatch.setattr(session, "usable_cores", lambda: 2)
     options: dict[str, Any] = {"provider": "cpu", "on_mismatch": "ignore", "full_turn": full_turn}
+    n_lanes = sum(thread.name.startswith("edgeperc-lane") for thread in threading.enumerate())
     alone, both = (Perceiver(["ssadnet", "pointseg"], **more, **options) for more in ({"n_threads": 1}, {}))
     known = alone(scan.points)
 
@@ -224,8 +224,8 @@ def test_networks_run_one_after_the_other_where_no_thread_can_be_started(
             assert_same(known, both(scan.points))
     for _ in range(3):
         assert_same(known, both(scan.points))
-    (kept,) = both._beside._threads.values()
-    assert len(kept._threads) == 1
+    lanes = [thread for thread in threading.enumerate() if thread.name.startswith("edgeperc-lane")]
+    assert len(lanes) <= 1 + n_lanes
 
 
 @pytest.mark.skipif(os.name != "posix", reason="forks")
@@ -257,10 +257,11 @@ def test_two_threads_share_the_sectors_of_a_full_turn(
     alone = Perceiver(["ssadnet", "pointseg"], n_threads=1, **options)
     monkeypatch.setattr(session, "usable_cores", lambda: 2)
     both = Perceiver(["ssadnet", "pointseg"], **options)
-    assert alone._aside is None
-    assert both._aside is not None
-    top, ranged = both.sessions
-    of = {"aside": both._aside.session, "top view": top, "sectors": ranged}
+    assert alone._pipeline is not None
+    assert both._pipeline is not None
+    assert len(alone._pipeline.ranged) == 1
+    top, (ranged, aside) = both.sessions[0], (network.session for network in both._pipeline.ranged)
+    of = {"aside": aside, "top view": top, "sectors": ranged}
     runs = dict.fromkeys(of, 0)
 
     def run(name: str, run: Callable[[], object]) -> object:
@@ -693,7 +694,9 @@ def test_clusters_do_not_repeat_boxes_of_the_network(scan: SimulatedScan) -> Non
 
 
 @pytest.mark.parametrize(("seen", "n_boxes"), [(1.0, 1), (0.8, 1), (0.5, 1), (0.3, 0)])
-def test_car_cut_by_the_views_edge_gets_a_full_box_or_none(seen: float, n_boxes: int) -> None:
+def test_car_cut_by_the_views_edge_gets_a_full_box_or_none(
+    monkeypatch: pytest.MonkeyPatch, seen: float, n_boxes: int
+) -> None:
     perceive = Perceiver("pointseg", provider="cpu", n_threads=1)
     x, y = (v.ravel() for v in np.meshgrid(np.arange(-20.0, 20.0, 0.4), np.arange(-20.0, 20.0, 0.4)))
     floor = np.column_stack([x, y, np.full(x.size, -1.73)])
@@ -701,12 +704,15 @@ def test_car_cut_by_the_views_edge_gets_a_full_box_or_none(seen: float, n_boxes:
     flank = np.column_stack([4.0 + along, np.full(along.size, 6.0), up])
     scan = np.zeros((len(floor) + len(flank), 4), np.float32)
     scan[:, :3] = np.concatenate([floor, flank])
-    labels = np.zeros(len(scan), np.uint8)
-    labels[len(floor) :] = along >= 4.0 * (1.0 - seen) - 0.01
-    ground = find_ground(scan)
-    assert ground is not None
-    points = PointLabels(labels, labels > 0, ("background", "car", "pedestrian", "cyclist"))
-    _, _, boxes = perceive._combine(scan, ground, points, lambda: None, (), Stopwatch(), infer=False)
+    scan[len(floor) :, 3] = along >= 4.0 * (1.0 - seen) - 0.01  # the label
+
+    def label(points: NDArray[np.float32], *_: object) -> PointLabels:
+        labels = points[:, 3].astype(np.uint8)
+        return PointLabels(labels, labels > 0, ("background", "car", "pedestrian", "cyclist"))
+
+    assert perceive._pipeline is not None
+    monkeypatch.setattr(perceive._pipeline.ranged[0], "label", label)
+    boxes = perceive._pipeline(scan, MODEL_MOUNTING, Stopwatch()).boxes
     assert len(boxes) == n_boxes
     for box in boxes:
         np.testing.assert_allclose(box.center[0], 6.0, atol=0.05)

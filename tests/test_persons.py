@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from agreeing import agreed_points, voters_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import twins.persons
 from edgeperc import persons
-from edgeperc.agreement import RULES, agree_on_points, find_voters
+from edgeperc.agreement import RULES
 from edgeperc.cluster import OBJECT_SIZE_M, fill_groups, find_clusters, join_boxes, objects_from_points
 from edgeperc.geometry import oriented_iou
 from edgeperc.ground import Ground
@@ -140,10 +141,10 @@ def test_a_pedestrian_longer_than_a_stride_is_a_cyclist(away, alike):
     labels = np.where(is_rider & (np.arange(len(xyz)) % 5 == 0), 0 if alike else 3, 2).astype(np.uint8)
     found = PointLabels(labels, np.ones(len(labels), np.bool_), CLASSES)
     ground = Ground(np.zeros(len(labels), np.bool_), points[:, 2] - np.float32(GROUND_Z), (0.0, 0.0, GROUND_Z))
-    clusters = find_voters(points, found, ground)
-    agreed = agree_on_points(points, found, ground, clusters)
+    clusters = voters_of(points, found, ground)
+    agreed = agreed_points(points, found, ground, clusters)
     assert (agreed.labels == np.where(is_rider, 3, 2)).all()
-    without = agree_on_points(points, found, ground, clusters, rules=RULES - {"person", "fill"})
+    without = agreed_points(points, found, ground, clusters, rules=RULES - {"person", "fill"})
     assert without.labels.tolist() == labels.tolist()
     boxes = objects_from_points(points, agreed.labels, CLASSES, height_m=ground.height_m, clusters=clusters)
     (cyclist,) = (box for box in boxes if box.label == "cyclist")

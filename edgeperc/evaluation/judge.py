@@ -16,7 +16,7 @@ from ..agreement import RULES
 from ..card import TopViewGeometry
 from ..cluster import classes_of_boxes
 from ..decode import decode_classes
-from ..errors import ModelError, OptionError
+from ..errors import ModelError
 from ..frame import ModelFrame
 from ..geometry import inside
 from ..ground import find_ground
@@ -364,9 +364,7 @@ def _perceiver(
     mounting: Mounting = MODEL_MOUNTING,  # the truth of cells is in the frame of the scan
     sensor: SensorProfile | None = None,
 ) -> Perceiver:
-    if not {*rules} <= RULES:
-        raise OptionError(f"rules are {sorted(rules)}; expected some of {', '.join(sorted(RULES))}")
-    perceiver = Perceiver(
+    return Perceiver(
         list(models),
         sensor=sensor or "hdl-64e",
         full_turn=sensor is not None,
@@ -376,10 +374,8 @@ def _perceiver(
         n_threads=n_threads,
         on_mismatch="ignore",
         boxes_from=boxes_from,
-        agree=bool(rules),
+        agree=rules,
     )
-    perceiver._rules = frozenset(rules)
-    return perceiver
 
 
 def _without_vehicles(classes: tuple[str, ...], right: NDArray[np.uint8]) -> tuple[tuple[str, ...], NDArray[np.uint8]]:

@@ -17,9 +17,9 @@ from typing import Any
 import numba
 import pytest
 
-from edgeperc import first_start
-from edgeperc.first_start import PARTS, Helpers
+from edgeperc import warm_up
 from edgeperc.kernel_cache import RARE, fewer_collections
+from edgeperc.warm_up import PARTS, Helpers
 
 MOST_COMPILATIONS = 150
 
@@ -33,10 +33,10 @@ with open(sys.argv[1] + "/begun", "a") as begun:
 import hashlib, json
 import numpy as np
 from numba.core import event
-from edgeperc import Perceiver, first_start
+from edgeperc import Perceiver, warm_up
 
-first_start.usable_cores = lambda: int(sys.argv[2])
-first_start.MIN_WAIT_S = 600.0  # however busy this computer is
+warm_up.usable_cores = lambda: int(sys.argv[2])
+warm_up.MIN_WAIT_S = 600.0  # however busy this computer is
 
 class Compilations(event.Listener):
     def __init__(self):
@@ -99,8 +99,8 @@ def test_helpers_fill_the_same_cache_and_change_no_result(cold: None, tmp_path: 
 @pytest.fixture
 def cold(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two cores, and nothing in the cache."""
-    monkeypatch.setattr(first_start, "_is_cold", lambda _: True)
-    monkeypatch.setattr(first_start, "usable_cores", lambda: 2)
+    monkeypatch.setattr(warm_up, "_is_cold", lambda _: True)
+    monkeypatch.setattr(warm_up, "usable_cores", lambda: 2)
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def helpers(cold: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[s
     made: list[Helpers] = []
 
     def make(code: str) -> Helpers:
-        monkeypatch.setattr(first_start, "START", code)
+        monkeypatch.setattr(warm_up, "START", code)
         made.append(Helpers(["road"]))
         return made[-1]
 
@@ -121,7 +121,7 @@ HANGS = "import time; time.sleep(600)"
 
 
 def test_a_helper_that_hangs_is_killed(helpers: Callable[[str], Helpers], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(first_start, "MIN_WAIT_S", 0.1)
+    monkeypatch.setattr(warm_up, "MIN_WAIT_S", 0.1)
     with helpers(HANGS) as running:
         (process,) = running._running
         running.wait()
@@ -130,7 +130,7 @@ def test_a_helper_that_hangs_is_killed(helpers: Callable[[str], Helpers], monkey
 
 
 def test_a_helper_that_fails_is_reported(helpers: Callable[[str], Helpers], caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO", logger="edgeperc.first_start")
+    caplog.set_level("INFO", logger="edgeperc.warm_up")
     with helpers("raise SystemExit(3)") as running:
         running.wait()
     assert "ended with 3; they are compiled here" in caplog.text
@@ -158,7 +158,7 @@ def test_no_helper_is_left_where_construction_is_interrupted(
 def test_what_cannot_start_is_reported(
     helpers: Callable[[str], Helpers], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level("INFO", logger="edgeperc.first_start")
+    caplog.set_level("INFO", logger="edgeperc.warm_up")
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python3"))
     with helpers(HANGS) as running:
         assert not running._running
@@ -185,20 +185,20 @@ def test_a_frozen_application_is_not_started_again(
 
 @pytest.mark.parametrize("n_cores", range(1, 7))
 def test_helpers_share_the_work(cold: None, monkeypatch: pytest.MonkeyPatch, n_cores: int) -> None:
-    monkeypatch.setattr(first_start, "usable_cores", lambda: n_cores)
+    monkeypatch.setattr(warm_up, "usable_cores", lambda: n_cores)
     helpers = Helpers([*PARTS])
     assert len(helpers._shares) == min(n_cores - 1, 3)
     parts = [*helpers._own, *(part for share in helpers._shares for part in share)]
     assert sorted(parts) == sorted(PARTS)
     seconds = [sum(PARTS[part].seconds for part in share) for share in (helpers._own, *helpers._shares)]
-    seconds[0] += first_start.OTHERS_S
+    seconds[0] += warm_up.OTHERS_S
     assert max(seconds) <= {1: 23.0, 2: 12.0}.get(n_cores, 8.5)
 
 
 def test_no_helper_where_the_cache_cannot_be_written_or_holds_the_kernels(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(first_start, "usable_cores", lambda: 2)
+    monkeypatch.setattr(warm_up, "usable_cores", lambda: 2)
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "new" / "cache"))
     cache = PARTS["road"].largest._cache
     assert Helpers(["road"])._shares == [["road"]]
@@ -226,9 +226,9 @@ def test_a_helper_inherits_no_files(helpers: Callable[[str], Helpers], tmp_path:
 
 
 def _help_once() -> None:
-    first_start._is_cold = lambda _: True  # type: ignore[assignment]
-    first_start.usable_cores = lambda: 2
-    first_start.START = "raise SystemExit(0)"
+    warm_up._is_cold = lambda _: True  # type: ignore[assignment]
+    warm_up.usable_cores = lambda: 2
+    warm_up.START = "raise SystemExit(0)"
     with Helpers(["road"]) as running:
         assert running._running
         running.wait()
@@ -243,18 +243,18 @@ def test_a_daemonic_process_has_helpers_too() -> None:
 
 PARENT = """
 import signal, time
-from edgeperc import first_start
+from edgeperc import warm_up
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-first_start._is_cold = lambda _: True
-first_start.usable_cores = lambda: 2
-first_start.START = '''
+warm_up._is_cold = lambda _: True
+warm_up.usable_cores = lambda: 2
+warm_up.START = '''
 import sys, time
 sys.path[:] = sys.argv[2:]
-from edgeperc import first_start
-first_start.PARTS = {"road": first_start.Part(lambda: time.sleep(600), None, 1.0)}
-first_start.main(sys.argv[1])
+from edgeperc import warm_up
+warm_up.PARTS = {"road": warm_up.Part(lambda: time.sleep(600), None, 1.0)}
+warm_up.main(sys.argv[1])
 '''
-with first_start.Helpers(["road"]) as running:
+with warm_up.Helpers(["road"]) as running:
     print(running._running[0].pid, flush=True)
     while True:
         time.sleep(0.1)  # a signal that arrives just before a sleep does not end it
@@ -293,10 +293,10 @@ def test_no_helper_outlives_a_process_that_is_killed(how: signal.Signals) -> Non
 def test_a_helper_ends_in_any_case(monkeypatch: pytest.MonkeyPatch) -> None:
     code = """
 import sys, time
-from edgeperc import first_start
-first_start.MAX_S = 0.2
-first_start.PARTS = {"road": first_start.Part(lambda: time.sleep(600), None, 1.0)}
-first_start.main("road")
+from edgeperc import warm_up
+warm_up.MAX_S = 0.2
+warm_up.PARTS = {"road": warm_up.Part(lambda: time.sleep(600), None, 1.0)}
+warm_up.main("road")
 """
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE) as process:
         try:
