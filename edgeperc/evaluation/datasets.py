@@ -245,9 +245,7 @@ def read_objects(label_path: Path, calibration: KittiCalibration) -> tuple[tuple
     return label_objects(read_labels(label_path), calibration)
 
 
-def label_objects(
-    labels: KittiLabels, calibration: KittiCalibration
-) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
+def label_objects(labels: KittiLabels, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
     """Boxes of labels in the sensor frame, and (k, 4) DontCare rectangles [px]."""
     is_object = np.array([kind != "dontcare" for kind in labels.kinds], np.bool_)
     placed = calibration.sensor_boxes(labels.numbers[is_object, 7:14])
