@@ -64,8 +64,8 @@ FLOORS = {
         evaluation.kitti_ap evaluation.scan_folder
         evaluation.tables
         evaluation.unseen evaluation.truth
-        evaluation.camvid evaluation.judge evaluation.painting evaluation.tracking evaluation.transfer
-        evaluation.evaluate
+        evaluation.camvid evaluation.judge evaluation.painting evaluation.tracking
+        evaluation.evaluate evaluation.transfer
         view.colors
         view.canvas view.content
         view.files view.mistakes view.page view.painted view.picture view.tracks
