@@ -795,6 +795,8 @@ def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFi
         "pixels",
         "boxes",
         "all_round",
+        "kitti",
+        "centers",
         "heading",
         "errors",
         "bumper",

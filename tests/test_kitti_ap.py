@@ -18,6 +18,8 @@ from edgeperc.evaluation.kitti_ap import (
     ApTable,
     FrontTruth,
     average_precisions,
+    best_candidates,
+    candidate_recall,
     count_all_round,
     count_in_image,
     image_size_of,
@@ -157,6 +159,20 @@ def test_without_objects_there_is_no_precision_and_without_detections_none_is_ri
     assert all(math.isnan(v) for v in scores(table_of((empty, [box("car", 10, 0)])), "car", "3-D 0.7", "hard"))
     car = box("car", 15, 0)
     assert scores(table_of((labels(("car", label_row(car))), [])), "car", "3-D 0.7", "hard") == (0.0, 0.0, 0.0)
+
+
+def test_candidates_of_any_class_cover_objects_of_a_level() -> None:
+    car, person, far, van = box("car", 15, 0), box("pedestrian", 15, 5), box("car", 80, 0), box("van", 20, -5)
+    scan = labels(*((each.label, label_row(each)) for each in (car, person, far, van)))
+    rough = Box("cluster", 0.05, (15.8, 0.2, -1.0), (3.0, 1.6, 1.4), 0.1)
+    found = best_candidates(FrontTruth(scan, CAMERA), [rough, box("truck", 40, 8)], "a")
+    assert [each.label for each in found] == ["car", "pedestrian"]
+    assert found[0].range_m == pytest.approx(15.0)
+    assert 0.3 < found[0].iou < 0.8
+    recall = candidate_recall(found)
+    assert (recall["car"], recall["pedestrian"]) == ((1.0, 1), (0.0, 1))
+    assert math.isnan(recall["cyclist"][0])
+    assert [each.iou for each in best_candidates(FrontTruth(scan, CAMERA), [], "a")] == [0.0, 0.0]
 
 
 @st.composite

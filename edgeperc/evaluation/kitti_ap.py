@@ -24,9 +24,12 @@ __all__ = [
     "LEVELS",
     "RANGES",
     "ApTable",
+    "Candidate",
     "Counts",
     "FrontTruth",
     "average_precisions",
+    "best_candidates",
+    "candidate_recall",
     "count_all_round",
     "count_in_image",
     "count_matches",
@@ -89,6 +92,16 @@ class FrontTruth:
     image_size: tuple[int, int] = IMAGE_SIZE
 
 
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """How well the best of all candidates covers an object: IoU from above; distance from the sensor [m]."""
+
+    object: ObjectKey
+    label: str
+    range_m: float
+    iou: float
+
+
 def image_size_of(drive: str) -> tuple[int, int]:
     """Width and height of the images of a raw drive [px], by its day; the most common size if the day is unknown."""
     return IMAGE_SIZES.get(drive[:10], IMAGE_SIZE)
@@ -106,16 +119,10 @@ def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> ApTab
         rectangle of a detection is its projection, clipped to the image.
     drive : str
     """
-    is_object = [kind != "dontcare" for kind in truth.labels.kinds]
-    kinds = [kind for kind in truth.labels.kinds if kind != "dontcare"]
-    numbers = truth.labels.numbers[is_object]
-    truncation, occlusion, height_px = numbers[:, 0], numbers[:, 1], numbers[:, 6] - numbers[:, 4]
+    kinds, numbers = _objects(truth.labels)
     placed = truth.calibration.sensor_boxes(numbers[:, 7:14])
     right_m = np.hypot(placed[:, 0], placed[:, 1])
-    objects = [
-        object_key(drive, Box(kind, 1.0, (0.0, 0.0, 0.0), (length, width, height), 0.0))
-        for kind, (height, width, length) in zip(kinds, numbers[:, 7:10].tolist(), strict=True)
-    ]
+    objects = [_key(drive, kind, row) for kind, row in zip(kinds, numbers, strict=True)]
     guesses = _rows(boxes)
     seen = truth.calibration.image_rectangles(guesses, truth.image_size)
     shown = ((seen[:, 2:] - seen[:, :2]) > 0.0).all(axis=1)
@@ -125,11 +132,10 @@ def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> ApTab
     overlaps = _overlaps(truth.calibration.in_camera(guesses), _level_rows(numbers[:, 7:14]))
     table = ApTable()
     for label, overlap_name, least_iou, level, (near, far) in _rules(LEVELS, "hard"):
-        least_px, most_occluded, most_truncated = LEVELS.get(level, LEVELS["hard"])
+        limits = level if level in LEVELS else "hard"
         neighbors = CLASSES[label][1]
-        hidden = (occlusion > most_occluded) | (truncation > most_truncated) | (height_px <= least_px)
-        hidden |= (right_m < near) | (right_m >= far)
-        small = guess_px < least_px
+        hidden = _hidden(numbers, limits) | (right_m < near) | (right_m >= far)
+        small = guess_px < LEVELS[limits][0]
         columns = np.flatnonzero([kind == label or kind in neighbors for kind in kinds])
         rows = np.flatnonzero(small | np.array([box.label == label for box in boxes], np.bool_))
         optional = [bool(hidden[k]) or kinds[k] != label for k in columns]
@@ -188,6 +194,43 @@ def count_all_round(
             ),
         )
     return table
+
+
+def best_candidates(
+    truth: FrontTruth, candidates: Sequence[Box], drive: str, level: str = "moderate"
+) -> list[Candidate]:
+    """Find the best candidate of each object of a level.
+
+    Parameters
+    ----------
+    truth : FrontTruth
+    candidates : sequence of Box
+        Of any class and score, in the sensor frame, such as rectangles around clusters. One may cover several objects.
+    drive : str
+    level : {"easy", "moderate", "hard"}
+
+    Returns
+    -------
+    list of Candidate
+        One for each object of `CLASSES` within the limits of the level; IoU 0 without a candidate.
+    """
+    kinds, numbers = _objects(truth.labels)
+    placed = truth.calibration.sensor_boxes(numbers[:, 7:14])
+    best = np.zeros(len(kinds))
+    if candidates:
+        guesses = truth.calibration.in_camera(_rows(candidates))
+        best = _overlaps(guesses, _level_rows(numbers[:, 7:14]))[BIRDS_EYE].max(axis=0)
+    return [
+        Candidate(_key(drive, kinds[k], numbers[k]), kinds[k], float(np.hypot(*placed[k, :2])), float(best[k]))
+        for k in np.flatnonzero(~_hidden(numbers, level)).tolist()
+        if kinds[k] in CLASSES
+    ]
+
+
+def candidate_recall(found: Sequence[Candidate], least_iou: float = 0.3) -> dict[str, tuple[float, int]]:
+    """Share of the objects of each class with a candidate of at least this IoU, and the number of objects."""
+    by_class = {label: [each.iou >= least_iou for each in found if each.label == label] for label in CLASSES}
+    return {label: (sum(hits) / len(hits) if hits else math.nan, len(hits)) for label, hits in by_class.items()}
 
 
 def count_matches(
@@ -322,6 +365,24 @@ def _rules(levels: Collection[str], of_ranges: str) -> Iterator[tuple[str, str, 
                     yield label, overlap_name, least_iou, level, EVERYWHERE
         for band, within_m in RANGES.items():
             yield label, BIRDS_EYE, RANGE_IOU, band, within_m
+
+
+def _objects(labels: KittiLabels) -> tuple[list[str], NDArray[np.float64]]:
+    """Classes and numbers of the rows that are no DontCare regions."""
+    is_object = np.array([kind != "dontcare" for kind in labels.kinds], np.bool_)
+    return [kind for kind in labels.kinds if kind != "dontcare"], labels.numbers[is_object]
+
+
+def _hidden(numbers: NDArray[np.float64], level: str) -> NDArray[np.bool_]:
+    """Which objects exceed a limit of the level."""
+    least_px, most_occluded, most_truncated = LEVELS[level]
+    hidden = (numbers[:, 1] > most_occluded) | (numbers[:, 0] > most_truncated)
+    return np.asarray(hidden | (numbers[:, 6] - numbers[:, 4] <= least_px), np.bool_)
+
+
+def _key(drive: str, kind: str, numbers: NDArray[np.float64]) -> ObjectKey:
+    height, width, length = numbers[7:10].tolist()
+    return object_key(drive, Box(kind, 1.0, (0.0, 0.0, 0.0), (length, width, height), 0.0))
 
 
 def _rows(boxes: Sequence[Box]) -> NDArray[np.float64]:
