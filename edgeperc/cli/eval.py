@@ -36,8 +36,9 @@ def add_parser(commands: Commands) -> None:
         eval_command,
         help="accuracy on labeled scans and images: the papers' tables",
         description="Compare the models' results with the labels of scans: points, boxes, top view and road, over all "
-        "distances and by range, with 95 % intervals over drives. It is an error to evaluate a model on a scan that it "
-        "was trained on, except with --split train.\n\nCompare a camera model with labeled images: IoU of each class "
+        "distances and by range, with 95 % intervals over drives; boxes also as KITTI and nuScenes measure them. "
+        "It is an error to evaluate a model on a scan that it was trained on, except with "
+        "--split train.\n\nCompare a camera model with labeled images: IoU of each class "
         "and their mean, with 95 % intervals over images; unlabeled pixels do not count.",
         examples=[
             "edgeperc eval simulation:24",
