@@ -61,11 +61,13 @@ FLOORS = {
         simulation.__init__
         simulation.samples
         evaluation.__init__ evaluation.metrics evaluation.mistakes evaluation.splits evaluation.tracking_metrics
-        evaluation.ab3dmot evaluation.annotations evaluation.causes evaluation.datasets evaluation.headings
-        evaluation.scan_folder evaluation.tables
+        evaluation.ab3dmot evaluation.annotations evaluation.causes evaluation.center_ap evaluation.datasets
+        evaluation.headings
+        evaluation.kitti_ap evaluation.scan_folder
+        evaluation.tables
         evaluation.unseen evaluation.truth
-        evaluation.camvid evaluation.judge evaluation.painting evaluation.tracking evaluation.transfer
-        evaluation.evaluate
+        evaluation.camvid evaluation.judge evaluation.painting evaluation.tracking
+        evaluation.evaluate evaluation.transfer
         view.colors
         view.canvas view.content
         view.files view.mistakes view.page view.painted view.picture view.tracks
@@ -73,7 +75,7 @@ FLOORS = {
         ros2.__init__ ros2.graph ros2.messages sinks.scene
         ros2.node ros2.rclpy_graph ros2.zenoh_graph sinks.foxglove sinks.page sinks.rerun sinks.rosbag
         cli.arguments cli.output
-        cli.report cli.scans cli.sinks
+        cli.box_tables cli.report cli.scans cli.sinks
         cli.engine
         cli.straighten
         cli.completion cli.doctor cli.fit_sensor cli.info cli.program cli.run
