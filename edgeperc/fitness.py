@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from .errors import CardError, PointsError
 from .kernel_cache import njit
+from .perception import DroppedPoints
 from .points import read_only
 from .sensor import SensorProfile
 
-__all__ = ["Finding", "FitnessProfile", "check_fitness", "check_profiles", "fill_scan_sums"]
+__all__ = ["Finding", "FitnessProfile", "check_dropped", "check_fitness", "check_profiles", "fill_scan_sums"]
 
 # About 6,000 points are enough. Steps are prime, so that they do not align with the rows of an organized scan.
 _STEPS = np.array([1, 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 53, 61, 71, 83, 97, 127, 167, 223, 307, 401])
@@ -529,6 +530,43 @@ def _too_few(scan: _Measures, profile: FitnessProfile) -> Finding:
         f"The model's view holds about {scan.points_in_view:.0f} points, in training it held at least {fewest:.0f}: is "
         "the scan complete, and the sensor clean?",
         scan.points_in_view < fewest / 20.0,
+    )
+
+
+_NEARLY_ALL = 10  # near points for each that is left; also empty beams may be more than the returns
+_USUAL_M = 9.0  # median distance in a street
+
+
+def check_dropped(points: NDArray[np.float32], dropped: DroppedPoints, sensor: SensorProfile) -> tuple[Finding, ...]:
+    """Describe a scan of which nearly all is nearer than the sensor measures, if it is a street in another unit.
+
+    Parameters
+    ----------
+    points : (n, 4) float32
+        The scan before anything was dropped.
+    dropped : DroppedPoints
+        What `edgeperc.returns.returns` dropped of it.
+    sensor : SensorProfile
+    """
+    if dropped.too_near <= _NEARLY_ALL * (len(points) - dropped.total):
+        return ()
+    with np.errstate(over="ignore", invalid="ignore"):
+        flat = np.hypot(points[:, 0], points[:, 1])
+        scan = points[np.isfinite(points).all(axis=1) & (flat > 0.0)]
+        if not len(scan):
+            return ()
+        median_m = float(np.median(flat[np.isfinite(flat) & (flat > 0.0)]))
+        street = _measure(np.float32([*[_USUAL_M / median_m] * 3, 1.0]) * scan, (180.0, -180.0))
+    # Empty beams are on one ray, or at ranges that show no ground.
+    if street is None or street.ground_m is None or street.beams < min(_FEWEST_ROWS, sensor.n_beams):
+        return ()
+    return (
+        Finding(
+            f"The median distance is {median_m:.3g}, and {dropped.too_near / len(points):.0%} of the points are nearer "
+            f"than the {sensor.name} measures ({sensor.min_range_m:g} m): the coordinates seem to be in another unit; "
+            "convert them to meters.",
+            True,
+        ),
     )
 
 

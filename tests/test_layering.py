@@ -26,7 +26,7 @@ FLOORS = {
         extras mounting onnx_file
         card engine points remote sensor tuning
         kernel_cache perception zoo.__init__
-        blocks calibration frame geometry linkage outline persons
+        blocks calibration frame geometry linkage outline persons returns
         adapt cluster decode drivable fitness ground image motion observed projection refine sensor_fit session
         crop voting
         agreement level network_input occupancy painting remission

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from ..card import ModelCard
     from ..level import MountingEstimator
+    from ..perception import DroppedPoints
     from ..sensor import SensorProfile
     from ..zoo import Variant
 
@@ -271,18 +272,29 @@ def _size(card: ModelCard) -> tuple[int, int]:
     return card.view.width, card.view.height
 
 
+def _dropped_text(dropped: DroppedPoints, sensor: SensorProfile) -> str:
+    """How many points are not returns, by kind."""
+    parts = [f"{dropped.not_finite:,} are not finite"]
+    if dropped.too_near:
+        parts.append(f"{dropped.too_near:,} at most {sensor.min_range_m:g} m from the sensor, not returns")
+    if sensor.ego_box is not None:
+        parts.append(f"{dropped.ego:,} inside the box of the own vehicle")
+    return ", ".join(parts)
+
+
 def _scan_rows(
     path: Path, arguments: argparse.Namespace, estimators: dict[SensorProfile, MountingEstimator]
 ) -> tuple[list[tuple[str, str]], dict[str, Any]]:
     """Measure a scan and check which models suit it: rows to print, and the same measurements for JSON."""
     import numpy as np
 
-    from ..adapt import condition
-    from ..fitness import FitnessProfile, check_fitness
+    from ..adapt import scale
+    from ..fitness import FitnessProfile, check_dropped, check_fitness
     from ..frame import ModelFrame
     from ..level import FROZEN_AFTER, MountingEstimator
     from ..readers.captures import read_scans
     from ..remission import RemissionMatcher
+    from ..returns import returns
     from ..sensor import get_sensor
     from ..zoo import listed
 
@@ -297,22 +309,26 @@ def _scan_rows(
             raise
         damage = str(exc)
     points = first[0]
-    finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-    n_lost = len(points) - len(finite)
+    cleaned, dropped = zip(*(returns(each, sensor) for each in first), strict=True)
+    finite = cleaned[0][~np.isnan(cleaned[0][:, 0])].astype(np.float64)
     document: dict[str, Any] = {
         "scan": str(path),
         "n_points": len(points),
-        "n_not_finite": n_lost,
+        "n_not_finite": dropped[0].not_finite,
+        "n_too_near": dropped[0].too_near,
+        "n_ego": dropped[0].ego,
         "sensor": sensor.name,
         "sensor_from": because,
     }
     rows = [
         ("scan", str(path)),
-        ("points", f"{len(points):,}, of which {n_lost:,} are not finite"),
+        ("points", f"{len(points):,}, of which {_dropped_text(dropped[0], sensor)}"),
         ("sensor", f"{sensor.name}: {because}"),
     ]
     if damage:
         rows.append(("damage", f"after {len(first)} scans: {damage}"))
+    unit = check_dropped(points, dropped[0], sensor)
+    rows += [("unit", sentence) for sentence in unit]
     if not len(finite):
         return rows, document
     flat = np.hypot(finite[:, 0], finite[:, 1])
@@ -331,13 +347,13 @@ def _scan_rows(
         ("remission", "min {:g}, 5 % {:g}, median {:g}, 95 % {:g}, max {:g}".format(*measured["remission"])),
     ]
     matcher, used, said = RemissionMatcher(sensor), sensor, list[str]()
-    for each in first:
+    for each in cleaned:
         matcher, used, more = matcher.add(each)
         said += more
     if used.remission is not None:
         how = "" if used is sensor else f", {used.remission.source}"
         rows.append(("", f"mapped to that of the {used.remission.to} by a {used.remission.kind}{how}"))
-    conditioned = [condition(each, used)[0] for each in first]
+    conditioned = [scale(each, used)[0] for each in cleaned]
     own, reason = _estimated(MountingEstimator(sensor.mounting), conditioned)
     estimators[sensor] = _estimated(estimators[sensor], conditioned)[0] if sensor in estimators else own
     try:
@@ -359,7 +375,7 @@ def _scan_rows(
             findings[card.name] = None
             rows.append((card.name, "its card does not describe its training scans"))
             continue
-        found = (*check_fitness(scan, FitnessProfile.from_dict(card.fitness), used), *said)
+        found = (*unit, *check_fitness(scan, FitnessProfile.from_dict(card.fitness), used), *said)
         findings[card.name] = list(found)
         rows += [(card.name, f"as a scan of {sensor.name}: {sentence}") for sentence in found]
         if not found:

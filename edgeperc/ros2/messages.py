@@ -330,7 +330,9 @@ class RosMessages:
             found = scan.perception
             level = _LEVELS[scan.health] if level is None else level
             message = message or scan.health or "OK"
-            listed |= {"points": found.n_points, "points not finite": found.n_dropped, "boxes": len(found.boxes)}
+            listed |= {"points": found.n_points, "points not finite": found.dropped.not_finite}
+            listed |= {"points too near": found.dropped.too_near, "points of the own vehicle": found.dropped.ego}
+            listed |= {"boxes": len(found.boxes)}
             if scan.tracks is not None:
                 listed["tracks"] = len(scan.tracks)
             if found.top_view is not None:
