@@ -1,8 +1,9 @@
 """Prepare scans for the networks: remission in 0..1, gaps of a coarser sensor filled (KUL-Seg 5).
 
-`condition` prepares every scan: rows that are not returns are dropped, and remission is scaled. If the sensor's profile has a remission function, `render` converts the remission to
-that of the sensor that the models were trained on. `Interpolator` fills the pixels between neighboring beams and
-columns of a coarser sensor. Only the network sees the interpolated points; the results do not contain them.
+`condition` prepares every scan: rows that are not returns are dropped, and remission is scaled. If the sensor's profile
+has a remission function, `render` converts the remission to that of the sensor that the models were trained on.
+`Interpolator` fills the pixels between neighboring beams and columns of a coarser sensor. Only the network sees the
+interpolated points; the results do not contain them.
 """
 
 from __future__ import annotations

@@ -308,8 +308,8 @@ class Perception:
         dict
             ``stamp_s``, ``n_points``, ``n_dropped``, ``dropped`` (by kind), ``stage_ms``, ``providers``, ``boxes``
             (`Box.to_dict`), ``drivable_area_m2``, ``point_counts``, ``fitness``, ``mounting``, ``remission`` and
-            ``image`` (`ImageLabels.to_dict`). Every key is always present; its value is None if no model of that kind ran, or if
-            remission was only scaled.
+            ``image`` (`ImageLabels.to_dict`). Every key is always present; its value is None if no model of that kind
+            ran, or if remission was only scaled.
         """
         return {
             "stamp_s": self.stamp_s,

@@ -55,10 +55,11 @@ def blank_too_near(points: NDArray[np.float32], min_range_m: float) -> NDArray[n
 def about_too_near(dropped: DroppedPoints, n_points: int, sensor: SensorProfile) -> str:
     """A sentence about the rows that are too near: how many, what they are, what was done, how to change it."""
     return (
-        f"{dropped.too_near:,} of {n_points:,} points of the scan lie at most {sensor.min_range_m:g} m from the sensor, "
-        f"nearer than the profile {sensor.name} says it measures: beams without a return, such as (0, 0, 0). Here and in "
-        "later scans, such points are labeled 0, counted in perception.dropped, and otherwise ignored. If they are true "
-        "returns, pass sensor= a profile with a smaller min_range_m, such as dataclasses.replace(profile, min_range_m=0)."
+        f"{dropped.too_near:,} of {n_points:,} points of the scan lie at most {sensor.min_range_m:g} m from "
+        f"the sensor: nearer than the profile {sensor.name} says that it measures. They are beams without a return, such as "
+        "(0, 0, 0). In this and later scans, such points are labeled 0, counted in perception.dropped, and otherwise "
+        "ignored. If they are true returns, pass sensor= a profile with a smaller min_range_m, such as "
+        "dataclasses.replace(profile, min_range_m=0)."
     )
 
 
@@ -84,7 +85,7 @@ def mark_dropped(
     box: NDArray[np.float64],
     kind: NDArray[np.uint8],
 ) -> tuple[int, int, int]:
-    """Write the kind of each row (n,), overwritten: 0 kept, 1 to 3 dropped; return how many are not finite, too near and of the own vehicle.
+    """Write the kind of each row (n,): 0 kept, 1 not finite, 2 too near, 3 ego; return how many are of 1, 2 and 3.
 
     ``square`` is that of the nearest range [m2] about ``origin`` (3,); ``box`` (3, 2) has lowest and highest x, y, z
     about it.

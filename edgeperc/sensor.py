@@ -21,8 +21,8 @@ from .mounting import MODEL_HEIGHT_M, UNKNOWN_MOUNTING, Mounting
 __all__ = ["REMISSION_KINDS", "SENSORS", "RemissionFunction", "SensorProfile", "get_sensor"]
 
 SCHEMA = 2  # of a sensor profile's file
-# Of a profile that states none. Empty beams of real recordings lie up to 0.45 m from the sensor, and the sensors that are
-# built in measure from 0.05 to 1 m on.
+# Of a profile that states none. Empty beams of real recordings lie up to 0.45 m from the sensor, and the built-in
+# sensors measure from 0.05 to 1 m on.
 MIN_RANGE_M = 0.5
 MAX_EGO_M = 100.0
 

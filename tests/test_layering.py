@@ -29,7 +29,7 @@ FLOORS = {
         blocks calibration frame geometry linkage outline persons returns
         adapt cluster decode drivable fitness ground image motion observed projection refine sensor_fit session
         crop voting
-        agreement level network_input occupancy painting remission
+        agreement ego level network_input occupancy painting remission
         cells
         combine first_start
         readers.__init__ readers.times

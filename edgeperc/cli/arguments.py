@@ -115,7 +115,7 @@ def add_sensor(group: Any, *, required: bool = False, of_capture: bool = False) 
 
 
 def add_mounting(group: Any) -> None:
-    """Add ``--mount-height``, ``--turn``, ``--extrinsic``, ``--ego-box``; `edgeperc.cli.scans.with_mounting` reads them."""
+    """Add options of the mounting and ``--ego-box``; `edgeperc.cli.scans.with_mounting` reads them."""
     group.add_argument(
         "--mount-height",
         type=finite_number,

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "info_command"]
 
 _WIDTH = 100  # characters of a line, with its name
+_MOST_SCANS = 300  # to look for the own vehicle in
 _LINES = 2  # lines of a row; --json prints everything
 
 
@@ -50,6 +51,7 @@ def add_parser(commands: Commands) -> None:
             "edgeperc info 000123.bin",
             "edgeperc info drive.pcap",
             "edgeperc info velodyne/*.bin --write my-sensor.json",
+            "edgeperc info drive.pcap --suggest-ego-box",
             "edgeperc info pointseg:int8 --json",
             "edgeperc info street.jpg",
         ],
@@ -65,6 +67,12 @@ def add_parser(commands: Commands) -> None:
     add_sensor(reading, of_capture=True)
     add_mounting(reading)
     add_topic(reading)
+    reading.add_argument(
+        "--suggest-ego-box",
+        action="store_true",
+        help=f"suggest --ego-box: returns near the sensor that never move in up to {_MOST_SCANS} scans of a drive, while "
+        "the street does; look at it before you use it (default: no)",
+    )
     output = parser.add_argument_group("output")
     output.add_argument(
         "--json",
@@ -91,6 +99,7 @@ def info_command(arguments: argparse.Namespace) -> int:
     if arguments.write is not None and arguments.write.suffix != ".json":
         arguments.usage_error(f"--write {arguments.write}: expected a name that ends in .json")
     estimators: dict[SensorProfile, MountingEstimator] = {}
+    scans: list[Path] = []
     n_failed = n_printed = 0
     for thing in arguments.things:
         try:
@@ -101,6 +110,7 @@ def info_command(arguments: argparse.Namespace) -> int:
                 rows, document = _image_rows(Path(thing))
             else:
                 rows, document = _scan_rows(Path(thing), arguments, estimators)
+                scans.append(Path(thing))
         except MissingExtraError:
             raise
         except EdgepercError as exc:
@@ -115,6 +125,8 @@ def info_command(arguments: argparse.Namespace) -> int:
             print_rows(_folded(rows))
         n_printed += 1
     n_failed += _mounting_of_all(arguments, estimators)
+    if arguments.suggest_ego_box:
+        n_failed += _suggest_ego_box(arguments, scans, estimators)
     return 1 if n_failed else 0
 
 
@@ -138,6 +150,41 @@ def _mounting_of_all(arguments: argparse.Namespace, estimators: Mapping[SensorPr
     write_atomic(arguments.write, (profile.to_json() + "\n").encode())
     if not arguments.json:
         print_rows([("written", f"{arguments.write}: pass it as --sensor")])
+    return False
+
+
+def _suggest_ego_box(
+    arguments: argparse.Namespace, paths: Sequence[Path], estimators: Mapping[SensorProfile, MountingEstimator]
+) -> bool:
+    """Print a box of the own vehicle for ``--ego-box``; whether the scans do not show one."""
+    from ..ego import suggest_ego_box
+    from ..readers.captures import read_scans
+
+    if len(estimators) != 1:
+        print_error(f"--suggest-ego-box: the scans are of {len(estimators)} sensors; expected scans of one")
+        return True
+    ((sensor, estimator),) = estimators.items()
+    scans = (points for path in paths for _, points in read_scans(path, topic=arguments.topic))
+    try:
+        found = suggest_ego_box(islice(scans, _MOST_SCANS), sensor, estimator.mounting())
+    except EdgepercError as exc:
+        print_error(f"--suggest-ego-box: {exc}")
+        return True
+    if arguments.json:
+        print_line(json.dumps({"sensor": sensor.name, "suggested_ego_box": found.box, "n_places": found.n_places}))
+    elif found.box is None:
+        print_rows([("own vehicle", f"in {found.n_places} places, no return near the sensor stays where it is")])
+    else:
+        option = " ".join(f"{value:g}" for axis in found.box for value in axis)
+        print_rows(
+            [
+                (
+                    "own vehicle",
+                    f"returns in {found.n_directions} directions stay in {found.n_places} places: if the box",
+                ),
+                ("", f"holds the own vehicle and nothing else, pass --ego-box {option}"),
+            ]
+        )
     return False
 
 
