@@ -20,8 +20,8 @@ from .sensor import EgoBox, SensorProfile
 
 __all__ = ["EgoSuggestion", "suggest_ego_box"]
 
-# In KITTI's drives with 10 to 43 such places, 7 to 9 directions fulfil all of these, all on the corners of the own roof,
-# as in one scan each of 30 drives. In 77 scans of a traffic jam the vehicle is in 3 places: too few to tell the cars
+# In KITTI's drives with 10 to 43 such places, 7 to 9 directions fulfil all of these, all on corners of the own roof, as
+# in one scan each of 30 drives. In 77 scans of a traffic jam the vehicle is in 3 places: too few to tell the cars
 # beside it, which stand as still as it does, from itself.
 MIN_PLACES = 10
 REACH_M = 3.0  # horizontal
@@ -76,7 +76,8 @@ def suggest_ego_box(scans: Iterable[NDArray[np.float32]], sensor: SensorProfile,
     places: list[frozenset[tuple[int, int]]] = []
     ranges: list[NDArray[np.float64]] = []
     n_scans = 0
-    for n_scans, scan in enumerate(scans, 1):
+    for scan in scans:
+        n_scans += 1
         cleaned = returns(scan, plain, mounting.origin_m)[0]
         cleaned = cleaned[~np.isnan(cleaned[:, 0])]
         moved = frame.move(cleaned)

@@ -556,7 +556,7 @@ def check_dropped(points: NDArray[np.float32], dropped: DroppedPoints, sensor: S
         if not len(scan):
             return ()
         median_m = float(np.median(flat[np.isfinite(flat) & (flat > 0.0)]))
-        street = _measure(np.float32([*[_USUAL_M / median_m] * 3, 1.0]) * scan, (180.0, -180.0))
+        street = _measure(scan * np.array([*[_USUAL_M / median_m] * 3, 1.0], np.float32), (180.0, -180.0))
     # Empty beams are on one ray, or at ranges that show no ground.
     if street is None or street.ground_m is None or street.beams < min(_FEWEST_ROWS, sensor.n_beams):
         return ()

@@ -202,8 +202,9 @@ class SensorProfile:
                 f"the sensor profile has schema {found!r}, this edgeperc reads {SCHEMA}; write it again with edgeperc "
                 "fit-sensor or edgeperc info --write"
             )
-        document.setdefault("ego_box", None)  # profiles of earlier versions have none
-        _check_entries(document, {"schema", *(field.name for field in fields(cls))}, "sensor profile")
+        # Profiles of earlier versions have no box of the own vehicle.
+        names = {field.name for field in fields(cls)} - ({"ego_box"} - document.keys())
+        _check_entries(document, {"schema", *names}, "sensor profile")
         del document["schema"]
         if document["remission"] is not None:
             _check_entries(document["remission"], {field.name for field in fields(RemissionFunction)}, "remission")

@@ -70,8 +70,8 @@ def add_parser(commands: Commands) -> None:
     reading.add_argument(
         "--suggest-ego-box",
         action="store_true",
-        help=f"suggest --ego-box: returns near the sensor that never move in up to {_MOST_SCANS} scans of a drive, while "
-        "the street does; look at it before you use it (default: no)",
+        help=f"suggest --ego-box: returns near the sensor that never move in up to {_MOST_SCANS} scans of a drive, "
+        "while the street does; look at it before you use it (default: no)",
     )
     output = parser.add_argument_group("output")
     output.add_argument(
