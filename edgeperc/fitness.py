@@ -538,7 +538,7 @@ _USUAL_M = 9.0  # median distance in a street
 
 
 def check_dropped(points: NDArray[np.float32], dropped: DroppedPoints, sensor: SensorProfile) -> tuple[Finding, ...]:
-    """Describe a scan of which nearly all is nearer than the sensor measures, if it is a street in another unit.
+    """Describe a scan of which nearly all is nearer than the sensor measures: a street in another unit, or no returns.
 
     Parameters
     ----------
@@ -548,23 +548,32 @@ def check_dropped(points: NDArray[np.float32], dropped: DroppedPoints, sensor: S
         What `edgeperc.returns.returns` dropped of it.
     sensor : SensorProfile
     """
-    if dropped.too_near <= _NEARLY_ALL * (len(points) - dropped.total):
+    n_left = len(points) - dropped.total
+    if dropped.too_near <= _NEARLY_ALL * n_left:
         return ()
     with np.errstate(over="ignore", invalid="ignore"):
-        flat = np.hypot(points[:, 0], points[:, 1])
-        scan = points[np.isfinite(points).all(axis=1) & (flat > 0.0)]
-        if not len(scan):
-            return ()
-        median_m = float(np.median(flat[np.isfinite(flat) & (flat > 0.0)]))
-        street = _measure(scan * np.array([*[_USUAL_M / median_m] * 3, 1.0], np.float32), (180.0, -180.0))
+        flat_m = np.hypot(points[:, 0], points[:, 1])
+        known = np.isfinite(points).all(axis=1) & np.isfinite(flat_m) & (flat_m > 0.0)
+        median_m = float(np.median(flat_m[known])) if known.any() else math.inf
+        factors = np.array([*[_USUAL_M / median_m] * 3, 1.0], np.float32)
+        street = _measure(points[known] * factors, (180.0, -180.0))
     # Empty beams are on one ray, or at ranges that show no ground.
-    if street is None or street.ground_m is None or street.beams < min(_FEWEST_ROWS, sensor.n_beams):
+    if street is not None and street.ground_m is not None and street.beams >= min(_FEWEST_ROWS, sensor.n_beams):
+        return (
+            Finding(
+                f"The median distance is {median_m:.3g}, and {dropped.too_near / len(points):.0%} of the points are "
+                f"nearer than the {sensor.name} measures ({sensor.min_range_m:g} m): the coordinates seem to be in "
+                "another unit; convert them to meters.",
+                True,
+            ),
+        )
+    if n_left:
         return ()
     return (
         Finding(
-            f"The median distance is {median_m:.3g}, and {dropped.too_near / len(points):.0%} of the points are nearer "
-            f"than the {sensor.name} measures ({sensor.min_range_m:g} m): the coordinates seem to be in another unit; "
-            "convert them to meters.",
+            f"The scan holds no return: {dropped.too_near:,} of its {len(points):,} points are at most "
+            f"{sensor.min_range_m:g} m from the sensor, beams without a return. Is the sensor covered, or the profile "
+            f"{sensor.name} another sensor's?",
             True,
         ),
     )

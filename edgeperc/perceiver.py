@@ -540,8 +540,9 @@ class Perceiver:
         if not self._frame.is_identity:
             scan = self._frame.move(scan)
             watch.lap("adapt")
-        fitness = check_profiles(scan, [n.fitness for n in self._networks if n.fitness], profile) if check else ()
-        fitness = (*check_dropped(given, dropped, profile), *fitness) if check else fitness
+        fitness = check_dropped(given, dropped, profile) if check else ()
+        if check and not fitness:
+            fitness = check_profiles(scan, [n.fitness for n in self._networks if n.fitness], profile)
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *hidden)
         if self.on_mismatch != "ignore":
