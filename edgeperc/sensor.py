@@ -203,14 +203,15 @@ class SensorProfile:
                 "fit-sensor or edgeperc info --write"
             )
         # Profiles of earlier versions have no box of the own vehicle.
-        names = {field.name for field in fields(cls)} - ({"ego_box"} - document.keys())
-        _check_entries(document, {"schema", *names}, "sensor profile")
+        box = document.pop("ego_box", None)
+        names = {field.name for field in fields(cls)} - {"ego_box"}
+        _check_entries(document, {"schema", *names}, "sensor profile", optional="ego_box")
         del document["schema"]
         if document["remission"] is not None:
             _check_entries(document["remission"], {field.name for field in fields(RemissionFunction)}, "remission")
             document["remission"] = RemissionFunction(**document["remission"])
         document["mounting"] = Mounting.from_dict(document["mounting"])
-        return cls(**document)
+        return cls(**document, ego_box=box)
 
     @classmethod
     def uniform(
@@ -404,10 +405,11 @@ def _ego_box(name: str, given: object) -> EgoBox:
     return (x_low, x_high), (y_low, y_high), (z_low, z_high)
 
 
-def _check_entries(document: object, names: set[str], what: str) -> None:
+def _check_entries(document: object, names: set[str], what: str, optional: str = "") -> None:
     if not isinstance(document, dict) or set(document) != names:
         found = ", ".join(sorted(map(str, document))) if isinstance(document, dict) else repr(document)
-        raise SensorError(f"a {what} file holds exactly {', '.join(sorted(names))}; got {found}")
+        more = f" (and {optional}, or not)" if optional else ""
+        raise SensorError(f"a {what} file holds exactly {', '.join(sorted(names))}{more}; got {found}")
     numbers = {name: value for name, value in document.items() if name not in ("name", "kind", "to", "source")}
     listed = [v for value in numbers.values() for v in (value if isinstance(value, list) else [value])]
     if any(isinstance(v, (str, bool)) for v in listed):
