@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple, NoReturn, ParamSpec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .adapt import Interpolator, condition, render
+from .adapt import Interpolator, render, scale
 from .agreement import RULES
 from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE, sort_points
@@ -29,7 +29,7 @@ from .decode import decode_boxes, decode_cells, decode_labels
 from .drivable import compile_kernels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
 from .first_start import Helpers, car_and_person, compile_parts
-from .fitness import Finding, FitnessProfile, check_profiles
+from .fitness import Finding, FitnessProfile, check_dropped, check_profiles
 from .frame import ModelFrame, turned
 from .ground import GroundFit, find_ground, fit_ground
 from .image import ImageScaler, as_image, label_pixels
@@ -44,6 +44,7 @@ from .points import as_points
 from .projection import RangeImageProjector, TopViewProjector, make_projector
 from .refine import label_points, remove_outliers
 from .remission import NO_REMISSION, RemissionMatcher
+from .returns import about_too_near, returns
 from .sensor import SensorProfile, get_sensor
 from .session import Session
 from .side_thread import SideThread
@@ -344,9 +345,10 @@ class Perceiver:
         self._sectors = sectors_of_turn(ranged.session.card.view, whole=interpolates) if full_turn and ranged else []
         self._crop = Crop([] if full_turn or interpolates else [n.session.card.view for n in self._networks])
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
+        self._told_of_near = False
         self._beside = SideThread()
         self._locks = {os.getpid(): threading.Lock()}
-        # Compile every kernel here, not in the first call, with an image of one pixel and a scan of two points. The
+        # Compile every kernel here, not in the first call, with an image of one pixel and a scan of three points. The
         # networks have already run on their golden inputs, and those outputs are decoded.
         if self._camera is not None:
             self._camera.label(as_image(np.zeros((1, 1, 3), np.uint8)), Stopwatch(), infer=False)
@@ -355,7 +357,7 @@ class Perceiver:
 
     def _compile(self, views: Sequence[str]) -> None:
         """Compile every kernel of scans."""
-        warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
+        warm_up = np.array([[10, 0, -1, 0], [20, 1, -1, 0], [0, 0, 0, 0]], np.float32)
         labels_points = "range_image" in views
         boxes_points = labels_points and self.boxes_from != "network"
         needed = {
@@ -451,7 +453,8 @@ class Perceiver:
         ----------
         points : (n, 4) or (n, 3) array_like, or a structured array; None without a LiDAR model
             x, y, z [m] about the sensor, z up; remission in the sensor's raw unit. Not modified. Rows that are not
-            finite are counted, labeled 0 and otherwise ignored; an empty scan gives an empty perception.
+            finite, nearer than the sensor measures, or inside its ``ego_box`` are counted (`Perception.dropped`),
+            labeled 0 and otherwise ignored; an empty scan gives an empty perception.
         stamp_s : float or None
             Time of the scan [s], for the tracker; returned in the perception.
         image : (H, W, 3) uint8 array_like; None without a camera model
@@ -485,7 +488,11 @@ class Perceiver:
                 self._to_check -= check
             if pixels is not None and self._camera is not None:
                 perception = replace(perception, image=self._camera.label(pixels, watch))
-        for sentence in perception.fitness:
+            sentences = perception.fitness
+            if perception.dropped.too_near and not self._told_of_near:
+                self._told_of_near = True
+                sentences = (*sentences, about_too_near(perception.dropped, perception.n_points, self.sensor))
+        for sentence in sentences:
             warnings.warn(sentence, stacklevel=2)
         return perception
 
@@ -515,12 +522,14 @@ class Perceiver:
     def _perceive(
         self, scan: NDArray[np.float32], stamp_s: float | None, watch: Stopwatch, check: bool, infer: bool = True
     ) -> Perception:
-        before, matcher, profile = self._estimator, self._remission, self.sensor
+        given, before, matcher, profile = scan, self._estimator, self._remission, self.sensor
         hidden: tuple[Finding, ...] = ()
         matched: tuple[Finding, ...] = ()
+        scan, dropped = returns(given, profile, before.known.origin_m)
         if self._renders:
             self._remission, profile, matched = matcher.add(scan)
-        scan, n_dropped = condition(scan, profile, rendered=self._renders)
+        scan, n_overflowed = scale(scan, profile, rendered=self._renders)
+        dropped = replace(dropped, not_finite=dropped.not_finite + n_overflowed)
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
         if infer and not before.is_complete and len(scan):
             try:
@@ -531,7 +540,9 @@ class Perceiver:
         if not self._frame.is_identity:
             scan = self._frame.move(scan)
             watch.lap("adapt")
-        fitness = check_profiles(scan, [n.fitness for n in self._networks if n.fitness], profile) if check else ()
+        fitness = check_dropped(given, dropped, profile) if check else ()
+        if check and not fitness:
+            fitness = check_profiles(scan, [n.fitness for n in self._networks if n.fitness], profile)
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *hidden)
         if self.on_mismatch != "ignore":
@@ -590,7 +601,7 @@ class Perceiver:
             top_view = cells()
         return Perception(
             n_points=len(scan),
-            n_dropped=n_dropped,
+            n_dropped=dropped.total,
             points=None if points is None else spread([(points, rows)], len(scan)),
             top_view=top_view,
             boxes=self._frame.boxes_back(boxes),
@@ -600,6 +611,7 @@ class Perceiver:
             stamp_s=stamp_s,
             mounting=self._mounting,
             remission=profile.remission if self._renders else None,
+            dropped=dropped,
         )
 
     def _network_of(self, kind: type) -> _Network | None:

@@ -28,10 +28,10 @@ FLOORS = {
         extras mounting onnx_file
         card engine points remote sensor tuning
         kernel_cache perception zoo.__init__
-        blocks calibration frame geometry linkage outline persons
+        blocks calibration frame geometry linkage outline persons returns
         adapt cluster decode drivable fitness ground image motion observed projection refine sensor_fit session
         crop voting
-        agreement level network_input occupancy painting remission
+        agreement ego level network_input occupancy painting remission
         cells
         combine first_start
         readers.__init__ readers.times
