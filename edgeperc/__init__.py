@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from .occupancy import OccupancyGrid, occupancy_grid
     from .painting import camera_road, paint
     from .perceiver import Perceiver
-    from .perception import Box, ImageLabels, Perception, PointLabels, TopView
+    from .perception import Box, DroppedPoints, ImageLabels, Perception, PointLabels, TopView
     from .readers.captures import read_scans, read_timed_scans, sensor_of
     from .readers.files import read_points
     from .readers.images import read_image
@@ -76,6 +76,7 @@ __all__ = [
     "CardError",
     "CardMismatchError",
     "Crossing",
+    "DroppedPoints",
     "EdgepercError",
     "FitnessError",
     "ImageError",
@@ -153,6 +154,7 @@ _MODULES = {
     "OccupancyGrid": "occupancy",
     "Perceiver": "perceiver",
     "Perception": "perception",
+    "DroppedPoints": "perception",
     "PointLabels": "perception",
     "ProviderInfo": "listing",
     "RoadAhead": "drivable",

@@ -1,8 +1,9 @@
 """Prepare scans for the networks: remission in 0..1, gaps of a coarser sensor filled (KUL-Seg 5).
 
-`condition` prepares every scan. If the sensor's profile has a remission function, `render` converts the remission to
-that of the sensor that the models were trained on. `Interpolator` fills the pixels between neighboring beams and
-columns of a coarser sensor. Only the network sees the interpolated points; the results do not contain them.
+`condition` prepares every scan: rows that are not returns are dropped, and remission is scaled. If the sensor's profile
+has a remission function, `render` converts the remission to that of the sensor that the models were trained on.
+`Interpolator` fills the pixels between neighboring beams and columns of a coarser sensor. Only the network sees the
+interpolated points; the results do not contain them.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ from .errors import PointsError, SensorError
 from .kernel_cache import njit
 from .mounting import MODEL_HEIGHT_M
 from .points import as_points, read_only
+from .returns import returns
 from .sensor import SensorProfile
 
-__all__ = ["Interpolator", "condition", "render"]
+__all__ = ["Interpolator", "condition", "render", "scale"]
 
 KIND_CODES = {"linear": 0, "polynomial": 1, "logarithm": 2, "power": 3}
 
@@ -33,41 +35,62 @@ def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True
     points : array_like
         A scan, as for `edgeperc.points.as_points`; remission in the sensor's raw unit. Not modified.
     sensor : SensorProfile
-        Its ``remission_range`` scales remission to 0..1.
+        Rows that are not returns of the world are dropped (`edgeperc.returns.returns`), and remission is scaled to 0..1
+        (`scale`).
     rendered : bool
         Convert the remission with ``sensor.remission`` (`render`), if the profile has a function.
 
     Returns
     -------
     scan : (n, 4) float32, C-contiguous, read-only
-        x, y, z [m], remission in 0..1, in input order. Rows with a non-finite value are NaN in all four columns. A
-        view of ``points`` if nothing had to be changed.
+        x, y, z [m], remission in 0..1, in input order. Dropped rows are NaN in all four columns. A view of ``points``
+        if nothing had to be changed.
     n_dropped : int
-        Number of rows with a non-finite value.
+        Number of dropped rows, those whose scaled remission is not finite included.
 
     Raises
     ------
     PointsError
         ``points`` is not a scan.
     """
-    given = scan = as_points(points)
+    scan, dropped = returns(as_points(points), sensor)
+    scan, n_overflowed = scale(scan, sensor, rendered=rendered)
+    return scan, dropped.total + n_overflowed
+
+
+def scale(
+    points: NDArray[np.float32], sensor: SensorProfile, *, rendered: bool = True
+) -> tuple[NDArray[np.float32], int]:
+    """Scale the remission of a scan, whose rows are finite or NaN, to 0..1.
+
+    Parameters
+    ----------
+    points : (n, 4) float32
+        From `edgeperc.returns.returns`. Not modified.
+    sensor : SensorProfile
+    rendered : bool
+        As in `condition`.
+
+    Returns
+    -------
+    scan : (n, 4) float32, C-contiguous, read-only
+        A view of ``points`` if nothing had to be changed.
+    n_overflowed : int
+        Number of rows that became NaN because their scaled remission is not finite.
+    """
     if rendered and sensor.remission is not None:
-        scan = render(given, sensor)
-    else:
-        offset, scale = np.float32(sensor.remission_offset), np.float32(sensor.remission_scale)
-        if (offset, scale) != (0.0, 1.0):
-            scan = given.copy()
-            with np.errstate(over="ignore", invalid="ignore"):
-                scan[:, 3] = (scan[:, 3] + offset) * scale
-    finite = np.isfinite(scan)
-    n_dropped = 0
-    # First the whole array: all(axis=1) takes ten times as long, and nearly every scan is entirely finite.
-    if not finite.all():
-        dropped = ~finite.all(axis=1)
-        n_dropped = int(np.count_nonzero(dropped))
-        scan = given.copy() if scan is given else scan
-        scan[dropped] = np.nan
-    return read_only(scan), n_dropped
+        return read_only(render(points, sensor)), 0
+    offset, factor = np.float32(sensor.remission_offset), np.float32(sensor.remission_scale)
+    if (offset, factor) == (0.0, 1.0):
+        return read_only(points), 0
+    scan = points.copy()
+    with np.errstate(over="ignore", invalid="ignore"):
+        scan[:, 3] = (scan[:, 3] + offset) * factor
+    overflowed = np.isinf(scan[:, 3])
+    n_overflowed = int(np.count_nonzero(overflowed))
+    if n_overflowed:
+        scan[overflowed] = np.nan
+    return read_only(scan), n_overflowed
 
 
 def render(points: NDArray[np.float32], sensor: SensorProfile) -> NDArray[np.float32]:

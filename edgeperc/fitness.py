@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from .errors import CardError, PointsError
 from .kernel_cache import njit
+from .perception import DroppedPoints
 from .points import read_only
 from .sensor import SensorProfile
 
-__all__ = ["Finding", "FitnessProfile", "check_fitness", "check_profiles", "fill_scan_sums"]
+__all__ = ["Finding", "FitnessProfile", "check_dropped", "check_fitness", "check_profiles", "fill_scan_sums"]
 
 # About 6,000 points are enough. Steps are prime, so that they do not align with the rows of an organized scan.
 _STEPS = np.array([1, 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 53, 61, 71, 83, 97, 127, 167, 223, 307, 401])
@@ -529,6 +530,52 @@ def _too_few(scan: _Measures, profile: FitnessProfile) -> Finding:
         f"The model's view holds about {scan.points_in_view:.0f} points, in training it held at least {fewest:.0f}: is "
         "the scan complete, and the sensor clean?",
         scan.points_in_view < fewest / 20.0,
+    )
+
+
+_NEARLY_ALL = 10  # near points for each that is left; also empty beams may be more than the returns
+_USUAL_M = 9.0  # median distance in a street
+
+
+def check_dropped(points: NDArray[np.float32], dropped: DroppedPoints, sensor: SensorProfile) -> tuple[Finding, ...]:
+    """Describe a scan of which nearly all is nearer than the sensor measures: a street in another unit, or no returns.
+
+    Parameters
+    ----------
+    points : (n, 4) float32
+        The scan before anything was dropped.
+    dropped : DroppedPoints
+        What `edgeperc.returns.returns` dropped of it.
+    sensor : SensorProfile
+    """
+    n_left = len(points) - dropped.total
+    if dropped.too_near <= _NEARLY_ALL * n_left:
+        return ()
+    with np.errstate(over="ignore", invalid="ignore"):
+        flat_m = np.hypot(points[:, 0], points[:, 1])
+        known = np.isfinite(points).all(axis=1) & np.isfinite(flat_m) & (flat_m > 0.0)
+        median_m = float(np.median(flat_m[known])) if known.any() else math.inf
+        factors = np.array([*[_USUAL_M / median_m] * 3, 1.0], np.float32)
+        street = _measure(points[known] * factors, (180.0, -180.0))
+    # Empty beams are on one ray, or at ranges that show no ground.
+    if street is not None and street.ground_m is not None and street.beams >= min(_FEWEST_ROWS, sensor.n_beams):
+        return (
+            Finding(
+                f"The median distance is {median_m:.3g}, and {dropped.too_near / len(points):.0%} of the points are "
+                f"nearer than the {sensor.name} measures ({sensor.min_range_m:g} m): the coordinates seem to be in "
+                "another unit; convert them to meters.",
+                True,
+            ),
+        )
+    if n_left:
+        return ()
+    return (
+        Finding(
+            f"The scan holds no return: {dropped.too_near:,} of its {len(points):,} points are at most "
+            f"{sensor.min_range_m:g} m from the sensor, beams without a return. Is the sensor covered, or the profile "
+            f"{sensor.name} another sensor's?",
+            True,
+        ),
     )
 
 

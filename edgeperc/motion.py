@@ -16,6 +16,7 @@ from .errors import EdgepercError, OptionError, PointsError, SensorError, StampE
 from .frame import fill_moved
 from .kernel_cache import njit
 from .points import as_points, read_only
+from .returns import blank_too_near
 
 __all__ = ["Motion", "Trajectory", "deskew", "fill_deskewed", "merge"]
 
@@ -202,7 +203,9 @@ class Trajectory:
         )
 
 
-def deskew(points: ArrayLike, times: ArrayLike, motion: Motion, *, at_s: float | None = None) -> NDArray[np.float32]:
+def deskew(
+    points: ArrayLike, times: ArrayLike, motion: Motion, *, at_s: float | None = None, min_range_m: float = 0.0
+) -> NDArray[np.float32]:
     """Move each point of a scan to where a sensor that stands still would have seen it.
 
     A spinning sensor takes about 0.1 s for a scan. At 20 m/s it moves by 2 m in this time.
@@ -217,11 +220,15 @@ def deskew(points: ArrayLike, times: ArrayLike, motion: Motion, *, at_s: float |
         Of the sensor, constant during the scan.
     at_s : float, optional
         Time of the pose in whose frame the result lies, on the same clock; by default the last time.
+    min_range_m : float
+        Points at most so far from the sensor are not returns, but beams without one [m]
+        (`SensorProfile.min_range_m`). With 0, those at (0, 0, 0) are.
 
     Returns
     -------
     (n, 4) float32
-        In input order. Points or times that are not finite give points that are not finite.
+        In input order. Points or times that are not finite give points that are not finite. Beams without a return stay
+        as they are, so that the result still shows which they are.
 
     Raises
     ------
@@ -230,7 +237,7 @@ def deskew(points: ArrayLike, times: ArrayLike, motion: Motion, *, at_s: float |
     StampError
         ``at_s`` is not finite.
     OptionError
-        ``motion`` is not a `Motion`.
+        ``motion`` is not a `Motion`, or ``min_range_m`` is not a number of meters from 0.
 
     Notes
     -----
@@ -238,6 +245,7 @@ def deskew(points: ArrayLike, times: ArrayLike, motion: Motion, *, at_s: float |
     the exponential of both times the time from ``at_s``. Objects that move themselves stay distorted.
     """
     rows = as_points(points)
+    seen = blank_too_near(rows, _meters(min_range_m))
     try:
         moments: NDArray[np.float64] = np.array(times, np.float64)
     except (OverflowError, TypeError, ValueError) as exc:
@@ -252,16 +260,21 @@ def deskew(points: ArrayLike, times: ArrayLike, motion: Motion, *, at_s: float |
         raise StampError(f"at_s is {at_s}; expected finite seconds")
     moved = np.empty(rows.shape, np.float32)
     fill_deskewed(
-        read_only(rows),
+        seen,
         read_only(moments - at, np.float64),
         np.array(motion.velocity_mps),
         np.array(motion.rate_radps),
         moved,
     )
+    if not np.shares_memory(seen, rows):
+        blank = np.isnan(seen[:, 0])
+        moved[blank] = rows[blank]
     return moved
 
 
-def merge(scans: Sequence[ArrayLike], T_vehicle_sensor: Sequence[ArrayLike]) -> NDArray[np.float32]:
+def merge(
+    scans: Sequence[ArrayLike], T_vehicle_sensor: Sequence[ArrayLike], *, min_range_m: float | Sequence[float] = 0.0
+) -> NDArray[np.float32]:
     """Join the scans of several sensors to one scan in the frame of the vehicle.
 
     Parameters
@@ -270,11 +283,14 @@ def merge(scans: Sequence[ArrayLike], T_vehicle_sensor: Sequence[ArrayLike]) -> 
         Taken at the same time, each in the frame of its sensor. `deskew` moves scans to one time.
     T_vehicle_sensor : sequence of (4, 4) array_like
         Pose of each sensor: maps its points to the frame of the vehicle, whose z is 0 on the road.
+    min_range_m : float or sequence of float
+        Nearest range of the sensors, or of each [m]; as in `deskew`. In the merged scan, it can no longer be told.
 
     Returns
     -------
     (n, 4) float32
-        The points of the first scan, then those of the second, and so on, with their own remission.
+        The points of the first scan, then those of the second, and so on, with their own remission. Beams without a
+        return are NaN.
 
     Raises
     ------
@@ -282,20 +298,35 @@ def merge(scans: Sequence[ArrayLike], T_vehicle_sensor: Sequence[ArrayLike]) -> 
         A scan is not points, or there is no scan.
     SensorError
         There is not one pose for each scan, or one is not a rotation and a translation.
+    OptionError
+        ``min_range_m`` is not one number of meters from 0, or one for each scan.
     """
     rows = [as_points(scan) for scan in scans]
     if not rows:
         raise PointsError("got no scan; expected at least one")
     if len(T_vehicle_sensor) != len(rows):
         raise SensorError(f"got {len(T_vehicle_sensor)} poses for {len(rows)} scans; expected one for each")
+    ranges_m = [min_range_m] * len(rows) if not isinstance(min_range_m, Sequence) else list(min_range_m)
+    if len(ranges_m) != len(rows):
+        raise OptionError(f"got {len(ranges_m)} values of min_range_m for {len(rows)} scans; expected one for each")
     merged = np.empty((sum(map(len, rows)), 4), np.float32)
     begin = 0
-    for k, (scan, given) in enumerate(zip(rows, T_vehicle_sensor, strict=True)):
+    for k, (scan, given, range_m) in enumerate(zip(rows, T_vehicle_sensor, ranges_m, strict=True)):
         pose = _rigid(f"T_vehicle_sensor[{k}]", given, SensorError)
         R, t = np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy()
-        fill_moved(read_only(scan), R, t, merged[begin : begin + len(scan)])
+        fill_moved(blank_too_near(scan, _meters(range_m)), R, t, merged[begin : begin + len(scan)])
         begin += len(scan)
     return merged
+
+
+def _meters(min_range_m: float) -> float:
+    try:
+        meters = float(min_range_m)
+    except (OverflowError, TypeError, ValueError):
+        meters = math.nan
+    if not 0.0 <= meters < math.inf:
+        raise OptionError(f"min_range_m is {min_range_m!r:.80}; expected meters from 0")
+    return meters
 
 
 def _rigid(name: str, given: ArrayLike, error: type[EdgepercError]) -> NDArray[np.float64]:

@@ -22,6 +22,7 @@ from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .observed import OVERHEAD_M, Observer
 from .perception import Perception, TopView
 from .points import as_points, read_only
+from .returns import returns
 from .sensor import SensorProfile, get_sensor
 
 __all__ = ["OccupancyGrid", "fill_standing", "occupancy_grid"]
@@ -200,7 +201,8 @@ def occupancy_grid(
     min_height_m : float
         Returns up to this height above the ground are no obstacles [m]. A kerb is 0.1 to 0.2 m high.
     sensor : str, Path or SensorProfile
-        As passed to `Perceiver`: its beams tell which ground was observed between two returns.
+        As passed to `Perceiver`: its beams tell which ground was observed between two returns, and its nearest range
+        and ``ego_box`` which points are not returns.
 
     Returns
     -------
@@ -245,7 +247,7 @@ def occupancy_grid(
         ) from exc
     profile = get_sensor(sensor)
     frame = ModelFrame(perception.mounting)
-    moved = read_only(frame.move(rows))
+    moved = read_only(frame.move(returns(rows, profile, perception.mounting.origin_m)[0]))
     ground = find_ground(moved, mount_height_m=MODEL_HEIGHT_M)
 
     shape = (view.height, view.width)

@@ -23,6 +23,7 @@ from .kernel_cache import njit
 from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .perception import ImageLabels, Perception, TopView
 from .points import read_only
+from .returns import returns
 from .sensor import SensorProfile, get_sensor
 
 __all__ = ["UNSEEN", "camera_road", "fill_nearest", "fill_painted", "paint"]
@@ -69,7 +70,8 @@ def paint(
     -------
     (n,) uint8
         Class of each point, in input order, as in the image; 255 (`UNSEEN`) for points that are out of the image,
-        hidden from the camera, not finite, or on a pixel without a class. The same for any order of the points.
+        hidden from the camera, dropped (`edgeperc.returns.returns`), or on a pixel without a class. The same for any
+        order of the points.
 
     Raises
     ------
@@ -194,8 +196,11 @@ def _hidden_by(
     if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
         raise PointsError(f"got {_described(points)} for points; expected an array (n, 3 or more): x, y, z")
     with np.errstate(over="ignore", invalid="ignore"):
-        rows: NDArray[np.float32] = read_only(points)
-        frame = ModelFrame(_mounting_of(image, mounting))
+        known = _mounting_of(image, mounting)
+        scan = np.zeros((len(points), 4), np.float32)
+        scan[:, :3] = points[:, :3]
+        rows, _ = returns(scan, sensor, known.origin_m)
+        frame = ModelFrame(known)
         moved = rows[:, :3].astype(np.float64) @ frame.R.T + frame.t
         cells = np.empty((0 if places is None else len(places), 3))
         if places is not None:

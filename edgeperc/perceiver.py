@@ -17,12 +17,12 @@ from typing import Literal, NamedTuple, NoReturn, ParamSpec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .adapt import Interpolator, condition
+from .adapt import Interpolator, scale
 from .agreement import RULES
 from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
-from .fitness import Finding, FitnessProfile, check_profiles
+from .fitness import Finding, FitnessProfile, check_dropped, check_profiles
 from .frame import ModelFrame
 from .image import ImageScaler, as_image, label_pixels
 from .lanes import Lanes, Stopwatch
@@ -32,6 +32,7 @@ from .perception import ImageLabels, Perception
 from .pipeline import BoxesFrom, Options, Pipeline, RangeImageNetwork, TopViewNetwork
 from .points import as_points
 from .remission import RemissionMatcher
+from .returns import about_too_near, returns
 from .sensor import SensorProfile, get_sensor
 from .session import Session
 from .warm_up import Rehearsed, warm_up
@@ -299,6 +300,7 @@ class Perceiver:
         self.providers = MappingProxyType({s.card.name: s.description for s in self.sessions})
         self._fitness = [FitnessProfile.from_dict(card.fitness) for card in self.cards if card.fitness is not None]
         self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
+        self._told_of_near = False
         self._locks = {os.getpid(): threading.Lock()}
         self._lanes = Lanes(2 if at_once == 2 and all(session.shares_cores for session in self.sessions) else 1)
         self._pipeline = self._assemble()
@@ -393,7 +395,8 @@ class Perceiver:
         ----------
         points : (n, 4) or (n, 3) array_like, or a structured array; None without a LiDAR model
             x, y, z [m] about the sensor, z up; remission in the sensor's raw unit. Not modified. Rows that are not
-            finite are counted, labeled 0 and otherwise ignored; an empty scan gives an empty perception.
+            finite, nearer than the sensor measures, or inside its ``ego_box`` are counted (`Perception.dropped`),
+            labeled 0 and otherwise ignored; an empty scan gives an empty perception.
         stamp_s : float or None
             Time of the scan [s], for the tracker; returned in the perception.
         image : (H, W, 3) uint8 array_like; None without a camera model
@@ -423,7 +426,11 @@ class Perceiver:
                 self._to_check -= check
             if pixels is not None and self._camera is not None:
                 perception = replace(perception, image=self._camera.label(pixels, watch))
-        for sentence in perception.fitness:
+            sentences = perception.fitness
+            if perception.dropped.too_near and not self._told_of_near:
+                self._told_of_near = True
+                sentences = (*sentences, about_too_near(perception.dropped, perception.n_points, self.sensor))
+        for sentence in sentences:
             warnings.warn(sentence, stacklevel=2)
         return perception
 
@@ -451,12 +458,14 @@ class Perceiver:
         return Perception(0, 0, None, None, (), MappingProxyType(watch.ms), self.providers, (), stamp_s)
 
     def _perceive(self, scan: NDArray[np.float32], stamp_s: float | None, watch: Stopwatch, check: bool) -> Perception:
-        before, matcher, profile = self._estimator, self._remission, self.sensor
+        given, before, matcher, profile = scan, self._estimator, self._remission, self.sensor
         hidden: tuple[Finding, ...] = ()
         matched: tuple[Finding, ...] = ()
+        scan, dropped = returns(given, profile, before.known.origin_m)
         if self._renders:
             self._remission, profile, matched = matcher.add(scan)
-        scan, n_dropped = condition(scan, profile, rendered=self._renders)
+        scan, n_overflowed = scale(scan, profile, rendered=self._renders)
+        dropped = replace(dropped, not_finite=dropped.not_finite + n_overflowed)
         watch.lap("adapt" if self._renders and profile.remission is not None else "check")
         if not before.is_complete and len(scan):
             try:
@@ -467,7 +476,9 @@ class Perceiver:
         if not self._frame.is_identity:
             scan = self._frame.move(scan)
             watch.lap("adapt")
-        fitness = check_profiles(scan, self._fitness, profile) if check else ()
+        fitness = check_dropped(given, dropped, profile) if check else ()
+        if check and not fitness:
+            fitness = check_profiles(scan, self._fitness, profile)
         if check and not any(finding.gross for finding in fitness):
             fitness = (*fitness, *hidden)
         if self.on_mismatch != "ignore":
@@ -484,7 +495,7 @@ class Perceiver:
         parts = self._pipeline(scan, self._mounting, watch)
         return Perception(
             n_points=len(scan),
-            n_dropped=n_dropped,
+            n_dropped=dropped.total,
             points=parts.points,
             top_view=parts.top_view,
             boxes=self._frame.boxes_back(parts.boxes),
@@ -494,6 +505,7 @@ class Perceiver:
             stamp_s=stamp_s,
             mounting=self._mounting,
             remission=profile.remission if self._renders else None,
+            dropped=dropped,
         )
 
     def _without_ground(self, reason: MountingError) -> tuple[Finding, ...]:

@@ -14,7 +14,7 @@ from .errors import PointsError
 from .mounting import MODEL_MOUNTING, Mounting
 from .sensor import RemissionFunction
 
-__all__ = ["Box", "ImageLabels", "Perception", "PointLabels", "TopView"]
+__all__ = ["Box", "DroppedPoints", "ImageLabels", "Perception", "PointLabels", "TopView"]
 
 _PART = 2**20
 ROADS = ("drivable", "road")  # names of classes of an image on which a vehicle may drive, in lower case
@@ -160,7 +160,7 @@ class PointLabels:
     Attributes
     ----------
     labels : (n,) uint8
-        Index into ``classes``; 0 for points out of the network's view and for points that are not finite.
+        Index into ``classes``; 0 for points out of the network's view and for dropped points (`DroppedPoints`).
     in_view : (n,) bool
         False if the point is out of the network's view; its label 0 is then not a prediction.
     classes : tuple of str
@@ -224,6 +224,30 @@ class ImageLabels:
         }
 
 
+@dataclass(frozen=True, slots=True)
+class DroppedPoints:
+    """Number of input points that are not returns of the world, by kind. Each counts once, as the first of its kinds.
+
+    Attributes
+    ----------
+    not_finite : int
+        A coordinate or the remission is not finite.
+    too_near : int
+        At most the profile's ``min_range_m`` from the sensor: beams without a return, such as (0, 0, 0).
+    ego : int
+        Inside the profile's ``ego_box``: the own vehicle.
+    """
+
+    not_finite: int = 0
+    too_near: int = 0
+    ego: int = 0
+
+    @property
+    def total(self) -> int:
+        """Number of dropped points."""
+        return self.not_finite + self.too_near + self.ego
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Perception:
     """Everything perceived in one scan, in one image, or in both.
@@ -233,7 +257,8 @@ class Perception:
     n_points : int
         Points in the input; 0 without a scan.
     n_dropped : int
-        Input points that are not finite; they are labeled 0 and otherwise ignored.
+        Input points that are not returns of the world: the total of ``dropped``. They are labeled 0, are not in view,
+        and take no part in anything.
     points : PointLabels or None
         From a range-image model; None without one.
     top_view : TopView or None
@@ -257,6 +282,8 @@ class Perception:
         far, or a constant if the scan has no remission; its ``source`` says which. None: remission was only scaled.
     image : ImageLabels or None
         From a camera model; None without one.
+    dropped : DroppedPoints
+        ``n_dropped`` by kind.
     """
 
     n_points: int
@@ -271,6 +298,7 @@ class Perception:
     mounting: Mounting = MODEL_MOUNTING
     remission: RemissionFunction | None = None
     image: ImageLabels | None = None
+    dropped: DroppedPoints = DroppedPoints()
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to a dict for JSON, with the number of points of each class in place of their labels.
@@ -278,15 +306,16 @@ class Perception:
         Returns
         -------
         dict
-            ``stamp_s``, ``n_points``, ``n_dropped``, ``stage_ms``, ``providers``, ``boxes`` (`Box.to_dict`),
-            ``drivable_area_m2``, ``point_counts``, ``fitness``, ``mounting``, ``remission`` and ``image``
-            (`ImageLabels.to_dict`). Every key is always present; its value is None if no model of that kind ran, or if
-            remission was only scaled.
+            ``stamp_s``, ``n_points``, ``n_dropped``, ``dropped`` (by kind), ``stage_ms``, ``providers``, ``boxes``
+            (`Box.to_dict`), ``drivable_area_m2``, ``point_counts``, ``fitness``, ``mounting``, ``remission`` and
+            ``image`` (`ImageLabels.to_dict`). Every key is always present; its value is None if no model of that kind
+            ran, or if remission was only scaled.
         """
         return {
             "stamp_s": self.stamp_s,
             "n_points": self.n_points,
             "n_dropped": self.n_dropped,
+            "dropped": asdict(self.dropped),
             "stage_ms": {name: round(ms, 3) for name, ms in self.stage_ms.items()},
             "providers": dict(self.providers),
             "boxes": [box.to_dict() for box in self.boxes],

@@ -20,6 +20,7 @@ __all__ = ["SCAN_KEYS", "read_boxes", "scan_record"]
 SCAN_KEYS = (
     "n_points",
     "n_dropped",
+    "dropped",
     "stage_ms",
     "providers",
     "boxes",

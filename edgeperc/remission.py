@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .adapt import condition
+from .adapt import scale
 from .errors import SensorError
 from .fitness import Finding
 from .sensor import RemissionFunction, SensorProfile
@@ -102,14 +102,14 @@ class RemissionMatcher:
         Parameters
         ----------
         points : (n, 4) float32
-            x, y, z [m] in the sensor frame, remission in the sensor's raw unit. A scan whose remission is out of the
-            profile's range, or in another unit, or that has too few points, is not used.
+            From `edgeperc.returns.returns`: x, y, z [m] in the sensor frame, remission in the sensor's raw unit. A scan
+            whose remission is out of the profile's range, or in another unit, or that has too few points, is not used.
 
         Returns
         -------
         matcher : RemissionMatcher
         sensor : SensorProfile
-            With the function for this scan, for `edgeperc.adapt.condition`.
+            With the function for this scan, for `edgeperc.adapt.scale` or `edgeperc.adapt.condition`.
         findings : tuple of Finding
             A sentence when the remission is missing for the first time, and when a function is matched for the first
             time; neither is gross.
@@ -199,7 +199,7 @@ def _difference(raw: NDArray[np.float64], wanted: NDArray[np.float64], sensor: S
     """Mean difference between converted quantiles and the training sensor's."""
     points = np.zeros((len(raw), 4), np.float32)
     points[:, 3] = raw
-    return float(np.abs(condition(points, sensor)[0][:, 3] - wanted).mean())
+    return float(np.abs(scale(points, sensor)[0][:, 3] - wanted).mean())
 
 
 def is_missing(points: NDArray[np.float32]) -> bool:

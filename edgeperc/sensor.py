@@ -10,8 +10,10 @@ from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import SensorError
 from .mounting import MODEL_HEIGHT_M, UNKNOWN_MOUNTING, Mounting
@@ -20,6 +22,12 @@ from .names import check_text
 __all__ = ["REMISSION_KINDS", "SENSORS", "RemissionFunction", "SensorProfile", "get_sensor"]
 
 SCHEMA = 2  # of a sensor profile's file
+# Of a profile that states none. Empty beams of real recordings lie up to 0.45 m from the sensor, and the built-in
+# sensors measure from 0.05 to 1 m on.
+MIN_RANGE_M = 0.5
+MAX_EGO_M = 100.0
+
+EgoBox = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 REMISSION_KINDS = {"linear": 2, "polynomial": 3, "logarithm": 2, "power": 2}  # number of coefficients
 
 
@@ -105,10 +113,14 @@ class SensorProfile:
     mounting : Mounting
         How it is mounted on the vehicle. What is None is estimated from the scans.
     min_range_m, max_range_m : float
-        Nearest and farthest return to expect [m].
+        Nearest and farthest return to expect [m]. Points at most ``min_range_m`` from the sensor are not returns, but
+        beams without one: they are dropped. With 0, only those at the sensor's own place (0, 0, 0) are.
     remission : RemissionFunction or None
         Maps this sensor's remission to that of the sensor that the models were trained on. None: remission is only
         scaled by ``remission_range``.
+    ego_box : tuple of 3 tuples of 2 float, or None
+        The vehicle or robot that carries the sensor, as far as its beams meet it: lowest and highest x, y and z [m]
+        about the sensor, along the axes of the scan. Points inside are dropped. None: no point is.
 
     Raises
     ------
@@ -121,9 +133,10 @@ class SensorProfile:
     columns: int
     remission_range: tuple[float, float] = (0.0, 1.0)
     mounting: Mounting = UNKNOWN_MOUNTING
-    min_range_m: float = 0.9
+    min_range_m: float = MIN_RANGE_M
     max_range_m: float = 120.0
     remission: RemissionFunction | None = None
+    ego_box: EgoBox | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -163,6 +176,8 @@ class SensorProfile:
             )
         if self.remission is not None and not isinstance(self.remission, RemissionFunction):
             raise SensorError(f"sensor {self.name!r}: remission is a RemissionFunction or None, got {self.remission!r}")
+        if self.ego_box is not None:
+            object.__setattr__(self, "ego_box", _ego_box(self.name, self.ego_box))
 
     def to_json(self) -> str:
         """Convert to JSON, which `get_sensor` reads from a file."""
@@ -189,13 +204,16 @@ class SensorProfile:
                 f"the sensor profile has schema {found!r}, this edgeperc reads {SCHEMA}; write it again with edgeperc "
                 "fit-sensor or edgeperc info --write"
             )
-        _check_entries(document, {"schema", *(field.name for field in fields(cls))}, "sensor profile")
+        # Profiles of earlier versions have no box of the own vehicle.
+        box = document.pop("ego_box", None)
+        names = {field.name for field in fields(cls)} - {"ego_box"}
+        _check_entries(document, {"schema", *names}, "sensor profile", optional="ego_box")
         del document["schema"]
         if document["remission"] is not None:
             _check_entries(document["remission"], {field.name for field in fields(RemissionFunction)}, "remission")
             document["remission"] = RemissionFunction(**document["remission"])
         document["mounting"] = Mounting.from_dict(document["mounting"])
-        return cls(**document)
+        return cls(**document, ego_box=box)
 
     @classmethod
     def uniform(
@@ -208,9 +226,10 @@ class SensorProfile:
         columns: int = 1800,
         remission_range: tuple[float, float] = (0.0, 1.0),
         mounting: Mounting = UNKNOWN_MOUNTING,
-        min_range_m: float = 0.9,
+        min_range_m: float = MIN_RANGE_M,
         max_range_m: float = 120.0,
         remission: RemissionFunction | None = None,
+        ego_box: EgoBox | None = None,
     ) -> SensorProfile:
         """Describe a sensor with evenly spaced beams.
 
@@ -220,7 +239,7 @@ class SensorProfile:
         n_beams : int
         fov_up_deg, fov_down_deg : float
             Elevation of the top and of the bottom beam [deg].
-        columns, remission_range, mounting, min_range_m, max_range_m, remission
+        columns, remission_range, mounting, min_range_m, max_range_m, remission, ego_box
             As the attributes.
 
         Raises
@@ -242,6 +261,7 @@ class SensorProfile:
             min_range_m,
             max_range_m,
             remission,
+            ego_box,
         )
 
     @property
@@ -339,8 +359,9 @@ _OF_PANDASET = RemissionFunction(
 _OF_VELODYNE = replace(_OF_NUSCENES, source=f"the hdl-32e's, calibrated to the same scale: {_OF_NUSCENES.source}")
 _BUILT_IN = (
     # KITTI, where a turn has up to 2,160 returns a laser; its files hold remission / 255.
-    SensorProfile("hdl-64e", _HDL_64E, 2083),
-    # nuScenes (20 Hz, on the roof).
+    SensorProfile("hdl-64e", _HDL_64E, 2083, min_range_m=0.9),
+    # nuScenes (20 Hz, on the roof). It writes empty beams up to 0.452 m away on one ray; the nearest return of two
+    # recordings, 0.26 m away, is on the own roof.
     SensorProfile.uniform(
         "hdl-32e",
         32,
@@ -348,6 +369,7 @@ _BUILT_IN = (
         -30.67,
         columns=1084,
         remission_range=_BYTE,
+        min_range_m=0.5,
         max_range_m=105.0,
         remission=_OF_NUSCENES,
     ),
@@ -365,10 +387,31 @@ SENSORS: Mapping[str, SensorProfile] = MappingProxyType({profile.name: profile f
 """The built-in profiles by name."""
 
 
-def _check_entries(document: object, names: set[str], what: str) -> None:
+def _ego_box(name: str, given: object) -> EgoBox:
+    """The box as numbers; SensorError if it is not one."""
+    try:
+        box: NDArray[Any] = np.array(given)
+    except (TypeError, ValueError) as exc:
+        box = np.array(str(exc))
+    if (
+        box.shape != (3, 2)
+        or box.dtype.kind not in "fiu"
+        or not (np.abs(box) <= MAX_EGO_M).all()
+        or not (box[:, 0] < box[:, 1]).all()
+    ):
+        raise SensorError(
+            f"sensor {name!r}: ego_box is {given!r:.200}; expected ((x, x), (y, y), (z, z)), lowest and highest value "
+            f"about the sensor [m], up to {MAX_EGO_M:g} m"
+        )
+    (x_low, x_high), (y_low, y_high), (z_low, z_high) = box.astype(float).tolist()
+    return (x_low, x_high), (y_low, y_high), (z_low, z_high)
+
+
+def _check_entries(document: object, names: set[str], what: str, optional: str = "") -> None:
     if not isinstance(document, dict) or set(document) != names:
         found = ", ".join(sorted(map(str, document))) if isinstance(document, dict) else repr(document)
-        raise SensorError(f"a {what} file holds exactly {', '.join(sorted(names))}; got {found}")
+        more = f" (and {optional}, or not)" if optional else ""
+        raise SensorError(f"a {what} file holds exactly {', '.join(sorted(names))}{more}; got {found}")
     numbers = {name: value for name, value in document.items() if name not in ("name", "kind", "to", "source")}
     listed = [v for value in numbers.values() for v in (value if isinstance(value, list) else [value])]
     if any(isinstance(v, (str, bool)) for v in listed):

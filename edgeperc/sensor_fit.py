@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import PointsError, SensorError
+from .returns import returns
 from .sensor import REMISSION_KINDS, RemissionFunction, SensorProfile
 
 __all__ = [
@@ -341,7 +342,7 @@ def fit_sensor(
     scans : sequence of (n, 4) float32
         With raw remissions.
     sensor : SensorProfile
-        The sensor that took them.
+        The sensor that took them. What it drops (`edgeperc.returns.returns`) is not used.
     to : str
         A key of `REFERENCES`.
     source : str
@@ -364,10 +365,17 @@ def fit_sensor(
     if to not in REFERENCES:
         raise SensorError(f"no reference remissions of {to!r}; known are {', '.join(REFERENCES)}")
     low, high = sensor.remission_range
-    raw, wanted = match_quantiles(remission_strata(scans), REFERENCES[to])
+    raw, wanted = match_quantiles(remission_strata(_returns_of(scans, sensor)), REFERENCES[to])
     described = source or f"quantiles by range and incidence of {len(scans)} scans"
     functions = fit_functions(raw - low, wanted, full_scale=high - low, to=to, source=described)
     return replace(sensor, remission=increasing(functions)), functions
+
+
+def _returns_of(scans: Iterable[NDArray[np.float32]], sensor: SensorProfile) -> Iterator[NDArray[np.float32]]:
+    for scan in scans:
+        if scan.ndim != 2 or scan.shape[1] != 4:
+            raise PointsError(f"got an array of shape {scan.shape}; expected (n, 4): x, y, z, remission")
+        yield returns(scan, sensor)[0]
 
 
 def increasing(functions: Sequence[RemissionFunction]) -> RemissionFunction:

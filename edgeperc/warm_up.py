@@ -55,6 +55,7 @@ from .perception import Box, PointLabels, TopView
 from .pipeline import Pipeline, RangeImageNetwork, TopViewNetwork, View
 from .points import read_only
 from .remission import NO_REMISSION
+from .returns import returns
 from .scan import Scan
 from .sensor import SensorProfile
 from .session import Session
@@ -126,7 +127,7 @@ def warm_up(
     pipeline: Pipeline, sensor: SensorProfile, fitness: Sequence[FitnessProfile], estimator: MountingEstimator
 ) -> None:
     """Compile what a scan needs, and `edgeperc.road_ahead`."""
-    two_points = np.array([[10, 0, -1, 0], [20, 1, -1, 0]], np.float32)
+    few_points = np.array([[10, 0, -1, 0], [20, 1, -1, 0], [0, 0, 0, 0]], np.float32)
     options, top, ranged = pipeline.options, pipeline.top, pipeline.ranged
     boxes_points = bool(ranged) and options.boxes_from != "network"
     needed = {
@@ -139,14 +140,15 @@ def warm_up(
     alone = Lanes(1)
     with fewer_collections(), Helpers([part for part in needed if needed[part]]) as helpers:
         # The networks' own stages, with their outputs for the golden input
-        render(two_points, replace(sensor, remission=NO_REMISSION))
-        check_profiles(two_points, fitness, sensor)
+        few_points, _ = returns(few_points, sensor)
+        render(few_points, replace(sensor, remission=NO_REMISSION))
+        check_profiles(few_points, fitness, sensor)
         golden_top, golden_ranged = copy(top), [copy(network) for network in ranged]
         for network in (golden_top, *golden_ranged):
             if network is not None:
                 network.session = Rehearsed(network.session)
         apart = replace(options, rules=frozenset(), boxes_from="network")
-        Pipeline(golden_top, golden_ranged, apart, alone)(read_only(two_points), MODEL_MOUNTING, Stopwatch())
+        Pipeline(golden_top, golden_ranged, apart, alone)(few_points, MODEL_MOUNTING, Stopwatch())
         # What moves a scan
         floor, labels = car_and_person()
         with suppress(MountingError):  # the floor has no street

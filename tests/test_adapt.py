@@ -576,6 +576,9 @@ def test_eval_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert ("car" in boxed["few"]) == (boxed["n_objects"]["car"] < 10)
     assert set(boxed["few"]) == {name for name, n in boxed["n_objects"].items() if 0 < n < 10}
     assert (pictured["n_objects"], pictured["few"]) == (None, [])
+    assert printed.count("KITTI's benchmark") == printed.count("nuScenes measures") == 1  # boxes alone have them
+    assert boxed["boxes"]["kitti"]["car"]["bird's eye 0.5"]["all round"]["ap"] > 0.2
+    assert boxed["boxes"]["centers"]["car"]["n_truth"] > 0
     assert all((f"{name} (n<10)" in printed) for found in (simulated, boxed) for name in found["few"])
     for found in (boxed, pictured):
         assert found["function"] is None

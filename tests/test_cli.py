@@ -229,6 +229,7 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pyte
         "live": None,
         "n_points": 5,
         "n_dropped": 0,
+        "dropped": {"not_finite": 0, "too_near": 0, "ego": 0},
         "stage_ms": {"project": 1.0, "infer": 20.25},
         "providers": {"ssadnet": "CPUExecutionProvider (fp32)", "pointseg": "CPUExecutionProvider (fp32)"},
         "boxes": [

@@ -25,7 +25,15 @@ from edgeperc.cli.output import print_line
 from edgeperc.errors import ModelError, PointsError, SplitError
 from edgeperc.evaluation import evaluate
 from edgeperc.evaluation.causes import count_causes
-from edgeperc.evaluation.datasets import Frame, KittiCalibration, KittiObjects, RoadFrame, SemanticKitti, scan_hash
+from edgeperc.evaluation.datasets import (
+    Frame,
+    KittiCalibration,
+    KittiLabels,
+    KittiObjects,
+    RoadFrame,
+    SemanticKitti,
+    scan_hash,
+)
 from edgeperc.evaluation.judge import Judge
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
 from edgeperc.evaluation.tables import BANDS, FEWEST_OBJECTS, Record, banded, figures
@@ -196,6 +204,21 @@ def test_boxes_by_hand(world: World) -> None:
             for band, rows in table[kind].items()
         }
         assert counts == {"all": [3, 3, 4], "0-15 m": [1, 1, 1], "15-30 m": [1, 1, 1], "30-46 m": [1, 1, 2]}
+
+
+def test_labels_of_kitti_are_measured_by_levels_and_other_boxes_all_round(world: World) -> None:
+    car = box(15, 0)
+    world.boxes = (car, box(-15, 0))
+    seen = frame(car, points=hits(car, 3))
+    row = [0.0, 0.0, 0.0, 500.0, 150.0, 600.0, 250.0, 1.6, 2.0, 4.0, 0.0, 1.8, 15.0, -math.pi / 2]
+    labeled = replace(seen, labels=KittiLabels(("car",), np.array([row])), drive="2011_09_28_drive_0001")
+    all_round = evaluated(Judge(["ssadnet"]), seen)
+    levels = evaluated(Judge(["ssadnet"]), labeled)
+    assert set(all_round["kitti"]["car"]["3-D 0.7"]) == {"all round"}
+    assert set(levels["kitti"]["car"]["3-D 0.7"]) == {"easy", "moderate", "hard"}
+    for result in (all_round["kitti"]["car"]["3-D 0.7"]["all round"], levels["kitti"]["car"]["3-D 0.7"]["easy"]):
+        assert (result["n_truth"], result["ap"], result["few"]) == (1, 1.0, True)
+    assert levels["centers"]["car"]["ap"] == pytest.approx(1.0)
 
 
 def test_boxes_of_clusters_by_hand(world: World) -> None:
@@ -794,6 +817,8 @@ def test_the_command_on_simulated_scans(tmp_path: Path, capsys: pytest.CaptureFi
         "pixels",
         "boxes",
         "all_round",
+        "kitti",
+        "centers",
         "heading",
         "errors",
         "bumper",

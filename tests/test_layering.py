@@ -28,10 +28,10 @@ FLOORS = {
         extras mounting onnx_file
         card engine points remote sensor tuning
         kernel_cache perception zoo.__init__
-        blocks calibration frame geometry linkage outline persons
+        blocks calibration frame geometry linkage outline persons returns
         adapt cluster decode drivable fitness ground image motion observed projection refine sensor_fit session
         crop voting
-        level network_input occupancy painting remission scan
+        ego level network_input occupancy painting remission scan
         agreement
         cells
         pipeline
@@ -63,11 +63,13 @@ FLOORS = {
         simulation.__init__
         simulation.samples
         evaluation.__init__ evaluation.metrics evaluation.mistakes evaluation.splits evaluation.tracking_metrics
-        evaluation.ab3dmot evaluation.annotations evaluation.causes evaluation.datasets evaluation.headings
-        evaluation.scan_folder evaluation.tables
+        evaluation.ab3dmot evaluation.annotations evaluation.causes evaluation.center_ap evaluation.datasets
+        evaluation.headings
+        evaluation.kitti_ap evaluation.scan_folder
+        evaluation.tables
         evaluation.unseen evaluation.truth
-        evaluation.camvid evaluation.judge evaluation.painting evaluation.tracking evaluation.transfer
-        evaluation.evaluate
+        evaluation.camvid evaluation.judge evaluation.painting evaluation.tracking
+        evaluation.evaluate evaluation.transfer
         view.colors
         view.canvas view.content
         view.files view.mistakes view.page view.painted view.picture view.tracks
@@ -75,7 +77,7 @@ FLOORS = {
         ros2.__init__ ros2.graph ros2.messages sinks.scene
         ros2.node ros2.rclpy_graph ros2.zenoh_graph sinks.foxglove sinks.page sinks.rerun sinks.rosbag
         cli.arguments cli.output
-        cli.report cli.scans cli.sinks
+        cli.box_tables cli.report cli.scans cli.sinks
         cli.engine
         cli.straighten
         cli.completion cli.doctor cli.fit_sensor cli.info cli.program cli.run

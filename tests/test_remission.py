@@ -146,7 +146,7 @@ def test_functions_keep_the_order_and_stay_in_0_to_1(
     top = sensor.remission_range[1]
     raw = top * gain * streets[0][:, 3] ** power
     _, used, _ = RemissionMatcher(sensor).add(with_remission(streets[0], np.rint(raw) if whole else raw))
-    ramp = np.zeros((2000, 4), np.float32)
+    ramp = np.full((2000, 4), 10.0, np.float32)
     ramp[:, 3] = np.linspace(0.0, top, len(ramp))
     converted = condition(ramp, used)[0][:, 3]
     assert (np.diff(converted) >= 0.0).all()

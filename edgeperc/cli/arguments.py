@@ -22,6 +22,7 @@ __all__ = [
     "add_agreement",
     "add_boxes_from",
     "add_command",
+    "add_ego_box",
     "add_figures_file",
     "add_model",
     "add_mounting",
@@ -114,7 +115,7 @@ def add_sensor(group: Any, *, required: bool = False, of_capture: bool = False) 
 
 
 def add_mounting(group: Any) -> None:
-    """Add ``--mount-height``, ``--turn`` and ``--extrinsic``; `edgeperc.cli.scans.with_mounting` reads them."""
+    """Add options of the mounting and ``--ego-box``; `edgeperc.cli.scans.with_mounting` reads them."""
     group.add_argument(
         "--mount-height",
         type=finite_number,
@@ -134,6 +135,20 @@ def add_mounting(group: Any) -> None:
         metavar="FILE",
         help="T_vehicle_sensor, a 4 x 4 matrix as JSON or text: maps points of a scan into a vehicle frame with x "
         "forward, z up, and z = 0 on the road (default: tilt is found from the ground in the scans)",
+    )
+    add_ego_box(group)
+
+
+def add_ego_box(group: Any) -> None:
+    """Add ``--ego-box``; `edgeperc.cli.scans.with_mounting` reads it."""
+    group.add_argument(
+        "--ego-box",
+        nargs=6,
+        type=finite_number,
+        metavar=("X", "X", "Y", "Y", "Z", "Z"),
+        help="the vehicle or robot that carries the sensor: lowest and highest x, y and z about the sensor, along the "
+        "scan's axes [m]; points inside are dropped, e.g. --ego-box -2.5 1.5 -1 1 -1.5 -0.2; 'edgeperc info' suggests "
+        "it from several scans (default: the profile's, none for the built-in ones)",
     )
 
 

@@ -21,6 +21,7 @@ from .arguments import (
     add_provider,
     finite_number,
 )
+from .box_tables import box_table_lines, interval_columns
 from .engine import add_engine
 from .output import FEW, many, print_line, progress, table_lines, write_figures
 
@@ -35,8 +36,9 @@ def add_parser(commands: Commands) -> None:
         eval_command,
         help="accuracy on labeled scans and images: the papers' tables",
         description="Compare the models' results with the labels of scans: points, boxes, top view and road, over all "
-        "distances and by range, with 95 % intervals over drives. It is an error to evaluate a model on a scan that it "
-        "was trained on, except with --split train.\n\nCompare a camera model with labeled images: IoU of each class "
+        "distances and by range, with 95 % intervals over drives; boxes also as KITTI and nuScenes measure them. "
+        "It is an error to evaluate a model on a scan that it was trained on, except with "
+        "--split train.\n\nCompare a camera model with labeled images: IoU of each class "
         "and their mean, with 95 % intervals over images; unlabeled pixels do not count.",
         examples=[
             "edgeperc eval simulation:24",
@@ -182,48 +184,44 @@ def _eval_images(arguments: argparse.Namespace, roots: Sequence[Path]) -> int:
 
 
 # Columns of the tables: heading and key. Shares are printed in per cent, each with its interval.
-def _with_intervals(*rates: tuple[str, str]) -> tuple[tuple[str, str], ...]:
-    return tuple(column for title, key in rates for column in ((title, key), ("95 %", f"{key}_interval")))
-
-
 _RATES = (("precision", "precision"), ("recall", "recall"))
 _OBJECT_COUNTS = (("objects", "n_objects"), ("drives", "n_drives"))
 _LABELED_COLUMNS = (("labels", "n_boxes"), *_OBJECT_COUNTS)
 _POINT_COLUMNS = (
-    *_with_intervals(("IoU", "iou"), ("IoU by drive", "iou_by_drive"), *_RATES),
+    *interval_columns(("IoU", "iou"), ("IoU by drive", "iou_by_drive"), *_RATES),
     *(("points", "n_points"), *_OBJECT_COUNTS),
 )
 _HIT_COLUMNS = (("true", "n_truth"), ("predicted", "n_predicted"), ("hits", "n_hits"), *_OBJECT_COUNTS)
 _BOX_COLUMNS = (
-    *_with_intervals(("AP50", "ap"), *_RATES, ("mIoU@.5", "mean_iou_50"), ("mIoU@.7", "mean_iou_70")),
+    *interval_columns(("AP50", "ap"), *_RATES, ("mIoU@.5", "mean_iou_50"), ("mIoU@.7", "mean_iou_70")),
     *_HIT_COLUMNS,
 )
-_ALL_ROUND_COLUMNS = (*_with_intervals(("AP", "ap"), *_RATES), *_HIT_COLUMNS)
+_ALL_ROUND_COLUMNS = (*interval_columns(("AP", "ap"), *_RATES), *_HIT_COLUMNS)
 _HEADING_COLUMNS = (
-    *_with_intervals(("heading", "heading"), ("modulo half a turn", "axis"), ("front known", "front_known")),
+    *interval_columns(("heading", "heading"), ("modulo half a turn", "axis"), ("front known", "front_known")),
     *(("boxes", "n_hits"), ("objects", "n_objects")),
 )
 _ERROR_COLUMNS = (
-    *_with_intervals(("share", "share")),
+    *interval_columns(("share", "share")),
     *(("points", "n_points"), ("95 %", "n_points_interval"), ("of", "n_of"), ("scans", "n_scans")),
     *_OBJECT_COUNTS,
 )
 _CELL_COLUMNS = (
-    *_with_intervals(("IoU", "iou"), ("ACC", "accuracy"), ("mAP", "mean_ap"), ("mIoU", "mean_iou")),
+    *interval_columns(("IoU", "iou"), ("ACC", "accuracy"), ("mAP", "mean_ap"), ("mIoU", "mean_iou")),
     ("cells", "n_cells"),
 )
 _ROAD_COLUMNS = (
-    *_with_intervals(("F1", "f1"), ("AP", "ap"), ("ACC", "accuracy"), ("PRE", "precision"), ("REC", "recall")),
+    *interval_columns(("F1", "f1"), ("AP", "ap"), ("ACC", "accuracy"), ("PRE", "precision"), ("REC", "recall")),
     ("cells", "n_cells"),
 )
 _ROAD_COLUMNS_2 = (
-    *_with_intervals(("IoU", "iou"), ("MaxF", "max_f1")),
-    *_with_intervals(("observed PRE", "drivable_precision"), ("observed REC", "drivable_recall")),
+    *interval_columns(("IoU", "iou"), ("MaxF", "max_f1")),
+    *interval_columns(("observed PRE", "drivable_precision"), ("observed REC", "drivable_recall")),
     ("cells", "n_cells"),
 )
-_PIXEL_COLUMNS = (*_with_intervals(("IoU", "iou"), *_RATES), ("pixels", "n_pixels"), ("images", "n_images"))
+_PIXEL_COLUMNS = (*interval_columns(("IoU", "iou"), *_RATES), ("pixels", "n_pixels"), ("images", "n_images"))
 _IMAGE_COLUMNS = (
-    *_with_intervals(("mIoU", "mean_iou"), ("accuracy", "accuracy"), ("mean recall", "mean_accuracy")),
+    *interval_columns(("mIoU", "mean_iou"), ("accuracy", "accuracy"), ("mean recall", "mean_accuracy")),
     ("pixels", "n_pixels"),
 )
 _BLOCKS = {"real": "real scans with boxes", "semantickitti": "SemanticKITTI", "simulated": "simulated scans"}
@@ -240,7 +238,12 @@ def _figure_lines(figures: Mapping[str, Any]) -> list[str]:
     for name, of_block in (*blocks, *figures.get("folders", {}).items()):
         if of_block is not None:
             lines += ["", f"== {name}: {many(of_block['n_frames'], 'scan')}, {many(of_block['n_drives'], 'drive')} =="]
-            lines += [*_labeled_lines(of_block), *_point_lines(of_block), *_box_lines(of_block)]
+            lines += [
+                *_labeled_lines(of_block),
+                *_point_lines(of_block),
+                *_box_lines(of_block),
+                *box_table_lines(of_block),
+            ]
             lines += [*_error_lines(of_block), *_cell_lines(of_block), *_road_lines(of_block)]
     return lines
 

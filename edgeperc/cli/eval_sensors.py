@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from .arguments import Commands, add_command, add_figures_file, add_provider
+from .box_tables import box_table_lines
 from .output import FEW, many, print_line, progress, table_lines, write_figures
 
 __all__ = ["add_parser", "eval_sensors_command"]
@@ -18,7 +19,8 @@ def add_parser(commands: Commands) -> None:
         eval_sensors_command,
         help="accuracy on sensors that the model was not trained on",
         description="IoU of points by class on labeled scans of sensors that the model was not trained on: without "
-        "adaptation, with the remission mapped, with interpolation between beams, and with both.",
+        "adaptation, with the remission mapped, with interpolation between beams, and with both. Of labeled scans with "
+        "boxes also the average precision of boxes of the default pair, as KITTI and nuScenes measure it.",
         examples=[
             "edgeperc eval-sensors os1-64=simulation:24",
             "edgeperc eval-sensors PandaSet/:pandaset vlp-16=simulation:8 --json out.json",
@@ -68,6 +70,7 @@ def eval_sensors_command(arguments: argparse.Namespace) -> int:
         function = result["function"] or "no function"
         title = f"{name}: {many(result['n_scans'], 'scan')}, {counts}; remission: {function}"
         lines += table_lines(title, (*columns, ("mIoU", "mean")), rows)
+        lines += box_table_lines(result.get("boxes", {}))
     for line in lines:
         print_line(line)
     write_figures(arguments, figures)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from ..atomic import write_atomic
 from ..errors import PointsError, SensorError
-from .arguments import Commands, add_command, add_sensor
+from .arguments import Commands, add_command, add_ego_box, add_sensor
 from .output import print_rows
-from .scans import find_scans
+from .scans import find_scans, with_mounting
 
 __all__ = ["add_parser", "fit_sensor_command"]
 
@@ -34,6 +34,7 @@ def add_parser(commands: Commands) -> None:
         "scans", nargs="+", type=Path, metavar="SCAN", help="scan files, captures, or folders of them, as for 'run'"
     )
     add_sensor(reading, required=True)
+    add_ego_box(reading)
     reading.add_argument(
         "--to",
         default="hdl-64e",
@@ -60,7 +61,7 @@ def fit_sensor_command(arguments: argparse.Namespace) -> int:
             f"{arguments.out}: expected a name that ends in .json: --sensor reads other names as built-in sensors"
         )
     scans = [points for path in found.paths for _, points in read_scans(path)]
-    profile, functions = fit_sensor(scans, get_sensor(arguments.sensor), arguments.to)
+    profile, functions = fit_sensor(scans, get_sensor(with_mounting(arguments.sensor, arguments)), arguments.to)
     assert profile.remission is not None
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(arguments.out, (profile.to_json() + "\n").encode())

@@ -24,12 +24,14 @@ if TYPE_CHECKING:
 
     from ..card import ModelCard
     from ..level import MountingEstimator
+    from ..perception import DroppedPoints
     from ..sensor import SensorProfile
     from ..zoo import Variant
 
 __all__ = ["add_parser", "info_command"]
 
 _WIDTH = 100  # characters of a line, with its name
+_MOST_SCANS = 300  # to look for the own vehicle in
 _LINES = 2  # lines of a row; --json prints everything
 
 
@@ -49,6 +51,7 @@ def add_parser(commands: Commands) -> None:
             "edgeperc info 000123.bin",
             "edgeperc info drive.pcap",
             "edgeperc info velodyne/*.bin --write my-sensor.json",
+            "edgeperc info drive.pcap --suggest-ego-box",
             "edgeperc info pointseg:int8 --json",
             "edgeperc info street.jpg",
         ],
@@ -64,6 +67,12 @@ def add_parser(commands: Commands) -> None:
     add_sensor(reading, of_capture=True)
     add_mounting(reading)
     add_topic(reading)
+    reading.add_argument(
+        "--suggest-ego-box",
+        action="store_true",
+        help=f"suggest --ego-box: returns near the sensor that never move in up to {_MOST_SCANS} scans of a drive, "
+        "while the street does; look at it before you use it (default: no)",
+    )
     output = parser.add_argument_group("output")
     output.add_argument(
         "--json",
@@ -90,6 +99,7 @@ def info_command(arguments: argparse.Namespace) -> int:
     if arguments.write is not None and arguments.write.suffix != ".json":
         arguments.usage_error(f"--write {arguments.write}: expected a name that ends in .json")
     estimators: dict[SensorProfile, MountingEstimator] = {}
+    scans: list[Path] = []
     n_failed = n_printed = 0
     for thing in arguments.things:
         try:
@@ -100,6 +110,7 @@ def info_command(arguments: argparse.Namespace) -> int:
                 rows, document = _image_rows(Path(thing))
             else:
                 rows, document = _scan_rows(Path(thing), arguments, estimators)
+                scans.append(Path(thing))
         except MissingExtraError:
             raise
         except EdgepercError as exc:
@@ -114,6 +125,8 @@ def info_command(arguments: argparse.Namespace) -> int:
             print_rows(_folded(rows))
         n_printed += 1
     n_failed += _mounting_of_all(arguments, estimators)
+    if arguments.suggest_ego_box:
+        n_failed += _suggest_ego_box(arguments, scans, estimators)
     return 1 if n_failed else 0
 
 
@@ -137,6 +150,41 @@ def _mounting_of_all(arguments: argparse.Namespace, estimators: Mapping[SensorPr
     write_atomic(arguments.write, (profile.to_json() + "\n").encode())
     if not arguments.json:
         print_rows([("written", f"{arguments.write}: pass it as --sensor")])
+    return False
+
+
+def _suggest_ego_box(
+    arguments: argparse.Namespace, paths: Sequence[Path], estimators: Mapping[SensorProfile, MountingEstimator]
+) -> bool:
+    """Print a box of the own vehicle for ``--ego-box``; whether the scans do not show one."""
+    from ..ego import suggest_ego_box
+    from ..readers.captures import read_scans
+
+    if len(estimators) != 1:
+        print_error(f"--suggest-ego-box: the scans are of {len(estimators)} sensors; expected scans of one")
+        return True
+    ((sensor, estimator),) = estimators.items()
+    scans = (points for path in paths for _, points in read_scans(path, topic=arguments.topic))
+    try:
+        found = suggest_ego_box(islice(scans, _MOST_SCANS), sensor, estimator.mounting())
+    except EdgepercError as exc:
+        print_error(f"--suggest-ego-box: {exc}")
+        return True
+    if arguments.json:
+        print_line(json.dumps({"sensor": sensor.name, "suggested_ego_box": found.box, "n_places": found.n_places}))
+    elif found.box is None:
+        print_rows([("own vehicle", f"in {found.n_places} places, no return near the sensor stays where it is")])
+    else:
+        option = " ".join(f"{value:g}" for axis in found.box for value in axis)
+        print_rows(
+            [
+                (
+                    "own vehicle",
+                    f"returns in {found.n_directions} directions stay in {found.n_places} places: if the box",
+                ),
+                ("", f"holds the own vehicle and nothing else, pass --ego-box {option}"),
+            ]
+        )
     return False
 
 
@@ -271,18 +319,29 @@ def _size(card: ModelCard) -> tuple[int, int]:
     return card.view.width, card.view.height
 
 
+def _dropped_text(dropped: DroppedPoints, sensor: SensorProfile) -> str:
+    """How many points are not returns, by kind."""
+    parts = [f"{dropped.not_finite:,} are not finite"]
+    if dropped.too_near:
+        parts.append(f"{dropped.too_near:,} at most {sensor.min_range_m:g} m from the sensor, not returns")
+    if sensor.ego_box is not None:
+        parts.append(f"{dropped.ego:,} inside the box of the own vehicle")
+    return ", ".join(parts)
+
+
 def _scan_rows(
     path: Path, arguments: argparse.Namespace, estimators: dict[SensorProfile, MountingEstimator]
 ) -> tuple[list[tuple[str, str]], dict[str, Any]]:
     """Measure a scan and check which models suit it: rows to print, and the same measurements for JSON."""
     import numpy as np
 
-    from ..adapt import condition
-    from ..fitness import FitnessProfile, check_fitness
+    from ..adapt import scale
+    from ..fitness import FitnessProfile, check_dropped, check_fitness
     from ..frame import ModelFrame
     from ..level import FROZEN_AFTER, MountingEstimator
     from ..readers.captures import read_scans
     from ..remission import RemissionMatcher
+    from ..returns import returns
     from ..sensor import get_sensor
     from ..zoo import listed
 
@@ -297,22 +356,26 @@ def _scan_rows(
             raise
         damage = str(exc)
     points = first[0]
-    finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-    n_lost = len(points) - len(finite)
+    cleaned, dropped = zip(*(returns(each, sensor) for each in first), strict=True)
+    finite = cleaned[0][~np.isnan(cleaned[0][:, 0])].astype(np.float64)
     document: dict[str, Any] = {
         "scan": str(path),
         "n_points": len(points),
-        "n_not_finite": n_lost,
+        "n_not_finite": dropped[0].not_finite,
+        "n_too_near": dropped[0].too_near,
+        "n_ego": dropped[0].ego,
         "sensor": sensor.name,
         "sensor_from": because,
     }
     rows = [
         ("scan", str(path)),
-        ("points", f"{len(points):,}, of which {n_lost:,} are not finite"),
+        ("points", f"{len(points):,}, of which {_dropped_text(dropped[0], sensor)}"),
         ("sensor", f"{sensor.name}: {because}"),
     ]
     if damage:
         rows.append(("damage", f"after {len(first)} scans: {damage}"))
+    unit = check_dropped(points, dropped[0], sensor)
+    rows += [("unit", sentence) for sentence in unit]
     if not len(finite):
         return rows, document
     flat = np.hypot(finite[:, 0], finite[:, 1])
@@ -331,13 +394,13 @@ def _scan_rows(
         ("remission", "min {:g}, 5 % {:g}, median {:g}, 95 % {:g}, max {:g}".format(*measured["remission"])),
     ]
     matcher, used, said = RemissionMatcher(sensor), sensor, list[str]()
-    for each in first:
+    for each in cleaned:
         matcher, used, more = matcher.add(each)
         said += more
     if used.remission is not None:
         how = "" if used is sensor else f", {used.remission.source}"
         rows.append(("", f"mapped to that of the {used.remission.to} by a {used.remission.kind}{how}"))
-    conditioned = [condition(each, used)[0] for each in first]
+    conditioned = [scale(each, used)[0] for each in cleaned]
     own, reason = _estimated(MountingEstimator(sensor.mounting), conditioned)
     estimators[sensor] = _estimated(estimators[sensor], conditioned)[0] if sensor in estimators else own
     try:
@@ -359,7 +422,7 @@ def _scan_rows(
             findings[card.name] = None
             rows.append((card.name, "its card does not describe its training scans"))
             continue
-        found = (*check_fitness(scan, FitnessProfile.from_dict(card.fitness), used), *said)
+        found = (*unit, *check_fitness(scan, FitnessProfile.from_dict(card.fitness), used), *said)
         findings[card.name] = list(found)
         rows += [(card.name, f"as a scan of {sensor.name}: {sentence}") for sentence in found]
         if not found:

@@ -158,9 +158,11 @@ def table_lines(
 
 
 def _cell(value: Any) -> str:
-    """Format a value: shares and their intervals in per cent, counts unchanged."""
+    """Format a value: shares and their intervals in per cent, counts and texts unchanged."""
     if value is None:
         return "-"
+    if isinstance(value, str):
+        return value
     if isinstance(value, list):
         return "-".join(map(_cell, value))
     return f"{100.0 * value:.1f}" if isinstance(value, float) else f"{value:,}"

@@ -441,7 +441,7 @@ class _Run:
                 name, file = (shown / f"{k:06d}", target / f"{k:06d}") if numbered else (shown, target)
                 try:
                     if self._straightener is not None:
-                        points = self._straightener.straighten(stamp_s, points, *times_s)
+                        points = self._straightener.straighten(stamp_s, points, times_s[0], perceive.sensor)
                     perception = perceive(points, stamp_s)
                     if self._kinds and numbered:
                         target.mkdir(exist_ok=True)

@@ -181,7 +181,7 @@ def scan_sensor(path: Path, arguments: argparse.Namespace) -> tuple[str | Sensor
 
 
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:
-    """The sensor with the mounting of ``--extrinsic``, ``--mount-height`` and ``--turn``, where they are given.
+    """The sensor with what ``--extrinsic``, ``--mount-height``, ``--turn`` and ``--ego-box`` give.
 
     Raises
     ------
@@ -192,9 +192,12 @@ def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) ->
     from ..sensor import get_sensor
 
     height_m, turn, file = (getattr(arguments, name, None) for name in ("mount_height", "turn", "extrinsic"))
-    if height_m is None and turn is None and file is None:
+    ego = getattr(arguments, "ego_box", None)
+    if height_m is None and turn is None and file is None and ego is None:
         return sensor
     profile = get_sensor(sensor)
+    if ego is not None:
+        profile = replace(profile, ego_box=((ego[0], ego[1]), (ego[2], ego[3]), (ego[4], ego[5])))
     mounting = profile.mounting if file is None else Mounting.from_file(file)
     if height_m is not None:
         mounting = replace(mounting, height_m=height_m)

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..motion import Motion, Trajectory, deskew
+from ..returns import returns
 
 if TYPE_CHECKING:
+    from ..sensor import SensorProfile
     from ..tracking.tracks import Tracks
 
 __all__ = ["Straightener"]
@@ -38,7 +40,11 @@ class Straightener:
         self._tracked: list[Tracks] = []
 
     def straighten(
-        self, stamp_s: float | None, points: NDArray[np.float32], times_s: NDArray[np.float64] | None
+        self,
+        stamp_s: float | None,
+        points: NDArray[np.float32],
+        times_s: NDArray[np.float64] | None,
+        sensor: SensorProfile | None = None,
     ) -> NDArray[np.float32]:
         """Points in the sensor's frame at the scan's stamp, or at its last point if it has none.
 
@@ -46,6 +52,8 @@ class Straightener:
         ----------
         stamp_s, points, times_s
             A `edgeperc.TimedScan`.
+        sensor : SensorProfile, optional
+            What it drops of the scan stays where it is: the own vehicle moves with the sensor.
 
         Raises
         ------
@@ -82,7 +90,11 @@ class Straightener:
                 )
             return points
         at_s = stamp_s if stamp_s is not None and first_s <= stamp_s <= last_s else last_s
-        return deskew(points, times_s, motion, at_s=at_s)
+        scan = points if sensor is None else returns(points, sensor)[0]
+        straight = deskew(scan, times_s, motion, at_s=at_s)
+        dropped = np.isnan(scan[:, 0])
+        straight[dropped] = points[dropped]
+        return straight
 
     def follow(self, tracks: Tracks) -> None:
         """Take the tracks of the last scan, for the motion during the next one. Motion needs two of one session."""

@@ -29,19 +29,31 @@ from .splits import TEST_DRIVES, in_split
 
 __all__ = [
     "IMAGE_SIZE",
+    "IMAGE_SIZES",
     "ROAD_CLASSES",
     "SEQUENCE_DRIVES",
     "Frame",
     "KittiCalibration",
+    "KittiLabels",
     "KittiObjects",
     "RoadFrame",
     "SemanticKitti",
+    "label_objects",
     "layouts",
+    "read_labels",
     "read_objects",
     "scan_hash",
 ]
 
 IMAGE_SIZE = (1242, 375)
+IMAGE_SIZES = {
+    "2011_09_26": IMAGE_SIZE,
+    "2011_09_28": (1224, 370),
+    "2011_09_29": (1238, 374),
+    "2011_09_30": (1226, 370),
+    "2011_10_03": (1241, 376),
+}
+"""Width and height of the rectified images [px], by the day of the drive."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +117,45 @@ class KittiCalibration:
         ahead = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], axis=1) @ T_velo_cam[:3, :3].T
         return np.column_stack([centers, length, width, height, np.arctan2(ahead[:, 1], ahead[:, 0])])
 
+    def in_camera(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Convert boxes (n, 7) to x ahead, y left, z up in the camera's frame: undoes `sensor_boxes`."""
+        R, t = self.T_cam_velo[:3, :3], self.T_cam_velo[:3, 3]
+        right, down, ahead = R @ rows[:, :3].T + t[:, None]
+        cos, sin = np.cos(rows[:, 6]), np.sin(rows[:, 6])
+        climb = -(R[1, 0] * cos + R[1, 1] * sin) / R[1, 2]  # of the heading that is level in the camera's frame
+        heading = R @ np.stack([cos, sin, climb])
+        return np.column_stack([ahead, -right, -down, rows[:, 3:6], np.arctan2(-heading[0], heading[2])])
+
+    def image_rectangles(
+        self, rows: NDArray[np.float64], image_size: tuple[int, int] = IMAGE_SIZE
+    ) -> NDArray[np.float64]:
+        """Project boxes into the image.
+
+        Parameters
+        ----------
+        rows : (n, 7) float64
+            x, y, z of the center, length, width, height [m], yaw [rad] in the sensor frame.
+        image_size : tuple of 2 int
+            Width and height [px].
+
+        Returns
+        -------
+        (n, 4) float64
+            Left, top, right, bottom [px], clipped to the image; without area if a box is not in it.
+        """
+        signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
+        local = signs[None] * rows[:, None, 3:6]
+        cos, sin = np.cos(rows[:, 6])[:, None], np.sin(rows[:, 6])[:, None]
+        x = rows[:, :1] + cos * local[..., 0] - sin * local[..., 1]
+        y = rows[:, 1:2] + sin * local[..., 0] + cos * local[..., 1]
+        corners = np.stack([x, y, rows[:, 2:3] + local[..., 2]], axis=-1)
+        pixel, depth = self.to_image(corners.reshape(-1, 3))
+        pixel, depth = pixel.reshape(-1, 8, 2), depth.reshape(-1, 8)
+        ahead = depth > 0.1  # a corner behind the camera has no pixel
+        low = np.where(ahead[..., None], pixel, np.inf).min(axis=1).clip(0.0, image_size)
+        high = np.where(ahead[..., None], pixel, -np.inf).max(axis=1).clip(0.0, image_size)
+        return np.hstack([low, np.maximum(high, low)])
+
     def in_image(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """Which points (n, 3+) in the sensor frame lie in the camera's field of view, (n,) bool."""
         pixel, depth = self.to_image(points)
@@ -118,6 +169,23 @@ class KittiCalibration:
             within = (pixel[:, 0] >= left) & (pixel[:, 0] <= right) & (pixel[:, 1] >= top) & (pixel[:, 1] <= bottom)
             labeled &= ~within
         return labeled
+
+
+@dataclass(frozen=True)
+class KittiLabels:
+    """Rows of a KITTI label file, in its own frame.
+
+    Attributes
+    ----------
+    kinds : tuple of str
+        Classes in lower case, ``"dontcare"`` among them.
+    numbers : (n, 14) float64
+        Truncation, occlusion, observation angle [rad]; left, top, right, bottom [px]; height, width, length, x, y, z
+        [m] and rotation [rad] as in `KittiCalibration.sensor_boxes`.
+    """
+
+    kinds: tuple[str, ...]
+    numbers: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -136,6 +204,8 @@ class Frame:
     unlabeled : (k, 4) float64
         Image rectangles (left, top, right, bottom) [px] in which objects are not labeled (DontCare).
     calibration : KittiCalibration
+    labels : KittiLabels or None
+        The rows that ``boxes`` and ``unlabeled`` come from; None: unknown.
     """
 
     name: str
@@ -145,6 +215,7 @@ class Frame:
     boxes: tuple[Box, ...]
     unlabeled: NDArray[np.float64]
     calibration: KittiCalibration
+    labels: KittiLabels | None = None
 
     @cached_property
     def known(self) -> NDArray[np.bool_]:
@@ -163,25 +234,28 @@ class Frame:
         return labels
 
 
+def read_labels(path: Path) -> KittiLabels:
+    """Read the rows of a KITTI label file."""
+    rows = [line.split() for line in path.read_text().splitlines() if line.strip()]
+    numbers = np.array([[float(value) for value in row[1:15]] for row in rows], np.float64).reshape(-1, 14)
+    return KittiLabels(tuple(row[0].lower() for row in rows), numbers)
+
+
 def read_objects(label_path: Path, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
     """Read a KITTI label file: boxes in the sensor frame, and (k, 4) DontCare rectangles [px] (SSADNet 3.1.1)."""
-    kinds, rows, unlabeled = [], [], []
-    for line in label_path.read_text().splitlines():
-        values = line.split()
-        if not values:
-            continue
-        kind, numbers = values[0], [float(v) for v in values[1:15]]
-        if kind == "DontCare":
-            unlabeled.append(numbers[3:7])
-            continue
-        kinds.append(kind.lower())
-        rows.append(numbers[7:14])
-    placed = calibration.sensor_boxes(np.array(rows, np.float64).reshape(-1, 7))
+    return label_objects(read_labels(label_path), calibration)
+
+
+def label_objects(labels: KittiLabels, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
+    """Boxes of labels in the sensor frame, and (k, 4) DontCare rectangles [px]."""
+    is_object = np.array([kind != "dontcare" for kind in labels.kinds], np.bool_)
+    placed = calibration.sensor_boxes(labels.numbers[is_object, 7:14])
+    kinds = [kind for kind in labels.kinds if kind != "dontcare"]
     boxes = tuple(
         Box(kind, 1.0, (x, y, z), (length, width, height), yaw)
         for kind, (x, y, z, length, width, height, yaw) in zip(kinds, placed.tolist(), strict=True)
     )
-    return boxes, np.array(unlabeled, np.float64).reshape(-1, 4)
+    return boxes, labels.numbers[~is_object, 3:7]
 
 
 def scan_hash(points: NDArray[np.float32]) -> str:
@@ -238,9 +312,10 @@ class KittiObjects:
         """Read a labeled scan with its labels and calibration."""
         row = next(row for row in self.rows if row["name"] == name)
         calibration = KittiCalibration.read(self.root / "training/calib" / f"{name}.txt")
-        boxes, unlabeled = read_objects(self.root / "training/label_2" / f"{name}.txt", calibration)
+        labels = read_labels(self.root / "training/label_2" / f"{name}.txt")
+        boxes, unlabeled = label_objects(labels, calibration)
         points = read_points(self.root / "training/velodyne" / f"{name}.bin")
-        return Frame(name, row["drive"], row.get("grade", "A"), points, boxes, unlabeled, calibration)
+        return Frame(name, row["drive"], row.get("grade", "A"), points, boxes, unlabeled, calibration, labels)
 
 
 def _frame_rows(root: Path) -> list[dict[str, str]]:

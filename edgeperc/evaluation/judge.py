@@ -30,10 +30,12 @@ from ..session import Session
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASSES
 from .causes import count_causes
+from .center_ap import count_centers
 from .datasets import Frame, RoadFrame
+from .kitti_ap import count_all_round, count_in_image
 from .metrics import FEWEST_RETURNS, BoxEvaluator, ProbabilitySweep, boxes_to_find, object_key
 from .mistakes import Mistakes
-from .scan_folder import ScanFrame, class_number
+from .scan_folder import IGNORED, ScanFrame, box_label, class_number
 from .tables import ALL_ROUND, BANDS, SITTING, VEHICLES, Record, banded, within
 from .truth import Truth, folder_truth, kitti_truth, semantickitti_truth, simulated_truth
 from .unseen import check_unseen, training_scans_of
@@ -174,7 +176,8 @@ class Judge:
         mistakes : Mistakes or None
             None if the objects of the scan are not labeled.
         """
-        return self._compare(truth, self._perceive(truth.points))
+        found = self._perceive(truth.points)
+        return self._compare(truth, found, found.boxes)
 
     def record_scan(self, frame: ScanFrame) -> tuple[Record, Mistakes | None]:
         """Evaluate one scan of a `ScanFolder`, perceived as a user's: its mounting is found from scans of its drive.
@@ -184,6 +187,19 @@ class Judge:
         SplitError
             A model was trained on this scan.
         """
+        truth, found, scan_boxes = self._perceive_frame(frame)
+        return self._compare(truth, found, scan_boxes)
+
+    def record_boxes(self, frame: ScanFrame) -> Record:
+        """As `record_scan`, of the boxes alone: `kitti_ap` and `center_ap`."""
+        truth, found, scan_boxes = self._perceive_frame(frame)
+        tallies: dict[tuple[str, ...], Any] = {}
+        if frame.boxes is not None:
+            self._count_ap(tallies, truth, found.boxes, scan_boxes)
+        return Record(truth.name, truth.drive, tallies)
+
+    def _perceive_frame(self, frame: ScanFrame) -> tuple[Truth, Perception, Sequence[Box]]:
+        """Truth and perception of a scan in the frame of the models, and its boxes in that of the scan."""
         check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
         if frame.drive != self.drive:
             self.perceive.reset_mounting()
@@ -191,9 +207,9 @@ class Judge:
         found = self.perceive(frame.points)
         boxes = ModelFrame(found.mounting).move_boxes(found.boxes)
         truth = folder_truth(frame, found.mounting, self.view, self.point_classes)
-        return self._compare(truth, replace(found, boxes=boxes))
+        return truth, replace(found, boxes=boxes), found.boxes
 
-    def _compare(self, truth: Truth, found: Perception) -> tuple[Record, Mistakes | None]:
+    def _compare(self, truth: Truth, found: Perception, scan_boxes: Sequence[Box]) -> tuple[Record, Mistakes | None]:
         tallies: dict[tuple[str, ...], Any] = {}
         mistakes = None
         if truth.labels is not None:
@@ -205,6 +221,7 @@ class Judge:
                 tallies["labeled",] = Counter(object_key(truth.drive, box) for box in seen)
             if self.box_classes:
                 mistakes = self._count_boxes(tallies, truth, found, mistakes)
+                self._count_ap(tallies, truth, found.boxes, scan_boxes)
             if found.points is not None:
                 mistakes = self._count_points(tallies, truth, found.points, mistakes, shown)
         if found.top_view is not None and self.mounted is None:
@@ -253,6 +270,25 @@ class Judge:
             missed=tuple((right, returns_of[id(right)]) for guess, right in pairs if right and not guess),
             false=tuple(guess for guess, right in pairs if guess and not right),
         )
+
+    def _count_ap(
+        self, tallies: dict[tuple[str, ...], Any], truth: Truth, boxes: Sequence[Box], scan_boxes: Sequence[Box]
+    ) -> None:
+        """Match all boxes as KITTI's benchmark does, in its image or all round, and as nuScenes does, all round."""
+
+        def known(box: Box) -> bool:
+            return bool(truth.known(np.array([box.center]))[0])
+
+        predicted = [box for box in boxes if known(box)]
+        if truth.box_labels is not None:
+            predicted = [replace(box, label=box_label(box.label, truth.box_labels)) for box in predicted]
+        returns = list(zip(truth.boxes, truth.returns, strict=True))
+        to_find, ignored = boxes_to_find(returns, None, {box.label for box in truth.boxes} - {IGNORED}, known=known)
+        if truth.front is not None:
+            tallies["kitti",] = count_in_image(truth.front, scan_boxes, truth.drive)
+        else:
+            tallies["kitti",] = count_all_round(predicted, to_find, ignored, truth.drive)
+        tallies["centers",] = count_centers(predicted, to_find, ignored, truth.drive)
 
     def _count_points(
         self,

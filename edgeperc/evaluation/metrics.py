@@ -23,6 +23,7 @@ __all__ = [
     "ProbabilitySweep",
     "average_precision",
     "boxes_to_find",
+    "interpolated_precision",
     "mean",
     "object_key",
 ]
@@ -158,9 +159,16 @@ def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float
 
 def _eleven_points(found: NDArray[np.int64], predicted: NDArray[np.int64], n_truth: int) -> float:
     """Eleven-point average precision; both counts are cumulative, (k,), over falling thresholds."""
+    return interpolated_precision(found, predicted, n_truth, np.arange(11), 10)
+
+
+def interpolated_precision(
+    found: NDArray[np.int64], predicted: NDArray[np.int64], n_truth: int, levels: NDArray[np.int64], n_levels: int
+) -> float:
+    """Mean of the best precision at recalls ``levels / n_levels``; counts are (k,), over falling thresholds."""
     best_from_here = np.maximum.accumulate((found / np.maximum(predicted, 1))[::-1])[::-1]
     # In integers, because 0.1 * 3 > 0.3: a recall of exactly 3 in 10 must reach the level 0.3.
-    reached = np.searchsorted(found * 10, np.arange(11) * n_truth)
+    reached = np.searchsorted(np.maximum.accumulate(found) * n_levels, levels * n_truth)
     return float(np.append(best_from_here, 0.0)[reached].mean())
 
 

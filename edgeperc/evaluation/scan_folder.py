@@ -21,7 +21,7 @@ import csv
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -41,10 +41,19 @@ from ..sensor import SensorProfile, get_sensor
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
 from .annotations import read_datumaro, read_labelcloud, read_sustechpoints
-from .datasets import IMAGE_SIZE, SEQUENCE_DRIVES, KittiCalibration, read_objects
+from .datasets import IMAGE_SIZE, SEQUENCE_DRIVES, KittiCalibration, KittiLabels, label_objects, read_labels
 from .splits import in_split
 
-__all__ = ["SCHEMA", "ScanFolder", "ScanFrame", "ScanLayout", "class_number", "known_layouts", "read_layout"]
+__all__ = [
+    "SCHEMA",
+    "ScanFolder",
+    "ScanFrame",
+    "ScanLayout",
+    "box_label",
+    "class_number",
+    "known_layouts",
+    "read_layout",
+]
 
 SCHEMA = 1
 LAYOUTS = Path(__file__).with_name("layouts")
@@ -244,6 +253,8 @@ class ScanFrame:
         Of the camera in whose image objects are labeled, if the labels are KITTI's.
     unlabeled : (k, 4) float64
         DontCare rectangles of that image [px].
+    image_labels : KittiLabels or None
+        KITTI's rows, with the classes of `boxes`.
     """
 
     name: str
@@ -255,6 +266,7 @@ class ScanFrame:
     drivable: tuple[NDArray[np.float64], ...] | None
     calibration: KittiCalibration | None = None
     unlabeled: NDArray[np.float64] | None = None
+    image_labels: KittiLabels | None = None
 
     @cached_property
     def class_names(self) -> tuple[str, ...]:
@@ -330,6 +342,11 @@ class ScanFrame:
         return np.array([numbers.get(name, 0) for name in self.class_names], np.uint8)[self.point_classes]
 
 
+def box_label(name: str, labels: Collection[str]) -> str:
+    """Class of a detection in a set that tells ``labels`` apart: a van is a car in a set without vans."""
+    return name if name in labels else _COARSE.get(name, name)
+
+
 class ScanFolder:
     """The labeled scans of a folder in the plain layout.
 
@@ -397,12 +414,15 @@ class ScanFolder:
         if name not in self.drives:
             raise PointsError(f"{self.root} has no labeled scan {name!r}; its names are those of the files in velodyne")
         points = read_points(self.scans[name])
-        calibration = unlabeled = boxes = None
+        calibration = unlabeled = boxes = image_labels = None
         path = self._path("boxes", name)
         if path is not None and self.layout.box_format == "kitti":
             calibration = KittiCalibration.read(self.root / "calib" / f"{name}.txt")
-            found, unlabeled = read_objects(path, calibration)
+            rows = read_labels(path)
+            found, unlabeled = label_objects(rows, calibration)
             boxes = self._renamed(found, path)
+            kinds = [k if k == "dontcare" else _class_of(k, self.layout.boxes, path, "boxes") for k in rows.kinds]
+            image_labels = KittiLabels(tuple(kinds), rows.numbers)
         elif path is not None:
             boxes = self._renamed(self._read_boxes(path, name), path)
         classes = self._path("points", name)
@@ -417,6 +437,7 @@ class ScanFolder:
             None if area is None else _read_polygons(area),
             calibration,
             unlabeled,
+            image_labels,
         )
 
     def _path(self, kind: str, name: str) -> Path | None:

@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .causes import BUMPER, CAUSES, FLOOR
+from .center_ap import CLASSES, CenterTable, center_scores
+from .kitti_ap import ApTable, average_precisions
 from .metrics import BoxEvaluator, BoxScores, Confusion, ObjectKey, ProbabilitySweep, mean
 
 __all__ = ["ALL_ROUND", "BANDS", "FEWEST_OBJECTS", "SITTING", "VEHICLES", "Record", "banded", "figures", "within"]
@@ -124,6 +126,9 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
           models detect.
         - ``"all_round"``: by band and class, oriented boxes of vehicles (AP50) and people (AP25) wherever the truth is
           known, detected or not.
+        - ``"kitti"``: by class, overlap and level or range: AP as KITTI's benchmark computes it (`kitti_ap`), in its
+          image, or all round where all objects are labeled.
+        - ``"centers"``: by class: AP by the distance of centers, and errors of matches (`center_ap`).
         - ``"heading"``: of the matched boxes of ``"boxes"`` and ``"all_round"``, by band and class, those whose heading
           is right within 45 degrees.
         - ``"errors"``: by error and cause (`causes.CAUSES`). ``"all"`` is a share of the true (missed) or predicted
@@ -187,6 +192,10 @@ def _figures(tallies: Tallies) -> dict[str, Any]:
                 found.setdefault(group, {}).setdefault(name, {}).update(_box_rows(scores))
                 headings = found.setdefault("heading", {}).setdefault(group, {})
                 headings.setdefault(name, {}).update(_heading_rows(scores))
+        elif group == "kitti":
+            found[group] = _kitti_rows(tally)
+        elif group == "centers":
+            found[group] = _center_rows(tally)
         elif key == ("errors", "points"):
             scans, objects = tallies["errors", "scans"], tallies["errors", "objects"]
             found["errors"] = {error: _error_rows(error, tally, scans, objects) for error in CAUSES}
@@ -245,6 +254,25 @@ def _box_rows(scores_of: Mapping[str, BoxScores]) -> dict[str, Any]:
         label: {name: getattr(scores, name) for name in names} | _few(scores.n_objects)
         for label, scores in scores_of.items()
     }
+
+
+def _kitti_rows(table: ApTable) -> dict[str, Any]:
+    """By class, overlap and level or range."""
+    rows: dict[str, Any] = {}
+    for (label, overlap, level), counts in table.counts.items():
+        objects = [key for each in counts for key in each.objects]
+        scores = dict(zip(("ap_r40", "ap_r11", "ap"), average_precisions(counts), strict=True))
+        row = scores | {"n_truth": len(objects)} | _distinct(objects)
+        rows.setdefault(label, {}).setdefault(overlap, {})[level] = row
+    return rows
+
+
+def _center_rows(table: CenterTable) -> dict[str, Any]:
+    rows: dict[str, Any] = {}
+    for label in CLASSES:
+        objects = table.objects.get(label, ())
+        rows[label] = center_scores(table, label) | {"n_truth": len(objects)} | _distinct(objects)
+    return {"mean_ap": mean([row["ap"] for row in rows.values()])} | rows
 
 
 _HEADING = ("heading", "axis", "front_known", "n_found")

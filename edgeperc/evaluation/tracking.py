@@ -240,7 +240,7 @@ def read_sequence(
         )
     else:
         detections = [list(of_frame) for of_frame in boxes]
-        image_boxes = [_image_rectangles(_rows(of_frame), calibration) for of_frame in detections]
+        image_boxes = [calibration.image_rectangles(_rows(of_frame)) for of_frame in detections]
     n_frames = len(detections)
     placed = calibration.sensor_boxes(values[:, 9:16])
     ignored = (values[:, 2] > MAX_TRUNCATION) | (values[:, 3] > MAX_OCCLUSION)
@@ -359,21 +359,11 @@ def ab3dmot_sequence(sequence: TrackingSequence, classes: Sequence[str] = CLASSE
     return results
 
 
-def _in_camera(boxes: NDArray[np.float64], calibration: KittiCalibration) -> NDArray[np.float64]:
-    """Convert boxes (n, 7) to x ahead, y left, z up in the camera's frame: undoes `KittiCalibration.sensor_boxes`."""
-    R, t = calibration.T_cam_velo[:3, :3], calibration.T_cam_velo[:3, 3]
-    right, down, ahead = R @ boxes[:, :3].T + t[:, None]
-    cos, sin = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
-    climb = -(R[1, 0] * cos + R[1, 1] * sin) / R[1, 2]  # of the heading that is level in the camera's frame
-    heading = R @ np.stack([cos, sin, climb])
-    return np.column_stack([ahead, -right, -down, boxes[:, 3:6], np.arctan2(-heading[0], heading[2])])
-
-
 def _frame_truth(sequence: TrackingSequence, of: str, rules: str) -> list[FrameTruth]:
     """True boxes of one class for the metrics, by frame."""
     if rules != "ab3dmot":
         return [*sequence.truth[of]]
-    return [replace(frame, boxes=_in_camera(frame.boxes, sequence.calibration)) for frame in sequence.truth[of]]
+    return [replace(frame, boxes=sequence.calibration.in_camera(frame.boxes)) for frame in sequence.truth[of]]
 
 
 def _frame_tracks(sequence: TrackingSequence, results: Sequence[FrameResult], of: str, rules: str) -> list[FrameTracks]:
@@ -383,31 +373,15 @@ def _frame_tracks(sequence: TrackingSequence, results: Sequence[FrameResult], of
     for result, seen, unlabeled in zip(results, sequence.image_boxes, sequence.unlabeled, strict=True):
         mine = np.flatnonzero([label in KINDS[of] for label in result.labels])
         ids, boxes = result.ids[mine], result.boxes[mine]
-        shown = _image_rectangles(boxes, sequence.calibration)
+        shown = sequence.calibration.image_rectangles(boxes)
         if rules == "ab3dmot":
             for k, (one, source) in enumerate(zip(ids.tolist(), result.sources[mine].tolist(), strict=True)):
                 if source >= 0:
                     last[one] = seen[source]
                 shown[k] = last.get(one, shown[k])
-            boxes = _in_camera(boxes, sequence.calibration)
+            boxes = sequence.calibration.in_camera(boxes)
         frames.append(FrameTracks(ids, boxes, result.scores[mine], _excused(shown, unlabeled)))
     return frames
-
-
-def _image_rectangles(boxes: NDArray[np.float64], calibration: KittiCalibration) -> NDArray[np.float64]:
-    """Project boxes (n, 7): left, top, right, bottom [px] within the image; without area if a box is not in it."""
-    signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
-    local = signs[None] * boxes[:, None, 3:6]
-    cos, sin = np.cos(boxes[:, 6])[:, None], np.sin(boxes[:, 6])[:, None]
-    x = boxes[:, :1] + cos * local[..., 0] - sin * local[..., 1]
-    y = boxes[:, 1:2] + sin * local[..., 0] + cos * local[..., 1]
-    corners = np.stack([x, y, boxes[:, 2:3] + local[..., 2]], axis=-1)
-    pixel, depth = calibration.to_image(corners.reshape(-1, 3))
-    pixel, depth = pixel.reshape(-1, 8, 2), depth.reshape(-1, 8)
-    ahead = depth > 0.1  # a corner behind the camera has no pixel
-    low = np.where(ahead[..., None], pixel, np.inf).min(axis=1).clip(0.0, IMAGE_SIZE)
-    high = np.where(ahead[..., None], pixel, -np.inf).max(axis=1).clip(0.0, IMAGE_SIZE)
-    return np.hstack([low, np.maximum(high, low)])
 
 
 def _excused(shown: NDArray[np.float64], unlabeled: NDArray[np.float64]) -> NDArray[np.bool_]:

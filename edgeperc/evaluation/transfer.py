@@ -17,9 +17,11 @@ from ..sensor import SensorProfile, get_sensor
 from ..sensor_fit import fit_sensor
 from ..simulation.samples import FIRST_SEED, IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASSES
+from ..zoo import DEFAULT
+from .judge import Judge
 from .metrics import FEWEST_RETURNS, Confusion, ObjectKey, object_key
 from .scan_folder import ScanFolder, ScanFrame, class_number
-from .tables import FEWEST_OBJECTS
+from .tables import FEWEST_OBJECTS, figures
 from .unseen import check_unseen, training_scans_of
 
 __all__ = ["Scan", "compare"]
@@ -94,7 +96,9 @@ def compare(
         By dataset: ``"n_scans"``, ``"function"``, and by adaptation ``"iou"`` (class -> IoU, None for a class that does
         not occur), ``"mean_iou"`` over the classes except the background, ``"n_points"`` (class -> count). In
         ``"n_objects"`` distinct objects by class, or None if only points are labeled, and in ``"few"`` the classes with
-        fewer than `tables.FEWEST_OBJECTS`: their figures say little.
+        fewer than `tables.FEWEST_OBJECTS`: their figures say little. In ``"boxes"`` the figures ``"kitti"`` and
+        ``"centers"`` of `tables.figures` for labeled scans with boxes: those of the default pair, all round, with
+        ``model`` for the points.
 
     Raises
     ------
@@ -107,8 +111,8 @@ def compare(
     """
     result: dict[str, Any] = {}
     sets = [(name, *_dataset(name)) for name in datasets]
-    total, done = sum(len(ADAPTATIONS) * n for _, _, n, _ in sets), 0
-    for name, sensor, n_scans, read in sets:
+    total, done = sum((len(ADAPTATIONS) + (folder is not None)) * n for _, _, n, _, folder in sets), 0
+    for name, sensor, n_scans, read, folder in sets:
         perceivers = {
             adaptation: Perceiver(
                 model,
@@ -141,6 +145,15 @@ def compare(
             **_distinct(objects),
             **{adaptation: _row(confusion) for adaptation, confusion in counts.items()},
         }
+        if folder is not None:
+            judge = Judge([*DEFAULT[:1], model], provider=provider, precision=precision, sensor=sensor)
+            records = []
+            for frame in _frames(folder):
+                records.append(judge.record_boxes(frame))
+                done += 1
+                on_scan(done, total)
+            measured = figures(records)
+            result[name]["boxes"] = {key: measured[key] for key in ("kitti", "centers") if key in measured}
     return result
 
 
@@ -169,12 +182,11 @@ def _row(confusion: Confusion) -> dict[str, Any]:
     return {"iou": known, "mean_iou": sum(objects) / len(objects) if objects else None, "n_points": n_points}
 
 
-def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]]]:
-    """Sensor and number of scans of a dataset, and a function that reads them."""
+def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]], ScanFolder | None]:
+    """Sensor and number of scans of a dataset, a function that reads them, and their folder if they have boxes."""
     sensor_name, equals, source = name.partition("=")
     if not equals:
-        folder = _folder(name)
-        return folder.layout.sensor, len(folder.names("test")), lambda: map(_of_frame, _frames(folder))
+        return _of_folder(_folder(name))
     sensor = get_sensor(sensor_name)
     kind, _, number = source.partition(":")
     if kind == "simulation":
@@ -183,12 +195,23 @@ def _dataset(name: str) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]
         n = int(number or 24)
         sensor = replace(sensor, remission_range=(0.0, _raw_model(sensor)[0]), remission=None)
         fitted, _ = fit_sensor([_simulated(sensor, FIRST_SEED - 1 - k).points for k in range(N_FITTED)], sensor)
-        return fitted, n, lambda: (_simulated(sensor, FIRST_SEED + k) for k in range(n))
+        return fitted, n, lambda: (_simulated(sensor, FIRST_SEED + k) for k in range(n)), None
     images = sorted(Path(source).glob("*.npy"))
     if images:
-        return sensor, len(images), lambda: map(_from_image, images)
-    folder = _folder(source)
-    return sensor, len(folder.names("test")), lambda: map(_of_frame, _frames(folder))
+        return sensor, len(images), lambda: map(_from_image, images), None
+    return _of_folder(_folder(source), sensor)
+
+
+def _of_folder(
+    folder: ScanFolder, sensor: SensorProfile | None = None
+) -> tuple[SensorProfile, int, Callable[[], Iterator[Scan]], ScanFolder | None]:
+    n_scans = len(folder.names("test"))
+    return (
+        sensor or folder.layout.sensor,
+        n_scans,
+        lambda: map(_of_frame, _frames(folder)),
+        folder if folder.layout.boxes else None,
+    )
 
 
 def _folder(source: str) -> ScanFolder:

@@ -18,6 +18,7 @@ from ..points import read_only
 from ..simulation.samples import IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES, TOP_VIEW_CLASSES
 from .datasets import ROAD_CLASSES, Frame, RoadFrame
+from .kitti_ap import FrontTruth, image_size_of
 from .scan_folder import ScanFrame
 from .tables import VEHICLES
 
@@ -60,6 +61,10 @@ class Truth:
         By name of a table: its classes, and the true class of each cell (rows, columns) uint8, `IGNORE` where unknown.
     road : tuple of 2 str, or None
         The table, and its class that counts as drivable.
+    front : FrontTruth or None
+        KITTI's labels of the image, if the scan has them.
+    box_labels : frozenset of str or None
+        Classes that the boxes of the set tell apart; None: all.
     """
 
     name: str
@@ -71,6 +76,8 @@ class Truth:
     known: Callable[[NDArray[np.float64]], NDArray[np.bool_]]
     cells: Cells
     road: tuple[str, str] | None = None
+    front: FrontTruth | None = None
+    box_labels: frozenset[str] | None = None
 
 
 def kitti_truth(frame: Frame, view: TopViewGeometry | None, road: tuple[str, NDArray[np.bool_]] | None = None) -> Truth:
@@ -96,7 +103,12 @@ def kitti_truth(frame: Frame, view: TopViewGeometry | None, road: tuple[str, NDA
             cells[title] = TOP_VIEW_CLASSES, np.where(known, surface, IGNORE).astype(np.uint8)
     returns = tuple(int(np.count_nonzero(inside(box, frame.points, 0.1))) for box in frame.boxes)
     labels = frame.point_labels()
-    return Truth(frame.name, frame.drive, frame.points, labels, frame.boxes, returns, frame.known_at, cells)
+    front = None
+    if frame.labels is not None:
+        front = FrontTruth(frame.labels, frame.calibration, image_size_of(frame.drive))
+    return Truth(
+        frame.name, frame.drive, frame.points, labels, frame.boxes, returns, frame.known_at, cells, front=front
+    )
 
 
 def semantickitti_truth(frame: RoadFrame, view: TopViewGeometry | None) -> Truth:
@@ -142,7 +154,11 @@ def folder_truth(
         if surface is not None:
             cells[OBSERVED], road = (ROAD_CLASSES, surface), (OBSERVED, "road")
     points = model.move(frame.points)
-    return Truth(frame.name, frame.drive, points, labels, boxes, frame.returns, known, cells, road)
+    front = None
+    if frame.calibration is not None and frame.image_labels is not None:
+        front = FrontTruth(frame.image_labels, frame.calibration, image_size_of(frame.drive))
+    box_labels = frozenset(frame.layout.boxes.values())
+    return Truth(frame.name, frame.drive, points, labels, boxes, frame.returns, known, cells, road, front, box_labels)
 
 
 def road_cells(frame: ScanFrame, mounting: Mounting, view: TopViewGeometry) -> NDArray[np.uint8] | None:

@@ -335,7 +335,11 @@ class RosMessages:
             found = scan.perception
             level = _LEVELS[scan.health] if level is None else level
             message = message or scan.health or "OK"
-            listed |= {"points": found.n_points, "points not finite": found.n_dropped, "boxes": len(found.boxes)}
+            near, ego = found.dropped.too_near, found.dropped.ego
+            listed |= {"points": found.n_points, "points not finite": found.n_dropped - near - ego}
+            listed |= {"points too near": near} if near else {}
+            listed |= {"points of the own vehicle": ego} if ego else {}
+            listed |= {"boxes": len(found.boxes)}
             if scan.tracks is not None:
                 listed["tracks"] = len(scan.tracks)
             if found.top_view is not None:

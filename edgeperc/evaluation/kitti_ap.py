@@ -1,0 +1,409 @@
+"""Average precision of boxes as KITTI's object benchmark defines it (``evaluate_object.cpp`` of its development kit).
+
+Boxes are compared from above (bird's eye) and in 3-D. In the image of KITTI's camera the benchmark's levels apply
+(easy, moderate, hard): limits of the height in the image, of occlusion and of truncation. Where all objects around the
+sensor are labeled, the same matching is used without these limits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry import oriented_iou, shared_area
+from ..perception import Box
+from .datasets import IMAGE_SIZE, IMAGE_SIZES, KittiCalibration, KittiLabels
+from .metrics import EVERYWHERE, ObjectKey, interpolated_precision, object_key
+
+__all__ = [
+    "CLASSES",
+    "LEVELS",
+    "RANGES",
+    "ApTable",
+    "Candidate",
+    "Counts",
+    "FrontTruth",
+    "average_precisions",
+    "best_candidates",
+    "candidate_recall",
+    "count_all_round",
+    "count_in_image",
+    "count_matches",
+    "image_size_of",
+]
+
+N_POSITIONS = 40  # recall positions of the curve, without recall 0
+
+# Smallest IoU of a match, the benchmark's own and a looser one, and neighboring classes that a detector may find.
+CLASSES = {
+    "car": ((0.7, 0.5), ("van",)),
+    "pedestrian": ((0.5, 0.25), ("person_sitting",)),
+    "cyclist": ((0.5, 0.25), ()),
+}
+# Smallest height in the image [px], largest occlusion and truncation of an object to find.
+LEVELS = {"easy": (40, 0, 0.15), "moderate": (25, 1, 0.3), "hard": (25, 2, 0.5)}
+ALL_ROUND = "all round"
+RANGES = {"0-15 m": (0.0, 15.0), "15-30 m": (15.0, 30.0), "30-45 m": (30.0, 45.0), "45-80 m": (45.0, 80.0)}
+RANGE_IOU = 0.5
+BIRDS_EYE, IN_3D = "bird's eye", "3-D"
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """Matches of one scan, for one class and one rule.
+
+    Attributes
+    ----------
+    objects : tuple of ObjectKey
+        One for each object to find.
+    hits : tuple of float
+        Scores of the first pass: of the best detection of each object.
+    steps : tuple of (float, int, int)
+        Change of the number of true and of false positives as the threshold falls to a score, best score first.
+    """
+
+    objects: tuple[ObjectKey, ...]
+    hits: tuple[float, ...]
+    steps: tuple[tuple[float, int, int], ...]
+
+
+@dataclass(slots=True)
+class ApTable:
+    """Counts of any number of scans by class, kind of overlap with its threshold, and level or range."""
+
+    counts: dict[tuple[str, str, str], tuple[Counts, ...]] = field(default_factory=dict)
+
+    def __add__(self, other: ApTable) -> ApTable:
+        """Add the scans of both."""
+        keys = dict.fromkeys((*self.counts, *other.counts))
+        return ApTable({key: self.counts.get(key, ()) + other.counts.get(key, ()) for key in keys})
+
+
+@dataclass(frozen=True)
+class FrontTruth:
+    """Labels of a KITTI scan and what is needed to see boxes as the camera does."""
+
+    labels: KittiLabels
+    calibration: KittiCalibration
+    image_size: tuple[int, int] = IMAGE_SIZE
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """How well the best of all candidates covers an object: IoU from above; distance from the sensor [m]."""
+
+    object: ObjectKey
+    label: str
+    range_m: float
+    iou: float
+
+
+def image_size_of(drive: str) -> tuple[int, int]:
+    """Width and height of the images of a raw drive [px], by its day; the most common size if the day is unknown."""
+    return IMAGE_SIZES.get(drive[:10], IMAGE_SIZE)
+
+
+def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> ApTable:
+    """Count the matches of one scan as KITTI's benchmark does.
+
+    Parameters
+    ----------
+    truth : FrontTruth
+        DontCare rectangles have no 3-D boxes, so no detection is excused by them from above and in 3-D.
+    boxes : sequence of Box
+        Detections in the sensor frame. Those that the image does not show are left out, as in a submission. The
+        rectangle of a detection is its projection, clipped to the image.
+    drive : str
+    """
+    kinds, numbers = _objects(truth.labels)
+    placed = truth.calibration.sensor_boxes(numbers[:, 7:14])
+    right_m = np.hypot(placed[:, 0], placed[:, 1])
+    objects = [_key(drive, kind, row) for kind, row in zip(kinds, numbers, strict=True)]
+    guesses = _rows(boxes)
+    seen = truth.calibration.image_rectangles(guesses, truth.image_size)
+    shown = ((seen[:, 2:] - seen[:, :2]) > 0.0).all(axis=1)
+    guesses, seen, boxes = guesses[shown], seen[shown], [boxes[k] for k in np.flatnonzero(shown).tolist()]
+    # The development kit keeps whole pixels of a detection's height, and the exact height of an object.
+    guess_px, guess_m = np.floor(seen[:, 3] - seen[:, 1]), np.hypot(guesses[:, 0], guesses[:, 1])
+    overlaps = _overlaps(truth.calibration.in_camera(guesses), _level_rows(numbers[:, 7:14]))
+    table = ApTable()
+    for label, overlap_name, least_iou, level, (near, far) in _rules(LEVELS, "hard"):
+        limits = level if level in LEVELS else "hard"
+        neighbors = CLASSES[label][1]
+        hidden = _hidden(numbers, limits) | (right_m < near) | (right_m >= far)
+        small = guess_px < LEVELS[limits][0]
+        columns = np.flatnonzero([kind == label or kind in neighbors for kind in kinds])
+        rows = np.flatnonzero(small | np.array([box.label == label for box in boxes], np.bool_))
+        optional = [bool(hidden[k]) or kinds[k] != label for k in columns]
+        table.counts[label, f"{overlap_name} {least_iou:g}", level] = (
+            count_matches(
+                overlaps[overlap_name][np.ix_(rows, columns)],
+                [boxes[k].score for k in rows],
+                least_iou,
+                [objects[k] for k in columns],
+                optional=optional,
+                small=small[rows].tolist(),
+                excused=((guess_m < near) | (guess_m >= far))[rows].tolist(),
+            ),
+        )
+    return table
+
+
+def count_all_round(
+    boxes: Sequence[Box],
+    to_find: Sequence[Box],
+    ignored: Sequence[Box],
+    drive: str,
+    unknown: Collection[str] = ("ignore",),
+) -> ApTable:
+    """Count the matches of one scan without the limits in the image.
+
+    Parameters
+    ----------
+    boxes : sequence of Box
+        Detections where objects are labeled.
+    to_find, ignored : sequence of Box
+        From `metrics.boxes_to_find`. Ignored objects of a class, of its neighbors or of an ``unknown`` class may be
+        found; those of other classes may not.
+    drive : str
+    unknown : collection of str
+    """
+    every = [*to_find, *ignored]
+    guesses, rights = _rows(boxes), _rows(every)
+    guess_m, right_m = (np.hypot(rows[:, 0], rows[:, 1]) for rows in (guesses, rights))
+    overlaps = _overlaps(guesses, rights)
+    table = ApTable()
+    for label, overlap_name, least_iou, level, (near, far) in _rules((ALL_ROUND,), ALL_ROUND):
+        may_be = (label, *CLASSES[label][1], *unknown)
+        columns = [k for k, box in enumerate(every) if box.label in may_be]
+        rows = [k for k, box in enumerate(boxes) if box.label == label]
+        optional = [k >= len(to_find) or every[k].label != label or not near <= right_m[k] < far for k in columns]
+        table.counts[label, f"{overlap_name} {least_iou:g}", level] = (
+            count_matches(
+                overlaps[overlap_name][np.ix_(rows, columns)],
+                [boxes[k].score for k in rows],
+                least_iou,
+                [object_key(drive, every[k]) for k in columns],
+                optional=optional,
+                small=[False] * len(rows),
+                excused=[not near <= guess_m[k] < far for k in rows],
+            ),
+        )
+    return table
+
+
+def best_candidates(
+    truth: FrontTruth, candidates: Sequence[Box], drive: str, level: str = "moderate"
+) -> list[Candidate]:
+    """Find the best candidate of each object of a level.
+
+    Parameters
+    ----------
+    truth : FrontTruth
+    candidates : sequence of Box
+        Of any class and score, in the sensor frame, such as rectangles around clusters. One may cover several objects.
+    drive : str
+    level : {"easy", "moderate", "hard"}
+
+    Returns
+    -------
+    list of Candidate
+        One for each object of `CLASSES` within the limits of the level; IoU 0 without a candidate.
+    """
+    kinds, numbers = _objects(truth.labels)
+    placed = truth.calibration.sensor_boxes(numbers[:, 7:14])
+    best = np.zeros(len(kinds))
+    if candidates:
+        guesses = truth.calibration.in_camera(_rows(candidates))
+        best = _overlaps(guesses, _level_rows(numbers[:, 7:14]))[BIRDS_EYE].max(axis=0)
+    return [
+        Candidate(_key(drive, kinds[k], numbers[k]), kinds[k], float(np.hypot(*placed[k, :2])), float(best[k]))
+        for k in np.flatnonzero(~_hidden(numbers, level)).tolist()
+        if kinds[k] in CLASSES
+    ]
+
+
+def candidate_recall(found: Sequence[Candidate], least_iou: float = 0.3) -> dict[str, tuple[float, int]]:
+    """Share of the objects of each class with a candidate of at least this IoU, and the number of objects."""
+    by_class = {label: [each.iou >= least_iou for each in found if each.label == label] for label in CLASSES}
+    return {label: (sum(hits) / len(hits) if hits else math.nan, len(hits)) for label, hits in by_class.items()}
+
+
+def count_matches(
+    overlaps: NDArray[np.float64],
+    scores: Sequence[float],
+    least_iou: float,
+    objects: Sequence[ObjectKey],
+    *,
+    optional: Sequence[bool],
+    small: Sequence[bool],
+    excused: Sequence[bool],
+) -> Counts:
+    """Match detections to objects in the two passes of the development kit, at every threshold at which they change.
+
+    Objects choose in their order: in the first pass the detection with the best score, in the second, among those
+    that reach the threshold, the one with the largest overlap, and one that is not small before one that is.
+
+    Parameters
+    ----------
+    overlaps : (n, m) float64
+        IoU of each detection with each object.
+    scores : sequence of float, n
+    least_iou : float
+        A match has a larger IoU.
+    objects : sequence of ObjectKey, m
+    optional : sequence of bool, m
+        Objects that may be found but need not.
+    small : sequence of bool, n
+        Detections too small in the image: neither hits nor false positives.
+    excused : sequence of bool, n
+        Detections that are no false positives, but may be hits.
+    """
+    candidates = [
+        [(j, float(overlaps[j, k])) for j in np.flatnonzero(overlaps[:, k] > least_iou).tolist()]
+        for k in range(len(objects))
+    ]
+    hits: list[float] = []
+    taken: set[int] = set()
+    for k, near in enumerate(candidates):
+        free = [j for j, _ in near if j not in taken]
+        if free:
+            best = max(free, key=lambda j: scores[j])
+            taken.add(best)
+            if not optional[k] and not small[best]:
+                hits.append(scores[best])
+    steps, last = [], (0, 0)
+    for threshold in sorted(set(scores), reverse=True):
+        counted = _second_pass(candidates, scores, threshold, optional, small, excused)
+        if counted != last:
+            steps.append((threshold, counted[0] - last[0], counted[1] - last[1]))
+            last = counted
+    to_find = tuple(key for key, spare in zip(objects, optional, strict=True) if not spare)
+    return Counts(to_find, tuple(hits), tuple(steps))
+
+
+def _second_pass(
+    candidates: Sequence[Sequence[tuple[int, float]]],
+    scores: Sequence[float],
+    threshold: float,
+    optional: Sequence[bool],
+    small: Sequence[bool],
+    excused: Sequence[bool],
+) -> tuple[int, int]:
+    """Number of true and of false positives among the detections with at least this score."""
+    n_hits = 0
+    taken: set[int] = set()
+    for k, near in enumerate(candidates):
+        free = [(j, iou) for j, iou in near if j not in taken and scores[j] >= threshold]
+        large = [(j, iou) for j, iou in free if not small[j]]
+        if not free:
+            continue
+        best = max(large, key=lambda pair: pair[1])[0] if large else free[0][0]
+        taken.add(best)
+        n_hits += not optional[k] and bool(large)
+    n_false = sum(
+        score >= threshold and not small[j] and not excused[j] and j not in taken for j, score in enumerate(scores)
+    )
+    return n_hits, n_false
+
+
+def average_precisions(counts: Sequence[Counts]) -> tuple[float, float, float]:
+    """Average precision of any number of scans.
+
+    Returns
+    -------
+    ap_r40, ap_r11 : float
+        As the development kit computes it: precision at the thresholds of 41 recall positions, best from each on; the
+        mean without recall 0, and of every fourth. With fewer than 41 objects there are fewer thresholds than
+        positions, and the others count as 0.
+    ap : float
+        Mean of the best precision at recalls 1/40, 2/40 .. 1, read from the whole curve; for any number of objects.
+        All are NaN without objects.
+    """
+    n_truth = sum(len(each.objects) for each in counts)
+    if n_truth == 0:
+        return math.nan, math.nan, math.nan
+    hits = np.sort(np.array([score for each in counts for score in each.hits], np.float64))[::-1]
+    steps = np.array([step for each in counts for step in each.steps], np.float64).reshape(-1, 3)
+    steps = steps[np.argsort(-steps[:, 0], kind="stable")]
+    n_hits, n_false = np.cumsum(steps[:, 1:], axis=0).astype(np.int64).T
+    curve = np.zeros(N_POSITIONS + 1)
+    thresholds = hits[[*_positions(len(hits), n_truth)]]
+    last = np.searchsorted(-steps[:, 0], -thresholds, side="right") - 1
+    curve[: len(last)] = n_hits[last] / np.maximum(n_hits[last] + n_false[last], 1)
+    curve = np.maximum.accumulate(curve[::-1])[::-1]
+    # Scans of equal scores change together.
+    ends = np.flatnonzero(np.append(np.diff(steps[:, 0]) != 0.0, True)[: len(steps)])
+    levels = np.arange(1, N_POSITIONS + 1)
+    ap = interpolated_precision(n_hits[ends], (n_hits + n_false)[ends], n_truth, levels, N_POSITIONS)
+    return float(curve[1:].mean()), float(curve[::4].mean()), ap
+
+
+def _positions(n_hits: int, n_truth: int) -> Iterator[int]:
+    """Which hits, best first, give the thresholds of the recall positions (``getThresholds``)."""
+    recall, k = 0.0, 0
+    while k < n_hits:
+        # All but a few of the hits that are skipped, without a loop over them.
+        k = max(k, min(int(n_truth * recall - 1.5) - 2, n_hits - 1))
+        while k < n_hits - 1 and (k + 2) / n_truth - recall < recall - (k + 1) / n_truth:
+            k += 1
+        yield k
+        recall += 1.0 / N_POSITIONS
+        k += 1
+
+
+def _rules(levels: Collection[str], of_ranges: str) -> Iterator[tuple[str, str, float, str, tuple[float, float]]]:
+    """Class, kind of overlap, smallest IoU, level or range, and range of distances of each row."""
+    for label, (least_ious, _) in CLASSES.items():
+        for least_iou in least_ious:
+            for overlap_name in (BIRDS_EYE, IN_3D):
+                for level in levels:
+                    yield label, overlap_name, least_iou, level, EVERYWHERE
+        for band, within_m in RANGES.items():
+            yield label, BIRDS_EYE, RANGE_IOU, band, within_m
+
+
+def _objects(labels: KittiLabels) -> tuple[list[str], NDArray[np.float64]]:
+    """Classes and numbers of the rows that are no DontCare regions."""
+    is_object = np.array([kind != "dontcare" for kind in labels.kinds], np.bool_)
+    return [kind for kind in labels.kinds if kind != "dontcare"], labels.numbers[is_object]
+
+
+def _hidden(numbers: NDArray[np.float64], level: str) -> NDArray[np.bool_]:
+    """Which objects exceed a limit of the level."""
+    least_px, most_occluded, most_truncated = LEVELS[level]
+    hidden = (numbers[:, 1] > most_occluded) | (numbers[:, 0] > most_truncated)
+    return np.asarray(hidden | (numbers[:, 6] - numbers[:, 4] <= least_px), np.bool_)
+
+
+def _key(drive: str, kind: str, numbers: NDArray[np.float64]) -> ObjectKey:
+    height, width, length = numbers[7:10].tolist()
+    return object_key(drive, Box(kind, 1.0, (0.0, 0.0, 0.0), (length, width, height), 0.0))
+
+
+def _rows(boxes: Sequence[Box]) -> NDArray[np.float64]:
+    """x, y, z of the center, length, width, height, yaw, (n, 7)."""
+    return np.array([(*box.center, *box.size, box.yaw) for box in boxes], np.float64).reshape(-1, 7)
+
+
+def _level_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Labels (n, 7) in the camera's frame as `KittiCalibration.in_camera` returns boxes."""
+    height, width, length, x, y, z, turn = numbers.T
+    yaw = np.arctan2(-np.cos(turn), -np.sin(turn))
+    return np.column_stack([z, -x, height / 2.0 - y, length, width, height, yaw])
+
+
+def _overlaps(a: NDArray[np.float64], b: NDArray[np.float64]) -> Mapping[str, NDArray[np.float64]]:
+    """IoU of boxes (n, 7) and (m, 7) from above and in 3-D, (n, m) each."""
+    flat_a, flat_b = a[:, [0, 1, 3, 4, 6]], b[:, [0, 1, 3, 4, 6]]
+    from_above = oriented_iou(flat_a, flat_b)
+    top = np.minimum.outer(a[:, 2] + a[:, 5] / 2.0, b[:, 2] + b[:, 5] / 2.0)
+    bottom = np.maximum.outer(a[:, 2] - a[:, 5] / 2.0, b[:, 2] - b[:, 5] / 2.0)
+    shared = shared_area(from_above, flat_a, flat_b) * np.maximum(top - bottom, 0.0)
+    volumes = np.add.outer(a[:, 3:6].prod(axis=1), b[:, 3:6].prod(axis=1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return {BIRDS_EYE: from_above, IN_3D: np.where(shared > 0.0, shared / (volumes - shared), 0.0)}

@@ -1,0 +1,24 @@
+"""Slow twin of what is a return of the world."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def returns(points, min_range_m, origin=(0.0, 0.0), ego_box=None):
+    """Twin of `edgeperc.returns.returns`: the points, and the number that are not finite, too near and of the ego."""
+    out = points.copy()
+    counts = [0, 0, 0]
+    for i, (x, y, z, remission) in enumerate(points.astype(np.float64)):
+        place = np.array([x - origin[0], y - origin[1], z])
+        if not np.isfinite([x, y, z, remission]).all():
+            kind = 0
+        elif (place**2).sum() <= (min_range_m * (1.0 + 1e-6)) ** 2:
+            kind = 1
+        elif ego_box is not None and all(low <= v <= high for v, (low, high) in zip(place, ego_box, strict=True)):
+            kind = 2
+        else:
+            continue
+        counts[kind] += 1
+        out[i] = np.nan
+    return out, tuple(counts)
