@@ -158,10 +158,10 @@ class Pipeline:
         # Between points, the ground is found anew, with all points.
         interpolates = any(network.interpolator is not None for network in ranged)
         turns = bool(ranged) and options.full_turn
-        self._sectors = sectors_of_turn(ranged[0].view, whole=interpolates) if turns else []
+        self.sectors = sectors_of_turn(ranged[0].view, whole=interpolates) if turns else []
         # Half of the points of a scan are near no view that looks ahead: 16.1 in place of 17.5 ms.
         views = [network.view for network in (top, *ranged[:1]) if network is not None]
-        self._crop = Crop([] if options.full_turn or interpolates else views)
+        self.crop = Crop([] if options.full_turn or interpolates else views)
 
     def __call__(self, points: NDArray[np.float32], mounting: Mounting, watch: Stopwatch) -> Parts:
         """Perceive points in the frame of the models, (n, 4) float32, read-only, finite or NaN."""
@@ -186,7 +186,7 @@ class Pipeline:
 
         # The range image (PointSeg), once or for each sector of a turn
         labels = absent
-        sectors = [value("refine", self._label_sector, k, near, scan, watch) for k in range(len(self._sectors))]
+        sectors = [value("refine", self._label_sector, k, near, scan, watch) for k in range(len(self.sectors))]
         if sectors:
             labels = value("refine", _joined, near, *sectors)
         elif self.ranged:
@@ -228,7 +228,7 @@ class Pipeline:
         return Parts(whole, view(), joined())
 
     def _select(self, points: NDArray[np.float32]) -> View:
-        return View(*self._crop.select(points))
+        return View(*self.crop.select(points))
 
     def _label_ahead(self, near: View, scan: Scan | None, watch: Stopwatch) -> PointLabels:
         return self.ranged[0].label(near.points, None if scan is None else scan.ground.height_m, watch)
@@ -237,7 +237,7 @@ class Pipeline:
         self, k: int, near: View, scan: Scan | None, watch: Stopwatch
     ) -> tuple[PointLabels, NDArray[np.int32] | None]:
         """Labels of the points in a sector of the turn, by a network that is free, and their rows."""
-        turn_rad, crop = self._sectors[k]
+        turn_rad, crop = self.sectors[k]
         points, rows = crop.select(near.points)
         heights = None if scan is None else scan.ground.height_m
         if heights is not None and rows is not None:

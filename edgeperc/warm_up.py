@@ -143,6 +143,8 @@ def warm_up(
         few_points, _ = returns(few_points, sensor)
         render(few_points, replace(sensor, remission=NO_REMISSION))
         check_profiles(few_points, fitness, sensor)
+        if pipeline.needs_ground:
+            find_ground(few_points, mount_height_m=MODEL_HEIGHT_M)  # these show none
         golden_top, golden_ranged = copy(top), [copy(network) for network in ranged]
         for network in (golden_top, *golden_ranged):
             if network is not None:

@@ -18,6 +18,7 @@ from edgeperc.card import RangeImageGeometry, TopViewGeometry
 from edgeperc.crop import MARGIN_M, Crop, fill_rows, spread
 from edgeperc.observed import Observer
 from edgeperc.perception import PointLabels
+from edgeperc.pipeline import Pipeline
 from edgeperc.projection import make_projector
 from edgeperc.sensor import get_sensor
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
@@ -139,13 +140,18 @@ def test_buffers_grow_and_empty_scans_stay_empty() -> None:
         np.testing.assert_array_equal(rows_of(crop, points), np.arange(0, n, 2))
 
 
+def pipeline_of(perceive: Perceiver) -> Pipeline:
+    assert perceive._pipeline is not None
+    return perceive._pipeline
+
+
 @pytest.mark.parametrize("models", [["ssadnet", "pointseg"], ["pointseg"], ["ssadnet"]])
 def test_answers_are_those_with_all_points(models: list[str]) -> None:
     cropping, whole = (Perceiver(models, provider="cpu", n_threads=1, on_mismatch="ignore") for _ in range(2))
-    whole._crop = Crop([])
+    pipeline_of(whole).crop = Crop([])
     for seed in range(3):
         points = simulated_scan(FIRST_SEED + seed).points
-        assert 0.2 < len(rows_of(cropping._crop, points)) / len(points) < 0.8
+        assert 0.2 < len(rows_of(pipeline_of(cropping).crop, points)) / len(points) < 0.8
         seen, expected = cropping(points), whole(points)
         assert seen.boxes == expected.boxes
         assert seen.n_points == expected.n_points
@@ -161,8 +167,9 @@ def test_answers_of_a_full_turn_are_those_of_sectors_with_all_points() -> None:
     options: dict[str, Any] = {"provider": "cpu", "n_threads": 1, "on_mismatch": "ignore", "full_turn": True}
     cropping, whole = Perceiver("pointseg", **options), Perceiver("pointseg", **options)
     everything = Crop([])
-    whole._sectors = [(turn_rad, everything) for turn_rad, _ in whole._sectors]
-    whole._sectors[0][1].select = lambda points: (points, np.arange(len(points), dtype=np.int32))  # type: ignore[method-assign]
+    sectors = [(turn_rad, everything) for turn_rad, _ in pipeline_of(whole).sectors]
+    pipeline_of(whole).sectors = sectors
+    sectors[0][1].select = lambda points: (points, np.arange(len(points), dtype=np.int32))  # type: ignore[method-assign]
     for seed in range(2):
         points = simulated_scan(FIRST_SEED + seed).points
         seen, expected = cropping(points), whole(points)
@@ -179,7 +186,7 @@ def test_between_points_the_ground_is_found_with_all_of_them(full_turn: bool) ->
     options: dict[str, Any] = {"provider": "cpu", "sensor": "vlp-16", "on_mismatch": "ignore"}
     perceive = Perceiver("pointseg", adapt="interpolation", full_turn=full_turn, **options)
     points = np.ones((3, 4), np.float32)
-    for crop in (perceive._crop, *(crop for _, crop in perceive._sectors)):
+    for crop in (pipeline_of(perceive).crop, *(crop for _, crop in pipeline_of(perceive).sectors)):
         assert crop.select(points)[1] is None
     points = simulated_scan(FIRST_SEED, "vlp-16").points
     seen = perceive(points).points
@@ -196,4 +203,4 @@ def test_every_point_that_a_network_sees_is_kept() -> None:
         pixel = np.empty(len(points), np.int32)
         values = np.empty((len(card.input.channels), *index.shape), np.float32)
         make_projector(card.view, card.input).fill(points, values, index, pixel, points[:, 2].copy())
-        assert set(np.flatnonzero(pixel >= 0)) <= set(rows_of(perceive._crop, points))
+        assert set(np.flatnonzero(pixel >= 0)) <= set(rows_of(pipeline_of(perceive).crop, points))

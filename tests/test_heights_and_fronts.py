@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 torch = pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
-import edgeperc.perceiver as perceiver_module
+import edgeperc.pipeline as pipeline_module
 import edgeperc_export.quantize as quantize_module
 from edgeperc import Perceiver, SensorProfile
 from edgeperc.ground import fit_ground
@@ -76,7 +76,7 @@ def test_from_training_to_the_vehicle(tmp_path: Path, scans: Sequence[NDArray[np
 
     boxes_from: BoxesFrom = "network" if top else "both"
     perceive = Perceiver(path, provider="cpu", mounting=MODEL_MOUNTING, on_mismatch="ignore", boxes_from=boxes_from)
-    with mock.patch.object(perceiver_module, "fit_ground", side_effect=fit_ground) as found:
+    with mock.patch.object(pipeline_module, "fit_ground", side_effect=fit_ground) as found:
         answer = perceive(scans[0])
     assert found.call_count == 1  # once for the network's input, the clusters and the agreement
     seen = project(make_projector(card.view, card.input), scans[0])

@@ -489,7 +489,7 @@ def test_gross_differences_are_refused_before_a_network_runs(
     """As often as such a scan comes; good scans are perceived."""
     perceive = Perceiver("pointseg", provider="cpu")
     with monkeypatch.context() as patch:
-        patch.setattr(perceive, "_label_sector", None)
+        patch.setattr(perceive, "_pipeline", pytest.fail)
         for _ in range(7):
             with pytest.raises(FitnessError, match=rf"(?s){FAULTS[fault]}.*on_mismatch=\"warn\".*--anyway"):
                 perceive(faulty(scan.points, fault))
