@@ -48,7 +48,7 @@ from .errors import (
 if TYPE_CHECKING:
     from .calibration import Calibration
     from .card import ModelCard
-    from .drivable import RoadAhead, road_ahead
+    from .drivable import FreeAhead, RoadAhead, free_ahead, road_ahead
     from .frame import ModelFrame
     from .listing import ModelInfo, ProviderInfo, SensorInfo, models, providers, sensors
     from .live import Answer, Stream, stream
@@ -155,6 +155,7 @@ _MODULES = {
     "Perception": "perception",
     "PointLabels": "perception",
     "ProviderInfo": "listing",
+    "FreeAhead": "drivable",
     "RoadAhead": "drivable",
     "SensorInfo": "listing",
     "SensorProfile": "sensor",
@@ -180,6 +181,7 @@ _MODULES = {
     "read_points": "readers.files",
     "read_scans": "readers.captures",
     "read_timed_scans": "readers.captures",
+    "free_ahead": "drivable",
     "road_ahead": "drivable",
     "sensor_of": "readers.captures",
     "sensors": "listing",

@@ -657,8 +657,17 @@ class Perceiver:
         assert self._mounting.height_m is not None
         found = boxes()  # first: where no thread can be started, this runs the network
         labels = decode_cells(card, network.index >= 0, network.session.outputs, found)
-        observed = network.observer.observe(scan, network.index, self._mounting.height_m)
-        return TopView(labels, card.classes, grid.cell_m, grid.x_range_m, grid.y_range_m, observed, self._mounting)
+        observed, between_beams = network.observer.observe(scan, network.index, self._mounting)
+        return TopView(
+            labels,
+            card.classes,
+            grid.cell_m,
+            grid.x_range_m,
+            grid.y_range_m,
+            observed,
+            self._mounting,
+            between_beams,
+        )
 
     def _label_sector(
         self,
