@@ -31,6 +31,7 @@ __all__ = [
     "Observation",
     "Observer",
     "fill_lowest_returns",
+    "bridge_sectors",
     "follow_rays",
     "mark_cells",
 ]
@@ -68,7 +69,7 @@ SECTOR_RAD = math.radians(0.4)
 MAX_RINGS = 4096
 STEEPEST_DEG = 80.0
 GRADIENT_BIN = 0.005
-SEEN, BETWEEN = 1, 2  # states of a bin; 0: neither
+SEEN, BETWEEN, PASSED = 1, 2, 3  # states of a bin, from `follow_rays`; 0: no ray says anything
 FARTHER = 1.4  # returns up to this many times as far as the view are used, for the rays that pass over it
 
 # A return is on the ground if it is at most MAX_STEP_M + MAX_SLOPE * distance above or below the previous one, with a
@@ -195,6 +196,7 @@ class Observer:
         # A direction of the models' frame has this much more gradient in the frame of the sensor.
         tilt = ModelFrame(mounting).R[:2, 2] @ self._ahead
         follow_rays(self._lowest, rays, self._steps, tilt, self._level, self._state)
+        bridge_sectors(self._state)
         mark_cells(rows, cells, self._bin_of_cell, self._level, self._state, observed, between)
         return Observation(observed, between)
 
@@ -274,6 +276,7 @@ def follow_rays(
     state : (sectors, rings) uint8, overwritten
         `SEEN`: bins with a return below `OVERHEAD_M`, and bins between two connected returns that the ray to the
         farther one passes at most `CLEARANCE_M` above the ground. `BETWEEN`: other bins of a gap that is bridged.
+        `PASSED`: bins of a longer gap that a ray passes as closely as observed ones.
     """
     n_sectors, n_rings = lowest.shape
     ring_m, z_beams, first_gradient, max_apart = rays[0], rays[1], rays[2], rays[3]
@@ -301,8 +304,10 @@ def follow_rays(
             share = CLEARANCE_M / height if height > CLEARANCE_M else 1.0
             apart = (z - z_beams) / x - gradient
             step = steps[min(max(int(-(gradient + tilt[sector]) / GRADIENT_BIN), 0), steps.shape[0] - 1)]
-            highest = CLEARANCE_M if x_last == 0.0 else BRIDGE_M
-            bridged = (not hidden) & ((x_last == 0.0) | (apart <= step))
+            first = x_last == 0.0  # returns before it are those of the vehicle itself
+            neighbors = first | (apart <= step)
+            highest = BRIDGE_M if neighbors and not first else CLEARANCE_M
+            bridged = (first or not hidden) and foot <= highest
             for between in range(begin, ring if on_ground | bridged else begin):
                 back = (x - (between + 0.5) * ring_m) / (x - x_last)
                 if on_ground:
@@ -310,11 +315,29 @@ def follow_rays(
                     if (back <= share) & (apart <= max_apart):
                         state[sector, between] = SEEN
                 if bridged & (state[sector, between] != SEEN) & (foot + (height - foot) * back <= highest):
-                    state[sector, between] = BETWEEN
+                    state[sector, between] = BETWEEN if neighbors else PASSED
             hidden = not on_ground
             if on_ground:
                 level[sector, ring] = z
                 x_last, z_last, gradient, begin = x, z, (z - z_beams) / x, ring + 1
+
+
+@njit(cache=True, nogil=True)
+def bridge_sectors(state: NDArray[np.uint8]) -> None:
+    """Make `PASSED` bins `BETWEEN` where both neighboring sectors are `SEEN` or `BETWEEN`: returns of one are missing.
+
+    Parameters
+    ----------
+    state : (sectors, rings) uint8, changed in place
+    """
+    n_sectors, n_rings = state.shape
+    for sector in range(1, n_sectors - 1):
+        for ring in range(n_rings):
+            # Of two such sectors side by side, each lacks a neighbor: both stay.
+            if state[sector, ring] == PASSED:
+                left, right = state[sector - 1, ring], state[sector + 1, ring]
+                if ((left == SEEN) | (left == BETWEEN)) & ((right == SEEN) | (right == BETWEEN)):
+                    state[sector, ring] = BETWEEN
 
 
 @njit(cache=True, nogil=True)

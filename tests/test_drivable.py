@@ -19,7 +19,7 @@ import edgeperc
 import twins.drivable
 import twins.outline
 from edgeperc import Box, OptionError, Perceiver, PointsError, TopView, read_points
-from edgeperc.drivable import fill_corridor, fill_free, road_ahead
+from edgeperc.drivable import FREE_ENDS, FreeAhead, fill_corridor, fill_first_cells, free_ahead, road_ahead
 from edgeperc.outline import resolve_contacts
 
 CLASSES = ("background", "drivable", "car", "van", "truck")
@@ -44,10 +44,11 @@ def blank() -> NDArray[np.bool_]:
 
 @patient
 @given(MASKS)
-def test_free_cells_are_counted_from_the_near_edge(cells: NDArray[np.bool_]) -> None:
-    free = np.full(cells.shape[1], 99)
-    fill_free(cells, free)
-    assert free.tolist() == twins.drivable.free_cells(cells)
+def test_cells_are_counted_from_the_near_edge_to_the_first_of_each_kind(cells: NDArray[np.bool_]) -> None:
+    objects, road = np.roll(cells, 1, axis=0) & np.roll(cells, 1, axis=1), np.ascontiguousarray(cells[::-1])
+    firsts = np.full((3, cells.shape[1]), 99)
+    fill_first_cells(objects, cells, road, firsts)
+    assert firsts.tolist() == twins.drivable.first_cells(objects, cells, road)
 
 
 @patient

@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 
 import twins.observed
 from edgeperc import Box, Perceiver, PointsError, TopView, road_ahead
 from edgeperc.card import InputSpec, TopViewGeometry
-from edgeperc.observed import CLEARANCE_M, Observer, fill_lowest_returns, follow_rays, mark_cells
+from edgeperc.mounting import MODEL_MOUNTING
+from edgeperc.observed import (
+    BRIDGE_M,
+    CLEARANCE_M,
+    Observer,
+    bridge_sectors,
+    fill_lowest_returns,
+    follow_rays,
+    mark_cells,
+)
 from edgeperc.projection import TopViewProjector
 from edgeperc.sensor import SensorProfile, get_sensor
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
@@ -61,7 +72,7 @@ def cast(
 
 def observe(points: NDArray[np.float32], sensor: str = "hdl-64e", view: TopViewGeometry = VIEW) -> NDArray[np.bool_]:
     projector = TopViewProjector(view, InputSpec("image", ("height",), (0.0,), (1.0,)))
-    return Observer(view, get_sensor(sensor)).observe(points, projector.project(points).index)
+    return Observer(view, get_sensor(sensor)).observe(points, projector.project(points).index).observed
 
 
 def at(mask: NDArray[np.bool_], x: tuple[float, float], y: tuple[float, float]) -> NDArray[np.bool_]:
@@ -84,16 +95,20 @@ def test_the_kernels_agree_with_their_twins(points: NDArray[np.float32], view: T
         lowest, twins.observed.lowest_returns(points, observer._bounds, observer._grid, shape)
     )
     for z_beams in (0.0, 0.4, -1.2):
-        level, seen = np.full(shape, 7.0, np.float32), np.ones(shape, np.bool_)
-        follow_rays(lowest, 1.0, z_beams, *observer._beams, level, seen)
-        right_level, right_seen = twins.observed.rays(lowest, 1.0, z_beams, *observer._beams)
-        np.testing.assert_array_equal(seen, right_seen)
+        level, state = np.full(shape, 7.0, np.float32), np.ones(shape, np.uint8)
+        rays, tilt = np.array([1.0, z_beams, *observer._beams]), 0.03 * observer._ahead[1]
+        follow_rays(lowest, rays, observer._steps, tilt, level, state)
+        right_level, right_state = twins.observed.rays(lowest, rays, observer._steps, tilt)
+        np.testing.assert_array_equal(state, right_state)
         np.testing.assert_array_equal(level, right_level)
+        bridge_sectors(state)
+        np.testing.assert_array_equal(state, twins.observed.sectors(right_state))
     projector = TopViewProjector(view, InputSpec("image", ("height",), (0.0,), (1.0,)))
     index = projector.project(points).index
-    observed = np.ones(index.shape, np.bool_)
-    mark_cells(points, index, observer._bin_of_cell, level, seen, observed)
-    np.testing.assert_array_equal(observed, twins.observed.cells(points, index, observer._bin_of_cell, level, seen))
+    observed, between = np.ones((2, *index.shape), np.bool_)
+    mark_cells(points, index, observer._bin_of_cell, level, state, observed, between)
+    right = twins.observed.cells(points, index, observer._bin_of_cell, level, state)
+    np.testing.assert_array_equal([observed, between], right)
 
 
 @patient
@@ -102,11 +117,21 @@ def test_rays_over_uneven_ground_agree_with_the_twin(seed: int, missing: float) 
     rng = np.random.default_rng(seed)
     lowest = (ROAD_Z + np.cumsum(rng.normal(0.0, 0.15, (6, 80)), axis=1)).astype(np.float32)
     lowest[rng.random(lowest.shape) < 0.7 + missing] = np.inf
-    level, seen = np.empty_like(lowest), np.empty(lowest.shape, np.bool_)
-    follow_rays(lowest, 0.2, 0.1, -0.44, 0.02 + missing, level, seen)
-    right_level, right_seen = twins.observed.rays(lowest, 0.2, 0.1, -0.44, 0.02 + missing)
-    np.testing.assert_array_equal(seen, right_seen)
+    level, state = np.empty_like(lowest), np.empty(lowest.shape, np.uint8)
+    rays = np.array([0.2, 0.1, -0.44, 0.02 + missing])
+    steps, tilt = rng.uniform(0.0, 0.1, 90), rng.normal(0.0, 0.05, 6)
+    follow_rays(lowest, rays, steps, tilt, level, state)
+    right_level, right_state = twins.observed.rays(lowest, rays, steps, tilt)
+    np.testing.assert_array_equal(state, right_state)
     np.testing.assert_array_equal(level, right_level)
+
+
+@patient
+@given(npst.arrays(np.uint8, npst.array_shapes(min_dims=2, max_dims=2, max_side=7), elements=st.integers(0, 3)))
+def test_a_sector_between_two_known_ones_is_bridged_as_by_the_twin(state: NDArray[np.uint8]) -> None:
+    right = twins.observed.sectors(state)
+    bridge_sectors(state)
+    np.testing.assert_array_equal(state, right)
 
 
 # --- properties ------------------------------------------------------------------------------------------------------
@@ -253,7 +278,7 @@ def test_the_height_of_the_beams_counts() -> None:
     shares = []
     for height_m in (1.2, 1.73, 2.4):
         points = cast(profile, height_m=height_m)
-        observed = Observer(VIEW, profile).observe(points, index, height_m)
+        observed = Observer(VIEW, profile).observe(points, index, replace(MODEL_MOUNTING, height_m=height_m)).observed
         first_m = height_m / math.tan(math.radians(15.0))
         assert at(observed, (max(6.0, first_m + 0.3), 12.0), (-2.0, 2.0)).all()
         shares.append(observed[:, 90:110].mean())
@@ -261,7 +286,8 @@ def test_the_height_of_the_beams_counts() -> None:
     # Points about an origin on the ground are no reason to observe more.
     points = cast(profile)
     observer = Observer(VIEW, profile)
-    np.testing.assert_array_equal(observer.observe(points, index, 0.0), observer.observe(points, index, 1.73))
+    on_ground = replace(MODEL_MOUNTING, height_m=0.0)
+    np.testing.assert_array_equal(observer.observe(points, index, on_ground), observer.observe(points, index))
 
 
 def test_adding_returns_never_hides_what_has_returns() -> None:
@@ -306,7 +332,7 @@ def test_large_views_have_bounded_tables() -> None:
     assert observer._lowest.size < 600 * 4200
     no_ground = SensorProfile("up", (5.0, 3.0), 1800)
     index = np.full((16, 12), -1, np.int32)
-    assert not Observer(SMALL, no_ground).observe(np.empty((0, 4), np.float32), index).any()
+    assert not np.any(Observer(SMALL, no_ground).observe(np.empty((0, 4), np.float32), index))
 
 
 # --- for a planner ---------------------------------------------------------------------------------------------------
