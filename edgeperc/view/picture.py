@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..drivable import FreeAhead, FreeEnd, RoadAhead, road_ahead
+from ..drivable import FreeAhead, RoadAhead, road_ahead
 from ..perception import Box, Perception, TopView
 from .canvas import (
     Label,
@@ -49,12 +49,6 @@ _WIDTH, _MARGIN, _TOP, _BOTTOM = 1600, 28, 128, 868
 _AXIS = 62
 _NEAR_M = 1.0
 _HALF_STRIP_M = 1.0
-_ENDS: dict[FreeEnd, str] = {
-    "obstacle": "an obstacle",
-    "edge of the road": "the edge of the road",
-    "unknown": "what no ray shows",
-    "end of view": "the end of the view",
-}
 
 
 def draw(
@@ -193,8 +187,8 @@ def _strip(ahead: FreeAhead, x_near: float) -> tuple[str, NDArray[np.float64] | 
     if ahead.end is None:
         return "", None
     if free_m <= x_near:
-        return f"not free {x_near:.0f} m ahead: {ahead.end}", None
-    text = f"free ahead: {free_m:.0f} m, to {_ENDS[ahead.end]}"
+        return f"not free {x_near:.0f} m ahead", None
+    text = f"free ahead: {'at least ' if ahead.end == 'end of view' else ''}{free_m:.0f} m"
     half = _HALF_STRIP_M
     neck = max(x_near, free_m - 2.0 * half)
     return text, np.array(
@@ -279,7 +273,7 @@ def _draw_top_view(
     if text:
         labels.append(Label(beside_arrow, text, AMBER if arrow is None else INK))
     n_omitted = place_labels(axes, labels, avoid)
-    write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", _omitted("scores; gray: not observed; pale: between beams", n_omitted))
+    write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", _omitted("scores; gray: not observed", n_omitted))
     return width
 
 
@@ -387,7 +381,9 @@ def _draw_from_behind(
 
     labels: list[Label] = []
     if top_view is not None and road is not None:
-        text, arrow = _strip(road.free_ahead(_HALF_STRIP_M), top_view.x_range_m[0])
+        ahead = road.free_ahead(_HALF_STRIP_M)
+        text, arrow = _strip(ahead, top_view.x_range_m[0])
+        text += "" if ahead.end in (None, "end of view") else f" ({ahead.end})"
         if arrow is not None:
             flat = (np.column_stack([arrow, a + arrow @ [b, c] + 0.02]) - eye) @ turn.T
             flat = flat[:, :2] / np.maximum(flat[:, 2:], _NEAR_M)
