@@ -31,7 +31,6 @@ __all__ = [
     "Observation",
     "Observer",
     "fill_lowest_returns",
-    "bridge_sectors",
     "follow_rays",
     "mark_cells",
 ]
@@ -145,6 +144,12 @@ class Observer:
         self._ahead = ahead / np.maximum(np.hypot(*ahead), 1e-9)
         self._lowest, self._level = np.empty((2, *shape), np.float32)
         self._state = np.empty(shape, np.uint8)
+        self._set_mounting(MODEL_MOUNTING)
+
+    def _set_mounting(self, mounting: Mounting) -> None:
+        self._mounting = mounting
+        # A direction of the models' frame has this much more gradient in the frame of the sensor.
+        self._tilt = ModelFrame(mounting).R[:2, 2] @ self._ahead
 
     def observe(
         self, points: NDArray[np.float32], index: NDArray[np.int32], mounting: Mounting = MODEL_MOUNTING
@@ -193,10 +198,9 @@ class Observer:
         observed, between = np.empty((2, *self.shape), np.bool_)
         fill_lowest_returns(rows, self._bounds, self._grid, self._lowest)
         rays = np.array([float(self._grid[2]), beams_above_m(mounting) + ROAD_Z_M, *self._beams])
-        # A direction of the models' frame has this much more gradient in the frame of the sensor.
-        tilt = ModelFrame(mounting).R[:2, 2] @ self._ahead
-        follow_rays(self._lowest, rays, self._steps, tilt, self._level, self._state)
-        bridge_sectors(self._state)
+        if mounting != self._mounting:
+            self._set_mounting(mounting)
+        follow_rays(self._lowest, rays, self._steps, self._tilt, self._level, self._state)
         mark_cells(rows, cells, self._bin_of_cell, self._level, self._state, observed, between)
         return Observation(observed, between)
 
@@ -323,24 +327,6 @@ def follow_rays(
 
 
 @njit(cache=True, nogil=True)
-def bridge_sectors(state: NDArray[np.uint8]) -> None:
-    """Make `PASSED` bins `BETWEEN` where both neighboring sectors are `SEEN` or `BETWEEN`: returns of one are missing.
-
-    Parameters
-    ----------
-    state : (sectors, rings) uint8, changed in place
-    """
-    n_sectors, n_rings = state.shape
-    for sector in range(1, n_sectors - 1):
-        for ring in range(n_rings):
-            # Of two such sectors side by side, each lacks a neighbor: both stay.
-            if state[sector, ring] == PASSED:
-                left, right = state[sector - 1, ring], state[sector + 1, ring]
-                if ((left == SEEN) | (left == BETWEEN)) & ((right == SEEN) | (right == BETWEEN)):
-                    state[sector, ring] = BETWEEN
-
-
-@njit(cache=True, nogil=True)
 def mark_cells(
     points: NDArray[np.float32],
     index: NDArray[np.int32],
@@ -362,12 +348,19 @@ def mark_cells(
     level : (sectors, rings) float32, C-contiguous
     state : (sectors, rings) uint8, C-contiguous
     observed, between : (rows, columns) bool, C-contiguous, overwritten
+        `PASSED` bins are between two beams where both neighboring sectors are `SEEN` or `BETWEEN`: returns of a single
+        sector are missing.
     """
     highest, z_ground, state_of_bin = index.reshape(-1), level.reshape(-1), state.reshape(-1)
     is_observed, is_between = observed.reshape(-1), between.reshape(-1)
+    n_rings, n_bins = state.shape[1], state_of_bin.shape[0]
     for cell in range(is_observed.shape[0]):
         at, i = bin_of_cell[cell], highest[cell]
         # A small cell may hold a return that lies in the next bin.
         seen = state_of_bin[at] == SEEN or (i >= 0 and np.float64(points[i, 2]) - z_ground[at] <= OVERHEAD_M)
         is_observed[cell] = seen
-        is_between[cell] = (not seen) & (state_of_bin[at] == BETWEEN)
+        bridged = state_of_bin[at] == BETWEEN
+        if state_of_bin[at] == PASSED and n_rings <= at < n_bins - n_rings:
+            left, right = state_of_bin[at - n_rings], state_of_bin[at + n_rings]
+            bridged = ((left == SEEN) | (left == BETWEEN)) & ((right == SEEN) | (right == BETWEEN))
+        is_between[cell] = bridged & (not seen)

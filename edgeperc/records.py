@@ -61,10 +61,10 @@ def _road_record(perception: Perception) -> dict[str, Any] | None:
     ahead = road.free_ahead()
     lengths = {
         "free_ahead_m": ahead.free_m,
-        "obstacle_m": ahead.obstacle_m,
-        "edge_m": ahead.edge_m,
-        "unknown_m": ahead.unknown_m,
-        "view_m": ahead.view_m,
+        "obstacle_ahead_m": ahead.obstacle_m,
+        "edge_ahead_m": ahead.edge_m,
+        "unknown_ahead_m": ahead.unknown_m,
+        "view_ahead_m": ahead.view_m,
         "lane_width_m": road.lane_width_m,
     }
     return {

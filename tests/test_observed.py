@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 
 import twins.observed
@@ -21,7 +20,6 @@ from edgeperc.observed import (
     BRIDGE_M,
     CLEARANCE_M,
     Observer,
-    bridge_sectors,
     fill_lowest_returns,
     follow_rays,
     mark_cells,
@@ -102,8 +100,6 @@ def test_the_kernels_agree_with_their_twins(points: NDArray[np.float32], view: T
         right_level, right_state = twins.observed.rays(lowest, rays, observer._steps, tilt)
         np.testing.assert_array_equal(state, right_state)
         np.testing.assert_array_equal(level, right_level)
-        bridge_sectors(state)
-        np.testing.assert_array_equal(state, twins.observed.sectors(right_state))
     projector = TopViewProjector(view, InputSpec("image", ("height",), (0.0,), (1.0,)))
     index = projector.project(points).index
     observed, between = np.ones((2, *index.shape), np.bool_)
@@ -128,11 +124,16 @@ def test_rays_over_uneven_ground_agree_with_the_twin(seed: int, missing: float) 
 
 
 @patient
-@given(npst.arrays(np.uint8, npst.array_shapes(min_dims=2, max_dims=2, max_side=7), elements=st.integers(0, 3)))
-def test_a_sector_between_two_known_ones_is_bridged_as_by_the_twin(state: NDArray[np.uint8]) -> None:
-    right = twins.observed.sectors(state)
-    bridge_sectors(state)
-    np.testing.assert_array_equal(state, right)
+@given(st.integers(0, 2**32))
+def test_cells_of_any_states_agree_with_the_twin(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    observer, index = Observer(SMALL, get_sensor("vlp-16")), np.full((16, 12), -1, np.int32)
+    state = rng.integers(0, 4, observer._state.shape).astype(np.uint8)
+    level, points = np.zeros(state.shape, np.float32), np.empty((0, 4), np.float32)
+    observed, between = np.ones((2, *index.shape), np.bool_)
+    mark_cells(points, index, observer._bin_of_cell, level, state, observed, between)
+    right = twins.observed.cells(points, index, observer._bin_of_cell, level, state)
+    np.testing.assert_array_equal([observed, between], right)
 
 
 # --- properties ------------------------------------------------------------------------------------------------------

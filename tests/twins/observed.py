@@ -75,7 +75,7 @@ def rays(lowest, rays, steps, tilt):
 
 
 def sectors(state):
-    """Twin of `edgeperc.observed.bridge_sectors`."""
+    """States with `PASSED` bins `BETWEEN` where both neighboring sectors are known."""
     known = (state == 1) | (state == 2)
     bridged = (state == 3) & np.pad(known, ((1, 0), (0, 0)))[:-1] & np.pad(known, ((0, 1), (0, 0)))[1:]
     return np.where(bridged, np.uint8(2), state)
@@ -87,6 +87,6 @@ def cells(points, index, bin_of_cell, level, state):
     top = np.full(flat.shape, np.inf)
     top[flat >= 0] = points[flat[flat >= 0], 2]
     near = top - level.reshape(-1)[bin_of_cell].astype(np.float64) <= 2.0
-    state = state.reshape(-1)[bin_of_cell].reshape(index.shape)
+    state = sectors(state).reshape(-1)[bin_of_cell].reshape(index.shape)
     observed = (state == 1) | near.reshape(index.shape)
     return observed, (state == 2) & ~observed
