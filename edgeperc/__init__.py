@@ -48,7 +48,7 @@ from .errors import (
 if TYPE_CHECKING:
     from .calibration import Calibration
     from .card import ModelCard
-    from .drivable import RoadAhead, road_ahead
+    from .drivable import FreeAhead, RoadAhead, free_ahead, road_ahead
     from .frame import ModelFrame
     from .listing import ModelInfo, ProviderInfo, SensorInfo, models, providers, sensors
     from .live import Answer, Stream, stream
@@ -79,6 +79,7 @@ __all__ = [
     "DroppedPoints",
     "EdgepercError",
     "FitnessError",
+    "FreeAhead",
     "ImageError",
     "ImageLabels",
     "InferenceError",
@@ -120,6 +121,7 @@ __all__ = [
     "camera_road",
     "deskew",
     "draw",
+    "free_ahead",
     "merge",
     "models",
     "movable_points",
@@ -146,6 +148,7 @@ _MODULES = {
     "ImageLabels": "perception",
     "Line": "zones",
     "Calibration": "calibration",
+    "FreeAhead": "drivable",
     "ModelCard": "card",
     "ModelFrame": "frame",
     "ModelInfo": "listing",
@@ -171,6 +174,7 @@ _MODULES = {
     "camera_road": "painting",
     "deskew": "motion",
     "draw": "view",
+    "free_ahead": "drivable",
     "merge": "motion",
     "models": "listing",
     "movable_points": "moving",

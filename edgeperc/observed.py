@@ -1,25 +1,39 @@
-"""Find the cells of a top view that a scan observed: cells with returns, and cells that a ray passes closely.
+"""Find the cells of a top view that a scan observed, and those between two beams.
 
 A network labels every cell, including those that the sensor could not see. The rays tell which ones it saw. The scan is
 sorted into a polar grid around the sensor, and each sector is followed outwards from one return on the ground to the
 next. Between the returns of neighboring beams, the ray to the farther one passes over the ground. Where it passes at
-most `CLEARANCE_M` above the ground, nothing higher stands, because it would have stopped the ray.
+most `CLEARANCE_M` above the ground, nothing higher stands, because it would have stopped the ray. The rest of a gap
+that is as long as the spacing of the beams explains lies between two beams: a ray passes it, but higher.
 """
 
 from __future__ import annotations
 
 import math
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .card import TopViewGeometry
 from .errors import PointsError
+from .frame import ModelFrame
 from .kernel_cache import njit
+from .mounting import MODEL_MOUNTING, Mounting
 from .points import read_only
 from .sensor import SensorProfile
 
-__all__ = ["CLEARANCE_M", "OVERHEAD_M", "Observer", "fill_lowest_returns", "follow_rays", "mark_cells"]
+__all__ = [
+    "BRIDGE_M",
+    "CLEARANCE_M",
+    "OVERHEAD_M",
+    "Observation",
+    "Observer",
+    "fill_lowest_returns",
+    "follow_rays",
+    "mark_cells",
+]
 
 CLEARANCE_M = 0.5
 """A ray observes the ground that it passes at most this far above [m].
@@ -35,6 +49,16 @@ MAX_BEAMS = 2.2
 
 One beam may have no return. In a wider gap the ground itself is missing: a pit, water, a floor that reflects nothing.
 """
+BRIDGE_M = 0.8
+"""A gap between two neighboring beams is bridged if the ray over it passes at most this far above the ground [m].
+
+Lower than a child of three years. The ray is highest at the near end of the gap: 0.69 m for the beams of a VLP-16 that
+meet the road at 20 and 33 m, 0.57 m for those of an HDL-32E at 25 and 37 m.
+"""
+BEAM_STEPS = 1.5
+"""Two beams are neighbors if their gradients differ by at most this many steps of the sensor's beams there."""
+BEAM_TOLERANCE = math.tan(math.radians(1.0))
+"""Error of a beam's gradient in the frame of the sensor: the estimated tilt, pitch of the vehicle, calibration."""
 OVERHEAD_M = 2.0
 """A return higher above the ground [m], such as a tree's crown or a ceiling, does not observe the cell below it."""
 
@@ -42,6 +66,9 @@ ROAD_Z_M = -1.73  # the road below the sensor
 MIN_MOUNT_HEIGHT_M = 0.5
 SECTOR_RAD = math.radians(0.4)
 MAX_RINGS = 4096
+STEEPEST_DEG = 80.0
+GRADIENT_BIN = 0.005
+SEEN, BETWEEN, PASSED = 1, 2, 3  # states of a bin, from `follow_rays`; 0: no ray says anything
 FARTHER = 1.4  # returns up to this many times as far as the view are used, for the rays that pass over it
 
 # A return is on the ground if it is at most MAX_STEP_M + MAX_SLOPE * distance above or below the previous one, with a
@@ -51,8 +78,26 @@ MAX_SLOPE = 0.1
 MAX_REACH_M = 5.0
 
 
+class Observation(NamedTuple):
+    """What the rays of a scan say about the cells of a top view.
+
+    Attributes
+    ----------
+    observed : (rows, columns) bool
+        Cells with a return at most 2 m above the ground, and cells between two connected returns on the ground that
+        the ray to the farther one passes at most `CLEARANCE_M` above the ground.
+    between_beams : (rows, columns) bool
+        Cells that are not observed in a gap that the spacing of the beams explains: from a return on the ground to the
+        next return of the neighboring beam, whose ray passes at most `BRIDGE_M` above the ground; and before the first
+        return, where its ray passes at most `CLEARANCE_M` above the road.
+    """
+
+    observed: NDArray[np.bool_]
+    between_beams: NDArray[np.bool_]
+
+
 class Observer:
-    """Find the cells of a top view that a scan observed.
+    """Find the cells of a top view that a scan observed, and those between two beams.
 
     Tables and scratch are made once and reused between calls, so use one instance per thread.
 
@@ -82,16 +127,34 @@ class Observer:
             [(min(low, 0.0), max(high, 0.0)) for low, high in (view.x_range_m, view.y_range_m)]
         )
         # Gradients dz / dx of the beams that meet level ground. A sensor without such beams connects no returns.
-        gradients = np.tan(np.deg2rad([max(angle, -80.0) for angle in sensor.elevations_deg if angle < 0.0]))
-        widest_step = float(np.abs(np.diff(gradients)).max(initial=0.0))
-        self._beams = float(gradients.min(initial=0.0)), MAX_BEAMS * widest_step
+        steepest = math.tan(math.radians(STEEPEST_DEG))
+        gradients = np.tan(np.deg2rad(np.clip(sensor.elevations_deg, -STEEPEST_DEG, STEEPEST_DEG)))
+        downward = gradients[gradients < 0.0]
+        widest_step = float(np.abs(np.diff(downward)).max(initial=0.0))
+        self._beams = float(downward.min(initial=0.0)), MAX_BEAMS * widest_step
+        # Step of the beams around each bin of -gradient, the widest within the tolerance.
+        self._steps = np.zeros(int(steepest / GRADIENT_BIN) + 1)
+        middles = -(np.arange(len(self._steps)) + 0.5) * GRADIENT_BIN
+        for upper, lower in pairwise(gradients.tolist()):
+            near = (middles <= upper + BEAM_TOLERANCE) & (middles >= lower - BEAM_TOLERANCE)
+            self._steps[near] = np.maximum(self._steps[near], BEAM_STEPS * (upper - lower))
+        # Directions of the sectors: x, y from the pseudo-azimuth.
+        turn = first + (np.arange(shape[0]) + 0.5) * width
+        ahead = np.stack([1.0 - np.abs(turn), np.where(np.abs(turn) <= 1.0, turn, np.copysign(2.0, turn) - turn)])
+        self._ahead = ahead / np.maximum(np.hypot(*ahead), 1e-9)
         self._lowest, self._level = np.empty((2, *shape), np.float32)
-        self._seen = np.empty(shape, np.bool_)
+        self._state = np.empty(shape, np.uint8)
+        self._set_mounting(MODEL_MOUNTING)
+
+    def _set_mounting(self, mounting: Mounting) -> None:
+        self._mounting = mounting
+        # A direction of the models' frame has this much more gradient in the frame of the sensor.
+        self._tilt = ModelFrame(mounting).R[:2, 2] @ self._ahead
 
     def observe(
-        self, points: NDArray[np.float32], index: NDArray[np.int32], mount_height_m: float = 1.73
-    ) -> NDArray[np.bool_]:
-        """Find the observed cells.
+        self, points: NDArray[np.float32], index: NDArray[np.int32], mounting: Mounting = MODEL_MOUNTING
+    ) -> Observation:
+        """Find the observed cells, and those between two beams.
 
         Parameters
         ----------
@@ -100,15 +163,14 @@ class Observer:
             rows that are not finite are ignored.
         index : (rows, columns) int32
             Highest point of each cell, -1 without one (`TopViewProjector`).
-        mount_height_m : float
-            Height of the beams above the road [m]. Below 0.5 m, 1.73 m is used: either the origin of the points is not
-            at the beams, or the rays are so flat that this only connects fewer returns.
+        mounting : Mounting
+            The one with which the scan was moved: its height is that of the beams above the road, its tilt tells which
+            beam a ray belongs to. Below 0.5 m, 1.73 m is used: either the origin of the points is not at the beams, or
+            the rays are so flat that this only connects fewer returns.
 
         Returns
         -------
-        (rows, columns) bool
-            True for a cell with a return at most 2 m above the ground, and for a cell between two connected returns on
-            the ground that the ray to the farther one passes at most 0.5 m above the ground.
+        Observation
 
         Raises
         ------
@@ -123,18 +185,30 @@ class Observer:
         connected if one beam at most has no return between them, and no return lies below the line: then the ground
         between them is that line. Cells behind objects are observed only if rays pass beside them or above them. Cells
         beyond the last return are not observed.
+
+        A gap is bridged up to the next return, on the ground or on what stands there, but not beyond an object. Which
+        beam is next is read from the profile's elevations at the gradient of the last return on the ground, to within
+        1 degree. The ground before the first return is bridged for any beam: there the vehicle itself hides the ground.
         """
         if points.ndim != 2 or points.shape[1] != 4 or points.dtype != np.float32:
             raise PointsError(f"points are {points.shape} {points.dtype}; expected (n, 4) float32")
         if index.shape != self.shape or index.dtype != np.int32:
             raise PointsError(f"index is {index.shape} {index.dtype}; expected {self.shape} int32")
-        rows, of_cell = read_only(points), read_only(index, np.int32)
-        observed = np.empty(self.shape, np.bool_)
+        rows, cells = read_only(points), read_only(index, np.int32)
+        observed, between = np.empty((2, *self.shape), np.bool_)
         fill_lowest_returns(rows, self._bounds, self._grid, self._lowest)
-        z_beams = mount_height_m + ROAD_Z_M if mount_height_m >= MIN_MOUNT_HEIGHT_M else 0.0
-        follow_rays(self._lowest, float(self._grid[2]), z_beams, *self._beams, self._level, self._seen)
-        mark_cells(rows, of_cell, self._bin_of_cell, self._level, self._seen, observed)
-        return observed
+        rays = np.array([float(self._grid[2]), beams_above_m(mounting) + ROAD_Z_M, *self._beams])
+        if mounting != self._mounting:
+            self._set_mounting(mounting)
+        follow_rays(self._lowest, rays, self._steps, self._tilt, self._level, self._state)
+        mark_cells(rows, cells, self._bin_of_cell, self._level, self._state, observed, between)
+        return Observation(observed, between)
+
+
+def beams_above_m(mounting: Mounting) -> float:
+    """Height of the beams above the road [m]; see `Observer.observe`."""
+    height_m = mounting.height_m
+    return height_m if height_m is not None and height_m >= MIN_MOUNT_HEIGHT_M else -ROAD_Z_M
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -182,12 +256,11 @@ def fill_lowest_returns(
 @njit(cache=True, nogil=True)
 def follow_rays(
     lowest: NDArray[np.float32],
-    ring_m: float,
-    z_beams: float,
-    first_gradient: float,
-    max_apart: float,
+    rays: NDArray[np.float64],
+    steps: NDArray[np.float64],
+    tilt: NDArray[np.float64],
     level: NDArray[np.float32],
-    seen: NDArray[np.bool_],
+    state: NDArray[np.uint8],
 ) -> None:
     """Follow the ground outwards in every sector.
 
@@ -195,47 +268,62 @@ def follow_rays(
     ----------
     lowest : (sectors, rings) float32
         From `fill_lowest_returns`.
-    ring_m : float
-        Width of a ring [m].
-    z_beams : float
-        z of the beams [m], from which all rays start.
-    first_gradient : float
-        dz / dx of the lowest beam.
-    max_apart : float
-        Largest difference of the gradients of two connected returns.
+    rays : (4,) float64
+        Width of a ring [m]; z of the beams [m], from which all rays start; dz / dx of the lowest beam; largest
+        difference of the gradients of two connected returns.
+    steps : (n,) float64
+        Largest difference of the gradients of two neighboring beams, by the bin of the lower one's gradient.
+    tilt : (sectors,) float64
+        What a gradient is more in the frame of the sensor.
     level : (sectors, rings) float32, overwritten
         z of the ground [m]: on the line between two returns on the ground; that of the last one beyond it.
-    seen : (sectors, rings) bool, overwritten
-        Bins with a return below `OVERHEAD_M`, and bins between two connected returns that the ray to the farther one
-        passes at most `CLEARANCE_M` above the ground.
+    state : (sectors, rings) uint8, overwritten
+        `SEEN`: bins with a return below `OVERHEAD_M`, and bins between two connected returns that the ray to the
+        farther one passes at most `CLEARANCE_M` above the ground. `BETWEEN`: other bins of a gap that is bridged.
+        `PASSED`: bins of a longer gap that a ray passes as closely as observed ones.
     """
     n_sectors, n_rings = lowest.shape
+    ring_m, z_beams, first_gradient, max_apart = rays[0], rays[1], rays[2], rays[3]
     for sector in range(n_sectors):
         # The last return on the ground: distance, z, gradient of its ray. At first the road below the sensor; it is
         # connected with the return of the lowest beam.
         x_last, z_last, gradient = 0.0, ROAD_Z_M, first_gradient
         begin = 0  # the ring after it, or after a return below the ground
+        hidden = False  # by an object after it
         for ring in range(n_rings):
             z = np.float64(lowest[sector, ring])
             rise = z - z_last
             level[sector, ring] = z_last
-            seen[sector, ring] = rise <= OVERHEAD_M
+            state[sector, ring] = SEEN if rise <= OVERHEAD_M else 0
             x = (ring + 0.5) * ring_m
             limit = MAX_STEP_M + MAX_SLOPE * min(x - x_last, MAX_REACH_M)
             if rise < -limit:
                 begin = ring + 1
-            if not abs(rise) <= limit:
+            if not ((rise >= -limit) & (rise <= OVERHEAD_M)):
                 continue
-            # The ray is on the ground at x and this high above it at x_last; in between, its height is linear.
+            on_ground = rise <= limit
+            # Height of the ray above the ground: `height` at x_last, `foot` at x; in between, it is linear.
             height = z_beams + (z - z_beams) * x_last / x - z_last
+            foot = 0.0 if on_ground else rise
             share = CLEARANCE_M / height if height > CLEARANCE_M else 1.0
             apart = (z - z_beams) / x - gradient
-            for between in range(begin, ring):
+            step = steps[min(max(int(-(gradient + tilt[sector]) / GRADIENT_BIN), 0), steps.shape[0] - 1)]
+            first = x_last == 0.0  # returns before it are those of the vehicle itself
+            neighbors = first | (apart <= step)
+            highest = BRIDGE_M if neighbors and not first else CLEARANCE_M
+            bridged = (first or not hidden) and foot <= highest
+            for between in range(begin, ring if on_ground | bridged else begin):
                 back = (x - (between + 0.5) * ring_m) / (x - x_last)
-                level[sector, between] = z - rise * back
-                seen[sector, between] |= (back <= share) & (apart <= max_apart)
-            level[sector, ring] = z
-            x_last, z_last, gradient, begin = x, z, (z - z_beams) / x, ring + 1
+                if on_ground:
+                    level[sector, between] = z - rise * back
+                    if (back <= share) & (apart <= max_apart):
+                        state[sector, between] = SEEN
+                if bridged & (state[sector, between] != SEEN) & (foot + (height - foot) * back <= highest):
+                    state[sector, between] = BETWEEN if neighbors else PASSED
+            hidden = not on_ground
+            if on_ground:
+                level[sector, ring] = z
+                x_last, z_last, gradient, begin = x, z, (z - z_beams) / x, ring + 1
 
 
 @njit(cache=True, nogil=True)
@@ -244,10 +332,11 @@ def mark_cells(
     index: NDArray[np.int32],
     bin_of_cell: NDArray[np.int32],
     level: NDArray[np.float32],
-    seen: NDArray[np.bool_],
+    state: NDArray[np.uint8],
     observed: NDArray[np.bool_],
+    between: NDArray[np.bool_],
 ) -> None:
-    """Mark the observed cells of a top view.
+    """Mark the observed cells of a top view, and those between two beams.
 
     Parameters
     ----------
@@ -257,11 +346,21 @@ def mark_cells(
     bin_of_cell : (rows * columns,) int32
         Flat bin of each cell's center.
     level : (sectors, rings) float32, C-contiguous
-    seen : (sectors, rings) bool, C-contiguous
-    observed : (rows, columns) bool, C-contiguous, overwritten
+    state : (sectors, rings) uint8, C-contiguous
+    observed, between : (rows, columns) bool, C-contiguous, overwritten
+        `PASSED` bins are between two beams where both neighboring sectors are `SEEN` or `BETWEEN`: returns of a single
+        sector are missing.
     """
-    highest, z_ground, seen_bin, marked = index.reshape(-1), level.reshape(-1), seen.reshape(-1), observed.reshape(-1)
-    for cell in range(marked.shape[0]):
+    highest, z_ground, state_of_bin = index.reshape(-1), level.reshape(-1), state.reshape(-1)
+    is_observed, is_between = observed.reshape(-1), between.reshape(-1)
+    n_rings, n_bins = state.shape[1], state_of_bin.shape[0]
+    for cell in range(is_observed.shape[0]):
         at, i = bin_of_cell[cell], highest[cell]
         # A small cell may hold a return that lies in the next bin.
-        marked[cell] = seen_bin[at] or (i >= 0 and np.float64(points[i, 2]) - z_ground[at] <= OVERHEAD_M)
+        seen = state_of_bin[at] == SEEN or (i >= 0 and np.float64(points[i, 2]) - z_ground[at] <= OVERHEAD_M)
+        is_observed[cell] = seen
+        bridged = state_of_bin[at] == BETWEEN
+        if state_of_bin[at] == PASSED and n_rings <= at < n_bins - n_rings:
+            left, right = state_of_bin[at - n_rings], state_of_bin[at + n_rings]
+            bridged = ((left == SEEN) | (left == BETWEEN)) & ((right == SEEN) | (right == BETWEEN))
+        is_between[cell] = bridged & (not seen)

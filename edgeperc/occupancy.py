@@ -254,10 +254,7 @@ def occupancy_grid(
     highest, tallest = np.empty(shape, np.int32), np.empty(shape, np.float32)
     corner = np.array([view.x_range_m[1], view.y_range_m[1], view.cell_m])
     fill_standing(moved, read_only(ground.height_m), corner, float(min_height_m), OVERHEAD_M, highest, tallest)
-    mount_height_m = perception.mounting.height_m
-    observed = Observer(view, profile).observe(
-        moved, highest, MODEL_HEIGHT_M if mount_height_m is None else mount_height_m
-    )
+    observed = Observer(view, profile).observe(moved, highest, perception.mounting).observed
     for box in frame.move_boxes(perception.boxes):
         inside = np.zeros(shape, np.uint8)
         draw_footprints(inside, [box], view, ("free", box.label))

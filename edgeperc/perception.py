@@ -116,6 +116,9 @@ class TopView:
         objects, between the rays of sensors with few beams, or beyond the last return.
     mounting : Mounting
         That of the scan, as in `Perception`.
+    between_beams : (rows, columns) bool, optional
+        Cells that are not observed in gaps that the spacing of the sensor's beams explains
+        (`edgeperc.observed.Observation`). A `Perceiver` knows them. None: no cell is known to be one.
     """
 
     labels: NDArray[np.uint8]
@@ -125,6 +128,7 @@ class TopView:
     y_range_m: tuple[float, float]
     observed: NDArray[np.bool_]
     mounting: Mounting = MODEL_MOUNTING
+    between_beams: NDArray[np.bool_] | None = None
 
     @property
     def geometry(self) -> TopViewGeometry:

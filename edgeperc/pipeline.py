@@ -89,11 +89,19 @@ class TopViewNetwork:
 
     def label_cells(self, near: View, boxes: Sequence[Box], mounting: Mounting) -> TopView:
         """Class of every cell, and which cells the scan observed; after `find_boxes`."""
-        assert mounting.height_m is not None
         view = self.view
         labels = decode_cells(self.card, self.index >= 0, self.session.outputs, boxes)
-        observed = self._observer.observe(near.points, self.index, mounting.height_m)
-        return TopView(labels, self.card.classes, view.cell_m, view.x_range_m, view.y_range_m, observed, mounting)
+        observed, between_beams = self._observer.observe(near.points, self.index, mounting)
+        return TopView(
+            labels,
+            self.card.classes,
+            view.cell_m,
+            view.x_range_m,
+            view.y_range_m,
+            observed,
+            mounting,
+            between_beams,
+        )
 
 
 class RangeImageNetwork:

@@ -59,11 +59,20 @@ def _road_record(perception: Perception) -> dict[str, Any] | None:
     if perception.top_view is None:
         return None
     road = road_ahead(perception.top_view, perception.boxes)
-    widths = {"free_ahead_m": road.free_ahead_m(), "lane_width_m": road.lane_width_m}
+    ahead = road.free_ahead()
+    lengths = {
+        "free_ahead_m": ahead.free_m,
+        "obstacle_ahead_m": ahead.obstacle_m,
+        "edge_ahead_m": ahead.edge_m,
+        "unknown_ahead_m": ahead.unknown_m,
+        "view_ahead_m": ahead.view_m,
+        "lane_width_m": road.lane_width_m,
+    }
     return {
         "outline": [[round(float(v), 2) for v in corner] for corner in road.outline],
         "tolerance_m": round(road.tolerance_m, 2) if math.isfinite(road.tolerance_m) else None,
-        **{name: None if math.isnan(value) else round(value, 2) for name, value in widths.items()},
+        "free_ahead_end": ahead.end,
+        **{name: round(value, 2) if math.isfinite(value) else None for name, value in lengths.items()},
     }
 
 

@@ -246,7 +246,12 @@ def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pyte
         "road": {
             "outline": [[36.0, 0.0], [46.0, 0.0], [46.0, 10.0], [36.0, 10.0]],
             "tolerance_m": 0.2,
+            "free_ahead_end": "edge of the road",
             "free_ahead_m": 6.0,
+            "obstacle_ahead_m": None,
+            "edge_ahead_m": 6.0,
+            "unknown_ahead_m": None,
+            "view_ahead_m": 46.0,
             "lane_width_m": None,
         },
         "point_counts": {"background": 3, "car": 2, "pedestrian": 0, "cyclist": 0},

@@ -19,7 +19,7 @@ import edgeperc
 import twins.drivable
 import twins.outline
 from edgeperc import Box, OptionError, Perceiver, PointsError, TopView, read_points
-from edgeperc.drivable import fill_corridor, fill_free, road_ahead
+from edgeperc.drivable import fill_corridor, fill_first_cells, free_ahead, road_ahead
 from edgeperc.outline import resolve_contacts
 
 CLASSES = ("background", "drivable", "car", "van", "truck")
@@ -44,10 +44,11 @@ def blank() -> NDArray[np.bool_]:
 
 @patient
 @given(MASKS)
-def test_free_cells_are_counted_from_the_near_edge(cells: NDArray[np.bool_]) -> None:
-    free = np.full(cells.shape[1], 99)
-    fill_free(cells, free)
-    assert free.tolist() == twins.drivable.free_cells(cells)
+def test_cells_are_counted_from_the_near_edge_to_the_first_of_each_kind(cells: NDArray[np.bool_]) -> None:
+    objects, road = np.roll(cells, 1, axis=0) & np.roll(cells, 1, axis=1), np.ascontiguousarray(cells[::-1])
+    firsts = np.full((3, cells.shape[1]), 99)
+    fill_first_cells(objects, cells, road, firsts)
+    assert firsts.tolist() == twins.drivable.first_cells(objects, cells, road)
 
 
 @patient
@@ -226,6 +227,44 @@ def test_boxes_are_obstacles_on_the_road() -> None:
     assert len(road.holes) == 1
     assert (road.free_m[np.abs(road.y_m) > 0.6] == 46.0).all()
     assert top_view.drivable.all()  # the map itself is as it was
+
+
+def test_each_end_of_the_free_distance_has_its_distance() -> None:
+    labels, observed = np.ones((400, 200), np.uint8), ~blank()
+    labels[:100] = 0  # no road from 36 m on
+    labels[150:160, 95:100] = 2  # a car from 30 to 31 m, left of the axis
+    observed[170:180, 100:105] = False  # a gap from 28 to 29 m, right of it
+    top_view = TopView(labels, CLASSES, 0.1, (6.0, 46.0), (-10.0, 10.0), observed)
+    ahead = free_ahead(top_view)
+    assert ahead.end == "unknown"
+    np.testing.assert_allclose(ahead[2:], [30.0, 36.0, 28.0, 46.0])
+    road = road_ahead(top_view)
+    assert road.free_ahead() == ahead
+    assert {*road.free_end} == {"obstacle", "unknown", "edge of the road"}
+    # In a gap that the beams explain, the label counts.
+    between = ~observed
+    bridged = free_ahead(dataclasses.replace(top_view, between_beams=between))
+    assert (bridged.end, bridged.free_m, bridged.unknown_m) == ("obstacle", pytest.approx(30.0), math.inf)
+    labels[175, 102] = 0
+    edge = free_ahead(dataclasses.replace(top_view, between_beams=between))
+    assert (edge.end, edge.free_m) == ("edge of the road", pytest.approx(28.4))
+
+
+@pytest.mark.parametrize(("before_m", "end"), [(0.4, "obstacle"), (1.4, "obstacle"), (1.7, "edge of the road")])
+def test_the_margin_before_an_obstacle_is_not_the_edge_of_the_road(before_m: float, end: str) -> None:
+    labels = np.ones((400, 200), np.uint8)
+    labels[200 : 200 + round(10.0 * before_m)] = 0
+    labels[150:200] = 2  # from 26 m on
+    ahead = free_ahead(TopView(labels, CLASSES, 0.1, (6.0, 46.0), (-10.0, 10.0), ~blank()))
+    assert ahead.end == end
+    assert ahead.free_m == ahead.edge_m == pytest.approx(26.0 - before_m)
+    assert ahead.obstacle_m == pytest.approx(26.0)
+
+
+def test_a_strip_without_columns_has_no_end() -> None:
+    ahead = free_ahead(view(~blank()), half_width_m=0.01)
+    assert math.isnan(ahead.free_m)
+    assert ahead[1:] == (None, math.inf, math.inf, math.inf, 46.0)
 
 
 def test_all_cells_drivable() -> None:

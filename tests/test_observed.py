@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +12,18 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import twins.observed
-from edgeperc import Box, Perceiver, PointsError, TopView, road_ahead
+from edgeperc import Box, Mounting, Perceiver, PointsError, TopView, free_ahead, road_ahead
 from edgeperc.card import InputSpec, TopViewGeometry
-from edgeperc.observed import CLEARANCE_M, Observer, fill_lowest_returns, follow_rays, mark_cells
+from edgeperc.frame import ModelFrame
+from edgeperc.mounting import MODEL_MOUNTING
+from edgeperc.observed import (
+    BRIDGE_M,
+    CLEARANCE_M,
+    Observer,
+    fill_lowest_returns,
+    follow_rays,
+    mark_cells,
+)
 from edgeperc.projection import TopViewProjector
 from edgeperc.sensor import SensorProfile, get_sensor
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
@@ -61,7 +71,7 @@ def cast(
 
 def observe(points: NDArray[np.float32], sensor: str = "hdl-64e", view: TopViewGeometry = VIEW) -> NDArray[np.bool_]:
     projector = TopViewProjector(view, InputSpec("image", ("height",), (0.0,), (1.0,)))
-    return Observer(view, get_sensor(sensor)).observe(points, projector.project(points).index)
+    return Observer(view, get_sensor(sensor)).observe(points, projector.project(points).index).observed
 
 
 def at(mask: NDArray[np.bool_], x: tuple[float, float], y: tuple[float, float]) -> NDArray[np.bool_]:
@@ -84,16 +94,18 @@ def test_the_kernels_agree_with_their_twins(points: NDArray[np.float32], view: T
         lowest, twins.observed.lowest_returns(points, observer._bounds, observer._grid, shape)
     )
     for z_beams in (0.0, 0.4, -1.2):
-        level, seen = np.full(shape, 7.0, np.float32), np.ones(shape, np.bool_)
-        follow_rays(lowest, 1.0, z_beams, *observer._beams, level, seen)
-        right_level, right_seen = twins.observed.rays(lowest, 1.0, z_beams, *observer._beams)
-        np.testing.assert_array_equal(seen, right_seen)
+        level, state = np.full(shape, 7.0, np.float32), np.ones(shape, np.uint8)
+        rays, tilt = np.array([1.0, z_beams, *observer._beams]), 0.03 * observer._ahead[1]
+        follow_rays(lowest, rays, observer._steps, tilt, level, state)
+        right_level, right_state = twins.observed.rays(lowest, rays, observer._steps, tilt)
+        np.testing.assert_array_equal(state, right_state)
         np.testing.assert_array_equal(level, right_level)
     projector = TopViewProjector(view, InputSpec("image", ("height",), (0.0,), (1.0,)))
     index = projector.project(points).index
-    observed = np.ones(index.shape, np.bool_)
-    mark_cells(points, index, observer._bin_of_cell, level, seen, observed)
-    np.testing.assert_array_equal(observed, twins.observed.cells(points, index, observer._bin_of_cell, level, seen))
+    observed, between = np.ones((2, *index.shape), np.bool_)
+    mark_cells(points, index, observer._bin_of_cell, level, state, observed, between)
+    right = twins.observed.cells(points, index, observer._bin_of_cell, level, state)
+    np.testing.assert_array_equal([observed, between], right)
 
 
 @patient
@@ -102,11 +114,26 @@ def test_rays_over_uneven_ground_agree_with_the_twin(seed: int, missing: float) 
     rng = np.random.default_rng(seed)
     lowest = (ROAD_Z + np.cumsum(rng.normal(0.0, 0.15, (6, 80)), axis=1)).astype(np.float32)
     lowest[rng.random(lowest.shape) < 0.7 + missing] = np.inf
-    level, seen = np.empty_like(lowest), np.empty(lowest.shape, np.bool_)
-    follow_rays(lowest, 0.2, 0.1, -0.44, 0.02 + missing, level, seen)
-    right_level, right_seen = twins.observed.rays(lowest, 0.2, 0.1, -0.44, 0.02 + missing)
-    np.testing.assert_array_equal(seen, right_seen)
+    level, state = np.empty_like(lowest), np.empty(lowest.shape, np.uint8)
+    rays = np.array([0.2, 0.1, -0.44, 0.02 + missing])
+    steps, tilt = rng.uniform(0.0, 0.1, 90), rng.normal(0.0, 0.05, 6)
+    follow_rays(lowest, rays, steps, tilt, level, state)
+    right_level, right_state = twins.observed.rays(lowest, rays, steps, tilt)
+    np.testing.assert_array_equal(state, right_state)
     np.testing.assert_array_equal(level, right_level)
+
+
+@patient
+@given(st.integers(0, 2**32))
+def test_cells_of_any_states_agree_with_the_twin(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    observer, index = Observer(SMALL, get_sensor("vlp-16")), np.full((16, 12), -1, np.int32)
+    state = rng.integers(0, 4, observer._state.shape).astype(np.uint8)
+    level, points = np.zeros(state.shape, np.float32), np.empty((0, 4), np.float32)
+    observed, between = np.ones((2, *index.shape), np.bool_)
+    mark_cells(points, index, observer._bin_of_cell, level, state, observed, between)
+    right = twins.observed.cells(points, index, observer._bin_of_cell, level, state)
+    np.testing.assert_array_equal([observed, between], right)
 
 
 # --- properties ------------------------------------------------------------------------------------------------------
@@ -253,7 +280,7 @@ def test_the_height_of_the_beams_counts() -> None:
     shares = []
     for height_m in (1.2, 1.73, 2.4):
         points = cast(profile, height_m=height_m)
-        observed = Observer(VIEW, profile).observe(points, index, height_m)
+        observed = Observer(VIEW, profile).observe(points, index, replace(MODEL_MOUNTING, height_m=height_m)).observed
         first_m = height_m / math.tan(math.radians(15.0))
         assert at(observed, (max(6.0, first_m + 0.3), 12.0), (-2.0, 2.0)).all()
         shares.append(observed[:, 90:110].mean())
@@ -261,7 +288,8 @@ def test_the_height_of_the_beams_counts() -> None:
     # Points about an origin on the ground are no reason to observe more.
     points = cast(profile)
     observer = Observer(VIEW, profile)
-    np.testing.assert_array_equal(observer.observe(points, index, 0.0), observer.observe(points, index, 1.73))
+    on_ground = replace(MODEL_MOUNTING, height_m=0.0)
+    np.testing.assert_array_equal(observer.observe(points, index, on_ground), observer.observe(points, index))
 
 
 def test_adding_returns_never_hides_what_has_returns() -> None:
@@ -306,7 +334,7 @@ def test_large_views_have_bounded_tables() -> None:
     assert observer._lowest.size < 600 * 4200
     no_ground = SensorProfile("up", (5.0, 3.0), 1800)
     index = np.full((16, 12), -1, np.int32)
-    assert not Observer(SMALL, no_ground).observe(np.empty((0, 4), np.float32), index).any()
+    assert not np.any(Observer(SMALL, no_ground).observe(np.empty((0, 4), np.float32), index))
 
 
 # --- for a planner ---------------------------------------------------------------------------------------------------
@@ -331,3 +359,139 @@ def test_an_empty_scan_has_no_road() -> None:
         assert not found.top_view.observed.any()
         assert found.top_view.drivable_area_m2 == found.to_dict()["drivable_area_m2"] == 0.0
         assert len(road_ahead(found.top_view).outline) == 0
+
+
+def top_view(points: NDArray[np.float32], sensor: str, mounting: Mounting = MODEL_MOUNTING) -> TopView:
+    """The view of a network that takes everything for road."""
+    projector = TopViewProjector(VIEW, InputSpec("image", ("height",), (0.0,), (1.0,)))
+    index = projector.project(points).index
+    observed, between_beams = Observer(VIEW, get_sensor(sensor)).observe(points, index, mounting)
+    return TopView(
+        np.ones((400, 200), np.uint8),
+        ("background", "drivable"),
+        0.1,
+        VIEW.x_range_m,
+        VIEW.y_range_m,
+        observed,
+        between_beams=between_beams,
+    )
+
+
+def last_ring_m(sensor: str, height_m: float = -ROAD_Z) -> float:
+    """Where the last beam meets the ground in view [m], or the end of the view if a beam does beyond it."""
+    rings = [height_m / math.tan(math.radians(-e)) for e in get_sensor(sensor).elevations_deg if e < 0.0]
+    return 46.0 if any(46.0 < ring < 60.0 for ring in rings) else max(ring for ring in rings if ring < 46.0)
+
+
+@pytest.mark.parametrize("sensor", ["vlp-16", "vlp-32c", "hdl-32e", "os1-64", "hdl-64e"])
+def test_an_empty_road_is_free_as_far_as_rings_remain(sensor: str) -> None:
+    view = top_view(cast(get_sensor(sensor)), sensor)
+    ahead = free_ahead(view)
+    last = {"vlp-16": 33.0, "hdl-32e": 37.1}.get(sensor, 46.0)
+    assert last_ring_m(sensor) == pytest.approx(last, abs=0.1)
+    assert ahead.free_m == pytest.approx(last, abs=0.3)
+    assert ahead.end == ("end of view" if last == 46.0 else "unknown")
+    assert view.between_beams is not None
+    assert not (view.between_beams & view.observed).any()
+    # Without the beams, the observed cells alone count, as in a view that comes from elsewhere.
+    assert free_ahead(replace(view, between_beams=None)).free_m <= ahead.free_m
+
+
+@pytest.mark.parametrize("sensor", ["vlp-16", "vlp-32c", "hdl-32e", "os1-64", "hdl-64e"])
+@pytest.mark.parametrize("x_m", [12.0, 20.0, 30.0])
+def test_a_box_ends_the_free_distance_before_its_shadow(sensor: str, x_m: float) -> None:
+    view = top_view(cast(get_sensor(sensor), (x_m, x_m + 4.0, -0.9, 0.9, 1.5)), sensor)
+    ahead = free_ahead(view, [Box("car", 0.9, (x_m + 2.0, 0.0, -1.0), (4.0, 1.8, 1.5), 0.0)])
+    assert ahead.end == "obstacle"
+    assert ahead.free_m == ahead.obstacle_m == pytest.approx(x_m, abs=0.11)
+    assert ahead.obstacle_m <= ahead.unknown_m < x_m + 4.0
+    # What no network finds ends it, too: nothing is seen behind it.
+    unnoticed = free_ahead(view)
+    assert unnoticed.end == "unknown"
+    assert unnoticed.free_m < x_m + 0.5
+
+
+@pytest.mark.parametrize("sensor", ["vlp-16", "vlp-32c", "hdl-32e", "os1-64", "hdl-64e"])
+def test_a_kerb_and_a_hedge_are_the_edge_of_the_road(sensor: str) -> None:
+    for tall in (0.12, 1.0):
+        view = top_view(cast(get_sensor(sensor), (18.0, 22.0, -9.0, 9.0, tall)), sensor)
+        view.labels[240:280] = 0
+        ahead = free_ahead(view)
+        assert ahead.end == "edge of the road"
+        assert ahead.free_m == ahead.edge_m == pytest.approx(18.0, abs=0.11)
+        assert ahead.obstacle_m == math.inf
+
+
+@pytest.mark.parametrize("sensor", ["vlp-16", "hdl-32e", "os1-64", "hdl-64e"])
+def test_a_missing_sector_is_unknown(sensor: str) -> None:
+    scan = cast(get_sensor(sensor))
+    azimuth = np.degrees(np.arctan2(scan[:, 1], scan[:, 0]))
+    ahead = free_ahead(top_view(np.ascontiguousarray(scan[np.abs(azimuth - 1.0) > 1.5]), sensor))
+    assert (ahead.free_m, ahead.end) == (6.0, "unknown")
+    distance = np.hypot(scan[:, 0], scan[:, 1])
+    # From here to there no beam returns: several rings, more than one beam explains.
+    first, end = (12.0, 25.0) if sensor == "vlp-16" else (12.0, 22.0)
+    hole = (np.abs(azimuth) < 4.0) & (distance > first) & (distance < end)
+    ahead = free_ahead(top_view(np.ascontiguousarray(scan[~hole]), sensor))
+    assert ahead.end == "unknown"
+    assert ahead.free_m < end - 1.0
+
+
+def test_one_missing_return_is_not_a_gap_but_two_sectors_are() -> None:
+    scan = cast(get_sensor("hdl-64e"))
+    sector, distance = np.arctan2(scan[:, 1], scan[:, 0]), np.hypot(scan[:, 0], scan[:, 1])
+    missing = (distance > 9.0) & (distance < 11.5)
+    for width_deg, end in ((0.35, "end of view"), (2.0, "unknown")):
+        kept = ~(missing & (np.abs(sector) < math.radians(width_deg) / 2.0))
+        assert free_ahead(top_view(np.ascontiguousarray(scan[kept]), "hdl-64e")).end == end
+
+
+@pytest.mark.parametrize("sensor", ["vlp-16", "vlp-32c", "hdl-32e", "os1-64"])
+@pytest.mark.parametrize("height_m", [1.2, 1.73, 2.2])
+def test_no_bridge_leads_over_anything_higher_than_its_rays(sensor: str, height_m: float) -> None:
+    mounting = replace(MODEL_MOUNTING, height_m=height_m)
+    for x in np.arange(6.5, 45.0, 1.7):
+        scan = cast(get_sensor(sensor), (x, x + 0.4, -1.2, 1.2, BRIDGE_M + 0.05), height_m=height_m)
+        view = top_view(scan, sensor, mounting)
+        row, col, inside = VIEW.cells(scan[:, 0], scan[:, 1])
+        touched = inside & (scan[:, 2] > ROAD_Z + 0.1)
+        view.labels[row[touched], col[touched]] = 0
+        ahead = free_ahead(view, half_width_m=0.5)
+        assert ahead.free_m <= x + 0.5, f"{sensor} at {height_m} m: free through a block at {x:.1f} m"
+
+
+@pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(-2.0, 0.0), (3.0, 0.0), (0.66, 4.0)])
+def test_a_tilted_sensor_is_read_with_its_tilt(pitch_deg: float, roll_deg: float) -> None:
+    mounting = Mounting(1.73, roll_deg, pitch_deg, 0.0)
+    frame, profile = ModelFrame(mounting), get_sensor("vlp-32c")
+    azimuth = np.deg2rad(np.arange(-90.0, 90.0, 0.2))
+    azimuth, elevation = (grid.ravel() for grid in np.meshgrid(azimuth, np.deg2rad(profile.elevations_deg)))
+    rays = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1
+    )
+    rays = rays @ frame.R.T
+    rays = rays[rays[:, 2] < -0.01]
+    scan = scan_of(rays * (ROAD_Z / rays[:, 2:]))
+    assert free_ahead(top_view(scan, "vlp-32c", mounting)).free_m > 40.0
+
+
+@patient
+@given(clouds, st.integers(0, 2**32))
+def test_the_free_distance_is_the_least_of_the_distances_to_its_ends(points: NDArray[np.float32], seed: int) -> None:
+    projector = TopViewProjector(SMALL, InputSpec("image", ("height",), (0.0,), (1.0,)))
+    seen = Observer(SMALL, get_sensor("vlp-16")).observe(points, projector.project(points).index)
+    labels = np.random.default_rng(seed).integers(0, 3, (16, 12)).astype(np.uint8)
+    view = TopView(
+        labels, ("background", "drivable", "car"), 0.5, (2.0, 10.0), (-3.0, 3.0), seen[0], between_beams=seen[1]
+    )
+    road = road_ahead(view)
+    np.testing.assert_array_equal(
+        road.free_m, np.minimum(np.minimum(road.obstacle_m, road.unknown_m), np.minimum(road.edge_m, 10.0))
+    )
+    assert road.free_ahead(0.6) == free_ahead(view, half_width_m=0.6)
+    assert road.free_ahead_m(0.6) == road.free_ahead(0.6).free_m
+    for k, end in enumerate(road.free_end):
+        named = {"edge of the road": road.edge_m, "unknown": road.unknown_m}.get(end)
+        assert named is None or named[k] == road.free_m[k]
+        assert end != "obstacle" or road.obstacle_m[k] <= road.free_m[k] + 1.5
+        assert end != "end of view" or road.free_m[k] == 10.0

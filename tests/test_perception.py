@@ -105,7 +105,9 @@ def test_only_observed_road_is_in_the_json() -> None:
     assert found.top_view is not None
     found.top_view.observed[:100] = False  # farther than 30 m
     assert found.to_dict()["drivable_area_m2"] == 240.0
-    assert scan_record(found)["road"]["free_ahead_m"] == 30.0
+    road = scan_record(found)["road"]
+    assert (road["free_ahead_m"], road["free_ahead_end"], road["unknown_ahead_m"]) == (30.0, "unknown", 30.0)
+    assert (road["obstacle_ahead_m"], road["edge_ahead_m"], road["view_ahead_m"]) == (None, None, 40.0)
     assert np.count_nonzero(found.top_view.road) == 400 * 80
     found.top_view.observed[:] = False
     nothing = scan_record(found)
@@ -120,6 +122,7 @@ def test_a_record_adds_road_and_tracks() -> None:
     record = scan_record(perception_of(CAR), tracks)
     assert tuple(record) == SCAN_KEYS
     assert record["road"]["free_ahead_m"] == pytest.approx(10.34, abs=0.5)  # up to the car's rear
+    assert record["road"]["free_ahead_end"] == "obstacle"
     (track,) = tracks
     assert record["tracks"] == [track.to_dict()]
     assert Box.from_dict(track.to_dict()) == Box.from_dict(track.box.to_dict())

@@ -121,6 +121,11 @@ def _summary(perception: Perception) -> str:
     parts += [f"{perception.n_points:,} points", f"{sum(perception.stage_ms.values()):.1f} ms"]
     if perception.top_view is not None:
         parts.append(f"drivable {perception.top_view.drivable_area_m2:.1f} m2")
+        from ..drivable import free_ahead  # after the first scan: it loads numba
+
+        ahead = free_ahead(perception.top_view, perception.boxes)
+        if ahead.end is not None:
+            parts.append(f"free to {ahead.free_m:.1f} m ({ahead.end})")
     labels = [box.label for box in perception.boxes]
     boxes = ", ".join(f"{labels.count(label)} {label}" for label in dict.fromkeys(labels))
     parts.append(f"boxes: {boxes or 'none'}")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..drivable import RoadAhead, road_ahead
+from ..drivable import FreeAhead, RoadAhead, road_ahead
 from ..perception import Box, Perception, TopView
 from .canvas import (
     Label,
@@ -181,14 +181,14 @@ def _write_header(figure: Any, perception: Perception, title: str) -> None:
     write_at(figure, _MARGIN, 46, shorten(figure, title, 1100, **style), **style)
 
 
-def _strip(road: RoadAhead, x_near: float, x_far: float) -> tuple[str, NDArray[np.float64] | None]:
+def _strip(ahead: FreeAhead, x_near: float) -> tuple[str, NDArray[np.float64] | None]:
     """The free distance ahead as text, and the corners x, y [m] of an arrow of that length; None for no arrow."""
-    free_m = road.free_ahead_m(_HALF_STRIP_M)
-    if not math.isfinite(free_m):
+    free_m = ahead.free_m
+    if ahead.end is None:
         return "", None
     if free_m <= x_near:
         return f"not free {x_near:.0f} m ahead", None
-    text = f"free ahead: {'at least ' if free_m >= x_far else ''}{free_m:.0f} m"
+    text = f"free ahead: {'at least ' if ahead.end == 'end of view' else ''}{free_m:.0f} m"
     half = _HALF_STRIP_M
     neck = max(x_near, free_m - 2.0 * half)
     return text, np.array(
@@ -219,7 +219,11 @@ def _draw_top_view(
     for k, name in enumerate(top_view.classes):
         if k:
             layer[top_view.labels == k] = (*rgb([color_of(name)])[0], 0.62 if name == "drivable" else 0.45)
-    layer[~top_view.observed & ((top_view.labels == 0) | top_view.road)] = (*rgb([FAINT])[0], 0.22)
+    unobserved = ~top_view.observed & ((top_view.labels == 0) | top_view.road)
+    if top_view.between_beams is not None:
+        layer[unobserved & top_view.between_beams & top_view.road, 3] = 0.35
+        unobserved &= ~top_view.between_beams
+    layer[unobserved] = (*rgb([FAINT])[0], 0.22)
     extent = (y_left, y_right, x_near, x_far)
     axes.imshow(layer, extent=extent, aspect="auto", interpolation="nearest", zorder=1)
     x, y, z = points[:, :3].astype(np.float64).T
@@ -244,7 +248,8 @@ def _draw_top_view(
     axes.add_patch(sensor)
 
     avoid = [area_of(axes, sensor.get_xy())]
-    text, arrow = _strip(road, x_near, x_far)
+    ahead = road.free_ahead(_HALF_STRIP_M)
+    text, arrow = _strip(ahead, x_near)
     if arrow is not None:
         axes.add_patch(Polygon(arrow[:, ::-1], closed=True, facecolor=INK, alpha=0.3, zorder=3))
         axes.add_patch(Polygon(arrow[:, ::-1], closed=True, fill=False, edgecolor=INK, linewidth=1.5, zorder=4))
@@ -260,6 +265,11 @@ def _draw_top_view(
         if low <= box.center[0] <= high and right <= box.center[1] <= left:
             area = area_of(axes, footprint[:, ::-1])
             labels.append(Label(area, f"{box.label} {box.score:.2f}", color))
+    for kind, x_m in (("obstacle", ahead.obstacle_m), ("edge", ahead.edge_m), ("unknown", ahead.unknown_m)):
+        if math.isfinite(x_m):
+            axes.plot([-_HALF_STRIP_M, _HALF_STRIP_M], [x_m, x_m], color=INK, linewidth=1.5, zorder=4)
+            line = area_of(axes, [[-_HALF_STRIP_M, x_m], [_HALF_STRIP_M, x_m]])
+            labels.append(Label(line, f"{kind} {x_m:.1f} m", FAINT))
     if text:
         labels.append(Label(beside_arrow, text, AMBER if arrow is None else INK))
     n_omitted = place_labels(axes, labels, avoid)
@@ -371,7 +381,9 @@ def _draw_from_behind(
 
     labels: list[Label] = []
     if top_view is not None and road is not None:
-        text, arrow = _strip(road, *top_view.x_range_m)
+        ahead = road.free_ahead(_HALF_STRIP_M)
+        text, arrow = _strip(ahead, top_view.x_range_m[0])
+        text += "" if ahead.end in (None, "end of view") else f" ({ahead.end})"
         if arrow is not None:
             flat = (np.column_stack([arrow, a + arrow @ [b, c] + 0.02]) - eye) @ turn.T
             flat = flat[:, :2] / np.maximum(flat[:, 2:], _NEAR_M)

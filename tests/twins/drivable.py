@@ -7,9 +7,10 @@ import itertools
 import numpy as np
 
 
-def free_cells(drivable):
-    """Twin of `edgeperc.drivable.fill_free`."""
-    return [len(list(itertools.takewhile(bool, column[::-1]))) for column in drivable.T]
+def first_cells(objects, known, road):
+    """Twin of `edgeperc.drivable.fill_first_cells`."""
+    kinds = (objects, known & ~road & ~objects, ~known & ~objects)
+    return [[len(list(itertools.takewhile(lambda cell: not cell, c[::-1]))) for c in kind.T] for kind in kinds]
 
 
 def corridor(drivable, first, last):

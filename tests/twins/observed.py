@@ -23,12 +23,14 @@ def lowest_returns(points, bounds, grid, shape):
     return lowest
 
 
-def rays(lowest, ring_m, z_beams, first_gradient, max_apart):
-    """Twin of `edgeperc.observed.follow_rays`: first the returns on the ground, then what lies between two of them."""
+def rays(lowest, rays, steps, tilt):
+    """Twin of `edgeperc.observed.follow_rays`: the returns on the ground, what lies between two of them, bridges."""
+    ring_m, z_beams, first_gradient, max_apart = rays
     middles = (np.arange(lowest.shape[1]) + 0.5) * ring_m
-    level, seen = np.empty_like(lowest), np.zeros(lowest.shape, bool)
-    for z_of, level_of, seen_of in zip(lowest.astype(np.float64), level, seen, strict=True):
-        ground, below = [(-1, 0.0, -1.73)], []
+    level, state = np.empty_like(lowest), np.zeros(lowest.shape, np.uint8)
+    for z_of, level_of, state_of, tilted in zip(lowest.astype(np.float64), level, state, tilt, strict=True):
+        seen_of = np.zeros(len(z_of), bool)
+        ground, below, standing = [(-1, 0.0, -1.73)], [], []
         for ring in np.flatnonzero(np.isfinite(z_of)).tolist():
             _, x_last, z_last = ground[-1]
             rise, limit = z_of[ring] - z_last, 0.1 + 0.1 * min(middles[ring] - x_last, 5.0)
@@ -37,6 +39,8 @@ def rays(lowest, ring_m, z_beams, first_gradient, max_apart):
                 ground.append((ring, middles[ring], z_of[ring]))
             elif rise < 0.0:
                 below.append(ring)
+            elif rise <= 2.0:
+                standing.append(ring)
         for k, (ring, x, z) in enumerate(ground):
             level_of[max(ring, 0) :] = z
             if k == 0:
@@ -51,13 +55,38 @@ def rays(lowest, ring_m, z_beams, first_gradient, max_apart):
                 continue
             height = z_beams + (z - z_beams) * x_last / x - z_last
             seen_of[begin:ring] |= back <= (0.5 / height if height > 0.5 else 1.0)
-    return level, seen
+        state_of[seen_of] = 1
+        for k, (last, x_last, z_last) in enumerate(ground):
+            end = ground[k + 1][0] if k + 1 < len(ground) else len(z_of)
+            gradient = first_gradient if k == 0 else (z_last - z_beams) / x_last
+            step = steps[min(max(int(-(gradient + tilted) / 0.005), 0), len(steps) - 1)]
+            nexts = [r for r in standing if last < r < end]
+            nexts = (nexts if k == 0 else nexts[:1]) + [end] * (end < len(z_of) and (k == 0 or not nexts))
+            for ring in nexts:
+                begin = max([last, *(r for r in below if last < r < ring)]) + 1
+                x, z = middles[ring], z_of[ring]
+                height, foot = z_beams + (z - z_beams) * x_last / x - z_last, 0.0 if ring == end else z - z_last
+                close = k == 0 or (z - z_beams) / x - gradient <= step
+                highest = 0.8 if close and k > 0 else 0.5
+                if foot <= highest:
+                    passing = foot + (height - foot) * (x - middles[begin:ring]) / (x - x_last)
+                    state_of[begin:ring][(passing <= highest) & ~seen_of[begin:ring]] = 2 if close else 3
+    return level, state
 
 
-def cells(points, index, bin_of_cell, level, seen):
+def sectors(state):
+    """States with `PASSED` bins `BETWEEN` where both neighboring sectors are known."""
+    known = (state == 1) | (state == 2)
+    bridged = (state == 3) & np.pad(known, ((1, 0), (0, 0)))[:-1] & np.pad(known, ((0, 1), (0, 0)))[1:]
+    return np.where(bridged, np.uint8(2), state)
+
+
+def cells(points, index, bin_of_cell, level, state):
     """Twin of `edgeperc.observed.mark_cells`."""
     flat = index.reshape(-1)
     top = np.full(flat.shape, np.inf)
     top[flat >= 0] = points[flat[flat >= 0], 2]
     near = top - level.reshape(-1)[bin_of_cell].astype(np.float64) <= 2.0
-    return (seen.reshape(-1)[bin_of_cell] | near).reshape(index.shape)
+    state = sectors(state).reshape(-1)[bin_of_cell].reshape(index.shape)
+    observed = (state == 1) | near.reshape(index.shape)
+    return observed, (state == 2) & ~observed
