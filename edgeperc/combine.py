@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
@@ -13,6 +14,7 @@ from .agreement import agree_on_boxes, agree_on_points, find_support, find_voter
 from .card import ModelCard, TopViewGeometry
 from .cells import agree_on_cells, mark_cells
 from .cluster import join_boxes, objects_from_points
+from .geometry import oriented_iou, rectangles, shared_area
 from .ground import Ground
 from .linkage import Strips
 from .perception import Box, PointLabels, TopView
@@ -41,7 +43,8 @@ def combine(
 ) -> tuple[PointLabels | None, TopView | None, Sequence[Box]]:
     """What the parts agree on, and boxes around clusters of points above the ground (KUL-Seg 5.2).
 
-    An object cut by the view's edge gets either a box of the whole object, if about half of it is in view, or none.
+    No box around a cluster is dropped because a network might have found it. If a network that sees the object has not,
+    only its score is lower.
 
     Parameters
     ----------
@@ -116,7 +119,7 @@ def combine(
             distance_per_m=distance_per_m,
             min_score=min_score,
         )
-        boxes = join_boxes(boxes, _new_to_networks(clustered, cards)) if boxes_from == "both" else clustered
+        boxes = join_boxes(boxes, _weighed(clustered, cards, min_score)) if boxes_from == "both" else clustered
         watch.lap("cluster")
     if top_view is not None and marks is not None:
         top_view = agree_on_cells(top_view, scan, points, ground, boxes, dropped, rules=rules, marks=marks())
@@ -124,9 +127,24 @@ def combine(
     return points, top_view, boxes
 
 
-def _new_to_networks(boxes: tuple[Box, ...], cards: Sequence[ModelCard]) -> list[Box]:
-    """Boxes that no network can detect, because of their class or because they are out of its view."""
-    detectors = [(card.view, card.box_classes) for card in cards if isinstance(card.view, TopViewGeometry)]
-    return [
-        b for b in boxes if not any(b.label in classes and view.holds(*b.center[:2]) for view, classes in detectors)
-    ]
+def _weighed(boxes: Sequence[Box], cards: Sequence[ModelCard], min_score: float) -> list[Box]:
+    """Boxes around clusters that no network has found, with the scores that both views give them.
+
+    A network that sees all of an object of its classes has given it less than ``min_score``: the score is the mean of
+    that and the cluster's. Out of the network's view, the cluster's score stands; across the edge, each has the weight
+    of the share of the footprint that the network sees.
+    """
+    weighed = list(boxes)
+    for view, classes in ((card.view, card.box_classes) for card in cards):
+        rows = [row for row, box in enumerate(weighed) if box.label in classes]
+        if not isinstance(view, TopViewGeometry) or not rows:
+            continue
+        footprints = rectangles(weighed[row] for row in rows)
+        (near, far), (right, left) = view.x_range_m, view.y_range_m
+        field = np.array([(0.5 * (near + far), 0.5 * (right + left), far - near, left - right, 0.0)])
+        areas = footprints[:, 2] * footprints[:, 3]
+        seen = shared_area(oriented_iou(footprints, field), footprints, field)[:, 0] / areas
+        for row, share in zip(rows, seen.tolist(), strict=True):
+            box = weighed[row]
+            weighed[row] = replace(box, score=box.score - 0.5 * share * (box.score - min_score))
+    return weighed
