@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .agreement import agree_on_boxes, agree_on_points, find_support, find_voters, without_poles
+from .agreement import agree_on_boxes, agree_on_points, find_support, find_voters, stand_boxes, without_poles
 from .card import ModelCard, TopViewGeometry
 from .cells import agree_on_cells, mark_cells
 from .cluster import join_boxes, objects_from_points
@@ -43,8 +43,8 @@ def combine(
 ) -> tuple[PointLabels | None, TopView | None, Sequence[Box]]:
     """What the parts agree on, and boxes around clusters of points above the ground (KUL-Seg 5.2).
 
-    No box around a cluster is dropped because a network might have found it. If a network that sees the object has not,
-    only its score is lower.
+    A box around a cluster is not dropped because a network might have found it: if a network that sees the object has
+    not, the score is lower (`_weighed`).
 
     Parameters
     ----------
@@ -121,6 +121,7 @@ def combine(
         )
         boxes = join_boxes(boxes, _weighed(clustered, cards, min_score)) if boxes_from == "both" else clustered
         watch.lap("cluster")
+    boxes = stand_boxes(boxes, scan, ground, rules=rules)
     if top_view is not None and marks is not None:
         top_view = agree_on_cells(top_view, scan, points, ground, boxes, dropped, rules=rules, marks=marks())
         watch.lap("agree")
@@ -130,9 +131,8 @@ def combine(
 def _weighed(boxes: Sequence[Box], cards: Sequence[ModelCard], min_score: float) -> list[Box]:
     """Boxes around clusters that no network has found, with the scores that both views give them.
 
-    A network that sees all of an object of its classes has given it less than ``min_score``: the score is the mean of
-    that and the cluster's. Out of the network's view, the cluster's score stands; across the edge, each has the weight
-    of the share of the footprint that the network sees.
+    The score is the mean of the cluster's and that of a network of the top view, which is 0 where it sees the object.
+    The network's has the weight of the share of the footprint in its view: out of the view, the cluster's score stands.
     """
     weighed = list(boxes)
     for view, classes in ((card.view, card.box_classes) for card in cards):
@@ -146,5 +146,5 @@ def _weighed(boxes: Sequence[Box], cards: Sequence[ModelCard], min_score: float)
         seen = shared_area(oriented_iou(footprints, field), footprints, field)[:, 0] / areas
         for row, share in zip(rows, seen.tolist(), strict=True):
             box = weighed[row]
-            weighed[row] = replace(box, score=box.score - 0.5 * share * (box.score - min_score))
-    return weighed
+            weighed[row] = replace(box, score=box.score * (1.0 - 0.5 * share))
+    return [box for box in weighed if box.score >= min_score]

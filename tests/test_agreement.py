@@ -21,6 +21,8 @@ from edgeperc.agreement import (
     clear_columns,
     clear_ground,
     count_inside,
+    sum_inside,
+    stand_boxes,
     fill_support,
     find_support,
     find_voters,
@@ -165,6 +167,9 @@ def test_boxes_around_points_match_the_twin(given: list, boxes: list[Box]) -> No
     more = *arrays, *map_read_only((scene.in_view, scene.labels))
     count_inside(*more, ROLES, as_rows, counts)
     np.testing.assert_array_equal(counts, twins.agreement.inside_counts(*more, ROLES, as_rows))
+    sums = np.empty((len(boxes), 3))
+    sum_inside(*arrays, as_rows, sums)
+    np.testing.assert_array_equal(sums, twins.agreement.inside_sums(*arrays, as_rows))
 
 
 @patient

@@ -87,6 +87,16 @@ def inside_counts(points, height, on_ground, in_view, labels, roles, boxes):
     return np.array(rows, np.int64).reshape(-1, 3)
 
 
+def inside_sums(points, height, on_ground, boxes):
+    """Twin of `edgeperc.agreement.sum_inside`."""
+    sums = np.zeros((len(boxes), 3))
+    for row, box in zip(sums, boxes, strict=True):
+        own = inside(points, height, on_ground, box) & (height >= 0.0)
+        levels = points[own, 2].astype(np.float64) - height[own]
+        row[:] = np.count_nonzero(own), sum(levels.tolist()), max(0.0, 0.0, *height[own].tolist())
+    return sums
+
+
 def verdicts(in_view, clusters, table, roles, scores, names, labels):
     """Twin of `edgeperc.voting.apply_verdicts`."""
     agreed = labels.copy()
@@ -117,6 +127,7 @@ def verdict_table(counts, bounds, refused, roles, parts, by_share, by_height, is
     low, high = bounds[:, :2].astype(np.float64), bounds[:, 2:4].astype(np.float64)
     is_near = np.hypot(*np.maximum(np.maximum(low, -high), 0.0).T) < 30.0  # nearest place of the bounds
     is_own = (np.hypot(*np.maximum(np.abs(low), np.abs(high)).T) < 2.6) & (person_share < 0.1)
+    is_own &= (length < 2.0) | (top < 1.7)
     is_low = top < np.where(is_near, 1.0, 0.5)
     no_vehicle = refused | by_share & (vehicle_share < np.where(large, 0.75, 0.6)) | by_height & (is_low | is_own)
     no_person = by_share & (person_share < 0.1) | by_height & (top < 1.0)
