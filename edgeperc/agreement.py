@@ -75,7 +75,7 @@ COLUMN_GAP_M = 0.3  # a larger gap ends a column: a head and the foliage above i
 
 MARGIN_M = 0.1  # by which boxes are grown for points
 ABOVE_BOX_M = 0.5
-# Of a cluster's points in the range image's view; if more are out of the top view, its cells prove nothing. With 0.5 in
+# Of a cluster's points; if more are out of the top view or of the range image's, its cells prove nothing. With 0.5 in
 # place of 0.8, fold 1 loses 961 points of a car that is cut by the edge of the top view.
 MIN_IN_TOP_VIEW = 0.8
 # A box with a smaller share of vehicle points is contradicted. Of 28 such uncertain boxes on every second scan of the
@@ -236,11 +236,11 @@ def agree_on_points(
     n = int(clusters.max(initial=-1)) + 1
     counts = np.empty((n, len(labels.classes) + 1), np.int32)
     bounds = np.empty((n, 5), np.float32)
-    above = np.empty((n, 2), np.int32)
+    above = np.empty((n, 3), np.int32)
     votes = "cells" in rules and view is not None and not VEHICLES.isdisjoint(view.classes)
     cells = cells_of(view if votes else None)
     fill_tallies(rows, height, in_view, read_only(agreed, np.uint8), of, *cells, counts, bounds, above)
-    refused = (above[:, 1] == 0) & (above[:, 0] >= MIN_IN_TOP_VIEW * counts[:, -1])
+    refused = (above[:, 1] == 0) & (above[:, 0] >= MIN_IN_TOP_VIEW * above[:, 2])
     verdicts = _verdicts(labels.classes, counts, bounds, refused, rules)
     scores, names = support or find_support(points, labels, ground, boxes, rules=rules)
     before = agreed.copy()

@@ -20,7 +20,7 @@ from .geometry import oriented_iou, rectangles, shared_area, suppress_overlaps
 from .kernel_cache import njit
 from .linkage import COLUMN_EDGE, MAX_COLUMNS, TESTS_PER_POINT, Strips, chain_points, fill_clusters, levels_of
 from .perception import Box
-from .persons import MIN_OF_WHOLE, RIDES, WALKS, fill_person_groups, fill_persons
+from .persons import MIN_OF_WHOLE, RIDES, UNSEEN, WALKS, fill_person_groups, fill_persons
 from .points import read_only
 
 __all__ = [
@@ -479,8 +479,12 @@ def objects_from_points(
     if clusters.shape != labels.shape:
         raise PointsError(f"got clusters of shape {clusters.shape} for {len(points)} points; expected one a point")
     order, starts = _grouped(clusters)
+    numbers = labels
+    if in_view is not None and roles.any() and len(classes) < len(roles):
+        numbers = np.where(in_view, labels, len(classes)).astype(np.uint8)
+        roles[len(classes)] = UNSEEN
     persons = _persons(
-        points, labels, classes, roles, clusters, order, starts, height_m, distance_per_m, min_points, size_m
+        points, numbers, classes, roles, clusters, order, starts, height_m, distance_per_m, min_points, size_m
     )
     sizes = np.diff(starts)
     found, shares = _labels_of_groups(order, starts, labels, 0.0, {})

@@ -109,8 +109,8 @@ def fill_tallies(
         Points in view of each class; last, of all classes.
     bounds : (k, 5) float32, overwritten
         Lowest x and y, highest x and y, highest height [m] of all points.
-    above : (k, 2) int32, overwritten
-        Points in view that are in the top view too, and those of them in cells of vehicles.
+    above : (k, 3) int32, overwritten
+        Points in view that are in the top view too; those of them in cells of vehicles; all points, in view or not.
     """
     n_rows, n_cols = cells.shape
     counts[:] = 0
@@ -124,6 +124,7 @@ def fill_tallies(
         k = clusters[i]
         if k < 0:
             continue
+        above[k, 2] += 1
         if in_view[i]:
             counts[k, labels[i]] += 1
             counts[k, last] += 1

@@ -137,7 +137,7 @@ def test_dense_columns_match_the_twin(seed: int) -> None:
 @given(scenes, st.sampled_from([(0, 0), (40, 40)]))
 def test_tallies_match_the_twin(given: list, shape: tuple[int, int]) -> None:
     scene = Scene(given)
-    found = np.empty((6, 5), np.int32), np.empty((6, 5), np.float32), np.empty((6, 2), np.int32)
+    found = np.empty((6, 5), np.int32), np.empty((6, 5), np.float32), np.empty((6, 3), np.int32)
     cells = np.random.default_rng(len(given)).integers(0, 5, shape).astype(np.uint8)
     args = scene.points, scene.height, scene.in_view, scene.labels, scene.clusters, cells, np.arange(256) % 5 > 1
     grid = np.array([16.0, 8.0, 0.4])

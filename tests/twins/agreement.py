@@ -35,7 +35,7 @@ def tallies(points, height, in_view, labels, clusters, cells, is_vehicle, grid, 
     """Twin of `edgeperc.voting.fill_tallies`."""
     counts = np.zeros((n, n_classes + 1), np.int32)
     bounds = np.empty((n, 5), np.float32)
-    above = np.zeros((n, 2), np.int32)
+    above = np.zeros((n, 3), np.int32)
     row, col = ((grid[k] - points[:, k].astype(np.float64)) / grid[2] for k in range(2))
     is_held = (row >= 0) & (row < cells.shape[0]) & (col >= 0) & (col < cells.shape[1])
     marked = np.zeros(len(points), np.bool_)
@@ -48,7 +48,8 @@ def tallies(points, height, in_view, labels, clusters, cells, is_vehicle, grid, 
         bounds[k, :2] = xy.min(axis=0, initial=np.inf)
         bounds[k, 2:4] = xy.max(axis=0, initial=-np.inf)
         bounds[k, 4] = height[own].max(initial=-np.inf)
-        above[k] = np.count_nonzero(own & in_view & is_held), np.count_nonzero(own & in_view & marked)
+        above[k, :2] = np.count_nonzero(own & in_view & is_held), np.count_nonzero(own & in_view & marked)
+        above[k, 2] = np.count_nonzero(own)
     return counts, bounds, above
 
 
