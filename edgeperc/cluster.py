@@ -398,8 +398,8 @@ def objects_from_points(
     others : sequence of Box
         Boxes that are known, such as a network's. Points inside of them are no further object.
     min_share : float
-        A cluster is kept if more than this share of its points in view has one class (KUL-Seg 5.2), however many are out
-        of view. Persons need no share.
+        A cluster is kept if more than this share of its points in view has one class (KUL-Seg 5.2), however many are
+        out of view. Persons need no share.
     min_distance_m, distance_per_m, min_points
         As in `find_clusters`.
     min_score : float
@@ -410,12 +410,12 @@ def objects_from_points(
     Returns
     -------
     tuple of Box
-        Best score first. The score is a product of four factors: the share of the class; n / (n + 10) for n points in view;
-        the square of height / usual height, at most 1; and longer side / usual width, at most 1. To the height and the
-        side, range * ``distance_per_m`` is added, the gap that two returns of an object may have. Of persons: the share
-        of persons' points; n / (n + m), with m from 10 to 80, more for near persons; the square of height / usual
-        height, inverted if too tall; and the square of the greatest width of heads / width of the heads, at most 1. The
-        heading is known up to a half turn: yaw is in -pi/2..pi/2.
+        Best score first. The score is a product of four factors: the share of the class; n / (n + 10) for n points in
+        view; the square of height / usual height, at most 1; and longer side / usual width, at most 1. To the height
+        and the side, range * ``distance_per_m`` is added, the gap that two returns of an object may have. Of persons:
+        the share of persons' points; n / (n + m), with m from 10 to 80, more for near persons; the square of height /
+        usual height, inverted if too tall; and the square of the greatest width of heads / width of the heads, at most
+        1. The heading is known up to a half turn: yaw is in -pi/2..pi/2.
 
     Raises
     ------

@@ -188,8 +188,8 @@ def complete_persons(
         The labels of persons on foot and of those who ride.
     labels : (n,) uint8, modified
         A cluster up to 2.3 m long and 0.7 m wide (0.8 m if the person rides), whose upper quarter is at most 0.8 m
-        wide, and of which a fifth in view is labeled as persons, is one person, who rides if longer than a stride, or if a
-        quarter of the persons' points says so.
+        wide, and of which a fifth in view is labeled as persons, is one person, who rides if longer than a stride, or
+        if a quarter of the persons' points says so.
         The persons' points of one who is longer than a stride, or all points of one who is 1.3 to 2.0 m high and of
         whom at least 0.3 is labeled, get the label.
     """
@@ -342,8 +342,8 @@ def fill_persons(
         Smaller parts are dropped.
     persons : (p, 11) float64, overwritten
         For each person: 1 if he or she rides, else 0; x, y of the middle, extent along and across the principal axis
-        [m], its angle [rad]; lowest and highest z [m], from the ground on; number of points in view; share of labeled ones among them;
-        `head_width` of the group [m].
+        [m], its angle [rad]; lowest and highest z [m], from the ground on; number of points in view; share of
+        labeled ones among them; `head_width` of the group [m].
 
     Returns
     -------

@@ -27,9 +27,9 @@ MIN_VEHICLE_TOP_M, MIN_PERSON_TOP_M = 0.5, 1.0
 # Nearer vehicles show enough of themselves to be higher. With 0.5 m for all, 4,140 more points of tables, kerbs and
 # hedges on the folds are called car, and 298 fewer points of cars are missed. Some sports cars are lower than 1.2 m.
 NEAR_M, MIN_NEAR_VEHICLE_TOP_M = 30.0, 1.0
-# What ends nearer to the sensor and is not a person is a part of the own vehicle, such as a mirror or an open door: other
-# vehicles are longer. Open doors in two KITTI scans reach to 2.5 m. What is both longer and higher than a door is the
-# flank or the rear of a truck.
+# What ends nearer to the sensor and is not a person is a part of the own vehicle, such as a mirror or an open door:
+# other vehicles are longer. Open doors in two KITTI scans reach to 2.5 m. What is both longer and higher than a door is
+# the flank or the rear of a truck.
 OWN_REACH_M = 2.6
 DOOR_M, DOOR_TOP_M = 2.0, 1.7
 # A cluster is completed if this share of its points is labeled, and if it is not too large for a group of persons.

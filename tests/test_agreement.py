@@ -21,11 +21,11 @@ from edgeperc.agreement import (
     clear_columns,
     clear_ground,
     count_inside,
-    sum_inside,
-    stand_boxes,
     fill_support,
     find_support,
     find_voters,
+    stand_boxes,
+    sum_inside,
     without_poles,
 )
 from edgeperc.card import TopViewGeometry
@@ -585,6 +585,32 @@ def test_box_that_the_labels_contradict_labels_nothing() -> None:
     wall[np.flatnonzero(own)[::8], 3] = 1
     labels = agreed_scene(wall, boxes=(box,))[1]
     assert (labels[-len(wall) :][own & (wall[:, 2] < 2.3)] == 1).all()
+
+
+def test_rear_of_a_truck_beside_the_own_vehicle_is_no_door() -> None:
+    rear = block(0.0, 1.8, (2.5, 0.3, 1.84), 1)
+    assert (agreed_scene(rear)[1] == 1).sum() > 0.95 * len(rear)
+    assert not agreed_scene(block(0.0, 1.8, (2.5, 0.3, 1.5), 1))[1].any()
+
+
+@pytest.mark.parametrize(("label", "tall", "least"), [("car", 1.6, 1.4), ("car", 1.2, 1.4), ("van", 2.1, 1.75)])
+def test_vehicles_stand_on_the_ground_below_them(label: str, tall: float, least: float) -> None:
+    sides = block(12.0, 3.0, (4.0, 1.7, tall + 0.01), 1)
+    tree = block(12.0, 3.0, (3.0, 1.0, 4.0), 0)
+    rows = np.concatenate([sides, tree[tree[:, 2] > 3.0]])
+    points = np.column_stack([rows[:, :2], rows[:, 2] - 2.3, np.zeros(len(rows))]).astype(np.float32)
+    # Below this car, the street is 0.57 m lower than around the sensor.
+    ground = Ground(np.zeros(len(rows), np.bool_), rows[:, 2].astype(np.float32), (0.0, 0.0, GROUND_Z))
+    own, empty = (Box(label, 0.6, (x, 3.0, -0.9), (4.1, 1.8, 1.5), 0.1) for x in (12.0, 30.0))
+    person = Box("pedestrian", 0.6, (12.0, 3.0, -0.9), (1.0, 1.0, 1.7), 0.0)
+    standing, *others = stand_boxes([own, empty, person], points, ground)
+    assert others == [empty, person]
+    top = rows[rows[:, 2] < 2.5, 2].max()
+    assert standing.size == pytest.approx((4.1, 1.8, max(top, least)), abs=1e-6)
+    assert standing.center == pytest.approx((12.0, 3.0, -2.3 + 0.03 + standing.size[2] / 2), abs=1e-6)
+    assert replace(standing, center=own.center, size=own.size) == own
+    assert stand_boxes([own], points, ground, rules=RULES - {"stand"}) == (own,)
+    assert stand_boxes([own], points, replace(ground, plane=None)) == (own,)
 
 
 def test_cyclist_is_one_object() -> None:

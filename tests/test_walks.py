@@ -23,7 +23,28 @@ MIN_POINTS = {"car": 30, "truck": 30, "pedestrian": 50}
 MIN_RECOGNIZED = {"car": 0.0, "truck": 0.6, "pedestrian": 0.3}
 LABELS_OF = {"car": (1,), "truck": (1,), "pedestrian": (2, 3)}
 OWN_LENGTH_M, OWN_WIDTH_M = 5.0, 2.4  # with a gap
-RANGES_M = (1.0, 1.5, 2.0, 2.8, 3.6, 4.5, 5.6, 6.4, 7.2, 9.0, 12.0, 16.0, 21.0, 27.0, 34.0, 41.0, 45.0, 48.0, 54.0, 60.0)
+RANGES_M = (
+    1.0,
+    1.5,
+    2.0,
+    2.8,
+    3.6,
+    4.5,
+    5.6,
+    6.4,
+    7.2,
+    9.0,
+    12.0,
+    16.0,
+    21.0,
+    27.0,
+    34.0,
+    41.0,
+    45.0,
+    48.0,
+    54.0,
+    60.0,
+)
 
 Place = tuple[str, float, float, float]
 """Kind, x, y [m] and yaw [rad]."""
