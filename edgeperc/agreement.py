@@ -211,17 +211,17 @@ def agree_on_points(
     First, a person's point becomes background if the points within about 0.3 m around go on to above 2.0 m (cyclist:
     2.2 m) without a gap of more than 0.3 m. Each cluster then votes, by the shares of its points in view. It loses its
     vehicle labels if less than 0.6 of its points have them (0.75 if it is longer than 10 m or higher than 4 m), or if
-    it is lower than 0.5 m (1.0 m within 30 m), or if all of it is within 2.6 m and less than 0.1 of it is labeled as a
-    person's, or if at least 0.8 of its points are in the top view and none of them lies in a cell of a vehicle; labels
-    in a box with a score of 0.3 stay. It loses its person labels below a share of 0.1 or a height of
-    1.0 m. A share of 0.6 gives the class to all of its points in view; persons are cyclists if a quarter of them is
-    labeled so. A cluster up to 2.3 m long whose upper quarter is at most 0.8 m wide is one person from a share of 0.2
-    on: a cyclist if longer than 1.1 m, more than a stride; from a share of 0.3 and with a height from 1.3 to 2.0 m,
-    with all of its points in view. Where a cluster loses a person's labels, a group of them of that size stays if it is
-    at least 1.4 m high and 0.15 m wide and has 0.7 of the points in its place. A box with a score of 0.5 makes the
-    points above the ground in it vehicle points, except persons. Boxes count only if a tenth of their points in view
-    have a vehicle's label. Last, points on the ground keep a label only in cells of 0.2 m in which an object of their
-    kind stands; within 6 m, points lower than 0.06 m lose it.
+    it is lower than 0.5 m (1.0 m within 30 m), or if all of it is within 2.6 m, it is shorter than 2 m or lower than
+    1.7 m, and less than 0.1 of it is labeled as a person's, or if at least 0.8 of its points are in both views and none
+    of them lies in a cell of a vehicle; labels in a box with a score of 0.3 stay. It loses its person labels below a
+    share of 0.1 or a height of 1.0 m. A share of 0.6 gives the class to all of its points in view; persons are cyclists
+    if a quarter of them is labeled so. A cluster up to 2.3 m long whose upper quarter is at most 0.8 m wide is one
+    person from a share of 0.2 on: a cyclist if longer than 1.1 m, more than a stride; from a share of 0.3 and with a
+    height from 1.3 to 2.0 m, with all of its points in view. Where a cluster loses a person's labels, a group of them
+    of that size stays if it is at least 1.4 m high and 0.15 m wide and has 0.7 of the points in its place. A box with a
+    score of 0.5 makes the points above the ground in it vehicle points, except persons. Boxes count only if a tenth of
+    their points in view have a vehicle's label. Last, points on the ground keep a label only in cells of 0.2 m in which
+    an object of their kind stands; within 6 m, points lower than 0.06 m lose it.
     """
     check_scan(points, labels, ground)
     if clusters.shape != labels.labels.shape:
