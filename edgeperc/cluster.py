@@ -20,7 +20,7 @@ from .geometry import oriented_iou, rectangles, shared_area, suppress_overlaps
 from .kernel_cache import njit
 from .linkage import COLUMN_EDGE, MAX_COLUMNS, TESTS_PER_POINT, Strips, chain_points, fill_clusters, levels_of
 from .perception import Box
-from .persons import MIN_OF_WHOLE, RIDES, WALKS, fill_person_groups, fill_persons
+from .persons import MIN_OF_WHOLE, RIDES, UNSEEN, WALKS, fill_person_groups, fill_persons
 from .points import read_only
 
 __all__ = [
@@ -59,7 +59,6 @@ N_ANGLES = 90
 MAX_FITTED = 256  # a rectangle's heading is fitted to at most this many points
 MAX_OBJECTS = 1000  # clusters that get a box; 40 KITTI scans have at most 16
 MIN_SIDE_M = 0.1
-MIN_SEEN = 0.7  # of a cluster's points; if fewer are in view, the missing ones count as background
 MAX_END = 1.4  # a front or a rear is at most this many usual widths wide
 MAX_OVERLAP = 0.1  # IoU of two objects; the completed boxes of two pieces of one object overlap by more
 MAX_INSIDE = 0.5  # of the smaller of two footprints
@@ -399,8 +398,8 @@ def objects_from_points(
     others : sequence of Box
         Boxes that are known, such as a network's. Points inside of them are no further object.
     min_share : float
-        A cluster is kept if more than this share of its points in view has one class (KUL-Seg 5.2); if less than 70 %
-        of it is in view, of 70 % of its points. Persons need no share.
+        A cluster is kept if more than this share of its points in view has one class (KUL-Seg 5.2), however many are
+        out of view. Persons need no share.
     min_distance_m, distance_per_m, min_points
         As in `find_clusters`.
     min_score : float
@@ -411,12 +410,12 @@ def objects_from_points(
     Returns
     -------
     tuple of Box
-        Best score first. The score is a product of four factors: the share of the class; n / (n + 10) for n points;
-        the square of height / usual height, at most 1; and longer side / usual width, at most 1. To the height and the
-        side, range * ``distance_per_m`` is added, the gap that two returns of an object may have. Of persons: the share
-        of persons' points; n / (n + m), with m from 10 to 80, more for near persons; the square of height / usual
-        height, inverted if too tall; and the square of the greatest width of heads / width of the heads, at most 1. The
-        heading is known up to a half turn: yaw is in -pi/2..pi/2.
+        Best score first. The score is a product of four factors: the share of the class; n / (n + 10) for n points in
+        view; the square of height / usual height, at most 1; and longer side / usual width, at most 1. To the height
+        and the side, range * ``distance_per_m`` is added, the gap that two returns of an object may have. Of persons:
+        the share of persons' points; n / (n + m), with m from 10 to 80, more for near persons; the square of height /
+        usual height, inverted if too tall; and the square of the greatest width of heads / width of the heads, at most
+        1. The heading is known up to a half turn: yaw is in -pi/2..pi/2.
 
     Raises
     ------
@@ -480,18 +479,22 @@ def objects_from_points(
     if clusters.shape != labels.shape:
         raise PointsError(f"got clusters of shape {clusters.shape} for {len(points)} points; expected one a point")
     order, starts = _grouped(clusters)
+    numbers = labels
+    if in_view is not None and roles.any() and len(classes) < len(roles):
+        numbers = np.where(in_view, labels, len(classes)).astype(np.uint8)
+        roles[len(classes)] = UNSEEN
     persons = _persons(
-        points, labels, classes, roles, clusters, order, starts, height_m, distance_per_m, min_points, size_m
+        points, numbers, classes, roles, clusters, order, starts, height_m, distance_per_m, min_points, size_m
     )
     sizes = np.diff(starts)
     found, shares = _labels_of_groups(order, starts, labels, 0.0, {})
+    seen = sizes
     if in_view is not None and len(sizes):
         seen = np.add.reduceat(in_view[order[: starts[-1]]], starts[:-1], dtype=np.int64)
-        shares *= sizes / np.maximum(np.maximum(seen, MIN_SEEN * sizes), 1.0)
+        shares *= sizes / np.maximum(seen, 1)
     found[(shares <= min_share) | (roles[found] > 0)] = 0
-    highest = np.where(
-        (found > 0) & (sizes >= min_points), shares * sizes / (sizes + EVIDENCE), -math.inf
-    )  # the box may reduce this score
+    evidence = seen / (seen + EVIDENCE)
+    highest = np.where((found > 0) & (sizes >= min_points), shares * evidence, -math.inf)  # the box may reduce it
     kept = np.argsort(-highest, kind="stable")[:MAX_OBJECTS]
     kept = np.sort(kept[(found[kept] > 0) & (highest[kept] >= min_score)])
     named_by_size = {*classes_of_boxes(classes)} - {*classes}
@@ -508,7 +511,7 @@ def objects_from_points(
         else:
             bottom = 0.5 * float(levels[(len(levels) - 1) // 2] + levels[len(levels) // 2])  # the median
         side = float(max(rectangle[2:4]))
-        score = float(shares[k]) * len(levels) / (len(levels) + EVIDENCE)
+        score = float(highest[k])
         if name in size_m:
             _, width, height = size_m[name]
             # Points below the ground are reflections. What is too tall for a car may be a van.

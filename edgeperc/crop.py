@@ -26,6 +26,7 @@ MARGIN_M = 5.0
 With it, no answer to 61 scans of KITTI changes, nor a figure of `edgeperc eval` on PandaSet, Argoverse 2, View of Delft
 and DDAD.
 """
+BOX_BESIDE_M = 2.2  # how far a car reaches whose middle is at the side of a top view, turned by any angle
 ROUNDING_M = 0.01  # of a point, when its scan is turned
 
 
@@ -38,8 +39,9 @@ class Crop:
     ----------
     views : sequence of RangeImageGeometry or TopViewGeometry
         Of a range image, the sector and `MARGIN_M` beside it are kept. Of a top view, what `edgeperc.observed.Observer`
-        uses: up to 1.4 times as far as the view, between the directions of its sides. Everything is kept without a
-        view, for a sector of more than 180 degrees, and for a top view alone that is not ahead of the sensor.
+        uses: up to 1.4 times as far as the view, between the directions of its sides; and 2.2 m beside it, where boxes
+        reach. Everything is kept without a view, for a sector of more than 180 degrees, and for a top view alone that
+        is not ahead of the sensor.
     margin_m : float
         In place of `MARGIN_M`.
     turn_rad : float
@@ -153,7 +155,7 @@ def _hull(view: RangeImageGeometry | TopViewGeometry, margin_m: float) -> tuple[
     if x[0] <= 0.0:
         x, y = (x[0], max(x[1], 0.0)), (min(y[0], 0.0), max(y[1], 0.0))
     corners = [(0.0, 0.0), *((FARTHER * each_x, FARTHER * each_y) for each_x in x for each_y in y)]
-    return np.array(corners), view.cell_m
+    return np.array(corners), BOX_BESIDE_M
 
 
 @njit(cache=True, nogil=True)

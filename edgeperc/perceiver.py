@@ -178,7 +178,8 @@ class Perceiver:
         ``"network"``: boxes of a top-view model, vehicles ahead. ``"clusters"``: boxes around clusters of labeled
         points above the ground, of every class and everywhere in the range image
         (`edgeperc.cluster.objects_from_points`). ``"both"``: use both. A cluster's box is dropped if it overlaps a
-        network's box, unless it is a person's with the better score, or if the network detects its class there.
+        network's box, unless it is a person's with the better score. Otherwise it stays wherever it is: a network that
+        detects its class, and sees it, but has not found it, halves its score, in part if it sees the object in part.
     full_turn : bool
         Run a range-image model once for each sector, four times for the shipped models. Every point then has a class,
         and there are boxes beside and behind the vehicle.

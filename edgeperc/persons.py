@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from .kernel_cache import njit
 
-__all__ = ["MIN_OF_WHOLE", "RIDES", "WALKS", "complete_persons", "fill_person_groups", "fill_persons"]
+__all__ = ["MIN_OF_WHOLE", "RIDES", "UNSEEN", "WALKS", "complete_persons", "fill_person_groups", "fill_persons"]
 
 WALKS, RIDES = 1, 2  # roles of labels
+UNSEEN = 3  # role of points out of view: they belong to a person, but say nothing about the class
 MIN_OF_WHOLE = 0.25  # a person rides if at least this share of the persons' points says so: many say "pedestrian"
 
 # A cluster with this share of persons' points is one group if it is not larger than a cyclist. Of larger clusters, only
@@ -119,7 +120,7 @@ def fill_person_groups(
         [m] above the ground.
     labels : (n,) uint8
     roles : (256,) uint8
-        0 for labels that are no persons'.
+        0 for labels that are no persons', `UNSEEN` for points out of view.
     order, starts : (m,) int32, (k + 1,) int64
         Points by cluster, from `edgeperc.cluster.fill_groups`.
     groups, group_starts : (m,) int32, (k + 1,) int64, overwritten
@@ -136,12 +137,13 @@ def fill_person_groups(
     group_starts[0] = 0
     for k in range(len(starts) - 1):
         members = order[starts[k] : starts[k + 1]]
-        n_labeled = 0
+        n_labeled, n_seen = 0, 0
         for i in members:
-            n_labeled += 1 if roles[labels[i]] != 0 else 0
+            n_labeled += 1 if 0 < roles[labels[i]] < UNSEEN else 0
+            n_seen += 1 if roles[labels[i]] != UNSEEN else 0
         if n_labeled == 0:
             continue
-        is_group = n_labeled >= MIN_GROUP_SHARE * len(members)
+        is_group = n_labeled >= MIN_GROUP_SHARE * n_seen
         if is_group:
             measure(points, height, members, -math.inf, found)
             is_group = found[3] - found[2] <= MAX_LENGTH_M and found[6] <= MAX_TOP_M
@@ -149,7 +151,7 @@ def fill_person_groups(
             if is_group:
                 groups[n] = i
                 n += 1
-            elif roles[labels[i]] != 0:
+            elif 0 < roles[labels[i]] < UNSEEN:
                 loose[n_loose] = i
                 n_loose += 1
         if is_group:
@@ -186,8 +188,8 @@ def complete_persons(
         The labels of persons on foot and of those who ride.
     labels : (n,) uint8, modified
         A cluster up to 2.3 m long and 0.7 m wide (0.8 m if the person rides), whose upper quarter is at most 0.8 m
-        wide, and of which a fifth is labeled as persons, is one person, who rides if longer than a stride, or if a
-        quarter of the persons' points says so.
+        wide, and of which a fifth in view is labeled as persons, is one person, who rides if longer than a stride, or
+        if a quarter of the persons' points says so.
         The persons' points of one who is longer than a stride, or all points of one who is 1.3 to 2.0 m high and of
         whom at least 0.3 is labeled, get the label.
     """
@@ -216,12 +218,13 @@ def complete_persons(
     found = np.empty(7)
     for slot in range(n_slots):
         members = order[starts[slot] : starts[slot + 1]]
-        n_walking, n_riding = 0, 0
+        n_walking, n_riding, n_seen = 0, 0, 0
         for i in members:
+            n_seen += 1 if in_view[i] else 0
             n_walking += 1 if labels[i] == walks else 0
             n_riding += 1 if labels[i] == rides else 0
         n_labeled = n_walking + n_riding
-        if n_labeled < max(MIN_GROUP_SHARE * len(members), MIN_LABELED):
+        if n_labeled < max(MIN_GROUP_SHARE * n_seen, MIN_LABELED):
             continue
         measure(points, height, members, -math.inf, found)
         length, width, top = found[3] - found[2], found[5] - found[4], found[6]
@@ -230,7 +233,7 @@ def complete_persons(
         max_width = MAX_RIDING_WIDTH_M if is_riding else MAX_WALKING_WIDTH_M
         if not (length <= MAX_LENGTH_M and width <= max_width and found[3] - found[2] <= MAX_UPPER_M):
             continue
-        is_whole = n_labeled >= MIN_WHOLE_SHARE * len(members) and WHOLE_TOP_M[0] <= top <= WHOLE_TOP_M[1]
+        is_whole = n_labeled >= MIN_WHOLE_SHARE * n_seen and WHOLE_TOP_M[0] <= top <= WHOLE_TOP_M[1]
         if not is_whole and length <= MAX_STRIDE_M:
             continue
         for i in members:
@@ -326,7 +329,7 @@ def fill_persons(
         [m] above the ground.
     labels : (n,) uint8
     roles : (256,) uint8
-        0 for labels that are no persons', `WALKS` or `RIDES` for others.
+        0 for labels that are no persons', `UNSEEN` for points out of view, `WALKS` or `RIDES` for others.
     order : (m,) int32, modified
     starts : (k + 1,) int64
         Points by group. Those of a group are put in the order of its persons.
@@ -339,8 +342,8 @@ def fill_persons(
         Smaller parts are dropped.
     persons : (p, 11) float64, overwritten
         For each person: 1 if he or she rides, else 0; x, y of the middle, extent along and across the principal axis
-        [m], its angle [rad]; lowest and highest z [m], from the ground on; number of points; share of labeled ones;
-        `head_width` of the group [m].
+        [m], its angle [rad]; lowest and highest z [m], from the ground on; number of points in view; share of
+        labeled ones among them; `head_width` of the group [m].
 
     Returns
     -------
@@ -379,14 +382,15 @@ def fill_persons(
                 left[n_left + 1, 0], left[n_left + 1, 1], left[n_left + 1, 2] = first, middle, n_cuts + 1
                 n_left += 2
                 continue
-            n_labeled, n_riding, ground, highest = 0, 0, 0.0, -math.inf
+            n_labeled, n_riding, n_seen, ground, highest = 0, 0, 0, 0.0, -math.inf
             for i in members:
                 role = roles[labels[i]]
-                n_labeled += 1 if role != 0 else 0
+                n_labeled += 1 if 0 < role < UNSEEN else 0
+                n_seen += 1 if role != UNSEEN else 0
                 n_riding += 1 if role == RIDES else 0
                 ground += np.float64(points[i, 2]) - np.float64(height[i])
                 highest = max(highest, np.float64(points[i, 2]))
-            n_near = len(members)
+            n_near = n_seen
             if k >= n_whole:
                 n_near = 0
                 own = clusters[members[0]]
@@ -395,7 +399,8 @@ def fill_persons(
                     v = found[0] * np.float64(points[i, 1]) - found[1] * np.float64(points[i, 0])
                     along = found[2] - NEAR_M <= u <= found[3] + NEAR_M
                     across = found[4] - NEAR_M <= v <= found[5] + NEAR_M
-                    n_near += 1 if along and across and height[i] <= MAX_TOP_M else 0
+                    is_near = along and across and height[i] <= MAX_TOP_M
+                    n_near += 1 if is_near and roles[labels[i]] != UNSEEN else 0
             length, u, v = found[3] - found[2], 0.5 * (found[2] + found[3]), 0.5 * (found[4] + found[5])
             rides = n_riding > 0 and n_riding >= MIN_OF_WHOLE * n_labeled
             persons[n_found, 0] = 1.0 if rides else 0.0
@@ -404,8 +409,8 @@ def fill_persons(
             persons[n_found, 3], persons[n_found, 4] = length, found[5] - found[4]
             persons[n_found, 5] = math.atan2(found[1], found[0])
             persons[n_found, 6], persons[n_found, 7] = ground / len(members), highest
-            persons[n_found, 8] = len(members)
-            persons[n_found, 9] = n_labeled / max(n_near, len(members))
+            persons[n_found, 8] = n_seen
+            persons[n_found, 9] = n_labeled / max(n_near, n_seen, 1)
             persons[n_found, 10] = heads
             n_found += 1
     return n_found

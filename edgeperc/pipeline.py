@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .adapt import Interpolator
-from .agreement import agree_on_boxes, agree_on_points, find_support, find_voters, without_poles
+from .agreement import agree_on_boxes, agree_on_points, find_support, find_voters, stand_boxes, without_poles
 from .card import RangeImageGeometry, TopViewGeometry
 from .cells import agree_on_cells, mark_cells
 from .cluster import join_boxes, objects_from_points, sort_points
 from .crop import Crop, sectors_of_turn, spread
 from .decode import decode_boxes, decode_cells, decode_labels
 from .frame import turned
+from .geometry import oriented_iou, rectangles, shared_area
 from .ground import GroundFit, fit_ground
 from .lanes import Lanes, Once, Stopwatch
 from .linkage import Strips
@@ -31,7 +32,7 @@ from .scan import Scan
 from .sensor import SensorProfile
 from .session import Session
 
-__all__ = ["BoxesFrom", "Options", "Parts", "Pipeline", "RangeImageNetwork", "TopViewNetwork"]
+__all__ = ["BoxesFrom", "Options", "Parts", "Pipeline", "RangeImageNetwork", "TopViewNetwork", "weigh"]
 
 BoxesFrom = Literal["both", "network", "clusters"]
 
@@ -223,6 +224,8 @@ class Pipeline:
         if self.ranged and options.boxes_from != "network":
             objects = value("cluster", _objects, scan, agreed, clusters, trusted, options)
             joined = value("cluster", self._join, trusted, objects)
+        if rules:
+            joined = value("agree", stand_boxes, joined, scan, rules)
         if top is not None and rules:
             marks = value("agree", mark_cells, cells, scan, agreed, rules)
             view = value("agree", _agreed_cells, cells, agreed, joined, boxes, trusted, marks, rules)
@@ -258,13 +261,32 @@ class Pipeline:
             self._free.append(network)
 
     def _join(self, boxes: Sequence[Box], objects: Sequence[Box]) -> Sequence[Box]:
-        """Boxes of the network, and those around clusters that no network can detect: its class, or out of its view."""
+        """Boxes of the network, and those around clusters; one that the network should have found is weighed."""
         if self.options.boxes_from != "both":
             return objects
-        top = self.top
-        if top is not None:
-            objects = [b for b in objects if b.label not in top.card.box_classes or not top.view.holds(*b.center[:2])]
+        if self.top is not None:
+            objects = weigh(objects, self.top.view, self.top.card.box_classes, self.options.cluster_score)
         return join_boxes(boxes, objects)
+
+
+def weigh(boxes: Sequence[Box], view: TopViewGeometry, classes: Sequence[str], min_score: float) -> list[Box]:
+    """Boxes around clusters that a network of the top view has not found, with the scores that both views give them.
+
+    The score is the mean of the cluster's and that of the network, which is 0 where it sees the object. The network's
+    has the weight of the share of the footprint in its view: out of the view, the cluster's score stands. Boxes below
+    ``min_score`` are dropped.
+    """
+    rows = [row for row, box in enumerate(boxes) if box.label in classes]
+    weighed = list(boxes)
+    if rows:
+        footprints = rectangles(boxes[row] for row in rows)
+        (near, far), (right, left) = view.x_range_m, view.y_range_m
+        field = np.array([(0.5 * (near + far), 0.5 * (right + left), far - near, left - right, 0.0)])
+        areas = footprints[:, 2] * footprints[:, 3]
+        seen = shared_area(oriented_iou(footprints, field), footprints, field)[:, 0] / areas
+        for row, share in zip(rows, seen.tolist(), strict=True):
+            weighed[row] = replace(boxes[row], score=boxes[row].score * (1.0 - 0.5 * share))
+    return [box for box in weighed if box.score >= min_score]
 
 
 def _absent() -> None:
@@ -289,7 +311,7 @@ def _objects(
 ) -> tuple[Box, ...]:
     """Boxes around clusters of points above the ground.
 
-    An object cut by the view's edge gets either a box of the whole object, if about half of it is in view, or none.
+    An object cut by the edge of the range image gets a box of the whole object.
     """
     return objects_from_points(
         scan.points,

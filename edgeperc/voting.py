@@ -27,9 +27,11 @@ MIN_VEHICLE_TOP_M, MIN_PERSON_TOP_M = 0.5, 1.0
 # Nearer vehicles show enough of themselves to be higher. With 0.5 m for all, 4,140 more points of tables, kerbs and
 # hedges on the folds are called car, and 298 fewer points of cars are missed. Some sports cars are lower than 1.2 m.
 NEAR_M, MIN_NEAR_VEHICLE_TOP_M = 30.0, 1.0
-# What ends nearer to the sensor and is no person is a part of the own vehicle, such as a mirror or an open door: other
-# vehicles are longer. Open doors in two KITTI scans reach to 2.5 m.
+# What ends nearer to the sensor and is not a person is a part of the own vehicle, such as a mirror or an open door:
+# other vehicles are longer. Open doors in two KITTI scans reach to 2.5 m. What is both longer and higher than a door is
+# the flank or the rear of a truck.
 OWN_REACH_M = 2.6
+DOOR_M, DOOR_TOP_M = 2.0, 1.7
 # A cluster is completed if this share of its points is labeled, and if it is not too large for a group of persons.
 MIN_FILL_SHARE = 0.6
 MAX_GROUP_M, MAX_GROUP_TOP_M = 3.0, 2.1
@@ -107,8 +109,8 @@ def fill_tallies(
         Points in view of each class; last, of all classes.
     bounds : (k, 5) float32, overwritten
         Lowest x and y, highest x and y, highest height [m] of all points.
-    above : (k, 2) int32, overwritten
-        Points in view that are in the top view too, and those of them in cells of vehicles.
+    above : (k, 3) int32, overwritten
+        Points in view that are in the top view too; those of them in cells of vehicles; all points, in view or not.
     """
     n_rows, n_cols = cells.shape
     counts[:] = 0
@@ -122,6 +124,7 @@ def fill_tallies(
         k = clusters[i]
         if k < 0:
             continue
+        above[k, 2] += 1
         if in_view[i]:
             counts[k, labels[i]] += 1
             counts[k, last] += 1
@@ -190,7 +193,8 @@ def fill_verdicts(
             reach_x = max(abs(np.float64(bounds[k, 0])), abs(np.float64(bounds[k, 2])))
             reach_y = max(abs(np.float64(bounds[k, 1])), abs(np.float64(bounds[k, 3])))
             no_vehicle |= top < (MIN_NEAR_VEHICLE_TOP_M if is_near else MIN_VEHICLE_TOP_M)
-            no_vehicle |= math.hypot(reach_x, reach_y) < OWN_REACH_M and person_share < MIN_PERSON_SHARE
+            is_door = length < DOOR_M or top < DOOR_TOP_M
+            no_vehicle |= math.hypot(reach_x, reach_y) < OWN_REACH_M and is_door and person_share < MIN_PERSON_SHARE
             no_person |= top < MIN_PERSON_TOP_M
         for c in range(n_classes):
             is_lost = (roles[c] == VEHICLE and no_vehicle) or (roles[c] == PERSON and no_person)

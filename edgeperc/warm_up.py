@@ -36,7 +36,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .adapt import render
-from .agreement import Support, agree_on_boxes, agree_on_points, clear_columns, find_support, find_voters, without_poles
+from .agreement import (
+    Support,
+    agree_on_boxes,
+    agree_on_points,
+    clear_columns,
+    find_support,
+    find_voters,
+    stand_boxes,
+    without_poles,
+)
 from .cells import agree_on_cells, mark_cells
 from .cluster import fill_rectangle, join_boxes, objects_from_points
 from .drivable import compile_kernels
@@ -205,6 +214,7 @@ def _compile_agreement() -> None:
     clusters = np.where(scan.ground.mask, -1, 0).astype(np.int32)
     agreed = agree_on_points(scan, labels, clusters, support, without_poles(scan, labels))
     agree_on_boxes([UNCERTAIN], scan, agreed)
+    stand_boxes([UNCERTAIN], scan)
     cells = np.zeros((400, 200), np.uint8)
     view = TopView(cells, ("background", "drivable"), 0.1, (6.0, 46.0), (-10.0, 10.0), np.ones(cells.shape, np.bool_))
     agree_on_cells(view, agreed, [UNCERTAIN], [UNCERTAIN], mark_cells(view, scan, agreed))

@@ -24,6 +24,8 @@ from edgeperc.agreement import (
     fill_support,
     find_support,
     find_voters,
+    stand_boxes,
+    sum_inside,
 )
 from edgeperc.card import TopViewGeometry
 from edgeperc.cells import clear_cells, fill_marks
@@ -135,7 +137,7 @@ def test_dense_columns_match_the_twin(seed: int) -> None:
 @given(scenes, st.sampled_from([(0, 0), (40, 40)]))
 def test_tallies_match_the_twin(given: list, shape: tuple[int, int]) -> None:
     scene = Scene(given)
-    found = np.empty((6, 5), np.int32), np.empty((6, 5), np.float32), np.empty((6, 2), np.int32)
+    found = np.empty((6, 5), np.int32), np.empty((6, 5), np.float32), np.empty((6, 3), np.int32)
     cells = np.random.default_rng(len(given)).integers(0, 5, shape).astype(np.uint8)
     args = scene.points, scene.height, scene.in_view, scene.labels, scene.clusters, cells, np.arange(256) % 5 > 1
     grid = np.array([16.0, 8.0, 0.4])
@@ -165,6 +167,9 @@ def test_boxes_around_points_match_the_twin(given: list, boxes: list[Box]) -> No
     more = *arrays, *map_read_only((scene.in_view, scene.labels))
     count_inside(*more, ROLES, as_rows, counts)
     np.testing.assert_array_equal(counts, twins.agreement.inside_counts(*more, ROLES, as_rows))
+    sums = np.empty((len(boxes), 3))
+    sum_inside(*arrays, as_rows, sums)
+    np.testing.assert_array_equal(sums, twins.agreement.inside_sums(*arrays, as_rows))
 
 
 @patient
@@ -568,6 +573,32 @@ def test_box_that_the_labels_contradict_labels_nothing() -> None:
     wall[np.flatnonzero(own)[::8], 3] = 1
     labels = agreed_scene(wall, boxes=(box,))[1]
     assert (labels[-len(wall) :][own & (wall[:, 2] < 2.3)] == 1).all()
+
+
+def test_rear_of_a_truck_beside_the_own_vehicle_is_no_door() -> None:
+    rear = block(0.0, 1.8, (2.5, 0.3, 1.84), 1)
+    assert (agreed_scene(rear)[1] == 1).sum() > 0.95 * len(rear)
+    assert not agreed_scene(block(0.0, 1.8, (2.5, 0.3, 1.5), 1))[1].any()
+
+
+@pytest.mark.parametrize(("label", "tall", "least"), [("car", 1.6, 1.4), ("car", 1.2, 1.4), ("van", 2.1, 1.75)])
+def test_vehicles_stand_on_the_ground_below_them(label: str, tall: float, least: float) -> None:
+    sides = block(12.0, 3.0, (4.0, 1.7, tall + 0.01), 1)
+    tree = block(12.0, 3.0, (3.0, 1.0, 4.0), 0)
+    rows = np.concatenate([sides, tree[tree[:, 2] > 3.0]])
+    points = np.column_stack([rows[:, :2], rows[:, 2] - 2.3, np.zeros(len(rows))]).astype(np.float32)
+    # Below this car, the street is 0.57 m lower than around the sensor.
+    ground = Ground(np.zeros(len(rows), np.bool_), rows[:, 2].astype(np.float32), (0.0, 0.0, GROUND_Z))
+    own, empty = (Box(label, 0.6, (x, 3.0, -0.9), (4.1, 1.8, 1.5), 0.1) for x in (12.0, 30.0))
+    person = Box("pedestrian", 0.6, (12.0, 3.0, -0.9), (1.0, 1.0, 1.7), 0.0)
+    standing, *others = stand_boxes([own, empty, person], Scan.of(points, ground))
+    assert others == [empty, person]
+    top = rows[rows[:, 2] < 2.5, 2].max()
+    assert standing.size == pytest.approx((4.1, 1.8, max(top, least)), abs=1e-6)
+    assert standing.center == pytest.approx((12.0, 3.0, -2.3 + 0.03 + standing.size[2] / 2), abs=1e-6)
+    assert replace(standing, center=own.center, size=own.size) == own
+    assert stand_boxes([own], Scan.of(points, ground), RULES - {"stand"}) == (own,)
+    assert stand_boxes([own], Scan.of(points, replace(ground, plane=None))) == (own,)
 
 
 def test_cyclist_is_one_object() -> None:

@@ -463,7 +463,7 @@ def test_ground_points_do_not_join_objects():
     assert objects_from_points(points, labels, CLASSES) == ()
 
 
-def test_points_out_of_view_count_if_they_are_most_of_a_cluster():
+def test_a_cluster_is_judged_by_its_points_in_view():
     points = as_points(car_points(12.0, 6.0, 0.0))
     rank = np.argsort(np.argsort(points[:, 0], kind="stable"))
 
@@ -473,13 +473,15 @@ def test_points_out_of_view_count_if_they_are_most_of_a_cluster():
         return objects_from_points(points, labels, CLASSES, in_view=in_view)
 
     (whole,) = boxes(1.0)
-    for seen in (0.9, 0.7, 0.5):
+    for seen in (0.9, 0.7, 0.5, 0.3):
         (box,) = boxes(seen)
         assert replace(box, score=1.0) == replace(whole, score=1.0)
-        assert box.score == pytest.approx(whole.score * min(seen / 0.7, 1.0), rel=0.02)
+        n, n_seen = len(points), np.count_nonzero(rank < seen * len(points))
+        assert box.score == pytest.approx(whole.score * n_seen / (n_seen + 10) * (n + 10) / n)
     assert boxes(0.8, 0.8) != ()
     assert boxes(0.8, 0.6) == ()  # background in view
-    assert boxes(0.3) == ()
+    assert boxes(30 / len(points)) != ()
+    assert boxes(3 / len(points)) == ()
     labels = np.ones(len(points), np.uint8)
     apart = np.where(rank < 3, 0, 2).astype(np.int32)  # no point has number 1
     assert len(objects_from_points(points, labels, CLASSES, clusters=apart, in_view=labels > 0)) == 1

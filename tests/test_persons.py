@@ -23,7 +23,7 @@ CLASSES = ("background", "car", "pedestrian", "cyclist")
 GROUND_Z = -1.73
 BY_ANGLE = 0.014  # of an HDL-64E
 ROLES = np.zeros(256, np.uint8)
-ROLES[[2, 3]] = persons.WALKS, persons.RIDES
+ROLES[[2, 3, 4]] = persons.WALKS, persons.RIDES, persons.UNSEEN
 
 
 def person(x, y, height=1.75):
@@ -241,6 +241,7 @@ def grouped(clusters):
 @given(st.integers(0, 2**31), st.integers(0, 14))
 def test_groups_agree_with_the_twin(seed, n_people):
     points, height, labels, clusters = crowd(seed, n_people)
+    labels[np.random.default_rng(seed).random(len(labels)) < 0.05] = 4  # out of view
     order, starts = grouped(clusters)
     groups, group_starts, loose = np.empty_like(order), np.empty_like(starts), np.empty_like(order)
     n, n_loose = persons.fill_person_groups(points, height, labels, ROLES, order, starts, groups, group_starts, loose)
@@ -253,6 +254,7 @@ def test_groups_agree_with_the_twin(seed, n_people):
 @given(st.integers(0, 2**31), st.integers(0, 14), st.integers(1, 6))
 def test_persons_agree_with_the_twin(seed, n_people, min_points):
     points, height, labels, clusters = crowd(seed, n_people)
+    labels[np.random.default_rng(seed).random(len(labels)) < 0.05] = 4  # out of view
     order, starts = grouped(clusters)
     groups = [order[starts[k] : starts[k + 1]].copy() for k in range(len(starts) - 1) if starts[k] < starts[k + 1]]
     n_whole = len(groups) // 2
@@ -279,7 +281,7 @@ def test_completed_persons_agree_with_the_twin(seed, n_people):
     n = clusters.max(initial=-1) + 1
     counts, bounds = np.empty((n, 5), np.int32), np.empty((n, 5), np.float32)
     no_view = np.empty((0, 0), np.uint8), np.zeros(256, np.bool_), np.ones(3)
-    fill_tallies(points, height, in_view, labels, clusters, *no_view, counts, bounds, np.empty((n, 2), np.int32))
+    fill_tallies(points, height, in_view, labels, clusters, *no_view, counts, bounds, np.empty((n, 3), np.int32))
     expected = twins.persons.completed(points, height, in_view, clusters, 2, 3, labels)
     persons.complete_persons(points, height, in_view, clusters, counts, bounds, 2, 3, labels)
     np.testing.assert_array_equal(labels, expected)

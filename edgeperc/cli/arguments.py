@@ -44,7 +44,7 @@ DEFAULT = ("ssadnet", "pointseg")
 CAMERA = "camseg"
 DEFAULT_SENSOR = "hdl-64e"
 PROVIDERS = ("auto", "cpu", "openvino", "cuda", "tensorrt", "tensorrt-rtx", "coreml", "directml", "qnn", "webgpu")
-RULES = ("boxes", "cells", "column", "fill", "ground", "height", "person", "road", "share", "support")
+RULES = ("boxes", "cells", "column", "fill", "ground", "height", "person", "road", "share", "stand", "support")
 PRECISIONS = ("auto", "fp32", "bf16", "int8")
 
 

@@ -20,6 +20,7 @@ class KeptFile:
             raise OSError(self._error.errno, self._error.strerror)
 
     def write(self, data: bytes) -> int:
+        """Write, unless there was an error; the number of bytes given."""
         try:
             if self._error is None:
                 self._file.write(data)
@@ -28,9 +29,11 @@ class KeptFile:
         return len(data)
 
     def seek(self, offset: int, whence: int = 0) -> int:
+        """As of a file."""
         return int(self._file.seek(offset, whence))
 
     def flush(self) -> None:
+        """As of a file, unless there was an error."""
         try:
             if self._error is None:
                 self._file.flush()

@@ -35,7 +35,7 @@ def tallies(points, height, in_view, labels, clusters, cells, is_vehicle, grid, 
     """Twin of `edgeperc.voting.fill_tallies`."""
     counts = np.zeros((n, n_classes + 1), np.int32)
     bounds = np.empty((n, 5), np.float32)
-    above = np.zeros((n, 2), np.int32)
+    above = np.zeros((n, 3), np.int32)
     row, col = ((grid[k] - points[:, k].astype(np.float64)) / grid[2] for k in range(2))
     is_held = (row >= 0) & (row < cells.shape[0]) & (col >= 0) & (col < cells.shape[1])
     marked = np.zeros(len(points), np.bool_)
@@ -48,7 +48,8 @@ def tallies(points, height, in_view, labels, clusters, cells, is_vehicle, grid, 
         bounds[k, :2] = xy.min(axis=0, initial=np.inf)
         bounds[k, 2:4] = xy.max(axis=0, initial=-np.inf)
         bounds[k, 4] = height[own].max(initial=-np.inf)
-        above[k] = np.count_nonzero(own & in_view & is_held), np.count_nonzero(own & in_view & marked)
+        above[k, :2] = np.count_nonzero(own & in_view & is_held), np.count_nonzero(own & in_view & marked)
+        above[k, 2] = np.count_nonzero(own)
     return counts, bounds, above
 
 
@@ -87,6 +88,16 @@ def inside_counts(points, height, on_ground, in_view, labels, roles, boxes):
     return np.array(rows, np.int64).reshape(-1, 3)
 
 
+def inside_sums(points, height, on_ground, boxes):
+    """Twin of `edgeperc.agreement.sum_inside`."""
+    sums = np.zeros((len(boxes), 3))
+    for row, box in zip(sums, boxes, strict=True):
+        own = inside(points, height, on_ground, box) & (height >= 0.0)
+        levels = points[own, 2].astype(np.float64) - height[own]
+        row[:] = np.count_nonzero(own), sum(levels.tolist()), max(0.0, 0.0, *height[own].tolist())
+    return sums
+
+
 def verdicts(in_view, clusters, table, roles, scores, names, labels):
     """Twin of `edgeperc.voting.apply_verdicts`."""
     agreed = labels.copy()
@@ -117,6 +128,7 @@ def verdict_table(counts, bounds, refused, roles, parts, by_share, by_height, is
     low, high = bounds[:, :2].astype(np.float64), bounds[:, 2:4].astype(np.float64)
     is_near = np.hypot(*np.maximum(np.maximum(low, -high), 0.0).T) < 30.0  # nearest place of the bounds
     is_own = (np.hypot(*np.maximum(np.abs(low), np.abs(high)).T) < 2.6) & (person_share < 0.1)
+    is_own &= (length < 2.0) | (top < 1.7)
     is_low = top < np.where(is_near, 1.0, 0.5)
     no_vehicle = refused | by_share & (vehicle_share < np.where(large, 0.75, 0.6)) | by_height & (is_low | is_own)
     no_person = by_share & (person_share < 0.1) | by_height & (top < 1.0)

@@ -31,12 +31,13 @@ def groups(points, height, labels, roles, clusters):
     whole, loose = [], []
     for k in range(clusters.max(initial=-1) + 1):
         members = np.flatnonzero(clusters == k)
-        labeled = members[roles[labels[members]] > 0]
+        role = roles[labels[members]]
+        labeled, n_seen = members[(role > 0) & (role < persons.UNSEEN)], (role != persons.UNSEEN).sum()
         if len(labeled) == 0:
             continue
         found = measured(points, height, members, -np.inf)
         small = found[3] - found[2] <= persons.MAX_LENGTH_M and found[6] <= persons.MAX_TOP_M
-        if small and len(labeled) >= persons.MIN_GROUP_SHARE * len(members):
+        if small and len(labeled) >= persons.MIN_GROUP_SHARE * n_seen:
             whole.append(members)
         else:
             loose += labeled.tolist()
@@ -96,21 +97,22 @@ def rows(points, height, labels, roles, groups, n_whole, clusters, min_points):
                 continue
             box = measured(points, height, part, -np.inf)
             of = roles[labels[part]]
-            n_near = len(part)
+            n_seen = n_near = (of != persons.UNSEEN).sum()
             if k >= n_whole:
-                near = np.flatnonzero((clusters == clusters[part[0]]) & (height <= persons.MAX_TOP_M))
+                is_near = (clusters == clusters[part[0]]) & (height <= persons.MAX_TOP_M)
+                near = np.flatnonzero(is_near & (roles[labels] != persons.UNSEEN))
                 u, v = along(points, near, box[0], box[1])
                 inside = (u >= box[2] - persons.NEAR_M) & (u <= box[3] + persons.NEAR_M)
                 inside &= (v >= box[4] - persons.NEAR_M) & (v <= box[5] + persons.NEAR_M)
                 n_near = max(n_near, inside.sum())
             u, v = (box[2] + box[3]) / 2, (box[4] + box[5]) / 2
-            n, n_riding = (of > 0).sum(), (of == persons.RIDES).sum()
+            n, n_riding = ((of > 0) & (of < persons.UNSEEN)).sum(), (of == persons.RIDES).sum()
             rides = n_riding > 0 and n_riding >= 0.25 * n
             z = points[part, 2].astype(np.float64)
             middle = u * box[0] - v * box[1], u * box[1] + v * box[0]
             extent = box[3] - box[2], box[5] - box[4], np.arctan2(box[1], box[0])
             levels = (z - height[part].astype(np.float64)).mean(), z.max()
-            found.append([rides, *middle, *extent, *levels, len(part), n / n_near, width])
+            found.append([rides, *middle, *extent, *levels, n_seen, n / max(n_near, 1), width])
     return np.array(found).reshape(-1, 11)
 
 
@@ -120,8 +122,8 @@ def completed(points, height, in_view, clusters, walks, rides, labels):
     for k in range(clusters.max(initial=-1) + 1):
         members = np.flatnonzero(clusters == k)
         own = labels[members]
-        n, n_riding = np.isin(own, (walks, rides)).sum(), (own == rides).sum()
-        if n < 5 or n < persons.MIN_GROUP_SHARE * len(own) or np.ptp(points[members, :2], axis=0).max() > 4.6:
+        n, n_riding, n_seen = np.isin(own, (walks, rides)).sum(), (own == rides).sum(), in_view[members].sum()
+        if n < 5 or n < persons.MIN_GROUP_SHARE * n_seen or np.ptp(points[members, :2], axis=0).max() > 4.6:
             continue
         box = measured(points, height, members, -np.inf)
         upper = measured(points, height, members, persons.UPPER * box[6])
@@ -131,7 +133,7 @@ def completed(points, height, in_view, clusters, walks, rides, labels):
             continue
         if length > persons.MAX_LENGTH_M or top > persons.MAX_TOP_M or upper[3] - upper[2] > persons.MAX_UPPER_M:
             continue
-        whole = n >= 0.3 * len(own) and 1.3 <= top <= 2.0
+        whole = n >= 0.3 * n_seen and 1.3 <= top <= 2.0
         changed = in_view[members] & (np.isin(own, (walks, rides)) | (whole & (own == 0)))
         if whole or length > persons.MAX_STRIDE_M:
             labels[members[changed]] = rides if riding else walks

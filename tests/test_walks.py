@@ -1,0 +1,130 @@
+"""Nothing that points show is without a box: objects are moved through the edges of all views."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from edgeperc import Perceiver
+from edgeperc.card import RangeImageGeometry, TopViewGeometry
+from edgeperc.geometry import oriented_iou, rectangles
+from edgeperc.mounting import MODEL_MOUNTING
+from edgeperc.simulation.raycast import CROWN, SLOPE_X, SLOPE_Y, WAVE_X, WAVE_Y
+from edgeperc.simulation.scene import SimulatedScan, simulate
+from edgeperc.simulation.street import Street, random_terrain, strip_row
+
+SIZES = {"car": (4.1, 1.7, 1.5), "truck": (8.0, 2.5, 3.2), "pedestrian": (0.8, 0.6, 1.75)}
+BOXES_OF = {kind: ("car", "van", "truck") for kind in ("car", "truck")} | {"pedestrian": ("pedestrian", "cyclist")}
+MIN_POINTS = {"car": 30, "truck": 30, "pedestrian": 50}
+# A network that labels a smaller share of the points in view has not seen the object: no view is to blame.
+MIN_RECOGNIZED = {"car": 0.0, "truck": 0.6, "pedestrian": 0.3}
+LABELS_OF = {"car": (1,), "truck": (1,), "pedestrian": (2, 3)}
+OWN_LENGTH_M, OWN_WIDTH_M = 5.0, 2.4  # with a gap
+RANGES_M = (
+    1.0,
+    1.5,
+    2.0,
+    2.8,
+    3.6,
+    4.5,
+    5.6,
+    6.4,
+    7.2,
+    9.0,
+    12.0,
+    16.0,
+    21.0,
+    27.0,
+    34.0,
+    41.0,
+    45.0,
+    48.0,
+    54.0,
+    60.0,
+)
+
+Place = tuple[str, float, float, float]
+"""Kind, x, y [m] and yaw [rad]."""
+
+
+def hits_own_vehicle(place: Place) -> bool:
+    kind, x, y, yaw = place
+    u, v = (np.linspace(-0.5, 0.5, 17) * side for side in SIZES[kind][:2])
+    along, across = (grid.ravel() for grid in np.meshgrid(u, v))
+    px, py = x + math.cos(yaw) * along - math.sin(yaw) * across, y + math.sin(yaw) * along + math.cos(yaw) * across
+    return bool(((np.abs(px) < OWN_LENGTH_M / 2) & (np.abs(py) < OWN_WIDTH_M / 2)).any())
+
+
+def scan_of(places: list[Place], seed: int) -> SimulatedScan:
+    """A scan of objects on a level road without an end."""
+    rng = np.random.default_rng(1)
+    terrain = random_terrain(rng, "urban")
+    terrain[[SLOPE_X, SLOPE_Y, WAVE_X, WAVE_Y, CROWN]] = 0.0
+    street = Street(rng, [strip_row(0.0, 0.0, 0.0, 0.0, -90.0, 90.0)], terrain)
+    for kind, x, y, yaw in places:
+        street.add_object(kind, x, y, yaw, SIZES[kind], force=True)
+    return simulate(street.scene(), "hdl-64e", seed, ego_shadow=False)
+
+
+def radial(kind: str, bearing_deg: float, yaw: float) -> Iterator[Place]:
+    """From 1 to 60 m, in one direction."""
+    bearing = math.radians(bearing_deg)
+    for range_m in RANGES_M:
+        yield kind, range_m * math.cos(bearing), range_m * math.sin(bearing), yaw
+
+
+def across(kind: str, x: float, yaw: float) -> Iterator[Place]:
+    """From the right to the left, through the side edges of the top view."""
+    for y in (-12.5, -11.0, -10.2, -9.4, -8.0, 8.0, 9.4, 10.2, 11.0, 12.5):
+        yield kind, x, y, yaw
+
+
+AHEAD = [radial(kind, *way) for kind in SIZES for way in ((0.0, 0.0), (-20.0, 0.2), (45.0, 0.0), (-50.0, 0.0))]
+AHEAD += [radial(kind, 8.0, math.pi / 2) for kind in ("car", "truck")]
+AHEAD += [across(kind, x, 0.1) for kind in SIZES for x in (7.0, 20.0)]
+# Beside and behind, and through the seams of the sectors: a car, a truck and a person on three sides at a time.
+AROUND = [
+    zip(*(radial(kind, bearing + 120.0 * k, yaw) for k, kind in enumerate(SIZES)), strict=True)
+    for bearing, yaw in ((90.0, 0.0), (180.0, 0.0), (-90.0, math.pi / 2), (-60.0, 0.0), (135.0, 0.4))
+]
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["ahead", "around"])
+def full_turn(request: pytest.FixtureRequest) -> bool:
+    return bool(request.param)
+
+
+def test_no_object_that_points_show_is_without_a_box(full_turn: bool) -> None:
+    options = {"mounting": MODEL_MOUNTING, "on_mismatch": "ignore", "full_turn": full_turn, "n_threads": 1}
+    perceive, networks = (Perceiver(provider="cpu", agree=agree, **options) for agree in (True, False))
+    top_view, sector = (
+        next(card.view for card in perceive.cards if isinstance(card.view, view))
+        for view in (TopViewGeometry, RangeImageGeometry)
+    )
+    assert (top_view.x_range_m, top_view.y_range_m) == ((6.0, 46.0), (-10.0, 10.0))  # the walks go through these edges
+    assert (sector.azimuth_left_deg, sector.azimuth_right_deg) == (45.0, -45.0)
+    scenes = [[*places] for way in AROUND for places in way] if full_turn else [[place] for w in AHEAD for place in w]
+    n_seen, lost = 0, []
+    for seed, given in enumerate(scenes):
+        places = [place for place in given if not hits_own_vehicle(place)]
+        scan = scan_of(places, seed)
+        perception = perceive(scan.points)
+        assert perception.points is not None
+        for k, (kind, x, y, _) in enumerate(places):
+            seen = (scan.objects == k) & perception.points.in_view
+            if np.count_nonzero(seen) < MIN_POINTS[kind]:
+                continue
+            n_seen += 1
+            boxes = [box for box in perception.boxes if box.label in BOXES_OF[kind]]
+            if oriented_iou(rectangles(boxes), rectangles([scan.boxes[k]])).max(initial=0.0) >= 0.2:
+                continue
+            points = networks(scan.points).points
+            assert points is not None
+            recognized = np.isin(points.labels[seen], LABELS_OF[kind]).mean()
+            if recognized >= MIN_RECOGNIZED[kind]:
+                lost.append((kind, x, y, int(np.count_nonzero(seen)), round(float(recognized), 2), perception.boxes))
+    assert n_seen > (150 if full_turn else 180)
+    assert not lost
