@@ -24,6 +24,7 @@ from .errors import PointsError
 from .ground import Ground
 from .kernel_cache import njit
 from .linkage import Strips
+from .mounting import MODEL_HEIGHT_M
 from .perception import Box, PointLabels, TopView
 from .persons import complete_persons
 from .points import read_only
@@ -355,7 +356,8 @@ def stand_boxes(
     tuple of Box
         In the same order. The bottom of a vehicle is 0.03 m above the ground below its points, its top 0.03 m above the
         highest of them. The height is that of a vehicle of its class: 1.40 to 1.75 m for cars, 1.75 to 2.75 m for vans,
-        2.4 to 4.15 m for trucks. Higher points hang over the vehicle and do not count.
+        2.4 to 4.15 m for trucks. Higher points hang over the vehicle and do not count. Vans and trucks, which may end
+        above the view, do not become lower.
 
     Raises
     ------
@@ -375,7 +377,8 @@ def stand_boxes(
         if n >= MIN_STANDING:
             box = boxes[k]
             low, high = TALL_M[box.label]
-            tall = min(max(top, low), high)
+            # What is taller than the sensor may end above its view: the highest point does not show the top.
+            tall = min(max(top, low, box.size[2] if low > MODEL_HEIGHT_M else 0.0), high)
             center = (*box.center[:2], level / n + CLEARANCE_M + 0.5 * tall)
             standing[k] = replace(box, center=center, size=(*box.size[:2], tall))
     return tuple(standing)
