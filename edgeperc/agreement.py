@@ -24,6 +24,7 @@ from .cluster import MIN_PERSON_SHARE, PART_OF, find_clusters
 from .ground import Ground
 from .kernel_cache import njit
 from .linkage import Strips
+from .mounting import MODEL_HEIGHT_M
 from .perception import Box, PointLabels, TopView
 from .persons import complete_persons
 from .points import read_only
@@ -267,7 +268,8 @@ def stand_boxes(boxes: Sequence[Box], scan: Scan, rules: Collection[str] = RULES
 
     The bottom of a vehicle is 0.03 m above the ground below its points, its top 0.03 m above the highest of them. The
     height is that of a vehicle of its class (`TALL_M`); higher points hang over the vehicle and do not count. Boxes of
-    other classes, and those that hold fewer than five points, are not changed.
+    other classes, and those that hold fewer than five points, are not changed. Vans and
+    trucks, which may end above the view, do not become lower.
     """
     vehicles = [k for k, box in enumerate(boxes) if box.label in TALL_M]
     if "stand" not in _applicable(rules, scan.ground) or not vehicles:
@@ -281,7 +283,8 @@ def stand_boxes(boxes: Sequence[Box], scan: Scan, rules: Collection[str] = RULES
         if n >= MIN_STANDING:
             box = boxes[k]
             low, high = TALL_M[box.label]
-            tall = min(max(top, low), high)
+            # What is taller than the sensor may end above its view: the highest point does not show the top.
+            tall = min(max(top, low, box.size[2] if low > MODEL_HEIGHT_M else 0.0), high)
             center = (*box.center[:2], level / n + CLEARANCE_M + 0.5 * tall)
             standing[k] = replace(box, center=center, size=(*box.size[:2], tall))
     return tuple(standing)
