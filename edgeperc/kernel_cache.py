@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import gc
 import hashlib
-import inspect
 import logging
 import os
 import pickle
@@ -34,23 +33,33 @@ import numba.core.config
 import numba.core.runtime
 import numba.core.serialize
 import numba.core.sigutils
-import numpy as np
 
 from .atomic import write_atomic
 from .errors import SettingsError
+from .kernel_stamp import settings, stamp_of
 from .tuning import cache_folder, unsafe_because
 
-__all__ = ["KernelCache", "fewer_collections", "njit"]
+__all__ = ["KernelCache", "are_kept", "fewer_collections", "missing", "njit", "tell_watchers", "watchers"]
 
 logger = logging.getLogger(__name__)
 
 _numba: Any = numba.core  # internals, which have no types
-FORMAT = 2  # of the files
+FORMAT = 3  # of the files
 _DIGEST_BYTES = hashlib.sha256().digest_size
 _reported: set[str] = set()
 _collecting = threading.Lock()
 _rarely: list[tuple[int, int, int]] = []  # the thresholds before, once for each `fewer_collections` that is active
 RARE = 50_000  # objects; a collection takes 0.2 s once numba has built its tables
+
+
+watchers: list[Callable[[], None]] = []
+"""Called before a kernel is compiled, and when it was."""
+
+
+def tell_watchers() -> None:
+    """Call the `watchers`."""
+    for each in tuple(watchers):
+        each()
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -76,7 +85,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         if (
             kept and function.__closure__ is None and hasattr(kernel, "_cache")
         ):  # with NUMBA_DISABLE_JIT, the kernel is the function itself
-            kernel._cache = KernelCache(function)
+            kernel._cache = KernelCache(kernel)
         return kernel
 
     return decorate
@@ -96,6 +105,27 @@ class _Compiler(numba.core.compiler.CompilerBase):
                 passes.add_pass(each, name)
         passes.finalize()
         return [passes]
+
+
+def missing(kernels: Iterable[Any]) -> list[Any]:
+    """Those of some kernels that no folder and no memory holds in compiled form, for any types."""
+    left = {kernel._cache._name: kernel for kernel in kernels if _is_cached(kernel) and not kernel.signatures}
+    for folder in dict.fromkeys(folder for kernel in left.values() for folder in kernel._cache._folders()):
+        for file in folder.glob("*.kernel") if left and _unusable(folder) is None else ():
+            kernel = left.get(file.name.rpartition("-")[0])
+            if kernel is not None and _stamp_of(file) == kernel._cache._stamp():
+                del left[kernel._cache._name]
+    return [*left.values()]
+
+
+def are_kept(kernels: Iterable[Any]) -> bool:
+    """Whether compiled kernels are put into a cache, from which the next start loads them."""
+    caches = [kernel._cache for kernel in kernels if _is_cached(kernel)]
+    return bool(caches) and any(_can_be_written(each) and not _unusable(each) for each in caches[0]._folders())
+
+
+def _is_cached(kernel: Any) -> bool:
+    return isinstance(getattr(kernel, "_cache", None), KernelCache)
 
 
 @contextmanager
@@ -120,23 +150,31 @@ def fewer_collections() -> Iterator[None]:
 class KernelCache:
     """The compiled forms of one kernel on disk, in place of `numba.core.caching.FunctionCache`.
 
-    One file holds the machine code for one signature, processor and version of Python. It begins with a SHA-256 of the
-    rest and a stamp of the source file and the versions of numba, llvmlite and numpy. With another stamp it is compiled
-    again and replaced.
+    One file holds the machine code for one signature, processor, version of Python and setting of numba. It begins with
+    a SHA-256 of the rest and a stamp of what the machine code depends on (`edgeperc.kernel_stamp`). With another stamp
+    it is compiled again and replaced.
 
     Parameters
     ----------
-    function : callable
-        The Python function.
+    kernel : Dispatcher
+        What `numba.njit` returns.
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
+    def __init__(self, kernel: Any) -> None:
+        self._kernel, self._function = kernel, kernel.py_func
         # In a frozen application there are no source files.
-        self._source = Path(sys.executable if getattr(sys, "frozen", False) else inspect.getfile(function)).absolute()
-        # Of the source that was imported; the file may change while the process runs.
-        self._stamp = _stamp(str(self._source))
+        is_frozen = getattr(sys, "frozen", False)
+        self._source = Path(sys.executable if is_frozen else self._function.__code__.co_filename).absolute()
         self._enabled = True
+
+    def _stamp(self, *, anew: bool = False) -> bytes | None:
+        """Changes with everything that the machine code depends on; None, after a report, if that is not known."""
+        try:
+            stamp = stamp_of(self._kernel, _Compiler.define_pipelines, anew=anew)
+        except Exception as exc:  # a value of a kind that is not known
+            _report("unknown", "the compiled kernel %s is not kept: %s", self._name, exc)
+            return None
+        return hashlib.sha256(b"%d %s" % (FORMAT, stamp)).digest()
 
     @property
     def cache_path(self) -> str | None:
@@ -146,9 +184,9 @@ class KernelCache:
         return next(map(str, kept), None)
 
     def is_missing(self) -> bool:
-        """Whether no folder holds a compiled form of this source, for any types, and one of them can be written."""
+        """Whether no folder holds a compiled form of this kernel, for any types, and one of them can be written."""
         can_write = False
-        for folder in self._folders() if self._enabled and self._stamp is not None else ():
+        for folder in self._folders() if self._enabled and self._stamp() is not None else ():
             if _unusable(folder) is not None:
                 continue
             if self._is_in(folder):
@@ -157,8 +195,9 @@ class KernelCache:
         return can_write
 
     def _is_in(self, folder: Path) -> bool:
-        """Whether a folder holds a compiled form of this source, for any types."""
-        return any(_stamp_of(file) == self._stamp for file in folder.glob(f"{self._name}-*.kernel"))
+        """Whether a folder holds a compiled form of this kernel, for any types."""
+        stamp = self._stamp()
+        return any(_stamp_of(file) == stamp for file in folder.glob(f"{self._name}-*.kernel"))
 
     def enable(self) -> None:
         """Load and save from now on."""
@@ -185,13 +224,22 @@ class KernelCache:
         CompileResult or None
             None if there is none that can be used.
         """
-        stamp = self._stamp
-        if stamp is None or not self._enabled:
+        result = self._load(sig, target_context)
+        if result is None:
+            tell_watchers()
+        return result
+
+    def _load(self, sig: Any, target_context: Any) -> Any:
+        if not self._enabled or (stamp := self._stamp()) is None:
             return None
-        # Machine code needs numba's memory allocator, but neither its compiler's tables of types and functions nor
-        # scipy, which they import; if something is compiled, numba loads them. This saves 0.3 to 0.5 s a start.
-        _numba.runtime.rtsys.initialize(target_context)
-        name, known = self._key(sig, target_context.codegen())
+        try:
+            # Machine code needs numba's memory allocator, but neither its compiler's tables of types and functions nor
+            # scipy, which they import; if something is compiled, numba loads them. This saves 0.3 to 0.5 s a start.
+            _numba.runtime.rtsys.initialize(target_context)
+            name, known = self._key(sig, target_context.codegen())
+        except Exception as exc:  # another numba
+            _report("unknown", "compiled kernels cannot be loaded with numba %s: %s", numba.__version__, _text(exc))
+            return None
         for folder in self._folders():
             file = folder / name
             try:
@@ -200,52 +248,67 @@ class KernelCache:
                     if found == known:
                         return _rebuilt(target_context, defined, *payload)
             except Exception as exc:  # what a file holds, or what cannot be read, never stops the start
-                reason = f"{type(exc).__name__}: {exc}"
-                _report("damaged", "the compiled kernel %s cannot be used and is compiled again: %s", file, reason)
+                message = "the compiled kernel %s cannot be used and is compiled again: %s"
+                _report("damaged", message, file, _text(exc))
         return None
 
     def save_overload(self, sig: Any, result: Any) -> None:
-        """Save a compiled form in the first folder that takes it.
+        """Save a compiled form in the first folder that takes it; where that fails, a warning in the log says why.
 
         Parameters
         ----------
         sig : tuple of types, Signature or str
         result : CompileResult
         """
-        if not self._enabled or result.library.has_dynamic_globals:  # addresses in this process
+        self._save(sig, result)
+        tell_watchers()
+
+    def _save(self, sig: Any, result: Any) -> None:
+        if not self._enabled or (stamp := self._stamp()) is None:
             return
-        stamp, reasons = self._stamp, []
-        if stamp is None:
-            reasons.append(f"{self._source} cannot be read")
-        else:
+        if self._stamp(anew=True) != stamp:
+            _report("unknown", "the compiled kernel %s is not kept: a value that it reads was set anew", self._name)
+            return
+        try:
+            if result.library.has_dynamic_globals:  # addresses in this process
+                return
             name, known = self._key(sig, result.codegen)
             module = result.library._get_module_for_linking()
             defined = [each.name for each in (*module.functions, *module.global_variables) if not each.is_declaration]
-            rest = stamp + _numba.serialize.dumps((known, defined, result._reduce()))
-            for folder in self._folders():
-                try:
-                    # mkdir's mode, lessened by the umask, is that of the last folder only.
-                    folder.parent.mkdir(0o755, parents=True, exist_ok=True)
-                    folder.mkdir(0o755, exist_ok=True)
-                    reason = _unusable(folder)
-                    if reason is None:
-                        write_atomic(folder / name, hashlib.sha256(rest).digest() + rest, 0o644)
-                        return
-                except OSError as exc:
-                    reason = exc.strerror or str(exc)
-                reasons.append(f"{folder}: {reason}")
-        _report(
-            "not kept",
-            "compiled kernels are not kept, and every start compiles them again (%s); set NUMBA_CACHE_DIR to a folder "
-            "that exists and only you can write",
-            "; ".join(reasons) or "there is no home folder",
-        )
+            reason = self._write(name, stamp + _numba.serialize.dumps((known, defined, result._reduce())))
+        except Exception as exc:  # another numba
+            reason = f"numba {numba.__version__}: {_text(exc)}"
+        if reason is not None:
+            _report(
+                "not kept",
+                "compiled kernels are not kept, and every start compiles them again (%s); set NUMBA_CACHE_DIR to a "
+                "folder that exists and only you can write",
+                reason,
+            )
+
+    def _write(self, name: str, content: bytes) -> str | None:
+        """Write a file into the first folder that takes it; the reasons if none does."""
+        reasons = []
+        for folder in self._folders():
+            try:
+                # mkdir's mode, lessened by the umask, is that of the last folder only.
+                folder.parent.mkdir(0o755, parents=True, exist_ok=True)
+                folder.mkdir(0o755, exist_ok=True)
+                reason = _unusable(folder)
+                if reason is None:
+                    write_atomic(folder / name, hashlib.sha256(content).digest() + content, 0o644)
+                    return None
+            except OSError as exc:
+                reason = exc.strerror or str(exc)
+            reasons.append(f"{folder}: {reason}")
+        return "; ".join(reasons) or "there is no home folder"
 
     def _key(self, sig: Any, codegen: Any) -> tuple[str, Any]:
-        """The file's name for a signature; and the function's place in its source and the types that it is for."""
+        """The file's name for a signature; and the types that it is for."""
         function, tag = self._function, sys.implementation.cache_tag
-        known = function.__code__.co_firstlineno, *_numba.sigutils.normalize_signature(sig)
-        what = repr((function.__qualname__, *map(str, known[1:]), codegen.magic_tuple(), tag)).encode()
+        known = _numba.sigutils.normalize_signature(sig)
+        processor = codegen.magic_tuple()
+        what = repr((function.__qualname__, *map(str, known), processor, tag, settings())).encode()
         return f"{self._name}-{hashlib.sha256(what).hexdigest()[:16]}.kernel", known
 
     @property
@@ -260,7 +323,7 @@ class KernelCache:
         if _numba.config.CACHE_DIR:
             yield Path(_numba.config.CACHE_DIR).absolute() / place
             return
-        if not getattr(sys, "frozen", False):
+        if not getattr(sys, "frozen", False) and self._source.is_file():  # not in an archive
             yield self._source.parent / "__pycache__"
         try:
             yield cache_folder() / "kernels" / place
@@ -278,8 +341,14 @@ def _rebuilt(target_context: Any, defined: Iterable[str], library: tuple[str, st
     if kind != "object":
         return _numba.compiler.CompileResult._rebuild(target_context, library, *rest)
     code, for_callers = content
-    target_context.codegen()._engine._defined_symbols.update(defined)
-    result = _numba.compiler.CompileResult._rebuild(target_context, (name, kind, (code, _empty_module())), *rest)
+    symbols = target_context.codegen()._engine._defined_symbols
+    added = {*defined} - symbols
+    symbols |= added
+    try:
+        result = _numba.compiler.CompileResult._rebuild(target_context, (name, kind, (code, _empty_module())), *rest)
+    except BaseException:
+        symbols -= added  # the kernel is compiled, and defines them
+        raise
     loaded = result.library
 
     def parsed() -> Any:
@@ -342,15 +411,8 @@ def _unusable(folder: Path) -> str | None:
     return None
 
 
-@cache
-def _stamp(source: str) -> bytes | None:
-    """Changes with the source file and everything else that the machine code depends on; None without a source."""
-    try:
-        text = Path(source).read_bytes()
-    except OSError:
-        return None
-    versions = f"{FORMAT} {numba.__version__} {llvmlite.__version__} {np.__version__} {sys.version}"
-    return hashlib.sha256(versions.encode() + b"\n" + text).digest()
+def _text(exc: Exception) -> str:
+    return f"{type(exc).__name__}: {exc}"
 
 
 def _report(kind: str, message: str, *values: object) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import compileall
 import errno
 import importlib.util
 import json
 import logging
 import os
+import pickle
 import pkgutil
 import re
 import shutil
@@ -18,21 +20,26 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import llvmlite
 import numba
 import numpy as np
 import pytest
 import tiny_camera
+from numba.core import serialize
 from numba.core.caching import FunctionCache
+from numba.core.codegen import CPUCodegen, CPUCodeLibrary, JitEngine
+from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 
 import edgeperc
-from edgeperc import kernel_cache, tuning
+from edgeperc import kernel_cache, kernel_stamp, tuning
 from edgeperc.kernel_cache import KernelCache
 from edgeperc.tuning import unsafe_because
 
 pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled with the JIT off")
 
 SOURCE = """
+import llvmlite
 import numba
 import numpy as np
 from edgeperc.kernel_cache import njit
@@ -62,7 +69,6 @@ class Place:
         """Load the kernels and call one; return the warnings and the number of compilations."""
         self._monkeypatch.setattr(kernel_cache, "_reported", set())
         self._caplog.clear()
-        kernel_cache._stamp.cache_clear()
         spec = importlib.util.spec_from_file_location("some_kernels", self.source)
         assert spec is not None
         assert spec.loader is not None
@@ -188,22 +194,29 @@ def test_unreadable_file_is_compiled_again(place: Place, monkeypatch: pytest.Mon
     assert n_compiled == 1
 
 
-def test_an_edited_source_replaces_its_files(place: Place) -> None:
+def test_an_edited_kernel_replaces_its_file_and_those_of_its_callers(place: Place) -> None:
     place.start()
     names = [file.name for file in place.files]
-    for edit in range(3):
-        with place.source.open("a") as source:
-            source.write(f"# {edit}\n")
-        assert place.start() == ([], 2)
+    for edit, n_compiled in (("x * x * 1.0", 2), ("x * 1.0 * x", 2), ("x * x", 2)):
+        place.source.write_text(SOURCE.replace("x * x", edit))
+        assert place.start() == ([], n_compiled)
         assert place.start() == ([], 0)
         assert [file.name for file in place.files] == names
+    place.source.write_text(SOURCE.replace("found = 0.0", "found = -0.0"))
+    assert place.start() == ([], 1)
+
+
+def test_edits_of_comments_and_dates_change_nothing(place: Place) -> None:
+    place.start()
+    place.source.write_text("# A comment.\n" + SOURCE.replace("    return x * x", "    return x * x  # as a float"))
+    os.utime(place.source, (0, 0))
+    assert place.start() == ([], 0)
 
 
 def test_what_is_compiled_after_an_edit_is_of_the_imported_source(place: Place) -> None:
     place.start()
     whole = VALUES.astype(np.int64)
     place.source.write_text(SOURCE.replace("x * x", "2 * x * x"))
-    kernel_cache._stamp.cache_clear()
     assert sys.modules["some_kernels"].total(whole) == ANSWER  # as imported
     with pytest.raises(AssertionError, match=r"60\.0 == 30\.0"):
         place.start()
@@ -399,15 +412,249 @@ def test_no_home(without_setting: Place, monkeypatch: pytest.MonkeyPatch) -> Non
     assert "compiled kernels are not kept" in warning
 
 
-def test_without_its_source_a_kernel_is_not_kept(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    def unknown(_: str) -> None:
-        return None
+@pytest.mark.parametrize("fails", ["_get_module_for_linking", "_reduce", "dumps", "has_dynamic_globals", "magic_tuple"])
+@pytest.mark.parametrize("error", [AttributeError, RuntimeError, pickle.PicklingError, TypeError, AssertionError])
+def test_a_kernel_that_numba_cannot_write_is_compiled_at_every_start(
+    place: Place, monkeypatch: pytest.MonkeyPatch, fails: str, error: type[Exception]
+) -> None:
+    def refuse(*_: object) -> None:
+        raise error("another numba")
 
-    unknown.cache_clear = lambda: None  # type: ignore[attr-defined]
-    monkeypatch.setattr(kernel_cache, "_stamp", unknown)
-    (warning,), n_compiled = place.start()
+    owner = {"_reduce": CompileResult, "dumps": serialize, "magic_tuple": CPUCodegen}.get(fails, CPUCodeLibrary)
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, fails, property(refuse) if fails == "has_dynamic_globals" else refuse)
+        warnings, n_compiled = place.start()
     assert n_compiled == 2
-    assert "some_kernels.py cannot be read" in warning
+    assert f"{error.__name__}: another numba" in warnings[-1]
+    assert not place.files
+    assert place.start() == ([], 2)
+
+
+@pytest.mark.parametrize("fails", ["rtsys", "_rebuild", "_engine"])
+def test_a_file_that_numba_cannot_load_is_compiled_again(
+    place: Place, monkeypatch: pytest.MonkeyPatch, fails: str
+) -> None:
+    place.start()
+
+    def refuse(*_: object) -> None:
+        raise AttributeError("another numba")
+
+    owner, name = {
+        "rtsys": (type(numba.core.runtime.rtsys), "initialize"),
+        "_rebuild": (CompileResult, "_rebuild"),
+        "_engine": (CPUCodeLibrary, "_unserialize"),
+    }[fails]
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, refuse)
+        (warning,), n_compiled = place.start()
+    assert n_compiled == 2
+    assert "AttributeError: another numba" in warning
+    assert place.start() == ([], 0)
+
+
+# --- what the machine code depends on --------------------------------------------------------------------------------
+
+CALLER = """
+import numpy as np
+from edgeperc.kernel_cache import njit
+from . import constants
+from .callee import SHARE, share, table
+
+@njit(cache=True, nogil=True)
+def answer(x):
+    return share(x) + SHARE + table[1] + constants.OFFSET
+"""
+CALLEE = """
+import numpy as np
+from edgeperc.kernel_cache import njit
+from .constants import FACTOR, SCALES, Kind
+
+SHARE = 0.25
+table = np.array([0.0, 0.0])
+
+@njit(cache=True, nogil=True)
+def share(x):
+    return x * FACTOR + SCALES[1] + Kind.ONE.value
+"""
+CONSTANTS = """
+import enum
+
+FACTOR = 1.0
+OFFSET = 0.0
+SCALES = (0.0, 0.0)
+
+class Kind(enum.IntEnum):
+    ONE = 0
+"""
+RUN = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from kernels.caller import answer
+print(float(answer(1.0)), answer.stats.cache_misses.total())
+"""
+
+
+def ask(folder: Path, *options: str, **environment: str) -> tuple[float, int]:
+    """What a new process answers, and the number of callers that it compiled."""
+    settings = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache"), "PYTHONDONTWRITEBYTECODE": "1"} | environment
+    command = [sys.executable, *options, "-c", RUN, str(folder)]
+    done = subprocess.run(command, env=settings, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert not done.stderr
+    answer, n_compiled = done.stdout.split()
+    return float(answer), int(n_compiled)
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    folder = tmp_path / "kernels"
+    folder.mkdir(0o755)
+    sources = {"__init__": "", "caller": CALLER, "callee": CALLEE, "constants": CONSTANTS}
+    for name, source in sources.items():
+        (folder / f"{name}.py").write_text(source)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("module", "old", "new", "answer"),
+    [
+        pytest.param("callee", "SHARE = 0.25", "SHARE = 0.75", 1.75, id="a constant of another module"),
+        pytest.param("callee", "[0.0, 0.0]", "[0.0, 2.0]", 3.25, id="an array"),
+        pytest.param("callee", "x * FACTOR", "x + x * FACTOR", 2.25, id="a kernel"),
+        pytest.param("constants", "FACTOR = 1.0", "FACTOR = 3.0", 3.25, id="a constant of the kernel called"),
+        pytest.param("constants", "OFFSET = 0.0", "OFFSET = 7.0", 8.25, id="a module's attribute"),
+        pytest.param("constants", "(0.0, 0.0)", "(0.0, 0.5)", 1.75, id="a tuple"),
+        pytest.param("constants", "ONE = 0", "ONE = 4", 5.25, id="an enumeration"),
+    ],
+)
+def test_a_kernel_sees_what_other_modules_define(package: Path, module: str, old: str, new: str, answer: float) -> None:
+    """numba freezes it into the caller, whose own source does not change, nor do the dates of the files."""
+    assert ask(package) == (1.25, 1)
+    assert ask(package) == (1.25, 0)
+    file = package / "kernels" / f"{module}.py"
+    status, source = file.stat(), file.read_text()
+    assert source.count(old) == 1
+    file.write_text(source.replace(old, new))
+    os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert ask(package) == (answer, 1)
+    assert ask(package) == (answer, 0)
+    file.write_text(source)
+    assert ask(package) == (1.25, 1)
+
+
+def test_settings_of_numba_and_processors_have_files_of_their_own(package: Path) -> None:
+    assert ask(package) == (1.25, 1)
+    for environment in ({"NUMBA_BOUNDSCHECK": "1"}, {"NUMBA_OPT": "1"}, {"NUMBA_CPU_NAME": "generic"}):
+        assert ask(package, **environment) == (1.25, 1)
+        assert ask(package, **environment) == (1.25, 0)
+    assert ask(package) == (1.25, 0)
+
+
+def test_another_version_of_what_compiles_has_another_stamp(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    for part in (numba.__version__, llvmlite.__version__, np.__version__, sys.version):
+        assert part in kernel_stamp.VERSIONS
+    place.start()
+    with monkeypatch.context() as patch:
+        patch.setattr(kernel_stamp, "VERSIONS", "another")
+        assert place.start() == ([], 2)
+    assert place.start() == ([], 2)
+
+
+def test_kernels_in_an_archive_are_kept(package: Path, tmp_path: Path) -> None:
+    packed = Path(shutil.make_archive(str(tmp_path / "packed"), "zip", package, "kernels"))
+    code = RUN.replace("sys.argv[1]", repr(str(packed)))
+    for n_compiled in (1, 0):
+        environment = os.environ | {"EDGEPERC_CACHE_DIR": str(tmp_path / "user"), "NUMBA_CACHE_DIR": ""}
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        assert (done.stdout, done.stderr) == (f"1.25 {n_compiled}\n", "")
+
+
+def test_kernels_without_sources_are_kept(package: Path) -> None:
+    assert ask(package) == (1.25, 1)
+    assert compileall.compile_dir(package / "kernels", legacy=True, quiet=1)
+    for file in (package / "kernels").glob("*.py"):
+        file.unlink()
+    assert ask(package) == (1.25, 0)
+
+
+def test_a_constant_set_after_the_import_is_not_kept_for_others(place: Place) -> None:
+    place.source.write_text(SOURCE.replace("x * x", "FACTOR * x * x") + "\nFACTOR = 1.0\n")
+    place.start()
+    module: Any = sys.modules["some_kernels"]
+    module.FACTOR = 3.0
+    assert module.total(VALUES.astype(np.int64)) == 3.0 * ANSWER
+    assert len(place.files) == 2
+    assert place.start() == ([], 0)
+    assert sys.modules["some_kernels"].total(VALUES.astype(np.int64)) == ANSWER
+
+
+def test_a_value_without_a_digest_is_named(place: Place) -> None:
+    place.source.write_text(SOURCE.replace("x * x", "x * x if x in WHAT else x * x") + "\nWHAT = iter([1.0])\n")
+    kernel_cache._reported.clear()
+    spec = importlib.util.spec_from_file_location("some_kernels", place.source)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    with pytest.raises(TypeError, match="squared reads WHAT, a list_iterator, which has no digest"):
+        kernel_stamp.stamp_of(module.total)
+    assert not module.total._cache.is_missing()
+
+
+STAMPS = """
+import pkgutil, sys
+from importlib import import_module
+from numba.core.dispatcher import Dispatcher
+import edgeperc
+names = [m.name for m in pkgutil.walk_packages(edgeperc.__path__, "edgeperc.") if not m.name.endswith("__main__")]
+for name in names:
+    for key, thing in sorted(vars(import_module(name)).items()):
+        if isinstance(thing, Dispatcher) and thing.py_func.__module__ == name:
+            print(name, key, thing._cache._stamp().hex())
+"""
+
+
+def test_stamps_are_the_same_in_every_process() -> None:
+    def stamps(seed: int) -> str:
+        environment = os.environ | {"PYTHONHASHSEED": str(seed)}
+        return subprocess.run(
+            [sys.executable, "-c", STAMPS], env=environment, capture_output=True, check=True, text=True
+        ).stdout
+
+    first = stamps(1)
+    assert first.count("\n") > 80
+    assert first == stamps(2)
+
+
+def test_the_internals_of_numba_that_are_used_exist() -> None:
+    """With a numba that moves one, kernels are compiled at every start. Then raise the bound in pyproject.toml."""
+    library, engine = CPUCodeLibrary, JitEngine
+    used = [
+        (numba.core.compiler.DefaultPassBuilder, "define_nopython_pipeline"),
+        (numba.core.compiler, "PassManager"),
+        (numba.core.compiler.PassManager, "add_pass"),
+        (numba.core.compiler.PassManager, "finalize"),
+        (numba.core.config, "CACHE_DIR"),
+        *((numba.core.config, name) for name in kernel_stamp.SETTINGS),
+        (type(numba.core.runtime.rtsys), "initialize"),
+        (serialize, "dumps"),
+        (numba.core.sigutils, "normalize_signature"),
+        (CompileResult, "_reduce"),
+        (CompileResult, "_rebuild"),
+        (CompileResult, "codegen"),
+        (library, "has_dynamic_globals"),
+        (library, "_get_module_for_linking"),
+        (CPUCodegen, "magic_tuple"),
+        (engine, "is_symbol_defined"),
+    ]
+    assert [f"{owner.__name__}.{name}" for owner, name in used if not hasattr(owner, name)] == []
+    kernel: Any = numba.njit(lambda x: x)
+    assert {"_cache", "py_func", "targetoptions"} <= {*dir(kernel)}
+    assert kernel(1) == 1
+    (result,) = kernel.overloads.values()
+    assert isinstance(result.codegen._engine._defined_symbols, set)
+    assert hasattr(result.library, "_shared_module")
 
 
 # --- the kernels of edgeperc -----------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ PACKAGES = {
 FLOORS = {
     "edgeperc": """
         clock errors atomic lanes names printable
-        extras mounting onnx_file
+        extras kernel_stamp mounting onnx_file
         card engine points remote sensor tuning
         kernel_cache perception zoo.__init__
         blocks calibration frame geometry linkage outline persons returns
