@@ -39,7 +39,7 @@ class _Described(NamedTuple):
 _described: dict[Any, _Described] = {}
 
 
-def stamp_of(kernel: Any, passes: FunctionType | None = None, *, anew: bool = False) -> bytes:
+def stamp_of(kernel: Any, passes: Any = None, *, anew: bool = False) -> bytes:
     """Digest of all that the machine code of a kernel depends on, except types, processor and `settings`.
 
     Parameters
@@ -84,7 +84,9 @@ def settings() -> tuple[str, ...]:
 
 
 def _describe(kernel: Any) -> _Described:
-    function, called, values = getattr(kernel, "py_func", kernel), [], []
+    function = getattr(kernel, "py_func", kernel)
+    called: list[Any] = []
+    values: list[tuple[str, object]] = []
     for name, value in _read_by(function.__code__, function):
         try:
             values.append((name, _value(value, function, called)))
@@ -139,7 +141,7 @@ def _content(value: Any, reader: FunctionType | None, called: list[Any] | None) 
     if isinstance(value, Mapping):
         return each_of(value.items())
     if isinstance(value, enum.EnumMeta):
-        return each_of((name, member.value) for name, member in value.__members__.items())
+        return each_of((name, member.value) for name, member in dict[str, Any](value.__members__).items())
     if isinstance(value, enum.Enum | np.dtype | numba.types.Type):
         return str(value)
     module = str(getattr(value, "__module__", None))
