@@ -21,6 +21,7 @@ from .adapt import Interpolator, scale
 from .agreement import RULES
 from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
 from .cluster import MIN_SCORE
+from .compilation import Compilation, kernels_of
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
 from .fitness import Finding, FitnessProfile, check_dropped, check_profiles
 from .frame import ModelFrame
@@ -35,7 +36,7 @@ from .remission import RemissionMatcher
 from .returns import about_too_near, returns
 from .sensor import SensorProfile, get_sensor
 from .session import Session
-from .warm_up import Rehearsed, warm_up
+from .warm_up import Rehearsed, n_processes, warm_up
 from .zoo import CAMERA, DEFAULT, resolve
 
 __all__ = ["ADAPTATIONS", "BoxesFrom", "Learned", "Perceiver"]
@@ -87,10 +88,10 @@ class Learned(NamedTuple):
     is_settled: bool
 
 
-def _view_kind(model: str | os.PathLike[str]) -> str | None:
-    """Kind of a model's view; None if its card cannot be read, which the model's session reports."""
+def _card_of(model: str | os.PathLike[str]) -> ModelCard | None:
+    """A model's card; None if it cannot be read, which the model's session reports."""
     try:
-        return resolve(model)[0].card.view.kind
+        return resolve(model)[0].card
     except EdgepercError:
         return None
 
@@ -278,7 +279,48 @@ class Perceiver:
         self.boxes_from = boxes_from
         self.full_turn = full_turn
         self.agree = agree if isinstance(agree, bool) else frozenset(agree)
-        kinds = {_view_kind(model) for model in wanted}
+        cards = [card for card in map(_card_of, wanted) if card is not None]
+        with Compilation(lambda: kernels_of(self._kernel_needs(cards)), n_processes()):
+            self._construct(wanted, provider, precision, n_threads, trusted)
+
+    def _kernel_needs(self, cards: Sequence[ModelCard]) -> list[str]:
+        """Which kernels are needed: keys of `edgeperc.compilation.KERNELS`."""
+        kinds, scans = {card.view.kind for card in cards}, [c for c in cards if not isinstance(c.view, CameraGeometry)]
+        points, top_view = "range_image" in kinds, "top_view" in kinds
+        boxes, agreement = points and self.boxes_from != "network", points and bool(self.agree)
+        gaps = self._interpolates and any(
+            isinstance(card.view, RangeImageGeometry) and Interpolator(card.view, self.sensor).needed for card in scans
+        )
+        needs = {
+            "scans": bool(scans),
+            "crop": bool(scans) and not gaps,
+            "gaps": gaps,
+            "turn": points and self.full_turn,
+            "ground": bool(scans) and (bool(self.agree) or boxes or any(card.input.needs_ground for card in scans)),
+            "points": points,
+            "points outside": points and not gaps,
+            "clusters": boxes or agreement,
+            "boxes": boxes,
+            "agreement": agreement,
+            "standing": bool(self.agree) and (boxes or any(card.box_classes for card in scans)),
+            "road": top_view,
+            "cells": top_view and bool(self.agree),
+            "detections": any(card.box_classes for card in scans),
+            "blocks": any(output.block != (1, 1) for card in scans for output in card.outputs),
+            "image": "camera" in kinds,
+        }
+        return [name for name, is_needed in needs.items() if is_needed]
+
+    def _construct(
+        self,
+        wanted: Sequence[str | os.PathLike[str]],
+        provider: str,
+        precision: str,
+        n_threads: int | None,
+        trusted: bool,
+    ) -> None:
+        """Load the models, assemble the pipeline and compile every kernel."""
+        kinds = {card.view.kind for card in map(_card_of, wanted) if card is not None}
         at_once = 2 if {"top_view", "range_image"} <= kinds else 1
         self.sessions = tuple(
             Session(model, provider, precision=precision, n_threads=n_threads, at_once=at_once, trusted=trusted)
@@ -296,11 +338,11 @@ class Perceiver:
             ),
             None,
         )
-        if boxes_from == "clusters" and "range_image" not in views:
+        if self.boxes_from == "clusters" and "range_image" not in views:
             raise OptionError("boxes_from is 'clusters', which needs a class for every point; add a range-image model")
         self.providers = MappingProxyType({s.card.name: s.description for s in self.sessions})
         self._fitness = [FitnessProfile.from_dict(card.fitness) for card in self.cards if card.fitness is not None]
-        self._to_check = 0 if on_mismatch == "ignore" else CHECKED_SCANS
+        self._to_check = 0 if self.on_mismatch == "ignore" else CHECKED_SCANS
         self._told_of_near = False
         self._locks = {os.getpid(): threading.Lock()}
         self._lanes = Lanes(2 if at_once == 2 and all(session.shares_cores for session in self.sessions) else 1)

@@ -54,7 +54,7 @@ from .fitness import FitnessProfile, check_profiles
 from .frame import ModelFrame
 from .geometry import suppress_overlaps
 from .ground import Ground, fill_planes, find_ground
-from .kernel_cache import KernelCache, fewer_collections
+from .kernel_cache import KernelCache, fewer_collections, tell_watchers
 from .lanes import Lanes, Stopwatch
 from .level import MountingEstimator
 from .linkage import fill_clusters
@@ -70,12 +70,13 @@ from .sensor import SensorProfile
 from .session import Session
 from .tuning import usable_cores
 
-__all__ = ["Helpers", "Rehearsed", "car_and_person", "compile_parts", "warm_up"]
+__all__ = ["Helpers", "Rehearsed", "car_and_person", "compile_parts", "n_processes", "warm_up"]
 
 logger = logging.getLogger(__name__)
 
 MAX_S = 120.0  # after which a helper ends in any case; one took 12 s on two cores at 2.4 GHz
 MIN_WAIT_S = 5.0
+LOOK_S = 0.25  # after which those who watch see how far the helpers are
 
 # At the end, nothing is collected or torn down, which would take a second.
 START = "import os, sys; sys.path[:] = sys.argv[2:]; from edgeperc.warm_up import main; main(sys.argv[1]); os._exit(0)"
@@ -116,7 +117,7 @@ class _RehearsedTop(TopViewNetwork):
         vars(self).update(vars(network))
 
     def find_boxes(self, projected: None, score_threshold: float) -> list[Box]:
-        return [UNCERTAIN]
+        return [UNCERTAIN] if self.card.box_classes else []
 
     def project(self, near: View) -> None:
         self.index.fill(-1)
@@ -285,13 +286,14 @@ class Helpers:
             compile_parts(self._own)
         until_s = time.monotonic() + max(MIN_WAIT_S, time.monotonic() - self._began_s)
         for helper in self._running:
-            try:
-                code = helper.wait(max(until_s - time.monotonic(), 0.0))
-            except subprocess.TimeoutExpired:
+            while (code := helper.poll()) is None and (left_s := until_s - time.monotonic()) > 0.0:
+                tell_watchers()
+                with suppress(subprocess.TimeoutExpired):
+                    helper.wait(min(left_s, LOOK_S))
+            if code is None:
                 logger.info("a helper process that compiles kernels takes too long; they are compiled here")
-            else:
-                if code != 0:
-                    logger.info("a helper process that compiles kernels ended with %d; they are compiled here", code)
+            elif code != 0:
+                logger.info("a helper process that compiles kernels ended with %d; they are compiled here", code)
         self._end()
 
     def __exit__(self, kind: type[BaseException] | None, exc: BaseException | None, at: TracebackType | None) -> None:
@@ -340,9 +342,14 @@ def _kill() -> None:
     os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))
 
 
+def n_processes() -> int:
+    """How many processes compile at a first start: this one, and one for each further core."""
+    return 1 + min(usable_cores() - 1, MAX_HELPERS) if _interpreter() is not None else 1
+
+
 def _shares(parts: Sequence[str]) -> list[list[str]]:
     """Which parts the caller compiles, and which each helper, so that all are done soon."""
-    n_helpers = min(usable_cores() - 1, MAX_HELPERS) if parts and _interpreter() is not None else 0
+    n_helpers = n_processes() - 1 if parts else 0
 
     def seconds(owners: Sequence[int]) -> list[float]:
         loads = [OTHERS_S, *[0.0] * n_helpers]
@@ -372,7 +379,9 @@ def _interpreter() -> str | None:
 
 def _start(parts: Sequence[str]) -> subprocess.Popen[bytes]:
     """Start a helper. It inherits no files; its standard input is open until it is closed or this process ends."""
-    flags = [*(["-B"] if sys.dont_write_bytecode else []), *(["-E"] if sys.flags.ignore_environment else [])]
+    # What is compiled depends on the bytecode, and that on -O.
+    flags = ["-O"] * sys.flags.optimize
+    flags += [*(["-B"] if sys.dont_write_bytecode else []), *(["-E"] if sys.flags.ignore_environment else [])]
     paths = [path for path in sys.path if isinstance(path, str)]
     environment = dict(os.environ)
     config: Any = numba.config  # may have been set without the environment

@@ -34,7 +34,7 @@ FLOORS = {
         ego level network_input occupancy painting remission scan
         agreement
         cells
-        pipeline
+        compilation pipeline
         warm_up
         readers.__init__ readers.times
         readers.tables

@@ -209,7 +209,7 @@ def test_no_helper_where_the_cache_cannot_be_written_or_holds_the_kernels(
     folder = next(cache._folders())
     folder.mkdir(0o755, parents=True)
     file = folder / f"{cache._name}-0123456789abcdef.kernel"
-    for content, is_cold in ((b"", True), (bytes(64), True), (bytes(32) + cache._stamp, False)):
+    for content, is_cold in ((b"", True), (bytes(64), True), (bytes(32) + cache._stamp(), False)):
         file.write_bytes(content)
         assert bool(Helpers(["road"])._shares) is is_cold
 
