@@ -340,7 +340,12 @@ def agree_on_boxes(
 
 
 def stand_boxes(
-    boxes: Sequence[Box], points: NDArray[np.float32], ground: Ground, *, rules: Collection[str] = RULES
+    boxes: Sequence[Box],
+    points: NDArray[np.float32],
+    labels: PointLabels | None,
+    ground: Ground,
+    *,
+    rules: Collection[str] = RULES,
 ) -> tuple[Box, ...]:
     """Give vehicles' boxes the height of their points, and put them on the ground below.
 
@@ -350,6 +355,8 @@ def stand_boxes(
         Of any class; those of other classes are not changed, nor those that hold fewer than five points.
     points, ground, rules
         As in `agree_on_points`.
+    labels : PointLabels or None
+        Points in view that are labeled as another class than a vehicle's do not count. None: all points count.
 
     Returns
     -------
@@ -364,14 +371,24 @@ def stand_boxes(
     PointsError
         Arrays disagree in shape.
     """
-    check_scan(points, None, ground)
+    check_scan(points, labels, ground)
     vehicles = [k for k, box in enumerate(boxes) if box.label in TALL_M]
     if "stand" not in _applicable(rules, ground) or not vehicles:
         return tuple(boxes)
     rows = _as_rows([boxes[k] for k in vehicles])
     rows[:, 6] = [TALL_M[boxes[k].label][1] for k in vehicles]  # what is higher hangs over the vehicle
     sums = np.empty((len(rows), 3))
-    sum_inside(read_only(points), read_only(ground.height_m), read_only(ground.mask, np.bool_), rows, sums)
+    nothing = np.zeros(len(points), np.bool_)
+    sum_inside(
+        read_only(points),
+        read_only(ground.height_m),
+        read_only(ground.mask, np.bool_),
+        read_only(nothing if labels is None else labels.in_view, np.bool_),
+        read_only(nothing.view(np.uint8) if labels is None else labels.labels, np.uint8),
+        roles_of(("background",) if labels is None else labels.classes),
+        rows,
+        sums,
+    )
     standing = list(boxes)
     for k, (n, level, top) in zip(vehicles, sums.tolist(), strict=True):
         if n >= MIN_STANDING:
@@ -755,18 +772,23 @@ def sum_inside(
     points: NDArray[np.float32],
     height: NDArray[np.float32],
     on_ground: NDArray[np.bool_],
+    in_view: NDArray[np.bool_],
+    labels: NDArray[np.uint8],
+    roles: NDArray[np.uint8],
     boxes: NDArray[np.float64],
     sums: NDArray[np.float64],
 ) -> None:
-    """Sum up the points above the ground, without reflections from below, in every box of (m, 8) as in `fill_support`.
+    """Sum up the points above the ground in every box of (m, 8) as in `fill_support`: vehicles', and those out of view.
 
     ``sums``, (m, 3), is overwritten: number of points, sum of the z of the ground below them, greatest height [m].
     """
     sums[:] = 0.0
     low_x, high_x, low_y, high_y = bounds_of(boxes)
     for i in range(points.shape[0]):
+        if on_ground[i] or (in_view[i] and roles[labels[i]] != VEHICLE):
+            continue
         x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
-        if on_ground[i] or not ((x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)):
+        if not ((x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)):
             continue
         above = np.float64(height[i])
         for k in range(boxes.shape[0]):

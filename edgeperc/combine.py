@@ -121,7 +121,7 @@ def combine(
         )
         boxes = join_boxes(boxes, _weighed(clustered, cards, min_score)) if boxes_from == "both" else clustered
         watch.lap("cluster")
-    boxes = stand_boxes(boxes, scan, ground, rules=rules)
+    boxes = stand_boxes(boxes, scan, points, ground, rules=rules)
     if top_view is not None and marks is not None:
         top_view = agree_on_cells(top_view, scan, points, ground, boxes, dropped, rules=rules, marks=marks())
         watch.lap("agree")

@@ -103,7 +103,7 @@ def _compile_agreement() -> None:
     clusters = np.where(ground.mask, -1, 0).astype(np.int32)
     points = agree_on_points(scan, points, ground, clusters, boxes, support=held)
     agree_on_boxes(boxes, scan, points, ground)
-    stand_boxes(boxes, scan, ground)
+    stand_boxes(boxes, scan, points, ground)
     cells = np.zeros((400, 200), np.uint8)
     view = TopView(cells, ("background", "drivable"), 0.1, (6.0, 46.0), (-10.0, 10.0), np.ones(cells.shape, np.bool_))
     agree_on_cells(view, scan, points, ground, boxes, boxes)
