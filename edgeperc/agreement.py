@@ -263,13 +263,15 @@ def agree_on_boxes(
     return tuple(box for k, box in enumerate(boxes) if k not in dropped)
 
 
-def stand_boxes(boxes: Sequence[Box], scan: Scan, rules: Collection[str] = RULES) -> tuple[Box, ...]:
+def stand_boxes(
+    boxes: Sequence[Box], scan: Scan, labels: PointLabels | None, rules: Collection[str] = RULES
+) -> tuple[Box, ...]:
     """Give vehicles' boxes the height of their points, and put them on the ground below.
 
     The bottom of a vehicle is 0.03 m above the ground below its points, its top 0.03 m above the highest of them. The
-    height is that of a vehicle of its class (`TALL_M`); higher points hang over the vehicle and do not count. Boxes of
-    other classes, and those that hold fewer than five points, are not changed. Vans and
-    trucks, which may end above the view, do not become lower.
+    height is that of a vehicle of its class (`TALL_M`); higher points hang over the vehicle and do not count. Vans and
+    trucks, which may end above the view, do not become lower. Points in view that are labeled as another class than a
+    vehicle's do not count. Boxes of other classes, and those that hold fewer than five points, are not changed.
     """
     vehicles = [k for k, box in enumerate(boxes) if box.label in TALL_M]
     if "stand" not in _applicable(rules, scan.ground) or not vehicles:
@@ -277,7 +279,17 @@ def stand_boxes(boxes: Sequence[Box], scan: Scan, rules: Collection[str] = RULES
     rows = _as_rows([boxes[k] for k in vehicles])
     rows[:, 6] = [TALL_M[boxes[k].label][1] for k in vehicles]
     sums = np.empty((len(rows), 3))
-    sum_inside(scan.points, scan.ground.height_m, scan.ground.mask, rows, sums)
+    nothing = np.zeros(len(scan.points), np.bool_)
+    sum_inside(
+        scan.points,
+        scan.ground.height_m,
+        scan.ground.mask,
+        read_only(nothing if labels is None else labels.in_view, np.bool_),
+        read_only(nothing.view(np.uint8) if labels is None else labels.labels, np.uint8),
+        roles_of(("background",) if labels is None else labels.classes),
+        rows,
+        sums,
+    )
     standing = list(boxes)
     for k, (n, level, top) in zip(vehicles, sums.tolist(), strict=True):
         if n >= MIN_STANDING:
@@ -617,18 +629,23 @@ def sum_inside(
     points: NDArray[np.float32],
     height: NDArray[np.float32],
     on_ground: NDArray[np.bool_],
+    in_view: NDArray[np.bool_],
+    labels: NDArray[np.uint8],
+    roles: NDArray[np.uint8],
     boxes: NDArray[np.float64],
     sums: NDArray[np.float64],
 ) -> None:
-    """Sum up the points above the ground, without reflections from below, in every box of (m, 8) as in `fill_support`.
+    """Sum up the points above the ground in every box of (m, 8) as in `fill_support`: vehicles', and those out of view.
 
     ``sums``, (m, 3), is overwritten: number of points, sum of the z of the ground below them, greatest height [m].
     """
     sums[:] = 0.0
     low_x, high_x, low_y, high_y = bounds_of(boxes)
     for i in range(points.shape[0]):
+        if on_ground[i] or (in_view[i] and roles[labels[i]] != VEHICLE):
+            continue
         x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
-        if on_ground[i] or not ((x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)):
+        if not ((x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)):
             continue
         above = np.float64(height[i])
         for k in range(boxes.shape[0]):

@@ -64,7 +64,7 @@ class Crop:
         if left - right <= math.pi:
             inward = np.array([(math.sin(left), -math.cos(left)), (-math.sin(right), math.cos(right))])
             hulls = [_hull(view, margin_m) for view in views]
-            nearest = [(inward @ corners.T).min(axis=1) - beside for corners, beside in hulls]
+            nearest = [(inward @ corners.T - beside).min(axis=1) for corners, beside in hulls]
             cos, sin = math.cos(turn_rad), math.sin(turn_rad)
             self._lines = np.column_stack([inward @ np.array([(cos, sin), (-sin, cos)]), np.min(nearest, axis=0)])
 
@@ -147,15 +147,18 @@ def _ahead(view: TopViewGeometry) -> tuple[float, float]:
     return max(azimuths), min(azimuths)
 
 
-def _hull(view: RangeImageGeometry | TopViewGeometry, margin_m: float) -> tuple[NDArray[np.float64], float]:
-    """Corners of the least region that must be kept between two lines, and the margin around it [m]."""
+def _hull(
+    view: RangeImageGeometry | TopViewGeometry, margin_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners of the least region that must be kept between two lines, and the margin around each [m]."""
     if isinstance(view, RangeImageGeometry):
-        return np.zeros((1, 2)), margin_m  # the sector's own edges are the directions of the lines
+        return np.zeros((1, 2)), np.array([margin_m])  # the sector's own edges are the directions of the lines
     x, y = view.x_range_m, view.y_range_m
     if x[0] <= 0.0:
         x, y = (x[0], max(x[1], 0.0)), (min(y[0], 0.0), max(y[1], 0.0))
-    corners = [(0.0, 0.0), *((FARTHER * each_x, FARTHER * each_y) for each_x in x for each_y in y)]
-    return np.array(corners), BOX_BESIDE_M
+    corners = np.array([(each_x, each_y) for each_x in x for each_y in y])
+    hull = np.concatenate([np.zeros((1, 2)), FARTHER * corners, corners])
+    return hull, np.repeat([view.cell_m, BOX_BESIDE_M], [5, 4])
 
 
 @njit(cache=True, nogil=True)

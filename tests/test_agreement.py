@@ -168,8 +168,8 @@ def test_boxes_around_points_match_the_twin(given: list, boxes: list[Box]) -> No
     count_inside(*more, ROLES, as_rows, counts)
     np.testing.assert_array_equal(counts, twins.agreement.inside_counts(*more, ROLES, as_rows))
     sums = np.empty((len(boxes), 3))
-    sum_inside(*arrays, as_rows, sums)
-    np.testing.assert_array_equal(sums, twins.agreement.inside_sums(*arrays, as_rows))
+    sum_inside(*more, ROLES, as_rows, sums)
+    np.testing.assert_array_equal(sums, twins.agreement.inside_sums(*more, ROLES, as_rows))
 
 
 @patient
@@ -591,14 +591,23 @@ def test_vehicles_stand_on_the_ground_below_them(label: str, tall: float, least:
     ground = Ground(np.zeros(len(rows), np.bool_), rows[:, 2].astype(np.float32), (0.0, 0.0, GROUND_Z))
     own, empty = (Box(label, 0.6, (x, 3.0, -0.9), (4.1, 1.8, 1.5), 0.1) for x in (12.0, 30.0))
     person = Box("pedestrian", 0.6, (12.0, 3.0, -0.9), (1.0, 1.0, 1.7), 0.0)
-    standing, *others = stand_boxes([own, empty, person], Scan.of(points, ground))
+    standing, *others = stand_boxes([own, empty, person], Scan.of(points, ground), None)
     assert others == [empty, person]
     top = rows[rows[:, 2] < 2.5, 2].max()
     assert standing.size == pytest.approx((4.1, 1.8, max(top, least)), abs=1e-6)
     assert standing.center == pytest.approx((12.0, 3.0, -2.3 + 0.03 + standing.size[2] / 2), abs=1e-6)
     assert replace(standing, center=own.center, size=own.size) == own
-    assert stand_boxes([own], Scan.of(points, ground), RULES - {"stand"}) == (own,)
-    assert stand_boxes([own], Scan.of(points, replace(ground, plane=None))) == (own,)
+    seen, unseen = np.ones(len(rows), np.bool_), np.zeros(len(rows), np.bool_)
+    scan = Scan.of(points, ground)
+    for labels in (
+        PointLabels(rows[:, 3].astype(np.uint8), seen, CLASSES),
+        PointLabels(unseen.view(np.uint8), unseen, CLASSES),
+    ):
+        assert stand_boxes([own], scan, labels) == (standing,)
+    background = PointLabels(unseen.view(np.uint8), seen, CLASSES)
+    assert stand_boxes([own], scan, background) == (own,)
+    assert stand_boxes([own], scan, None, RULES - {"stand"}) == (own,)
+    assert stand_boxes([own], Scan.of(points, replace(ground, plane=None)), None) == (own,)
 
 
 def test_cyclist_is_one_object() -> None:

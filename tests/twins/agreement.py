@@ -88,11 +88,11 @@ def inside_counts(points, height, on_ground, in_view, labels, roles, boxes):
     return np.array(rows, np.int64).reshape(-1, 3)
 
 
-def inside_sums(points, height, on_ground, boxes):
+def inside_sums(points, height, on_ground, in_view, labels, roles, boxes):
     """Twin of `edgeperc.agreement.sum_inside`."""
     sums = np.zeros((len(boxes), 3))
     for row, box in zip(sums, boxes, strict=True):
-        own = inside(points, height, on_ground, box) & (height >= 0.0)
+        own = inside(points, height, on_ground, box) & (height >= 0.0) & (~in_view | (roles[labels] == 1))
         levels = points[own, 2].astype(np.float64) - height[own]
         row[:] = np.count_nonzero(own), sum(levels.tolist()), max(0.0, 0.0, *height[own].tolist())
     return sums
