@@ -248,8 +248,8 @@ def _draw_top_view(
     axes.add_patch(sensor)
 
     avoid = [area_of(axes, sensor.get_xy())]
-    ahead = road.free_ahead(_HALF_STRIP_M)
-    text, arrow = _strip(ahead, x_near)
+    strip = road.free_ahead(_HALF_STRIP_M)
+    text, arrow = _strip(strip, x_near)
     if arrow is not None:
         axes.add_patch(Polygon(arrow[:, ::-1], closed=True, facecolor=INK, alpha=0.3, zorder=3))
         axes.add_patch(Polygon(arrow[:, ::-1], closed=True, fill=False, edgecolor=INK, linewidth=1.5, zorder=4))
@@ -265,7 +265,7 @@ def _draw_top_view(
         if low <= box.center[0] <= high and right <= box.center[1] <= left:
             area = area_of(axes, footprint[:, ::-1])
             labels.append(Label(area, f"{box.label} {box.score:.2f}", color))
-    for kind, x_m in (("obstacle", ahead.obstacle_m), ("edge", ahead.edge_m), ("unknown", ahead.unknown_m)):
+    for kind, x_m in (("obstacle", strip.obstacle_m), ("edge", strip.edge_m), ("unknown", strip.unknown_m)):
         if math.isfinite(x_m):
             axes.plot([-_HALF_STRIP_M, _HALF_STRIP_M], [x_m, x_m], color=INK, linewidth=1.5, zorder=4)
             line = area_of(axes, [[-_HALF_STRIP_M, x_m], [_HALF_STRIP_M, x_m]])
@@ -381,9 +381,9 @@ def _draw_from_behind(
 
     labels: list[Label] = []
     if top_view is not None and road is not None:
-        ahead = road.free_ahead(_HALF_STRIP_M)
-        text, arrow = _strip(ahead, top_view.x_range_m[0])
-        text += "" if ahead.end in (None, "end of view") else f" ({ahead.end})"
+        strip = road.free_ahead(_HALF_STRIP_M)
+        text, arrow = _strip(strip, top_view.x_range_m[0])
+        text += "" if strip.end in (None, "end of view") else f" ({strip.end})"
         if arrow is not None:
             flat = (np.column_stack([arrow, a + arrow @ [b, c] + 0.02]) - eye) @ turn.T
             flat = flat[:, :2] / np.maximum(flat[:, 2:], _NEAR_M)
