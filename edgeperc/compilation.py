@@ -30,17 +30,18 @@ logger = logging.getLogger(__name__)
 KERNELS: Mapping[str, str] = MappingProxyType(
     {
         "scans": "returns.fill_returns returns.has_returns_only adapt.fill_rendered "
-        "decode.fill_labels fitness.fill_scan_sums frame.fill_moved ground.fill_lowest "
+        "decode.fill_labels frame.fill_moved ground.fill_lowest "
         "ground.fit_first_plane projection.fill_image",
+        "fitness": "fitness.fill_scan_sums",
         "crop": "crop.fill_rows",
         "gaps": "adapt.fill_between",
         "turn": "frame.fill_turned",
         "ground": "ground.fill_heights ground.fill_heights_above_plane ground.fill_levels ground.fill_planes",
         "points": "projection.mark_range_image refine.fill_point_labels refine.fill_without_outliers",
         "points outside": "crop.fill_spread",
-        "clusters": "cluster.fill_cluster_labels linkage.chain_points linkage.fill_clusters persons.fill_person_groups "
-        "persons.fill_persons",
-        "boxes": "cluster.fill_groups cluster.fill_rectangle geometry.fill_oriented_iou geometry.mark_nms",
+        "clusters": "linkage.chain_points linkage.fill_clusters",
+        "boxes": "cluster.fill_cluster_labels cluster.fill_groups cluster.fill_rectangle geometry.fill_oriented_iou "
+        "geometry.mark_nms persons.fill_person_groups persons.fill_persons",
         "agreement": "agreement.clear_columns agreement.clear_ground agreement.count_inside agreement.fill_support "
         "persons.complete_persons voting.apply_verdicts voting.fill_tallies voting.fill_verdicts voting.fill_votes",
         "standing": "agreement.sum_inside",

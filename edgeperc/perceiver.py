@@ -293,6 +293,7 @@ class Perceiver:
         )
         needs = {
             "scans": bool(scans),
+            "fitness": self.on_mismatch != "ignore" and any(card.fitness is not None for card in scans),
             "crop": bool(scans) and not gaps,
             "gaps": gaps,
             "turn": points and self.full_turn,

@@ -63,7 +63,8 @@ def kernels(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
 
 def lines() -> list[str]:
     """What stands on the terminal's line, one after the other."""
-    return compilation.sys.stderr.getvalue().split("\r")  # type: ignore[attr-defined, union-attr]
+    terminal: Any = compilation.sys.stderr
+    return str(terminal.getvalue()).split("\r")
 
 
 def test_a_terminal_shows_one_line_with_a_bar(kernels: list[Any]) -> None:
@@ -213,7 +214,8 @@ print(json.dumps([sorted(name for name in names if name.startswith("edgeperc."))
     "options",
     [
         pytest.param({}, id="both"),
-        pytest.param({"models": "lodnn"}, id="road"),
+        pytest.param({"models": "lodnn", "on_mismatch": "ignore"}, id="road"),
+        pytest.param({"boxes_from": "network", "full_turn": True}, id="full turn"),
         pytest.param({"models": "pointseg", "sensor": "vlp-16", "agree": False}, id="coarse sensor"),
     ],
 )
