@@ -179,6 +179,8 @@ def warm_up(
         rehearsed(read_only(floor), MODEL_MOUNTING, Stopwatch())
         if boxes_points:
             compile_parts(["boxes"])  # some only several boxes need
+        if options.rules and (boxes_points or (top is not None and top.card.box_classes)):
+            stand_boxes([UNCERTAIN], *_made_up())
         if top is not None:
             compile_kernels()
 

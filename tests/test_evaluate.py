@@ -869,10 +869,10 @@ def test_the_command_on_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_no_shipped_model_was_trained_on_a_test_scan(kitti_root: Path, semantickitti_root: Path) -> None:
     objects, sequences = KittiObjects(kitti_root), SemanticKitti(semantickitti_root)
     held_back = [*objects.names("test", grades="AB"), *objects.names("validation", grades="AB")]
-    files = [kitti_root / f"training/velodyne/{name}.bin" for name in held_back]
-    files += [semantickitti_root / f"sequences/00/velodyne/{name[3:]}.bin" for name in sequences.names("test")]
-    assert len(files) > 35 + 100
-    hashes = {scan_hash(np.fromfile(file, np.float32)) for file in files}
+    scans = [kitti_root / f"training/velodyne/{name}.bin" for name in held_back]
+    scans += [semantickitti_root / f"sequences/00/velodyne/{name[3:]}.bin" for name in sequences.names("test")]
+    assert len(scans) > 35 + 100
+    hashes = {scan_hash(np.fromfile(scan, np.float32)) for scan in scans}
     assert scan_hash(objects.frame(held_back[0]).points) in hashes
     models = files(".onnx", "models")
     assert len(models) >= len(shipped_models())

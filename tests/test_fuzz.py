@@ -177,7 +177,15 @@ def test_boxes_beyond_the_limits(boxes: list[Box]) -> None:
     tracker.update([NEAR], 0.1)  # the tracker is unchanged
 
 
-@pytest.mark.parametrize("stamp_s", [1e300, 1.7e18, -1e300, 1e-300, 1e-7])
+@pytest.mark.parametrize("stamp_s", [1e-300, 1e-7])
+def test_doubled_stamps_change_no_track(stamp_s: float) -> None:
+    tracker = Tracker()
+    tracker.update([NEAR], 0.0)
+    with pytest.warns(UserWarning, match="late or doubled"):
+        assert tracker.update([NEAR], stamp_s).is_late
+
+
+@pytest.mark.parametrize("stamp_s", [1e300, 1.7e18, -1e300])
 def test_stamps_beyond_the_limits(stamp_s: float) -> None:
     tracker = Tracker()
     tracker.update([NEAR], 0.0)
