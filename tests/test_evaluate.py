@@ -18,6 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from checkout import files
 from edgeperc import cli
 from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.cli import eval, output

@@ -107,8 +107,14 @@ def test_the_second_process_compiles_nothing_and_an_edited_kernel_is_compiled_ag
     assert second["sum"] == first["sum"]
     assert first["folders"] == [str(site / "edgeperc" / "__pycache__")]
     source = site / "edgeperc" / "projection.py"
-    source.write_text(source.read_text("utf-8") + "\n# edited\n", "utf-8")
-    assert use_kernels(site)["misses"] == first["misses"]
+    text = source.read_text("utf-8")
+    source.write_text(text + "\n# edited\n", "utf-8")
+    assert use_kernels(site)["misses"] == 0  # the same machine code
+    assert "\nPIXEL_BLOCK = " in text
+    source.write_text(text.replace("\nPIXEL_BLOCK = ", "\nPIXEL_BLOCK = 2 * "), "utf-8")
+    edited = use_kernels(site)
+    assert edited["misses"] == 1  # that of the kernel that reads it
+    assert edited["sum"] == first["sum"]
 
 
 @needs_compiler
