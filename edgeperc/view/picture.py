@@ -273,7 +273,8 @@ def _draw_top_view(
     if text:
         labels.append(Label(beside_arrow, text, AMBER if arrow is None else INK))
     n_omitted = place_labels(axes, labels, avoid)
-    write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", _omitted("scores; gray: not observed", n_omitted))
+    seen = _omitted("scores", n_omitted) if n_omitted else "scores; gray: not observed"  # both are wider than the panel
+    write_heading(figure, _MARGIN + _AXIS, _TOP - 20, "from above", seen)
     return width
 
 
