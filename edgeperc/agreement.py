@@ -264,14 +264,20 @@ def agree_on_boxes(
 
 
 def stand_boxes(
-    boxes: Sequence[Box], scan: Scan, labels: PointLabels | None, rules: Collection[str] = RULES
+    boxes: Sequence[Box],
+    scan: Scan,
+    labels: PointLabels | None,
+    rules: Collection[str] = RULES,
+    distance_per_m: float = 0.015,
 ) -> tuple[Box, ...]:
     """Give vehicles' boxes the height of their points, and put them on the ground below.
 
-    The bottom of a vehicle is 0.03 m above the ground below its points, its top 0.03 m above the highest of them. The
-    height is that of a vehicle of its class (`TALL_M`); higher points hang over the vehicle and do not count. Vans and
-    trucks, which may end above the view, do not become lower. Points in view that are labeled as another class than a
-    vehicle's do not count. Boxes of other classes, and those that hold fewer than five points, are not changed.
+    The bottom of a vehicle is 0.03 m above the ground below its points. Its top is at least as high as the highest of
+    them, and at most as much higher as two returns of an object may be apart (``distance_per_m`` as in
+    `edgeperc.cluster.find_clusters`): in between, the box keeps its height. The height is that of a vehicle of its class (`TALL_M`); higher points hang over the vehicle and
+    do not count. Vans and trucks, which may end above the view, do not become lower. Points in view that are labeled as
+    another class than a vehicle's do not count. Boxes of other classes, and those that hold fewer than five points, are
+    not changed.
     """
     vehicles = [k for k, box in enumerate(boxes) if box.label in TALL_M]
     if "stand" not in _applicable(rules, scan.ground) or not vehicles:
@@ -295,8 +301,10 @@ def stand_boxes(
         if n >= MIN_STANDING:
             box = boxes[k]
             low, high = TALL_M[box.label]
+            gap_m = distance_per_m * math.hypot(*box.center[:2])
             # What is taller than the sensor may end above its view: the highest point does not show the top.
-            tall = min(max(top, low, box.size[2] if low > MODEL_HEIGHT_M else 0.0), high)
+            most = math.inf if low > MODEL_HEIGHT_M else top + gap_m
+            tall = min(max(box.size[2], top, low), max(most, low), high)
             center = (*box.center[:2], level / n + CLEARANCE_M + 0.5 * tall)
             standing[k] = replace(box, center=center, size=(*box.size[:2], tall))
     return tuple(standing)

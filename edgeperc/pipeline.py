@@ -225,7 +225,7 @@ class Pipeline:
             objects = value("cluster", _objects, scan, agreed, clusters, trusted, options)
             joined = value("cluster", self._join, trusted, objects)
         if rules:
-            joined = value("agree", stand_boxes, joined, scan, agreed, rules)
+            joined = value("agree", stand_boxes, joined, scan, agreed, rules, options.distance_per_m)
         if top is not None and rules:
             marks = value("agree", mark_cells, cells, scan, agreed, rules)
             view = value("agree", _agreed_cells, cells, agreed, joined, boxes, trusted, marks, rules)

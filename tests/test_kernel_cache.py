@@ -197,7 +197,8 @@ def test_unreadable_file_is_compiled_again(place: Place, monkeypatch: pytest.Mon
 def test_an_edited_kernel_replaces_its_file_and_those_of_its_callers(place: Place) -> None:
     place.start()
     names = [file.name for file in place.files]
-    for edit, n_compiled in (("x * x * 1.0", 2), ("x * 1.0 * x", 2), ("x * x", 2)):
+    # Of different lengths: Python reads a source again only if its size or its second of change differs.
+    for edit, n_compiled in (("x * x * 1.0", 2), ("x * 1.00 * x", 2), ("x * x", 2)):
         place.source.write_text(SOURCE.replace("x * x", edit))
         assert place.start() == ([], n_compiled)
         assert place.start() == ([], 0)
