@@ -274,10 +274,10 @@ def stand_boxes(
 
     The bottom of a vehicle is 0.03 m above the ground below its points. Its top is at least as high as the highest of
     them, and at most as much higher as two returns of an object may be apart (``distance_per_m`` as in
-    `edgeperc.cluster.find_clusters`): in between, the box keeps its height. The height is that of a vehicle of its class (`TALL_M`); higher points hang over the vehicle and
-    do not count. Vans and trucks, which may end above the view, do not become lower. Points in view that are labeled as
-    another class than a vehicle's do not count. Boxes of other classes, and those that hold fewer than five points, are
-    not changed.
+    `edgeperc.cluster.find_clusters`): in between, the box keeps its height. The height is that of a vehicle of its
+    class (`TALL_M`); higher points hang over the vehicle and do not count. Vans and trucks, which may end above the
+    view, do not become lower. Points in view that are labeled as another class than a vehicle's do not count. Boxes of
+    other classes, and those that hold fewer than five points, are not changed.
     """
     vehicles = [k for k, box in enumerate(boxes) if box.label in TALL_M]
     if "stand" not in _applicable(rules, scan.ground) or not vehicles:

@@ -610,6 +610,18 @@ def test_vehicles_stand_on_the_ground_below_them(label: str, tall: float, least:
     assert stand_boxes([own], Scan.of(points, replace(ground, plane=None)), None) == (own,)
 
 
+@pytest.mark.parametrize("away", [2.0, 10.0, 20.0, 40.0])
+def test_a_far_box_keeps_its_height_where_the_next_return_may_be_missing(away: float) -> None:
+    sides = block(away, 0.0, (4.0, 1.7, 1.4), 1)
+    points = np.column_stack([sides[:, :2], sides[:, 2] + GROUND_Z, np.zeros(len(sides))]).astype(np.float32)
+    ground = Ground(np.zeros(len(sides), np.bool_), sides[:, 2].astype(np.float32), (0.0, 0.0, GROUND_Z))
+    box = Box("car", 0.6, (away, 0.0, -0.9), (4.1, 1.8, 1.6), 0.0)
+    (standing,) = stand_boxes([box], Scan.of(points, ground), None)
+    most = sides[:, 2].max() + 0.015 * away
+    assert standing.size[2] == pytest.approx(min(max(most, 1.4), 1.6), abs=1e-6)
+    assert (standing.size[2] == 1.6) == (away > 30.0)
+
+
 def test_cyclist_is_one_object() -> None:
     rider = block(9.0, 1.0, (1.7, 0.5, 1.7), 2, 0.1)
     rider[::3, 3] = 3
