@@ -224,19 +224,34 @@ class Pipeline:
         if self.ranged and options.boxes_from != "network":
             objects = value("cluster", _objects, scan, agreed, clusters, trusted, options)
             joined = value("cluster", self._join, trusted, objects)
+        standing = joined
         if rules:
-            joined = value("agree", stand_boxes, joined, scan, agreed, rules, options.distance_per_m)
+            standing = value("agree", stand_boxes, joined, scan, agreed, rules, options.distance_per_m)
         if top is not None and rules:
             marks = value("agree", mark_cells, cells, scan, agreed, rules)
             view = value("agree", _agreed_cells, cells, agreed, joined, boxes, trusted, marks, rules)
 
+        # The second lane has time for what needs no labels. In a turn, the lane that finds no sector left takes it.
+        aside = [strips, cells]
         self._lanes.run(
-            [near, projected, scan, *sectors, strips, cells, labels, clusters, agreed, trusted, joined, view],
-            [planes, boxes, *reversed(sectors), strips, cells, upright, marks],
+            [
+                near,
+                projected,
+                scan,
+                *sectors,
+                *(aside if sectors else ()),
+                labels,
+                clusters,
+                agreed,
+                trusted,
+                joined,
+                view,
+            ],
+            [planes, boxes, *reversed(sectors), *aside, upright, marks, standing],
         )
         labeled = agreed()
         whole = None if labeled is None else spread([(labeled, near().rows)], len(points))
-        return Parts(whole, view(), joined())
+        return Parts(whole, view(), standing())
 
     def _select(self, points: NDArray[np.float32]) -> View:
         return View(*self.crop.select(points))
