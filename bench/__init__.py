@@ -1,5 +1,5 @@
 """Measure edgeperc's latency on this computer (extra ``bench``)."""
 
-from edgeperc.extras import without_telemetry
+from edgeperc.system.extras import without_telemetry
 
 without_telemetry()  # modules of this package import onnxruntime themselves

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from edgeperc.card import TopViewGeometry
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
 from edgeperc.evaluation.tables import VEHICLES
 from edgeperc.simulation.samples import IGNORE, labels_by_boxes
 from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES, SimulatedScan
+from edgeperc.types.card import TopViewGeometry
 
 from .worker import Prediction
 

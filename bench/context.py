@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from edgeperc import __version__
-from edgeperc.extras import require
-from edgeperc.tuning import cpu_model
+from edgeperc.system.extras import require
+from edgeperc.system.machine import cpu_model
 
 __all__ = [
     "EnergyMeter",

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from edgeperc import EdgepercError
-from edgeperc.atomic import write_atomic
+from edgeperc.system.atomic import write_atomic
 
 from .samples import noise_floor, percentile, summary
 

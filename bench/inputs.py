@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from edgeperc import Box, PointsError, read_points
 from edgeperc.readers.captures import SCAN_SUFFIXES
-from edgeperc.sensor import get_sensor
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
+from edgeperc.types.sensor import get_sensor
 
 __all__ = ["Input", "crowd", "raw", "read_input", "simulated_input", "sized", "store"]
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeperc.extras import require
+from edgeperc.system.extras import require
 
 from .scenarios import KeepGoing, Limits, Perceive, Timings, back_to_back
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
-from edgeperc.session import PRECISIONS, PROVIDERS
+from edgeperc.inference.session import PRECISIONS, PROVIDERS
 from edgeperc.zoo import DEFAULT
 
 __all__ = [

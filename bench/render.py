@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TextIO
 
-from edgeperc.printable import printable
+from edgeperc.system.printable import printable
 
 from .samples import summary
 

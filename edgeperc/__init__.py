@@ -46,27 +46,27 @@ from .errors import (
 )
 
 if TYPE_CHECKING:
-    from .calibration import Calibration
-    from .card import ModelCard
-    from .drivable import FreeAhead, RoadAhead, free_ahead, road_ahead
-    from .frame import ModelFrame
-    from .listing import ModelInfo, ProviderInfo, SensorInfo, models, providers, sensors
+    from .camera.calibration import Calibration
+    from .camera.painting import camera_road, paint
+    from .inference.listing import ModelInfo, ProviderInfo, SensorInfo, models, providers, sensors
     from .live import Answer, Stream, stream
-    from .motion import Motion, Trajectory, deskew, merge
-    from .mounting import Mounting
-    from .moving import movable_points, moving_points
-    from .occupancy import OccupancyGrid, occupancy_grid
-    from .painting import camera_road, paint
     from .perceiver import Perceiver
-    from .perception import Box, DroppedPoints, ImageLabels, Perception, PointLabels, TopView
+    from .preprocess.motion import Motion, Trajectory, deskew, merge
     from .readers.captures import read_scans, read_timed_scans, sensor_of
     from .readers.files import read_points
     from .readers.images import read_image
     from .readers.times import TimedScan
-    from .sensor import SensorProfile
+    from .road.ahead import FreeAhead, RoadAhead, free_ahead, road_ahead
+    from .road.grid import OccupancyGrid, occupancy_grid
     from .tracking import Track, Tracker, Tracks
+    from .tracking.moving import movable_points, moving_points
+    from .tracking.zones import Crossing, Line, Zone
+    from .types.card import ModelCard
+    from .types.frame import ModelFrame
+    from .types.mounting import Mounting
+    from .types.perception import Box, DroppedPoints, ImageLabels, Perception, PointLabels, TopView
+    from .types.sensor import SensorProfile
     from .view import draw
-    from .zones import Crossing, Line, Zone
 
 __all__ = [
     "Answer",
@@ -143,52 +143,52 @@ __version__ = "0.1.0"
 
 _MODULES = {
     "Answer": "live",
-    "Box": "perception",
-    "Crossing": "zones",
-    "ImageLabels": "perception",
-    "Line": "zones",
-    "Calibration": "calibration",
-    "FreeAhead": "drivable",
-    "ModelCard": "card",
-    "ModelFrame": "frame",
-    "ModelInfo": "listing",
-    "Motion": "motion",
-    "Mounting": "mounting",
-    "OccupancyGrid": "occupancy",
+    "Box": "types.perception",
+    "Crossing": "tracking.zones",
+    "ImageLabels": "types.perception",
+    "Line": "tracking.zones",
+    "Calibration": "camera.calibration",
+    "FreeAhead": "road.ahead",
+    "ModelCard": "types.card",
+    "ModelFrame": "types.frame",
+    "ModelInfo": "inference.listing",
+    "Motion": "preprocess.motion",
+    "Mounting": "types.mounting",
+    "OccupancyGrid": "road.grid",
     "Perceiver": "perceiver",
-    "Perception": "perception",
-    "DroppedPoints": "perception",
-    "PointLabels": "perception",
-    "ProviderInfo": "listing",
-    "RoadAhead": "drivable",
-    "SensorInfo": "listing",
-    "SensorProfile": "sensor",
+    "Perception": "types.perception",
+    "DroppedPoints": "types.perception",
+    "PointLabels": "types.perception",
+    "ProviderInfo": "inference.listing",
+    "RoadAhead": "road.ahead",
+    "SensorInfo": "inference.listing",
+    "SensorProfile": "types.sensor",
     "Stream": "live",
     "TimedScan": "readers.times",
-    "TopView": "perception",
+    "TopView": "types.perception",
     "Track": "tracking",
     "Tracker": "tracking",
     "Tracks": "tracking",
-    "Trajectory": "motion",
-    "Zone": "zones",
-    "camera_road": "painting",
-    "deskew": "motion",
+    "Trajectory": "preprocess.motion",
+    "Zone": "tracking.zones",
+    "camera_road": "camera.painting",
+    "deskew": "preprocess.motion",
     "draw": "view",
-    "free_ahead": "drivable",
-    "merge": "motion",
-    "models": "listing",
-    "movable_points": "moving",
-    "moving_points": "moving",
-    "occupancy_grid": "occupancy",
-    "paint": "painting",
-    "providers": "listing",
+    "free_ahead": "road.ahead",
+    "merge": "preprocess.motion",
+    "models": "inference.listing",
+    "movable_points": "tracking.moving",
+    "moving_points": "tracking.moving",
+    "occupancy_grid": "road.grid",
+    "paint": "camera.painting",
+    "providers": "inference.listing",
     "read_image": "readers.images",
     "read_points": "readers.files",
     "read_scans": "readers.captures",
     "read_timed_scans": "readers.captures",
-    "road_ahead": "drivable",
+    "road_ahead": "road.ahead",
     "sensor_of": "readers.captures",
-    "sensors": "listing",
+    "sensors": "inference.listing",
     "stream": "live",
 }
 

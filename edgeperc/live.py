@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from .clock import LATEST_S, Clock
 from .errors import EdgepercError, OptionError, PointsError, StampError
-from .perception import Perception
 from .readers.captures import read_scans, sensor_of
 from .readers.identify import contradicts
-from .sensor import SensorProfile
+from .system.clock import LATEST_S, Clock
+from .types.perception import Perception
+from .types.sensor import SensorProfile
 
 __all__ = ["Answer", "Health", "Stream", "stream"]
 

@@ -17,25 +17,25 @@ from typing import Literal, NamedTuple, NoReturn, ParamSpec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .adapt import Interpolator, scale
-from .agreement import RULES
-from .card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
-from .cluster import MIN_SCORE
-from .compilation import Compilation, kernels_of
+from .agreement.rules import RULES
+from .camera.image import ImageScaler, as_image, label_pixels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
-from .fitness import Finding, FitnessProfile, check_dropped, check_profiles
-from .frame import ModelFrame
-from .image import ImageScaler, as_image, label_pixels
-from .lanes import Lanes, Stopwatch
-from .level import MountingEstimate, MountingEstimator
-from .mounting import Mounting
-from .perception import ImageLabels, Perception
+from .ground.leveling import MountingEstimate, MountingEstimator
+from .inference.session import Session
+from .objects.cluster import MIN_SCORE
 from .pipeline import BoxesFrom, Options, Pipeline, RangeImageNetwork, TopViewNetwork
-from .points import as_points
-from .remission import RemissionMatcher
-from .returns import about_too_near, returns
-from .sensor import SensorProfile, get_sensor
-from .session import Session
+from .preprocess.condition import Interpolator, scale
+from .preprocess.fitness import Finding, FitnessProfile, check_dropped, check_profiles
+from .preprocess.remission import RemissionMatcher
+from .preprocess.returns import about_too_near, returns
+from .system.compilation import Compilation, kernels_of
+from .system.lanes import Lanes, Stopwatch
+from .types.card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
+from .types.frame import ModelFrame
+from .types.mounting import Mounting
+from .types.perception import ImageLabels, Perception
+from .types.points import as_points
+from .types.sensor import SensorProfile, get_sensor
 from .warm_up import Rehearsed, n_processes, warm_up
 from .zoo import CAMERA, DEFAULT, resolve
 
@@ -151,11 +151,11 @@ class Perceiver:
         fit-sensor``, or a profile.
     mounting : Mounting or None
         How the sensor is mounted. What is None in it is estimated from the ground in the first five scans that show
-        it (`edgeperc.level.MountingEstimator`). None: as the sensor's profile says, which for the built-in ones is
+        it (`leveling.MountingEstimator`). None: as the sensor's profile says, which for the built-in ones is
         nothing.
     provider : str
         ``"auto"``, ``"cpu"``, ``"openvino"``, ... Any other value than ``"auto"`` is required, without fallback
-        (`edgeperc.session.PROVIDERS`).
+        (`edgeperc.inference.session.PROVIDERS`).
     precision : {"auto", "fp32", "bf16", "int8"}
         Precision of the networks. ``"auto"`` takes a reduced precision if the processor computes it natively and the
         card shows a loss of at most 0.3 points (`edgeperc.zoo.choose`). Any other value is required.
@@ -165,7 +165,7 @@ class Perceiver:
         not depend on it.
     on_mismatch : {"refuse", "warn", "raise", "ignore"}
         What to do when one of the first five scans is unlike the training scans. ``"refuse"``: raise FitnessError,
-        before anything is perceived, if a difference is gross (`edgeperc.fitness.check_fitness` lists them), and warn
+        before anything is perceived, if a difference is gross (`fitness.check_fitness` lists them), and warn
         of others. ``"warn"``: warn of all. ``"raise"``: raise FitnessError for any. ``"ignore"``: skip the check.
     score_threshold : float or None
         Lowest score of a box, in 0..1. None takes the card's threshold for boxes of a network, and 0.3 for boxes of
@@ -173,25 +173,25 @@ class Perceiver:
     adapt : {"both", "remission", "interpolation", "none"}
         How to adapt scans of a sensor that the models were not trained on. ``"remission"``: convert its remission to
         that of the training sensor, by the function of its profile or one that is matched to the first five scans
-        (`edgeperc.remission.RemissionMatcher`). ``"interpolation"``: fill the range image
+        (`edgeperc.preprocess.remission.RemissionMatcher`). ``"interpolation"``: fill the range image
         between its beams and columns, if they are fewer. Scans of the training sensor are not changed.
     boxes_from : {"both", "network", "clusters"}
         ``"network"``: boxes of a top-view model, vehicles ahead. ``"clusters"``: boxes around clusters of labeled
         points above the ground, of every class and everywhere in the range image
-        (`edgeperc.cluster.objects_from_points`). ``"both"``: use both. A cluster's box is dropped if it overlaps a
+        (`cluster.objects_from_points`). ``"both"``: use both. A cluster's box is dropped if it overlaps a
         network's box, unless it is a person's with the better score. Otherwise it stays wherever it is: a network that
         detects its class, and sees it, but has not found it, halves its score, in part if it sees the object in part.
     full_turn : bool
         Run a range-image model once for each sector, four times for the shipped models. Every point then has a class,
         and there are boxes beside and behind the vehicle.
     agree : bool or collection of str
-        Correct the parts of the result by one another (`edgeperc.agreement`): the clusters of points above the ground
+        Correct the parts of the result by one another (`agreement.rules`): the clusters of points above the ground
         vote on their class, boxes support or complete labels, and no cell below an object is drivable. Boxes below
         ``score_threshold`` take no part. False, for comparisons: labels and cells are those of the networks. Of a
-        collection, the rules apply that it names (`edgeperc.agreement.RULES`).
+        collection, the rules apply that it names (`edgeperc.agreement.rules.RULES`).
     trusted : bool
         Open model files whose graphs are otherwise refused: with unusual operators, functions, subgraphs or sizes
-        (`edgeperc.session.Session`). Only for files whose origin you know.
+        (`edgeperc.inference.session.Session`). Only for files whose origin you know.
 
     Attributes
     ----------
@@ -284,7 +284,7 @@ class Perceiver:
             self._construct(wanted, provider, precision, n_threads, trusted)
 
     def _kernel_needs(self, cards: Sequence[ModelCard]) -> list[str]:
-        """Which kernels are needed: keys of `edgeperc.compilation.KERNELS`."""
+        """Which kernels are needed: keys of `edgeperc.system.compilation.KERNELS`."""
         kinds, scans = {card.view.kind for card in cards}, [c for c in cards if not isinstance(c.view, CameraGeometry)]
         points, top_view = "range_image" in kinds, "top_view" in kinds
         boxes, agreement = points and self.boxes_from != "network", points and bool(self.agree)

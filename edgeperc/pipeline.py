@@ -10,27 +10,27 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .adapt import Interpolator
-from .agreement import agree_on_boxes, agree_on_points, find_support, find_voters, stand_boxes, without_poles
-from .card import RangeImageGeometry, TopViewGeometry
-from .cells import agree_on_cells, mark_cells
-from .cluster import join_boxes, objects_from_points, sort_points
-from .crop import Crop, sectors_of_turn, spread
-from .decode import decode_boxes, decode_cells, decode_labels
-from .frame import turned
-from .geometry import oriented_iou, rectangles, shared_area
-from .ground import GroundFit, fit_ground
-from .lanes import Lanes, Once, Stopwatch
-from .linkage import Strips
-from .mounting import MODEL_HEIGHT_M, Mounting
-from .network_input import input_heights
-from .observed import Observer
-from .perception import Box, PointLabels, TopView
-from .projection import RangeImageProjector, make_projector
-from .refine import label_points, remove_outliers
-from .scan import Scan
-from .sensor import SensorProfile
-from .session import Session
+from .agreement.cells import agree_on_cells, mark_cells
+from .agreement.rules import agree_on_boxes, agree_on_points, find_support, find_voters, stand_boxes, without_poles
+from .ground.observed import Observer
+from .ground.planes import GroundFit, fit_ground
+from .ground.scan import Scan
+from .inference.crop import Crop, sectors_of_turn, spread
+from .inference.decode import decode_boxes, decode_cells, decode_labels
+from .inference.network_input import input_heights
+from .inference.projection import RangeImageProjector, make_projector
+from .inference.session import Session
+from .objects.cluster import join_boxes, objects_from_points, sort_points
+from .objects.linkage import Strips
+from .objects.refine import label_points, remove_outliers
+from .preprocess.condition import Interpolator
+from .system.lanes import Lanes, Once, Stopwatch
+from .types.card import RangeImageGeometry, TopViewGeometry
+from .types.frame import turned
+from .types.geometry import oriented_iou, rectangles, shared_area
+from .types.mounting import MODEL_HEIGHT_M, Mounting
+from .types.perception import Box, PointLabels, TopView
+from .types.sensor import SensorProfile
 
 __all__ = ["BoxesFrom", "Options", "Parts", "Pipeline", "RangeImageNetwork", "TopViewNetwork", "weigh"]
 
@@ -50,7 +50,7 @@ class Options:
     """How the parts become one answer (`edgeperc.Perceiver`).
 
     Boxes below ``network_score`` and ``cluster_score`` are dropped. ``distance_per_m`` links the points of an object
-    (`edgeperc.cluster.find_clusters`).
+    (`edgeperc.objects.cluster.find_clusters`).
     """
 
     rules: frozenset[str]

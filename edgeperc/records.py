@@ -7,13 +7,13 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .drivable import road_ahead
 from .errors import TrackingError
-from .perception import Box
+from .road.ahead import road_ahead
+from .types.perception import Box
 
 if TYPE_CHECKING:
-    from .perception import Perception
     from .tracking.tracks import Tracks
+    from .types.perception import Perception
 
 __all__ = ["SCAN_KEYS", "read_boxes", "scan_record"]
 

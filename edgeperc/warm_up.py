@@ -3,7 +3,7 @@
 `warm_up` runs the pipeline on small scans. At the first start, helper processes compile a part of the kernels while the
 process that needs them compiles the rest, because numba compiles in one thread. Where the cache of kernels is empty and
 can be written, `Helpers` starts one process for each further core, three at most. A helper runs this package in a new
-interpreter and puts what it compiles into the cache; `edgeperc.kernel_cache` finds it there. It opens no model, writes
+interpreter and puts what it compiles into the cache; `system.kernel_cache` finds it there. It opens no model, writes
 nothing else, and never imports the caller's main module. It ends by itself when its part is compiled, when the process
 that started it has ended, or after two minutes, and is killed when construction ends. Everything that is not in the
 cache afterwards is compiled as without helpers: one that cannot start, fails or hangs costs time and changes nothing.
@@ -35,8 +35,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .adapt import render
-from .agreement import (
+from .agreement.cells import agree_on_cells, mark_cells
+from .agreement.rules import (
     Support,
     agree_on_boxes,
     agree_on_points,
@@ -46,29 +46,29 @@ from .agreement import (
     stand_boxes,
     without_poles,
 )
-from .cells import agree_on_cells, mark_cells
-from .cluster import fill_rectangle, join_boxes, objects_from_points
-from .drivable import compile_kernels
 from .errors import MountingError
-from .fitness import FitnessProfile, check_profiles
-from .frame import ModelFrame
-from .geometry import suppress_overlaps
-from .ground import Ground, fill_planes, find_ground
-from .kernel_cache import KernelCache, fewer_collections, tell_watchers
-from .lanes import Lanes, Stopwatch
-from .level import MountingEstimator
-from .linkage import fill_clusters
-from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
-from .outline import merge_corners
-from .perception import Box, PointLabels, TopView
+from .ground.leveling import MountingEstimator
+from .ground.planes import Ground, fill_planes, find_ground
+from .ground.scan import Scan
+from .inference.session import Session
+from .objects.cluster import fill_rectangle, join_boxes, objects_from_points
+from .objects.linkage import fill_clusters
 from .pipeline import Pipeline, RangeImageNetwork, TopViewNetwork, View
-from .points import read_only
-from .remission import NO_REMISSION
-from .returns import returns
-from .scan import Scan
-from .sensor import SensorProfile
-from .session import Session
-from .tuning import usable_cores
+from .preprocess.condition import render
+from .preprocess.fitness import FitnessProfile, check_profiles
+from .preprocess.remission import NO_REMISSION
+from .preprocess.returns import returns
+from .road.ahead import compile_kernels
+from .road.outline import merge_corners
+from .system.kernel_cache import KernelCache, fewer_collections, tell_watchers
+from .system.lanes import Lanes, Stopwatch
+from .system.machine import usable_cores
+from .types.frame import ModelFrame
+from .types.geometry import suppress_overlaps
+from .types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
+from .types.perception import Box, PointLabels, TopView
+from .types.points import read_only
+from .types.sensor import SensorProfile
 
 __all__ = ["Helpers", "Rehearsed", "car_and_person", "compile_parts", "n_processes", "warm_up"]
 

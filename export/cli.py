@@ -331,7 +331,7 @@ def _recipe(args: argparse.Namespace) -> Recipe:
 
 
 def _simulate(args: argparse.Namespace) -> int:
-    from .simulate import simulate
+    from .data.simulate import simulate
 
     simulate(args.out, args.n, first=args.first, layouts_root=args.layouts, sensor=args.sensor, n_workers=args.workers)
     return 0
@@ -339,9 +339,9 @@ def _simulate(args: argparse.Namespace) -> int:
 
 def _train(args: argparse.Namespace) -> int:
     recipe = _recipe(args)
-    from edgeperc.evaluation.scan_folder import ScanFolder
+    from edgeperc.datasets.scan_folder import ScanFolder
 
-    from .train import train
+    from .training.train import train
 
     checkpoint = train(
         recipe,
@@ -363,7 +363,7 @@ def _train(args: argparse.Namespace) -> int:
 
 
 def _curve(args: argparse.Namespace) -> int:
-    from .curve import curve_table
+    from .training.curve import curve_table
 
     for run in args.runs:
         for line in curve_table(run, args.lines):
@@ -372,9 +372,9 @@ def _curve(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    from .checkpoint import read_checkpoint
-    from .simulate import fitness_of, parity_images, parity_scans
-    from .to_onnx import export
+    from .data.simulate import fitness_of, parity_images, parity_scans
+    from .release.to_onnx import export
+    from .training.checkpoint import read_checkpoint
 
     metrics = json.loads(args.metrics.read_text()) if args.metrics else None
     camera = read_checkpoint(args.checkpoint)["recipe"].task == "camera"
@@ -393,8 +393,8 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    from .simulate import parity_images, parity_scans
-    from .to_onnx import load, verify
+    from .data.simulate import parity_images, parity_scans
+    from .release.to_onnx import load, verify
 
     network, recipe, _ = load(args.checkpoint)
     samples = parity_images(args.scans) if recipe.task == "camera" else parity_scans(args.scans)
@@ -406,9 +406,9 @@ def _card(args: argparse.Namespace) -> int:
     import onnx
     from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 
-    from edgeperc.card import ModelCard
+    from edgeperc.types.card import ModelCard
 
-    from .to_onnx import with_golden, write_card
+    from .release.to_onnx import with_golden, write_card
 
     try:
         model = onnx.load(args.model)
@@ -421,7 +421,7 @@ def _card(args: argparse.Namespace) -> int:
 
 
 def _quantize(args: argparse.Namespace) -> int:
-    from .quantize import calibration_images, calibration_scans, quantize
+    from .release.quantize import calibration_images, calibration_scans, quantize
 
     scans: Sequence[Any]
     if args.camvid is not None:
@@ -452,7 +452,7 @@ def _quantize(args: argparse.Namespace) -> int:
 
 
 def _agree(args: argparse.Namespace) -> int:
-    from .agree import agree, summary
+    from .release.agree import agree, summary
 
     measured = agree(
         args.models,
@@ -470,7 +470,7 @@ def _agree(args: argparse.Namespace) -> int:
 
 
 def _make(args: argparse.Namespace) -> int:
-    from edgeperc.evaluation.scan_folder import ScanFolder
+    from edgeperc.datasets.scan_folder import ScanFolder
 
     from .make import make
 
@@ -496,7 +496,7 @@ def _make(args: argparse.Namespace) -> int:
 def _ablate(args: argparse.Namespace) -> int:
     if args.network == "camvid":
         return _ablate_camvid(args)
-    from .ablation import ablate, plot
+    from .training.ablation import ablate, plot
 
     if args.kitti is None or args.simulated is None:
         raise ValueError(f"{args.network} is trained on real and simulated scans; give --kitti and --simulated")
@@ -529,7 +529,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _ablate_camvid(args: argparse.Namespace) -> int:
-    from .camvid import ablate_camvid, plot_camvid, show_camvid, table
+    from .training.camvid import ablate_camvid, plot_camvid, show_camvid, table
 
     if args.camvid is None:
         raise ValueError("no images to train on; give --camvid")
@@ -559,7 +559,7 @@ def _ablate_camvid(args: argparse.Namespace) -> int:
 def _triton(args: argparse.Namespace) -> int:
     from edgeperc.zoo import DEFAULT
 
-    from .triton import write_repository
+    from .release.triton import write_repository
 
     for folder in write_repository(args.out, args.model or DEFAULT, sensor=args.sensor):
         print_line(str(folder))
@@ -567,7 +567,7 @@ def _triton(args: argparse.Namespace) -> int:
 
 
 def _models(args: argparse.Namespace) -> int:
-    from .models_page import models_page
+    from .release.models_page import models_page
 
     (args.folder / "MODELS.md").write_text(models_page(args.folder))
     return 0

@@ -10,15 +10,15 @@ from typing import Any
 
 import onnx
 
-from edgeperc.card import ModelCard
+from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.evaluation.camvid import evaluate_images
 from edgeperc.evaluation.evaluate import evaluate
-from edgeperc.evaluation.scan_folder import ScanFolder
+from edgeperc.types.card import ModelCard
 
+from .data.simulate import fitness_of, parity_images, parity_scans, simulate
 from .recipe import MODELS
-from .simulate import fitness_of, parity_images, parity_scans, simulate
-from .to_onnx import export, write_card
-from .train import train
+from .release.to_onnx import export, write_card
+from .training.train import train
 
 __all__ = ["finish", "make"]
 
@@ -68,7 +68,7 @@ def make(
     n_threads : int or None
     n_workers : int
     compiled : bool
-        As for `edgeperc_export.train.train`.
+        As for `edgeperc_export.training.train.train`.
     version : str
         Version to write into the card.
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
-from edgeperc.card import ModelCard
 from edgeperc.errors import ModelFileError, ProviderError
-from edgeperc.onnx_file import read_model
+from edgeperc.types.card import ModelCard
+from edgeperc.types.onnx_file import read_model
 
 __all__ = [
     "BF16_FEATURES",
@@ -42,7 +42,7 @@ CAMERA = "camseg"
 MAX_LOSS = 0.3
 """Largest loss of mean IoU or AP, in percentage points, that ``precision="auto"`` accepts for speed."""
 
-# Processor flags (`edgeperc.tuning.cpu_features`). Without a dot product of bytes, x86 adds pairs of 8-bit products in
+# Processor flags (`machine.cpu_features`). Without a dot product of bytes, x86 adds pairs of 8-bit products in
 # 16 bits, which saturates. int8 is then not faster than fp32.
 INT8_FEATURES = frozenset({"avx512_vnni", "avx_vnni", "amx_int8", "asimddp"})
 BF16_FEATURES = frozenset({"amx_bf16", "avx512_bf16"})
@@ -186,10 +186,10 @@ def choose(
     variants : sequence of Variant
         Of one network, from `resolve`.
     provider : str
-        A key of `edgeperc.session.PROVIDERS`.
+        A key of `edgeperc.inference.session.PROVIDERS`.
     precision : {"auto", "fp32", "bf16", "int8"}
     features : collection of str
-        Flags of the processor (`edgeperc.tuning.cpu_features`); empty if they are not known. ``"auto"`` then takes
+        Flags of the processor (`machine.cpu_features`); empty if they are not known. ``"auto"`` then takes
         no reduced precision.
 
     Returns

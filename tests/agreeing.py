@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import Box, PointLabels, TopView
-from edgeperc.agreement import RULES, agree_on_points, find_support, find_voters, without_poles
-from edgeperc.cells import agree_on_cells, mark_cells
-from edgeperc.ground import Ground
-from edgeperc.scan import Scan
+from edgeperc.agreement.cells import agree_on_cells, mark_cells
+from edgeperc.agreement.rules import RULES, agree_on_points, find_support, find_voters, without_poles
+from edgeperc.ground.planes import Ground
+from edgeperc.ground.scan import Scan
 
 
 def voters_of(

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from edgeperc import cli
-from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
 
 POINTSEG = ModelCard(
     name="pointseg",

@@ -10,9 +10,9 @@ import numpy as np
 import onnx
 from PIL import Image
 
-from edgeperc.card import CARD_KEY, InputSpec, ModelCard, OutputSpec, TopViewGeometry
-from edgeperc.perception import Box
 from edgeperc.simulation.samples import simulated_scan
+from edgeperc.types.card import CARD_KEY, InputSpec, ModelCard, OutputSpec, TopViewGeometry
+from edgeperc.types.perception import Box
 from edgeperc_export.database.scenes import Plan
 
 DRIVES = ("0005", "0005", "0005", "0048", "0029", "0013", "0014", "0011")

@@ -14,9 +14,9 @@ from edgeperc import Perception, PointLabels
 from edgeperc.ros2.graph import SENSOR_DATA
 from edgeperc.ros2.messages import CLOUD, RosMessages
 from edgeperc.ros2.zenoh_graph import ZenohGraph
-from edgeperc.sensor import get_sensor
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
+from edgeperc.types.sensor import get_sensor
 
 __all__ = ["FIELDS", "MESSAGES", "TIMEOUT_S", "Perceive", "cloud", "publish", "scans", "until"]
 

@@ -15,9 +15,9 @@ from arm import answers
 from arm.compare import COLUMNS, MAX_UNLIKE, compare, read, unlike_boxes, unlike_values
 from arm.environment import CPUS, cpuinfo
 
-from edgeperc import tuning
-from edgeperc.session import golden_input
+from edgeperc.inference.session import golden_input
 from edgeperc.simulation.samples import simulated_scan
+from edgeperc.system import machine
 from edgeperc.zoo import DEFAULT, choose, model_path, resolve
 from edgeperc_bench import context
 
@@ -31,7 +31,7 @@ def show_cpuinfo(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(sys, "platform", "linux")
 
     def show(text: str) -> None:
-        monkeypatch.setattr(tuning, "_text", lambda path: text if path == Path("/proc/cpuinfo") else None)
+        monkeypatch.setattr(machine, "_text", lambda path: text if path == Path("/proc/cpuinfo") else None)
         monkeypatch.setattr(context, "_read", lambda path: text)
 
     return show
@@ -41,21 +41,21 @@ def show_cpuinfo(monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_int8_is_taken_with_dot_products_only(show_cpuinfo: Any, cpu: str, expected: str) -> None:
     show_cpuinfo(cpuinfo(cpu))
     for model in DEFAULT:
-        assert choose(resolve(model), "cpu", "auto", tuning.cpu_features())[1] == expected
+        assert choose(resolve(model), "cpu", "auto", machine.cpu_features())[1] == expected
 
 
 def test_arm_processors_without_a_name_have_different_fingerprints(show_cpuinfo: Any) -> None:
     prints = set()
     for cpu, (part, _) in CPUS.items():
         show_cpuinfo(cpuinfo(cpu))
-        assert tuning.cpu_model() == f"ARM implementer 0x41 part {part}"
-        prints.add(tuning.fingerprint())
+        assert machine.cpu_model() == f"ARM implementer 0x41 part {part}"
+        prints.add(machine.fingerprint())
     assert len(prints) == len(CPUS)
     big_and_little = cpuinfo("neoverse-n1") + "\n" + cpuinfo("cortex-a53") * 2
     show_cpuinfo(big_and_little)
-    assert tuning.cpu_model() == "ARM implementer 0x41 part 0xd03, ARM implementer 0x41 part 0xd0c"
+    assert machine.cpu_model() == "ARM implementer 0x41 part 0xd03, ARM implementer 0x41 part 0xd0c"
     show_cpuinfo(f"{big_and_little}\nModel\t\t: Raspberry Pi 5 Model B Rev 1.0")
-    assert tuning.cpu_model() == "Raspberry Pi 5 Model B Rev 1.0"
+    assert machine.cpu_model() == "Raspberry Pi 5 Model B Rev 1.0"
 
 
 def test_a_hypervisor_is_unknown_on_arm(show_cpuinfo: Any) -> None:

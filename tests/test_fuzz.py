@@ -30,13 +30,13 @@ from tiny_model import field
 
 import edgeperc.perceiver as perceiver_module
 from edgeperc import Box, Perceiver, SensorProfile, Tracker
-from edgeperc.card import ModelCard, RangeImageGeometry, TopViewGeometry
 from edgeperc.errors import EdgepercError, InferenceError, ModelFileError, PointsError, TrackingError
-from edgeperc.fitness import FitnessProfile
+from edgeperc.inference.session import Session
+from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.records import read_boxes
-from edgeperc.sensor import get_sensor
-from edgeperc.session import Session
-from edgeperc.tuning import read_setting
+from edgeperc.system.machine import read_setting
+from edgeperc.types.card import ModelCard, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.sensor import get_sensor
 
 CORPUS = files("", "tests/fuzz/corpus")
 
@@ -265,10 +265,10 @@ CHANGES: list[Callable[[dict[str, Any]], Any]] = [
 def test_damaged_checkpoints(tmp_path: Path, change: int) -> None:
     torch = pytest.importorskip("torch")
     pytest.importorskip("onnx")
-    from edgeperc_export.checkpoint import CheckpointError
     from edgeperc_export.networks import build
     from edgeperc_export.recipe import Recipe
-    from edgeperc_export.to_onnx import load
+    from edgeperc_export.release.to_onnx import load
+    from edgeperc_export.training.checkpoint import CheckpointError
 
     recipe = Recipe("lodnn", edge=True)
     texts = {"recipe": json.dumps(vars(recipe)), "frames": "{}", "before": "[]", "curve": "[]"}

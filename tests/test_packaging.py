@@ -46,7 +46,7 @@ def conda(texts: list[str]) -> dict[str, Any]:
 
 
 def wanted_extras() -> Iterator[tuple[str, str]]:
-    """File and extra of each call of `edgeperc.extras.require`."""
+    """File and extra of each call of `edgeperc.system.extras.require`."""
     for file in files(".py", "edgeperc", "bench", "export"):
         for node in ast.walk(ast.parse(file.read_text("utf-8"))):
             named = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "require"

@@ -32,27 +32,24 @@ from edgeperc import (
     PointsError,
     ProviderError,
     SensorError,
-    adapt,
-    cluster,
-    decode,
-    drivable,
-    fitness,
-    geometry,
-    ground,
     pipeline,
-    projection,
-    refine,
-    session,
 )
-from edgeperc.card import RangeImageGeometry, TopViewGeometry
-from edgeperc.geometry import inside, oriented_iou
-from edgeperc.lanes import Stopwatch
-from edgeperc.mounting import MODEL_MOUNTING
-from edgeperc.perception import PointLabels
+from edgeperc.ground import planes
+from edgeperc.inference import decode, projection, session
+from edgeperc.objects import cluster, refine
 from edgeperc.pipeline import weigh
-from edgeperc.sensor import get_sensor
+from edgeperc.preprocess import condition
+from edgeperc.preprocess import fitness
+from edgeperc.road import ahead
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import SimulatedScan, simulate
+from edgeperc.system.lanes import Stopwatch
+from edgeperc.types import geometry
+from edgeperc.types.card import RangeImageGeometry, TopViewGeometry
+from edgeperc.types.geometry import inside, oriented_iou
+from edgeperc.types.mounting import MODEL_MOUNTING
+from edgeperc.types.perception import PointLabels
+from edgeperc.types.sensor import get_sensor
 from edgeperc.zoo import model_path, shipped_models
 
 
@@ -787,7 +784,7 @@ def test_the_first_call_compiles_nothing(scan: SimulatedScan, options: dict[str,
     """Construction compiles every kernel that a call needs, whatever the layout of the scan in memory."""
     kernels = {
         f"{module.__name__}.{name}": kernel
-        for module in (adapt, cluster, decode, drivable, fitness, geometry, ground, projection, refine)
+        for module in (ahead, cluster, condition, decode, fitness, geometry, planes, projection, refine)
         for name, kernel in vars(module).items()
         if hasattr(kernel, "signatures") and kernel.__module__ == module.__name__
     }

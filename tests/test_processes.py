@@ -22,7 +22,7 @@ import pytest
 from numpy.typing import NDArray
 
 from edgeperc import EdgepercError, Perceiver
-from edgeperc.session import Session, available_providers
+from edgeperc.inference.session import Session, available_providers
 from edgeperc.simulation import random_scene, simulate
 
 posix = pytest.mark.skipif(os.name != "posix", reason="forks, signals and limits differ elsewhere")
@@ -340,7 +340,7 @@ def test_without_a_home_kernels_are_compiled_and_it_is_said(tmp_path: Path) -> N
     (tmp_path / "edgeperc" / "__pycache__").write_bytes(b"")
     code = WITHOUT_PASSWD.partition("from edgeperc")[0] + (
         "import numpy as np\n"
-        "from edgeperc.geometry import oriented_iou\n"
+        "from edgeperc.types.geometry import oriented_iou\n"
         "print(oriented_iou(np.ones((1, 5)), np.ones((1, 5))))\n"
     )
     kept = {name: value for name, value in os.environ.items() if name not in (*HOMES, "EDGEPERC_CACHE_DIR")}

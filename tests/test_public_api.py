@@ -16,9 +16,9 @@ import pytest
 import edgeperc
 import edgeperc.errors
 import edgeperc.zoo
-from edgeperc import listing, session
 from edgeperc.errors import ModelFileError
-from edgeperc.sensor import SENSORS
+from edgeperc.inference import listing, session
+from edgeperc.types.sensor import SENSORS
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 MODULES = sorted(

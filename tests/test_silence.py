@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from edgeperc.extras import without_telemetry
+from edgeperc.system.extras import without_telemetry
 
 FOLDERS = {"HOME": ".", "XDG_CACHE_HOME": ".cache", "XDG_CONFIG_HOME": ".config", "XDG_DATA_HOME": ".local/share"}
 

@@ -9,8 +9,8 @@ import numpy as np
 import tiny_model
 from tiny_model import field, node, number, shaped, tensor
 
-from edgeperc.card import CameraGeometry, Golden, InputSpec, ModelCard, OutputSpec
-from edgeperc.session import golden_input
+from edgeperc.inference.session import golden_input
+from edgeperc.types.card import CameraGeometry, Golden, InputSpec, ModelCard, OutputSpec
 
 __all__ = ["CLASSES", "camera_card", "camera_model", "write_camera"]
 

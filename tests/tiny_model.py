@@ -6,8 +6,8 @@ import hashlib
 
 import numpy as np
 
-from edgeperc.card import CARD_KEY, Golden, InputSpec, ModelCard, OutputSpec, TopViewGeometry
-from edgeperc.session import golden_input
+from edgeperc.inference.session import golden_input
+from edgeperc.types.card import CARD_KEY, Golden, InputSpec, ModelCard, OutputSpec, TopViewGeometry
 
 __all__ = [
     "CONVOLUTION",

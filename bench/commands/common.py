@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgeperc.atomic import write_atomic
-from edgeperc.extras import require
-from edgeperc.tuning import fingerprint
+from edgeperc.system.atomic import write_atomic
+from edgeperc.system.extras import require
+from edgeperc.system.machine import fingerprint
 from edgeperc.zoo import DEFAULT
 
 from .. import context, plots

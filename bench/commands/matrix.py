@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgeperc import EdgepercError
-from edgeperc.session import PRECISIONS, PROVIDERS, available_providers
-from edgeperc.tuning import cpu_features, settings_path, write_settings
+from edgeperc.inference.session import PRECISIONS, PROVIDERS, available_providers
+from edgeperc.system.machine import cpu_features, settings_path, write_settings
 from edgeperc.zoo import DEFAULT, choose, resolve
 
 from ..document import pooled, repeats_ms, setting_label

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from edgeperc.atomic import write_atomic
-from edgeperc.extras import require
+from edgeperc.system.atomic import write_atomic
+from edgeperc.system.extras import require
 
 from .. import plots
 from ..document import latency, stage_medians

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import ImageLabels
-from edgeperc.card import CHANNELS, CameraGeometry, ModelCard
 from edgeperc.simulation.camera import forward_camera, render
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
+from edgeperc.types.card import CHANNELS, CameraGeometry, ModelCard
 
 from ..worker import Prediction
 from .engines import Engine

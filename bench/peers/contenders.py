@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from edgeperc.adapt import condition
-from edgeperc.card import CameraGeometry, ModelCard
-from edgeperc.image import ImageScaler
-from edgeperc.network_input import project
-from edgeperc.projection import make_projector
-from edgeperc.sensor import get_sensor
-from edgeperc.session import available_providers
+from edgeperc.camera.image import ImageScaler
+from edgeperc.inference.network_input import project
+from edgeperc.inference.projection import make_projector
+from edgeperc.inference.session import available_providers
+from edgeperc.preprocess.condition import condition
+from edgeperc.types.card import CameraGeometry, ModelCard
+from edgeperc.types.sensor import get_sensor
 from edgeperc.zoo import DEFAULT, Variant, listed, resolve
 
 from ..samples import percentile
@@ -236,7 +236,7 @@ def _one_or_two(variant: Variant, folder: Path) -> list[Contender]:
         import onnx
 
         from edgeperc_export.networks.ssadnet import DenseHead
-        from edgeperc_export.to_onnx import to_graph
+        from edgeperc_export.release.to_onnx import to_graph
 
         extractor = onnx.utils.Extractor(onnx.load(path))
         classes, boxes = sorted(card.outputs, key=lambda output: output.kind.startswith("box_"))

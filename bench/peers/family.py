@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from edgeperc.card import CameraGeometry, ModelCard
 from edgeperc.evaluation.evaluate import evaluate
-from edgeperc.network_input import project
-from edgeperc.projection import make_projector
+from edgeperc.inference.network_input import project
+from edgeperc.inference.projection import make_projector
 from edgeperc.simulation.samples import simulated_scan
+from edgeperc.types.card import CameraGeometry, ModelCard
 from edgeperc.zoo import listed
 
 from ..plots import as_svg

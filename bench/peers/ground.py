@@ -29,12 +29,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeperc.cluster import find_clusters
-from edgeperc.ground import find_ground
+from edgeperc.ground.planes import find_ground
+from edgeperc.objects.cluster import find_clusters
 from edgeperc.readers.files import read_points
-from edgeperc.sensor import get_sensor
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
+from edgeperc.types.sensor import get_sensor
 
 from ..render import Section, number, share, text
 from .rounds import measure, versions

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from edgeperc import ModelError
-from edgeperc.card import TopViewGeometry
+from edgeperc.types.card import TopViewGeometry
 from edgeperc.zoo import resolve
 
 __all__ = ["resized"]
@@ -25,7 +25,7 @@ def resized(model: str, share: float, folder: Path) -> Path:
     """
     from edgeperc_export.networks import build
     from edgeperc_export.recipe import Recipe
-    from edgeperc_export.to_onnx import to_graph, write_card
+    from edgeperc_export.release.to_onnx import to_graph, write_card
 
     variant = resolve(model)[0]
     card = variant.card

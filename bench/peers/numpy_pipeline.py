@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import Box, PointLabels, TopView
-from edgeperc.card import ModelCard, RangeImageGeometry, TopViewGeometry
-from edgeperc.geometry import draw_footprints
-from edgeperc.ground import find_ground
-from edgeperc.mounting import MODEL_HEIGHT_M
-from edgeperc.sensor import SensorProfile
+from edgeperc.ground.planes import find_ground
+from edgeperc.types.card import ModelCard, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.geometry import draw_footprints
+from edgeperc.types.mounting import MODEL_HEIGHT_M
+from edgeperc.types.sensor import SensorProfile
 
 from ..worker import Prediction
 from .engines import Engine
@@ -87,7 +87,7 @@ class NumpyPipeline:
 
 
 def spread(values: NDArray[np.float32], block: tuple[int, int]) -> NDArray[np.float32]:
-    """`edgeperc.blocks.fill_pixels` in numpy."""
+    """`edgeperc.inference.blocks.fill_pixels` in numpy."""
     (rows, cols), (n, height, width) = block, values.shape
     parts = values.reshape(n // (rows * cols), rows, cols, height, width)
     return parts.transpose(0, 3, 1, 4, 2).reshape(-1, height * rows, width * cols)
@@ -100,7 +100,7 @@ def vote(
     labels: NDArray[np.uint8],
     n_classes: int,
 ) -> NDArray[np.uint8]:
-    """`edgeperc.refine.label_points` of a view that is not a full turn, in numpy."""
+    """`edgeperc.objects.refine.label_points` of a view that is not a full turn, in numpy."""
     found = np.where(pixel >= 0, labels.reshape(-1)[pixel], 0).astype(np.uint8)
     hidden = np.flatnonzero((pixel >= 0) & (index.reshape(-1)[pixel] != np.arange(len(points))))
     distance = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
@@ -125,7 +125,7 @@ def _heights(projector: NumpyTopView | NumpyRangeImage, points: NDArray[np.float
 
 
 def dense_boxes(card: ModelCard, logits: NDArray[np.float32], dense: NDArray[np.float32]) -> list[Box]:
-    """`edgeperc.decode.decode_dense` in numpy."""
+    """`edgeperc.inference.decode.decode_dense` in numpy."""
     view = card.view
     assert isinstance(view, TopViewGeometry)
     heat = dense[0]

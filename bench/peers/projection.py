@@ -25,12 +25,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from edgeperc.card import InputSpec, RangeImageGeometry, TopViewGeometry
-from edgeperc.projection import HEIGHT_RANGE_M, RangeImageProjector, TopViewProjector, column_edges, row_edges, tabulate
+from edgeperc.inference.projection import (
+    HEIGHT_RANGE_M,
+    RangeImageProjector,
+    TopViewProjector,
+    column_edges,
+    row_edges,
+    tabulate,
+)
 from edgeperc.readers.files import read_points
-from edgeperc.sensor import get_sensor
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
+from edgeperc.types.card import InputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.sensor import get_sensor
 
 from ..render import Section, number, text
 from .rounds import measure, versions

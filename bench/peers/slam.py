@@ -44,15 +44,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import Box, Perceiver, Perception, Tracker, movable_points, moving_points
+from edgeperc.datasets.kitti import KittiCalibration, KittiObjects, read_objects
 from edgeperc.errors import SplitError
-from edgeperc.evaluation.datasets import KittiCalibration, KittiObjects, read_objects
 from edgeperc.evaluation.unseen import check_unseen, training_scans_of
-from edgeperc.extras import require
-from edgeperc.geometry import inside
-from edgeperc.moving import moving_tracks
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate_sequence
+from edgeperc.system.extras import require
+from edgeperc.tracking.moving import moving_tracks
+from edgeperc.types.geometry import inside
 
 from ..render import Section, number, text
 from .rounds import versions

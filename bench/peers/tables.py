@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from edgeperc.card import ModelCard
+from edgeperc.types.card import ModelCard
 
 from ..accuracy import agreement
 from ..render import number, share

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from edgeperc import Box, Tracker
 from edgeperc.evaluation.tracking import CLASSES, FRAME_S, read_sequence, sequence_names, sequence_scans
-from edgeperc.sensor import get_sensor
+from edgeperc.types.sensor import get_sensor
 
 from ..render import Section, number, text
 from .rounds import elapsed_ms, versions

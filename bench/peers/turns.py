@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import ModelCard, Perceiver
-from edgeperc.sensor import get_sensor
-from edgeperc.session import Session
+from edgeperc.inference.session import Session
+from edgeperc.types.sensor import get_sensor
 
 from ..context import conditions, disturbances, rss_mb
 from ..worker import Prediction

@@ -38,7 +38,7 @@ __all__ = [
 Commands = Any  # what ArgumentParser.add_subparsers returns; argparse keeps its class private
 _WIDTH = 78
 
-# Copies of the values in `edgeperc.zoo`, `edgeperc.session` and `edgeperc.agreement`. Those modules import numpy, which
+# Copies of the values in `zoo`, `inference.session` and `agreement.rules`. Those modules import numpy, which
 # would delay --help.
 DEFAULT = ("ssadnet", "pointseg")
 CAMERA = "camseg"

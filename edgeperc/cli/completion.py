@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Iterator
 from typing import Any
 
-from ..extras import require
+from ..system.extras import require
 from .arguments import PROVIDERS, Commands, add_command
 
 __all__ = ["add_parser", "completion_command"]
@@ -33,7 +33,7 @@ def add_parser(commands: Commands) -> None:
 def completion_command(arguments: argparse.Namespace) -> int:
     """Print the script."""
     shtab = require("shtab", "completion", "Completing a command line")
-    from ..sensor import SENSORS
+    from ..types.sensor import SENSORS
     from ..zoo import shipped_models
 
     names = {"model": shipped_models(), "sensor": tuple(SENSORS), "provider": PROVIDERS}

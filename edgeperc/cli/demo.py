@@ -14,10 +14,10 @@ from .output import one_line, print_rows
 from .run import make_perceiver
 
 if TYPE_CHECKING:
-    from ..calibration import Calibration
-    from ..perception import Box, Perception
+    from ..camera.calibration import Calibration
     from ..simulation.camera import CameraImage
     from ..simulation.scene import SimulatedScan
+    from ..types.perception import Box, Perception
 
 __all__ = ["add_parser", "demo_command"]
 
@@ -67,7 +67,7 @@ def demo_command(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from .. import view
-    from ..level import FROZEN_AFTER
+    from ..ground.leveling import FROZEN_AFTER
     from ..simulation.drawn import random_scene
     from ..simulation.scene import simulate
     from ..zoo import shipped_models
@@ -126,9 +126,9 @@ def _camera_rows(
     import numpy as np
 
     from .. import view
-    from ..painting import UNSEEN, camera_road, paint
-    from ..perception import ImageLabels
+    from ..camera.painting import UNSEEN, camera_road, paint
     from ..simulation.camera import CAMERA_CLASSES, VOID, true_classes
+    from ..types.perception import ImageLabels
 
     rows = [("image", f"{calibration.width} x {calibration.height} pixels, drawn from the scene; it is no photograph")]
     known, found, source = drawn.labels != VOID, perception.image, "the network's classes"

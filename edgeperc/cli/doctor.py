@@ -120,7 +120,7 @@ def _program() -> Iterator[Finding]:
 
 
 def _processor() -> Iterator[Finding]:
-    from ..tuning import cpu_features, cpu_model, usable_cores
+    from ..system.machine import cpu_features, cpu_model, usable_cores
 
     yield Finding("processor", "ok", f"{cpu_model()}, {usable_cores()} of {os.cpu_count()} cores usable")
     from ..zoo import BF16_FEATURES, INT8_FEATURES
@@ -151,7 +151,7 @@ def _packages() -> Iterator[Finding]:
             yield Finding(name, "ok", str(import_module(name).__version__))
         except Exception as exc:  # a wheel for another processor or numpy raises other errors than ImportError
             yield _broken(name, exc, f"pip install --force-reinstall {name}")
-    from ..session import runtime_version
+    from ..inference.session import runtime_version
 
     versions = _installed("onnxruntime")
     builds = [name for name in _BUILDS if name in versions]
@@ -178,7 +178,7 @@ def _packages() -> Iterator[Finding]:
 
 
 def _has_sme() -> bool:
-    from ..tuning import cpu_features
+    from ..system.machine import cpu_features
 
     return "sme" in cpu_features() or (sys.platform == "darwin" and platform.machine() == "arm64")
 
@@ -186,8 +186,8 @@ def _has_sme() -> bool:
 def _kernels() -> Iterator[Finding]:
     import numpy as np
 
-    from ..frame import fill_moved
-    from ..points import read_only
+    from ..types.frame import fill_moved
+    from ..types.points import read_only
 
     moved = np.empty((1, 4), np.float32)
     started = time.perf_counter()
@@ -207,12 +207,12 @@ def _kernels() -> Iterator[Finding]:
 
 
 def _providers() -> Iterator[Finding]:
-    from ..listing import providers
+    from ..inference.listing import providers
 
     present = [provider.name for provider in providers() if provider.available]
     if not present:
         return  # without onnxruntime, which `_packages` reports
-    from ..session import PLUGINS, devices
+    from ..inference.session import PLUGINS, devices
 
     for short, package in PLUGINS.items():
         if short not in present and find_spec(package) is not None:
@@ -224,7 +224,7 @@ def _providers() -> Iterator[Finding]:
 
 def _caches() -> Iterator[Finding]:
     from ..errors import SettingsError
-    from ..tuning import cache_folder, fingerprint, read_setting, settings_path, unsafe_because
+    from ..system.machine import cache_folder, fingerprint, read_setting, settings_path, unsafe_because
     from ..zoo import digest, resolve
 
     try:
@@ -271,7 +271,7 @@ def _size(folder: Path) -> str:
 
 
 def _models() -> Iterator[Finding]:
-    from ..card import ModelCard
+    from ..types.card import ModelCard
 
     folder = resources.files("edgeperc.zoo")
     page = folder / "MODELS.md"
@@ -304,7 +304,7 @@ def _models() -> Iterator[Finding]:
 
 def _runs(found: set[str]) -> Iterator[Finding]:
     """Whether the default models open and answer their golden inputs, with the provider that is chosen here."""
-    from ..session import Session
+    from ..inference.session import Session
 
     for name in DEFAULT:
         if name in found:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..atomic import write_atomic
 from ..errors import PointsError, SensorError
+from ..system.atomic import write_atomic
 from .arguments import Commands, add_command, add_ego_box, add_sensor
 from .output import print_rows
 from .scans import find_scans, with_mounting
@@ -49,9 +49,9 @@ def add_parser(commands: Commands) -> None:
 
 def fit_sensor_command(arguments: argparse.Namespace) -> int:
     """Fit a remission function and write the sensor profile."""
+    from ..preprocess.sensor_fit import fit_sensor
     from ..readers.captures import read_scans
-    from ..sensor import get_sensor
-    from ..sensor_fit import fit_sensor
+    from ..types.sensor import get_sensor
 
     found = find_scans(arguments.scans)
     if found.empty:

@@ -12,8 +12,8 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..atomic import write_atomic
 from ..errors import EdgepercError, MissingExtraError, MountingError, PointsError
+from ..system.atomic import write_atomic
 from .arguments import Commands, add_command, add_mounting, add_sensor, add_topic
 from .output import print_error, print_line, print_rows
 from .scans import scan_sensor
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from ..card import ModelCard
-    from ..level import MountingEstimator
-    from ..perception import DroppedPoints
-    from ..sensor import SensorProfile
+    from ..ground.leveling import MountingEstimator
+    from ..types.card import ModelCard
+    from ..types.perception import DroppedPoints
+    from ..types.sensor import SensorProfile
     from ..zoo import Variant
 
 __all__ = ["add_parser", "info_command"]
@@ -93,7 +93,7 @@ def info_command(arguments: argparse.Namespace) -> int:
     from ..readers.images import IMAGE_SUFFIXES
 
     if arguments.sensor is not None:
-        from ..sensor import get_sensor
+        from ..types.sensor import get_sensor
 
         get_sensor(arguments.sensor)
     if arguments.write is not None and arguments.write.suffix != ".json":
@@ -157,7 +157,7 @@ def _suggest_ego_box(
     arguments: argparse.Namespace, paths: Sequence[Path], estimators: Mapping[SensorProfile, MountingEstimator]
 ) -> bool:
     """Print a box of the own vehicle for ``--ego-box``; whether the scans do not show one."""
-    from ..ego import suggest_ego_box
+    from ..preprocess.ego import suggest_ego_box
     from ..readers.captures import read_scans
 
     if len(estimators) != 1:
@@ -212,8 +212,8 @@ def _folded(rows: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
 
 def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
     """Rows that describe a model; accuracy and geometry come from the card of its first variant."""
-    from ..card import CameraGeometry, TopViewGeometry
-    from ..listing import purpose
+    from ..inference.listing import purpose
+    from ..types.card import CameraGeometry, TopViewGeometry
 
     path, card = variants[0].path, variants[0].card
     size = ", ".join(f"{variant.precision} {_megabytes(variant.path)}" for variant in variants)
@@ -335,14 +335,14 @@ def _scan_rows(
     """Measure a scan and check which models suit it: rows to print, and the same measurements for JSON."""
     import numpy as np
 
-    from ..adapt import scale
-    from ..fitness import FitnessProfile, check_dropped, check_fitness
-    from ..frame import ModelFrame
-    from ..level import FROZEN_AFTER, MountingEstimator
+    from ..ground.leveling import FROZEN_AFTER, MountingEstimator
+    from ..preprocess.condition import scale
+    from ..preprocess.fitness import FitnessProfile, check_dropped, check_fitness
+    from ..preprocess.remission import RemissionMatcher
+    from ..preprocess.returns import returns
     from ..readers.captures import read_scans
-    from ..remission import RemissionMatcher
-    from ..returns import returns
-    from ..sensor import get_sensor
+    from ..types.frame import ModelFrame
+    from ..types.sensor import get_sensor
     from ..zoo import listed
 
     named, because = scan_sensor(path, arguments)

@@ -55,8 +55,8 @@ def add_parser(commands: Commands) -> None:
 
 def models_command(arguments: argparse.Namespace) -> int:
     """Print `edgeperc.models`, with the fastest setting measured on this computer."""
-    from ..listing import models
-    from ..tuning import fingerprint, read_setting, settings_path
+    from ..inference.listing import models
+    from ..system.machine import fingerprint, read_setting, settings_path
     from ..zoo import digest, resolve
 
     machine, listed = fingerprint(), models()
@@ -81,7 +81,7 @@ def models_command(arguments: argparse.Namespace) -> int:
 
 def sensors_command(arguments: argparse.Namespace) -> int:
     """Print `edgeperc.sensors`."""
-    from ..listing import sensors
+    from ..inference.listing import sensors
 
     return _print(
         [{**_fields(sensor), "default": sensor.name == DEFAULT_SENSOR} for sensor in sensors()],
@@ -101,7 +101,7 @@ def sensors_command(arguments: argparse.Namespace) -> int:
 
 def providers_command(arguments: argparse.Namespace) -> int:
     """Print `edgeperc.providers`."""
-    from ..listing import providers
+    from ..inference.listing import providers
 
     return _print(
         [_fields(provider) for provider in providers()],

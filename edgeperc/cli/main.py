@@ -16,20 +16,8 @@ from collections.abc import Sequence
 # Commands import numpy, numba, onnxruntime and matplotlib inside functions, so that --help is fast.
 from .. import __version__
 from ..errors import EdgepercError
-from . import (
-    completion,
-    demo,
-    doctor,
-    eval,
-    eval_painting,
-    eval_sensors,
-    eval_tracking,
-    fit_sensor,
-    info,
-    lists,
-    ros2,
-    run,
-)
+from . import completion, demo, doctor, fit_sensor, info, lists, ros2, run
+from .evaluation import painting, scans, sensors, tracking
 from .program import Parser, run_program
 
 __all__ = ["build_parser", "in_options", "main"]
@@ -111,7 +99,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--version", action="version", version=f"edgeperc {__version__}", help="print the version and exit"
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    evaluations = (eval, eval_sensors, eval_tracking, eval_painting)
+    evaluations = (scans, sensors, tracking, painting)
     for module in (demo, run, ros2, info, doctor, lists, *evaluations, fit_sensor, completion):
         module.add_parser(commands)
     return parser

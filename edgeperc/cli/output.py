@@ -13,8 +13,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
-from ..atomic import write_atomic
-from ..printable import printable
+from ..system.atomic import write_atomic
+from ..system.printable import printable
 
 __all__ = [
     "FEW",

@@ -18,7 +18,7 @@ from types import FrameType
 from typing import Any, NoReturn, TextIO
 
 from ..errors import EdgepercError
-from ..printable import printable
+from ..system.printable import printable
 from .output import print_error, show_warning
 
 __all__ = ["Parser", "run_program"]

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import MissingExtraError
-from ..remote import Remote
+from ..system.remote import Remote
 from .output import many, one_line, print_error, print_line
 
 if TYPE_CHECKING:
     from ..live import Answer
-    from ..perception import Perception
     from ..tracking.tracks import Tracks
+    from ..types.perception import Perception
 
 __all__ = ["Report"]
 
@@ -69,7 +69,7 @@ class Report:
         self, source: Path | Remote, outcome: Perception | Answer | Exception, tracks: Tracks | None = None
     ) -> str:
         """One scan's line or JSON object; of a failed scan without ``--json``, nothing."""
-        from ..perception import Perception
+        from ..types.perception import Perception
 
         if isinstance(outcome, Exception):
             return json.dumps({**self._names(source), "error": one_line(outcome)}) if self._json else ""
@@ -121,7 +121,7 @@ def _summary(perception: Perception) -> str:
     parts += [f"{perception.n_points:,} points", f"{sum(perception.stage_ms.values()):.1f} ms"]
     if perception.top_view is not None:
         parts.append(f"drivable {perception.top_view.drivable_area_m2:.1f} m2")
-        from ..drivable import free_ahead  # after the first scan: it loads numba
+        from ..road.ahead import free_ahead  # after the first scan: it loads numba
 
         ahead = free_ahead(perception.top_view, perception.boxes)
         if ahead.end is not None:

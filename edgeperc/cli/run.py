@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import EdgepercError, ImageError, ModelError, PointsError
-from ..extras import require
-from ..remote import Remote, location
 from ..sinks import PerceivedScan, Sink
+from ..system.extras import require
+from ..system.remote import Remote, location
 from .arguments import (
     CAMERA,
     DEFAULT,
@@ -29,8 +29,8 @@ from .arguments import (
     add_topic,
     positive_number,
 )
-from .engine import add_engine, check_engine, perceive_on_ray, through_temporary
 from .output import many, print_line, progress
+from .ray import add_engine, check_engine, perceive_on_ray, through_temporary
 from .report import Report
 from .scans import (
     Scans,
@@ -50,9 +50,9 @@ if TYPE_CHECKING:
 
     from ..live import Answer
     from ..perceiver import Perceiver
-    from ..perception import Perception
-    from ..sensor import SensorProfile
     from ..tracking.tracks import Tracks
+    from ..types.perception import Perception
+    from ..types.sensor import SensorProfile
 
 __all__ = ["add_parser", "make_perceiver", "run_command"]
 
@@ -315,7 +315,7 @@ def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, P
     if arguments.scan and len(scans) != len(images):
         arguments.usage_error(f"--scan: {many(len(scans), 'scan')} for {many(len(images), 'image')}; expected as many")
     if arguments.calib is not None and arguments.labels_for != "kitti":
-        from ..calibration import read_kitti_calibration
+        from ..camera.calibration import read_kitti_calibration
 
         if not (images and scans and arguments.png):
             arguments.usage_error("--calib is for the picture of images and their scans; add --scan and --png")
@@ -457,7 +457,7 @@ class _Run:
     def image(self, path: Path, scan: Path | None, target: Path) -> Iterator[Outcome]:
         """Perceive an image and its scan, if it has one."""
         from .. import view
-        from ..calibration import Calibration
+        from ..camera.calibration import Calibration
         from ..readers.files import read_points
         from ..readers.images import read_image
 

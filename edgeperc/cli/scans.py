@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import EdgepercError, ImageError
-from ..remote import Remote
+from ..system.remote import Remote
 from .arguments import DEFAULT_SENSOR
 
 if TYPE_CHECKING:
     from ..readers.identify import KnownSensor
-    from ..sensor import SensorProfile
+    from ..types.sensor import SensorProfile
 
 __all__ = [
     "Scans",
@@ -159,7 +159,7 @@ def scan_sensor(path: Path, arguments: argparse.Namespace) -> tuple[str | Sensor
     """
     from ..readers.captures import known_sensor
     from ..readers.identify import contradicts
-    from ..sensor import get_sensor
+    from ..types.sensor import get_sensor
 
     known: KnownSensor | None
     if arguments.sensor is None:
@@ -188,8 +188,8 @@ def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) ->
     SensorError
         A value is impossible, or the file of ``--extrinsic`` cannot be read.
     """
-    from ..mounting import Mounting
-    from ..sensor import get_sensor
+    from ..types.mounting import Mounting
+    from ..types.sensor import get_sensor
 
     height_m, turn, file = (getattr(arguments, name, None) for name in ("mount_height", "turn", "extrinsic"))
     ego = getattr(arguments, "ego_box", None)

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..motion import Motion, Trajectory, deskew
-from ..returns import returns
+from ..preprocess.motion import Motion, Trajectory, deskew
+from ..preprocess.returns import returns
 
 if TYPE_CHECKING:
-    from ..sensor import SensorProfile
     from ..tracking.tracks import Tracks
+    from ..types.sensor import SensorProfile
 
 __all__ = ["Straightener"]
 
@@ -26,7 +26,7 @@ class Straightener:
     Parameters
     ----------
     poses : Path, optional
-        A file for `edgeperc.motion.Trajectory.from_tum`; by default the motion is that between the last two scans
+        A file for `edgeperc.preprocess.motion.Trajectory.from_tum`; by default the motion is that between the last two scans
         that were tracked.
 
     Raises

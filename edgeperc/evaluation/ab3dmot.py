@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import wrapped
-from ..perception import Box
+from ..types.geometry import wrapped
+from ..types.perception import Box
 from .tracking_metrics import box_iou, fill_assignment
 
 __all__ = ["SETTINGS", "Ab3dmot", "Settings", "generalized_iou"]

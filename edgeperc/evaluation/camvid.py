@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CardMismatchError, ImageError, OptionError, SplitError
-from ..extras import require
 from ..perceiver import Perceiver
 from ..readers.images import IMAGE_SUFFIXES, read_image
+from ..system.extras import require
 from .metrics import Confusion
 from .unseen import training_scans_of
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cluster import find_clusters
-from ..geometry import inside
-from ..ground import Ground, find_ground
-from ..perception import Box
+from ..ground.planes import Ground, find_ground
+from ..objects.cluster import find_clusters
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
+from ..types.geometry import inside
+from ..types.perception import Box
 from .metrics import object_key
 
 __all__ = ["BUMPER", "CAUSES", "FLOOR", "count_causes"]

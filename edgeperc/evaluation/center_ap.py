@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..perception import Box
+from ..types.perception import Box
 from .metrics import ObjectKey, object_key
 
 __all__ = ["CLASSES", "DISTANCES_M", "CenterTable", "center_scores", "count_centers"]

@@ -13,17 +13,17 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 
-from ..agreement import RULES
-from ..engine import MOST_FIRST, Lost, map_on_ray
+from ..agreement.rules import RULES
+from ..datasets.kitti import KittiObjects, SemanticKitti
+from ..datasets.scan_folder import ScanFolder, known_layouts
 from ..errors import EdgepercError, OptionError, PointsError
-from ..mounting import Mounting
 from ..perceiver import BoxesFrom, Learned, Perceiver
 from ..simulation.samples import FIRST_SEED
+from ..system.ray_cluster import MOST_FIRST, Lost, map_on_ray
+from ..types.mounting import Mounting
 from ..zoo import DEFAULT
-from .datasets import KittiObjects, SemanticKitti
 from .judge import Judge
 from .mistakes import Mistakes
-from .scan_folder import ScanFolder, known_layouts
 from .tables import Record, figures
 
 __all__ = ["evaluate"]
@@ -73,7 +73,7 @@ def evaluate(
     n_resamples : int
         Number of resamples of the drives for the intervals.
     engine : {"local", "ray"}
-        This process, or processes with one thread each on a Ray cluster (`edgeperc.engine.map_on_ray`); the figures are
+        This process, or processes with one thread each on a Ray cluster (`ray_cluster.map_on_ray`); the figures are
         the same.
     workers : int or None
         Number of processes of ``"ray"``.

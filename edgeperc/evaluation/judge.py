@@ -12,30 +12,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..agreement import RULES
-from ..card import TopViewGeometry
-from ..cluster import classes_of_boxes
-from ..decode import decode_classes
+from ..agreement.rules import RULES
+from ..datasets.kitti import Frame, RoadFrame
+from ..datasets.scan_folder import IGNORED, ScanFrame, box_label, class_number
 from ..errors import ModelError
-from ..frame import ModelFrame
-from ..geometry import inside
-from ..ground import find_ground
-from ..mounting import MODEL_MOUNTING, Mounting
-from ..network_input import project
+from ..ground.planes import find_ground
+from ..inference.decode import decode_classes
+from ..inference.network_input import project
+from ..inference.projection import make_projector
+from ..inference.session import Session
+from ..objects.cluster import classes_of_boxes
 from ..perceiver import BoxesFrom, Perceiver
-from ..perception import Box, Perception, PointLabels, TopView
-from ..projection import make_projector
-from ..sensor import SensorProfile
-from ..session import Session
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASSES
+from ..types.card import TopViewGeometry
+from ..types.frame import ModelFrame
+from ..types.geometry import inside
+from ..types.mounting import MODEL_MOUNTING, Mounting
+from ..types.perception import Box, Perception, PointLabels, TopView
+from ..types.sensor import SensorProfile
 from .causes import count_causes
 from .center_ap import count_centers
-from .datasets import Frame, RoadFrame
 from .kitti_ap import count_all_round, count_in_image
 from .metrics import FEWEST_RETURNS, BoxEvaluator, ProbabilitySweep, boxes_to_find, object_key
 from .mistakes import Mistakes
-from .scan_folder import IGNORED, ScanFrame, box_label, class_number
 from .tables import ALL_ROUND, BANDS, SITTING, VEHICLES, Record, banded, within
 from .truth import Truth, folder_truth, kitti_truth, semantickitti_truth, simulated_truth
 from .unseen import check_unseen, training_scans_of
@@ -64,7 +64,7 @@ class Judge:
         As in `Perceiver`. The figures ``"boxes"`` are of the boxes that a top-view model detects, in its view; without
         such a model, or with "clusters", of the boxes around clusters, wherever the truth is known.
     rules : collection of str
-        Rules of the agreement of labels, boxes and cells; a part of `edgeperc.agreement.RULES` for an ablation.
+        Rules of the agreement of labels, boxes and cells; a part of `edgeperc.agreement.rules.RULES` for an ablation.
     mounted : Mounting or None
         Perceive each scan as a sensor mounted so would have recorded it, with the mounting to be estimated from this
         scan alone. Points (not pixels) and boxes are evaluated. None: as recorded, on the training vehicle.

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import oriented_iou, shared_area
-from ..perception import Box
-from .datasets import IMAGE_SIZE, IMAGE_SIZES, KittiCalibration, KittiLabels
+from ..datasets.kitti import IMAGE_SIZE, IMAGE_SIZES, KittiCalibration, KittiLabels
+from ..types.geometry import oriented_iou, shared_area
+from ..types.perception import Box
 from .metrics import EVERYWHERE, ObjectKey, interpolated_precision, object_key
 
 __all__ = [

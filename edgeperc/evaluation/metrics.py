@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..card import TopViewGeometry
 from ..errors import PointsError
-from ..geometry import bounding_rectangles, oriented_iou, rectangles, shared_area
-from ..perception import Box
+from ..types.card import TopViewGeometry
+from ..types.geometry import bounding_rectangles, oriented_iou, rectangles, shared_area
+from ..types.perception import Box
 
 __all__ = [
     "FEWEST_RETURNS",

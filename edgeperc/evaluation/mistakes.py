@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..perception import Box
+from ..types.perception import Box
 
 __all__ = ["Mistakes"]
 

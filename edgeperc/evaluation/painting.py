@@ -12,15 +12,15 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration import Calibration
+from ..camera.calibration import Calibration
+from ..camera.painting import UNSEEN, camera_road, paint
 from ..errors import OptionError
-from ..painting import UNSEEN, camera_road, paint
-from ..perception import ImageLabels
-from ..sensor import SensorProfile, get_sensor
 from ..simulation.camera import CAMERA_CLASSES, VOID, CameraImage, forward_camera, render, true_classes
 from ..simulation.drawn import random_scene
 from ..simulation.samples import FIRST_SEED
 from ..simulation.scene import SimulatedScan, simulate
+from ..types.perception import ImageLabels
+from ..types.sensor import SensorProfile, get_sensor
 
 __all__ = ["EDGE_PX", "count_painting", "evaluate_painting"]
 

@@ -121,7 +121,7 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
         - ``"points"``, ``"pixels"``: by band and class. ``"iou_by_drive"``: the IoU if each drive counts as one scan,
           its mean scan, so that a long drive does not count for more than a single scan of another street.
         - ``"sure"``: as ``"points"``, without points of which boxes say little: the ground in the boxes of objects
-          (`edgeperc.ground.find_ground`), and people who sit, whom KITTI's own evaluation leaves out.
+          (`edgeperc.ground.planes.find_ground`), and people who sit, whom KITTI's own evaluation leaves out.
         - ``"boxes"``: by kind (``"upright"``, ``"oriented"``), band and class, of the classes and in the view that the
           models detect.
         - ``"all_round"``: by band and class, oriented boxes of vehicles (AP50) and people (AP25) wherever the truth is

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..datasets.kitti import IMAGE_SIZE, KittiCalibration, KittiObjects
 from ..errors import TrackingError
 from ..perceiver import Perceiver
-from ..perception import Box
 from ..readers.files import read_points
 from ..tracking.tracker import Tracker
 from ..tracking.tracks import ClassParameters, Tracks
+from ..types.perception import Box
 from .ab3dmot import SETTINGS, Ab3dmot
-from .datasets import IMAGE_SIZE, KittiCalibration, KittiObjects
 from .headings import Headings, count_headings
 from .tracking_metrics import FrameTracks, FrameTruth, evaluate_tracks
 from .unseen import check_unseen, training_scans_of
@@ -123,7 +123,7 @@ def sequence_names(root: Path | str) -> list[str]:
     ----------
     root : str or Path
         Has ``label_02/NAME.txt``, or ``training/label_2``, ``training/track_id`` (one line for each label) and
-        ``frames.csv`` (`edgeperc.evaluation.datasets.KittiObjects`).
+        ``frames.csv`` (`edgeperc.datasets.kitti.KittiObjects`).
 
     Returns
     -------

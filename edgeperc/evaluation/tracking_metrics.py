@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import TrackingError
-from ..geometry import oriented_iou, shared_area
-from ..kernel_cache import njit
+from ..system.kernel_cache import njit
+from ..types.geometry import oriented_iou, shared_area
 
 __all__ = [
     "Clear",

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..datasets.scan_folder import ScanFolder, ScanFrame, class_number
 from ..errors import ModelError, PointsError
 from ..perceiver import ADAPTATIONS, Perceiver
-from ..perception import Box
-from ..sensor import SensorProfile, get_sensor
-from ..sensor_fit import fit_sensor
+from ..preprocess.sensor_fit import fit_sensor
 from ..simulation.samples import FIRST_SEED, IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASSES
+from ..types.perception import Box
+from ..types.sensor import SensorProfile, get_sensor
 from ..zoo import DEFAULT
 from .judge import Judge
 from .metrics import FEWEST_RETURNS, Confusion, ObjectKey, object_key
-from .scan_folder import ScanFolder, ScanFrame, class_number
 from .tables import FEWEST_OBJECTS, figures
 from .unseen import check_unseen, training_scans_of
 
@@ -34,7 +34,7 @@ IMAGE_LABELS = np.array([0, 0, 0, 0, 0, 2, IGNORE, 1, 1, 1, IGNORE], np.uint8)
 
 # The simulator gives every sensor the remission of an HDL-64E. These measured pairs (remission, raw value) turn it into
 # the raw value of another sensor: Ouster's signal by KUL-Seg's Table 4; Velodyne's calibrated byte by equal quantiles
-# of 13 nuScenes scans (HDL-32E) and of `edgeperc.sensor_fit.REFERENCES`.
+# of 13 nuScenes scans (HDL-32E) and of `edgeperc.preprocess.sensor_fit.REFERENCES`.
 OUSTER_SIGNAL = (9000.0, (0.0, 0.0148, 0.022, 0.426, 0.4838, 1.0), (0.0, 45.91, 113.28, 376.01, 714.5, 9000.0))
 VELODYNE_BYTE = (
     255.0,

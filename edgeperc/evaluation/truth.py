@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..card import TopViewGeometry
-from ..frame import ModelFrame
-from ..geometry import draw_footprints, inside
-from ..mounting import Mounting
-from ..observed import Observer
-from ..perception import Box
-from ..points import read_only
+from ..datasets.kitti import ROAD_CLASSES, Frame, RoadFrame
+from ..datasets.scan_folder import ScanFrame
+from ..ground.observed import Observer
 from ..simulation.samples import IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES, TOP_VIEW_CLASSES
-from .datasets import ROAD_CLASSES, Frame, RoadFrame
+from ..types.card import TopViewGeometry
+from ..types.frame import ModelFrame
+from ..types.geometry import draw_footprints, inside
+from ..types.mounting import Mounting
+from ..types.perception import Box
+from ..types.points import read_only
 from .kitti_ap import FrontTruth, image_size_of
-from .scan_folder import ScanFrame
 from .tables import VEHICLES
 
 __all__ = [

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..card import ModelCard
+from ..datasets.kitti import scan_hash
 from ..errors import SplitError
-from .datasets import scan_hash
+from ..types.card import ModelCard
 
 __all__ = ["check_unseen", "training_scans_of"]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError, SensorError
-from ..sensor import SensorProfile
+from ..types.sensor import SensorProfile
 from .apart import decode_apart, describe_apart
 from .files import read_points, read_timed_file
 from .identify import KnownSensor, of_cloud, of_metadata, of_packets

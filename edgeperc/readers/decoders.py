@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MissingExtraError, PointsError
-from ..extras import require
-from ..points import as_points, table_columns
+from ..system.extras import require
+from ..types.points import as_points, table_columns
 from .inflate import inflate, inflate_file, most_bytes
 from .mcap import McapFile
 from .ouster import check_osf, open_capture

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
-from ..points import as_points, assemble, table_columns
+from ..types.points import as_points, assemble, table_columns
 from .inflate import inflate, most_bytes
 from .pcd import begins_like_pcd, parse_pcd
 from .ply import parse_ply

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import PointsError, SensorError
-from ..sensor import SENSORS, SensorProfile
+from ..types.sensor import SENSORS, SensorProfile
 from .decoders import is_ouster_cloud
 from .ouster import check_metadata, metadata_beside, read_metadata
 from .packets import refuse_hesai, velodyne_packets

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.image import check_size
 from ..errors import ImageError
-from ..extras import require
-from ..image import check_size
+from ..system.extras import require
 
 __all__ = ["IMAGE_SUFFIXES", "read_image"]
 

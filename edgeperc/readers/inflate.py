@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import PointsError
-from ..extras import require
+from ..system.extras import require
 from .tables import MAX_BYTES
 
 __all__ = ["inflate", "inflate_file", "most_bytes"]

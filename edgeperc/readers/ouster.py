@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import PointsError
-from ..extras import require
+from ..system.extras import require
 from .packets import check_datagrams, copy_without
 
 __all__ = ["check_metadata", "check_osf", "metadata_beside", "open_capture", "read_metadata"]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..kernel_cache import njit
-from ..points import plain_name
+from ..system.kernel_cache import njit
+from ..types.points import plain_name
 from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES, Columns, column, cut_short, parse_table, whole_number
 
 __all__ = ["begins_like_pcd", "fill_unpacked_lzf", "parse_pcd"]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..points import plain_name
+from ..types.points import plain_name
 from .tables import Columns, column, cut_short, parse_table, whole_number
 
 __all__ = ["parse_ply"]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from ..points import remission_name
+from ..types.points import remission_name
 from .times import time_name
 
 __all__ = [
@@ -35,14 +35,14 @@ MAX_SCAN_BYTES = 1 << 28
 
 
 class Columns(NamedTuple):
-    """The fields of a scan, for `edgeperc.points.assemble`.
+    """The fields of a scan, for `edgeperc.types.points.assemble`.
 
     Attributes
     ----------
     n : int
         Number of points.
     fields : mapping of str to (n,) array
-        Columns by `edgeperc.points.plain_name`.
+        Columns by `edgeperc.types.points.plain_name`.
     names : sequence of str
         All fields of the source.
     """

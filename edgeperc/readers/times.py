@@ -39,7 +39,7 @@ class TimedScan(NamedTuple):
 
 
 def time_name(names: Iterable[str]) -> str | None:
-    """The field with the times of points among fields by `edgeperc.points.plain_name`; None if there is none."""
+    """The field with the times of points among fields by `edgeperc.types.points.plain_name`; None if there is none."""
     present = set(names)
     return next((name for name in _NAMES if name in present), None)
 
@@ -55,7 +55,7 @@ def point_times(
     Parameters
     ----------
     fields : mapping of str to (n,) array
-        Columns by `edgeperc.points.plain_name`.
+        Columns by `edgeperc.types.points.plain_name`.
     points : (n, 4) float32
         Times of points without a return, which are not finite or lie in the origin, do not show the unit.
     stamp_s : float or None

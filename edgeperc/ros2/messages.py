@@ -15,18 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError
-from ..extras import require
-from ..frame import ModelFrame, quaternion
-from ..mounting import MODEL_HEIGHT_M
-from ..names import check_text
-from ..occupancy import OCCUPIED, occupancy_grid
-from ..points import as_points
+from ..road.grid import OCCUPIED, occupancy_grid
+from ..system.extras import require
+from ..system.names import check_text
+from ..types.frame import ModelFrame, quaternion
+from ..types.mounting import MODEL_HEIGHT_M
+from ..types.points import as_points
 from ..view.colors import color_of, rgb
 from ..view.content import EDGES, box_corners
 
 if TYPE_CHECKING:
-    from ..perception import Box
     from ..sinks import PerceivedScan
+    from ..types.perception import Box
 
 __all__ = ["CLOUD", "OUTPUTS", "RosMessages", "nanoseconds"]
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import MissingExtraError, ModelError, OptionError, PointsError, ProviderError
 from ..live import stream
-from ..names import check_text
 from ..readers.decoders import cloud_points, describe_cloud
 from ..readers.tables import MAX_SCAN_BYTES
 from ..sinks import PerceivedScan
+from ..system.names import check_text
 from .graph import RELIABLE, Graph, Output
 from .messages import CLOUD, DIAGNOSTICS, OUTPUTS, RosMessages
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     from ..live import Answer
     from ..perceiver import Perceiver
-    from ..perception import Perception
     from ..tracking.tracker import Tracker
+    from ..types.perception import Perception
 
 __all__ = ["PerceptionNode"]
 

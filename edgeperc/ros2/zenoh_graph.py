@@ -26,8 +26,8 @@ from collections.abc import Callable
 from typing import Any
 
 from ..errors import OptionError
-from ..extras import require
-from ..lanes import returns
+from ..system.extras import require
+from ..system.lanes import returns
 from .graph import SENSOR_DATA, Qos, full_name
 from .messages import RosMessages
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..calibration import Calibration
+from ..camera.calibration import Calibration
 from ..errors import CalibrationError
 from .raycast import FACADE, GLASS, LEAVES, PAINT, RETRO, fill_cast, fill_ground_kinds
 from .scene import Scene, SimulatedScan, place_shapes

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..geometry import wrapped
-from ..perception import Box
+from ..types.geometry import wrapped
+from ..types.perception import Box
 from .raycast import LANE, SLOPE_X, SLOPE_Y
 from .roadside import add_beside_people, add_cafe, add_parked_bicycles, add_roadside
 from .scene import Scene

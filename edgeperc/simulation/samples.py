@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import inside
-from ..mounting import Mounting
-from ..perception import Box
-from ..sensor import SensorProfile
+from ..types.geometry import inside
+from ..types.mounting import Mounting
+from ..types.perception import Box
+from ..types.sensor import SensorProfile
 from .drawn import random_scene
 from .layouts import scene_from_boxes
 from .scene import POINT_CLASS_OF, Scene, SimulatedScan, sensor_pose, simulate

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..card import TopViewGeometry
 from ..errors import PointsError
-from ..geometry import draw_footprints, wrapped
-from ..perception import Box
-from ..sensor import SensorProfile, get_sensor
+from ..types.card import TopViewGeometry
+from ..types.geometry import draw_footprints, wrapped
+from ..types.perception import Box
+from ..types.sensor import SensorProfile, get_sensor
 from .raycast import (
     fill_bounds,
     fill_cast,

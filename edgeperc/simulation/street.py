@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import wrapped
+from ..types.geometry import wrapped
 from .people import cyclist, pedestrian, person_sitting
 from .raycast import (
     ASPHALT,

@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from ..perception import Perception
-    from ..sensor import SensorProfile
     from ..tracking.tracks import Tracks
+    from ..types.perception import Perception
+    from ..types.sensor import SensorProfile
 
 __all__ = ["PerceivedScan", "Sink"]
 

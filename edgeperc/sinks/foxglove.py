@@ -28,14 +28,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import open_atomic
 from ..errors import OptionError
-from ..extras import require
-from ..frame import quaternion
-from ..lanes import returns
-from ..mounting import MODEL_HEIGHT_M
-from ..perception import Box, TopView
-from ..printable import printable
+from ..system.atomic import open_atomic
+from ..system.extras import require
+from ..system.lanes import returns
+from ..system.printable import printable
+from ..types.frame import quaternion
+from ..types.mounting import MODEL_HEIGHT_M
+from ..types.perception import Box, TopView
 from ..view.content import EDGES, box_corners, box_text, track_text
 from . import PerceivedScan
 from .kept_file import KeptFile

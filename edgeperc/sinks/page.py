@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..points import as_points
+from ..types.points import as_points
 from ..view.page import DrivePage
 from . import PerceivedScan
 from .scene import checked_target

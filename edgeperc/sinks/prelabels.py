@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import open_atomic, write_atomic
-from ..calibration import read_kitti_calibration
+from ..camera.calibration import read_kitti_calibration
 from ..errors import OptionError
-from ..geometry import wrapped
-from ..perception import Box
+from ..system.atomic import open_atomic, write_atomic
+from ..types.geometry import wrapped
+from ..types.perception import Box
 from . import PerceivedScan
 from .names import ScanFiles, stem_of
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import OptionError
-from ..extras import require
 from ..ros2.messages import OUTPUTS, RosMessages, nanoseconds
+from ..system.extras import require
 
 if TYPE_CHECKING:
     from . import PerceivedScan

@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import write_atomic
 from ..errors import OptionError, PointsError
-from ..moving import movable_points, moving_points
-from ..points import as_points
+from ..system.atomic import write_atomic
+from ..tracking.moving import movable_points, moving_points
+from ..types.points import as_points
 from . import PerceivedScan
 from .names import ScanFiles, stem_of
 

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernel_cache import njit
+from ..system.kernel_cache import njit
 
 __all__ = ["fit_motion", "nearest_detection", "support"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernel_cache import njit
+from ..system.kernel_cache import njit
 
 __all__ = ["fill_combined", "fill_interaction", "fill_mode_probabilities"]
 

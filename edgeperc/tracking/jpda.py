@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernel_cache import njit
+from ..system.kernel_cache import njit
 
 __all__ = ["MAX_EVENTS", "fill_association", "fill_by_propagation", "fill_likelihoods"]
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..clock import GAP_S, LATEST_S, Clock, Step
 from ..errors import StampError, TrackingError
-from ..perception import Box, Perception
+from ..system.clock import GAP_S, LATEST_S, Clock, Step
+from ..types.perception import Box, Perception
 from .egomotion import fit_motion
 from .imm import fill_combined, fill_interaction, fill_mode_probabilities
 from .jpda import MAX_EVENTS, fill_association, fill_likelihoods

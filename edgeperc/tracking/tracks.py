@@ -10,8 +10,8 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import wrapped
-from ..perception import Box
+from ..types.geometry import wrapped
+from ..types.perception import Box
 from .lives import MOVED
 from .ukf import MODES
 

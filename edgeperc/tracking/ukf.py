@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernel_cache import njit
+from ..system.kernel_cache import njit
 
 __all__ = ["CONSTANT_VELOCITY", "CTRV", "MODES", "RANDOM_MOTION", "fill_predictions", "fill_updates"]
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import write_atomic
-from ..extras import require
+from ..system.atomic import write_atomic
+from ..system.extras import require
 from .colors import FAINT, FRAME, GROUND, INK, PANEL, color_of
 
 __all__ = [

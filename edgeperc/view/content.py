@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..camera.image import as_image
 from ..errors import ImageError, PointsError
-from ..frame import ModelFrame
-from ..image import as_image
-from ..mounting import MODEL_MOUNTING
-from ..perception import Box, ImageLabels, Perception
-from ..printable import printable
+from ..system.printable import printable
+from ..types.frame import ModelFrame
+from ..types.mounting import MODEL_MOUNTING
+from ..types.perception import Box, ImageLabels, Perception
 from .colors import CLASS_COLORS
 
 if TYPE_CHECKING:

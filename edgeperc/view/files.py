@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import write_atomic
 from ..errors import PointsError
-from ..perception import Perception
+from ..system.atomic import write_atomic
+from ..types.perception import Perception
 from .colors import color_of, rgb
 from .content import check_points
 

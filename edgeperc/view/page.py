@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import open_atomic
-from ..frame import ModelFrame
-from ..perception import Box, Perception, TopView
-from ..printable import printable
+from ..system.atomic import open_atomic
+from ..system.printable import printable
+from ..types.frame import ModelFrame
+from ..types.perception import Box, Perception, TopView
 from .colors import HIGH, LOW, color_of
 from .content import (
     box_corners,

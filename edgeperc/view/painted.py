@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration import Calibration
-from ..frame import ModelFrame
-from ..painting import UNSEEN, camera_road, paint
-from ..perception import Box, Perception, TopView
-from ..sensor import SensorProfile
+from ..camera.calibration import Calibration
+from ..camera.painting import UNSEEN, camera_road, paint
+from ..types.frame import ModelFrame
+from ..types.perception import Box, Perception, TopView
+from ..types.sensor import SensorProfile
 from .canvas import add_axes, as_png, draw_legend, height_of_legend, new_figure, shorten, write_at, write_heading
 from .colors import FAINT, INK, color_of, rgb
 from .content import check_points, drawable_boxes, drawable_points, perceived_image, provider_lines, timing_line

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..drivable import FreeAhead, RoadAhead, road_ahead
-from ..perception import Box, Perception, TopView
+from ..road.ahead import FreeAhead, RoadAhead, road_ahead
+from ..types.perception import Box, Perception, TopView
 from .canvas import (
     Label,
     add_axes,

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import write_atomic
-from ..clock import elapsed_s
 from ..errors import TrackingError
-from ..extras import require
-from ..frame import ModelFrame
-from ..perception import Perception
+from ..system.atomic import write_atomic
+from ..system.clock import elapsed_s
+from ..system.extras import require
+from ..types.frame import ModelFrame
+from ..types.perception import Perception
 from .canvas import free_place
 from .colors import CLASS_COLORS, FAINT, FRAME, GROUND, HIGH, INK, LOW, PANEL, color_of, rgb
 from .content import drawable_boxes, drawable_points, fit_ground, paint_points

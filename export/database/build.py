@@ -28,13 +28,13 @@ from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from edgeperc import __version__
-from edgeperc.atomic import write_atomic
+from edgeperc.datasets.kitti import KittiObjects
+from edgeperc.datasets.splits import TEST_DRIVES
 from edgeperc.errors import MissingExtraError
-from edgeperc.evaluation.datasets import KittiObjects
 from edgeperc.evaluation.metrics import Confusion
-from edgeperc.evaluation.splits import TEST_DRIVES
+from edgeperc.system.atomic import write_atomic
 
-from ..roads import CLASSES, VEHICLES, VIEW, Z_RANGE_M, DatabaseError, read_coco
+from ..data.roads import CLASSES, VEHICLES, VIEW, Z_RANGE_M, DatabaseError, read_coco
 from .files import FARTHEST_M, FORMAT, N_FOLDS
 from .scenes import FOLDERS, INDEX, ROAD_FOLDERS, ROAD_INDEX, TRAIN, TRAINED, Job, Plan, SceneBuilder, inputs_of
 from .workers import run_jobs
@@ -110,7 +110,7 @@ def build(
     polygons : sequence of Path
         COCO files of hand-drawn roads. They take precedence over the road model.
     test_drives : sequence of str
-        Drives to keep for testing, in addition to `edgeperc.evaluation.splits.TEST_DRIVES`.
+        Drives to keep for testing, in addition to `edgeperc.datasets.splits.TEST_DRIVES`.
     recipe : edgeperc_export.recipe.Recipe, optional
         Recipe of the road models if ``plan.road_by`` is ``"train"`` (default: the paper's LoDNN).
     engine : {"local", "ray"}

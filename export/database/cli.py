@@ -134,7 +134,7 @@ def _label(args: argparse.Namespace) -> int:
 
 
 def _coco(args: argparse.Namespace) -> int:
-    from edgeperc.atomic import open_atomic
+    from edgeperc.system.atomic import open_atomic
 
     from .coco import write_database_coco
     from .files import TopViewDatabase

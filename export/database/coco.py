@@ -1,6 +1,6 @@
 """Drafts and variations of hand-drawn roads, and the COCO file of a database.
 
-`edgeperc_export.roads` reads and writes the COCO files of drawn roads.
+`edgeperc_export.data.roads` reads and writes the COCO files of drawn roads.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edgeperc.simulation.samples import IGNORE
 
-from ..roads import CLASSES, HEIGHT, VIEW, WIDTH
+from ..data.roads import CLASSES, HEIGHT, VIEW, WIDTH
 from .files import TopViewDatabase, road_and_vehicles
 
 __all__ = ["draft", "varied", "write_database_coco"]

@@ -31,11 +31,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from edgeperc.geometry import draw_footprints, rectangles
-from edgeperc.names import check_file
-from edgeperc.perception import Box
+from edgeperc.system.names import check_file
+from edgeperc.types.geometry import draw_footprints, rectangles
+from edgeperc.types.perception import Box
 
-from ..roads import CELL_M, CLASSES, HEIGHT, VEHICLES, VIEW, WIDTH, X_RANGE_M, Y_RANGE_M, Z_RANGE_M, DatabaseError
+from ..data.roads import CELL_M, CLASSES, HEIGHT, VEHICLES, VIEW, WIDTH, X_RANGE_M, Y_RANGE_M, Z_RANGE_M, DatabaseError
 
 __all__ = [
     "FARTHEST_M",
@@ -65,7 +65,7 @@ def picture(points: NDArray[np.float32]) -> NDArray[np.uint8]:
     Parameters
     ----------
     points : (n, 4) float32
-        x, y, z [m] in the sensor frame, remission, clamped to 0..1 (`edgeperc.adapt.condition` scales a sensor's). Rows
+        x, y, z [m] in the sensor frame, remission, clamped to 0..1 (`condition.condition` scales a sensor's). Rows
         that are not finite are left out.
 
     Returns
@@ -209,7 +209,7 @@ class TopViewScene:
 
     @property
     def rectangles(self) -> NDArray[np.float64]:
-        """The vehicles as `edgeperc.geometry` takes them, (k, 5) float64: x, y, length, width [m], yaw [rad]."""
+        """The vehicles as `edgeperc.types.geometry` takes them, (k, 5) float64: x, y, length, width [m], yaw [rad]."""
         return rectangles(self.boxes)
 
 

@@ -16,17 +16,17 @@ from typing import Any
 
 import onnx
 
-from edgeperc.card import ModelCard
+from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.errors import EdgepercError
-from edgeperc.evaluation.datasets import KittiObjects, scan_hash
-from edgeperc.fitness import FitnessProfile
+from edgeperc.preprocess.fitness import FitnessProfile
+from edgeperc.types.card import ModelCard
 
+from ..data.roads import DatabaseError, mask_of, with_road
+from ..data.samples import RealScans
+from ..data.scans import LabeledScan
 from ..recipe import Recipe
-from ..roads import DatabaseError, mask_of, with_road
-from ..samples import RealScans
-from ..scans import LabeledScan
-from ..to_onnx import export, write_card
-from ..train import train
+from ..release.to_onnx import export, write_card
+from ..training.train import train
 from .files import N_FOLDS
 
 __all__ = ["DrawnScene", "train_folds"]

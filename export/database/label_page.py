@@ -25,12 +25,12 @@ from pathlib import Path
 from typing import Any, cast
 from urllib.parse import unquote
 
-from edgeperc.atomic import write_atomic
 from edgeperc.cli.output import print_error
 from edgeperc.errors import EdgepercError
-from edgeperc.printable import printable
+from edgeperc.system.atomic import write_atomic
+from edgeperc.system.printable import printable
 
-from ..roads import HEIGHT, WIDTH, DatabaseError, read_coco, write_coco
+from ..data.roads import HEIGHT, WIDTH, DatabaseError, read_coco, write_coco
 from .coco import draft
 from .files import TopViewDatabase
 

@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeperc import Perceiver
-from edgeperc.adapt import condition
-from edgeperc.atomic import write_atomic
-from edgeperc.card import TopViewGeometry
+from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.errors import CardMismatchError, EdgepercError
-from edgeperc.evaluation.datasets import KittiObjects, scan_hash
-from edgeperc.mounting import MODEL_MOUNTING
-from edgeperc.sensor import get_sensor
+from edgeperc.preprocess.condition import condition
+from edgeperc.system.atomic import write_atomic
+from edgeperc.types.card import TopViewGeometry
+from edgeperc.types.mounting import MODEL_MOUNTING
+from edgeperc.types.sensor import get_sensor
 from edgeperc.zoo import model_path
 
-from ..roads import CLASSES, HEIGHT, VEHICLES, VIEW, WIDTH, mask_of
+from ..data.roads import CLASSES, HEIGHT, VEHICLES, VIEW, WIDTH, mask_of
 from .coco import varied
 from .files import FORMAT, picture, png, road_and_vehicles, vehicles, write_labels
 

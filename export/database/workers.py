@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 
-from edgeperc.engine import Lost, map_on_ray
+from edgeperc.system.ray_cluster import Lost, map_on_ray
 
-from ..roads import DatabaseError
+from ..data.roads import DatabaseError
 from .scenes import Job, Plan, SceneBuilder
 
 __all__ = ["run_jobs"]

@@ -15,7 +15,7 @@ import math
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from edgeperc.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
+from edgeperc.types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
 
 from ..recipe import EDGE_BLOCKS
 from .pointseg import conv_bn_relu, initialize

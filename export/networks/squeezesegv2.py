@@ -1,7 +1,7 @@
 """SqueezeSegV2: segmentation of a range image (Wu et al., 2018), the network that KUL-Seg extends.
 
 It has SqueezeSeg's fire layers and three of the paper's four additions: context aggregation, the mask of returns, and
-batch norm. The fourth is the focal loss (`edgeperc_export.losses.cross_entropy`).
+batch norm. The fourth is the focal loss (`edgeperc_export.training.losses.cross_entropy`).
 
 What differs from the paper, and why:
 
@@ -10,7 +10,7 @@ What differs from the paper, and why:
 * Batch norm comes before the ReLU instead of after it, so that it can be folded into the convolution on export.
 * SqueezeSeg's recurrent CRF is left out. KUL-Seg's section 4 does not mention one. With it, cars gain 3.7 points of
   IoU, and pedestrians and cyclists lose 1.0 and 1.3 (PointSeg's Table 1). The runtime corrects labels itself, by a vote
-  of neighbors and RANSAC (`edgeperc.refine`).
+  of neighbors and RANSAC (`edgeperc.objects.refine`).
 * The widths of the fire layers are those of the authors' released network.
 """
 

@@ -31,9 +31,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from edgeperc.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
+from edgeperc.types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
 
-from ..targets import SLOT_CELLS
+from ..data.targets import SLOT_CELLS
 
 __all__ = [
     "CONTEXT_DILATIONS",

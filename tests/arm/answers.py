@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 import edgeperc
-from edgeperc.session import Session
-from edgeperc.tuning import cpu_features, cpu_model
+from edgeperc.inference.session import Session
+from edgeperc.system.machine import cpu_features, cpu_model
 from edgeperc.zoo import DEFAULT
 
 PRECISIONS = ("fp32", "int8")

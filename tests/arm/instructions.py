@@ -19,7 +19,7 @@ from .environment import REPOSITORY, Environment, run
 # On aarch64: run each network twice, and call getppid before and after the second run.
 PROGRAM = """
 import os, sys, onnxruntime
-from edgeperc.session import golden_input
+from edgeperc.inference.session import golden_input
 options = onnxruntime.SessionOptions()
 options.intra_op_num_threads = 1
 for file in sys.argv[1:]:

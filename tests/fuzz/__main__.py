@@ -18,7 +18,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the tests' helpers
 
-from edgeperc.atomic import write_atomic
+from edgeperc.system.atomic import write_atomic
 
 from .running import Kind, State, attempt, new_case, run_job, summary_of, supervise
 

@@ -28,9 +28,9 @@ import numpy as np
 import edgeperc.perceiver as perceiver_module
 from edgeperc import Perceiver
 from edgeperc.cli import main
+from edgeperc.inference.session import Session
 from edgeperc.readers import apart
-from edgeperc.sensor import SENSORS
-from edgeperc.session import Session
+from edgeperc.types.sensor import SENSORS
 
 from .arrays import base_scan
 from .captures import LIBRARIES, Forked
@@ -228,7 +228,7 @@ def _run(arguments: list[str]) -> tuple[int, str]:
 
 # Imported before the processes are forked, which would each spend 0.1 s on them.
 IMPORTED = (
-    "edgeperc.evaluation.tracking", "edgeperc.listing", "edgeperc.readers.captures", "edgeperc.readers.images",
+    "edgeperc.evaluation.tracking", "edgeperc.inference.listing", "edgeperc.readers.captures", "edgeperc.readers.images",
     "edgeperc.simulation.samples", "numba.np.arraymath", "onnxruntime",
 )  # fmt: skip
 

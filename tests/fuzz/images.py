@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 import edgeperc.perceiver as perceiver_module
 from edgeperc import Perceiver, Perception
-from edgeperc.card import CameraGeometry
+from edgeperc.camera.image import MAX_EDGE, MAX_PIXELS
 from edgeperc.errors import EdgepercError
 from edgeperc.evaluation.camvid import LabeledImages
-from edgeperc.image import MAX_EDGE, MAX_PIXELS
 from edgeperc.readers.images import read_image
+from edgeperc.types.card import CameraGeometry
 
 from .mutate import mutated_bytes, mutated_document
 from .running import Case, check

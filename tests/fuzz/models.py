@@ -15,13 +15,13 @@ from tiny_model import field, node, number, tensor
 
 import edgeperc.perceiver as perceiver_module
 from edgeperc import Perceiver, SensorProfile
-from edgeperc.card import ModelCard
 from edgeperc.errors import EdgepercError
-from edgeperc.onnx_file import OPERATORS
+from edgeperc.inference.session import Session
 from edgeperc.records import read_boxes
-from edgeperc.sensor import SENSORS, get_sensor
-from edgeperc.session import Session
-from edgeperc.tuning import fingerprint, read_setting, write_settings
+from edgeperc.system.machine import fingerprint, read_setting, write_settings
+from edgeperc.types.card import ModelCard
+from edgeperc.types.onnx_file import OPERATORS
+from edgeperc.types.sensor import SENSORS, get_sensor
 from edgeperc.zoo import digest, model_path, resolve
 
 from .mutate import mutated_bytes, mutated_document, mutated_json, mutated_message, noise, parse
@@ -211,7 +211,7 @@ class Models:
         import torch
 
         from edgeperc_export.recipe import Recipe
-        from edgeperc_export.to_onnx import load
+        from edgeperc_export.release.to_onnx import load
 
         if self.checkpoint is None:
             from edgeperc_export.networks import build

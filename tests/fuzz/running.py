@@ -28,8 +28,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from edgeperc.atomic import write_atomic
 from edgeperc.errors import EdgepercError
+from edgeperc.system.atomic import write_atomic
 
 __all__ = [
     "Case", "Failure", "Kind", "State", "attempt", "check", "peak_mb", "reset_peak", "run_job", "summary_of",

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 import edgeperc.perceiver as perceiver_module
 from edgeperc import Box, Perceiver, Perception, SensorProfile, Tracker, Tracks, road_ahead
-from edgeperc.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
 from edgeperc.errors import EdgepercError, FitnessError
-from edgeperc.frame import ModelFrame
-from edgeperc.geometry import draw_footprints
-from edgeperc.mounting import MODEL_MOUNTING, Mounting
-from edgeperc.points import as_points
 from edgeperc.records import scan_record
-from edgeperc.sensor import SENSORS
+from edgeperc.types.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.frame import ModelFrame
+from edgeperc.types.geometry import draw_footprints
+from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
+from edgeperc.types.points import as_points
+from edgeperc.types.sensor import SENSORS
 from edgeperc.view import draw, write_html, write_labels, write_ply
 from edgeperc.zoo import resolve
 
@@ -91,7 +91,7 @@ def cards() -> list[tuple[ModelCard, ...]]:
 
 
 class MadeUp:
-    """In place of `edgeperc.session.Session`: outputs as the case wants them, none of them from a network."""
+    """In place of `edgeperc.inference.session.Session`: outputs as the case wants them, none of them from a network."""
 
     def __init__(self, card: ModelCard) -> None:
         self.card = card

@@ -1,4 +1,4 @@
-"""Slow twin of `edgeperc.blocks`."""
+"""Slow twin of `edgeperc.inference.blocks`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def pixels(blocks: np.ndarray, rows: int, cols: int) -> np.ndarray:
-    """Twin of `edgeperc.blocks.fill_pixels`: the image (C, H, W) of blocks (C x rows x cols, H / rows, W / cols)."""
+    """Twin of `blocks.fill_pixels`: the image (C, H, W) of blocks (C x rows x cols, H / rows, W / cols)."""
     n, height, width = blocks.shape
     image = np.empty((n // (rows * cols), height * rows, width * cols), blocks.dtype)
     for c, row, col in np.ndindex(*image.shape):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from edgeperc.perception import Box
+from edgeperc.types.perception import Box
 
 
 def scores(scans: list[tuple[list[Box], list[Box]]], label: str, farthest_m: float) -> dict[str, float]:

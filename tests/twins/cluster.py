@@ -6,7 +6,7 @@ import numpy as np
 
 
 def clusters(points, among, min_distance, distance_per_m, max_range, min_points):
-    """Twin of `edgeperc.linkage.fill_clusters` with every point as a seed: every pair is looked at."""
+    """Twin of `edgeperc.objects.linkage.fill_clusters` with every point as a seed: every pair is looked at."""
     xyz = points[:, :3].astype(np.float64)
     used = np.flatnonzero(among & np.isfinite(xyz).all(axis=1) & (abs(xyz) <= max_range).all(axis=1))
     x, y, z = xyz[used].T
@@ -30,7 +30,7 @@ def clusters(points, among, min_distance, distance_per_m, max_range, min_points)
 
 
 def votes(clusters, labels, min_share, part_of):
-    """Twin of `edgeperc.cluster.cluster_labels`: a table of all clusters and labels."""
+    """Twin of `edgeperc.objects.cluster.cluster_labels`: a table of all clusters and labels."""
     counts = np.zeros((clusters.max(initial=-1) + 1, 256), int)
     np.add.at(counts, (clusters[clusters >= 0], labels[clusters >= 0]), 1)
     for part, whole in part_of.items():
@@ -42,7 +42,7 @@ def votes(clusters, labels, min_share, part_of):
 
 
 def rectangle(members, l_shaped):
-    """Twin of `edgeperc.cluster.fill_rectangle`: x, y, extent along, across, heading."""
+    """Twin of `edgeperc.objects.cluster.fill_rectangle`: x, y, extent along, across, heading."""
     voting = members[:: -(-len(members) // 256)]
 
     def turned(points, angle):

@@ -6,14 +6,14 @@ import numpy as np
 
 
 def kept_rows(points, lines):
-    """Twin of `edgeperc.crop.fill_rows`: the rows of the points between the lines."""
+    """Twin of `edgeperc.inference.crop.fill_rows`: the rows of the points between the lines."""
     x, y = points[:, :2].T.astype(np.float64)
     with np.errstate(invalid="ignore"):
         return np.flatnonzero(np.all([a * x + b * y >= c for a, b, c in lines], axis=0))
 
 
 def spread(parts, n):
-    """Twin of `edgeperc.crop.spread`: the first part in whose view a point is."""
+    """Twin of `edgeperc.inference.crop.spread`: the first part in whose view a point is."""
     labels, in_view = np.zeros(n, np.uint8), np.zeros(n, bool)
     for part, rows in parts:
         for k, row in enumerate(rows):

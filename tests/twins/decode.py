@@ -42,7 +42,7 @@ def clip_polygon(subject, clip):
 
 
 def oriented_iou(a, b):
-    """Twin of `edgeperc.geometry.fill_oriented_iou`."""
+    """Twin of `edgeperc.types.geometry.fill_oriented_iou`."""
     iou = np.zeros((len(a), len(b)))
     for i, first in enumerate(np.asarray(a, dtype=np.float64)):
         for j, second in enumerate(np.asarray(b, dtype=np.float64)):
@@ -55,7 +55,7 @@ def oriented_iou(a, b):
 
 
 def nms(rectangles, iou_threshold, max_inside=np.inf):
-    """Twin of `edgeperc.geometry.mark_nms`."""
+    """Twin of `edgeperc.types.geometry.mark_nms`."""
     iou = oriented_iou(rectangles, rectangles)
     limits = np.broadcast_to(iou_threshold, len(rectangles))
     area = rectangles[:, 2] * rectangles[:, 3]
@@ -75,14 +75,14 @@ def softmax(logits):
 
 
 def classes(values, are_logits):
-    """Twin of `edgeperc.decode.fill_labels` and `fill_scores`: labels, scores, number of values that are not finite."""
+    """Twin of `decode.fill_labels` and `fill_scores`: labels, scores, number of values that are not finite."""
     labels = np.argmax(values, axis=0).astype(np.uint8)
     probabilities = softmax(values) if are_logits else values
     return labels, probabilities.max(axis=0), int((~np.isfinite(values)).sum())
 
 
 def peaks(heat, threshold):
-    """Twin of `edgeperc.decode.mark_peaks`."""
+    """Twin of `edgeperc.inference.decode.mark_peaks`."""
     padded = np.pad(heat.astype(np.float64), 1, constant_values=-np.inf)
     height, width = heat.shape
     peak = heat >= threshold
@@ -97,7 +97,7 @@ def peaks(heat, threshold):
 
 
 def facing(yaw, x, y):
-    """Twin of `edgeperc.decode._facing` for one box: the yaw of the likelier front, and its probability."""
+    """Twin of `edgeperc.inference.decode._facing` for one box: the yaw of the likelier front, and its probability."""
     logit = np.dot([np.cos(yaw), np.sin(yaw)], [x, y])
     with np.errstate(over="ignore"):
         front = 1.0 / (1.0 + np.exp(-np.float64(logit)))
@@ -107,7 +107,7 @@ def facing(yaw, x, y):
 
 
 def footprint_sums(values, are_logits, rectangles, x_far, y_left, cell, max_summed=2**18):
-    """Twin of `edgeperc.decode.fill_footprint_sums`."""
+    """Twin of `edgeperc.inference.decode.fill_footprint_sums`."""
     probabilities = softmax(values) if are_logits else values.astype(np.float64)
     _, height, width = values.shape
     x = x_far - (np.arange(height)[:, None] + 0.5) * cell
@@ -138,7 +138,7 @@ def footprint_sums(values, are_logits, rectangles, x_far, y_left, cell, max_summ
 
 
 def footprints(labels, boxes, view, classes):
-    """Twin of `edgeperc.geometry.draw_footprints`: every cell of the view for every box."""
+    """Twin of `edgeperc.types.geometry.draw_footprints`: every cell of the view for every box."""
     x, y = view.cell_centers()
     for box in sorted(boxes, key=lambda box: -np.hypot(*box.center[:2])):
         dx, dy, cos, sin = x - box.center[0], y - box.center[1], np.cos(box.yaw), np.sin(box.yaw)

@@ -8,7 +8,7 @@ import numpy as np
 
 
 def scan_sums(points, step, beam_step, view_right, view_left):
-    """Twin of `edgeperc.fitness.fill_scan_sums`: its outputs in their order, but ``rows`` as eight lists."""
+    """Twin of `edgeperc.preprocess.fitness.fill_scan_sums`: its outputs in their order, but ``rows`` as eight lists."""
 
     def finite(rows):
         return rows[np.isfinite(rows).all(axis=1)].astype(np.float64)

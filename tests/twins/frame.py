@@ -1,4 +1,4 @@
-"""Twin of `edgeperc.frame`."""
+"""Twin of `edgeperc.types.frame`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def moved(points, R, t):
 
 
 def turned(points, angle_rad):
-    """Twin of `edgeperc.frame.turned`, one operation of numpy after another."""
+    """Twin of `edgeperc.types.frame.turned`, one operation of numpy after another."""
     found = points.copy()
     cos, sin = np.float32(np.cos(angle_rad)), np.float32(np.sin(angle_rad))
     with np.errstate(over="ignore", invalid="ignore"):

@@ -26,7 +26,7 @@ def screw(velocity, rate):
 
 
 def deskewed(points, after_s, velocity, rate):
-    """Twin of `edgeperc.motion.fill_deskewed`."""
+    """Twin of `edgeperc.preprocess.motion.fill_deskewed`."""
     moved = points.copy()
     for i, seconds in enumerate(after_s):
         with np.errstate(invalid="ignore", over="ignore"):
@@ -37,7 +37,7 @@ def deskewed(points, after_s, velocity, rate):
 
 
 def inside(polygon, points):
-    """Twin of `edgeperc.zones.mark_inside`: how often each point sees an edge above it, in fractions."""
+    """Twin of `edgeperc.tracking.zones.mark_inside`: how often each point sees an edge above it, in fractions."""
     found = []
     for point in points.tolist():
         odd = False

@@ -6,7 +6,7 @@ import numpy as np
 
 
 def in_boxes(boxes, points):
-    """Twin of `edgeperc.moving.mark_in_boxes`: each point is turned into the frame of each box."""
+    """Twin of `edgeperc.tracking.moving.mark_in_boxes`: each point is turned into the frame of each box."""
     found = []
     for point in points[:, :3].astype(float):
         there = False

@@ -6,7 +6,7 @@ import numpy as np
 
 
 def lowest_returns(points, bounds, grid, shape):
-    """Twin of `edgeperc.observed.fill_lowest_returns`."""
+    """Twin of `edgeperc.ground.observed.fill_lowest_returns`."""
     first, per_unit, ring_m = grid
     x, y = points[:, :2].T.astype(np.float64)
     z = points[:, 2]
@@ -24,7 +24,7 @@ def lowest_returns(points, bounds, grid, shape):
 
 
 def rays(lowest, rays, steps, tilt):
-    """Twin of `edgeperc.observed.follow_rays`: the returns on the ground, what lies between two of them, bridges."""
+    """Twin of `observed.follow_rays`: the returns on the ground, what lies between two of them, bridges."""
     ring_m, z_beams, first_gradient, max_apart = rays
     middles = (np.arange(lowest.shape[1]) + 0.5) * ring_m
     level, state = np.empty_like(lowest), np.zeros(lowest.shape, np.uint8)
@@ -82,7 +82,7 @@ def sectors(state):
 
 
 def cells(points, index, bin_of_cell, level, state):
-    """Twin of `edgeperc.observed.mark_cells`."""
+    """Twin of `edgeperc.ground.observed.mark_cells`."""
     flat = index.reshape(-1)
     top = np.full(flat.shape, np.inf)
     top[flat >= 0] = points[flat[flat >= 0], 2]

@@ -7,7 +7,7 @@ from shapely import LinearRing, LineString, Point, Polygon, box, union_all
 
 
 def grown(cells, radius):
-    """Twin of `edgeperc.outline.fill_grown`: distances to all marked cells."""
+    """Twin of `edgeperc.road.outline.fill_grown`: distances to all marked cells."""
     rows, cols = np.nonzero(cells)
     row, col = np.indices(cells.shape)
     squares = (row[..., None] - rows) ** 2 + (col[..., None] - cols) ** 2
@@ -15,7 +15,7 @@ def grown(cells, radius):
 
 
 def without_contacts(cells, addable):
-    """Twin of `edgeperc.outline.resolve_contacts`, in the same order."""
+    """Twin of `edgeperc.road.outline.resolve_contacts`, in the same order."""
     cells, addable, changed = cells.copy(), addable.copy(), True
     while changed:  # a cell may be added and removed again in one pass
         changed = False
@@ -33,7 +33,7 @@ def without_contacts(cells, addable):
 
 
 def connected(cells, row, col):
-    """Twin of `edgeperc.outline.mark_connected`: the part grows until it no longer does."""
+    """Twin of `edgeperc.road.outline.mark_connected`: the part grows until it no longer does."""
     part = np.zeros_like(cells)
     part[row, col] = True
     while True:
@@ -46,7 +46,7 @@ def connected(cells, row, col):
 
 
 def sides(cells):
-    """What the rings of `edgeperc.outline.fill_rings` consist of: sides from corner to corner, cells to the left."""
+    """What the rings of `outline.fill_rings` consist of: sides from corner to corner, cells to the left."""
     found = set()
     for row, col in np.argwhere(cells).tolist():
         square = [(row + 1, col), (row + 1, col + 1), (row, col + 1), (row, col)]
@@ -57,7 +57,7 @@ def sides(cells):
 
 
 def needed(rings, addable, removable, outer, enough):
-    """Twin of `edgeperc.outline.mark_needed`: the same order, shapely's geometry; rings of tuples."""
+    """Twin of `edgeperc.road.outline.mark_needed`: the same order, shapely's geometry; rings of tuples."""
     rings = [list(ring) for ring in rings]
     places = [(number, corner) for number, ring in enumerate(rings) for corner in ring]
     limit, largest = 0, 4 * np.prod(np.max([corner for _, corner in places], axis=0) + 2)
@@ -93,7 +93,7 @@ def needed(rings, addable, removable, outer, enough):
 
 
 def merged(ring, edges, changeable, around, enough):
-    """Twin of `edgeperc.outline.merge_corners`: the same order, shapely's geometry; a ring of tuples."""
+    """Twin of `edgeperc.road.outline.merge_corners`: the same order, shapely's geometry; a ring of tuples."""
     ring, limit, tried = list(ring), 8, {}
     (height, width), others = changeable.shape, [LineString([edge[:2], edge[2:]]) for edge in edges]
     fixed = union_all([box(row, col, row + 1, col + 1) for row, col in np.argwhere(~changeable).tolist()])

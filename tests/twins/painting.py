@@ -1,4 +1,4 @@
-"""Twins of `edgeperc.calibration` and `edgeperc.painting`."""
+"""Twins of `edgeperc.camera.calibration` and `edgeperc.camera.painting`."""
 
 from __future__ import annotations
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from edgeperc import persons
+from edgeperc.objects import persons
 
 
 def measured(points, height, members, above):
-    """Twin of `edgeperc.persons.measure`: the axis is the mean direction of squared offsets, as complex numbers."""
+    """Twin of `persons.measure`: the axis is the mean direction of squared offsets, as complex numbers."""
     tall = height[members].astype(np.float64)
     top = tall.max(initial=-np.inf)
     xy = points[members, :2].astype(np.float64)[tall > above]
@@ -27,7 +27,7 @@ def along(points, members, cos, sin):
 
 
 def groups(points, height, labels, roles, clusters):
-    """Twin of `edgeperc.persons.fill_person_groups`: the groups, and the points outside of them."""
+    """Twin of `edgeperc.objects.persons.fill_person_groups`: the groups, and the points outside of them."""
     whole, loose = [], []
     for k in range(clusters.max(initial=-1) + 1):
         members = np.flatnonzero(clusters == k)
@@ -45,7 +45,7 @@ def groups(points, height, labels, roles, clusters):
 
 
 def border(points, height, members, above, found):
-    """Twin of `edgeperc.persons.border_of`: a smoothed histogram."""
+    """Twin of `edgeperc.objects.persons.border_of`: a smoothed histogram."""
     length = found[3] - found[2]
     n = int(min(length / persons.BIN_M, persons.MAX_BINS - 1)) + 1
     edge = max(persons.BIN_M, length / n)
@@ -60,7 +60,7 @@ def border(points, height, members, above, found):
 
 
 def heads(points, height, members, found):
-    """Twin of `edgeperc.persons.head_width`: sorted places, cut at gaps."""
+    """Twin of `edgeperc.objects.persons.head_width`: sorted places, cut at gaps."""
     upper = members[height[members].astype(np.float64) > found[6] - persons.HEAD_M]
     u, v = along(points, upper, found[0], found[1])
     if np.ptp(v) > persons.MAX_FLAT_M:
@@ -85,7 +85,7 @@ def divided(points, height, members, n_cuts=0):
 
 
 def rows(points, height, labels, roles, groups, n_whole, clusters, min_points):
-    """Twin of `edgeperc.persons.fill_persons`: a row for each part that is large enough."""
+    """Twin of `edgeperc.objects.persons.fill_persons`: a row for each part that is large enough."""
     found = []
     for k, group in enumerate(groups):
         box = measured(points, height, group, -np.inf)
@@ -117,7 +117,7 @@ def rows(points, height, labels, roles, groups, n_whole, clusters, min_points):
 
 
 def completed(points, height, in_view, clusters, walks, rides, labels):
-    """Twin of `edgeperc.persons.complete_persons`."""
+    """Twin of `edgeperc.objects.persons.complete_persons`."""
     labels = labels.copy()
     for k in range(clusters.max(initial=-1) + 1):
         members = np.flatnonzero(clusters == k)

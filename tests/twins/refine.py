@@ -14,7 +14,7 @@ def neighbors(row, col, reach, shape, full_turn):
 
 
 def without_outliers(points, index, labels, radii, full_turn):
-    """Twin of `edgeperc.refine.fill_without_outliers`."""
+    """Twin of `edgeperc.objects.refine.fill_without_outliers`."""
     cleaned = labels.copy()
     seen = np.zeros(labels.shape, dtype=bool)
     for first in np.ndindex(*labels.shape):
@@ -64,7 +64,7 @@ def without_outliers(points, index, labels, radii, full_turn):
 
 
 def point_labels(points, pixel, index, labels, full_turn):
-    """Twin of `edgeperc.refine.fill_point_labels`."""
+    """Twin of `edgeperc.objects.refine.fill_point_labels`."""
     ranges = np.sqrt((points[:, :3].astype(np.float64) ** 2).sum(axis=1))
     out = np.zeros(len(points), dtype=np.uint8)
     for i, flat in enumerate(pixel):

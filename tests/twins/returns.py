@@ -6,7 +6,7 @@ import numpy as np
 
 
 def returns(points, min_range_m, origin=(0.0, 0.0), ego_box=None):
-    """Twin of `edgeperc.returns.returns`: the points, and the number that are not finite, too near and of the ego."""
+    """Twin of `returns.returns`: the points, and the number that are not finite, too near and of the ego."""
     out = points.copy()
     counts = [0, 0, 0]
     for i, (x, y, z, remission) in enumerate(points.astype(np.float64)):

@@ -1,0 +1,1 @@
+"""Labels, boxes and cells correct one another."""

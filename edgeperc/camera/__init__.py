@@ -1,0 +1,1 @@
+"""Images, the calibration of a camera, and classes of an image on points and on the top view."""

@@ -1,0 +1,240 @@
+"""How a camera sees what a LiDAR measures: intrinsics, pose, and the projection of points into the image."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import CalibrationError, PointsError
+from ..system.kernel_cache import njit
+from ..types.points import read_only
+
+__all__ = ["Calibration", "fill_projected", "read_kitti_calibration"]
+
+MAX_EDGE, MAX_PIXELS = 2**15, 2**26  # of an image, as in `edgeperc.camera.image`
+MAX_DISTANCE_M = 100.0  # between the sensors; more is probably a translation in millimeters
+# KITTI's rotations have seven digits; a product of two of them is off by some 1e-6.
+ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """A pinhole camera without distortion, and its pose relative to the LiDAR.
+
+    The camera frame is that of OpenCV and KITTI: x right, y down, z ahead [m]. The center of the top left pixel is at
+    (0, 0). Rectify images of a lens with distortion first; ``K`` is then that of the rectified image.
+
+    Attributes
+    ----------
+    K : (3, 3) float64, read-only
+        ``[[f_x, 0, c_x], [0, f_y, c_y], [0, 0, 1]]`` [px].
+    T_camera_sensor : (4, 4) float64, read-only
+        Moves a point of the sensor's frame into the camera's frame [m].
+    width, height : int
+        Size of the image [px].
+
+    Raises
+    ------
+    CalibrationError
+        A value is not finite or out of its bounds, ``K`` has another form, or ``T_camera_sensor`` is not a rotation
+        and a translation.
+    """
+
+    K: NDArray[np.float64]
+    T_camera_sensor: NDArray[np.float64]
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        K, T = _matrix("K", self.K, 3), _matrix("T_camera_sensor", self.T_camera_sensor, 4)
+        if K[0, 1] != 0.0 or K[1, 0] != 0.0 or K[2].tolist() != [0.0, 0.0, 1.0]:
+            raise CalibrationError(
+                f"K is {K.tolist()}; expected [[f_x, 0, c_x], [0, f_y, c_y], [0, 0, 1]], without skew. "
+                "Rectify the images first"
+            )
+        if not (min(K[0, 0], K[1, 1]) > 0.0 and np.abs(K).max() <= 1e6):
+            raise CalibrationError(
+                f"K has focal lengths {K[0, 0]:g}, {K[1, 1]:g} and center {K[0, 2]:g}, {K[1, 2]:g}; expected focal "
+                "lengths above 0 and values up to 1e6 pixels"
+            )
+        R, t = T[:3, :3], T[:3, 3]
+        if np.abs(R @ R.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(R) < 0.0:
+            raise CalibrationError(
+                f"T_camera_sensor has {R.tolist()} at its upper left; expected a rotation (orthonormal, determinant 1)"
+            )
+        if T[3].tolist() != [0.0, 0.0, 0.0, 1.0] or np.abs(t).max() > MAX_DISTANCE_M:
+            raise CalibrationError(
+                f"T_camera_sensor has translation {t.tolist()} and last row {T[3].tolist()}; expected at most "
+                f"{MAX_DISTANCE_M:g} m between camera and LiDAR (not millimeters), and 0, 0, 0, 1"
+            )
+        object.__setattr__(self, "K", K)
+        object.__setattr__(self, "T_camera_sensor", T)
+        object.__setattr__(self, "width", _pixels("width", self.width))
+        object.__setattr__(self, "height", _pixels("height", self.height))
+        if self.width * self.height > MAX_PIXELS:
+            raise CalibrationError(f"width x height is {self.width} x {self.height}; expected at most {MAX_PIXELS:,}")
+
+    @classmethod
+    def from_kitti(cls, path: str | os.PathLike[str], width: int, height: int) -> Calibration:
+        """Read the calibration of KITTI's left color camera.
+
+        Parameters
+        ----------
+        path : str or Path
+            A ``calib`` file of the object, tracking or odometry data, as in `read_kitti_calibration`.
+        width, height : int
+            Size of the image [px]. The file does not hold it; KITTI's images are 1224 to 1242 wide and 370 to 376 high.
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        CalibrationError
+            An entry is missing or malformed, or the values are not those of a camera.
+        OSError
+            The file cannot be read.
+        """
+        T_rectified_sensor, P2 = read_kitti_calibration(path)
+        K = P2[:, :3]
+        # P2 moves from the rectified frame of camera 0 to camera 2, and projects: K (p + t).
+        T_camera_rectified = np.eye(4)
+        try:
+            T_camera_rectified[:3, 3] = np.linalg.solve(K, P2[:, 3])
+        except np.linalg.LinAlgError as exc:
+            raise CalibrationError(f"{path}: P2 is {P2.tolist()}; expected K and a fourth column") from exc
+        return cls(K, T_camera_rectified @ T_rectified_sensor, width, height)
+
+    def resized(self, width: int, height: int) -> Calibration:
+        """The calibration of the same image, resized to ``width`` x ``height`` [px] without a crop."""
+        scale = np.diag([_pixels("width", width) / self.width, _pixels("height", height) / self.height, 1.0])
+        half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # from centers of pixels to their edges
+        return Calibration(np.linalg.inv(half) @ scale @ half @ self.K, self.T_camera_sensor, width, height)
+
+    def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Project points into the image.
+
+        Parameters
+        ----------
+        points : (n, 3 or more) array_like
+            x, y, z [m] in the sensor's frame; further columns are ignored.
+
+        Returns
+        -------
+        u, v : (n,) float64
+            Column and row [px]; may be outside the image. NaN for a point that is not in front of the camera, or not
+            finite.
+        depth_m : (n,) float64
+            Distance along the optical axis [m], negative behind the camera; NaN for a point that is not finite.
+
+        Raises
+        ------
+        PointsError
+            ``points`` has another shape.
+        """
+        try:
+            rows = read_only(points)
+        except (TypeError, ValueError) as exc:
+            raise PointsError(f"got points that are not an array of numbers ({exc}); expected (n, 3 or more)") from exc
+        if rows.ndim != 2 or rows.shape[1] < 3:
+            raise PointsError(f"got points of shape {rows.shape}; expected (n, 3 or more): x, y, z")
+        u, v, depth = np.empty((3, len(rows)))
+        fill_projected(rows, self.K @ self.T_camera_sensor[:3], u, v, depth)
+        return u, v, depth
+
+
+def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Read a calibration file of KITTI's object, tracking or odometry data.
+
+    Parameters
+    ----------
+    path : str or Path
+        A text file with P2, R0_rect (or R_rect) and Tr_velo_to_cam (or Tr_velo_cam); in odometry data P2 and Tr, which
+        includes the rectification.
+
+    Returns
+    -------
+    T_rectified_sensor : (4, 4) float64
+        From the Velodyne's frame to the rectified frame of camera 0.
+    P2 : (3, 4) float64
+        From there to the image of the left color camera.
+
+    Raises
+    ------
+    CalibrationError
+        An entry is missing or malformed.
+    OSError
+        The file cannot be read.
+    """
+    values = {}
+    try:
+        for line in Path(path).read_text("utf-8").splitlines():
+            key, _, numbers = line.replace(":", " ", 1).partition(" ")
+            if numbers.strip():
+                values[key] = np.array([float(v) for v in numbers.split()])
+        rectify, from_velo = np.eye(4), np.eye(4)
+        if "Tr" in values:
+            from_velo[:3] = values["Tr"].reshape(3, 4)
+        else:
+            rectify[:3, :3] = values["R0_rect" if "R0_rect" in values else "R_rect"].reshape(3, 3)
+            from_velo[:3] = values["Tr_velo_to_cam" if "Tr_velo_to_cam" in values else "Tr_velo_cam"].reshape(3, 4)
+        return rectify @ from_velo, values["P2"].reshape(3, 4)
+    except (KeyError, ValueError) as exc:
+        raise CalibrationError(
+            f"{path} holds no KITTI calibration ({type(exc).__name__}: {exc}); expected P2, R0_rect and Tr_velo_to_cam"
+        ) from exc
+
+
+def _pixels(name: str, given: object) -> int:
+    if isinstance(given, bool) or not isinstance(given, int | np.integer) or not 1 <= given <= MAX_EDGE:
+        raise CalibrationError(f"{name} is {given!r:.80}; expected a whole number of pixels from 1 to {MAX_EDGE}")
+    return int(given)
+
+
+def _matrix(name: str, given: ArrayLike, n: int) -> NDArray[np.float64]:
+    try:
+        matrix: NDArray[np.float64] = read_only(np.array(given, dtype=np.float64), np.float64)
+    except (TypeError, ValueError) as exc:
+        raise CalibrationError(f"{name} is not an array of numbers ({exc}); expected ({n}, {n})") from exc
+    if matrix.shape != (n, n) or not np.isfinite(matrix).all():
+        raise CalibrationError(
+            f"{name} has shape {matrix.shape}; expected a finite ({n}, {n}) matrix, got {given!r:.200}"
+        )
+    return matrix
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_projected(
+    points: NDArray[np.float32],
+    P: NDArray[np.float64],
+    u: NDArray[np.float64],
+    v: NDArray[np.float64],
+    depth: NDArray[np.float64],
+) -> None:
+    """Project points: column, row and depth of each.
+
+    Parameters
+    ----------
+    points : (n, 3 or more) float32, C-contiguous
+    P : (3, 4) float64
+        ``K`` times the upper three rows of ``T_camera_sensor``.
+    u, v : (n,) float64, overwritten
+        [px]; NaN unless the point is finite and in front of the camera.
+    depth : (n,) float64, overwritten
+        [m]; NaN if the point is not finite.
+    """
+    for i in range(points.shape[0]):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        u[i] = v[i] = depth[i] = math.nan
+        if not (abs(x) < math.inf and abs(y) < math.inf and abs(z) < math.inf):
+            continue
+        depth[i] = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
+        if depth[i] > 0.0:
+            u[i] = (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3]) / depth[i]
+            v[i] = (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3]) / depth[i]

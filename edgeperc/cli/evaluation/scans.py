@@ -1,0 +1,360 @@
+"""``edgeperc eval``: accuracy on labeled scans and images."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ...system.extras import require
+from ..arguments import (
+    CAMERA,
+    DEFAULT,
+    RULES,
+    Commands,
+    add_agreement,
+    add_boxes_from,
+    add_command,
+    add_figures_file,
+    add_model,
+    add_provider,
+    finite_number,
+)
+from ..output import FEW, many, print_line, progress, table_lines, write_figures
+from ..ray import add_engine
+from .box_tables import box_table_lines, interval_columns
+
+__all__ = ["add_parser", "eval_command"]
+
+
+def add_parser(commands: Commands) -> None:
+    """Add ``eval``."""
+    parser = add_command(
+        commands,
+        "eval",
+        eval_command,
+        help="accuracy on labeled scans and images: the papers' tables",
+        description="Compare the models' results with the labels of scans: points, boxes, top view and road, over all "
+        "distances and by range, with 95 % intervals over drives; boxes also as KITTI and nuScenes measure them. "
+        "It is an error to evaluate a model on a scan that it was trained on, except with "
+        "--split train.\n\nCompare a camera model with labeled images: IoU of each class "
+        "and their mean, with 95 % intervals over images; unlabeled pixels do not count.",
+        examples=[
+            "edgeperc eval simulation:24",
+            "edgeperc eval KITTI/ SemanticKITTI/ --model pointseg --json figures.json",
+            "edgeperc eval KITTI/ --split all --worst worst.png",
+            "edgeperc eval CamVid/ --model camseg",
+        ],
+    )
+    reading = parser.add_argument_group("input")
+    reading.add_argument(
+        "datasets",
+        nargs="+",
+        metavar="DATASET",
+        help="the root of a KITTI object set or of SemanticKITTI, simulation:N for N simulated scans (simulation "
+        "alone: 24), or labeled scans of any sensor: a folder with scans.json, or FOLDER:LAYOUT with the name of a "
+        "public set (pandaset, av2, vod, ddad, lyft, semantickitti); or labeled images: a folder with classes.json, "
+        "train, trainannot, val, valannot as in CamVid",
+    )
+    reading.add_argument(
+        "--split",
+        choices=("test", "validation", "held-back", "train", "all"),
+        help="which drives (default: test, or those of --fold; of images without test images: validation); nothing is "
+        "trained on test and validation drives, which are the held-back ones",
+    )
+    reading.add_argument(
+        "--fold",
+        type=int,
+        choices=(0, 1, 2),
+        help="evaluate on the validation drives of this training fold (default: none)",
+    )
+    reading.add_argument(
+        "--mounted",
+        type=_mounted,
+        metavar="M,DEG,DEG",
+        help="perceive each scan as a sensor of this height, roll and pitch would have recorded it, the mounting to be "
+        "estimated from that scan alone; evaluates points and boxes (default: as recorded)",
+    )
+    add_engine(parser)
+    models = parser.add_argument_group("models")
+    add_model(models)
+    add_provider(models, provider="cpu")
+    add_boxes_from(models)
+    add_agreement(models)
+    models.add_argument(
+        "--without-rule",
+        action="append",
+        choices=RULES,
+        default=[],
+        metavar="RULE",
+        help="leave out one rule of the agreement, to measure what it is worth; may be repeated: "
+        f"{', '.join(RULES)} (default: none)",
+    )
+    models.add_argument(
+        "--road-by",
+        metavar="MODEL",
+        help="another top-view model whose drivable cells are the ground truth on KITTI, which has no road labels "
+        "(default: no road figures on KITTI)",
+    )
+    output = parser.add_argument_group("output")
+    add_figures_file(output)
+    output.add_argument(
+        "--worst",
+        type=Path,
+        metavar="FILE",
+        help="write a picture, .png, of the scans with the most errors (needs the extra 'view'; default: none)",
+    )
+
+
+def _mounted(text: str) -> tuple[float, float, float]:
+    height_m, roll_deg, pitch_deg = (finite_number(part) for part in text.split(","))
+    return height_m, roll_deg, pitch_deg
+
+
+def eval_command(arguments: argparse.Namespace) -> int:
+    """Compare models with labeled scans."""
+    if arguments.worst is not None:
+        require("matplotlib", "view", "Drawing a picture")
+    for file in filter(None, (arguments.json, arguments.worst)):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    from ...evaluation.camvid import LabeledImages
+
+    of_images = [Path(dataset) for dataset in arguments.datasets if LabeledImages.is_one(Path(dataset))]
+    if of_images:
+        return _eval_images(arguments, of_images)
+    from ...evaluation.evaluate import evaluate
+    from ...types.mounting import Mounting
+
+    with progress() as show:
+        figures, mistakes = evaluate(
+            arguments.datasets,
+            arguments.model or DEFAULT,
+            split=arguments.split,
+            fold=arguments.fold,
+            road_by=arguments.road_by,
+            boxes_from=arguments.boxes_from,
+            rules=() if arguments.no_agreement else {*RULES} - {*arguments.without_rule},
+            mounted=None if arguments.mounted is None else Mounting(*arguments.mounted),
+            provider=arguments.provider,
+            precision=arguments.precision,
+            engine=arguments.engine,
+            workers=arguments.workers,
+            on_scan=show,
+        )
+    for line in _figure_lines(figures):
+        print_line(line, gray=FEW in line)
+    write_figures(arguments, figures)
+    if arguments.worst is not None:
+        from ...view.mistakes import draw_mistakes
+
+        models = ", ".join(f"{name} {version}" for name, version in figures["models"].items())
+        draw_mistakes(mistakes, arguments.worst, title=models)
+    return 0
+
+
+def _eval_images(arguments: argparse.Namespace, roots: Sequence[Path]) -> int:
+    """Compare a camera model with labeled images."""
+    from ...evaluation.camvid import evaluate_images
+
+    if len(roots) < len(arguments.datasets):
+        arguments.usage_error("labeled images and labeled scans have different figures; evaluate them one by one")
+    if arguments.engine == "ray":
+        arguments.usage_error("--engine ray is for scans; leave it out")
+    used = {"--fold": arguments.fold, "--mounted": arguments.mounted, "--road-by": arguments.road_by}
+    for option, value in (used | {"--worst": arguments.worst}).items():
+        if value is not None:
+            arguments.usage_error(f"{option} is for scans")
+    models = arguments.model or [CAMERA]
+    if len(models) > 1:
+        arguments.usage_error(f"got {len(models)} models; images are evaluated with one --model")
+    with progress("image") as show:
+        figures = evaluate_images(
+            roots,
+            models[0],
+            split=arguments.split,
+            provider=arguments.provider,
+            precision=arguments.precision,
+            on_image=show,
+        )
+    for line in _image_lines(figures):
+        print_line(line)
+    write_figures(arguments, figures)
+    return 0
+
+
+# Columns of the tables: heading and key. Shares are printed in per cent, each with its interval.
+_RATES = (("precision", "precision"), ("recall", "recall"))
+_OBJECT_COUNTS = (("objects", "n_objects"), ("drives", "n_drives"))
+_LABELED_COLUMNS = (("labels", "n_boxes"), *_OBJECT_COUNTS)
+_POINT_COLUMNS = (
+    *interval_columns(("IoU", "iou"), ("IoU by drive", "iou_by_drive"), *_RATES),
+    *(("points", "n_points"), *_OBJECT_COUNTS),
+)
+_HIT_COLUMNS = (("true", "n_truth"), ("predicted", "n_predicted"), ("hits", "n_hits"), *_OBJECT_COUNTS)
+_BOX_COLUMNS = (
+    *interval_columns(("AP50", "ap"), *_RATES, ("mIoU@.5", "mean_iou_50"), ("mIoU@.7", "mean_iou_70")),
+    *_HIT_COLUMNS,
+)
+_ALL_ROUND_COLUMNS = (*interval_columns(("AP", "ap"), *_RATES), *_HIT_COLUMNS)
+_HEADING_COLUMNS = (
+    *interval_columns(("heading", "heading"), ("modulo half a turn", "axis"), ("front known", "front_known")),
+    *(("boxes", "n_hits"), ("objects", "n_objects")),
+)
+_ERROR_COLUMNS = (
+    *interval_columns(("share", "share")),
+    *(("points", "n_points"), ("95 %", "n_points_interval"), ("of", "n_of"), ("scans", "n_scans")),
+    *_OBJECT_COUNTS,
+)
+_CELL_COLUMNS = (
+    *interval_columns(("IoU", "iou"), ("ACC", "accuracy"), ("mAP", "mean_ap"), ("mIoU", "mean_iou")),
+    ("cells", "n_cells"),
+)
+_ROAD_COLUMNS = (
+    *interval_columns(("F1", "f1"), ("AP", "ap"), ("ACC", "accuracy"), ("PRE", "precision"), ("REC", "recall")),
+    ("cells", "n_cells"),
+)
+_ROAD_COLUMNS_2 = (
+    *interval_columns(("IoU", "iou"), ("MaxF", "max_f1")),
+    *interval_columns(("observed PRE", "drivable_precision"), ("observed REC", "drivable_recall")),
+    ("cells", "n_cells"),
+)
+_PIXEL_COLUMNS = (*interval_columns(("IoU", "iou"), *_RATES), ("pixels", "n_pixels"), ("images", "n_images"))
+_IMAGE_COLUMNS = (
+    *interval_columns(("mIoU", "mean_iou"), ("accuracy", "accuracy"), ("mean recall", "mean_accuracy")),
+    ("pixels", "n_pixels"),
+)
+_BLOCKS = {"real": "real scans with boxes", "semantickitti": "SemanticKITTI", "simulated": "simulated scans"}
+
+
+def _figure_lines(figures: Mapping[str, Any]) -> list[str]:
+    models = ", ".join(f"{name} {version}" for name, version in figures["models"].items())
+    fold = "" if figures["fold"] is None else f", fold {figures['fold']}"
+    lines = [
+        f"{models}; {figures['split']} drives{fold}; shares in per cent, intervals over drives",
+        f"ran as {'; '.join(figures['providers'].values())}",
+    ]
+    blocks = [(name, figures.get(block)) for block, name in _BLOCKS.items()]
+    for name, of_block in (*blocks, *figures.get("folders", {}).items()):
+        if of_block is not None:
+            lines += ["", f"== {name}: {many(of_block['n_frames'], 'scan')}, {many(of_block['n_drives'], 'drive')} =="]
+            lines += [
+                *_labeled_lines(of_block),
+                *_point_lines(of_block),
+                *_box_lines(of_block),
+                *box_table_lines(of_block),
+            ]
+            lines += [*_error_lines(of_block), *_cell_lines(of_block), *_road_lines(of_block)]
+    return lines
+
+
+def _image_lines(figures: Mapping[str, Any]) -> list[str]:
+    images = figures["images"]
+    models = ", ".join(f"{name} {version}" for name, version in figures["models"].items())
+    n_images, n_classes = many(images["n_images"], "image"), len(images["classes"])
+    return [
+        f"{models}; {figures['split']} images; shares in per cent, intervals over images",
+        f"ran as {'; '.join(figures['providers'].values())}",
+        "",
+        f"== {n_images}, {n_classes} classes, unlabeled pixels not counted ==",
+        *table_lines("all pixels", _IMAGE_COLUMNS, [(("all", ""), images["all"])]),
+        *table_lines("classes", _PIXEL_COLUMNS, [((name, ""), row) for name, row in images["classes"].items()]),
+    ]
+
+
+def _labeled_lines(of_block: Mapping[str, Any]) -> list[str]:
+    rows = [((_marked(name, row), ""), row) for name, row in of_block.get("labeled", {}).items()]
+    return table_lines(
+        "labeled objects; each distinct object counts once, however often it is seen", _LABELED_COLUMNS, rows
+    )
+
+
+def _point_lines(of_block: Mapping[str, Any]) -> list[str]:
+    lines = []
+    for kind, title in (
+        ("points", "points; IoU by drive: each drive counts as one scan"),
+        ("sure", "points without the ground in the boxes of objects, and without people who sit"),
+        ("pixels", "points with the class of their pixel, before refinement"),
+    ):
+        columns = [column for column in _POINT_COLUMNS if kind == "points" or "iou_by_drive" not in column[1]]
+        lines += table_lines(title, columns, _class_rows(of_block.get(kind, {}), "n_points"))
+    return lines
+
+
+def _box_lines(of_block: Mapping[str, Any]) -> list[str]:
+    lines = []
+    for kind, of_kind in of_block.get("boxes", {}).items():
+        means = {
+            band: {"mean": {"ap": rows["mean_ap"], "ap_interval": rows.get("mean_ap_interval")}}
+            for band, rows in of_kind.items()
+            if rows["mean_ap"] is not None
+        }
+        rows = [*_class_rows(of_kind, "n_truth"), *_class_rows(means, "ap")]
+        order = sorted(rows, key=lambda row: [*of_kind].index(row[0][0]))
+        lines += table_lines(f"boxes where they can be detected, {kind}", _BOX_COLUMNS, order)
+    lines += table_lines(
+        "boxes wherever the truth is known, oriented: AP50 of vehicles, AP25 of pedestrians and cyclists",
+        _ALL_ROUND_COLUMNS,
+        _class_rows(of_block.get("all_round", {}), "n_truth"),
+    )
+    for kind, where in (("boxes", "where they can be detected"), ("all_round", "wherever the truth is known")):
+        rows = _class_rows(of_block.get("heading", {}).get(kind, {}), "n_hits")
+        lines += table_lines(f"heading of boxes {where}, within 45 degrees of the true one", _HEADING_COLUMNS, rows)
+    return lines
+
+
+def _error_lines(of_block: Mapping[str, Any]) -> list[str]:
+    rows = [
+        ((error, _marked(cause, row)), row)
+        for error, causes in of_block.get("errors", {}).items()
+        for cause, row in causes.items()
+        if causes["all"]["n_points"]
+    ]
+    rows += [(("car at the own bumper", cause), row) for cause, row in of_block.get("bumper", {}).items()]
+    return table_lines(
+        "errors: wrong points by cause; a cause is a share of its error, and a point may have several",
+        _ERROR_COLUMNS,
+        rows,
+    )
+
+
+def _cell_lines(of_block: Mapping[str, Any]) -> list[str]:
+    lines = []
+    for kind, of_kind in of_block.get("segmentation", {}).items():
+        rows = []
+        for band, row in of_kind.items():
+            if row["n_cells"]:
+                rows.append(((band, ""), row | {"iou": None, "iou_interval": None}))
+                for name, n_cells in row["n_cells_of"].items():
+                    own = {key: row[key][name] for key in ("iou", "iou_interval")}
+                    rows.append(((band, name), own | {"n_cells": n_cells}))
+        lines += table_lines(f"top view, {kind}", _CELL_COLUMNS, rows)
+    return lines
+
+
+def _road_lines(of_block: Mapping[str, Any]) -> list[str]:
+    rows = [((band, ""), row) for band, row in of_block.get("road", {}).items() if row["n_cells"]]
+    lines = table_lines("road", _ROAD_COLUMNS, rows)
+    lines += table_lines("road, over all thresholds and where it was observed", _ROAD_COLUMNS_2, rows)
+    for (band, _), row in rows[:1]:  # over all distances
+        titles = ("no road", "road")
+        shares = [
+            ((band, f"true {name}"), dict(zip(titles, part, strict=True)))
+            for name, part in zip(titles, row["confusion"], strict=True)
+        ]
+        lines += table_lines("road, confusion in shares of all cells", [(f"predicted {t}", t) for t in titles], shares)
+    return lines
+
+
+def _class_rows(bands: Mapping[str, Any], count: str) -> list[tuple[tuple[str, str], Mapping[str, Any]]]:
+    """A row for each class and band that has objects or predictions."""
+    return [
+        ((band, _marked(name, row)), row)
+        for band, rows in bands.items()
+        for name, row in rows.items()
+        if isinstance(row, Mapping) and (row[count] or row.get("n_predicted"))
+    ]
+
+
+def _marked(name: str, row: Mapping[str, Any]) -> str:
+    return f"{name}{FEW}" if row.get("few") else name

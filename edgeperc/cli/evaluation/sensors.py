@@ -1,0 +1,77 @@
+"""``edgeperc eval-sensors``: accuracy on other sensors, with and without adaptation."""
+
+from __future__ import annotations
+
+import argparse
+
+from ..arguments import Commands, add_command, add_figures_file, add_provider
+from ..output import FEW, many, print_line, progress, table_lines, write_figures
+from .box_tables import box_table_lines
+
+__all__ = ["add_parser", "eval_sensors_command"]
+
+
+def add_parser(commands: Commands) -> None:
+    """Add ``eval-sensors``."""
+    parser = add_command(
+        commands,
+        "eval-sensors",
+        eval_sensors_command,
+        help="accuracy on sensors that the model was not trained on",
+        description="IoU of points by class on labeled scans of sensors that the model was not trained on: without "
+        "adaptation, with the remission mapped, with interpolation between beams, and with both. Of labeled scans with "
+        "boxes also the average precision of boxes of the default pair, as KITTI and nuScenes measure it.",
+        examples=[
+            "edgeperc eval-sensors os1-64=simulation:24",
+            "edgeperc eval-sensors PandaSet/:pandaset vlp-16=simulation:8 --json out.json",
+        ],
+    )
+    reading = parser.add_argument_group("input")
+    reading.add_argument(
+        "datasets",
+        nargs="+",
+        metavar="SENSOR=SOURCE",
+        help="a sensor's name or .json profile, and simulation:N or a folder of labeled range images NAME.npy; or "
+        "labeled scans, without SENSOR=: a folder with scans.json, or FOLDER:LAYOUT with the name of a public set",
+    )
+    models = parser.add_argument_group("models")
+    models.add_argument(
+        "--model",
+        default="pointseg",
+        metavar="MODEL",
+        help="a range-image model: a name from 'edgeperc models' or an .onnx file with a card (default: %(default)s)",
+    )
+    add_provider(models, provider="cpu")
+    output = parser.add_argument_group("output")
+    add_figures_file(output)
+
+
+def eval_sensors_command(arguments: argparse.Namespace) -> int:
+    """Print IoU of points on other sensors."""
+    from ...evaluation.transfer import compare
+    from ...perceiver import ADAPTATIONS
+
+    with progress() as show:
+        figures = compare(
+            arguments.datasets,
+            arguments.model,
+            provider=arguments.provider,
+            precision=arguments.precision,
+            on_scan=show,
+        )
+    lines = [f"{arguments.model}; IoU of points in per cent, mIoU over the classes shown"]
+    for name, result in figures.items():
+        rows = [((kind, ""), {**result[kind]["iou"], "mean": result[kind]["mean_iou"]}) for kind in ADAPTATIONS]
+        counts = ", ".join(f"{count:,} {label}" for label, count in result["both"]["n_points"].items())
+        if result["n_objects"] is not None:
+            counts += "; objects: " + ", ".join(f"{n} {label}" for label, n in result["n_objects"].items())
+        labels = [label for label in result["both"]["iou"] if label != "background"]
+        columns = [(f"{label}{FEW * (label in result['few'])}", label) for label in labels]
+        function = result["function"] or "no function"
+        title = f"{name}: {many(result['n_scans'], 'scan')}, {counts}; remission: {function}"
+        lines += table_lines(title, (*columns, ("mIoU", "mean")), rows)
+        lines += box_table_lines(result.get("boxes", {}))
+    for line in lines:
+        print_line(line)
+    write_figures(arguments, figures)
+    return 0

@@ -1,0 +1,271 @@
+"""``--engine ray`` of ``edgeperc run``, and scans and results at URLs.
+
+A perceiver learns from its first scans how the sensor is mounted and how strong its remission is. The driver therefore
+perceives these itself, until more scans change nothing. All other scans are perceived by workers, each scan from this
+same state. So the results do not depend on the number of workers, and they equal those of ``--engine local``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .. import __version__
+from ..errors import EdgepercError
+from ..system.atomic import write_atomic
+from ..system.ray_cluster import MOST_FIRST, Lost, map_on_ray
+from ..system.remote import Remote
+from .arguments import positive
+from .output import many, one_line, print_line
+from .report import Report
+
+if TYPE_CHECKING:
+    from ..perceiver import Learned, Perceiver
+
+__all__ = ["add_engine", "check_engine", "perceive_on_ray", "through_temporary"]
+
+# Options that do not change what is written about a scan.
+_OTHERS = ("engine", "live", "out", "paths", "rate", "threads", "typed", "workers")
+# What the parser adds to the arguments; it cannot be pickled.
+_OF_PARSER = ("command", "parser", "usage_error")
+
+Outcome = tuple[Any, Any, Any, Any]  # `edgeperc.cli.run.Outcome`
+Scan = Callable[..., Iterator[Outcome]]
+Alone = Callable[..., "tuple[Perceiver, Scan, Callable[[Any], list[Any]]]"]
+"""From the arguments to a perceiver, what perceives and writes a scan file with it, and the files it writes."""
+
+
+def add_engine(parser: argparse.ArgumentParser) -> None:
+    """Add ``--engine`` and ``--workers``."""
+    group = parser.add_argument_group("engine")
+    group.add_argument(
+        "--engine",
+        choices=("local", "ray"),
+        default="local",
+        help="local: this process; ray: worker processes with one thread each, on the cluster that the environment "
+        "variable RAY_ADDRESS names, else on this computer (extra 'ray'). The results are the same (default: local)",
+    )
+    group.add_argument(
+        "--workers",
+        type=positive,
+        metavar="N",
+        help="number of workers of --engine ray (default: one for each CPU of the cluster)",
+    )
+
+
+def check_engine(arguments: argparse.Namespace, sinks: Sequence[str]) -> None:
+    """Check for options that do not go with ``--engine ray`` or with URLs."""
+    if arguments.workers is not None and arguments.engine != "ray":
+        arguments.usage_error("--workers is of --engine ray; add it")
+    in_order = [name for name in ("live", "track", "gif", "scan") if getattr(arguments, name)]
+    in_order = [f"--{name.replace('_', '-')}" for name in (*in_order, *sinks)]
+    if arguments.engine == "ray" and in_order:
+        arguments.usage_error(
+            f"{in_order[0]} needs the scans in their order, and --engine ray perceives them side by side; leave out one"
+        )
+    if arguments.engine == "ray" and arguments.deskew:
+        arguments.usage_error("--deskew works with --engine local, not with ray; leave out one")
+    local = [name for name in in_order if name in ("--live", "--gif", "--labels-for")]
+    urls = [path for path in (*arguments.paths, arguments.out) if isinstance(path, Remote)]
+    if urls and local:
+        arguments.usage_error(f"{local[0]} takes no URL such as {urls[0]}; copy the files to this computer")
+    if arguments.engine == "ray" and any(url.url.startswith("memory:") for url in urls):
+        arguments.usage_error("memory:// is of one process, and --engine ray has several; pass another URL or a path")
+
+
+def perceive_on_ray(
+    arguments: argparse.Namespace,
+    alone: Alone,
+    perceivers: Any,
+    scans: Sequence[Path | Remote],
+    targets: Sequence[Path | Remote],
+    report: Report,
+    show: Callable[[int, int], None],
+) -> None:
+    """Perceive scan files on a Ray cluster, and report them in their order.
+
+    Beside the files of a scan, ``.run/NAME.json`` records what they were made of: the scan, the options, the models,
+    and what was learned from the first scans. A scan is not perceived again if its record says the same and its files
+    have the recorded sizes. The first scans are always perceived again.
+    """
+    from ..readers.captures import CAPTURE_SUFFIXES
+
+    for scan in scans:
+        if scan.suffix.lower() in CAPTURE_SUFFIXES or (isinstance(scan, Path) and scan.is_dir()):
+            arguments.usage_error(f"--engine ray takes scan files; {scan} is a capture, which is decoded in its order")
+    perceive, run, _ = alone(arguments, perceivers)
+    n_first = 0
+    while n_first < min(len(scans), MOST_FIRST) and not perceive.learned.is_settled:
+        for outcome in run(scans[n_first], targets[n_first]):
+            report.add(*outcome)
+        n_first += 1
+        show(n_first, len(scans))
+    if n_first == len(scans):
+        return
+    learned = perceive.learned
+    if not learned.is_settled:
+        warnings.warn(
+            f"the first {n_first} scans do not settle mounting and remission (no ground, no remission, or refused): "
+            "--engine local would go on learning, and may give other results; pass --mount-height or --extrinsic",
+            stacklevel=2,
+        )
+    options = {name: value for name, value in vars(arguments).items() if name not in _OF_PARSER}
+    options["threads"] = n_threads = arguments.threads or 1
+    options["model"] = arguments.model and [_absolute_if_there(model) for model in arguments.model]
+    options |= {name: _absolute_if_there(options.get(name)) for name in ("sensor", "extrinsic", "poses", "out")}
+    items = [
+        (scan, _absolute(scan), _absolute(target))
+        for scan, target in zip(scans[n_first:], targets[n_first:], strict=True)
+    ]
+    answers = map_on_ray(
+        _ScanWorker,
+        (alone, argparse.Namespace(**options), learned),
+        items,
+        workers=arguments.workers,
+        n_threads=n_threads,
+    )
+    said: set[str] = set()
+    n_kept = 0
+    for done, (scan, answer) in enumerate(zip(scans[n_first:], answers, strict=True), start=n_first + 1):
+        if isinstance(answer, Lost):
+            answer = _Answer(report.text(scan, EdgepercError(answer.reason)), one_line(answer.reason), (), ())
+        for message in answer.warnings:
+            warnings.warn(message, stacklevel=2)
+        report.show(scan, _said_once(answer, said) if learned.is_settled else answer.text, answer.error)
+        n_kept += answer.kept
+        show(done, len(scans))
+    if n_kept:
+        print_line(f"{many(n_kept, 'scan')} of an earlier run kept", sys.stderr)
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """What a worker returns of a scan."""
+
+    text: str
+    error: str | None
+    fitness: tuple[str, ...]
+    warnings: tuple[str, ...]
+    kept: bool = False
+
+
+def _said_once(answer: _Answer, said: set[str]) -> str:
+    """The text without sentences of other scans: a perceiver says of its remission once what is wrong with it."""
+    text, again = answer.text, said & {*answer.fitness}
+    said |= {*answer.fitness}
+    if again and text.startswith("{"):
+        record = json.loads(text)
+        record["fitness"] = [sentence for sentence in record["fitness"] if sentence not in again]
+        text = json.dumps(record, allow_nan=False)
+    return text
+
+
+class _ScanWorker:
+    """Perceives scan files in a worker process, each from the same state."""
+
+    def __init__(self, alone: Alone, arguments: argparse.Namespace, learned: Learned) -> None:
+        self._perceive, self._run, self._files = alone(arguments)
+        self._learned = learned
+        self._report = Report(arguments, {})
+        state = (learned.mounting.mounting(), learned.mounting.n_scans, learned.remission.matched, learned.to_check)
+        options = {name: value for name, value in sorted(vars(arguments).items()) if name not in _OTHERS}
+        self._made_of = repr((__version__, self._perceive.cards, dict(self._perceive.providers), state, options))
+
+    def __call__(self, item: tuple[Path | Remote, Path | Remote, Path | Remote]) -> _Answer:
+        name, path, target = item
+        files = self._files(target)
+        record = target.parent / ".run" / f"{target.name}.json"
+        made_of = hashlib.sha256(f"{self._made_of} {name} {_stamp(path)}".encode()).hexdigest()
+        if files and (kept := _kept(record, made_of, files)) is not None:
+            return kept
+        self._perceive.start_from(self._learned)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            outcomes = list(self._run(path, target, name))
+        if len(outcomes) != 1:
+            raise EdgepercError(f"{name} holds {many(len(outcomes), 'scan')}; --engine ray takes files of one")
+        ((_, outcome, _, _),) = outcomes
+        if isinstance(outcome, EdgepercError):  # it names the absolute path
+            outcome.args = (str(outcome).replace(str(path), str(name)),)
+        text, said = self._report.text(name, outcome), tuple(dict.fromkeys(str(each.message) for each in caught))
+        if isinstance(outcome, Exception):
+            return _Answer(text, str(outcome).removeprefix(f"{name}: "), (), said)
+        answer = _Answer(text, None, tuple(map(str, outcome.fitness)), said)
+        if files:
+            sizes = {file.name: stamp[0] for file in files if (stamp := _stamp(file)) is not None}
+            content = json.dumps({"made_of": made_of, "files": sizes, "answer": astuple(answer)}).encode()
+            if isinstance(record, Path):
+                record.parent.mkdir(parents=True, exist_ok=True)
+                write_atomic(record, content)
+            else:
+                record.write_bytes(content)
+        return answer
+
+
+def _kept(record: Path | Remote, made_of: str, files: Sequence[Path | Remote]) -> _Answer | None:
+    """The answer of an earlier run, if it was made of the same and its files are complete."""
+    try:
+        content = json.loads(record.read_bytes())
+        if content["made_of"] != made_of:
+            return None
+        stamps = {file.name: _stamp(file) for file in files}
+        if any(stamp is None or stamp[0] != content["files"][name] for name, stamp in stamps.items()):
+            return None
+        text, error, fitness, said, _ = content["answer"]
+    except (FileNotFoundError, KeyError, TypeError, ValueError):
+        return None
+    return _Answer(text, error, tuple(fitness), tuple(said), kept=True)
+
+
+def _stamp(file: Path | Remote) -> tuple[int, str] | None:
+    """Size, and time or version of a file; None if there is none."""
+    if isinstance(file, Remote):
+        return file.stamp()
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    return found.st_size, str(found.st_mtime_ns)
+
+
+def _absolute(path: Path | Remote) -> Path | Remote:
+    # A worker has another current folder. A link keeps its name, so no resolve().
+    return path if isinstance(path, Remote) else Path(os.path.abspath(path))  # noqa: PTH100
+
+
+def _absolute_if_there(value: Any) -> Any:
+    """A name or path, absolute if it is a path that exists."""
+    return _absolute(Path(value)) if isinstance(value, str | Path) and Path(value).exists() else value
+
+
+def through_temporary(run: Scan, path: Path | Remote, target: Path | Remote) -> Iterator[Outcome]:
+    """Perceive a scan or capture that is at a URL, or whose files go to one, through a temporary folder."""
+    with tempfile.TemporaryDirectory(prefix="edgeperc-") as folder:
+        written = Path(folder) / "written"
+        written.mkdir()
+        try:
+            local = path.fetch(Path(folder)) if isinstance(path, Remote) else path
+        except (EdgepercError, OSError) as exc:
+            yield path, exc, None, None
+            return
+        aside = written / target.name if isinstance(target, Remote) else target
+        for name, outcome, tracks, under in run(local, aside, path):
+            try:
+                for file in sorted(each for each in written.rglob("*") if each.is_file()):
+                    assert isinstance(target, Remote)
+                    (target.parent / file.relative_to(written)).write_bytes(file.read_bytes())
+                    file.unlink()
+            except (EdgepercError, OSError) as exc:
+                outcome, tracks, under = exc, None, None
+            if isinstance(outcome, EdgepercError):  # it names the temporary file
+                outcome.args = (str(outcome).replace(str(local), str(path)),)
+            yield name, outcome, tracks, under

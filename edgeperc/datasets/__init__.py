@@ -1,0 +1,1 @@
+"""Labeled scans and images of others, as files lie on disk."""

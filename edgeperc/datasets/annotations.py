@@ -1,0 +1,133 @@
+"""Read the boxes that annotation tools save: labelCloud, SUSTechPOINTS, CVAT (Datumaro's JSON)."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from ..errors import PointsError
+from ..types.perception import Box
+
+__all__ = ["read_datumaro", "read_labelcloud", "read_sustechpoints"]
+
+
+LARGEST_TILT = math.radians(20.0)
+"""Boxes have a yaw alone. A box that is tilted further is an error."""
+
+
+def read_labelcloud(path: Path) -> list[Box]:
+    """Read ``labels/NAME.json`` of labelCloud, formats ``centroid_rel`` and ``centroid_abs``.
+
+    ``_classes.json`` in the same folder names the format; without it, angles are in radians.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    list of Box
+        With the classes of the file, in the frame of the scan.
+
+    Raises
+    ------
+    PointsError
+        The file cannot be read, or is not such a file; or its format is another one.
+    """
+    settings = path.with_name("_classes.json")
+    known = _read(settings).get("format", "centroid_rel") if settings.exists() else "centroid_rel"
+    if known not in ("centroid_rel", "centroid_abs"):
+        raise PointsError(f"{settings} has format {known!r:.40}; save the labels as centroid_rel or centroid_abs")
+    try:
+        return [
+            _box(
+                each["name"],
+                [each["centroid"][axis] for axis in "xyz"],
+                [each["dimensions"][name] for name in ("length", "width", "height")],
+                [_angle(each["rotations"][axis], known) for axis in "xyz"],
+            )
+            for each in _read(path)["objects"]
+        ]
+    except (KeyError, OverflowError, TypeError, ValueError) as exc:
+        raise PointsError(f"{path} holds no labels of labelCloud ({type(exc).__name__}: {exc})") from exc
+
+
+def read_sustechpoints(path: Path) -> list[Box]:
+    """Read ``label/NAME.json`` of SUSTechPOINTS. Parameters, results and errors as in `read_labelcloud`."""
+    try:
+        parts = [(each["obj_type"], each["psr"]) for each in _read(path, list)]
+        return [
+            _box(name, *([psr[part][axis] for axis in "xyz"] for part in ("position", "scale", "rotation")))
+            for name, psr in parts
+        ]
+    except (KeyError, OverflowError, TypeError, ValueError) as exc:
+        raise PointsError(f"{path} holds no labels of SUSTechPOINTS ({type(exc).__name__}: {exc})") from exc
+
+
+def read_datumaro(path: Path) -> dict[str, list[Box]]:
+    """Read ``annotations/default.json`` of "Datumaro 3D 1.0", which CVAT exports.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    dict of str to list of Box
+        By the name of the scan, without folders. Boxes of tracks that are outside are left out.
+
+    Raises
+    ------
+    PointsError
+        The file cannot be read, or is not such a file; or two scans have one name.
+    """
+    document, found = _read(path), dict[str, list[Box]]()
+    try:
+        names = [str(label["name"]) for label in document["categories"]["label"]["labels"]]
+        for item in document["items"]:
+            name = str(item["id"]).rpartition("/")[2]
+            if name in found:
+                raise PointsError(f"{path} has two scans called {name}; expected one")
+            found[name] = [
+                _box(names[each["label_id"]], each["position"], each["scale"], each["rotation"])
+                for each in item["annotations"]
+                if each["type"] == "cuboid_3d" and not each.get("attributes", {}).get("outside", False)
+            ]
+    except PointsError:
+        raise
+    except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as exc:
+        raise PointsError(f"{path} holds no annotations of Datumaro ({type(exc).__name__}: {exc})") from exc
+    return found
+
+
+def _read(path: Path, kind: type = dict) -> Any:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, RecursionError, ValueError) as exc:
+        raise PointsError(f"{path} cannot be read ({exc}); expected the tool's JSON") from exc
+    if not isinstance(document, kind):
+        raise PointsError(f"{path} holds a {type(document).__name__}; expected a {kind.__name__}")
+    return document
+
+
+def _angle(value: float, known: str) -> float:
+    if known == "centroid_abs":
+        return math.radians(value)
+    if abs(value) > 2.0 * math.pi:
+        raise ValueError(f"an angle of {value}, as in degrees; _classes.json of the tool says which they are")
+    return value
+
+
+def _box(name: str, center: Any, size: Any, rotation: Any) -> Box:
+    (x, y, z), (length, width, height) = (map(float, values) for values in (center, size))
+    roll, pitch, yaw = (math.remainder(float(angle), 2.0 * math.pi) for angle in rotation)
+    if (
+        not all(map(math.isfinite, (x, y, z, length, width, height, roll, pitch, yaw)))
+        or min(length, width, height) <= 0.0
+    ):
+        raise ValueError(f"a box at {center} of size {size}; expected finite numbers and sizes above 0")
+    if max(abs(roll), abs(pitch)) > LARGEST_TILT:
+        raise ValueError(f"a box is tilted by {math.degrees(max(abs(roll), abs(pitch))):.0f} degrees; expected a yaw")
+    return Box(str(name), 1.0, (x, y, z), (length, width, height), yaw)

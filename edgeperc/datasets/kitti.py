@@ -1,0 +1,439 @@
+"""Readers of labeled real scans: KITTI objects and SemanticKITTI, for training and evaluation.
+
+KITTI's object labels cover the field of view of the left color camera only. Outside it the truth is unknown.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera.calibration import read_kitti_calibration
+from ..errors import PointsError
+from ..readers.files import read_points
+from ..simulation.samples import IGNORE
+from ..simulation.scene import POINT_CLASS_OF
+from ..system.names import check_file
+from ..types.card import TopViewGeometry
+from ..types.geometry import inside
+from ..types.perception import Box
+from .splits import TEST_DRIVES, in_split
+
+__all__ = [
+    "IMAGE_SIZE",
+    "IMAGE_SIZES",
+    "ROAD_CLASSES",
+    "SEQUENCE_DRIVES",
+    "Frame",
+    "KittiCalibration",
+    "KittiLabels",
+    "KittiObjects",
+    "RoadFrame",
+    "SemanticKitti",
+    "label_objects",
+    "layouts",
+    "read_labels",
+    "read_objects",
+    "scan_hash",
+]
+
+IMAGE_SIZE = (1242, 375)
+IMAGE_SIZES = {
+    "2011_09_26": IMAGE_SIZE,
+    "2011_09_28": (1224, 370),
+    "2011_09_29": (1238, 374),
+    "2011_09_30": (1226, 370),
+    "2011_10_03": (1241, 376),
+}
+"""Width and height of the rectified images [px], by the day of the drive."""
+
+
+@dataclass(frozen=True)
+class KittiCalibration:
+    """Pose and projection of the left color camera.
+
+    Attributes
+    ----------
+    T_cam_velo : (4, 4) float64
+        Sensor frame to rectified camera frame.
+    P2 : (3, 4) float64
+        Rectified camera frame to the image of the left color camera.
+    """
+
+    T_cam_velo: NDArray[np.float64]
+    P2: NDArray[np.float64]
+
+    @classmethod
+    def read(cls, path: Path) -> KittiCalibration:
+        """Read a file of `read_kitti_calibration`, whose errors this raises."""
+        return cls(*read_kitti_calibration(path))
+
+    def to_image(self, points: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Project points into the image.
+
+        Parameters
+        ----------
+        points : (n, 3+) array
+            x, y, z [m] in the sensor frame; further columns are ignored.
+
+        Returns
+        -------
+        pixels : (n, 2) float64
+            Column and row [px]. Not valid for points behind the camera.
+        depth : (n,) float64
+            Distance along the optical axis [m], negative behind the camera.
+        """
+        cam = np.asarray(points[:, :3], np.float64) @ self.T_cam_velo[:3, :3].T + self.T_cam_velo[:3, 3]
+        image = cam @ self.P2[:, :3].T + self.P2[:, 3]
+        depth = image[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return image[:, :2] / depth[:, None], depth
+
+    def sensor_boxes(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Convert boxes from KITTI's camera frame to the sensor frame.
+
+        Parameters
+        ----------
+        rows : (n, 7) float64
+            Height, width, length, x, y, z of the bottom face's center [m], rotation about the camera's y axis [rad].
+
+        Returns
+        -------
+        (n, 7) float64
+            x, y, z of the center, length, width, height [m], yaw [rad].
+        """
+        T_velo_cam = np.linalg.inv(self.T_cam_velo)
+        height, width, length, x, y, z, turn = rows.T
+        # y points down in the camera frame.
+        centers = np.stack([x, y - height / 2.0, z], axis=1) @ T_velo_cam[:3, :3].T + T_velo_cam[:3, 3]
+        ahead = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], axis=1) @ T_velo_cam[:3, :3].T
+        return np.column_stack([centers, length, width, height, np.arctan2(ahead[:, 1], ahead[:, 0])])
+
+    def in_camera(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Convert boxes (n, 7) to x ahead, y left, z up in the camera's frame: undoes `sensor_boxes`."""
+        R, t = self.T_cam_velo[:3, :3], self.T_cam_velo[:3, 3]
+        right, down, ahead = R @ rows[:, :3].T + t[:, None]
+        cos, sin = np.cos(rows[:, 6]), np.sin(rows[:, 6])
+        climb = -(R[1, 0] * cos + R[1, 1] * sin) / R[1, 2]  # of the heading that is level in the camera's frame
+        heading = R @ np.stack([cos, sin, climb])
+        return np.column_stack([ahead, -right, -down, rows[:, 3:6], np.arctan2(-heading[0], heading[2])])
+
+    def image_rectangles(
+        self, rows: NDArray[np.float64], image_size: tuple[int, int] = IMAGE_SIZE
+    ) -> NDArray[np.float64]:
+        """Project boxes into the image.
+
+        Parameters
+        ----------
+        rows : (n, 7) float64
+            x, y, z of the center, length, width, height [m], yaw [rad] in the sensor frame.
+        image_size : tuple of 2 int
+            Width and height [px].
+
+        Returns
+        -------
+        (n, 4) float64
+            Left, top, right, bottom [px], clipped to the image; without area if a box is not in it.
+        """
+        signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
+        local = signs[None] * rows[:, None, 3:6]
+        cos, sin = np.cos(rows[:, 6])[:, None], np.sin(rows[:, 6])[:, None]
+        x = rows[:, :1] + cos * local[..., 0] - sin * local[..., 1]
+        y = rows[:, 1:2] + sin * local[..., 0] + cos * local[..., 1]
+        corners = np.stack([x, y, rows[:, 2:3] + local[..., 2]], axis=-1)
+        pixel, depth = self.to_image(corners.reshape(-1, 3))
+        pixel, depth = pixel.reshape(-1, 8, 2), depth.reshape(-1, 8)
+        ahead = depth > 0.1  # a corner behind the camera has no pixel
+        low = np.where(ahead[..., None], pixel, np.inf).min(axis=1).clip(0.0, image_size)
+        high = np.where(ahead[..., None], pixel, -np.inf).max(axis=1).clip(0.0, image_size)
+        return np.hstack([low, np.maximum(high, low)])
+
+    def in_image(self, points: NDArray[Any]) -> NDArray[np.bool_]:
+        """Which points (n, 3+) in the sensor frame lie in the camera's field of view, (n,) bool."""
+        pixel, depth = self.to_image(points)
+        return (depth > 0.1) & (pixel >= 0).all(axis=1) & (pixel[:, 0] < IMAGE_SIZE[0]) & (pixel[:, 1] < IMAGE_SIZE[1])
+
+    def labeled_at(self, places: NDArray[Any], unlabeled: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which places (n, 3+) in the sensor frame are in the image and in no ``unlabeled`` (k, 4) rectangle [px]."""
+        labeled = self.in_image(places)
+        pixel, _ = self.to_image(places)
+        for left, top, right, bottom in unlabeled:
+            within = (pixel[:, 0] >= left) & (pixel[:, 0] <= right) & (pixel[:, 1] >= top) & (pixel[:, 1] <= bottom)
+            labeled &= ~within
+        return labeled
+
+
+@dataclass(frozen=True)
+class KittiLabels:
+    """Rows of a KITTI label file, in its own frame.
+
+    Attributes
+    ----------
+    kinds : tuple of str
+        Classes in lower case, ``"dontcare"`` among them.
+    numbers : (n, 14) float64
+        Truncation, occlusion, observation angle [rad]; left, top, right, bottom [px]; height, width, length, x, y, z
+        [m] and rotation [rad] as in `KittiCalibration.sensor_boxes`.
+    """
+
+    kinds: tuple[str, ...]
+    numbers: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One KITTI scan and its labels.
+
+    Attributes
+    ----------
+    name, drive : str
+    grade : str
+        ``"A"`` if the boxes were checked to fit the scan.
+    points : (n, 4) float32
+        x, y, z [m] in the sensor frame, remission.
+    boxes : tuple of Box
+        In the sensor frame, labels in lower case (car, van, truck, pedestrian, person_sitting, cyclist, tram, misc).
+    unlabeled : (k, 4) float64
+        Image rectangles (left, top, right, bottom) [px] in which objects are not labeled (DontCare).
+    calibration : KittiCalibration
+    labels : KittiLabels or None
+        The rows that ``boxes`` and ``unlabeled`` come from; None: unknown.
+    """
+
+    name: str
+    drive: str
+    grade: str
+    points: NDArray[np.float32]
+    boxes: tuple[Box, ...]
+    unlabeled: NDArray[np.float64]
+    calibration: KittiCalibration
+    labels: KittiLabels | None = None
+
+    @cached_property
+    def known(self) -> NDArray[np.bool_]:
+        """Which points have known labels, (n,) bool: those in the camera's field of view and outside DontCare."""
+        return self.known_at(self.points)
+
+    def known_at(self, points: NDArray[Any]) -> NDArray[np.bool_]:
+        """Whether objects are labeled at places (n, 3+) in the sensor frame, (n,) bool."""
+        return self.calibration.labeled_at(points, self.unlabeled)
+
+    def point_labels(self) -> NDArray[np.uint8]:
+        """True class of each point, (n,) uint8: the class of the box around it, `IGNORE` where the truth is unknown."""
+        labels = np.where(self.known, 0, IGNORE).astype(np.uint8)
+        for box in self.boxes:
+            labels[inside(box, self.points)] = POINT_CLASS_OF.get(box.label, IGNORE)
+        return labels
+
+
+def read_labels(path: Path) -> KittiLabels:
+    """Read the rows of a KITTI label file."""
+    rows = [line.split() for line in path.read_text().splitlines() if line.strip()]
+    numbers = np.array([[float(value) for value in row[1:15]] for row in rows], np.float64).reshape(-1, 14)
+    return KittiLabels(tuple(row[0].lower() for row in rows), numbers)
+
+
+def read_objects(label_path: Path, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
+    """Read a KITTI label file: boxes in the sensor frame, and (k, 4) DontCare rectangles [px] (SSADNet 3.1.1)."""
+    return label_objects(read_labels(label_path), calibration)
+
+
+def label_objects(labels: KittiLabels, calibration: KittiCalibration) -> tuple[tuple[Box, ...], NDArray[np.float64]]:
+    """Boxes of labels in the sensor frame, and (k, 4) DontCare rectangles [px]."""
+    is_object = np.array([kind != "dontcare" for kind in labels.kinds], np.bool_)
+    placed = calibration.sensor_boxes(labels.numbers[is_object, 7:14])
+    kinds = [kind for kind in labels.kinds if kind != "dontcare"]
+    boxes = tuple(
+        Box(kind, 1.0, (x, y, z), (length, width, height), yaw)
+        for kind, (x, y, z, length, width, height, yaw) in zip(kinds, placed.tolist(), strict=True)
+    )
+    return boxes, labels.numbers[~is_object, 3:7]
+
+
+def scan_hash(points: NDArray[np.float32]) -> str:
+    """Identify a scan in a model's card: the first 16 hexadecimal digits of the SHA-256 of its points."""
+    return hashlib.sha256(points.tobytes()).hexdigest()[:16]
+
+
+class KittiObjects:
+    """The labeled scans below a KITTI root (``training/velodyne``, ``label_2``, ``calib``), by drive.
+
+    ``frames.csv`` and ``frames-*.csv`` beside ``training`` list the drive of each scan (columns ``name``, ``drive`` and
+    optionally ``grade``). Scans without an entry are left out, because a model may have been trained on their drive.
+    Without any table, each scan counts as a drive of its own.
+
+    Parameters
+    ----------
+    root : str or Path
+
+    Attributes
+    ----------
+    drives : dict of str to str
+        Name of each scan, labeled or not -> its drive.
+    rows : list of dict
+        Rows of the tables, of the labeled scans.
+
+    Raises
+    ------
+    PointsError
+        There are no label files, or a row of a table lacks the name or the drive.
+    """
+
+    def __init__(self, root: Path | str) -> None:
+        self.root = Path(root)
+        labels = self.root / "training/label_2"
+        rows = _frame_rows(self.root) or [
+            {"name": path.stem, "drive": path.stem} for path in sorted(labels.glob("*.txt"))
+        ]
+        self.drives = {row["name"]: row["drive"] for row in rows}
+        self.rows = [row for row in rows if (labels / f"{row['name']}.txt").exists()]
+        if not self.rows:
+            raise PointsError(f"{self.root} has no training/label_2/*.txt; expected the root of a KITTI object set")
+
+    def names(self, split: str, *, fold: int | None = None, grades: str = "A") -> list[str]:
+        """Names of the labeled scans of a split (`splits.in_split`) that have one of the ``grades``."""
+        return [r["name"] for r in self.rows if in_split(r["drive"], split, fold) and r.get("grade", "A") in grades]
+
+    def unlabeled(self, split: str, *, fold: int | None = None) -> list[str]:
+        """Names of the scans of a split that have no label file."""
+        labeled, scans = {row["name"] for row in self.rows}, self.root / "training/velodyne"
+        names = [name for name, drive in self.drives.items() if name not in labeled and in_split(drive, split, fold)]
+        return [name for name in names if (scans / f"{name}.bin").exists()]
+
+    def frame(self, name: str) -> Frame:
+        """Read a labeled scan with its labels and calibration."""
+        row = next(row for row in self.rows if row["name"] == name)
+        calibration = KittiCalibration.read(self.root / "training/calib" / f"{name}.txt")
+        labels = read_labels(self.root / "training/label_2" / f"{name}.txt")
+        boxes, unlabeled = label_objects(labels, calibration)
+        points = read_points(self.root / "training/velodyne" / f"{name}.bin")
+        return Frame(name, row["drive"], row.get("grade", "A"), points, boxes, unlabeled, calibration, labels)
+
+
+def _frame_rows(root: Path) -> list[dict[str, str]]:
+    """Rows of ``frames.csv`` and ``frames-*.csv``; an empty list without a table."""
+    rows: list[dict[str, str]] = []
+    for table in (root / "frames.csv", *sorted(root.glob("frames-*.csv"))):
+        if not table.exists():
+            continue
+        with table.open(newline="") as file:
+            rows += csv.DictReader(file)
+        nowhere = next((row for row in rows if not (row.get("name") and row.get("drive"))), None)
+        if nowhere is not None:
+            raise PointsError(f"{table}: got {nowhere}; expected columns name and drive, both filled in every row")
+    for name in [row["name"] for row in rows]:
+        check_file(f"{root}: a scan in frames.csv is called", name, PointsError)
+    return rows
+
+
+def layouts(root: Path | str) -> Iterator[tuple[Box, ...]]:
+    """Yield the boxes of every KITTI label file below ``root``, except those of test drives: layouts to simulate."""
+    root = Path(root)
+    for name in [row["name"] for row in _frame_rows(root) if row["drive"] not in TEST_DRIVES]:
+        calibration = KittiCalibration.read(root / "calib" / f"{name}.txt")
+        yield read_objects(root / "label_2" / f"{name}.txt", calibration)[0]
+
+
+ROAD_CLASSES = ("other", "road", "vehicle")
+
+# Raw ids of SemanticKITTI: road and lane marking; car, bus, on-rails, truck and other vehicle, standing and moving.
+ROAD_IDS = (40, 60)
+VEHICLE_IDS = (10, 13, 18, 20, 252, 257, 258, 259)
+
+# Raw drive of each odometry sequence with labels.
+SEQUENCE_DRIVES = {
+    "00": "2011_10_03_drive_0027",
+    "01": "2011_10_03_drive_0042",
+    "02": "2011_10_03_drive_0034",
+    "03": "2011_09_26_drive_0067",
+    "04": "2011_09_30_drive_0016",
+    "05": "2011_09_30_drive_0018",
+    "06": "2011_09_30_drive_0020",
+    "07": "2011_09_30_drive_0027",
+    "08": "2011_09_30_drive_0028",
+    "09": "2011_09_30_drive_0033",
+    "10": "2011_09_30_drive_0034",
+}
+
+
+@dataclass(frozen=True)
+class RoadFrame:
+    """One SemanticKITTI scan with labels of road and vehicles.
+
+    Attributes
+    ----------
+    name, drive : str
+    points : (n, 4) float32
+        x, y, z [m] in the sensor frame, remission.
+    labels : (n,) uint8
+        Index into `ROAD_CLASSES`, `IGNORE` for unlabeled points.
+    """
+
+    name: str
+    drive: str
+    points: NDArray[np.float32]
+    labels: NDArray[np.uint8]
+
+    def top_view(self, geometry: TopViewGeometry) -> NDArray[np.uint8]:
+        """True class of each cell, (rows, columns) uint8: index into `ROAD_CLASSES`.
+
+        A cell gets the class of more than half of its labeled returns, and `IGNORE` if it has no labeled return.
+        """
+        p, known = self.points, self.labels != IGNORE
+        row, col, in_view = geometry.cells(p[:, 0], p[:, 1])
+        known &= in_view
+        known &= (p[:, 2] >= geometry.z_range_m[0]) & (p[:, 2] <= geometry.z_range_m[1])
+        cell = row[known] * geometry.width + col[known]
+        size = geometry.height * geometry.width
+        counts = [np.bincount(cell, weights=self.labels[known] == k, minlength=size) for k in range(len(ROAD_CLASSES))]
+        total = np.sum(counts, axis=0)
+        truth = np.where(total == 0, IGNORE, 0).astype(np.uint8)
+        for k in (1, 2):
+            truth[2 * counts[k] > total] = k
+        return truth.reshape(geometry.height, geometry.width)
+
+
+class SemanticKitti:
+    """The scans with point labels below a SemanticKITTI root (``sequences/00/velodyne``, ``labels``), by drive.
+
+    Raises
+    ------
+    PointsError
+        There are no label files.
+    """
+
+    def __init__(self, root: Path | str) -> None:
+        self.root = Path(root)
+        found = sorted(self.root.glob("sequences/*/labels/*.label"))
+        if not found:
+            raise PointsError(
+                f"{self.root} has no sequences/*/labels/*.label; expected the root of a SemanticKITTI set"
+            )
+        self.drives = {
+            f"{path.parts[-3]}/{path.stem}": SEQUENCE_DRIVES.get(path.parts[-3], path.parts[-3]) for path in found
+        }
+
+    def names(self, split: str, *, fold: int | None = None) -> list[str]:
+        """Names of the scans of a split (`splits.in_split`), such as ``"00/000123"``."""
+        return [name for name, drive in self.drives.items() if in_split(drive, split, fold)]
+
+    def frame(self, name: str) -> RoadFrame:
+        """Read one scan and its labels; raise `PointsError` if their numbers differ."""
+        sequence, stem = name.split("/")
+        points = read_points(self.root / "sequences" / sequence / "velodyne" / f"{stem}.bin")
+        path = self.root / "sequences" / sequence / "labels" / f"{stem}.label"
+        raw = np.fromfile(path, np.uint32) & 0xFFFF  # the upper 16 bits are the instance
+        if len(raw) != len(points):
+            raise PointsError(
+                f"{path} has {len(raw)} labels for a scan of {len(points)} points; expected one for each point"
+            )
+        labels = np.where(np.isin(raw, ROAD_IDS), 1, np.where(np.isin(raw, VEHICLE_IDS), 2, 0))
+        return RoadFrame(name, self.drives[name], points, np.where(raw == 0, IGNORE, labels).astype(np.uint8))

@@ -1,0 +1,56 @@
+"""The scan that the stages work on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PointsError
+from ..types.perception import PointLabels
+from ..types.points import read_only
+from .planes import Ground
+
+__all__ = ["Scan"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """Points in the frame of the models with the ground below them; every stage trusts it.
+
+    Attributes
+    ----------
+    points : (n, 4) float32, C-contiguous, read-only
+        x, y, z [m], remission in 0..1; a row that is not finite is NaN.
+    ground : Ground
+        Of these points; its arrays are read-only.
+    """
+
+    points: NDArray[np.float32]
+    ground: Ground
+
+    @classmethod
+    def of(cls, points: NDArray[np.float32], ground: Ground, labels: PointLabels | None = None) -> Scan:
+        """A scan of given arrays, which are checked and not copied.
+
+        Raises
+        ------
+        PointsError
+            Arrays disagree in shape, or a label is not in the classes.
+        """
+        if points.ndim != 2 or points.shape[1] < 3:
+            raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
+        n = len(points)
+        arrays = {"ground.height_m": ground.height_m, "ground.mask": ground.mask}
+        if labels is not None:
+            arrays |= {"labels.labels": labels.labels, "labels.in_view": labels.in_view}
+            if labels.labels.size and int(labels.labels.max()) >= len(labels.classes):
+                raise PointsError(
+                    f"got label {int(labels.labels.max())} for {len(labels.classes)} classes; expected lower numbers"
+                )
+        for name, array in arrays.items():
+            if array.shape != (n,):
+                raise PointsError(f"got {name} of shape {array.shape} for {n} points; expected one value a point")
+        heights = Ground(read_only(ground.mask, np.bool_), read_only(ground.height_m), ground.plane)
+        return cls(read_only(points), heights)

@@ -1,0 +1,1 @@
+"""From a scan through a network to classes and boxes."""

@@ -1,0 +1,601 @@
+"""Run networks, from their input to their raw outputs. This is the only module that imports onnxruntime.
+
+There is no silent fallback: if a requested provider is absent, or would leave part of the graph to another provider,
+construction raises `ProviderError`. ``"auto"`` takes the setting that was measured to be the fastest on this computer
+(``edgeperc-bench matrix --recommend``), else the first of `AUTO` that runs the whole model and reproduces the card's
+golden outputs. `edgeperc.zoo.choose` selects the variant of a network and its precision.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.metadata
+import json
+import logging
+import os
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import (
+    CardError,
+    CardMismatchError,
+    EdgepercError,
+    InferenceError,
+    ModelFileError,
+    OptionError,
+    ProviderError,
+    SettingsError,
+)
+from ..system.extras import require, without_telemetry
+from ..system.machine import (
+    MAX_THREADS,
+    compiled_folder,
+    cpu_features,
+    fingerprint,
+    read_setting,
+    settings_path,
+    usable_cores,
+)
+from ..system.printable import printable
+from ..types.onnx_file import check_graph, read_model
+from ..zoo import Variant, choose, digest, resolve
+from .blocks import fill_pixels
+
+__all__ = ["PRECISIONS", "PROVIDERS", "Session", "available_providers", "devices", "golden_input", "runtime_version"]
+
+logger = logging.getLogger(__name__)
+
+PROVIDERS: Mapping[str, str] = {
+    "tensorrt-rtx": "NvTensorRTRTXExecutionProvider",
+    "tensorrt": "TensorrtExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "openvino": "OpenVINOExecutionProvider",
+    "coreml": "CoreMLExecutionProvider",
+    "directml": "DmlExecutionProvider",
+    "qnn": "QNNExecutionProvider",
+    "webgpu": "WebGpuExecutionProvider",
+    "cpu": "CPUExecutionProvider",
+}
+AUTO = ("cuda", "openvino", "cpu")
+# Providers that come as plugins beside stock onnxruntime: provider, then the package with its library.
+PLUGINS = {
+    "openvino": "onnxruntime_ep_openvino",
+    "tensorrt-rtx": "onnxruntime_ep_nv_tensorrt_rtx",
+    "qnn": "onnxruntime_qnn",
+    "webgpu": "onnxruntime_ep_webgpu",
+}
+# Providers that run on the processor's cores and take a number of threads.
+SHARING = ("cpu", "openvino")
+PRECISIONS = ("fp32", "bf16", "int8")
+# Largest accepted deviation, in standard deviations of an output. The same graph in fp32 differs by 1e-5 between
+# engines; tripled weights of one layer give 0.5.
+MAX_GOLDEN_DEVIATION = {"fp32": 0.02, "bf16": 0.5, "int8": 0.5}
+# Share of the golden values that must be within that deviation. If two maxima in max-pooling differ only by rounding,
+# engines may unpool to either one, and a few pixels differ from there on.
+GOLDEN_SHARE = 0.9
+# The largest network of this project takes 0.2 s on one core of a server.
+MAX_FIRST_RUN_S = 30.0
+
+
+def _onnxruntime() -> Any:
+    without_telemetry()
+    ort = require("onnxruntime", "cpu", "Running a model")
+    ort.set_default_logger_severity(4)  # its exceptions contain the messages, and ours repeat them
+    return ort
+
+
+def _version(package: str) -> str:
+    return importlib.metadata.version(package.replace("_", "-"))
+
+
+def _plugin_devices(ort: Any, short: str) -> list[Any]:
+    """Devices of a plugin provider on this computer; empty if its package is not installed or finds none.
+
+    Of Qualcomm's, the NPU comes first: its plugin also offers the GPU and the processor.
+    """
+    if not hasattr(ort, "get_ep_devices"):
+        return []
+    name = PROVIDERS[short]
+
+    def devices() -> list[Any]:
+        found = [d for d in ort.get_ep_devices() if d.ep_name == name]
+        return sorted(found, key=lambda d: d.device.type.name != "NPU") if short == "qnn" else found
+
+    if not devices():
+        try:
+            library = importlib.import_module(PLUGINS[short]).get_library_path()
+            ort.register_execution_provider_library(name, library)
+        except ImportError:
+            return []
+        except Exception as exc:  # onnxruntime's errors share no base but Exception
+            if "already registered" not in str(exc):
+                raise ProviderError(f"the plugin for provider {short!r} is installed but does not load: {exc}") from exc
+    return devices()
+
+
+def available_providers() -> tuple[str, ...]:
+    """The providers that ``Perceiver(provider=...)`` accepts on this computer, as keys of `PROVIDERS`.
+
+    Raises
+    ------
+    MissingExtraError
+        onnxruntime is not installed.
+    ProviderError
+        The plugin of a provider is installed but does not load.
+    """
+    ort = _onnxruntime()
+    stock = ort.get_available_providers()
+    return tuple(s for s, name in PROVIDERS.items() if name in stock or (s in PLUGINS and _plugin_devices(ort, s)))
+
+
+def runtime_version() -> str:
+    """The version of the installed onnxruntime.
+
+    Raises
+    ------
+    MissingExtraError
+        onnxruntime cannot be imported; the cause says why.
+    """
+    return str(_onnxruntime().__version__)
+
+
+def devices() -> tuple[str, ...]:
+    """The devices that onnxruntime and its installed plugins offer here, such as ``"cpu: CPU Intel"``.
+
+    Empty if onnxruntime is older than 1.23, which does not list them.
+
+    Raises
+    ------
+    MissingExtraError, ProviderError
+        As `available_providers`.
+    """
+    present, ort = available_providers(), _onnxruntime()  # in this order, which loads the plugins
+    found = ort.get_ep_devices() if hasattr(ort, "get_ep_devices") else ()
+    names = {PROVIDERS[short]: short for short in present}
+    listed = (
+        f"{names.get(each.ep_name.partition('.')[0], each.ep_name)}: "  # such as OpenVINOExecutionProvider.AUTO
+        f"{each.device.type.name} {each.device.vendor or each.ep_vendor}"
+        for each in found
+    )
+    return tuple(dict.fromkeys(each.strip() for each in listed))
+
+
+_Attempt = tuple[str, Variant, str, int | None]
+"""Provider, variant, precision and number of threads."""
+
+
+def _check_names(provider: str, precision: str) -> None:
+    if precision not in ("auto", *PRECISIONS):
+        raise ProviderError(f"precision {precision!r} is unknown; expected auto, {', '.join(PRECISIONS)}")
+    if provider == "auto" or provider in PROVIDERS:
+        return
+    short, _, suffix = provider.partition(":")
+    if short in PROVIDERS and suffix:
+        raise ProviderError(
+            f"provider {provider!r}: the precision is an option of its own; ask for provider {short!r} and "
+            f"precision {suffix!r}"
+        )
+    raise ProviderError(f"provider {provider!r} is unknown; expected auto or one of {', '.join(PROVIDERS)}")
+
+
+class Session:
+    """One network, loaded, checked against its card and warmed up, with buffers of its own.
+
+    Parameters
+    ----------
+    model : str or Path
+        A name, a name with a variant, or the path of an .onnx file with a card (`edgeperc.zoo.resolve`).
+    provider : str
+        ``"auto"``, or a key of `PROVIDERS`.
+    precision : {"auto", "fp32", "bf16", "int8"}
+        ``"auto"`` takes a reduced precision if the processor computes it natively and the card shows a small loss
+        (`edgeperc.zoo.choose`). Any other value is required.
+    n_threads : int or None
+        Threads inside one run, at most 4096; None leaves it to the provider.
+    at_once : int
+        Number of sessions that run at the same time. If it is above 1 and ``n_threads`` is None, the providers ``cpu``
+        and ``openvino`` get as large a part of the usable cores.
+    trusted : bool
+        Open graphs that are otherwise refused, because they could run without end or take all memory: with operators
+        that are not in `onnx_file.OPERATORS`, functions, subgraphs or sizes beyond the limits. The first run
+        is then not stopped after 30 s. Weights in other files are always refused.
+
+    Attributes
+    ----------
+    path : Path
+        The file that runs.
+    card : ModelCard
+    sha256 : str
+        Of the file.
+    digest : str
+        Key of this network's measured settings (`edgeperc.zoo.digest`).
+    short, provider : str
+        The active provider as a key of `PROVIDERS` and as onnxruntime calls it: ``"cpu"``, ``"CPUExecutionProvider"``.
+    precision : str
+        The active precision: ``"fp32"``, ``"bf16"`` or ``"int8"``.
+    options : dict of str to str
+        Settings of onnxruntime's session and of the provider, for reports.
+    input : (C, H, W) float32
+        Write the network's input here, then `run`.
+    outputs : mapping of str to ndarray
+        Outputs by output *kind*, without the batch axis; overwritten by every `run`. Values of blocks are written to
+        their pixels (`edgeperc.card.OutputSpec`).
+    raw : mapping of str to ndarray
+        The same as the graph gives them.
+    shares_cores : bool
+        Whether the session has a part of the cores (``at_once``).
+    golden_deviation : float
+        Deviation of the outputs for the card's golden input from the exporter's, in standard deviations of the output
+        (90th percentile). NaN if the card has no golden record, which is logged as a warning.
+
+    Raises
+    ------
+    OptionError
+        ``n_threads`` is below 1 or above 4096.
+    ModelFileError, CardError, CardMismatchError
+        The model cannot be read, or its graph or outputs do not agree with its card.
+    ProviderError
+        The provider or the precision is unknown or not available, or the provider cannot run the model.
+    InferenceError
+        The first run failed.
+    MissingExtraError
+        onnxruntime is not installed.
+
+    Notes
+    -----
+    A session belongs to its process. In a forked child it runs only with ``provider="cpu"`` and ``n_threads=1``: the
+    threads of a provider do not exist there, and waiting for them would never end. It cannot be pickled.
+    """
+
+    def __init__(
+        self,
+        model: str | os.PathLike[str],
+        provider: str = "auto",
+        *,
+        precision: str = "auto",
+        n_threads: int | None = None,
+        at_once: int = 1,
+        trusted: bool = False,
+    ) -> None:
+        if n_threads is not None and not 1 <= n_threads <= MAX_THREADS:
+            raise OptionError(f"n_threads is {n_threads!r:.20}; expected 1 to {MAX_THREADS}, or None")
+        _check_names(provider, precision)
+        self._trusted, self._at_once = trusted, at_once
+        self._made_in, self._running_in = os.getpid(), 0
+        ort = _onnxruntime()
+        variants = resolve(model)
+        self.digest = digest(variants)
+        attempts = self._attempts(variants, provider, precision, n_threads)
+        for attempt in attempts:
+            try:
+                self._prepare(ort, *attempt)
+                break
+            except (CardMismatchError, InferenceError, ProviderError) as exc:
+                if attempt == attempts[-1]:
+                    raise
+                short, _, runs_in, _ = attempt
+                logger.warning("provider auto skips %s on %s in %s: %s", variants[0].name, short, runs_in, exc)
+
+    def _attempts(
+        self, variants: Sequence[Variant], provider: str, precision: str, n_threads: int | None
+    ) -> list[_Attempt]:
+        """The settings to try, in this order: one, or several if provider or precision is "auto"."""
+        present, features = available_providers(), cpu_features()
+        candidates = [(provider, precision, n_threads)]
+        if provider == "auto":
+            candidates = [(short, precision, n_threads) for short in AUTO if short in present]
+            candidates = [*self._measured_best(variants[0].name, precision, n_threads, present), *candidates]
+        elif provider not in present:
+            raise ProviderError(
+                f"provider {provider!r} is not available on this computer (present: {', '.join(present)}); "
+                "install its onnxruntime build or plugin, or choose one that is present"
+            )
+        attempts: list[_Attempt] = []
+        refusal = None
+        for short, wanted, threads in candidates:
+            try:
+                variant, runs_in = choose(variants, short, wanted, features)
+            except ProviderError as exc:
+                refusal = exc
+                continue
+            attempts.append((short, variant, runs_in, threads))
+            if precision == "auto" and runs_in != "fp32" and variants[0].precision == "fp32":
+                attempts.append((short, variants[0], "fp32", threads))
+        if not attempts:
+            raise refusal or ProviderError(f"none of {', '.join(AUTO)} is available; install edgeperc[cpu]")
+        return attempts
+
+    def _measured_best(
+        self, name: str, precision: str, n_threads: int | None, present: Sequence[str]
+    ) -> list[tuple[str, str, int | None]]:
+        """The fastest provider, precision and threads measured on this computer; empty if none was measured."""
+        try:
+            setting = read_setting(settings_path(), fingerprint(), self.digest)
+        except SettingsError as exc:
+            logger.warning("provider auto cannot read the settings measured on this computer: %s", exc)
+            return []
+        if setting is None or precision not in ("auto", setting["precision"]):
+            return []
+        if setting["provider"] not in present:
+            logger.warning(
+                "provider auto skips %s on %s, which was measured as the fastest: it is no longer available",
+                *(name, printable(setting["provider"][:80])),
+            )
+            return []
+        return [(setting["provider"], setting["precision"], setting["n_threads"] if n_threads is None else n_threads)]
+
+    def _prepare(self, ort: Any, short: str, variant: Variant, precision: str, n_threads: int | None) -> None:
+        self.path, self.card = variant.path, variant.card
+        self.short, self.provider, self.precision = short, PROVIDERS[short], precision
+        blob = read_model(self.path)
+        check_graph(blob, self.path, trusted=self._trusted)
+        self.sha256 = hashlib.sha256(blob).hexdigest()
+        cores = usable_cores()
+        self.shares_cores = n_threads is None and short in SHARING and 1 < self._at_once <= cores
+        if self.shares_cores:
+            n_threads = cores // self._at_once
+        self._has_threads = short != "cpu" or n_threads != 1
+        self._session = self._open(ort, blob, short, precision, n_threads)
+        self._check_graph()
+        with _terminated(ort, None if self._trusted else MAX_FIRST_RUN_S) as run_options:
+            self._bind(run_options)
+            self.golden_deviation = self._warm_up(MAX_GOLDEN_DEVIATION[precision], run_options)
+
+    @property
+    def description(self) -> str:
+        """The active network, precision and provider: ``"pointseg int8, CPUExecutionProvider"``."""
+        return f"{self.card.name} {self.precision}, {self.provider}"
+
+    def _open(self, ort: Any, blob: bytes, short: str, precision: str, n_threads: int | None) -> Any:
+        options = ort.SessionOptions()
+        options.log_severity_level = 4
+        options.inter_op_num_threads = 1
+        options.use_deterministic_compute = True
+        if n_threads is not None:
+            options.intra_op_num_threads = n_threads
+        # The memory pattern would be allocated in addition to the blocks of the first run: 38 and 54 MB more, not
+        # faster.
+        options.enable_mem_pattern = False
+        entries = {}
+        # Threads that spin between two runs occupy the cores that the Perceiver's other network needs: both networks in
+        # turn took 357 ms with spinning and 290 ms without. Within a run, threads may spin.
+        entries["session.force_spinning_stop"] = "1"
+        if short != "cpu":
+            # Running part of the graph on the CPU provider would be a silent fallback.
+            entries["session.disable_cpu_ep_fallback"] = "1"
+        for key, value in entries.items():
+            options.add_session_config_entry(key, value)
+        plugin = _plugin_devices(ort, short) if short in PLUGINS else []
+        settings: dict[str, str] = {}
+        try:
+            if plugin:
+                if short == "openvino":
+                    hint = "bf16" if precision == "bf16" else "f32"  # layers that are not int8 run in fp32
+                    cpu = {"INFERENCE_PRECISION_HINT": hint, "PERFORMANCE_HINT": "LATENCY"}
+                    if n_threads is not None:
+                        cpu["INFERENCE_NUM_THREADS"] = str(n_threads)
+                    if self.shares_cores:  # else the threads of both sessions are tied to the same cores
+                        cpu["ENABLE_CPU_PINNING"] = "NO"
+                    engine = f"onnxruntime {ort.__version__}, {_version(PLUGINS[short])}"
+                    compiled = compiled_folder(engine, self.sha256, precision)
+                    if compiled is not None:
+                        cpu["CACHE_DIR"] = str(compiled)
+                    settings["load_config"] = json.dumps({"CPU": cpu})
+                elif short == "qnn":
+                    settings["htp_performance_mode"] = "burst"  # its default clocks the NPU down between two scans
+                options.add_provider_for_devices(plugin[:1], settings)
+                session = ort.InferenceSession(blob, options, enable_fallback=0)
+            else:
+                session = ort.InferenceSession(blob, options, [PROVIDERS[short]], enable_fallback=0)
+            session.disable_fallback()  # of runs; enable_fallback=0: of opening, which would print to stdout
+            for each in (*session.get_inputs(), *session.get_outputs()):
+                _ = each.name, each.shape  # fails if one is not UTF-8
+        except Exception as exc:  # onnxruntime's errors share no base but Exception
+            if short == "cpu":
+                raise ModelFileError(f"{self.path}: onnxruntime {ort.__version__} cannot open it: {exc}") from exc
+            raise ProviderError(f"{self.path}: provider {short!r} cannot run this model: {exc}") from exc
+        threads = "the provider's choice" if n_threads is None else str(n_threads)
+        self.options = {"threads": threads, "deterministic": "1", **entries, **settings}
+        active = session.get_providers()
+        if active[0] != PROVIDERS[short]:
+            raise ProviderError(f"{self.path}: asked for {PROVIDERS[short]}, onnxruntime made {active} active")
+        return session
+
+    def _check_graph(self) -> None:
+        card, height, width = self.card, self.card.view.height, self.card.view.width
+        inputs = {i.name: i for i in self._session.get_inputs()}
+        outputs = {o.name: o for o in self._session.get_outputs()}
+        expected_shape = (1, len(card.input.channels), height, width)
+        if list(inputs) != [card.input.name]:
+            raise CardMismatchError(f"{self.path}: card names input {card.input.name!r}, the graph has {list(inputs)}")
+        self._match(card.input.name, inputs[card.input.name], expected_shape)
+        for output in card.outputs:
+            if output.name not in outputs:
+                raise CardMismatchError(
+                    f"{self.path}: card names output {output.name!r}, the graph has {list(outputs)}"
+                )
+            self._match(output.name, outputs[output.name], self.card.output_shape(output.kind))
+
+    def _match(self, name: str, node: Any, expected: tuple[int | None, ...]) -> None:
+        shape = tuple(node.shape)
+        # A graph may leave a dimension open (a name or None); the first run then checks the shape.
+        fits = len(shape) == len(expected) and all(
+            e is None or not isinstance(s, int) or s == e for s, e in zip(shape, expected, strict=True)
+        )
+        if not fits or node.type != "tensor(float)":
+            raise CardMismatchError(
+                f"{self.path}: {name!r} is {node.type} of shape {shape} in the graph; its card declares tensor(float) "
+                f"of shape {expected} (None: any)"
+            )
+
+    def _bind(self, run_options: Any) -> None:
+        card = self.card
+        batch = np.zeros((1, len(card.input.channels), card.view.height, card.view.width), np.float32)
+        self.input: NDArray[np.float32] = batch[0]
+        self._binding = self._session.io_binding()
+        self.raw: dict[str, NDArray[np.float32]] = {}
+        self.outputs: dict[str, NDArray[np.float32]] = {}
+        for output, shape in zip(card.outputs, self._shapes(batch, run_options), strict=True):
+            if output.kind == "camera_logits" and (card.view.height % shape[2] or card.view.width % shape[3]):
+                raise CardMismatchError(
+                    f"{self.path}: {output.name!r} has shape {shape}; expected rows and columns that divide the view's "
+                    f"{card.view.height} and {card.view.width}"
+                )
+            buffer = np.zeros(shape, np.float32)
+            self._binding.bind_output(output.name, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
+            self.raw[output.kind] = self.outputs[output.kind] = buffer[0]
+            if output.block != (1, 1):
+                pixels = (len(card.classes), card.view.height, card.view.width)
+                self.outputs[output.kind] = np.zeros(pixels, np.float32)
+        self._batch = batch  # the binding holds a bare pointer
+        self._bound_input = (card.input.name, "cpu", 0, np.float32, batch.shape, batch.ctypes.data)
+
+    def _shapes(self, batch: NDArray[np.float32], run_options: Any) -> list[tuple[int, ...]]:
+        """Shapes of the outputs, from the graph, or from a run if the graph leaves dimensions open."""
+        declared = {o.name: tuple(o.shape) for o in self._session.get_outputs()}
+        shapes = [declared[o.name] for o in self.card.outputs]
+        if all(isinstance(n, int) for shape in shapes for n in shape):
+            return shapes
+        try:
+            answers = self._session.run([o.name for o in self.card.outputs], {self.card.input.name: batch}, run_options)
+        except Exception as exc:  # onnxruntime's errors share no base but Exception
+            raise InferenceError(f"{self.path}: the first run on {self.provider} failed: {exc}") from exc
+        for output, answer in zip(self.card.outputs, answers, strict=True):
+            expected = self.card.output_shape(output.kind)
+            if answer.ndim != len(expected) or any(
+                e is not None and s != e for s, e in zip(answer.shape, expected, strict=True)
+            ):
+                raise CardMismatchError(
+                    f"{self.path}: {output.name!r} has shape {answer.shape} after a run; its card declares {expected}"
+                )
+        return [answer.shape for answer in answers]
+
+    def _warm_up(self, limit: float, run_options: Any) -> float:
+        golden = self.card.golden
+        if golden is None:
+            logger.warning(
+                "the card of %s has no golden record: the outputs on %s are not compared with the exporter's",
+                *(self.path, self.provider),
+            )
+            self._run(run_options)
+            return float("nan")
+        self.input[:] = golden_input(golden.seed, self._batch.shape)[0]
+        if hashlib.sha256(self._batch.tobytes()).hexdigest() != golden.input_sha256:
+            raise CardMismatchError(
+                f"{self.path}: the golden input does not have the card's SHA-256; export the model again"
+            )
+        self._run(run_options)
+        self.input[:] = 0.0
+        deviation = 0.0
+        for output in self.card.outputs:
+            known, here = golden.outputs.get(output.name), self.raw[output.kind].reshape(-1)
+            if known is None:
+                raise CardMismatchError(f"{self.path}: the card's golden record lacks output {output.name!r}")
+            try:
+                golden.check_output(output.name, len(here))
+            except CardError as exc:
+                raise CardError(f"{self.path}: {exc}; export the model again") from exc
+            here = here[np.asarray(known["positions"], np.int64)]
+            apart = np.abs(here - np.asarray(known["values"], np.float32)) / max(float(known["std"]), 1e-6)
+            typical = np.quantile(apart, GOLDEN_SHARE) if np.isfinite(here).all() else np.inf
+            deviation = max(deviation, float(typical))
+        if deviation > limit:
+            raise CardMismatchError(
+                f"{self.path}: on {self.provider} the golden input gives answers {deviation:.2g} standard deviations "
+                "away from the exporter's; the file or the provider has changed the network"
+            )
+        return deviation
+
+    def run(self) -> Mapping[str, NDArray[np.float32]]:
+        """Run the network on `input`.
+
+        Returns
+        -------
+        mapping of str to ndarray
+            `outputs`, which the next run overwrites.
+
+        Raises
+        ------
+        InferenceError
+            onnxruntime failed, or this process was forked from the one that made the session, and the session has
+            threads or was running then.
+        """
+        here = os.getpid()
+        if here != self._made_in and (self._has_threads or self._running_in not in (0, here)):
+            raise InferenceError(
+                f"{self.path}: this session was made in process {self._made_in}, whose threads do not exist in process "
+                f"{here}; construct the Perceiver in the process that calls it. With provider 'cpu' and n_threads=1 it "
+                "also works in a process that is forked between two calls"
+            )
+        self._running_in = here
+        try:
+            self._run()
+        finally:
+            self._running_in = 0
+        return self.outputs
+
+    def second(self) -> Session:
+        """The same network with buffers of its own: two threads may run both sessions at the same time."""
+        if self.short != "cpu":  # the others run one graph in one thread at a time
+            at_once, trusted = self._at_once, self._trusted
+            return Session(self.path, self.short, precision=self.precision, at_once=at_once, trusted=trusted)
+        twin = object.__new__(Session)
+        vars(twin).update(vars(self))
+        with _terminated(_onnxruntime(), None) as run_options:
+            twin._bind(run_options)
+        return twin
+
+    def spread(self) -> None:
+        """Write the values of blocks in `raw` to their pixels in `outputs`; `run` does so."""
+        for output in self.card.outputs:
+            if output.block != (1, 1):
+                fill_pixels(self.raw[output.kind], *output.block, self.outputs[output.kind])
+
+    def __reduce__(self) -> NoReturn:
+        raise EdgepercError(
+            f"a session of {self.path} cannot be pickled or copied; construct a Perceiver or Session in each process"
+        )
+
+    def _run(self, *run_options: Any) -> None:
+        try:
+            # Bind before every run: a provider with its own memory copies the input only when it is bound.
+            self._binding.bind_input(*self._bound_input)
+            self._session.run_with_iobinding(self._binding, *run_options)
+        except Exception as exc:  # onnxruntime's errors share no base but Exception
+            raise InferenceError(f"{self.path}: a run on {self.provider} failed: {exc}") from exc
+        self.spread()
+
+
+@contextmanager
+def _terminated(ort: Any, after_s: float | None) -> Iterator[Any]:
+    """Run options with which onnxruntime stops between two operators after ``after_s`` seconds; None: never."""
+    options = ort.RunOptions()
+    options.log_severity_level = 4
+
+    def give_up() -> None:
+        options.terminate = True
+
+    if after_s is None:
+        yield options
+        return
+    timer = threading.Timer(after_s, give_up)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield options
+    finally:
+        timer.cancel()
+
+
+def golden_input(seed: int, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """The input of a card's golden record: uniform noise in -1..1, float32 of ``shape`` (`edgeperc.card.Golden`)."""
+    # From raw bits: these bytes are the same on every platform and numpy version, which normal() does not promise.
+    bits = np.random.PCG64(seed).random_raw(int(np.prod(shape)))
+    uniform = (bits >> np.uint64(40)).astype(np.float32) / np.float32(2**23) - np.float32(1.0)
+    return uniform.reshape(shape)

@@ -1,0 +1,1 @@
+"""From labeled points to objects."""

@@ -1,0 +1,384 @@
+"""Scans of moving sensors: removal of the distortion by the own motion, and several sensors in one scan."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import EdgepercError, OptionError, PointsError, SensorError, StampError, TrackingError
+from ..system.kernel_cache import njit
+from ..types.frame import fill_moved
+from ..types.points import as_points, read_only
+from .returns import blank_too_near
+
+__all__ = ["Motion", "Trajectory", "deskew", "fill_deskewed", "merge"]
+
+MAX_RATE = 1e4  # of m/s and rad/s
+MAX_TURN = 3.1  # rad; the axis of half a turn has no sign
+MAX_BYTES = 1 << 28  # of a file of poses; a line has about 100
+OUTSIDE_S = 0.2  # the motion at the ends of a trajectory holds for two scans of 10 Hz
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Constant motion of a sensor, in its own frame.
+
+    Attributes
+    ----------
+    velocity_mps : tuple of 3 float
+        Velocity of the sensor over ground along its own x, y, z [m/s].
+    rate_radps : tuple of 3 float
+        Turn rate about its own x, y, z [rad/s]; the third is positive in a turn to the left.
+
+    Raises
+    ------
+    OptionError
+        Not three numbers each, or one is not finite or over 10,000.
+    """
+
+    velocity_mps: tuple[float, float, float]
+    rate_radps: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("velocity_mps", "rate_radps"):
+            given = getattr(self, name)
+            try:
+                x, y, z = (float(value) for value in given)
+            except (OverflowError, TypeError, ValueError) as exc:
+                raise OptionError(f"{name} is {given!r:.200}; expected three numbers") from exc
+            if not all(abs(value) <= MAX_RATE for value in (x, y, z)):
+                raise OptionError(f"{name} is {(x, y, z)}; expected three numbers up to {MAX_RATE:g}")
+            object.__setattr__(self, name, (x, y, z))
+
+    @classmethod
+    def between(cls, T_world_first: ArrayLike, first_s: float, T_world_second: ArrayLike, second_s: float) -> Motion:
+        """The constant motion that leads from one pose of the sensor to another.
+
+        Parameters
+        ----------
+        T_world_first, T_world_second : (4, 4) array_like
+            Poses of the sensor, such as `Tracks.T_world_sensor` of two scans.
+        first_s, second_s : float
+            Their times [s].
+
+        Returns
+        -------
+        Motion
+
+        Raises
+        ------
+        TrackingError
+            A pose is not rigid, or between the poses is about half a turn or more.
+        StampError
+            A time is not finite, or the second is not later.
+        """
+        first = _rigid("T_world_first", T_world_first, TrackingError)
+        second = _rigid("T_world_second", T_world_second, TrackingError)
+        if not 0.0 < second_s - first_s < math.inf:
+            raise StampError(f"got poses at {first_s} s and {second_s} s; expected a second one that is later")
+        R = first[:3, :3].T @ second[:3, :3]
+        axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+        sine = 0.5 * float(np.linalg.norm(axis))
+        angle = math.atan2(sine, 0.5 * (float(np.trace(R)) - 1.0))
+        if angle > MAX_TURN:
+            raise TrackingError(
+                f"the sensor turns by {math.degrees(angle):.0f} degrees between the poses; expected less than 178"
+            )
+        turn = 0.5 * axis if sine < 1e-9 else axis * (0.5 * angle / sine)
+        # The inverse of the matrix that integrates the velocity over the turn.
+        cross = np.cross(np.eye(3), turn)
+        share = 1.0 / 12.0 if angle < 1e-4 else (1.0 - 0.5 * angle / math.tan(0.5 * angle)) / angle**2
+        way = (np.eye(3) - 0.5 * cross + share * cross @ cross) @ first[:3, :3].T @ (second[:3, 3] - first[:3, 3])
+        duration = second_s - first_s
+        (x, y, z), (roll, pitch, yaw) = (way / duration).tolist(), (turn / duration).tolist()
+        return cls((x, y, z), (roll, pitch, yaw))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Trajectory:
+    """Poses of a sensor over ground, by time.
+
+    Attributes
+    ----------
+    times_s : (n,) float64
+        Rising, on the clock of the scans [s]; at least two.
+    T_world_sensor : (n, 4, 4) float64
+
+    Raises
+    ------
+    TrackingError
+        A pose is not rigid, or there is not one for each time.
+    StampError
+        Fewer than two times, or they do not rise.
+    """
+
+    times_s: NDArray[np.float64]
+    T_world_sensor: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        times, poses = np.array(self.times_s, np.float64), np.array(self.T_world_sensor, np.float64)
+        if times.ndim != 1 or len(times) < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0.0).any():
+            raise StampError(f"got {times.size} times of poses; expected two or more finite ones that rise")
+        if poses.shape != (len(times), 4, 4):
+            raise TrackingError(
+                f"got poses of shape {poses.shape} for {len(times)} times; expected ({len(times)}, 4, 4)"
+            )
+        object.__setattr__(self, "times_s", times)
+        object.__setattr__(
+            self, "T_world_sensor", np.array([_rigid(f"pose {k}", pose, TrackingError) for k, pose in enumerate(poses)])
+        )
+
+    @classmethod
+    def from_tum(cls, path: str | os.PathLike[str]) -> Trajectory:
+        """Read a file in TUM's format, as kiss-icp, evo and others write it.
+
+        Parameters
+        ----------
+        path : str or path
+            Lines of time [s], x, y, z [m] and the quaternion x, y, z, w of T_world_sensor; ``#`` begins a comment.
+
+        Raises
+        ------
+        TrackingError
+            The file cannot be read, or a line is not such eight numbers.
+        StampError
+            Fewer than two lines, or their times do not rise.
+        """
+        try:
+            with Path(path).open("rb") as file:
+                content = file.read(MAX_BYTES + 1)
+            rows = np.loadtxt(io.BytesIO(content[:MAX_BYTES]), np.float64, ndmin=2, encoding="latin-1")
+            if len(content) > MAX_BYTES or rows.shape[1] != 8:
+                raise ValueError(f"{len(content):,} bytes, {rows.shape[1]} numbers in a line")
+        except (OSError, ValueError) as exc:
+            raise TrackingError(
+                f"{path} cannot be read as poses ({exc}); expected lines of time, x, y, z, qx, qy, qz, qw"
+            ) from exc
+        norm = np.linalg.norm(rows[:, 4:], axis=1)
+        if not (np.abs(norm - 1.0) < 1e-2).all():
+            raise TrackingError(
+                f"{path}: the quaternion of line {int(np.argmax(~(np.abs(norm - 1.0) < 1e-2))) + 1} has not length 1"
+            )
+        x, y, z, w = (rows[:, 4:] / norm[:, None]).T
+        poses = np.zeros((len(rows), 4, 4))
+        poses[:, 0, :3] = np.column_stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)])
+        poses[:, 1, :3] = np.column_stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)])
+        poses[:, 2, :3] = np.column_stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])
+        poses[:, :3, 3], poses[:, 3, 3] = rows[:, 1:4], 1.0
+        return cls(rows[:, 0], poses)
+
+    def motion(self, first_s: float, last_s: float) -> Motion:
+        """The motion during a scan, between the poses around it.
+
+        Parameters
+        ----------
+        first_s, last_s : float
+            Times of the scan's first and last point [s].
+
+        Raises
+        ------
+        StampError
+            The times are not finite, or more than 0.2 s outside those of the poses.
+        """
+        begin, end = float(self.times_s[0]), float(self.times_s[-1])
+        if not begin - OUTSIDE_S <= first_s <= last_s <= end + OUTSIDE_S:
+            raise StampError(
+                f"the poses are of {begin:.3f}..{end:.3f} s, the scan of {first_s:.3f}..{last_s:.3f} s; expected "
+                "poses around it, on its clock"
+            )
+        before = int(np.clip(np.searchsorted(self.times_s, first_s, "right") - 1, 0, len(self.times_s) - 2))
+        after = int(np.clip(np.searchsorted(self.times_s, last_s, "left"), before + 1, len(self.times_s) - 1))
+        return Motion.between(
+            self.T_world_sensor[before],
+            float(self.times_s[before]),
+            self.T_world_sensor[after],
+            float(self.times_s[after]),
+        )
+
+
+def deskew(
+    points: ArrayLike, times: ArrayLike, motion: Motion, *, at_s: float | None = None, min_range_m: float = 0.0
+) -> NDArray[np.float32]:
+    """Move each point of a scan to where a sensor that stands still would have seen it.
+
+    A spinning sensor takes about 0.1 s for a scan. At 20 m/s it moves by 2 m in this time.
+
+    Parameters
+    ----------
+    points : (n, 4) or (n, 3) array_like, or a structured array
+        x, y, z [m] in the frame of the sensor at the time of each point, and remission.
+    times : (n,) array_like
+        Time of each point [s], on any clock.
+    motion : Motion
+        Of the sensor, constant during the scan.
+    at_s : float, optional
+        Time of the pose in whose frame the result lies, on the same clock; by default the last time.
+    min_range_m : float
+        Points at most so far from the sensor are not returns, but beams without one [m]
+        (`SensorProfile.min_range_m`). With 0, those at (0, 0, 0) are.
+
+    Returns
+    -------
+    (n, 4) float32
+        In input order. Points or times that are not finite give points that are not finite. Beams without a return stay
+        as they are, so that the result still shows which they are.
+
+    Raises
+    ------
+    PointsError
+        ``points`` is not a scan, or there is not one time for each point.
+    StampError
+        ``at_s`` is not finite.
+    OptionError
+        ``motion`` is not a `Motion`, or ``min_range_m`` is not a number of meters from 0.
+
+    Notes
+    -----
+    The velocity and the turn rate are constant in the frame of the sensor, so its path is a screw, and a point moves by
+    the exponential of both times the time from ``at_s``. Objects that move themselves stay distorted.
+    """
+    rows = as_points(points)
+    seen = blank_too_near(rows, _meters(min_range_m))
+    try:
+        moments: NDArray[np.float64] = np.array(times, np.float64)
+    except (OverflowError, TypeError, ValueError) as exc:
+        raise PointsError(f"got times that are not numbers ({exc}); expected ({len(rows)},) seconds") from exc
+    if moments.shape != (len(rows),):
+        raise PointsError(f"got times of shape {moments.shape}; expected ({len(rows)},), one for each point")
+    if not isinstance(motion, Motion):
+        raise OptionError(f"motion is {motion!r:.200}; expected a Motion")
+    known = moments[np.isfinite(moments)]
+    at = (float(known.max()) if len(known) else 0.0) if at_s is None else at_s
+    if not math.isfinite(at):
+        raise StampError(f"at_s is {at_s}; expected finite seconds")
+    moved = np.empty(rows.shape, np.float32)
+    fill_deskewed(
+        seen,
+        read_only(moments - at, np.float64),
+        np.array(motion.velocity_mps),
+        np.array(motion.rate_radps),
+        moved,
+    )
+    if not np.shares_memory(seen, rows):
+        blank = np.isnan(seen[:, 0])
+        moved[blank] = rows[blank]
+    return moved
+
+
+def merge(
+    scans: Sequence[ArrayLike], T_vehicle_sensor: Sequence[ArrayLike], *, min_range_m: float | Sequence[float] = 0.0
+) -> NDArray[np.float32]:
+    """Join the scans of several sensors to one scan in the frame of the vehicle.
+
+    Parameters
+    ----------
+    scans : sequence of (n, 4) or (n, 3) array_like, or structured arrays
+        Taken at the same time, each in the frame of its sensor. `deskew` moves scans to one time.
+    T_vehicle_sensor : sequence of (4, 4) array_like
+        Pose of each sensor: maps its points to the frame of the vehicle, whose z is 0 on the road.
+    min_range_m : float or sequence of float
+        Nearest range of the sensors, or of each [m]; as in `deskew`. In the merged scan, it can no longer be told.
+
+    Returns
+    -------
+    (n, 4) float32
+        The points of the first scan, then those of the second, and so on, with their own remission. Beams without a
+        return are NaN.
+
+    Raises
+    ------
+    PointsError
+        A scan is not points, or there is no scan.
+    SensorError
+        There is not one pose for each scan, or one is not a rotation and a translation.
+    OptionError
+        ``min_range_m`` is not one number of meters from 0, or one for each scan.
+    """
+    rows = [as_points(scan) for scan in scans]
+    if not rows:
+        raise PointsError("got no scan; expected at least one")
+    if len(T_vehicle_sensor) != len(rows):
+        raise SensorError(f"got {len(T_vehicle_sensor)} poses for {len(rows)} scans; expected one for each")
+    ranges_m = [min_range_m] * len(rows) if not isinstance(min_range_m, Sequence) else list(min_range_m)
+    if len(ranges_m) != len(rows):
+        raise OptionError(f"got {len(ranges_m)} values of min_range_m for {len(rows)} scans; expected one for each")
+    merged = np.empty((sum(map(len, rows)), 4), np.float32)
+    begin = 0
+    for k, (scan, given, range_m) in enumerate(zip(rows, T_vehicle_sensor, ranges_m, strict=True)):
+        pose = _rigid(f"T_vehicle_sensor[{k}]", given, SensorError)
+        R, t = np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy()
+        fill_moved(blank_too_near(scan, _meters(range_m)), R, t, merged[begin : begin + len(scan)])
+        begin += len(scan)
+    return merged
+
+
+def _meters(min_range_m: float) -> float:
+    try:
+        meters = float(min_range_m)
+    except (OverflowError, TypeError, ValueError):
+        meters = math.nan
+    if not 0.0 <= meters < math.inf:
+        raise OptionError(f"min_range_m is {min_range_m!r:.80}; expected meters from 0")
+    return meters
+
+
+def _rigid(name: str, given: ArrayLike, error: type[EdgepercError]) -> NDArray[np.float64]:
+    try:
+        pose: NDArray[np.float64] = np.array(given, np.float64)
+    except (OverflowError, TypeError, ValueError) as exc:
+        raise error(f"{name} is not a matrix ({exc}); expected (4, 4) numbers") from exc
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise error(f"{name} has shape {pose.shape}; expected (4, 4) finite numbers")
+    R = pose[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0.0 or (pose[3] != [0.0, 0.0, 0.0, 1.0]).any():
+        raise error(f"{name} is not rigid; expected a rotation and a translation")
+    return pose
+
+
+@njit(cache=True, nogil=True)
+def fill_deskewed(
+    points: NDArray[np.float32],
+    after_s: NDArray[np.float64],
+    velocity: NDArray[np.float64],
+    rate: NDArray[np.float64],
+    moved: NDArray[np.float32],
+) -> None:
+    """Move points by the motion of the sensor (Rodrigues' formula for the turn and for its integral).
+
+    Parameters
+    ----------
+    points : (n, 4) float32, C-contiguous
+    after_s : (n,) float64
+        Time of each point after the pose of the result [s].
+    velocity, rate : (3,) float64
+        Of the sensor, in its own frame [m/s, rad/s].
+    moved : (n, 4) float32, overwritten
+    """
+    wx, wy, wz = rate[0], rate[1], rate[2]
+    squared = wx * wx + wy * wy + wz * wz
+    speed = math.sqrt(squared)
+    for i in range(points.shape[0]):
+        x, y, z, s = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2]), after_s[i]
+        angle = speed * s
+        if not abs(angle) >= 1e-4:  # the error of these series is below 1e-16
+            a, b, c = s, 0.5 * s * s, s * s * s / 6.0
+        else:
+            a, b = math.sin(angle) / speed, (1.0 - math.cos(angle)) / squared
+            c = (s - a) / squared
+        # The point turns to p + a w x p + b w x (w x p), and moves by s v + b w x v + c w x (w x v). Together, that is
+        # p + s v + w x (u + w x g), with g = b p + c v and u = a p + b v.
+        gx, gy, gz = b * x + c * velocity[0], b * y + c * velocity[1], b * z + c * velocity[2]
+        ux, uy, uz = a * x + b * velocity[0], a * y + b * velocity[1], a * z + b * velocity[2]
+        hx, hy, hz = wy * gz - wz * gy, wz * gx - wx * gz, wx * gy - wy * gx
+        hx, hy, hz = hx + ux, hy + uy, hz + uz
+        moved[i, 0] = x + s * velocity[0] + wy * hz - wz * hy
+        moved[i, 1] = y + s * velocity[1] + wz * hx - wx * hz
+        moved[i, 2] = z + s * velocity[2] + wx * hy - wy * hx
+        moved[i, 3] = points[i, 3]

@@ -1,0 +1,1 @@
+"""The road for a planner: polygon, free distance, lane, occupancy grid."""

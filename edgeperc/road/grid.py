@@ -1,0 +1,332 @@
+"""A grid for navigation: drivable, obstacle, other ground, and unknown where no ray came."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import CardError, OptionError, PointsError
+from ..ground.observed import OVERHEAD_M, Observer
+from ..ground.planes import find_ground
+from ..preprocess.returns import returns
+from ..system.atomic import write_atomic
+from ..system.kernel_cache import njit
+from ..types.card import TopViewGeometry
+from ..types.frame import ModelFrame
+from ..types.geometry import draw_footprints
+from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
+from ..types.perception import Perception, TopView
+from ..types.points import as_points, read_only
+from ..types.sensor import SensorProfile, get_sensor
+
+__all__ = ["OccupancyGrid", "fill_standing", "occupancy_grid"]
+
+UNKNOWN, FREE, OCCUPIED = -1, 0, 100  # values of nav_msgs/OccupancyGrid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OccupancyGrid:
+    """What a scan shows of the ground around the vehicle, cell by cell.
+
+    Cells lie in the frame of the models, as those of a `TopView`: x forward, y left [m], the road at z = -1.73 m.
+
+    Attributes
+    ----------
+    drivable : (rows, columns) bool
+        More than half of the cell is observed road, and no obstacle is in it. Row 0 is farthest ahead, column 0
+        leftmost. All False without a model with a top view.
+    obstacle : (rows, columns) bool
+        Something stands on the ground: a return above it, or the footprint of a box.
+    height_m : (rows, columns) float32
+        Height of the highest return or box of an obstacle above the ground [m]; NaN in other cells.
+    observed : (rows, columns) bool
+        Cells that the scan observed (`edgeperc.ground.observed.Observer`).
+    cell_m : float
+        Edge of a cell [m].
+    x_range_m, y_range_m : tuple of 2 float
+        Nearest and farthest x, rightmost and leftmost y [m].
+    stamp_s : float or None
+        That of the perception.
+    mounting : Mounting
+        That of the perception. If it is not ``MODEL_MOUNTING``, `edgeperc.ModelFrame` moves points of the scan into
+        the frame of the cells.
+    """
+
+    drivable: NDArray[np.bool_]
+    obstacle: NDArray[np.bool_]
+    height_m: NDArray[np.float32]
+    observed: NDArray[np.bool_]
+    cell_m: float
+    x_range_m: tuple[float, float]
+    y_range_m: tuple[float, float]
+    stamp_s: float | None = None
+    mounting: Mounting = MODEL_MOUNTING
+
+    @property
+    def unknown(self) -> NDArray[np.bool_]:
+        """Cells that no ray observed and no obstacle is known in, (rows, columns) bool."""
+        return ~self.observed & ~self.obstacle
+
+    def values(self, off_road: int = OCCUPIED) -> NDArray[np.int8]:
+        """Values of a map, (cells along y, cells along x) int8, from the lowest x and y on.
+
+        Parameters
+        ----------
+        off_road : int
+            Value in -1..100 of observed ground that is neither drivable nor an obstacle, such as a pavement.
+
+        Returns
+        -------
+        ndarray
+            -1 unknown, 0 drivable, 100 obstacle.
+
+        Raises
+        ------
+        OptionError
+            ``off_road`` is out of its range.
+        """
+        if isinstance(off_road, bool) or not (isinstance(off_road, int) and UNKNOWN <= off_road <= OCCUPIED):
+            raise OptionError(f"off_road is {off_road!r}; expected a whole number from -1 to 100")
+        found = np.full(self.drivable.shape, off_road, np.int8)
+        found[self.drivable] = FREE
+        found[self.obstacle] = OCCUPIED
+        found[self.unknown] = UNKNOWN
+        return np.ascontiguousarray(found[::-1, ::-1].T)
+
+    def to_occupancy_grid(self, frame_id: str = "base_link", off_road: int = OCCUPIED) -> dict[str, Any]:
+        """Convert to the fields of a ROS message nav_msgs/OccupancyGrid.
+
+        Parameters
+        ----------
+        frame_id : str
+            Name of the frame of the cells.
+        off_road : int
+            As in `values`.
+
+        Returns
+        -------
+        dict
+            ``header``, ``info`` and ``data`` (n,) int8, row by row from the corner with the lowest x and y. The stamp
+            is 0 if the perception has none.
+
+        Raises
+        ------
+        OptionError
+            ``off_road`` is out of its range.
+        """
+        values = self.values(off_road)
+        nanoseconds = round((self.stamp_s or 0.0) * 1e9)
+        stamp = {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
+        return {
+            "header": {"stamp": stamp, "frame_id": frame_id},
+            "info": {
+                "map_load_time": dict(stamp),
+                "resolution": self.cell_m,
+                "width": values.shape[1],
+                "height": values.shape[0],
+                "origin": {
+                    "position": {"x": self.x_range_m[0], "y": self.y_range_m[0], "z": -MODEL_HEIGHT_M},
+                    "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+                },
+            },
+            "data": values.reshape(-1),
+        }
+
+    def save_map(self, folder: str | os.PathLike[str], off_road: int = OCCUPIED) -> Path:
+        """Write ``map.pgm`` and ``map.yaml`` for nav2's map server (mode trinary).
+
+        Parameters
+        ----------
+        folder : str or Path
+            Created if it does not exist.
+        off_road : int
+            As in `values`. Other values than -1, 0 and 100 are shades between free and occupied; a map server in mode
+            trinary reads most of them as unknown.
+
+        Returns
+        -------
+        Path
+            The YAML file.
+
+        Raises
+        ------
+        OptionError
+            ``off_road`` is out of its range.
+        OSError
+            The files cannot be written.
+        """
+        values = self.values(off_road)[::-1].astype(np.int64)  # the first row of an image is its top
+        pixels = np.where(values < 0, 205, 254 - values * 254 // 100).astype(np.uint8)
+        out = Path(folder)
+        out.mkdir(parents=True, exist_ok=True)
+        write_atomic(out / "map.pgm", f"P5\n{pixels.shape[1]} {pixels.shape[0]}\n255\n".encode() + pixels.tobytes())
+        # 205 stands for an occupancy of 0.1961: above free_thresh, so unknown.
+        text = (
+            f"image: map.pgm\nmode: trinary\nresolution: {float(self.cell_m)!r}\n"
+            f"origin: [{float(self.x_range_m[0])!r}, {float(self.y_range_m[0])!r}, 0.0]\n"
+            "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+        )
+        write_atomic(out / "map.yaml", text.encode())
+        return out / "map.yaml"
+
+
+def occupancy_grid(
+    perception: Perception,
+    points: ArrayLike,
+    *,
+    cell_m: float = 0.2,
+    x_range_m: tuple[float, float] | None = None,
+    y_range_m: tuple[float, float] | None = None,
+    min_height_m: float = 0.2,
+    sensor: str | os.PathLike[str] | SensorProfile = "hdl-64e",
+) -> OccupancyGrid:
+    """Build a grid for navigation from a perception and its scan.
+
+    Parameters
+    ----------
+    perception : Perception
+        Drivable cells are those of its top view; boxes are obstacles.
+    points : (n, 4) or (n, 3) array_like, or a structured array
+        The scan that was perceived: it has the heights of obstacles, and its rays show what is unknown.
+    cell_m : float
+        Edge of a cell [m].
+    x_range_m, y_range_m : tuple of 2 float, optional
+        Bounds of the grid [m], lower first; by default those of the top view. Outside the top view no cell is drivable.
+    min_height_m : float
+        Returns up to this height above the ground are no obstacles [m]. A kerb is 0.1 to 0.2 m high.
+    sensor : str, Path or SensorProfile
+        As passed to `Perceiver`: its beams tell which ground was observed between two returns, and its nearest range
+        and ``ego_box`` which points are not returns.
+
+    Returns
+    -------
+    OccupancyGrid
+
+    Raises
+    ------
+    PointsError
+        ``points`` is not a scan, or has another number of points than the perceived one.
+    OptionError
+        The grid has no cell or too many, or ``min_height_m`` is not from 0 to 2.
+    SensorError
+        The sensor is unknown.
+
+    Notes
+    -----
+    The heights are above the ground that `find_ground` finds. Returns more than 2 m above it, such as those of a tree's
+    crown, are no obstacles. Returns and rays decide what is unknown, not the network's labels.
+
+    Its kernel is compiled in the first call, not when a `Perceiver` is made; later processes load it from the cache.
+
+    Examples
+    --------
+    >>> grid = edgeperc.occupancy_grid(found, points)       # doctest: +SKIP
+    >>> grid.save_map("map")                                # doctest: +SKIP
+    PosixPath('map/map.yaml')
+    """
+    rows = as_points(points)
+    if len(rows) != perception.n_points:
+        raise PointsError(
+            f"{len(rows)} points with a perception of {perception.n_points}; expected the scan that was perceived"
+        )
+    if not 0.0 <= min_height_m < OVERHEAD_M:
+        raise OptionError(f"min_height_m is {min_height_m}; expected meters from 0 to below {OVERHEAD_M:g}")
+    top_view = perception.top_view
+    usual = TopViewGeometry() if top_view is None else top_view.geometry
+    try:
+        view = TopViewGeometry(x_range_m or usual.x_range_m, y_range_m or usual.y_range_m, cell_m=cell_m)
+    except (CardError, TypeError, ValueError) as exc:
+        raise OptionError(
+            f"got cell_m={cell_m!r}, x_range_m={x_range_m!r}, y_range_m={y_range_m!r}: no grid ({exc})"
+        ) from exc
+    profile = get_sensor(sensor)
+    frame = ModelFrame(perception.mounting)
+    moved = read_only(frame.move(returns(rows, profile, perception.mounting.origin_m)[0]))
+    ground = find_ground(moved, mount_height_m=MODEL_HEIGHT_M)
+
+    shape = (view.height, view.width)
+    highest, tallest = np.empty(shape, np.int32), np.empty(shape, np.float32)
+    corner = np.array([view.x_range_m[1], view.y_range_m[1], view.cell_m])
+    fill_standing(moved, read_only(ground.height_m), corner, float(min_height_m), OVERHEAD_M, highest, tallest)
+    observed = Observer(view, profile).observe(moved, highest, perception.mounting).observed
+    for box in frame.move_boxes(perception.boxes):
+        inside = np.zeros(shape, np.uint8)
+        draw_footprints(inside, [box], view, ("free", box.label))
+        np.fmax(tallest, np.float32(box.size[2]), out=tallest, where=inside > 0)
+    obstacle = ~np.isnan(tallest)
+    return OccupancyGrid(
+        drivable=_drivable(top_view, view) & ~obstacle,
+        obstacle=obstacle,
+        height_m=tallest,
+        observed=observed,
+        cell_m=view.cell_m,
+        x_range_m=view.x_range_m,
+        y_range_m=view.y_range_m,
+        stamp_s=perception.stamp_s,
+        mounting=perception.mounting,
+    )
+
+
+def _drivable(top_view: TopView | None, view: TopViewGeometry) -> NDArray[np.bool_]:
+    """Cells of ``view`` of which more than half is drivable."""
+    shape = (view.height, view.width)
+    if top_view is None:
+        return np.zeros(shape, np.bool_)
+    # Each cell is sampled at its middle or, if it is larger than those of the top view, as finely as they are.
+    parts = max(1, math.ceil(view.cell_m / top_view.cell_m - 1e-6))
+    fine = (np.arange(parts) + 0.5) / parts
+    x = view.x_range_m[1] - (np.arange(shape[0])[:, None] + fine).reshape(-1, 1) * view.cell_m
+    y = view.y_range_m[1] - (np.arange(shape[1])[:, None] + fine).reshape(1, -1) * view.cell_m
+    row, col, in_view = top_view.geometry.cells(*np.broadcast_arrays(x, y))
+    found = np.zeros(in_view.shape, np.bool_)
+    found[in_view] = top_view.drivable[row[in_view], col[in_view]]
+    return found.reshape(shape[0], parts, shape[1], parts).mean(axis=(1, 3)) > 0.5
+
+
+@njit(cache=True, nogil=True)
+def fill_standing(
+    points: NDArray[np.float32],
+    height_m: NDArray[np.float32],
+    corner: NDArray[np.float64],
+    lowest: float,
+    overhead: float,
+    highest: NDArray[np.int32],
+    tallest: NDArray[np.float32],
+) -> None:
+    """Find what stands in each cell of a grid. Points higher than ``overhead`` above the ground are ignored.
+
+    Parameters
+    ----------
+    points : (n, 4) float32, C-contiguous
+    height_m : (n,) float32
+        Height of each point above the ground [m].
+    corner : (3,) float64
+        x and y of the upper left corner of the grid, edge of a cell [m].
+    lowest, overhead : float
+        Heights between which something stands on the ground [m].
+    highest : (rows, columns) int32, overwritten
+        The point with the largest height, the first of equals; -1 without one.
+    tallest : (rows, columns) float32, overwritten
+        Largest height above ``lowest`` [m]; NaN without one.
+    """
+    n_rows, n_cols = highest.shape
+    for r in range(n_rows):
+        for c in range(n_cols):
+            highest[r, c] = -1
+            tallest[r, c] = np.float32(np.nan)
+    for i in range(points.shape[0]):
+        row = np.floor((corner[0] - np.float64(points[i, 0])) / corner[2])
+        col = np.floor((corner[1] - np.float64(points[i, 1])) / corner[2])
+        if not ((row >= 0) & (row < n_rows) & (col >= 0) & (col < n_cols) & (height_m[i] <= overhead)):
+            continue
+        r, c = int(row), int(col)
+        if highest[r, c] < 0 or height_m[i] > height_m[highest[r, c]]:
+            highest[r, c] = i
+            if height_m[i] > lowest:
+                tallest[r, c] = height_m[i]

@@ -1,0 +1,1 @@
+"""The computer below: processor, caches, files written whole, compiled kernels, lanes, clocks."""

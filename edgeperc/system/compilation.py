@@ -1,0 +1,151 @@
+"""What a user sees while kernels are compiled: one line, at a first start only.
+
+The logger ``system.compilation`` has a record of it (level INFO). Where stderr is a terminal and the program has not
+set up logging, the same line is written there, with a bar. A program that wants none sets the level of this logger or
+of ``edgeperc`` above INFO, or sets up logging. Nothing is written into a pipe or a file, and nothing if all kernels are
+in the cache.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping
+from importlib import import_module
+from types import MappingProxyType, TracebackType
+from typing import Any, TextIO
+
+from .kernel_cache import are_kept, missing, watchers
+from .kernel_stamp import called_by
+
+__all__ = ["Compilation", "kernels_of"]
+
+logger = logging.getLogger(__name__)
+
+PACKAGE = "edgeperc"
+
+# Kernels that Python calls, by what needs them; tests compare them with what is compiled.
+KERNELS: Mapping[str, str] = MappingProxyType(
+    {
+        "scans": "preprocess.returns.fill_returns preprocess.returns.has_returns_only preprocess.condition.fill_rendered "
+        "inference.decode.fill_labels types.frame.fill_moved ground.planes.fill_lowest "
+        "ground.planes.fit_first_plane inference.projection.fill_image",
+        "fitness": "preprocess.fitness.fill_scan_sums",
+        "crop": "inference.crop.fill_rows",
+        "gaps": "preprocess.condition.fill_between",
+        "turn": "types.frame.fill_turned",
+        "ground": "ground.planes.fill_heights ground.planes.fill_heights_above_plane ground.planes.fill_levels ground.planes.fill_planes",
+        "points": "inference.projection.mark_range_image objects.refine.fill_point_labels objects.refine.fill_without_outliers",
+        "points outside": "inference.crop.fill_spread",
+        "clusters": "objects.linkage.chain_points objects.linkage.fill_clusters",
+        "boxes": "objects.cluster.fill_cluster_labels objects.cluster.fill_groups objects.cluster.fill_rectangle types.geometry.fill_oriented_iou "
+        "types.geometry.mark_nms objects.persons.fill_person_groups objects.persons.fill_persons",
+        "agreement": "agreement.rules.clear_columns agreement.rules.clear_ground agreement.rules.count_inside agreement.rules.fill_support "
+        "objects.persons.complete_persons agreement.votes.apply_verdicts agreement.votes.fill_tallies agreement.votes.fill_verdicts agreement.votes.fill_votes",
+        "standing": "agreement.rules.sum_inside",
+        "road": "road.ahead.fill_corridor road.ahead.fill_first_cells "
+        "types.geometry.fill_footprints ground.observed.fill_lowest_returns "
+        "ground.observed.follow_rays ground.observed.mark_cells road.outline.fill_grown road.outline.fill_rings road.outline.mark_connected "
+        "road.outline.mark_needed road.outline.merge_corners road.outline.resolve_contacts inference.projection.mark_top_view",
+        "cells": "agreement.cells.clear_cells agreement.cells.fill_marks",
+        "detections": "inference.decode.clear_empty inference.decode.count_not_finite inference.decode.fill_footprint_sums inference.decode.mark_peaks "
+        "types.geometry.mark_nms",
+        "blocks": "inference.blocks.fill_pixels",
+        "image": "camera.image.fill_image_labels camera.image.fill_scaled",
+    }
+)
+
+SECONDS_EACH = 0.27  # of a kernel on a core at 2.4 GHz, with what numba compiles for it
+UNEVEN = 1.4  # as long as if all processes ended at the same time
+MIN_S = 1.5  # below, nothing is said
+BAR = 10  # characters
+PRIOR = 10  # kernels that the estimate counts for, beside those that are done
+
+
+class Compilation:
+    """Say that kernels are compiled, for use in a ``with`` statement around what compiles them.
+
+    Parameters
+    ----------
+    kernels : callable
+        Returns the kernels that are needed; called when one is missing.
+    n_processes : int
+        That compile at the same time.
+    """
+
+    def __init__(self, kernels: Callable[[], Iterable[Any]], n_processes: int = 1) -> None:
+        self._kernels, self._n_processes = kernels, n_processes
+        self._left: list[Any] | None = None
+        self._n, self._width, self._began_s, self._each_s, self._what = 0, 0, 0.0, 0.0, ""
+        self._terminal: TextIO | None = None
+
+    def __enter__(self) -> Compilation:
+        watchers.append(self.update)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, exc: BaseException | None, at: TracebackType | None) -> None:
+        watchers.remove(self.update)
+        if kind is None and self._width:
+            later = "; later starts load them" if are_kept(self._kernels()) else ""
+            self._write(f"compiled {self._n} functions in {math.ceil(time.monotonic() - self._began_s)} s{later}")
+        if self._width and self._terminal is not None:
+            with contextlib.suppress(OSError, ValueError):
+                self._terminal.write("\n")
+
+    def update(self) -> None:
+        """Count what is missing: a kernel is to be compiled, or was compiled here or by a helper."""
+        if self._left is None:
+            self._begin()
+        elif self._terminal is not None:
+            self._left = missing(self._left)
+            done, passed_s = self._n - len(self._left), time.monotonic() - self._began_s
+            left_s = len(self._left) * (PRIOR * self._each_s + passed_s) / (PRIOR + done)
+            filled = BAR * done // self._n
+            self._write(f"{self._what} [{'#' * filled:-<{BAR}}] {math.ceil(left_s)} s left")
+
+    def _begin(self) -> None:
+        kernels = [*self._kernels()]
+        self._left, self._began_s = missing(kernels), time.monotonic()
+        self._n = len(self._left)
+        self._each_s = SECONDS_EACH * (UNEVEN / self._n_processes if self._n_processes > 1 else 1.0)
+        seconds = self._n * self._each_s
+        if seconds < MIN_S:
+            return
+        self._what = f"compiling {self._n} functions{' once for this computer' if are_kept(kernels) else ''}"
+        line = f"{self._what}, about {round(seconds) if seconds < 10.0 else 5 * round(seconds / 5.0)} s"
+        logger.info("%s", line)
+        self._terminal = _terminal()
+        self._write(line)
+
+    def _write(self, line: str) -> None:
+        """Replace the line on the terminal."""
+        if self._terminal is None:
+            return
+        shown = f"edgeperc: {line}"[: shutil.get_terminal_size().columns - 1]
+        with contextlib.suppress(OSError, ValueError):  # it was closed
+            self._terminal.write(f"\r{shown:<{self._width}}")
+            self._terminal.flush()
+        self._width = len(shown)
+
+
+def kernels_of(needs: Iterable[str]) -> list[Any]:
+    """The kernels of some of the keys of `KERNELS`, and those that they call, each once."""
+    names = dict.fromkeys(name.rpartition(".") for need in needs for name in KERNELS[need].split())
+    every = [getattr(import_module(f"{PACKAGE}.{module}"), name) for module, _, name in names]
+    for kernel in every:  # it grows
+        every.extend(other for other in called_by(kernel) if other not in every)
+    return every
+
+
+def _terminal() -> TextIO | None:
+    """Standard error if a user reads it, and the program has not said otherwise."""
+    levels = [logging.getLogger(name).level for name in (__name__, PACKAGE)]
+    try:
+        is_shown = sys.stderr is not None and sys.stderr.isatty()
+    except ValueError:  # it is closed
+        return None
+    return sys.stderr if is_shown and not logger.hasHandlers() and max(levels) <= logging.INFO else None

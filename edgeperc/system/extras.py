@@ -1,0 +1,52 @@
+"""Import packages of the optional extras."""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib import import_module
+from typing import Any
+
+from ..errors import MissingExtraError
+
+__all__ = ["require", "without_telemetry"]
+
+
+def require(module: str, extra: str, purpose: str, *, package: str | None = None) -> Any:
+    """Import a module of an optional package.
+
+    Parameters
+    ----------
+    module : str
+        Dotted name, e.g. ``"matplotlib"``.
+    extra : str
+        The extra of edgeperc that installs the package.
+    purpose : str
+        What needs the package; the beginning of the error message.
+    package : str, optional
+        Name on PyPI if it is not the module's top-level name.
+
+    Returns
+    -------
+    module
+
+    Raises
+    ------
+    MissingExtraError
+        The module cannot be imported; the message gives the command that installs it.
+    """
+    try:
+        return import_module(module)
+    except ImportError as exc:
+        raise MissingExtraError(package or module.partition(".")[0], extra, purpose) from exc
+
+
+def without_telemetry() -> None:
+    """Set ``ORT_DISABLE_TELEMETRY=1`` in this process, before onnxruntime is imported.
+
+    Since version 1.29, importing onnxruntime on Linux writes a device id and a database of events for Microsoft into
+    the user's cache folder. A value that is already set stays. If onnxruntime is already imported, nothing changes,
+    because it reads the variable only then.
+    """
+    if "onnxruntime" not in sys.modules:
+        os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

@@ -1,0 +1,422 @@
+"""Compiled kernels on disk: checked before they are loaded, and never a reason for a start to fail.
+
+numba keeps compiled functions as pickled machine code. Its own cache loads whatever the files hold, so a damaged file
+raises an unrelated error or crashes the process. Here each file begins with a checksum. A damaged file is reported,
+compiled again and replaced. The checksum protects against damage only. Against other users, a folder or file is used
+only if it belongs to this user or to root and nobody else can write it.
+
+Folders, in this order: ``NUMBA_CACHE_DIR``, if it is set; otherwise ``__pycache__`` beside the source, and ``kernels``
+in `machine.cache_folder`. If none can be written, every start compiles again, and a warning in the log says so.
+"""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import logging
+import os
+import pickle
+import stat
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import llvmlite.binding
+import numba
+import numba.core.compiler
+import numba.core.config
+import numba.core.runtime
+import numba.core.serialize
+import numba.core.sigutils
+
+from ..errors import SettingsError
+from .atomic import write_atomic
+from .kernel_stamp import settings, stamp_of
+from .machine import cache_folder, unsafe_because
+
+__all__ = ["KernelCache", "are_kept", "fewer_collections", "missing", "njit", "tell_watchers", "watchers"]
+
+logger = logging.getLogger(__name__)
+
+_numba: Any = numba.core  # internals, which have no types
+FORMAT = 3  # of the files
+_DIGEST_BYTES = hashlib.sha256().digest_size
+_reported: set[str] = set()
+_collecting = threading.Lock()
+_rarely: list[tuple[int, int, int]] = []  # the thresholds before, once for each `fewer_collections` that is active
+RARE = 50_000  # objects; a collection takes 0.2 s once numba has built its tables
+
+
+watchers: list[Callable[[], None]] = []
+"""Called before a kernel is compiled, and when it was."""
+
+
+def tell_watchers() -> None:
+    """Call the `watchers`."""
+    for each in tuple(watchers):
+        each()
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """`numba.njit`, whose cache is a `KernelCache`.
+
+    Parameters
+    ----------
+    **options
+        As `numba.njit`. With ``cache=True`` the compiled function is kept on disk, unless it is defined inside another
+        function and uses its variables.
+
+    Returns
+    -------
+    callable
+        The decorator.
+    """
+
+    kept = options.pop("cache", False)
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        # Kernels are never called from C: without that wrapper, they compile faster.
+        kernel = numba.njit(**{"no_cfunc_wrapper": True, "pipeline_class": _Compiler, **options})(function)
+        if (
+            kept and function.__closure__ is None and hasattr(kernel, "_cache")
+        ):  # with NUMBA_DISABLE_JIT, the kernel is the function itself
+            kernel._cache = KernelCache(kernel)
+        return kernel
+
+    return decorate
+
+
+class _Compiler(numba.core.compiler.CompilerBase):
+    """numba's passes without those for what kernels do not have, which take a twentieth of the time.
+
+    These are closures and comprehensions, and arithmetic with whole arrays.
+    """
+
+    def define_pipelines(self) -> list[Any]:
+        """What `numba.core.compiler.CompilerBase` asks for: the passes in their order."""
+        passes = _numba.compiler.PassManager("kernel")
+        for each, name in _numba.compiler.DefaultPassBuilder.define_nopython_pipeline(self.state).passes:
+            if each.__name__ not in ("InlineClosureLikes", "NopythonRewrites"):
+                passes.add_pass(each, name)
+        passes.finalize()
+        return [passes]
+
+
+def missing(kernels: Iterable[Any]) -> list[Any]:
+    """Those of some kernels that no folder and no memory holds in compiled form, for any types."""
+    left = {kernel._cache._name: kernel for kernel in kernels if _is_cached(kernel) and not kernel.signatures}
+    for folder in dict.fromkeys(folder for kernel in left.values() for folder in kernel._cache._folders()):
+        for file in folder.glob("*.kernel") if left and _unusable(folder) is None else ():
+            kernel = left.get(file.name.rpartition("-")[0])
+            if kernel is not None and _stamp_of(file) == kernel._cache._stamp():
+                del left[kernel._cache._name]
+    return [*left.values()]
+
+
+def are_kept(kernels: Iterable[Any]) -> bool:
+    """Whether compiled kernels are put into a cache, from which the next start loads them."""
+    caches = [kernel._cache for kernel in kernels if _is_cached(kernel)]
+    return bool(caches) and any(_can_be_written(each) and not _unusable(each) for each in caches[0]._folders())
+
+
+def _is_cached(kernel: Any) -> bool:
+    return isinstance(getattr(kernel, "_cache", None), KernelCache)
+
+
+@contextmanager
+def fewer_collections() -> Iterator[None]:
+    """Let garbage be collected more rarely while kernels are compiled, which takes a seventh less time.
+
+    Afterwards the thresholds are those from before. Where collection is off, it stays off.
+    """
+    with _collecting:
+        _rarely.append(_rarely[0] if _rarely else gc.get_threshold())
+        if len(_rarely) == 1 and 0 < _rarely[0][0] < RARE:
+            gc.set_threshold(RARE, *_rarely[0][1:])
+    try:
+        yield
+    finally:
+        with _collecting:
+            before = _rarely.pop()
+            if not _rarely:
+                gc.set_threshold(*before)
+
+
+class KernelCache:
+    """The compiled forms of one kernel on disk, in place of `numba.core.caching.FunctionCache`.
+
+    One file holds the machine code for one signature, processor, version of Python and setting of numba. It begins with
+    a SHA-256 of the rest and a stamp of what the machine code depends on (`system.kernel_stamp`). With another stamp
+    it is compiled again and replaced.
+
+    Parameters
+    ----------
+    kernel : Dispatcher
+        What `numba.njit` returns.
+    """
+
+    def __init__(self, kernel: Any) -> None:
+        self._kernel, self._function = kernel, kernel.py_func
+        # In a frozen application there are no source files.
+        is_frozen = getattr(sys, "frozen", False)
+        self._source = Path(sys.executable if is_frozen else self._function.__code__.co_filename).absolute()
+        self._enabled = True
+
+    def _stamp(self, *, anew: bool = False) -> bytes | None:
+        """Changes with everything that the machine code depends on; None, after a report, if that is not known."""
+        try:
+            stamp = stamp_of(self._kernel, _Compiler.define_pipelines, anew=anew)
+        except Exception as exc:  # a value of a kind that is not known
+            _report("unknown", "the compiled kernel %s is not kept: %s", self._name, exc)
+            return None
+        return hashlib.sha256(b"%d %s" % (FORMAT, stamp)).digest()
+
+    @property
+    def cache_path(self) -> str | None:
+        """The first folder that can be written, or holds this kernel already; None if there is none."""
+        usable = [folder for folder in self._folders() if _unusable(folder) is None]
+        kept = (folder for folder in usable if _can_be_written(folder) or self._is_in(folder))
+        return next(map(str, kept), None)
+
+    def is_missing(self) -> bool:
+        """Whether no folder holds a compiled form of this kernel, for any types, and one of them can be written."""
+        can_write = False
+        for folder in self._folders() if self._enabled and self._stamp() is not None else ():
+            if _unusable(folder) is not None:
+                continue
+            if self._is_in(folder):
+                return False
+            can_write |= _can_be_written(folder)
+        return can_write
+
+    def _is_in(self, folder: Path) -> bool:
+        """Whether a folder holds a compiled form of this kernel, for any types."""
+        stamp = self._stamp()
+        return any(_stamp_of(file) == stamp for file in folder.glob(f"{self._name}-*.kernel"))
+
+    def enable(self) -> None:
+        """Load and save from now on."""
+        self._enabled = True
+
+    def disable(self) -> None:
+        """Neither load nor save from now on."""
+        self._enabled = False
+
+    def flush(self) -> None:
+        """Nothing: files of another stamp are replaced when they are met."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Load a compiled form.
+
+        Parameters
+        ----------
+        sig : tuple of types, Signature or str
+        target_context : BaseContext
+            numba's description of the processor.
+
+        Returns
+        -------
+        CompileResult or None
+            None if there is none that can be used.
+        """
+        result = self._load(sig, target_context)
+        if result is None:
+            tell_watchers()
+        return result
+
+    def _load(self, sig: Any, target_context: Any) -> Any:
+        if not self._enabled or (stamp := self._stamp()) is None:
+            return None
+        try:
+            # Machine code needs numba's memory allocator, but neither its compiler's tables of types and functions nor
+            # scipy, which they import; if something is compiled, numba loads them. This saves 0.3 to 0.5 s a start.
+            _numba.runtime.rtsys.initialize(target_context)
+            name, known = self._key(sig, target_context.codegen())
+        except Exception as exc:  # another numba
+            _report("unknown", "compiled kernels cannot be loaded with numba %s: %s", numba.__version__, _text(exc))
+            return None
+        for folder in self._folders():
+            file = folder / name
+            try:
+                if _unusable(folder) is None and (content := _read(file)) is not None and content[0] == stamp:
+                    found, defined, payload = pickle.loads(content[1])
+                    if found == known:
+                        return _rebuilt(target_context, defined, *payload)
+            except Exception as exc:  # what a file holds, or what cannot be read, never stops the start
+                message = "the compiled kernel %s cannot be used and is compiled again: %s"
+                _report("damaged", message, file, _text(exc))
+        return None
+
+    def save_overload(self, sig: Any, result: Any) -> None:
+        """Save a compiled form in the first folder that takes it; where that fails, a warning in the log says why.
+
+        Parameters
+        ----------
+        sig : tuple of types, Signature or str
+        result : CompileResult
+        """
+        self._save(sig, result)
+        tell_watchers()
+
+    def _save(self, sig: Any, result: Any) -> None:
+        if not self._enabled or (stamp := self._stamp()) is None:
+            return
+        if self._stamp(anew=True) != stamp:
+            _report("unknown", "the compiled kernel %s is not kept: a value that it reads was set anew", self._name)
+            return
+        try:
+            if result.library.has_dynamic_globals:  # addresses in this process
+                return
+            name, known = self._key(sig, result.codegen)
+            module = result.library._get_module_for_linking()
+            defined = [each.name for each in (*module.functions, *module.global_variables) if not each.is_declaration]
+            reason = self._write(name, stamp + _numba.serialize.dumps((known, defined, result._reduce())))
+        except Exception as exc:  # another numba
+            reason = f"numba {numba.__version__}: {_text(exc)}"
+        if reason is not None:
+            _report(
+                "not kept",
+                "compiled kernels are not kept, and every start compiles them again (%s); set NUMBA_CACHE_DIR to a "
+                "folder that exists and only you can write",
+                reason,
+            )
+
+    def _write(self, name: str, content: bytes) -> str | None:
+        """Write a file into the first folder that takes it; the reasons if none does."""
+        reasons = []
+        for folder in self._folders():
+            try:
+                # mkdir's mode, lessened by the umask, is that of the last folder only.
+                folder.parent.mkdir(0o755, parents=True, exist_ok=True)
+                folder.mkdir(0o755, exist_ok=True)
+                reason = _unusable(folder)
+                if reason is None:
+                    write_atomic(folder / name, hashlib.sha256(content).digest() + content, 0o644)
+                    return None
+            except OSError as exc:
+                reason = exc.strerror or str(exc)
+            reasons.append(f"{folder}: {reason}")
+        return "; ".join(reasons) or "there is no home folder"
+
+    def _key(self, sig: Any, codegen: Any) -> tuple[str, Any]:
+        """The file's name for a signature; and the types that it is for."""
+        function, tag = self._function, sys.implementation.cache_tag
+        known = _numba.sigutils.normalize_signature(sig)
+        processor = codegen.magic_tuple()
+        what = repr((function.__qualname__, *map(str, known), processor, tag, settings())).encode()
+        return f"{self._name}-{hashlib.sha256(what).hexdigest()[:16]}.kernel", known
+
+    @property
+    def _name(self) -> str:
+        """What the names of the files of this kernel begin with."""
+        name = f"{self._source.stem}.{self._function.__qualname__}"
+        return name.translate({ord("<"): None, ord(">"): None})[:80]
+
+    def _folders(self) -> Iterator[Path]:
+        """Where compiled forms may lie, best first."""
+        place = f"{self._source.parent.name}-{hashlib.sha256(bytes(self._source.parent)).hexdigest()[:16]}"
+        if _numba.config.CACHE_DIR:
+            yield Path(_numba.config.CACHE_DIR).absolute() / place
+            return
+        if not getattr(sys, "frozen", False) and self._source.is_file():  # not in an archive
+            yield self._source.parent / "__pycache__"
+        try:
+            yield cache_folder() / "kernels" / place
+        except SettingsError:  # there is no home folder
+            return
+
+
+def _rebuilt(target_context: Any, defined: Iterable[str], library: tuple[str, str, Any], *rest: Any) -> Any:
+    """A compiled form from what ``CompileResult._reduce`` gave, and the names that its module defines.
+
+    Beside the machine code there is a module for kernels that call this one. It is parsed when such a kernel is
+    compiled; at a start that would take as long as everything else here.
+    """
+    name, kind, content = library
+    if kind != "object":
+        return _numba.compiler.CompileResult._rebuild(target_context, library, *rest)
+    code, for_callers = content
+    symbols = target_context.codegen()._engine._defined_symbols
+    added = {*defined} - symbols
+    symbols |= added
+    try:
+        result = _numba.compiler.CompileResult._rebuild(target_context, (name, kind, (code, _empty_module())), *rest)
+    except BaseException:
+        symbols -= added  # the kernel is compiled, and defines them
+        raise
+    loaded = result.library
+
+    def parsed() -> Any:
+        del loaded._get_module_for_linking
+        loaded._shared_module = llvmlite.binding.parse_bitcode(for_callers)
+        return loaded._shared_module
+
+    loaded._get_module_for_linking = parsed
+    return result
+
+
+@cache
+def _empty_module() -> bytes:
+    return bytes(llvmlite.binding.parse_assembly("").as_bitcode())
+
+
+def _read(file: Path) -> tuple[bytes, bytes] | None:
+    """Stamp and content of a file; None if there is none. Raises ValueError or OSError."""
+    try:
+        with file.open("rb") as opened:
+            reason = unsafe_because(os.fstat(opened.fileno()))
+            content = opened.read()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    if reason is not None:
+        raise ValueError(reason)
+    digest, rest = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+    if hashlib.sha256(rest).digest() != digest:
+        raise ValueError(f"its {len(content)} bytes do not have the checksum that they were written with")
+    return rest[:_DIGEST_BYTES], rest[_DIGEST_BYTES:]
+
+
+def _stamp_of(file: Path) -> bytes:
+    """The stamp of a file, which may be damaged; empty if it cannot be read."""
+    try:
+        with file.open("rb") as opened:
+            return opened.read(2 * _DIGEST_BYTES)[_DIGEST_BYTES:]
+    except OSError:
+        return b""
+
+
+def _can_be_written(folder: Path) -> bool:
+    """Whether files can be put into a folder, which may not exist yet."""
+    try:
+        return os.access(next(each for each in (folder, *folder.parents) if each.exists()), os.W_OK)
+    except OSError:
+        return False
+
+
+def _unusable(folder: Path) -> str | None:
+    """Why a folder for kernels is not used: other users could write it, or replace it; None if it may be used."""
+    for each in (folder, folder.parent):
+        try:
+            status = each.stat()
+        except OSError:
+            continue  # it does not exist, so it holds nothing
+        reason = unsafe_because(status) if stat.S_ISDIR(status.st_mode) else "it is not a folder"
+        if reason is not None:
+            return reason if each == folder else f"in {each}, {reason}"
+    return None
+
+
+def _text(exc: Exception) -> str:
+    return f"{type(exc).__name__}: {exc}"
+
+
+def _report(kind: str, message: str, *values: object) -> None:
+    """Log a warning the first time in this process; further ones of its kind are logged as information."""
+    level = logging.INFO if kind in _reported else logging.WARNING
+    _reported.add(kind)
+    logger.log(level, message, *values)

@@ -1,0 +1,181 @@
+"""Points on things that move, and on things that could move: what a map should not contain."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import OptionError, PointsError
+from ..system.kernel_cache import njit
+from ..types.perception import Box, Perception
+from ..types.points import as_points, read_only
+from . import Track
+from .tracks import PARAMETERS
+
+__all__ = ["MOVABLE", "mark_in_boxes", "movable_points", "moving_points", "moving_tracks"]
+
+MOVABLE = frozenset(
+    {
+        *("car", "van", "truck", "bus", "tram", "trailer", "vehicle", "motorcycle", "bicycle"),
+        *("pedestrian", "person", "person_sitting", "cyclist", "bicyclist", "motorcyclist"),
+    }
+)
+"""Classes of points and boxes that can move on their own or are moved by people."""
+
+
+def moving_tracks(
+    tracks: Iterable[Track], *, min_speed_mps: float | None = None, n_sigmas: float = 3.0
+) -> tuple[Track, ...]:
+    """The tracks that move over ground, in their order.
+
+    Parameters
+    ----------
+    tracks : iterable of Track
+        `Tracks` of one scan.
+    min_speed_mps : float, optional
+        Lowest speed over ground [m/s]. Default: `ClassParameters.moving_mps` of the class, 0.7 m/s for pedestrians and
+        1 m/s for others.
+    n_sigmas : float
+        The speed must also exceed its standard deviation by this factor.
+
+    Returns
+    -------
+    tuple of Track
+        A new track has no certain speed, so it does not count as moving in its first scans. Tracks that coast count.
+
+    Raises
+    ------
+    OptionError
+        ``min_speed_mps`` or ``n_sigmas`` is negative or not finite.
+    """
+    for name, value in (("min_speed_mps", min_speed_mps), ("n_sigmas", n_sigmas)):
+        if value is not None and not 0.0 <= value < math.inf:
+            raise OptionError(f"{name} is {value}; expected 0 or more")
+    found = []
+    for track in tracks:
+        slowest = PARAMETERS.get(track.label, PARAMETERS["car"]).moving_mps if min_speed_mps is None else min_speed_mps
+        speed, sigma = abs(float(track.state[2])), math.sqrt(max(float(track.covariance[2, 2]), 0.0))
+        if speed > max(slowest, n_sigmas * sigma):
+            found.append(track)
+    return tuple(found)
+
+
+def moving_points(
+    tracks: Iterable[Track],
+    points: ArrayLike,
+    *,
+    margin_m: float = 0.2,
+    min_speed_mps: float | None = None,
+    n_sigmas: float = 3.0,
+) -> NDArray[np.bool_]:
+    """Mark the points inside the boxes of tracks that move over ground.
+
+    Parameters
+    ----------
+    tracks : iterable of Track
+        `Tracks` of this scan. Their speed is over ground: the motion of the sensor is taken out, with poses or without.
+    points : (n, 3 or 4) array_like
+        The scan: x, y, z [m] in the frame of the sensor.
+    margin_m : float
+        Boxes are grown by this on every side [m].
+    min_speed_mps, n_sigmas
+        As in `moving_tracks`.
+
+    Returns
+    -------
+    (n,) bool
+        False for points that are not finite.
+
+    Raises
+    ------
+    OptionError
+        An option is negative or not finite.
+    PointsError
+        ``points`` is not a scan.
+    """
+    moving = moving_tracks(tracks, min_speed_mps=min_speed_mps, n_sigmas=n_sigmas)
+    return _inside_any([track.box for track in moving], as_points(points), margin_m)
+
+
+def movable_points(
+    perception: Perception,
+    points: ArrayLike,
+    *,
+    classes: Collection[str] = MOVABLE,
+    margin_m: float = 0.2,
+) -> NDArray[np.bool_]:
+    """Mark the points on things that could move, whether they move or not: by the classes of points and by boxes.
+
+    Parameters
+    ----------
+    perception : Perception
+        Of this scan.
+    points : (n, 3 or 4) array_like
+        The scan: x, y, z [m] in the frame of the sensor.
+    classes : collection of str
+        Classes that could move. Others, such as those of a network of your own, must be added.
+    margin_m : float
+        Boxes are grown by this on every side [m].
+
+    Returns
+    -------
+    (n,) bool
+        True for points of these classes, and for points in a box of these classes.
+
+    Raises
+    ------
+    OptionError
+        ``margin_m`` is negative or not finite.
+    PointsError
+        ``points`` is not the scan of the perception.
+    """
+    scan = as_points(points)
+    if len(scan) != perception.n_points:
+        raise PointsError(
+            f"got {len(scan):,} points and a perception of {perception.n_points:,}; pass the scan that was perceived"
+        )
+    found = _inside_any([box for box in perception.boxes if box.label in classes], scan, margin_m)
+    if perception.points is not None:
+        numbers = [k for k, name in enumerate(perception.points.classes) if name in classes]
+        found |= np.isin(perception.points.labels, numbers) & perception.points.in_view
+    return found
+
+
+def _inside_any(boxes: list[Box], points: NDArray[np.float32], margin_m: float) -> NDArray[np.bool_]:
+    if not 0.0 <= margin_m < math.inf:
+        raise OptionError(f"margin_m is {margin_m}; expected 0 or more meters")
+    rows = [
+        (*box.center, *(size / 2.0 + margin_m for size in box.size), math.cos(box.yaw), math.sin(box.yaw))
+        for box in boxes
+    ]
+    inside = np.empty(len(points), np.bool_)
+    mark_in_boxes(read_only(np.array(rows, np.float64).reshape(-1, 8), np.float64), read_only(points), inside)
+    return inside
+
+
+@njit(cache=True, nogil=True)
+def mark_in_boxes(boxes: NDArray[np.float64], points: NDArray[np.float32], inside: NDArray[np.bool_]) -> None:
+    """Mark the points inside at least one box.
+
+    Parameters
+    ----------
+    boxes : (m, 8) float64, C-contiguous, read-only
+        x, y, z of the center, half length, half width, half height [m], cosine and sine of the yaw.
+    points : (n, 3 or more) float32, C-contiguous, read-only
+    inside : (n,) bool, overwritten
+    """
+    for i in range(points.shape[0]):
+        inside[i] = False
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        for k in range(boxes.shape[0]):
+            dx, dy = x - boxes[k, 0], y - boxes[k, 1]
+            if (
+                abs(z - boxes[k, 2]) <= boxes[k, 5]
+                and abs(dx * boxes[k, 6] + dy * boxes[k, 7]) <= boxes[k, 3]
+                and abs(dy * boxes[k, 6] - dx * boxes[k, 7]) <= boxes[k, 4]
+            ):
+                inside[i] = True
+                break

@@ -1,0 +1,715 @@
+"""ModelCard: geometry, normalization, classes and origin of a model. The only reader and writer of the card's JSON.
+
+A card is stored in the model file, under one ``metadata_props`` key, so that it cannot be separated from the weights.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+import reprlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import CardError
+from ..system.names import check_name, check_text
+from .onnx_file import read_metadata
+
+__all__ = [
+    "CARD_KEY",
+    "CameraGeometry",
+    "Golden",
+    "InputSpec",
+    "ModelCard",
+    "OutputSpec",
+    "RangeImageGeometry",
+    "TopViewGeometry",
+]
+
+CARD_KEY = "edgeperc.card"
+Precision = Literal["fp32", "int8"]
+SCHEMA = 3
+MAX_CHARACTERS = 16 * 10**6
+MAX_DEPTH = 32
+MAX_TEXT = 100_000  # characters of one text of the free-form metadata
+MAX_ROWS, MAX_COLUMNS, MAX_PIXELS = 4096, 65_536, 16 * 10**6
+MAX_CHANNELS = 16
+MAX_BLOCK = 16
+MIN_SECTOR_DEG = 1.0
+MIN_GOLDEN_VALUES, MAX_GOLDEN_VALUES = 16, 100_000
+OUTPUT_KINDS = ("class_logits", "class_probabilities", "box_slots", "box_dense", "camera_logits")
+CHANNELS = {
+    "camera": ("red", "green", "blue"),
+    "top_view": ("distance", "remission", "height"),
+    "range_image": ("x", "y", "z", "remission", "range", "height_above_ground"),
+}
+N_DENSE_CHANNELS, N_FRONT_CHANNELS = 9, 2
+
+
+def _check(field: str, value: float, low: float, high: float) -> None:
+    """Refuse a number of the card that is out of its bounds, or not finite."""
+    if not low <= value <= high:
+        raise CardError(f"{field} is {reprlib.repr(value)}; expected a number from {low:g} to {high:g}")
+
+
+def _check_each(field: str, values: Iterable[float], low: float, high: float) -> None:
+    for index, value in enumerate(values):
+        _check(f"{field}[{index}]", value, low, high)
+
+
+def _check_size(rows: int, columns: int) -> None:
+    if not (1 <= rows <= MAX_ROWS and 1 <= columns <= MAX_COLUMNS and rows * columns <= MAX_PIXELS):
+        raise CardError(
+            f"the view has {reprlib.repr(rows)} rows and {reprlib.repr(columns)} columns; expected 1 to {MAX_ROWS} "
+            f"rows, 1 to {MAX_COLUMNS} columns and at most {MAX_PIXELS} pixels"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class TopViewGeometry:
+    """The ground ahead as an image (SSADNet 2.1.2). Row 0 is farthest ahead, column 0 leftmost.
+
+    Attributes
+    ----------
+    x_range_m, y_range_m, z_range_m : tuple of 2 float
+        Bounds of the view [m] in the sensor frame, lower first.
+    cell_m : float
+        Edge of a cell [m].
+    """
+
+    x_range_m: tuple[float, float] = (6.0, 46.0)
+    y_range_m: tuple[float, float] = (-10.0, 10.0)
+    z_range_m: tuple[float, float] = (-2.5, 2.5)
+    cell_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("x_range_m", "y_range_m", "z_range_m"):
+            low, high = getattr(self, name)
+            _check_each(f"view.{name}", (low, high), -1e4, 1e4)
+            if not high - low >= 1e-3:
+                raise CardError(f"view.{name} is {(low, high)}; expected two finite numbers, the lower first")
+        _check("view.cell_m", self.cell_m, 1e-3, 100.0)
+        _check_size(self.height, self.width)
+
+    @property
+    def kind(self) -> str:
+        return "top_view"
+
+    @property
+    def height(self) -> int:
+        """Rows, along x."""
+        return round((self.x_range_m[1] - self.x_range_m[0]) / self.cell_m)
+
+    @property
+    def width(self) -> int:
+        """Columns, along y."""
+        return round((self.y_range_m[1] - self.y_range_m[0]) / self.cell_m)
+
+    def holds(self, x: float, y: float) -> bool:
+        """Whether a position x, y [m] in the sensor frame is in view."""
+        (near, far), (right, left) = self.x_range_m, self.y_range_m
+        return near <= x < far and right <= y < left
+
+    def cells(self, x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        """Find the cells that contain some positions.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Positions in the sensor frame [m]; their shapes must broadcast.
+
+        Returns
+        -------
+        rows, cols : ndarray of int64
+        in_view : ndarray of bool
+            False if a position is out of view or not finite; its row and column are then not valid.
+        """
+        row = np.floor((self.x_range_m[1] - np.asarray(x)) / self.cell_m)
+        col = np.floor((self.y_range_m[1] - np.asarray(y)) / self.cell_m)
+        in_view = (row >= 0) & (row < self.height) & (col >= 0) & (col < self.width)
+        with np.errstate(invalid="ignore"):  # NaN and what int64 cannot hold are out of view
+            return row.astype(np.int64), col.astype(np.int64), in_view
+
+    def cell_centers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Centers of the cells in the sensor frame [m]: x (rows, 1) and y (1, columns)."""
+        # np.float64, because older type stubs of numpy widen the type of a product with a Python float
+        cell_m = np.float64(self.cell_m)
+        x = np.float64(self.x_range_m[1]) - (np.arange(self.height, dtype=np.float64)[:, None] + 0.5) * cell_m
+        y = np.float64(self.y_range_m[1]) - (np.arange(self.width, dtype=np.float64)[None, :] + 0.5) * cell_m
+        return x, y
+
+
+@dataclass(frozen=True, slots=True)
+class RangeImageGeometry:
+    """The scan as seen from the sensor (PointSeg 3.1). Row 0 is the top beam, column 0 leftmost.
+
+    Attributes
+    ----------
+    row_elevations_deg : tuple of float
+        Elevation of every row [deg], top to bottom, strictly decreasing, not necessarily evenly spaced.
+    width : int
+        Columns, evenly spread over the azimuths.
+    azimuth_left_deg, azimuth_right_deg : float
+        Azimuths of the image's left and right edges [deg], counter-clockwise from +x; 180 and -180 for a full turn.
+    """
+
+    row_elevations_deg: tuple[float, ...]
+    width: int = 512
+    azimuth_left_deg: float = 45.0
+    azimuth_right_deg: float = -45.0
+
+    def __post_init__(self) -> None:
+        rows = self.row_elevations_deg
+        falling = all(a > b for a, b in itertools.pairwise(rows))
+        if len(rows) < 2 or not falling or not all(-90.0 < e < 90.0 for e in rows):
+            raise CardError(
+                f"view.row_elevations_deg holds {len(rows)} values; expected two or more, strictly decreasing, "
+                "between -90 and 90 degrees"
+            )
+        _check_size(len(rows), self.width)
+        left, right = self.azimuth_left_deg, self.azimuth_right_deg
+        # A full turn takes a run of the network for each sector.
+        if not (right >= -180.0 and right + MIN_SECTOR_DEG <= left and left <= 180.0):
+            raise CardError(
+                f"view azimuths are left {left}, right {right}; expected -180 <= right < left <= 180, at least "
+                f"{MIN_SECTOR_DEG:g} degree apart"
+            )
+
+    @property
+    def kind(self) -> str:
+        return "range_image"
+
+    @property
+    def height(self) -> int:
+        """Rows, one per beam."""
+        return len(self.row_elevations_deg)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraGeometry:
+    """The image of a camera, scaled to the network's input. Row 0 is the top, column 0 leftmost.
+
+    Attributes
+    ----------
+    width, height : int
+        Columns and rows of the input.
+    fit : {"stretch"}
+        How an image of another size gets there: all of it is scaled to ``width`` and ``height``, bilinearly with
+        half-pixel centers (`edgeperc.camera.image.ImageScaler`), whatever its aspect; nothing is cropped or padded.
+    """
+
+    width: int
+    height: int
+    fit: Literal["stretch"] = "stretch"
+
+    def __post_init__(self) -> None:
+        if self.fit != "stretch":
+            raise CardError(f"view.fit is {reprlib.repr(self.fit)}; expected stretch")
+        _check_size(self.height, self.width)
+
+    @property
+    def kind(self) -> str:
+        return "camera"
+
+
+@dataclass(frozen=True, slots=True)
+class InputSpec:
+    """The network's input: ``(raw - mean) / std`` per channel; 0 in every channel of a pixel without a return.
+
+    The raw values of a camera are 0..255 in ``"red"``, ``"green"`` and ``"blue"``, in the order that the network takes.
+
+    Attributes
+    ----------
+    name : str
+        Name of the input in the graph.
+    channels : tuple of str
+    mean, std : tuple of float
+        One value per channel, in the channel's unit.
+    """
+
+    name: str
+    channels: tuple[str, ...]
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+
+    @property
+    def needs_ground(self) -> bool:
+        """Whether a channel is the height above the ground, which must be found before the input can be made."""
+        return "height_above_ground" in self.channels
+
+    def __post_init__(self) -> None:
+        if not len(self.channels) == len(self.mean) == len(self.std) or not self.channels:
+            raise CardError(
+                f"input has {len(self.channels)} channels, {len(self.mean)} means and {len(self.std)} standard "
+                "deviations; expected as many of each, at least one"
+            )
+        _check("the number of input channels", len(self.channels), 1, MAX_CHANNELS)
+        check_text("input.name", self.name, CardError)
+        _check_each("input.mean", self.mean, -1e6, 1e6)
+        _check_each("input.std", self.std, 1e-6, 1e6)
+
+
+@dataclass(frozen=True, slots=True)
+class OutputSpec:
+    """One output of the graph; ``kind`` picks the function in ``decode.py`` that reads it.
+
+    Attributes
+    ----------
+    name : str
+        Name of the output in the graph.
+    kind : str
+        One of ``OUTPUT_KINDS``.
+    front : bool
+        Of kind ``"box_dense"``: it has two more channels, a vector towards the front of a box. Its component along a
+        heading is the logit that the front is there.
+    block : (int, int)
+        Of a class output: rows and columns of the pixels whose values are channels of one position. Value of class c in
+        pixel (row, column): channel ``(c * rows + row % rows) * columns + column % columns``, at position
+        ``(row // rows, column // columns)``.
+    """
+
+    name: str
+    kind: str
+    front: bool = False
+    block: tuple[int, int] = (1, 1)
+
+    def __post_init__(self) -> None:
+        if self.kind not in OUTPUT_KINDS:
+            raise CardError(
+                f"output {reprlib.repr(self.name)} is of kind {reprlib.repr(self.kind)}; "
+                f"expected one of {', '.join(OUTPUT_KINDS)}"
+            )
+        if self.front and self.kind != "box_dense":
+            raise CardError(f"output {reprlib.repr(self.name)} of kind {self.kind} has a front; only box_dense may")
+        if len(self.block) != 2 or not all(1 <= n <= MAX_BLOCK for n in self.block):
+            raise CardError(f"output.block is {reprlib.repr(self.block)}; expected two numbers from 1 to {MAX_BLOCK}")
+        if self.block != (1, 1) and not self.kind.startswith("class_"):
+            raise CardError(
+                f"output {reprlib.repr(self.name)} of kind {self.kind} has blocks; only outputs of classes may"
+            )
+        check_text("output.name", self.name, CardError)
+
+
+@dataclass(frozen=True, slots=True)
+class Golden:
+    """A known input, and the outputs that the exporting computer got for it.
+
+    The input is uniform noise in -1..1 from ``numpy.random.PCG64(seed)``. Each output is stored at sampled flat
+    positions, so that any runtime can be compared with the exporter's: at 16 or more different positions, or at all
+    positions of a smaller output.
+
+    Attributes
+    ----------
+    seed : int
+    input_sha256 : str
+        SHA-256 of the input as float32 bytes in C order.
+    outputs : mapping
+        Output name to ``{"sha256": str, "std": float, "positions": [int], "values": [float]}``.
+    """
+
+    seed: int
+    input_sha256: str
+    outputs: Mapping[str, Mapping[str, Any]]
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**64:
+            raise CardError(f"golden.seed is {reprlib.repr(self.seed)}; expected a whole number from 0 to 2**64 - 1")
+        _check("the length of golden.input_sha256", len(self.input_sha256), 0, 64)
+        _check("the number of golden.outputs", len(self.outputs), 1, MAX_CHANNELS)
+        for name, record in self.outputs.items():
+            field = f"golden.outputs[{reprlib.repr(name)}]"
+            missing = {"std", "positions", "values"} - record.keys()
+            if missing:
+                raise CardError(f"{field} lacks {', '.join(sorted(missing))}; export the model again")
+            positions, values = record["positions"], record["values"]
+            if not isinstance(positions, list) or not isinstance(values, list) or len(positions) != len(values):
+                raise CardError(f"{field} holds positions and values that are not lists of one length")
+            _check(f"the number of {field}.values", len(values), 1, MAX_GOLDEN_VALUES)
+            _check(f"{field}.std", _float(f"{field}.std", record["std"]), 0.0, 1e30)
+            for index, (position, value) in enumerate(zip(positions, values, strict=True)):
+                _check(f"{field}.positions[{index}]", _int(f"{field}.positions", position), 0, 2**40)
+                _check(f"{field}.values[{index}]", _float(f"{field}.values", value), -1e30, 1e30)
+
+    def check_output(self, name: str, size: int) -> None:
+        """Check the record of an output against the number of its values.
+
+        Raises
+        ------
+        CardError
+            A position is outside the output, or there are too few different positions.
+        """
+        positions = self.outputs[name]["positions"]
+        field, fewest = f"golden.outputs[{reprlib.repr(name)}]", min(MIN_GOLDEN_VALUES, size)
+        if max(positions) >= size:
+            raise CardError(f"{field} has position {max(positions)}; the output has {size} values")
+        if len({*positions}) < fewest:
+            raise CardError(f"{field} has {len({*positions})} different positions; expected {fewest} or more")
+
+
+@dataclass(frozen=True, slots=True)
+class ModelCard:
+    """What a model is, how its input is made and what its outputs mean.
+
+    Attributes
+    ----------
+    name, version : str
+        The name may become that of files and of models on a server: see `edgeperc.system.names.check_name`.
+    precision : {"fp32", "int8"}
+        Precision of the stored weights. ``"int8"``: weights and activations are 8-bit integers.
+    view : TopViewGeometry, RangeImageGeometry or CameraGeometry
+    input : InputSpec
+    outputs : tuple of OutputSpec
+        That of a camera is of kind ``"camera_logits"``, float32 of shape (1, classes, h, w): logits on a grid whose h
+        and w divide the height and the width of the view.
+    classes : tuple of str
+        Index 0 is the background; those of a camera have none.
+    box_classes : tuple of str
+        Classes that boxes may have; a subset of ``classes``.
+    box_size_priors : mapping
+        Class to usual (length, width, height) [m].
+    box_size_spreads : mapping
+        Class to the standard deviations of the logarithms of these sizes; empty if size does not decide the class.
+    score_threshold, nms_iou : float
+        Defaults for boxes.
+    mount_height_m : float
+        Height of the training sensor above the road [m].
+    fitness : mapping or None
+        Statistics of the training scans (`edgeperc.preprocess.fitness.FitnessProfile`); None if they were not measured.
+    training : mapping
+        Free-form training metadata: data, licence, recipe, seed, hashes of the frames.
+    metrics : mapping
+        Measured accuracy.
+    parity : mapping
+        Measured differences between the exported graph and the network that it was made from.
+    golden : Golden or None
+    precisions : mapping
+        For each precision in which this file can run, the measured agreement with fp32 on real scans after
+        post-processing: ``n_scans``, ``label_agreement`` (share of pixels or cells), ``mean_iou`` and ``ap`` with
+        ``fp32_mean_iou`` and ``fp32_ap`` (0..1; AP is None without boxes), ``loss`` (the larger loss of mean IoU and
+        AP in percentage points, 0 if neither is lower), ``by`` (engine and processor) and ``command``.
+    """
+
+    name: str
+    version: str
+    view: TopViewGeometry | RangeImageGeometry | CameraGeometry
+    input: InputSpec
+    outputs: tuple[OutputSpec, ...]
+    classes: tuple[str, ...]
+    box_classes: tuple[str, ...] = ()
+    box_size_priors: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    box_size_spreads: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    score_threshold: float = 0.3
+    nms_iou: float = 0.2
+    mount_height_m: float = 1.73
+    fitness: Mapping[str, Any] | None = None
+    training: Mapping[str, Any] = field(default_factory=dict)
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+    parity: Mapping[str, Any] = field(default_factory=dict)
+    golden: Golden | None = None
+    precision: Precision = "fp32"
+    precisions: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.precision not in ("fp32", "int8"):
+            raise CardError(f"precision is {self.precision!r}; expected fp32 or int8, as the weights are stored")
+        check_name("name", self.name, CardError)
+        check_text("version", self.version, CardError)
+        if not 2 <= len(self.classes) <= 255 or len(set(self.classes)) != len(self.classes):
+            raise CardError(
+                f"classes {reprlib.repr(self.classes)}; expected 2 to 255 different names, the background first"
+            )
+        for each in self.classes:
+            check_text("class", each, CardError)
+        unknown = [c for c in self.input.channels if c not in CHANNELS[self.view.kind]]
+        if unknown:
+            raise CardError(
+                f"input channels {reprlib.repr(unknown)} are unknown to a {self.view.kind}; "
+                f"expected some of {', '.join(CHANNELS[self.view.kind])}"
+            )
+        kinds = [o.kind for o in self.outputs]
+        if self.view.kind == "camera":
+            self._check_camera(kinds)
+        elif (
+            sum(k.startswith("class_") for k in kinds) != 1 or len(kinds) != len(set(kinds)) or "camera_logits" in kinds
+        ):
+            raise CardError(f"output kinds {kinds}; expected one class output and at most one of each box kind")
+        for rows, cols in (output.block for output in self.outputs):
+            if self.view.height % rows or self.view.width % cols:
+                raise CardError(
+                    f"output.block is {(rows, cols)}; expected divisors of the view's {self.view.height} rows and "
+                    f"{self.view.width} columns"
+                )
+        if any(k.startswith("box_") for k in kinds):
+            if self.view.kind != "top_view":
+                raise CardError(f"output kinds {kinds} in a {self.view.kind}; boxes need a top_view")
+            if not self.box_classes:
+                raise CardError("a box output without box_classes; expected the classes that boxes may have")
+        unlisted = [c for c in (*self.box_classes, *self.box_size_priors) if c not in self.classes]
+        if unlisted:
+            raise CardError(f"box classes {reprlib.repr(unlisted)} are not among the classes {self.classes}")
+        if (
+            self.box_size_spreads
+            and not set(self.box_classes) <= self.box_size_spreads.keys() & self.box_size_priors.keys()
+        ):
+            raise CardError(
+                f"box_size_spreads of {[*self.box_size_spreads]}; expected a spread and a prior for each box class"
+            )
+        for name, sizes in self.box_size_priors.items():
+            _check_each(f"box_size_priors.{name}", sizes, 0.01, 100.0)
+        for name, spreads in self.box_size_spreads.items():
+            _check_each(f"box_size_spreads.{reprlib.repr(name)}", spreads, 1e-6, 10.0)
+        _check("score_threshold", self.score_threshold, 0.0, 1.0)
+        _check("nms_iou", self.nms_iou, 0.0, 1.0)
+        _check("mount_height_m", self.mount_height_m, -100.0, 100.0)
+        for name, record in self.precisions.items():
+            check_text("the precision", name, CardError)
+            if "loss" in record:
+                _check(f"precisions.{name}.loss", _float(f"precisions.{name}.loss", record["loss"]), 0.0, 100.0)
+        if self.golden is not None:
+            for output in self.outputs:
+                shape = self.output_shape(output.kind)
+                if output.name in self.golden.outputs and None not in shape:
+                    self.golden.check_output(output.name, math.prod(n for n in shape if n is not None))
+
+    def _check_camera(self, kinds: list[str]) -> None:
+        if kinds != ["camera_logits"]:
+            raise CardError(f"output kinds {kinds} of a camera; expected one, camera_logits")
+        if sorted(self.input.channels) != sorted(CHANNELS["camera"]):
+            raise CardError(
+                f"input channels {self.input.channels} of a camera; expected red, green and blue, each once"
+            )
+        if self.fitness is not None:
+            raise CardError("a camera with a fitness, which is of scans; expected null")
+
+    def output_shape(self, kind: str) -> tuple[int | None, ...]:
+        """Shape of the output of a kind, with the batch; None where any length is allowed."""
+        if kind == "box_slots":
+            return (1, None, None)
+        if kind == "camera_logits":
+            return (1, len(self.classes), None, None)
+        if kind == "box_dense":
+            n_channels = N_DENSE_CHANNELS + N_FRONT_CHANNELS * any(output.front for output in self.outputs)
+            return (1, n_channels, self.view.height // 4, self.view.width // 4)
+        rows, cols = next((output.block for output in self.outputs if output.kind == kind), (1, 1))
+        return (1, len(self.classes) * rows * cols, self.view.height // rows, self.view.width // cols)
+
+    def to_json(self) -> str:
+        """Canonical JSON: sorted keys, no blanks, no NaN."""
+        view: dict[str, Any] = {"kind": self.view.kind}
+        view |= {name: getattr(self.view, name) for name in type(self.view).__dataclass_fields__}
+        document = {name: getattr(self, name) for name in type(self).__dataclass_fields__}
+        document |= {
+            "schema": SCHEMA,
+            "view": view,
+            "input": {name: getattr(self.input, name) for name in InputSpec.__dataclass_fields__},
+            "outputs": [{n: getattr(o, n) for n in OutputSpec.__dataclass_fields__} for o in self.outputs],
+            "golden": self.golden and {n: getattr(self.golden, n) for n in Golden.__dataclass_fields__},
+        }
+        return json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> ModelCard:
+        """Read the card of an .onnx file; needs no onnxruntime, and takes less than a millisecond.
+
+        Raises
+        ------
+        ModelFileError
+            The file cannot be read, or is not a complete .onnx file.
+        CardError
+            The file has no card, or has a card that `from_json` refuses.
+        """
+        text = read_metadata(path, CARD_KEY)
+        if text is None:
+            raise CardError(
+                f"{os.fspath(path)} has no card; write one with: edgeperc-export card MODEL --card CARD.json"
+            )
+        try:
+            return cls.from_json(text)
+        except CardError as exc:
+            raise CardError(f"{os.fspath(path)}: {exc}") from exc
+
+    @classmethod
+    def from_json(cls, text: str) -> ModelCard:
+        """Read a card.
+
+        Raises
+        ------
+        CardError
+            Not JSON, no schema number, a newer schema, or a key that is missing, malformed or out of its bounds.
+            Unknown keys are ignored.
+        """
+        if len(text) > MAX_CHARACTERS:
+            raise CardError(f"the card has {len(text)} characters; expected at most {MAX_CHARACTERS}")
+        try:
+            document = json.loads(text)
+        except (RecursionError, ValueError) as exc:
+            raise CardError(f"the card is not JSON ({exc}); export the model again") from exc
+        _check_tree(document)
+        if not isinstance(document, dict) or not isinstance(document.get("schema"), int):
+            raise CardError("the card has no schema number; export the model again")
+        if document["schema"] not in (2, SCHEMA):
+            raise CardError(
+                f"the card has schema {reprlib.repr(document['schema'])}, this edgeperc reads {SCHEMA}; "
+                + ("upgrade edgeperc" if document["schema"] > SCHEMA else "export the model again")
+            )
+        try:
+            return _card(document)
+        except CardError:
+            raise
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as exc:
+            raise CardError(f"the card is malformed: {type(exc).__name__} {exc}; export the model again") from exc
+
+
+def _card(document: dict[str, Any]) -> ModelCard:
+    view = {**document["view"]}  # dict() would take a list of pairs, too
+    kind = view.pop("kind")
+    geometry: TopViewGeometry | RangeImageGeometry | CameraGeometry
+    if kind == "top_view":
+        geometry = TopViewGeometry(
+            x_range_m=_pair("view.x_range_m", view["x_range_m"]),
+            y_range_m=_pair("view.y_range_m", view["y_range_m"]),
+            z_range_m=_pair("view.z_range_m", view["z_range_m"]),
+            cell_m=_float("view.cell_m", view["cell_m"]),
+        )
+    elif kind == "range_image":
+        geometry = RangeImageGeometry(
+            row_elevations_deg=_floats("view.row_elevations_deg", view["row_elevations_deg"]),
+            width=_int("view.width", view["width"]),
+            azimuth_left_deg=_float("view.azimuth_left_deg", view["azimuth_left_deg"]),
+            azimuth_right_deg=_float("view.azimuth_right_deg", view["azimuth_right_deg"]),
+        )
+    elif kind == "camera":
+        geometry = CameraGeometry(_int("view.width", view["width"]), _int("view.height", view["height"]), view["fit"])
+    else:
+        raise CardError(f"view.kind is {reprlib.repr(kind)}; expected top_view, range_image or camera")
+    fitness, golden = document["fitness"], document["golden"]
+    if document["schema"] == 2:  # schema 2 has the precision in the free-form metadata, and no measured agreement
+        precision, precisions = document["training"].get("precision", "fp32"), {}
+    else:
+        precision, precisions = document["precision"], document["precisions"]
+    return ModelCard(
+        name=_text("name", document["name"]),
+        version=_text("version", document["version"]),
+        precision=precision,
+        view=geometry,
+        input=InputSpec(
+            name=_text("input.name", document["input"]["name"]),
+            channels=_texts("input.channels", document["input"]["channels"]),
+            mean=_floats("input.mean", document["input"]["mean"]),
+            std=_floats("input.std", document["input"]["std"]),
+        ),
+        outputs=tuple(
+            OutputSpec(
+                name=_text("output.name", o["name"]),
+                kind=_text("output.kind", o["kind"]),
+                front=_bool("output.front", o.get("front", False)),  # earlier cards lack it, and the block
+                block=_ints("output.block", o.get("block", [1, 1])),
+            )
+            for o in document["outputs"]
+        ),
+        classes=_texts("classes", document["classes"]),
+        box_classes=_texts("box_classes", document["box_classes"]),
+        box_size_priors=_sizes("box_size_priors", document["box_size_priors"]),
+        box_size_spreads=_sizes("box_size_spreads", document["box_size_spreads"]),
+        score_threshold=_float("score_threshold", document["score_threshold"]),
+        nms_iou=_float("nms_iou", document["nms_iou"]),
+        mount_height_m=_float("mount_height_m", document["mount_height_m"]),
+        fitness=None if fitness is None else {**fitness},
+        training={**document["training"]},
+        metrics={**document["metrics"]},
+        parity={**document["parity"]},
+        golden=None
+        if golden is None
+        else Golden(
+            _int("golden.seed", golden["seed"]),
+            _text("golden.input_sha256", golden["input_sha256"]),
+            {name: {**record} for name, record in golden["outputs"].items()},
+        ),
+        precisions={name: {**entry} for name, entry in precisions.items()},
+    )
+
+
+def _check_tree(document: Any) -> None:
+    """Refuse values anywhere in the document that JSON allows and a card does not."""
+    level = [document]
+    for _ in range(MAX_DEPTH):
+        inner: list[Any] = []
+        for value in level:
+            if isinstance(value, dict):
+                inner += value.keys()
+                inner += value.values()
+            elif isinstance(value, list):
+                inner += value
+            elif isinstance(value, str):
+                if len(value) > MAX_TEXT:
+                    raise CardError(f"the card has a text of {len(value)} characters; expected at most {MAX_TEXT}")
+                if not value.isascii() and any("\ud800" <= character <= "\udfff" for character in value):
+                    raise CardError(f"the card has a text that is not valid Unicode: {reprlib.repr(value)}")
+            elif isinstance(value, int | float) and not -1e300 <= value <= 1e300:
+                raise CardError(f"the card has the number {reprlib.repr(value)}; expected finite ones below 1e300")
+        level = inner
+        if not level:
+            return
+    raise CardError(f"the card is nested more than {MAX_DEPTH} deep; export the model again")
+
+
+def _text(field: str, value: Any) -> str:
+    if not isinstance(value, str):
+        raise CardError(f"{field} is {reprlib.repr(value)}; expected a text")
+    return value
+
+
+def _float(field: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise CardError(f"{field} is {reprlib.repr(value)}; expected a number")
+    return float(value)
+
+
+def _int(field: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise CardError(f"{field} is {reprlib.repr(value)}; expected a whole number")
+    return value
+
+
+def _bool(field: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise CardError(f"{field} is {reprlib.repr(value)}; expected true or false")
+    return value
+
+
+def _list(field: str, value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise CardError(f"{field} is {reprlib.repr(value)}; expected a list")
+    return value
+
+
+def _texts(field: str, values: Any) -> tuple[str, ...]:
+    return tuple(_text(field, value) for value in _list(field, values))
+
+
+def _floats(field: str, values: Any) -> tuple[float, ...]:
+    return tuple(_float(field, value) for value in _list(field, values))
+
+
+def _ints(field: str, values: Any) -> tuple[int, int]:
+    first, second = (_int(field, value) for value in _list(field, values))
+    return first, second
+
+
+def _sizes(field: str, document: dict[str, Any]) -> dict[str, tuple[float, float, float]]:
+    sizes = {}
+    for name, values in document.items():
+        length, width, height = _floats(f"{field}.{reprlib.repr(name)}", values)
+        sizes[name] = length, width, height
+    return sizes
+
+
+def _pair(field: str, values: Any) -> tuple[float, float]:
+    low, high = _floats(field, values)
+    return low, high

@@ -1,0 +1,136 @@
+"""The frame that the models work in.
+
+The models were trained on scans of one vehicle: x forward, the road 1.73 m below the sensor. `ModelFrame` moves a scan
+of any mounting into that frame, and boxes there and back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..system.kernel_cache import njit
+from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
+from .perception import Box
+from .points import read_only
+
+__all__ = ["ModelFrame", "fill_moved", "fill_turned", "quaternion", "turned"]
+
+
+class ModelFrame:
+    """Moves scans into the frame of the models, and boxes back.
+
+    Parameters
+    ----------
+    mounting : Mounting
+        A known one.
+
+    Attributes
+    ----------
+    is_identity : bool
+        Scans need not be moved.
+    R : (3, 3) float64
+    t : (3,) float64
+        A point p of the scan lies at ``R p + t`` [m] in the models' frame.
+    """
+
+    def __init__(self, mounting: Mounting) -> None:
+        assert mounting.height_m is not None
+        from_vehicle = MODEL_MOUNTING.rotation().T
+        self.R: NDArray[np.float64] = from_vehicle @ mounting.rotation()
+        raised = from_vehicle @ np.array([0.0, 0.0, mounting.height_m - MODEL_HEIGHT_M])
+        self.t: NDArray[np.float64] = raised - self.R @ np.array([*mounting.origin_m, 0.0])
+        self.is_identity = bool(np.allclose(self.R, np.eye(3), atol=1e-9) and np.allclose(self.t, 0.0, atol=1e-6))
+
+    def move(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Scan (n, 4) float32 in the models' frame, read-only; the same array if nothing moves."""
+        if self.is_identity:
+            return points
+        moved = np.empty(points.shape, np.float32)
+        fill_moved(read_only(points), self.R, self.t, moved)
+        return read_only(moved)
+
+    def move_boxes(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
+        """Boxes of the scan's frame in the models' frame. They stay upright: a box has no tilt."""
+        return tuple(boxes) if self.is_identity else _moved(boxes, self.R, self.t)
+
+    def boxes_back(self, boxes: Iterable[Box]) -> tuple[Box, ...]:
+        """Boxes of the models' frame in the frame of the scan."""
+        return tuple(boxes) if self.is_identity else _moved(boxes, self.R.T, -self.R.T @ self.t)
+
+
+def turned(points: NDArray[np.float32], angle_rad: float) -> NDArray[np.float32]:
+    """Scan (n, 4) float32 as a sensor that is turned to the left by an angle sees it, read-only."""
+    result = np.empty(points.shape, np.float32)
+    fill_turned(read_only(points), np.float32(math.cos(angle_rad)), np.float32(math.sin(angle_rad)), result)
+    return read_only(result)
+
+
+def quaternion(R: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """x, y, z, w of a rotation matrix (3, 3); w >= 0."""
+    # Of these four rows, each the quaternion times four of its entries, the longest is the most exact.
+    rows = np.array(
+        [
+            [1 + R[0, 0] - R[1, 1] - R[2, 2], R[1, 0] + R[0, 1], R[2, 0] + R[0, 2], R[2, 1] - R[1, 2]],
+            [R[1, 0] + R[0, 1], 1 - R[0, 0] + R[1, 1] - R[2, 2], R[2, 1] + R[1, 2], R[0, 2] - R[2, 0]],
+            [R[2, 0] + R[0, 2], R[2, 1] + R[1, 2], 1 - R[0, 0] - R[1, 1] + R[2, 2], R[1, 0] - R[0, 1]],
+            [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1 + R[0, 0] + R[1, 1] + R[2, 2]],
+        ]
+    )
+    row = rows[np.argmax(np.diag(rows))]
+    x, y, z, w = (math.copysign(1.0, row[3]) * row / np.linalg.norm(row)).tolist()
+    return x, y, z, w
+
+
+def _moved(boxes: Iterable[Box], R: NDArray[np.float64], t: NDArray[np.float64]) -> tuple[Box, ...]:
+    moved = []
+    for box in boxes:
+        x, y, z = (R @ np.array(box.center) + t).tolist()
+        ahead = R[:, 0] * math.cos(box.yaw) + R[:, 1] * math.sin(box.yaw)
+        moved.append(replace(box, center=(x, y, z), yaw=math.atan2(ahead[1], ahead[0])))
+    return tuple(moved)
+
+
+@njit(cache=True, nogil=True)
+def fill_moved(
+    points: NDArray[np.float32], R: NDArray[np.float64], t: NDArray[np.float64], moved: NDArray[np.float32]
+) -> None:
+    """Write ``R p + t`` of every point into ``moved`` (n, 4) float32, with its remission.
+
+    Parameters
+    ----------
+    points : (n, 4) float32, C-contiguous
+    R : (3, 3) float64
+    t : (3,) float64
+    moved : (n, 4) float32, overwritten
+        A coordinate beyond the range of float32 becomes infinite.
+    """
+    for i in range(points.shape[0]):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        for axis in range(3):
+            moved[i, axis] = R[axis, 0] * x + R[axis, 1] * y + R[axis, 2] * z + t[axis]
+        moved[i, 3] = points[i, 3]
+
+
+@njit(cache=True, nogil=True)
+def fill_turned(points: NDArray[np.float32], cos: np.float32, sin: np.float32, turned: NDArray[np.float32]) -> None:
+    """Write the points, turned about the z axis in float32.
+
+    Parameters
+    ----------
+    points : (n, 4) float32, C-contiguous
+    cos, sin : float32
+        Of the angle by which the sensor is turned to the left.
+    turned : (n, 4) float32, overwritten
+        A coordinate beyond the range of float32 becomes infinite.
+    """
+    for i in range(points.shape[0]):
+        x, y = points[i, 0], points[i, 1]
+        turned[i, 0] = cos * x + sin * y
+        turned[i, 1] = cos * y - sin * x
+        turned[i, 2] = points[i, 2]
+        turned[i, 3] = points[i, 3]

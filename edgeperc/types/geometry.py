@@ -1,0 +1,360 @@
+"""Rectangles on the ground: overlap, suppression, drawing, points inside.
+
+A rectangle is a row ``x, y, length, width, yaw``: center [m], extent along and across the heading [m], heading about
++z from +x [rad].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import PointsError
+from ..system.kernel_cache import njit
+from .card import TopViewGeometry
+from .perception import Box
+from .points import read_only
+
+__all__ = [
+    "bounding_rectangles",
+    "draw_footprints",
+    "inside",
+    "oriented_iou",
+    "rectangles",
+    "shared_area",
+    "suppress_overlaps",
+    "wrapped",
+]
+
+Angle = TypeVar("Angle", float, NDArray[np.float64])
+
+
+def wrapped(angle: Angle) -> Angle:
+    """Wrap an angle, or each of an array, to -pi..pi [rad]."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def draw_footprints(
+    labels: NDArray[np.uint8], boxes: Iterable[Box], view: TopViewGeometry, classes: Sequence[str]
+) -> None:
+    """Draw the footprints of boxes over top-view labels, in place (SSADNet 3.1.2).
+
+    A cell belongs to a box if its center lies in the footprint; the nearer of two boxes wins. Boxes of other classes
+    are not drawn.
+
+    Parameters
+    ----------
+    labels : (rows, columns) uint8, modified
+    boxes : iterable of Box
+    view : TopViewGeometry
+    classes : sequence of str
+        Names of the labels; a footprint gets the number of its box's class.
+    """
+    number = {name: k for k, name in enumerate(classes)}
+    known = [box for box in boxes if box.label in number]
+    known.sort(key=lambda box: -math.hypot(box.center[0], box.center[1]))
+    rows = [
+        (*box.center[:2], box.size[0] / 2.0, box.size[1] / 2.0, math.cos(box.yaw), math.sin(box.yaw)) for box in known
+    ]
+    drawn = np.require(labels, np.uint8, ["C", "W"])
+    fill_footprints(
+        np.array(rows, np.float64).reshape(-1, 6),
+        np.array([number[box.label] for box in known], np.uint8),
+        np.array([view.x_range_m[1], view.y_range_m[1], view.cell_m], np.float64),
+        drawn,
+    )
+    if drawn is not labels:
+        labels[:] = drawn
+
+
+def rectangles(boxes: Iterable[Box]) -> NDArray[np.float64]:
+    """Footprints of boxes, (n, 5): x, y, length, width [m], yaw [rad]."""
+    rows = [(*box.center[:2], *box.size[:2], box.yaw) for box in boxes]
+    return np.array(rows, dtype=np.float64).reshape(-1, 5)
+
+
+def oriented_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
+    """Intersection over union of every rectangle of ``a`` with every rectangle of ``b`` (SSADNet equation A1).
+
+    Parameters
+    ----------
+    a : (n, 5) array_like
+        x, y, length, width [m], yaw [rad].
+    b : (m, 5) array_like
+        As ``a``.
+
+    Returns
+    -------
+    (n, m) float64
+        In 0..1. A rectangle that is not finite or has no area overlaps nothing, not even itself.
+
+    Raises
+    ------
+    PointsError
+        ``a`` or ``b`` is not an (n, 5) array.
+    """
+    first, second = _as_rectangles(a), _as_rectangles(b)
+    iou = np.empty((len(first), len(second)))
+    fill_oriented_iou(first, second, iou)
+    return iou
+
+
+def shared_area(iou: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Area [m2] that rectangles share, from their overlap: ``iou = shared / (area of a + area of b - shared)``.
+
+    Parameters
+    ----------
+    iou : (n, m) float64
+        `oriented_iou` of ``a`` and ``b``.
+    a : (n, 5) float64
+    b : (m, 5) float64
+
+    Returns
+    -------
+    (n, m) float64
+    """
+    areas = np.add.outer(a[:, 2] * a[:, 3], b[:, 2] * b[:, 3])
+    return np.asarray(iou / (1.0 + iou) * areas, np.float64)
+
+
+def suppress_overlaps(
+    rectangles: ArrayLike, scores: ArrayLike, iou_threshold: ArrayLike, *, max_inside: float = math.inf
+) -> NDArray[np.int64]:
+    """Greedy non-maximum suppression of oriented rectangles.
+
+    Parameters
+    ----------
+    rectangles : (n, 5) array_like
+        x, y, length, width [m], yaw [rad].
+    scores : (n,) array_like
+    iou_threshold : float or (n,) array_like
+        A rectangle is dropped if it overlaps a kept one with a better score by more than this; with one threshold a
+        rectangle, by more than the lower one of the two.
+    max_inside : float
+        It is also dropped if the area shared with a better one is more than this share of the smaller one's area.
+
+    Returns
+    -------
+    (k,) int64
+        Rows kept, best score first, the earlier row on ties. Rows that are not finite overlap nothing, so they are
+        kept.
+
+    Raises
+    ------
+    PointsError
+        ``rectangles`` is not an (n, 5) array, or ``scores`` or ``iou_threshold`` has another length.
+    """
+    rows = _as_rectangles(rectangles)
+    values = np.asarray(scores, dtype=np.float64)
+    if values.shape != (len(rows),):
+        raise PointsError(f"got scores of shape {values.shape} for {len(rows)} rectangles; pass one score a rectangle")
+    limits = np.asarray(iou_threshold, dtype=np.float64)
+    if limits.shape not in ((), values.shape):
+        raise PointsError(f"got thresholds of shape {limits.shape} for {len(rows)} rectangles; pass one, or one each")
+    limits = np.broadcast_to(limits, values.shape)
+    order = np.argsort(-values, kind="stable")
+    keep = np.empty(len(rows), np.bool_)
+    mark_nms(read_only(rows[order], np.float64), read_only(limits[order], np.float64), max_inside, keep)
+    return order[keep]
+
+
+def bounding_rectangles(rectangles: ArrayLike) -> NDArray[np.float64]:
+    """Axis-aligned bounds of rectangles, as rectangles of yaw 0.
+
+    Parameters
+    ----------
+    rectangles : (n, 5) array_like
+        x, y, length, width [m], yaw [rad].
+
+    Returns
+    -------
+    (n, 5) float64
+        Same centers; extent along x, extent along y; yaw 0.
+
+    Raises
+    ------
+    PointsError
+        ``rectangles`` is not an (n, 5) array.
+    """
+    rows = _as_rectangles(rectangles)
+    cos, sin = np.abs(np.cos(rows[:, 4])), np.abs(np.sin(rows[:, 4]))
+    bounds = np.zeros_like(rows)
+    bounds[:, :2] = rows[:, :2]
+    bounds[:, 2] = rows[:, 2] * cos + rows[:, 3] * sin
+    bounds[:, 3] = rows[:, 2] * sin + rows[:, 3] * cos
+    return bounds
+
+
+def _as_rectangles(given: ArrayLike) -> NDArray[np.float64]:
+    rows = read_only(given, np.float64)
+    if rows.size == 0:
+        rows = rows.reshape(0, 5)
+    if rows.ndim != 2 or rows.shape[1] != 5:
+        raise PointsError(f"got rectangles of shape {rows.shape}; expected (n, 5): x, y, length, width, yaw")
+    return rows
+
+
+@njit(cache=True, nogil=True)
+def fill_footprints(
+    boxes: NDArray[np.float64], of_box: NDArray[np.uint8], grid: NDArray[np.float64], labels: NDArray[np.uint8]
+) -> None:
+    """Write the class of each box into the cells whose centers lie in its footprint, one box after the other.
+
+    Parameters
+    ----------
+    boxes : (m, 6) float64
+        x, y, half length, half width [m], cosine and sine of the yaw.
+    of_box : (m,) uint8
+    grid : (3,) float64
+        x of the far edge, y of the left edge, edge of a cell [m].
+    labels : (rows, columns) uint8, modified
+    """
+    x_far, y_left, cell_m = grid[0], grid[1], grid[2]
+    n_rows, n_cols = labels.shape
+    for k in range(boxes.shape[0]):
+        x, y, half_length, half_width = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3]
+        cos, sin = boxes[k, 4], boxes[k, 5]
+        reach_x = abs(cos) * half_length + abs(sin) * half_width
+        reach_y = abs(sin) * half_length + abs(cos) * half_width
+        # A cell more on each side; the view's size bounds them before they become whole numbers.
+        first_row = int(min(max((x_far - x - reach_x) / cell_m - 1.0, 0.0), n_rows))
+        last_row = int(min(max((x_far - x + reach_x) / cell_m + 1.0, -1.0), n_rows - 1.0))
+        first_col = int(min(max((y_left - y - reach_y) / cell_m - 1.0, 0.0), n_cols))
+        last_col = int(min(max((y_left - y + reach_y) / cell_m + 1.0, -1.0), n_cols - 1.0))
+        for row in range(first_row, last_row + 1):
+            dx = x_far - (row + 0.5) * cell_m - x
+            for col in range(first_col, last_col + 1):
+                dy = y_left - (col + 0.5) * cell_m - y
+                if abs(cos * dx + sin * dy) <= half_length and abs(cos * dy - sin * dx) <= half_width:
+                    labels[row, col] = of_box[k]
+
+
+@njit(cache=True, nogil=True)
+def fill_oriented_iou(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArray[np.float64]) -> None:
+    """Compute the overlap (IoU) of every pair.
+
+    Parameters
+    ----------
+    a : (n, 5) float64, C-contiguous
+    b : (m, 5) float64, C-contiguous
+        x, y, length, width [m], yaw [rad].
+    iou : (n, m) float64, overwritten
+    """
+    for i in range(a.shape[0]):
+        for j in range(b.shape[0]):
+            iou[i, j] = pair_iou(a[i], b[j])
+
+
+@njit(cache=True, nogil=True)
+def mark_nms(
+    rectangles: NDArray[np.float64], limits: NDArray[np.float64], max_inside: float, keep: NDArray[np.bool_]
+) -> None:
+    """Mark the rectangles that overlap no better kept rectangle too much.
+
+    Parameters
+    ----------
+    rectangles : (n, 5) float64, C-contiguous
+        Best first.
+    limits : (n,) float64, C-contiguous
+        Two may overlap by the lower one of their limits (IoU).
+    max_inside : float
+        Of the smaller area of two.
+    keep : (n,) bool, overwritten
+    """
+    for i in range(rectangles.shape[0]):
+        keep[i] = True
+        area = rectangles[i, 2] * rectangles[i, 3]
+        for j in range(i):
+            if not keep[j]:
+                continue
+            iou = pair_iou(rectangles[j], rectangles[i])
+            other = rectangles[j, 2] * rectangles[j, 3]
+            limit = min(limits[i], limits[j])
+            if iou > limit or iou / (1.0 + iou) * (other + area) > max_inside * min(other, area):
+                keep[i] = False
+                break
+
+
+@njit(cache=True, nogil=True)
+def pair_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """IoU of two rectangles (5,); the second is clipped by the first in the frame of the first."""
+    area_a = a[2] * a[3]
+    area_b = b[2] * b[3]
+    if not (a[2] > 0.0 and a[3] > 0.0 and b[2] > 0.0 and b[3] > 0.0 and area_a + area_b < math.inf):
+        return 0.0
+    dx = b[0] - a[0]
+    dy = b[1] - a[1]
+    reach = 0.5 * (math.hypot(a[2], a[3]) + math.hypot(b[2], b[3]))
+    if not dx * dx + dy * dy < reach * reach or not math.isfinite(a[4] + b[4]):
+        return 0.0
+    cos_a, sin_a = math.cos(a[4]), math.sin(a[4])
+    center_x = dx * cos_a + dy * sin_a
+    center_y = dy * cos_a - dx * sin_a
+    cos_r, sin_r = math.cos(b[4] - a[4]), math.sin(b[4] - a[4])
+    # Four clips leave at most 8 corners, and at most 20 with rounding.
+    # Source and target alternate between columns 0, 1 and columns 2, 3.
+    corners = np.empty((20, 4))
+    for k in range(4):
+        along = 0.5 * b[2] if k == 0 or k == 3 else -0.5 * b[2]
+        across = 0.5 * b[3] if k < 2 else -0.5 * b[3]
+        corners[k, 0] = center_x + along * cos_r - across * sin_r
+        corners[k, 1] = center_y + along * sin_r + across * cos_r
+    n = 4
+    source = 0
+    for side in range(4):
+        axis = side // 2
+        sign = 1.0 if side % 2 == 0 else -1.0
+        limit = 0.5 * a[2 + axis]
+        target = 2 - source
+        m = 0
+        for k in range(n):
+            last = n - 1 if k == 0 else k - 1
+            gap = limit - sign * corners[k, source + axis]
+            gap_last = limit - sign * corners[last, source + axis]
+            if (gap >= 0.0) != (gap_last >= 0.0):
+                share = gap_last / (gap_last - gap)
+                for c in range(2):
+                    start = corners[last, source + c]
+                    corners[m, target + c] = start + share * (corners[k, source + c] - start)
+                m += 1
+            if gap >= 0.0:
+                corners[m, target] = corners[k, source]
+                corners[m, target + 1] = corners[k, source + 1]
+                m += 1
+        n = m
+        source = target
+    twice = 0.0
+    for k in range(n):
+        last = n - 1 if k == 0 else k - 1
+        twice += corners[last, source] * corners[k, source + 1] - corners[k, source] * corners[last, source + 1]
+    # Rounding may give a sliver a negative area, and two equal rectangles a shared area above their own.
+    shared = min(max(0.5 * twice, 0.0), area_a, area_b)
+    return float(shared / (area_a + area_b - shared))
+
+
+def inside(box: Box, points: NDArray[Any], margin_m: float = 0.0) -> NDArray[np.bool_]:
+    """Find the points inside a box.
+
+    Parameters
+    ----------
+    box : Box
+    points : (n, 3 or more) array
+        x, y, z [m] in the frame of the box.
+    margin_m : float
+        The box is grown by this on every side [m].
+
+    Returns
+    -------
+    (n,) bool
+        False for points that are not finite.
+    """
+    offset = points[:, :3] - np.asarray(box.center, np.float32)
+    cos, sin = np.cos(box.yaw), np.sin(box.yaw)
+    along = offset[:, 0] * cos + offset[:, 1] * sin
+    across = offset[:, 1] * cos - offset[:, 0] * sin
+    half = np.asarray(box.size) / 2.0 + margin_m
+    return (np.abs(along) <= half[0]) & (np.abs(across) <= half[1]) & (np.abs(offset[:, 2]) <= half[2])

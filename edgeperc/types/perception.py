@@ -1,0 +1,332 @@
+"""Immutable results, in the frame of the scan (meters, radians); the top view in that of the models."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PointsError
+from .card import TopViewGeometry
+from .mounting import MODEL_MOUNTING, Mounting
+from .sensor import RemissionFunction
+
+__all__ = ["Box", "DroppedPoints", "ImageLabels", "Perception", "PointLabels", "TopView"]
+
+_PART = 2**20
+ROADS = ("drivable", "road")  # names of classes of an image on which a vehicle may drive, in lower case
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """An oriented box around one object.
+
+    Attributes
+    ----------
+    label : str
+        Class name, e.g. ``"car"``.
+    score : float
+        Confidence in 0..1.
+    center : tuple of 3 float
+        Middle of the box, x, y, z [m], in the frame of the scan.
+    size : tuple of 3 float
+        Length (along the heading), width, height [m].
+    yaw : float
+        Heading about +z from +x [rad], in -pi..pi.
+    front : float or None
+        Probability in 0..1 that ``yaw`` points to the object's front and not to its rear. None: the heading is known
+        only up to half a turn.
+    """
+
+    label: str
+    score: float
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    yaw: float
+    front: float | None = None
+
+    def corners(self) -> NDArray[np.float64]:
+        """Corners of the footprint, (4, 2) x, y [m]: front-left, rear-left, rear-right, front-right."""
+        along, across = self.size[0] / 2.0, self.size[1] / 2.0
+        local = np.array([[along, across], [-along, across], [-along, -across], [along, -across]])
+        cos, sin = np.cos(self.yaw), np.sin(self.yaw)
+        return local @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(self.center[:2])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert to a dict for JSON, rounded to 0.1 mm, 0.00001 rad and 0.0001 of the score; `from_dict` reads it."""
+        return {
+            "label": self.label,
+            "score": round(float(self.score), 4),
+            "center": [round(float(v), 4) for v in self.center],
+            "size": [round(float(v), 4) for v in self.size],
+            "yaw": round(float(self.yaw), 5),
+            "front": None if self.front is None else round(float(self.front), 4),
+        }
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Box:
+        """Read what `to_dict` wrote. Other keys are ignored, so the record of a track is read as its box.
+
+        Without ``front``, as in records of earlier versions, it is None.
+
+        Raises
+        ------
+        PointsError
+            A key is missing, or its value is of another type or length.
+        """
+        try:
+            (x, y, z), (length, width, height) = document["center"], document["size"]
+            numbers = [float(v) for v in (document["score"], x, y, z, length, width, height, document["yaw"])]
+            label, front = document["label"], document.get("front")
+            front = None if front is None else float(front)
+        except (KeyError, OverflowError, TypeError, ValueError) as exc:
+            raise PointsError(
+                f"got a box that cannot be read ({type(exc).__name__}: {exc}); expected label, score, yaw, center "
+                "(x, y, z), size (length, width, height) and front, a number or null"
+            ) from exc
+        if not isinstance(label, str):
+            raise PointsError(f"got a box with label {label!r}; expected a str")
+        score, x, y, z, length, width, height, yaw = numbers
+        return cls(label, score, (x, y, z), (length, width, height), yaw, front)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TopView:
+    """A class for every cell of the ground ahead (SSADNet 2.1.2, 3.1.2).
+
+    Cells lie in the frame of the models: x forward, y left, the road 1.73 m below the origin. It is the frame of the
+    scan if the sensor is mounted as on the training vehicle; otherwise ``ModelFrame(perception.mounting).move(points)``
+    (`edgeperc.ModelFrame`) moves points of the scan into it.
+
+    Attributes
+    ----------
+    labels : (rows, columns) uint8
+        Index into ``classes``. Row 0 is farthest ahead, column 0 leftmost.
+    classes : tuple of str
+    cell_m : float
+        Edge of a cell [m].
+    x_range_m, y_range_m : tuple of 2 float
+        Nearest and farthest x, rightmost and leftmost y [m].
+    observed : (rows, columns) bool
+        Cells that the scan observed: with a return, or passed closely by a ray to a return on the ground
+        (`observed.Observer`). The labels of the other cells are only the network's guess. They lie behind
+        objects, between the rays of sensors with few beams, or beyond the last return.
+    mounting : Mounting
+        That of the scan, as in `Perception`.
+    between_beams : (rows, columns) bool, optional
+        Cells that are not observed in gaps that the spacing of the sensor's beams explains
+        (`edgeperc.ground.observed.Observation`). A `Perceiver` knows them. None: no cell is known to be one.
+    """
+
+    labels: NDArray[np.uint8]
+    classes: tuple[str, ...]
+    cell_m: float
+    x_range_m: tuple[float, float]
+    y_range_m: tuple[float, float]
+    observed: NDArray[np.bool_]
+    mounting: Mounting = MODEL_MOUNTING
+    between_beams: NDArray[np.bool_] | None = None
+
+    @property
+    def geometry(self) -> TopViewGeometry:
+        """Where the cells lie."""
+        return TopViewGeometry(self.x_range_m, self.y_range_m, cell_m=self.cell_m)
+
+    @property
+    def road(self) -> NDArray[np.bool_]:
+        """Cells labeled drivable, observed or not, (rows, columns) bool; all False if the model has no such class."""
+        if "drivable" not in self.classes:
+            return np.zeros(self.labels.shape, dtype=np.bool_)
+        return self.labels == self.classes.index("drivable")
+
+    @property
+    def drivable(self) -> NDArray[np.bool_]:
+        """Cells labeled drivable that the scan observed, (rows, columns) bool. An empty scan has none."""
+        return self.road & self.observed
+
+    @property
+    def drivable_area_m2(self) -> float:
+        """Area of the drivable cells [m2], observed ones only."""
+        return float(np.count_nonzero(self.drivable)) * self.cell_m**2
+
+    def to_meters(self, row: float, col: float) -> tuple[float, float]:
+        """Center of a cell as x, y [m] in the sensor frame."""
+        return self.x_range_m[1] - (row + 0.5) * self.cell_m, self.y_range_m[1] - (col + 0.5) * self.cell_m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointLabels:
+    """A class for every input point, in input order.
+
+    Attributes
+    ----------
+    labels : (n,) uint8
+        Index into ``classes``; 0 for points out of the network's view and for dropped points (`DroppedPoints`).
+    in_view : (n,) bool
+        False if the point is out of the network's view; its label 0 is then not a prediction.
+    classes : tuple of str
+    """
+
+    labels: NDArray[np.uint8]
+    in_view: NDArray[np.bool_]
+    classes: tuple[str, ...]
+
+    def counts(self) -> dict[str, int]:
+        """Number of points in view, by class."""
+        counted = np.bincount(self.labels[self.in_view], minlength=len(self.classes))
+        return {name: int(counted[k]) for k, name in enumerate(self.classes)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageLabels:
+    """A class for every pixel of a camera's image, at the image's own size.
+
+    Attributes
+    ----------
+    labels : (H, W) uint8
+        Index into ``classes``; 255 for a pixel without a class, which a network never gives, but labeled images have.
+        Row 0 is the top, column 0 leftmost.
+    classes : tuple of str
+    """
+
+    labels: NDArray[np.uint8]
+    classes: tuple[str, ...]
+
+    @property
+    def drivable(self) -> NDArray[np.bool_]:
+        """Pixels of the road, (H, W) bool: of a class called road or drivable; all False if there is none."""
+        roads = [k for k, name in enumerate(self.classes) if name.casefold() in ROADS]
+        found = np.zeros(self.labels.shape, np.bool_)
+        for k in roads:
+            found |= self.labels == k
+        return found
+
+    @property
+    def drivable_share(self) -> float:
+        """Share of the image's pixels that are road, in 0..1."""
+        return float(np.count_nonzero(self.drivable)) / self.labels.size
+
+    def counts(self) -> dict[str, int]:
+        """Number of pixels, by class."""
+        flat, n_classes = self.labels.reshape(-1), len(self.classes)
+        # In parts, because bincount makes eight bytes of each label.
+        parts = (np.bincount(flat[k : k + _PART], minlength=n_classes)[:n_classes] for k in range(0, flat.size, _PART))
+        counted = sum(parts, np.zeros(n_classes, np.int64))
+        return {name: int(counted[k]) for k, name in enumerate(self.classes)}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert to a dict for JSON: ``width``, ``height``, ``drivable_share`` and ``pixel_counts`` by class."""
+        height, width = self.labels.shape
+        return {
+            "width": width,
+            "height": height,
+            "drivable_share": round(self.drivable_share, 4),
+            "pixel_counts": self.counts(),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class DroppedPoints:
+    """Number of input points that are not returns of the world, by kind. Each counts once, as the first of its kinds.
+
+    Attributes
+    ----------
+    not_finite : int
+        A coordinate or the remission is not finite.
+    too_near : int
+        At most the profile's ``min_range_m`` from the sensor: beams without a return, such as (0, 0, 0).
+    ego : int
+        Inside the profile's ``ego_box``: the own vehicle.
+    """
+
+    not_finite: int = 0
+    too_near: int = 0
+    ego: int = 0
+
+    @property
+    def total(self) -> int:
+        """Number of dropped points."""
+        return self.not_finite + self.too_near + self.ego
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Perception:
+    """Everything perceived in one scan, in one image, or in both.
+
+    Attributes
+    ----------
+    n_points : int
+        Points in the input; 0 without a scan.
+    n_dropped : int
+        Input points that are not returns of the world: the total of ``dropped``. They are labeled 0, are not in view,
+        and take no part in anything.
+    points : PointLabels or None
+        From a range-image model; None without one.
+    top_view : TopView or None
+        From a top-view model; None without one.
+    boxes : tuple of Box
+        Best score first.
+    stage_ms : mapping
+        Wall time [ms] of ``check``, ``project``, ``infer``, ``decode``, ``refine``, ``cluster`` and ``agree``, and of
+        ``adapt`` for sensors whose scans are adapted. ``project``, ``infer`` and ``decode`` include a camera's.
+    providers : mapping
+        What ran, by model name, e.g. ``"pointseg int8, CPUExecutionProvider"``.
+    fitness : tuple of str
+        How the scan differs from the training scans, one sentence for each difference; empty if there is none.
+    stamp_s : float or None
+        The time given with the scan [s].
+    mounting : Mounting
+        The mounting with which the scan was moved into the frame of the models: as given, or as estimated from the
+        scans so far. ``MODEL_MOUNTING``: the scan was not moved.
+    remission : RemissionFunction or None
+        The function that converted the remission: that of the sensor's profile, one that is matched to the scans so
+        far, or a constant if the scan has no remission; its ``source`` says which. None: remission was only scaled.
+    image : ImageLabels or None
+        From a camera model; None without one.
+    dropped : DroppedPoints
+        ``n_dropped`` by kind.
+    """
+
+    n_points: int
+    n_dropped: int
+    points: PointLabels | None
+    top_view: TopView | None
+    boxes: tuple[Box, ...]
+    stage_ms: Mapping[str, float]
+    providers: Mapping[str, str]
+    fitness: tuple[str, ...]
+    stamp_s: float | None
+    mounting: Mounting = MODEL_MOUNTING
+    remission: RemissionFunction | None = None
+    image: ImageLabels | None = None
+    dropped: DroppedPoints = DroppedPoints()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert to a dict for JSON, with the number of points of each class in place of their labels.
+
+        Returns
+        -------
+        dict
+            ``stamp_s``, ``n_points``, ``n_dropped``, ``dropped`` (by kind), ``stage_ms``, ``providers``, ``boxes``
+            (`Box.to_dict`), ``drivable_area_m2``, ``point_counts``, ``fitness``, ``mounting``, ``remission`` and
+            ``image`` (`ImageLabels.to_dict`). Every key is always present; its value is None if no model of that kind
+            ran, or if remission was only scaled.
+        """
+        return {
+            "stamp_s": self.stamp_s,
+            "n_points": self.n_points,
+            "n_dropped": self.n_dropped,
+            "dropped": asdict(self.dropped),
+            "stage_ms": {name: round(ms, 3) for name, ms in self.stage_ms.items()},
+            "providers": dict(self.providers),
+            "boxes": [box.to_dict() for box in self.boxes],
+            "drivable_area_m2": None if self.top_view is None else round(self.top_view.drivable_area_m2, 2),
+            "point_counts": None if self.points is None else self.points.counts(),
+            "fitness": list(self.fitness),
+            "mounting": self.mounting.to_dict(),
+            "remission": None if self.remission is None else asdict(self.remission),
+            "image": None if self.image is None else self.image.to_dict(),
+        }

@@ -1,0 +1,146 @@
+"""Convert arrays to points: (n, 4) float32, x, y, z [m] and remission in the sensor's raw unit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from ..errors import PointsError
+
+__all__ = ["as_points", "assemble", "plain_name", "read_only", "remission_name", "table_columns"]
+
+# Best first; of an Ouster's fields, "intensity" is the raw signal and "reflectivity" the calibrated byte.
+_REMISSION_NAMES = ("remission", "intensity", "i", "reflectivity", "reflectance")
+
+
+def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArray[np.float32]:
+    """Convert an array to points.
+
+    Parameters
+    ----------
+    array : (n, 4) or (n, 3) array of numbers, or a structured array
+        Any float or integer dtype, byte order and memory layout. The columns are x, y, z [m], remission; without
+        the fourth, remission is 0. A structured array (any shape, e.g. that of a PointCloud2 message) needs the
+        fields x, y and z; other fields and padding are skipped.
+    remission_field : str, optional
+        As in `read_points`; structured arrays only.
+
+    Returns
+    -------
+    (n, 4) float32, C-contiguous
+        The given array itself if it already has this form. Values beyond the range of float32 become infinite.
+
+    Raises
+    ------
+    PointsError
+        The shape, the dtype or the fields are not those of points.
+    """
+    if isinstance(array, np.ma.MaskedArray):
+        raise PointsError("got a masked array; fill it first, e.g. with array.filled(np.nan)")
+    try:
+        # Ragged sequences raise ValueError; the __array__ of an object may raise anything.
+        values = np.asarray(array)
+    except Exception as exc:
+        raise PointsError(f"got an object that is not an array: {exc}; expected (n, 4) x, y, z, remission") from exc
+    if values.dtype.names is not None:
+        return assemble(values.size, table_columns(values), values.dtype.names, remission_field)
+    if values.dtype.kind not in "fiu":
+        raise PointsError(f"got an array of {values.dtype}; expected (n, 4) numbers: x, y, z, remission")
+    if values.ndim != 2 or values.shape[1] not in (3, 4):
+        advice = ""
+        if values.ndim == 2 and values.shape[1] > 4:
+            advice = "; if the first four columns are these, pass points[:, :4]"
+            if values.shape[0] in (3, 4):
+                advice = "; pass points.T"
+        raise PointsError(f"got an array of shape {values.shape}; expected (n, 4): x, y, z, remission{advice}")
+    if values.shape[1] == 3:
+        return assemble(values.shape[0], dict(zip("xyz", values.T, strict=True)), "xyz", None)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.require(values, dtype=np.float32, requirements=["C", "A"])
+
+
+def table_columns(table: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """The numeric fields of a structured array of any shape, each (n,), by `plain_name`."""
+    flat = table.reshape(-1)
+    columns: dict[str, NDArray[Any]] = {}
+    for name in table.dtype.names or ():
+        field = flat[name]
+        if field.ndim == 1 and field.dtype.kind in "fiu":
+            columns.setdefault(plain_name(name), field)
+    return columns
+
+
+def read_only(array: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray[Any]:
+    """A read-only, C-contiguous and aligned view of an array; a copy only if its layout or dtype differs.
+
+    numba compiles a kernel separately for writable and read-only arrays. Kernels get their input through this function,
+    so that a memory map or ``np.frombuffer`` needs no second compilation.
+    """
+    view = np.require(array, dtype=dtype, requirements=["C", "A"]).view()
+    view.flags.writeable = False
+    return view
+
+
+def plain_name(name: str) -> str:
+    """A field's name for comparison: lower case, without CloudCompare's prefix (``"scalar_Intensity"``)."""
+    return name.lower().removeprefix("scalar_")
+
+
+def remission_name(names: Iterable[str], wanted: str | None) -> str | None:
+    """Name of the remission field: the wanted one, or the first known name that is present; None if there is none.
+
+    Raises
+    ------
+    PointsError
+        The wanted field is not among ``names``.
+    """
+    present = list(names)
+    if wanted is None:
+        return next((name for name in _REMISSION_NAMES if name in present), None)
+    if plain_name(wanted) not in present:
+        raise PointsError(f"there is no numeric field {wanted!r} for the remission, only {', '.join(present)}")
+    return plain_name(wanted)
+
+
+def assemble(
+    n: int, fields: Mapping[str, NDArray[Any]], names: Sequence[str], remission_field: str | None
+) -> NDArray[np.float32]:
+    """Build points from named columns.
+
+    Parameters
+    ----------
+    n : int
+        Number of points.
+    fields : mapping of str to (n,) array
+        Columns by `plain_name`.
+    names : sequence of str
+        All fields of the source, for the error message.
+    remission_field : str or None
+        As in `as_points`.
+
+    Returns
+    -------
+    (n, 4) float32
+        x, y, z [m], remission; 0 without a remission field.
+
+    Raises
+    ------
+    PointsError
+        A coordinate or the wanted remission field is missing.
+    """
+    missing = [axis for axis in "xyz" if axis not in fields]
+    if missing:
+        raise PointsError(
+            f"no numeric field {', '.join(missing)} among {', '.join(map(str, names)) or 'no fields'}; "
+            "expected x, y, z and a remission or intensity"
+        )
+    remission = remission_name(fields, remission_field)
+    points = np.zeros((n, 4), dtype=np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for column, name in enumerate(("x", "y", "z", remission)):
+            if name is not None:
+                points[:, column] = fields[name]
+    return points

@@ -1,0 +1,450 @@
+"""Sensor profiles: beams, columns, remission range and mounting."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from itertools import pairwise
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import SensorError
+from ..system.names import check_text
+from .mounting import MODEL_HEIGHT_M, UNKNOWN_MOUNTING, Mounting
+
+__all__ = ["REMISSION_KINDS", "SENSORS", "RemissionFunction", "SensorProfile", "get_sensor"]
+
+SCHEMA = 2  # of a sensor profile's file
+# Of a profile that states none. Empty beams of real recordings lie up to 0.45 m from the sensor, and the built-in
+# sensors measure from 0.05 to 1 m on.
+MIN_RANGE_M = 0.5
+MAX_EGO_M = 100.0
+
+EgoBox = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+REMISSION_KINDS = {"linear": 2, "polynomial": 3, "logarithm": 2, "power": 2}  # number of coefficients
+
+
+@dataclass(frozen=True)
+class RemissionFunction:
+    """Maps the remission of one sensor to that of another (KUL-Seg 5).
+
+    With ``x = full_scale * remission``, where remission is scaled to 0..1 by the profile's ``remission_range``, the
+    other sensor's remission in 0..1 is a + b x (linear), a + b x + c x^2 (polynomial), a + b ln(1 + x) (logarithm) or
+    a x^b (power), clipped to 0..1. `preprocess.sensor_fit` fits it, `preprocess.condition` applies it.
+
+    Attributes
+    ----------
+    kind : str
+        ``"linear"``, ``"polynomial"``, ``"logarithm"`` or ``"power"``.
+    coefficients : tuple of float
+        a, b and, for a polynomial, c.
+    full_scale : float
+        Width of the sensor's raw remission range when the function was fitted, e.g. 255.
+    to : str
+        The sensor whose remission is the result.
+    rmse : float
+        Root mean square error on held-back samples, as a share of the other sensor's full scale.
+    source : str
+        The data that it was fitted to.
+
+    Raises
+    ------
+    SensorError
+        The values do not describe such a function.
+    """
+
+    kind: str
+    coefficients: tuple[float, ...]
+    full_scale: float
+    to: str
+    rmse: float
+    source: str
+
+    def __post_init__(self) -> None:
+        try:
+            object.__setattr__(self, "coefficients", tuple(float(c) for c in self.coefficients))
+            object.__setattr__(self, "full_scale", float(self.full_scale))
+            object.__setattr__(self, "rmse", float(self.rmse))
+        except (TypeError, ValueError, OverflowError) as exc:
+            raise SensorError(f"remission function: a value is not a number ({exc})") from exc
+        if not isinstance(self.kind, str) or self.kind not in REMISSION_KINDS:
+            raise SensorError(f"remission function of kind {self.kind!r}; expected one of {', '.join(REMISSION_KINDS)}")
+        if len(self.coefficients) != REMISSION_KINDS[self.kind] or not all(abs(c) <= 1e9 for c in self.coefficients):
+            raise SensorError(
+                f"a {self.kind} remission function has {REMISSION_KINDS[self.kind]} finite coefficients up to 1e9, "
+                f"got {self.coefficients!r}"
+            )
+        if self.kind == "power" and self.coefficients[1] <= 0.0:
+            raise SensorError(f"a power remission function has an exponent above 0, got {self.coefficients[1]!r}")
+        if not 0.0 < self.full_scale <= 1e9 or not 0.0 <= self.rmse < math.inf:
+            raise SensorError(
+                f"full_scale {self.full_scale!r} must be above 0 and at most 1e9, rmse {self.rmse!r} finite, from 0"
+            )
+        if not isinstance(self.to, str) or not self.to or not isinstance(self.source, str):
+            raise SensorError(f"remission function to {self.to!r} from {self.source!r}; expected two str")
+
+
+@dataclass(frozen=True)
+class SensorProfile:
+    """A spinning LiDAR.
+
+    A built-in profile (`SENSORS`) describes a usual set-up of the sensor. Change single values with
+    ``dataclasses.replace``, e.g.
+    ``replace(get_sensor("os1-64"), remission_range=(0, 65535))`` for an Ouster whose 16-bit signal is used instead of
+    its 8-bit reflectivity. Describe another sensor with ``SensorProfile(...)``, or with
+    `SensorProfile.uniform` if its beams are evenly spaced.
+
+    Attributes
+    ----------
+    name : str
+    elevations_deg : tuple of float
+        Elevation of each beam [deg], strictly decreasing from the top beam to the bottom one, up positive.
+    columns : int
+        Azimuth steps in one turn.
+    remission_range : tuple of 2 float
+        Raw remissions that are scaled to 0 and 1.
+    mounting : Mounting
+        How it is mounted on the vehicle. What is None is estimated from the scans.
+    min_range_m, max_range_m : float
+        Nearest and farthest return to expect [m]. Points at most ``min_range_m`` from the sensor are not returns, but
+        beams without one: they are dropped. With 0, only those at the sensor's own place (0, 0, 0) are.
+    remission : RemissionFunction or None
+        Maps this sensor's remission to that of the sensor that the models were trained on. None: remission is only
+        scaled by ``remission_range``.
+    ego_box : tuple of 3 tuples of 2 float, or None
+        The vehicle or robot that carries the sensor, as far as its beams meet it: lowest and highest x, y and z [m]
+        about the sensor, along the axes of the scan. Points inside are dropped. None: no point is.
+
+    Raises
+    ------
+    SensorError
+        The values do not describe a possible sensor.
+    """
+
+    name: str
+    elevations_deg: tuple[float, ...]
+    columns: int
+    remission_range: tuple[float, float] = (0.0, 1.0)
+    mounting: Mounting = UNKNOWN_MOUNTING
+    min_range_m: float = MIN_RANGE_M
+    max_range_m: float = 120.0
+    remission: RemissionFunction | None = None
+    ego_box: EgoBox | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise SensorError(f"a sensor's name is a non-empty str, got {self.name!r}")
+        check_text("a sensor's name is", self.name, SensorError)
+        try:
+            object.__setattr__(self, "elevations_deg", tuple(float(e) for e in self.elevations_deg))
+            object.__setattr__(self, "remission_range", tuple(float(v) for v in self.remission_range))
+            for field in ("min_range_m", "max_range_m"):
+                object.__setattr__(self, field, float(getattr(self, field)))
+            columns_are_whole = int(self.columns) == self.columns
+            object.__setattr__(self, "columns", int(self.columns))
+        except (TypeError, ValueError, OverflowError) as exc:
+            raise SensorError(f"sensor {self.name!r}: a value is not a number ({exc})") from exc
+        if not 1 <= len(self.elevations_deg) <= 4096 or not all(-90.0 < e < 90.0 for e in self.elevations_deg):
+            raise SensorError(
+                f"sensor {self.name!r}: elevations_deg needs one angle a beam, between -90 and 90, of 1 to 4096 beams"
+            )
+        if any(upper <= lower for upper, lower in pairwise(self.elevations_deg)):
+            raise SensorError(f"sensor {self.name!r}: elevations_deg must strictly decrease, from the top beam down")
+        if not columns_are_whole or not 1 <= self.columns <= 1_000_000:
+            raise SensorError(
+                f"sensor {self.name!r}: columns is a whole number from 1 to 1,000,000, got {self.columns!r}"
+            )
+        bounds = self.remission_range
+        if len(bounds) != 2 or not max(map(abs, bounds)) <= 1e9 or not bounds[1] - bounds[0] >= 1e-9:
+            raise SensorError(
+                f"sensor {self.name!r}: remission_range is (lowest, highest) raw value, such as (0, 255), up to 1e9, "
+                f"got {bounds!r}"
+            )
+        if not isinstance(self.mounting, Mounting):
+            raise SensorError(f"sensor {self.name!r}: mounting is a Mounting, got {self.mounting!r:.80}")
+        if not 0.0 <= self.min_range_m < self.max_range_m < math.inf:
+            raise SensorError(
+                f"sensor {self.name!r}: 0 <= min_range_m < max_range_m must hold, "
+                f"got {self.min_range_m!r} and {self.max_range_m!r}"
+            )
+        if self.remission is not None and not isinstance(self.remission, RemissionFunction):
+            raise SensorError(f"sensor {self.name!r}: remission is a RemissionFunction or None, got {self.remission!r}")
+        if self.ego_box is not None:
+            object.__setattr__(self, "ego_box", _ego_box(self.name, self.ego_box))
+
+    def to_json(self) -> str:
+        """Convert to JSON, which `get_sensor` reads from a file."""
+        return json.dumps({"schema": SCHEMA, **asdict(self)}, indent=1, ensure_ascii=False, allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> SensorProfile:
+        """Read what `to_json` wrote.
+
+        Raises
+        ------
+        SensorError
+            Not JSON, another schema, or an entry that is missing, unknown or of another type.
+        """
+        try:
+            document = json.loads(text)
+        except (RecursionError, ValueError) as exc:
+            raise SensorError(
+                f"the sensor profile is not JSON ({exc}); write it again with edgeperc fit-sensor"
+            ) from exc
+        if not isinstance(document, dict) or document.get("schema") != SCHEMA:
+            found = document.get("schema") if isinstance(document, dict) else None
+            raise SensorError(
+                f"the sensor profile has schema {found!r}, this edgeperc reads {SCHEMA}; write it again with edgeperc "
+                "fit-sensor or edgeperc info --write"
+            )
+        # Profiles of earlier versions have no box of the own vehicle.
+        box = document.pop("ego_box", None)
+        names = {field.name for field in fields(cls)} - {"ego_box"}
+        _check_entries(document, {"schema", *names}, "sensor profile", optional="ego_box")
+        del document["schema"]
+        if document["remission"] is not None:
+            _check_entries(document["remission"], {field.name for field in fields(RemissionFunction)}, "remission")
+            document["remission"] = RemissionFunction(**document["remission"])
+        document["mounting"] = Mounting.from_dict(document["mounting"])
+        return cls(**document, ego_box=box)
+
+    @classmethod
+    def uniform(
+        cls,
+        name: str,
+        n_beams: int,
+        fov_up_deg: float,
+        fov_down_deg: float,
+        *,
+        columns: int = 1800,
+        remission_range: tuple[float, float] = (0.0, 1.0),
+        mounting: Mounting = UNKNOWN_MOUNTING,
+        min_range_m: float = MIN_RANGE_M,
+        max_range_m: float = 120.0,
+        remission: RemissionFunction | None = None,
+        ego_box: EgoBox | None = None,
+    ) -> SensorProfile:
+        """Describe a sensor with evenly spaced beams.
+
+        Parameters
+        ----------
+        name : str
+        n_beams : int
+        fov_up_deg, fov_down_deg : float
+            Elevation of the top and of the bottom beam [deg].
+        columns, remission_range, mounting, min_range_m, max_range_m, remission, ego_box
+            As the attributes.
+
+        Raises
+        ------
+        SensorError
+            The values do not describe a possible sensor.
+        """
+        if isinstance(n_beams, bool) or not isinstance(n_beams, int | np.integer) or not 1 <= n_beams <= 4096:
+            raise SensorError(f"sensor {name!r}: n_beams is a whole number in 1..4096, got {n_beams!r}")
+        if not math.isfinite(fov_up_deg) or not math.isfinite(fov_down_deg):
+            raise SensorError(f"sensor {name!r}: fov_up_deg and fov_down_deg must be finite")
+        return cls(
+            name,
+            # Rounded: a card then holds 2.3 and not 2.3000000000000003.
+            tuple(round(float(e), 4) for e in np.linspace(fov_up_deg, fov_down_deg, int(n_beams))),
+            columns,
+            remission_range,
+            mounting,
+            min_range_m,
+            max_range_m,
+            remission,
+            ego_box,
+        )
+
+    @property
+    def n_beams(self) -> int:
+        """Number of beams."""
+        return len(self.elevations_deg)
+
+    @property
+    def fov_up_deg(self) -> float:
+        """Elevation of the top beam [deg]."""
+        return self.elevations_deg[0]
+
+    @property
+    def fov_down_deg(self) -> float:
+        """Elevation of the bottom beam [deg]."""
+        return self.elevations_deg[-1]
+
+    @property
+    def azimuth_resolution_deg(self) -> float:
+        """Azimuth step between columns [deg]."""
+        return 360.0 / self.columns
+
+    @property
+    def mount_height_m(self) -> float:
+        """Height above the road [m] in simulated scans: that of the mounting, or else of the training vehicle."""
+        return MODEL_HEIGHT_M if self.mounting.height_m is None else self.mounting.height_m
+
+    @property
+    def remission_offset(self) -> float:
+        """``(raw + remission_offset) * remission_scale`` lies in 0..1."""
+        return -self.remission_range[0]
+
+    @property
+    def remission_scale(self) -> float:
+        """See `remission_offset`."""
+        return 1.0 / (self.remission_range[1] - self.remission_range[0])
+
+
+# Median elevation of each laser's returns seen from the origin, over 77 KITTI scans of 15 drives; the order of the
+# points in a scan identifies the lasers. The unit's own angles are 0.6 deg (upper block) to 1.4 deg (bottom laser)
+# lower, as the lasers sit 0.21 and 0.12 m above the origin; S3 calibrations published for other units differ by up to
+# 0.9 deg, and the data sheet (2 .. -8.33 every 1/3, -8.83 .. -24.33 every 1/2) by up to 0.7 deg.
+_HDL_64E = (
+    *(2.54, 2.17, 1.92, 1.46, 1.21, 0.79, 0.53, 0.15, -0.19, -0.59, -0.88, -1.22, -1.59, -1.93, -2.26, -2.61),
+    *(-2.90, -3.27, -3.53, -3.91, -4.20, -4.55, -4.86, -5.18, -5.57, -5.88, -6.18, -6.45, -6.82, -7.17, -7.39, -7.76),
+    *(-8.37, -8.89, -9.36, -9.75, -10.21, -10.81, -11.31, -11.73, -12.18, -12.61, -13.13, -13.65, -14.22, -14.65),
+    *(-15.15, -15.51, -16.12, -16.64, -17.20, -17.65, -18.15, -18.55, -19.01, -19.55, -20.06, -20.66, -21.14, -21.54),
+    *(-21.99, -22.62, -23.14, -23.62),
+)
+
+# Velodyne's default calibration of the model.
+_VLP_32C = (
+    *(15.0, 10.33, 7.0, 4.67, 3.33, 2.33, 1.67, 1.33, 1.0, 0.67, 0.33, 0.0, -0.33, -0.67, -1.0, -1.33, -1.67, -2.0),
+    *(-2.33, -2.67, -3.0, -3.33, -3.67, -4.0, -4.67, -5.33, -6.15, -7.25, -8.84, -11.31, -15.64, -25.0),
+)
+
+# Design angles of the Pandar64, which its drivers use for units without a calibration file.
+_PANDAR_64 = (
+    *(14.88, 11.03, 8.06, 5.06, 3.04, 2.03, 1.86, 1.69, 1.52, 1.35, 1.18, 1.01, 0.85, 0.68, 0.51, 0.34, 0.17, 0.0),
+    *(-0.17, -0.34, -0.51, -0.68, -0.85, -1.01, -1.18, -1.35, -1.52, -1.69, -1.86, -2.03, -2.20, -2.37, -2.54, -2.70),
+    *(-2.87, -3.04, -3.21, -3.38, -3.55, -3.71, -3.88, -4.05, -4.22, -4.39, -4.56, -4.72, -4.89, -5.06, -5.23, -5.39),
+    *(-5.57, -5.73, -5.90, -6.06, -7.06, -8.06, -9.06, -9.89, -11.03, -12.01, -12.97, -13.93, -18.89, -24.90),
+)
+
+
+def _ouster(model: str, half_fov_deg: float, min_range_m: float, max_range_m: float) -> tuple[SensorProfile, ...]:
+    # Evenly spaced over the field of view in the data sheet; calibrations of single units differ by up to 1.3 deg. The
+    # first OS1 generation had 33.2 deg instead. Remission is the 8-bit reflectivity.
+    return tuple(
+        SensorProfile.uniform(
+            f"{model}-{beams}",
+            beams,
+            half_fov_deg,
+            -half_fov_deg,
+            columns=1024,
+            remission_range=(0.0, 255.0),
+            min_range_m=min_range_m,
+            max_range_m=max_range_m,
+        )
+        for beams in (32, 64, 128)
+    )
+
+
+_BYTE = (0.0, 255.0)
+
+# `edgeperc fit-sensor`, from unlabeled scans. The logarithm was the best of line, parabola and logarithm each time.
+_OF_NUSCENES = RemissionFunction(
+    "logarithm", (-0.2949, 0.1832), 255.0, "hdl-64e", 0.0209, "13 nuScenes scans, quantiles by range and incidence"
+)
+_OF_PANDASET = RemissionFunction(
+    "logarithm", (-0.0483, 0.1482), 255.0, "hdl-64e", 0.0353, "4 PandaSet scans, quantiles by range and incidence"
+)
+
+# Velodyne calibrates these to one scale: 0 to 100 diffuse, above that retro-reflectors. Measured on the HDL-32E alone.
+_OF_VELODYNE = replace(_OF_NUSCENES, source=f"the hdl-32e's, calibrated to the same scale: {_OF_NUSCENES.source}")
+_BUILT_IN = (
+    # KITTI, where a turn has up to 2,160 returns a laser; its files hold remission / 255.
+    SensorProfile("hdl-64e", _HDL_64E, 2083, min_range_m=0.9),
+    # nuScenes (20 Hz, on the roof). It writes empty beams up to 0.452 m away on one ray; the nearest return of two
+    # recordings, 0.26 m away, is on the own roof.
+    SensorProfile.uniform(
+        "hdl-32e",
+        32,
+        10.67,
+        -30.67,
+        columns=1084,
+        remission_range=_BYTE,
+        min_range_m=0.5,
+        max_range_m=105.0,
+        remission=_OF_NUSCENES,
+    ),
+    SensorProfile.uniform(
+        "vlp-16", 16, 15.0, -15.0, remission_range=_BYTE, min_range_m=0.5, max_range_m=105.0, remission=_OF_VELODYNE
+    ),
+    SensorProfile("vlp-32c", _VLP_32C, 1800, _BYTE, min_range_m=1.0, max_range_m=200.0, remission=_OF_VELODYNE),
+    *_ouster("os0", 45.0, 0.3, 75.0),
+    *_ouster("os1", 22.5 - 1.25, 0.3, 170.0),
+    *_ouster("os2", 11.25, 0.8, 350.0),
+    SensorProfile("pandar64", _PANDAR_64, 1800, _BYTE, min_range_m=0.3, max_range_m=200.0, remission=_OF_PANDASET),
+    SensorProfile.uniform("pandarxt-32", 32, 15.0, -16.0, columns=2000, remission_range=_BYTE, min_range_m=0.05),
+)
+SENSORS: Mapping[str, SensorProfile] = MappingProxyType({profile.name: profile for profile in _BUILT_IN})
+"""The built-in profiles by name."""
+
+
+def _ego_box(name: str, given: object) -> EgoBox:
+    """The box as numbers; SensorError if it is not one."""
+    try:
+        box: NDArray[Any] = np.array(given)
+    except (TypeError, ValueError) as exc:
+        box = np.array(str(exc))
+    if (
+        box.shape != (3, 2)
+        or box.dtype.kind not in "fiu"
+        or not (np.abs(box) <= MAX_EGO_M).all()
+        or not (box[:, 0] < box[:, 1]).all()
+    ):
+        raise SensorError(
+            f"sensor {name!r}: ego_box is {given!r:.200}; expected ((x, x), (y, y), (z, z)), lowest and highest value "
+            f"about the sensor [m], up to {MAX_EGO_M:g} m"
+        )
+    (x_low, x_high), (y_low, y_high), (z_low, z_high) = box.astype(float).tolist()
+    return (x_low, x_high), (y_low, y_high), (z_low, z_high)
+
+
+def _check_entries(document: object, names: set[str], what: str, optional: str = "") -> None:
+    if not isinstance(document, dict) or set(document) != names:
+        found = ", ".join(sorted(map(str, document))) if isinstance(document, dict) else repr(document)
+        more = f" (and {optional}, or not)" if optional else ""
+        raise SensorError(f"a {what} file holds exactly {', '.join(sorted(names))}{more}; got {found}")
+    numbers = {name: value for name, value in document.items() if name not in ("name", "kind", "to", "source")}
+    listed = [v for value in numbers.values() for v in (value if isinstance(value, list) else [value])]
+    if any(isinstance(v, (str, bool)) for v in listed):
+        raise SensorError(f"a {what} file has a text or truth value where a number belongs: {numbers!r}")
+
+
+def get_sensor(sensor: str | os.PathLike[str] | SensorProfile) -> SensorProfile:
+    """Get a sensor profile by name, from a file, or as given.
+
+    Parameters
+    ----------
+    sensor : str, Path or SensorProfile
+        A str that ends in ``.json`` and every Path is a file, as ``edgeperc fit-sensor`` or `SensorProfile.to_json`
+        writes it.
+
+    Raises
+    ------
+    SensorError
+        No built-in profile has this name, or the file is not a sensor profile.
+    """
+    if isinstance(sensor, SensorProfile):
+        return sensor
+    if isinstance(sensor, os.PathLike) or (isinstance(sensor, str) and sensor.endswith(".json")):
+        try:
+            return SensorProfile.from_json(Path(sensor).read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError) as exc:
+            raise SensorError(f"{os.fspath(sensor)}: the sensor profile cannot be read ({exc})") from exc
+        except SensorError as exc:
+            raise SensorError(f"{os.fspath(sensor)}: {exc}") from exc
+    try:
+        return SENSORS[sensor]
+    except (KeyError, TypeError):
+        raise SensorError(
+            f"no sensor {sensor!r} is built in; known are {', '.join(SENSORS)}. "
+            "Describe another with SensorProfile(...) or SensorProfile.uniform(...), or name a .json file."
+        ) from None

@@ -1,0 +1,1 @@
+"""Training samples, and what is done with them."""

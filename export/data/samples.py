@@ -1,0 +1,335 @@
+"""Training samples: scans drawn at random, augmented and projected, in worker processes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+from tqdm import tqdm
+
+from edgeperc.datasets.kitti import KittiObjects, scan_hash
+from edgeperc.datasets.scan_folder import class_number
+from edgeperc.inference.projection import make_projector
+from edgeperc.simulation.samples import IGNORE
+from edgeperc.simulation.scene import POINT_CLASSES
+
+from ..recipe import Recipe
+from ..training.processes import CONTEXT
+from ..training.ranks import Ranks
+from ..training.task import Targets, task_of
+from ..training.teacher import OnnxTeacher
+from .augment import NEGATIVES, ObjectBank, augmented, swapped, with_ground_ahead
+from .roads import drawn_roads, sure_surface, with_road
+from .scan_sets import seen_by_network
+from .scans import LabeledScan
+
+__all__ = ["RealScans", "Recent", "Samples", "loaded", "real_scans"]
+
+# Scans whose objects are cut out for pasting; each holds about five.
+BANK_SCANS = 400
+# How often an object of a class of one's own is pasted; those of `Task.paste_odds` have a sum of 1.
+OWN_ODDS = 0.2
+# Scans of each kind, real and simulated, that are labeled to find those with false objects, and how much more or less
+# often one of them is drawn than by its weight alone.
+REDRAWN_SCANS = 64
+REDRAW_FACTORS = (0.5, 3.0)
+# Samples that are kept to be used again: 1 MB each.
+RECENT_SAMPLES = 2048
+
+
+class Samples:
+    """Network inputs and targets, from real and simulated scans.
+
+    Parameters
+    ----------
+    recipe : Recipe
+    real : sequence of LabeledScan
+    real_weights : sequence of float
+        How often each real scan is drawn, relative to the others.
+    simulated : sequence of Path
+        Files written by `LabeledScan.save`.
+    teacher : OnnxTeacher, optional
+        Its answers come with the samples.
+    n_workers : int
+        Number of processes that cut out the objects to paste; 0: this one.
+
+    Attributes
+    ----------
+    n_targets : int
+        Number of arrays of a batch that are targets; the first is the input, those after the targets are the teacher's.
+    odds : dict of str to (n,) float64
+        How often each ``"real"`` and each ``"simulated"`` scan is drawn beside its weight (`redraw`).
+
+    Raises
+    ------
+    ValueError
+        There are neither real nor simulated scans.
+    """
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        real: Sequence[LabeledScan],
+        real_weights: Sequence[float],
+        simulated: Sequence[Path],
+        teacher: OnnxTeacher | None = None,
+        n_workers: int = 0,
+    ) -> None:
+        if not real and not simulated:
+            raise ValueError("no scans to train on; give --kitti, --scans, --simulated or several of them")
+        self.task, self.recipe, self.teacher = task_of(recipe), recipe, teacher
+        self.n_targets = len(self.task.card.outputs)
+        self.real, self.simulated = [with_ground_ahead(scan) for scan in real], simulated
+        self.projector = make_projector(self.task.view, self.task.input)
+        self.weights = {"real": np.asarray(real_weights, np.float64), "simulated": np.ones(len(simulated))}
+        self.odds = {name: np.ones(len(weights)) for name, weights in self.weights.items()}
+        share = recipe.simulated_share if real else 1.0
+        self.simulated_share = share if simulated else 0.0
+        self._numbers = _numbers(recipe.classes)
+        self.paste_odds = dict(self.task.paste_odds)
+        if recipe.paste_cars > 0.0:
+            others = {name: share * (1.0 - recipe.paste_cars) for name, share in self.paste_odds.items()}
+            self.paste_odds = {**others, "car": recipe.paste_cars}
+        self.paste_odds |= {name: OWN_ODDS for name in recipe.classes[1:] if name not in POINT_CLASSES}
+        # A top view's road goes on under a pole, but not through a wall.
+        self.negatives = NEGATIVES if recipe.task == "points" else {"pole": 1.0}
+        self.bank: ObjectBank | None = None
+        if max(recipe.n_pasted, recipe.n_negatives) > 0.0:
+            stride = max(1, len(simulated) // BANK_SCANS)
+            scans = [*self.real, *(self._load(k) for k in range(0, len(simulated), stride))]
+            scans = tqdm(scans, desc="cutting out objects", leave=False)
+            self.bank = ObjectBank.of(scans, classes=recipe.classes or POINT_CLASSES, n_workers=n_workers)
+
+    def batch(self, step: int) -> Targets:
+        """The arrays of one step, always the same for the same step and `odds`.
+
+        Inputs (B, C, H, W) float32, the targets, and the teacher's class probabilities and boxes.
+        """
+        rng = np.random.default_rng((self.recipe.seed, step))
+        drawn = []
+        for _ in range(self.recipe.batch):
+            scan = self._drawn(rng)
+            drawn.append((*self.sample(scan), *(self.teacher(scan) if self.teacher else ())))
+        return tuple(np.stack(parts) for parts in zip(*drawn, strict=True))
+
+    __getitem__ = batch
+
+    def sample(self, scan: LabeledScan) -> Targets:
+        """One input (C, H, W) float32 and its targets."""
+        scan, projected = seen_by_network(self.projector, scan)
+        return projected.image, *self.task.target(scan, projected)
+
+    @torch.no_grad()
+    def redraw(self, network: nn.Module, step: int) -> None:
+        """Let a network label some of the scans, and draw those with many false objects more often (`odds`).
+
+        Parameters
+        ----------
+        network : nn.Module
+            In inference mode.
+        step : int
+            Together with the recipe's seed it decides which scans are labeled.
+        """
+        rng = np.random.default_rng((self.recipe.seed, step, 1))
+        device = next(network.parameters()).device
+        objects = np.array([name not in ("background", "drivable") for name in self.task.classes])
+        if not objects.any():
+            objects[1:] = True  # of a network that labels nothing but road
+        for name, odds in self.odds.items():
+            chosen = rng.permutation(len(odds))[:REDRAWN_SCANS]
+            false = np.zeros(len(chosen))
+            for k, number in enumerate(chosen):
+                image, truth, *_ = self.sample(self.real[number] if name == "real" else self._load(number))
+                outputs = network(torch.from_numpy(image[None]).to(device))
+                logits: Tensor = outputs[0] if isinstance(outputs, tuple) else outputs
+                labels = logits[0].argmax(0).cpu().numpy()
+                background = (truth != IGNORE) & ~objects[np.where(truth == IGNORE, 0, truth)]
+                false[k] = np.count_nonzero(objects[labels] & background)
+            if false.any():
+                odds[chosen] = np.clip(false / false.mean(), *REDRAW_FACTORS)
+
+    def _drawn(self, rng: np.random.Generator) -> LabeledScan:
+        recipe = self.recipe
+        scan = self._scan(rng)
+        if not recipe.augment:
+            return scan
+        change = partial(
+            augmented,
+            rng=rng,
+            bank=self.bank,
+            n_pasted=recipe.n_pasted,
+            odds=self.paste_odds,
+            turn_to_rare=recipe.turn_to_rare,
+            turn_anywhere=recipe.turn_anywhere,
+            weather=recipe.weather,
+            n_negatives=recipe.n_negatives,
+            negatives=self.negatives,
+            half_beams=recipe.half_beams,
+            tilt_deg=recipe.tilt_deg,
+            no_remission=recipe.no_remission,
+        )
+        scan = change(scan)
+        if self.task.swaps_sectors and rng.random() < recipe.swap:
+            other = change(self._scan(rng))
+            scan = swapped(scan, other, rng) if other.sensor == scan.sensor else scan
+        return scan
+
+    def _scan(self, rng: np.random.Generator) -> LabeledScan:
+        name = "simulated" if rng.random() < self.simulated_share else "real"
+        odds = self.weights[name] * self.odds[name]
+        number = int(rng.choice(len(odds), p=odds / odds.sum()))
+        return self._load(number) if name == "simulated" else self.real[number]
+
+    def _load(self, number: int) -> LabeledScan:
+        scan = LabeledScan.load(self.simulated[number])
+        return replace(scan, labels=self._numbers[scan.labels])
+
+
+def loaded(
+    samples: Samples, start: int, stop: int, n_workers: int, ranks: Ranks | None = None
+) -> Iterator[list[Tensor]]:
+    """The batches of the steps from ``start`` to ``stop``, made by ``n_workers`` processes ahead of their use.
+
+    With several ranks, each makes some of the batches and sends them to the others.
+
+    At multiples of the recipe's ``redraw_every``, the processes start anew, so that they see the new odds. With 0
+    workers each batch is made when it is asked for; the batches are the same.
+
+    If the recipe has a ``reuse`` above 1, only one batch in so many is new. The others are drawn from the newest
+    samples, which stay on the device.
+    """
+    recipe = samples.recipe
+    every, ranks = recipe.redraw_every or stop, ranks or Ranks()
+    device = ranks.device
+    recent = Recent(RECENT_SAMPLES)
+    while start < stop:
+        end = min(stop, start - start % every + every)
+        steps = range(start, end, recipe.reuse)
+        new: DataLoader[list[Tensor]] = DataLoader(
+            samples,  # type: ignore[arg-type]  # it has __getitem__, which is all that is needed
+            batch_size=None,
+            sampler=steps[ranks.rank :: ranks.world],
+            num_workers=n_workers,
+            prefetch_factor=4 if n_workers else None,
+            multiprocessing_context=CONTEXT if n_workers else None,
+            pin_memory=device.type == "cuda",
+        )
+        own = iter(new)
+        for number, step in enumerate(steps):
+            maker, batch = number % ranks.world, None
+            if maker == ranks.rank:
+                batch = [part.to(device, non_blocking=True) for part in next(own)]
+            batch = ranks.from_rank(maker, batch)
+            yield batch
+            if recipe.reuse > 1:
+                recent.add(batch)
+            for again in range(step + 1, min(step + recipe.reuse, end)):
+                yield recent.draw(recipe.batch, torch.Generator().manual_seed((recipe.seed << 32) + again))
+        start = end
+
+
+class Recent:
+    """The newest samples.
+
+    Parameters
+    ----------
+    size : int
+        At most this many samples are kept, rounded up to whole batches.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._size, self._n_added, self._n_kept = size, 0, 0
+        self._parts: list[Tensor] = []
+
+    def add(self, batch: Sequence[Tensor]) -> None:
+        """Keep a batch; the oldest one is dropped if there is no more room."""
+        n = len(batch[0])
+        n_batches = -(-self._size // n)
+        if not self._parts:
+            self._parts = [part.new_empty((n_batches * n, *part.shape[1:])) for part in batch]
+        at = self._n_added % n_batches * n
+        for kept, part in zip(self._parts, batch, strict=True):
+            kept[at : at + n] = part
+        self._n_added += 1
+        self._n_kept = min(self._n_added, n_batches) * n
+
+    def draw(self, n: int, generator: torch.Generator) -> list[Tensor]:
+        """``n`` different samples, drawn at random."""
+        chosen = torch.randperm(self._n_kept, generator=generator)[:n].to(self._parts[0].device)
+        return [part[chosen] for part in self._parts]
+
+
+def _numbers(classes: Sequence[str]) -> NDArray[np.uint8]:
+    """Number of each of `POINT_CLASSES` among a network's classes of points, by its label, (256,) uint8."""
+    numbers = np.arange(256, dtype=np.uint8)
+    numbers[: len(POINT_CLASSES)] = [class_number(name, classes or POINT_CLASSES) for name in POINT_CLASSES]
+    return numbers
+
+
+class RealScans(NamedTuple):
+    """Real scans with labels that are not in KITTI's files, for instance hand-drawn roads.
+
+    Attributes
+    ----------
+    scans : list of LabeledScan
+        Scans to train on.
+    hashes : dict of str to str
+        Name of each scan -> its `edgeperc.datasets.kitti.scan_hash`, for the card.
+    watched : list of LabeledScan
+        Scans to validate on.
+    """
+
+    scans: list[LabeledScan]
+    hashes: dict[str, str]
+    watched: list[LabeledScan]
+
+
+def real_scans(
+    kitti: KittiObjects, names: Sequence[str], *, drawn: bool = False, classes: Sequence[str] = ()
+) -> tuple[list[LabeledScan], list[float], dict[str, str]]:
+    """Read labeled scans of KITTI.
+
+    Parameters
+    ----------
+    kitti : KittiObjects
+    names : sequence of str
+    drawn : bool
+        Replace the ground truth by the hand-drawn road where a scan has one.
+    classes : sequence of str
+        Classes of points, the background first; empty: edgeperc's.
+
+    Returns
+    -------
+    scans : list of LabeledScan
+    weights : list of float
+        How often to draw each scan, relative to the others.
+    hashes : dict of str to str
+        Name of each scan -> its `edgeperc.datasets.kitti.scan_hash`.
+    """
+    scans: list[LabeledScan] = []
+    weights: list[float] = []
+    hashes: dict[str, str] = {}
+    numbers = _numbers(classes)
+    roads: dict[str, NDArray[np.uint8]] = drawn_roads() if drawn else {}
+    frames = [kitti.frame(name) for name in tqdm(names, desc="reading real scans", leave=False)]
+    drives = [frame.drive for frame in frames]
+    for frame in frames:
+        scan = LabeledScan.from_frame(frame, sure_surface)
+        scan = replace(scan, labels=numbers[scan.labels])
+        hashes[frame.name] = digest = scan_hash(frame.points)
+        if digest in roads:
+            scan = replace(scan, surface=with_road(scan.surface, roads[digest]))
+        scans.append(scan)
+        # The weight of a drive is the square root of its number of frames, because neighboring frames look alike (a
+        # drive has up to 154). A scan with a drawn road weighs as much as a drive with one frame, because its ground is
+        # known everywhere.
+        weights.append(1.0 if digest in roads else drives.count(frame.drive) ** -0.5)
+    return scans, weights, hashes

@@ -1,0 +1,225 @@
+"""Labeled scans of other sensors as training scans: moved into the frame of the models, and seen as the runtime would.
+
+`read_scan_set` turns a `ScanFolder` into `LabeledScan`s. `seen_by_network` projects any training scan; between the
+beams of a coarser sensor it fills the range image as `edgeperc.Perceiver` does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from edgeperc.datasets.kitti import scan_hash
+from edgeperc.datasets.scan_folder import IGNORED, ScanFolder, ScanFrame
+from edgeperc.errors import MountingError
+from edgeperc.evaluation.truth import road_cells
+from edgeperc.ground.leveling import MountingEstimator
+from edgeperc.inference.network_input import input_heights, project
+from edgeperc.inference.projection import Projection, RangeImageProjector, TopViewProjector
+from edgeperc.preprocess.condition import Interpolator, condition
+from edgeperc.preprocess.remission import NO_REMISSION, RemissionMatcher, is_missing
+from edgeperc.simulation.samples import IGNORE
+from edgeperc.simulation.scene import POINT_CLASSES
+from edgeperc.types.card import RangeImageGeometry
+from edgeperc.types.frame import ModelFrame
+from edgeperc.types.geometry import draw_footprints
+from edgeperc.types.mounting import Mounting
+from edgeperc.types.sensor import SensorProfile
+
+from .roads import box_sums
+from .scans import SURFACE, LabeledScan
+
+__all__ = ["labeled_scan", "read_scan_set", "seen_by_network"]
+
+NEAR_M = 0.5
+
+
+def read_scan_set(
+    folder: ScanFolder, split: str, fold: int | None = None, *, classes: Sequence[str] = POINT_CLASSES
+) -> tuple[list[LabeledScan], list[float], dict[str, str]]:
+    """Read the labeled scans of a split.
+
+    As in a `Perceiver`, what the description does not say of the mounting is estimated from the first scans of each
+    drive, and the remission is matched to that of the training sensor.
+
+    Parameters
+    ----------
+    folder : ScanFolder
+    split, fold
+        As in `ScanFolder.names`.
+    classes : sequence of str
+        Classes of points, the background first; objects of other classes are unknown (`IGNORE`).
+
+    Returns
+    -------
+    scans : list of LabeledScan
+    weights : list of float
+        How often to draw each scan: all scans of a drive together as the square root of their number.
+    hashes : dict of str to str
+        ``SET/NAME`` of each scan -> its `edgeperc.datasets.kitti.scan_hash`.
+
+    Raises
+    ------
+    PointsError
+        A file cannot be read.
+    MountingError
+        No scan of a drive shows how the sensor is mounted, and the description does not say it.
+    """
+    layout, names = folder.layout, folder.names(split, fold=fold)
+    n_scans = Counter(folder.drives[name] for name in names)
+    estimators: dict[str, MountingEstimator] = {}
+    matchers: dict[str, RemissionMatcher] = {}
+    sensors: dict[str, SensorProfile] = {}  # of each drive, with the function that all its scans have led to
+    frames = [folder.frame(name) for name in tqdm(names, desc=f"reading {layout.name}", leave=False)]
+    for frame in frames:
+        estimator = estimators.setdefault(frame.drive, MountingEstimator(layout.sensor.mounting))
+        with suppress(MountingError):  # perhaps another scan of the drive shows the ground
+            estimators[frame.drive] = estimator.add(frame.points)
+        if not is_missing(frame.points):
+            matcher = matchers.get(frame.drive, RemissionMatcher(layout.sensor))
+            matchers[frame.drive], sensors[frame.drive], _ = matcher.add(frame.points)
+    scans: list[LabeledScan] = []
+    for frame in frames:
+        estimator = estimators[frame.drive]
+        if not estimator.known.is_known and not estimator.n_scans:
+            raise MountingError(
+                f"{folder.root}: no scan of drive {frame.drive} shows the ground; give height_m, roll_deg and "
+                "pitch_deg as mounting in the description"
+            )
+        missing = is_missing(frame.points)
+        sensor = replace(layout.sensor, remission=NO_REMISSION) if missing else sensors[frame.drive]
+        points, _ = condition(frame.points, sensor)
+        scans.append(labeled_scan(frame, points, estimator.mounting(), classes))
+    weights = [n_scans[frame.drive] ** -0.5 for frame in frames]
+    return scans, weights, {f"{layout.name}/{frame.name}": scan_hash(frame.points) for frame in frames}
+
+
+def labeled_scan(
+    frame: ScanFrame, points: NDArray[np.float32], mounting: Mounting, classes: Sequence[str] = POINT_CLASSES
+) -> LabeledScan:
+    """A scan with its truth in the frame of the models.
+
+    Parameters
+    ----------
+    frame : ScanFrame
+    points : (n, 4) float32
+        Its points, with the remission as `edgeperc.preprocess.condition.condition` returns it.
+    mounting : Mounting
+        A known one.
+    classes : sequence of str
+        As in `read_scan_set`.
+    """
+    model = ModelFrame(mounting)
+    boxes = model.move_boxes(frame.boxes or ())
+    surface = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
+    cells = road_cells(frame, mounting, SURFACE)
+    if cells is not None:
+        cells = _filled(cells)
+        surface = np.where(cells <= 1, cells, IGNORE).astype(np.uint8)
+        # Of the ground under an ignored object nothing is known; vehicles are drawn over the surface later.
+        unclear = np.zeros_like(surface)
+        ignored = [replace(box, label="car") for box in boxes if box.label == IGNORED]
+        draw_footprints(unclear, ignored, SURFACE, ("", "car"))
+        surface[unclear > 0] = IGNORE
+    finite = np.isfinite(points).all(axis=1)
+    low, high = frame.azimuths
+    yaw = math.radians(mounting.yaw_deg or 0.0)
+    full = high - low >= 2.0 * math.pi - 1e-9
+    return LabeledScan(
+        np.array(model.move(points)[finite]),
+        frame.labels(classes)[finite],
+        boxes,
+        frame.returns,
+        surface,
+        (-math.pi, math.pi) if full else (low + yaw, high + yaw),
+        sensor=frame.layout.sensor,
+        boxes_known=frame.boxes is not None,
+    )
+
+
+def _filled(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Cells of `ROAD_CLASSES`, with road also between the returns.
+
+    An unknown cell becomes road if three cells in the 1.4 m around it are road and no other one is known.
+
+    In 16 simulated scans of two sensors, this makes the known road 2.5 and 4 times as large, and 99.6 % of what is
+    added is road.
+    """
+    road, other = (box_sums(known.astype(np.int64)) for known in (cells == 1, (cells != 1) & (cells != IGNORE)))
+    between = (cells == IGNORE) & (road >= 3) & (other == 0)
+    return np.where(between, np.uint8(1), cells)
+
+
+def seen_by_network(
+    projector: TopViewProjector | RangeImageProjector, scan: LabeledScan
+) -> tuple[LabeledScan, Projection]:
+    """A training scan projected as the runtime projects a scan of its sensor.
+
+    Parameters
+    ----------
+    projector : TopViewProjector or RangeImageProjector
+    scan : LabeledScan
+
+    Returns
+    -------
+    scan : LabeledScan
+        If the range image of a coarser sensor was filled: with the interpolated points. Each is labeled as the nearest
+        of the next measured points in its row and its column, and `IGNORE` if that is more than 0.5 m away and one of
+        them is no background. Else the given one.
+    projected : Projection
+        Its ``index`` refers to the points of the returned scan; ``pixel`` to the given ones.
+    """
+    points = np.ascontiguousarray(scan.points, np.float32)
+    projected = project(projector, points)
+    if scan.sensor is None or isinstance(projector, TopViewProjector):
+        return scan, projected
+    interpolator = _interpolator(projector.view, scan.sensor)
+    if not interpolator.needed:
+        return scan, projected
+    dense, filled = interpolator.fill(points, projected.index)
+    image = np.empty(projector.shape, np.float32)
+    projector.fill_image(dense, filled, image, input_heights(projector, dense))
+    labels = np.full(len(dense), IGNORE, np.uint8)
+    labels[: len(points)] = scan.labels
+    new = filled >= len(points)
+    labels[filled[new]] = _nearest_labels(dense, filled, projected.index, labels)[new]
+    return replace(scan, points=dense, labels=labels), Projection(image, filled, projected.pixel)
+
+
+@lru_cache(maxsize=64)
+def _interpolator(view: RangeImageGeometry, sensor: SensorProfile) -> Interpolator:
+    return Interpolator(view, sensor)
+
+
+def _nearest_labels(
+    points: NDArray[np.float32], filled: NDArray[np.int32], index: NDArray[np.int32], labels: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """Label of the nearest of the next measured points left, right, above and below, (H, W) uint8.
+
+    `IGNORE` without such a point, and where it is farther away than `NEAR_M` unless all are background: on the road,
+    points between two rings are interpolated over meters.
+    """
+    place = points[filled, :3]
+    best, nearest = np.full(index.shape, np.inf, np.float32), np.full(index.shape, IGNORE, np.uint8)
+    highest = np.zeros_like(nearest)
+    for axis in (0, 1):
+        for step in (1, -1):
+            way = (slice(None), slice(None, None, step)) if axis else (slice(None, None, step), slice(None))
+            ahead = index[way]
+            position = np.expand_dims(np.arange(ahead.shape[axis]), 1 - axis)
+            last = np.maximum.accumulate(np.where(ahead >= 0, position, -1), axis=axis)
+            row = np.where(last >= 0, np.take_along_axis(ahead, np.maximum(last, 0), axis=axis), -1)[way]
+            apart = np.where(row >= 0, np.linalg.norm(points[row, :3] - place, axis=2), np.inf)
+            closer = apart < best
+            best[closer], nearest[closer] = apart[closer], labels[row][closer]
+            highest = np.where(row >= 0, np.maximum(highest, labels[row]), highest)
+    nearest[(best > NEAR_M) & (highest > 0)] = IGNORE
+    return nearest

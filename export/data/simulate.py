@@ -1,0 +1,92 @@
+"""Simulated scans: to train on, to verify an export on, and to describe the expected input in its card."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from edgeperc.datasets.kitti import KittiObjects, layouts
+from edgeperc.preprocess.fitness import FitnessProfile
+from edgeperc.readers.files import read_points
+from edgeperc.readers.images import read_image
+from edgeperc.simulation.camera import forward_camera, render
+from edgeperc.simulation.samples import simulated_scan
+from edgeperc.types.perception import Box
+
+from ..training.processes import mapped
+from .scans import LabeledScan
+
+__all__ = ["fitness_of", "parity_images", "parity_scans", "simulate"]
+
+
+def simulate(
+    out: Path,
+    n: int,
+    *,
+    first: int = 0,
+    layouts_root: Path | None = None,
+    sensor: str = "hdl-64e",
+    n_workers: int = 0,
+) -> None:
+    """Write ``n`` labeled scans into ``out``. Existing files are kept, so a stopped run resumes.
+
+    Parameters
+    ----------
+    out : Path
+    n : int
+    first : int
+        Number and seed of the first scan.
+    layouts_root : Path, optional
+        Folder of KITTI's labels; every other scene gets the boxes of one of its scans.
+    sensor : str
+        Name of the sensor to simulate.
+    n_workers : int
+        Number of processes that simulate; 0: this one. The scans are the same.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    real = list(layouts(layouts_root)) if layouts_root else []
+    missing = [seed for seed in range(first, first + n) if not _path(out, seed).exists()]
+    with mapped(partial(_simulate, out=out, layouts=real, sensor=sensor), missing, n_workers) as done:
+        for _ in tqdm(done, desc="simulating", unit="scan", total=len(missing)):
+            pass
+
+
+def _path(out: Path, seed: int) -> Path:
+    return out / f"{seed:06d}.npz"
+
+
+def _simulate(seed: int, *, out: Path, layouts: Sequence[Sequence[Box]], sensor: str) -> None:
+    # 4,973 is prime: neighboring seeds take layouts of different drives.
+    boxes = layouts[seed * 4973 % len(layouts)] if layouts and seed % 2 else None
+    LabeledScan.from_simulation(simulated_scan(seed, sensor, boxes)).save(_path(out, seed))
+
+
+def parity_scans(paths: Sequence[Path]) -> list[NDArray[np.float32]]:
+    """Scans to verify an export on: the given files, and four simulated scans that are in no training set."""
+    return [read_points(p) for p in paths] + [simulated_scan(10**9 + k).points for k in range(4)]
+
+
+def parity_images(paths: Sequence[Path]) -> list[NDArray[np.uint8]]:
+    """Images to verify an export on: the given files, and four of simulated streets."""
+    images = [read_image(path) for path in paths]
+    for seed in range(10**9, 10**9 + 4):
+        scan = simulated_scan(seed)
+        images.append(render(scan.scene, forward_camera(480, 360), scan.T_world_sensor, seed).rgb)
+    return images
+
+
+def fitness_of(kitti: Path | None) -> FitnessProfile:
+    """The fitness profile of the training scans: KITTI's, or, if ``kitti`` is None, 32 simulated ones.
+
+    At runtime, inputs are compared with it.
+    """
+    if kitti is None:
+        return FitnessProfile.from_scans(simulated_scan(10**9 + k).points for k in range(32))
+    objects = KittiObjects(kitti)
+    names = objects.names("train", grades="AB")
+    return FitnessProfile.from_scans(objects.frame(n).points for n in names[:: max(1, len(names) // 64)])

@@ -1,0 +1,200 @@
+"""Targets of the box heads: slots by place, the paper's slots, and dense maps."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edgeperc.types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS, TopViewGeometry
+
+__all__ = ["REGRESSED_FROM", "SLOT_CELLS", "dense_targets", "paper_slot_targets", "slot_targets"]
+
+STRIDE = 4
+"""Top-view cells along the edge of one output cell of head "dense"."""
+SLOT_CELLS = 32
+"""Top-view cells along the edge of the square that belongs to one slot: five poolings by two. The last row and column
+of squares also get the cells that are left over."""
+REGRESSED_FROM = 0.5
+"""Cells with at least this heat learn the box's geometry, weighted by the heat. The detected peak may be a neighbor of
+the true one, so the neighbors' geometry must be correct too."""
+
+
+def slot_targets(
+    boxes: ArrayLike,
+    view: TopViewGeometry,
+    *,
+    labeled: NDArray[np.bool_] | None = None,
+    unsure: ArrayLike | None = None,
+) -> NDArray[np.float32]:
+    """Targets of head "slots": each slot has a square of the view, and the upright box of the object centered there.
+
+    Parameters
+    ----------
+    boxes, labeled, unsure
+        As for `dense_targets`.
+    view : TopViewGeometry
+        Height and width at least `SLOT_CELLS`.
+
+    Returns
+    -------
+    (rows * columns, 5) float32
+        By rows from the far left square: center column, center row, width and height as in `paper_slot_targets`, and
+        the presence: 1 with an object, 0 without one, -1 if it is not learned. A slot without an object has zeros. Of
+        several objects in one square, the slot gets the nearest.
+
+    Raises
+    ------
+    ValueError
+        A length, width or height is not positive.
+    """
+    n_rows, n_cols = view.height // SLOT_CELLS, view.width // SLOT_CELLS
+    target = np.zeros((n_rows, n_cols, 5), np.float32)
+    if labeled is not None:
+        every = (np.arange(n) * SLOT_CELLS for n in (n_rows, n_cols))
+        known = labeled
+        for axis, starts in enumerate(every):
+            known = np.logical_and.reduceat(known, starts, axis=axis)
+        target[~known, 4] = -1.0
+    for group, present in ((unsure, False), (boxes, True)):
+        if group is None:
+            continue
+        group, rows, cols = _boxes_in_view(group, view)
+        at_row = np.minimum(rows.astype(np.int64) // SLOT_CELLS, n_rows - 1)
+        at_col = np.minimum(cols.astype(np.int64) // SLOT_CELLS, n_cols - 1)
+        if not present:
+            target[at_row, at_col, 4] = -1.0
+            continue
+        nearest_last = np.argsort(rows, kind="stable")
+        target[at_row[nearest_last], at_col[nearest_last], :4] = _upright(group, rows, cols, view)[nearest_last]
+        target[at_row, at_col, 4] = 1.0
+    return target.reshape(-1, 5)
+
+
+def paper_slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> NDArray[np.float32]:
+    """Targets of head "slots-paper": upright boxes around rotated footprints, nearest first (SSADNet 3.1.1).
+
+    Parameters
+    ----------
+    boxes : (m, 7) array_like
+        x, y, z of the center, length, width, height [m], yaw [rad], in the sensor frame.
+    view : TopViewGeometry
+    n_slots : int
+        Number of boxes to keep, nearest first.
+
+    Returns
+    -------
+    (n_slots, 4) float32
+        Center column, center row, width and height as shares of the image's width and height; zeros in empty slots.
+        Boxes whose center is outside the view are left out.
+
+    Raises
+    ------
+    ValueError
+        A length, width or height is not positive.
+    """
+    boxes, rows, cols = _boxes_in_view(boxes, view)
+    found = _upright(boxes, rows, cols, view)
+    nearest = np.argsort(-rows, kind="stable")[:n_slots]
+    target = np.zeros((n_slots, 4), np.float32)
+    target[: len(nearest)] = found[nearest]
+    return target
+
+
+def dense_targets(
+    boxes: ArrayLike,
+    view: TopViewGeometry,
+    *,
+    labeled: NDArray[np.bool_] | None = None,
+    unsure: ArrayLike | None = None,
+) -> NDArray[np.float32]:
+    """Heat map and geometry for head "dense".
+
+    Parameters
+    ----------
+    boxes : (m, 7) array_like
+        As for `slot_targets`.
+    view : TopViewGeometry
+        Height and width divisible by 4.
+    labeled : (height, width) bool, optional
+        False in cells where boxes are not labeled, such as outside the camera's view.
+    unsure : (k, 7) array_like, optional
+        Boxes that count neither as found nor as missed, such as those without returns. Cells near them are not
+        learned.
+
+    Returns
+    -------
+    (11, height/4, width/4) float32
+        Channel 0, the heat: 1 in the output cell that holds a box's center; around it a Gaussian shaped like the box,
+        whose edges are three standard deviations away; -1 in cells that are not learned. Channels 1 to 8: the geometry
+        of the box with the highest heat, in the format of box_dense, where that heat is at least `REGRESSED_FROM`; else
+        0. Channels 9 and 10: x and y of the unit vector towards its front.
+
+    Raises
+    ------
+    ValueError
+        A length, width or height is not positive.
+    """
+    height, width = view.height // STRIDE, view.width // STRIDE
+    target = np.zeros((N_DENSE_CHANNELS + N_FRONT_CHANNELS, height, width), np.float32)
+    heat = target[0]
+
+    boxes, rows, cols = _boxes_in_view(boxes, view)
+    for box, row, col in zip(boxes, rows / STRIDE, cols / STRIDE, strict=True):
+        bump = _gaussian(box, row, col, (height, width), view.cell_m * STRIDE)
+        cell_rows, cell_cols = np.nonzero((bump > heat) & (bump >= REGRESSED_FROM))
+        doubled, front = (np.sin(2.0 * box[6]), np.cos(2.0 * box[6])), (np.cos(box[6]), np.sin(box[6]))
+        target[1, cell_rows, cell_cols] = row - (cell_rows + 0.5)
+        target[2, cell_rows, cell_cols] = col - (cell_cols + 0.5)
+        target[3:, cell_rows, cell_cols] = np.array(
+            [np.log(box[3]), np.log(box[4]), *doubled, box[2], np.log(box[5]), *front]
+        )[:, None]
+        np.maximum(heat, bump, out=heat)
+
+    unlearned = np.zeros((height, width), bool)
+    if labeled is not None:
+        unlearned |= ~labeled.reshape(height, STRIDE, width, STRIDE).all((1, 3))
+    if unsure is not None:
+        boxes, rows, cols = _boxes_in_view(unsure, view)
+        for box, row, col in zip(boxes, rows / STRIDE, cols / STRIDE, strict=True):
+            unlearned |= _gaussian(box, row, col, (height, width), view.cell_m * STRIDE) > 0.1
+    heat[unlearned & (heat < REGRESSED_FROM)] = -1.0
+    return target
+
+
+def _boxes_in_view(
+    boxes: ArrayLike, view: TopViewGeometry
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Boxes whose center is in the view, and the rows and columns of the centers [cells from the far left corner]."""
+    boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
+    if not (boxes[:, 3:6] > 0.0).all():
+        raise ValueError("a box has no extent; expected length, width and height above 0 m")
+    rows = (view.x_range_m[1] - boxes[:, 0]) / view.cell_m
+    cols = (view.y_range_m[1] - boxes[:, 1]) / view.cell_m
+    inside = (rows >= 0) & (rows < view.height) & (cols >= 0) & (cols < view.width)
+    return boxes[inside], rows[inside], cols[inside]
+
+
+def _upright(
+    boxes: NDArray[np.float64], rows: NDArray[np.float64], cols: NDArray[np.float64], view: TopViewGeometry
+) -> NDArray[np.float64]:
+    """Center column, center row, width and height of the upright boxes, (m, 4), as shares of the image's."""
+    length, width, yaw = boxes[:, 3], boxes[:, 4], boxes[:, 6]
+    across = np.abs(length * np.sin(yaw)) + np.abs(width * np.cos(yaw))
+    along = np.abs(length * np.cos(yaw)) + np.abs(width * np.sin(yaw))
+    return np.stack(
+        [cols / view.width, rows / view.height, across / view.cell_m / view.width, along / view.cell_m / view.height],
+        axis=1,
+    )
+
+
+def _gaussian(
+    box: NDArray[np.float64], row: float, col: float, shape: tuple[int, int], cell_m: float
+) -> NDArray[np.float32]:
+    """A bump of height 1 in the output cell that holds (row, col), as long and wide as the box."""
+    forward = int(row) - np.arange(shape[0])[:, None]  # rows grow backwards, columns to the right
+    left = int(col) - np.arange(shape[1])[None, :]
+    cos, sin = np.cos(box[6]), np.sin(box[6])
+    along, across = cos * forward + sin * left, cos * left - sin * forward
+    # At least half a cell: a peak of a single cell would be hard to learn.
+    sigma_along, sigma_across = max(box[3] / cell_m / 6.0, 0.5), max(box[4] / cell_m / 6.0, 0.5)
+    return np.exp(-0.5 * ((along / sigma_along) ** 2 + (across / sigma_across) ** 2)).astype(np.float32)

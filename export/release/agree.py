@@ -1,0 +1,272 @@
+"""Measures how a network's outputs in bf16 and int8 agree with fp32 on labeled real scans; writes it into its cards.
+
+`edgeperc.zoo.choose` reads this record: ``precision="auto"`` takes a reduced precision only if its loss is small.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import onnx
+import onnxruntime
+from numpy.typing import NDArray
+
+from edgeperc.datasets.kitti import KittiObjects, SemanticKitti
+from edgeperc.errors import ModelError, PointsError
+from edgeperc.evaluation.camvid import LabeledImages
+from edgeperc.evaluation.judge import Judge
+from edgeperc.evaluation.metrics import Confusion
+from edgeperc.evaluation.tables import Record, figures
+from edgeperc.evaluation.truth import Truth
+from edgeperc.inference.session import Session
+from edgeperc.perceiver import Perceiver
+from edgeperc.system.machine import cpu_features, cpu_model
+from edgeperc.types.perception import Perception
+from edgeperc.zoo import BF16_FEATURES, Variant, resolve
+
+from .to_onnx import write_card
+
+__all__ = ["agree", "summary"]
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """Labels and accuracy of one precision over all scans; ``by`` is the engine, provider and processor."""
+
+    labels: list[NDArray[np.uint8]]
+    mean_iou: float
+    ap: float | None
+    by: str
+
+
+def agree(
+    models: Sequence[str | Path],
+    *,
+    kitti: Path | None,
+    semantickitti: Path | None = None,
+    camvid: Path | None = None,
+    split: str = "validation",
+    n_scans: int | None = None,
+    on_scan: Callable[[str], None] = lambda precision: None,
+) -> dict[str, dict[str, Any]]:
+    """Measure every precision that the files of one network can run in, and write the record into their cards.
+
+    fp32 and int8 run on stock onnxruntime's CPU provider. bf16 runs the fp32 file in OpenVINO's own Python API. It is
+    measured if OpenVINO is installed and the processor has bf16 instructions.
+
+    Parameters
+    ----------
+    models : sequence of str or Path
+        Files of one network, or its name for all its variants. One of them is in fp32.
+    kitti, semantickitti : Path or None
+        Roots of a KITTI object set and of SemanticKITTI. Their labels are the ground truth: of points or vehicles
+        (KITTI) and of road (SemanticKITTI). All scans of SemanticKITTI are used, although they are of a test drive,
+        because no other real scans have road labels.
+    camvid : Path or None
+        Folder of CamVid, for a network of a camera; then the other sets are not used.
+    split : str
+        Drives of the KITTI object set (`edgeperc.datasets.splits.in_split`), or images of CamVid
+        (`edgeperc.evaluation.camvid.LabeledImages.files`).
+    n_scans : int or None
+        At most this many scans, or images, of each set, evenly spread; None takes all.
+    on_scan : callable
+        Called with the precision after each scan.
+
+    Returns
+    -------
+    precisions : dict
+        Precision -> its record (`edgeperc.card.ModelCard`, ``precisions``).
+
+    Raises
+    ------
+    ModelError
+        The files are not of one network, or none is in fp32.
+    PointsError
+        There are no labeled scans or images.
+    SplitError
+        The network was trained on one of the scans.
+    """
+    variants = {variant.precision: variant for model in models for variant in resolve(model)}
+    names = {f"{variant.name} {variant.card.version}" for variant in variants.values()}
+    if len(names) != 1 or "fp32" not in variants:
+        raise ModelError(
+            f"got {', '.join(map(str, variants.values()))} of {', '.join(sorted(names))}; "
+            "expected files of one network, one of them in fp32"
+        )
+    runs: dict[str, Variant] = {"fp32": variants["fp32"]}
+    if importlib.util.find_spec("openvino") is not None and not BF16_FEATURES.isdisjoint(cpu_features()):
+        runs["bf16"] = variants["fp32"]
+    runs |= variants
+    if variants["fp32"].card.view.kind == "camera":
+        if camvid is None:
+            raise PointsError(f"{variants['fp32'].name} is of a camera, and there is no labeled image; name CamVid")
+        measured = {
+            precision: _measure_images(variant, precision, LabeledImages(camvid), split, n_scans, on_scan)
+            for precision, variant in runs.items()
+        }
+    else:
+        measured = {
+            precision: _measure(variant, precision, kitti, semantickitti, split, n_scans, on_scan)
+            for precision, variant in runs.items()
+        }
+    options = [f"--kitti KITTI --split {split}"] * (kitti is not None)
+    options += [f"--camvid CAMVID --split {split}"] * (camvid is not None)
+    options += ["--semantickitti SEMANTICKITTI"] * (semantickitti is not None) + [f"--scans {n_scans}"] * bool(n_scans)
+    command = " ".join(["edgeperc-export agree", variants["fp32"].name, *options])
+    records = {precision: _record(each, measured["fp32"], command) for precision, each in measured.items()}
+    for variant in variants.values():
+        own = {precision: records[precision] for precision, each in runs.items() if each is variant}
+        write_card(onnx.load(variant.path), replace(variant.card, precisions=own), variant.path)
+    return records
+
+
+def summary(precisions: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """One line of text for each record of `agree`."""
+    return [
+        f"{precision}: labels agree on {record['label_agreement']:.3%}, mean IoU {100 * record['mean_iou']:.2f} "
+        f"(fp32 {100 * record['fp32_mean_iou']:.2f})"
+        + (f", AP {100 * record['ap']:.2f} (fp32 {100 * record['fp32_ap']:.2f})" if record["ap"] is not None else "")
+        + f", loss {record['loss']:.2f} points, {record['n_scans']} scans"
+        for precision, record in precisions.items()
+    ]
+
+
+def _record(own: _Measured, fp32: _Measured, command: str) -> dict[str, Any]:
+    same = sum(int(np.count_nonzero(a == b)) for a, b in zip(own.labels, fp32.labels, strict=True))
+    losses = [fp32.mean_iou - own.mean_iou, 0.0]
+    if own.ap is not None and fp32.ap is not None:
+        losses.append(fp32.ap - own.ap)
+    return {
+        "n_scans": len(own.labels),
+        "label_agreement": round(same / max(sum(labels.size for labels in own.labels), 1), 6),
+        "mean_iou": round(own.mean_iou, 5),
+        "fp32_mean_iou": round(fp32.mean_iou, 5),
+        "ap": None if own.ap is None else round(own.ap, 5),
+        "fp32_ap": None if fp32.ap is None else round(fp32.ap, 5),
+        "loss": round(100.0 * max(losses), 3),
+        "by": own.by,
+        "command": command,
+    }
+
+
+def _measure(
+    variant: Variant,
+    precision: str,
+    kitti: Path | None,
+    semantickitti: Path | None,
+    split: str,
+    n_scans: int | None,
+    on_scan: Callable[[str], None],
+) -> _Measured:
+    judge = Judge([variant.path], boxes_from="network")
+    (session,) = judge.perceive.sessions
+    by = f"onnxruntime {onnxruntime.__version__}, {session.provider}"
+    if precision == "bf16":
+        by = _run_in_openvino(session)
+    truths: list[tuple[str, Callable[[], Truth]]] = []
+    if kitti is not None:
+        objects = KittiObjects(kitti)
+        names = _spread(objects.names(split), n_scans)
+        truths += [("real", partial(_kitti, judge, objects, name)) for name in names]
+    if semantickitti is not None and judge.from_above is not None:
+        roads = SemanticKitti(semantickitti)
+        names = _spread(roads.names("all"), n_scans)
+        truths += [("road", partial(_semantickitti, judge, roads, name)) for name in names]
+    if not truths:
+        raise PointsError(f"no labeled scan of {split} drives in {kitti}, {semantickitti}; name a KITTI object set")
+    records: dict[str, list[Record]] = {}
+    labels = []
+    for block, read in truths:
+        truth = read()
+        records.setdefault(block, []).append(judge.record(truth)[0])
+        labels.append(_labels(judge.perceive(truth.points)))
+        on_scan(precision)
+    blocks = [figures(of_block, 0) for of_block in records.values()]
+    ious = [iou for block in blocks for iou in _ious(block)]
+    ap = [block["boxes"]["oriented"]["all"]["vehicle"]["ap"] for block in blocks if "boxes" in block]
+    return _Measured(labels, float(np.nanmean(ious)), ap[0] if ap else None, f"{by}, {cpu_model()}")
+
+
+def _measure_images(
+    variant: Variant,
+    precision: str,
+    data: LabeledImages,
+    split: str,
+    n_images: int | None,
+    on_image: Callable[[str], None],
+) -> _Measured:
+    perceive = Perceiver([variant.path])
+    (session,) = perceive.sessions
+    by = f"onnxruntime {onnxruntime.__version__}, {session.provider}"
+    if precision == "bf16":
+        by = _run_in_openvino(session)
+    labels, confusion = [], Confusion(variant.card.classes)
+    for file in _spread(data.files(split), n_images):
+        image, truth = data.read(file)
+        found = perceive(image=image).image
+        assert found is not None
+        labels.append(found.labels.ravel())
+        confusion.update(found.labels, truth)
+        on_image(precision)
+    return _Measured(labels, confusion.mean_iou(), None, f"{by}, {cpu_model()}")
+
+
+def _kitti(judge: Judge, objects: KittiObjects, name: str) -> Truth:
+    return judge.kitti(objects.frame(name))
+
+
+def _semantickitti(judge: Judge, roads: SemanticKitti, name: str) -> Truth:
+    return judge.semantickitti(roads.frame(name))
+
+
+def _spread(names: Sequence[T], most: int | None) -> Sequence[T]:
+    """At most ``most`` of the names or files, evenly spread."""
+    return names if most is None else names[:: max(1, -(-len(names) // most))]
+
+
+def _labels(found: Perception) -> NDArray[np.uint8]:
+    """Labels of points or of cells after post-processing, flat."""
+    if found.points is not None:
+        return found.points.labels
+    assert found.top_view is not None
+    return found.top_view.labels.ravel()
+
+
+def _ious(block: Mapping[str, Any]) -> list[float]:
+    """IoU of every class of points without background, of vehicles as one class, and of road."""
+    found = [row["iou"] for name, row in block.get("points", {}).get("all", {}).items() if name != "background"]
+    for bands in block.get("segmentation", {}).values():
+        found += [iou for name, iou in bands["all"]["iou"].items() if name in ("vehicle", "road")]
+    return [np.nan if iou is None else iou for iou in found]
+
+
+def _run_in_openvino(session: Session) -> str:
+    """Make a session compute its outputs in bf16 through OpenVINO's own API; returns the engine and its version."""
+    import openvino
+
+    core = openvino.Core()
+    settings = {"INFERENCE_PRECISION_HINT": "bf16", "PERFORMANCE_HINT": "LATENCY"}
+    compiled = core.compile_model(core.read_model(session.path), "CPU", settings)
+    active = compiled.get_property("INFERENCE_PRECISION_HINT")
+    if active != openvino.Type.bf16:
+        raise ModelError(f"OpenVINO runs {session.path} in {active}, not in bf16, on this processor")
+    request = compiled.create_infer_request()
+    request.set_input_tensor(openvino.Tensor(session.input[None], shared_memory=True))
+
+    def run() -> Mapping[str, NDArray[np.float32]]:
+        request.infer()
+        for output in session.card.outputs:
+            session.raw[output.kind][...] = request.get_tensor(output.name).data[0]
+        session.spread()
+        return session.outputs
+
+    session.run = run  # type: ignore[method-assign]
+    return f"OpenVINO {openvino.__version__.partition('-')[0]}"

@@ -1,0 +1,89 @@
+"""Views and inputs of this project's networks, and their model cards."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES
+from edgeperc.simulation.street import CAMERA_CLASSES
+from edgeperc.types.card import CameraGeometry, InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.sensor import get_sensor
+
+from ..recipe import EDGE_BLOCKS, Recipe
+
+__all__ = [
+    "CAMERA_INPUT",
+    "HEIGHT_INPUT",
+    "RANGE_IMAGE",
+    "RANGE_IMAGE_INPUT",
+    "ROAD_CLASSES",
+    "TOP_VIEW",
+    "TOP_VIEW_INPUT",
+    "card_of",
+]
+
+ROAD_CLASSES = TOP_VIEW_CLASSES[:2]
+"""LoDNN's classes; the ground under a vehicle is background."""
+
+TOP_VIEW = TopViewGeometry()
+RANGE_IMAGE = RangeImageGeometry(get_sensor("hdl-64e").elevations_deg)
+# SSADNet 2.1.2 scales every channel to its range; the farthest corner of the view is 47.07 m away.
+TOP_VIEW_INPUT = InputSpec("top_view", ("distance", "remission", "height"), (0.0, 0.0, -2.5), (47.07, 1.0, 5.0))
+# Means and standard deviations of the returns in the front 90 degrees of 27 training scans.
+RANGE_IMAGE_INPUT = InputSpec(
+    "range_image",
+    ("x", "y", "z", "remission", "range"),
+    (12.95, 0.0, -1.31, 0.234, 14.51),
+    (11.35, 7.86, 0.82, 0.148, 12.27),
+)
+# With the height above the ground: mean and standard deviation of 718,139 returns ahead in 26 training scans.
+HEIGHT_INPUT = InputSpec(
+    "range_image",
+    (*RANGE_IMAGE_INPUT.channels, "height_above_ground"),
+    (*RANGE_IMAGE_INPUT.mean, 0.41),
+    (*RANGE_IMAGE_INPUT.std, 0.72),
+)
+
+# Means and standard deviations of the 367 training images.
+CAMERA_INPUT = InputSpec("image", ("red", "green", "blue"), (105.0, 108.5, 110.3), (78.3, 79.4, 78.3))
+# The comparison of networks on CamVid divides by 255 (Jebamikyous, 2021, section 4.2).
+PLAIN_CAMERA_INPUT = InputSpec("image", ("red", "green", "blue"), (0.0, 0.0, 0.0), (255.0, 255.0, 255.0))
+
+
+def card_of(recipe: Recipe, **facts: Any) -> ModelCard:
+    """The card of a recipe's network; ``facts`` are further arguments of `ModelCard`, at least ``version``."""
+    facts = {"name": recipe.network, **facts}
+    task = recipe.task
+    block = EDGE_BLOCKS.get(recipe.network, (1, 1)) if recipe.edge else (1, 1)
+    if task == "camera":
+        return ModelCard(
+            view=CameraGeometry(recipe.image_width, recipe.image_height),
+            input=CAMERA_INPUT if recipe.network == "camseg" else PLAIN_CAMERA_INPUT,
+            outputs=(OutputSpec("logits", "camera_logits"),),
+            classes=CAMERA_CLASSES,
+            **facts,
+        )
+    if task == "points":
+        return ModelCard(
+            view=RANGE_IMAGE,
+            input=HEIGHT_INPUT if recipe.height_above_ground else RANGE_IMAGE_INPUT,
+            outputs=(OutputSpec("logits", "class_logits", block=block),),
+            classes=recipe.classes or POINT_CLASSES,
+            **facts,
+        )
+    if task == "road":
+        outputs = (OutputSpec("segmentation", "class_logits"),)
+        return ModelCard(view=TOP_VIEW, input=TOP_VIEW_INPUT, outputs=outputs, classes=ROAD_CLASSES, **facts)
+    boxes = OutputSpec("boxes", "box_dense" if recipe.head == "dense" else "box_slots", recipe.front)
+    return ModelCard(
+        view=TOP_VIEW,
+        input=TOP_VIEW_INPUT,
+        outputs=(OutputSpec("segmentation", "class_logits", block=block), boxes),
+        classes=TOP_VIEW_CLASSES,
+        box_classes=("car", "van", "truck"),
+        # Length, width, height: geometric means, and standard deviations of the logarithms, of 28,963 labels of KITTI
+        # without test drives.
+        box_size_priors={"car": (3.86, 1.63, 1.52), "van": (5.0, 1.9, 2.18), "truck": (10.02, 2.58, 3.2)},
+        box_size_spreads={"car": (0.11, 0.06, 0.084), "van": (0.164, 0.087, 0.143), "truck": (0.291, 0.09, 0.144)},
+        **facts,
+    )

@@ -1,0 +1,344 @@
+"""Writes models/MODELS.md from the cards, and from validation.json, ablation.json and folds.json beside them."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from edgeperc.datasets.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES
+from edgeperc.evaluation.tables import BANDS
+from edgeperc.types.card import CameraGeometry, ModelCard, TopViewGeometry
+from edgeperc.zoo import DEFAULT, MAX_LOSS, Variant, digest, resolve
+
+from ..recipe import Recipe
+
+__all__ = ["models_page"]
+
+NO_AGREEMENT = "--no-agreement"
+
+TASKS = {
+    "camera": "a class for every pixel of an image",
+    "range_image": "a class for every point",
+    "top_view": "drivable area and vehicles ahead",
+}
+SOURCES = {"real": "real", "semantickitti": "SemanticKITTI", "simulated": "simulated"}
+ALL_RANGES = ("all",)
+
+
+def models_page(folder: Path) -> str:
+    """The page (Markdown) for the models of a folder, which are shipped, and of its ``research``, which are not."""
+    shipped, research = (
+        sorted((variant for path in sorted(of.glob("*.onnx")) for variant in resolve(path)), key=str)
+        for of in (folder, folder / "research")
+    )
+    lines = [
+        "# Models",
+        "",
+        *_prose(
+            "Written by `edgeperc-export models models` from the cards in the files. `edgeperc info NAME` prints a "
+            "card; `edgeperc-export make NAME OUT --kitti KITTI --layouts KITTI_LABELS` trains a model again."
+        ),
+        "",
+        *_shipped(shipped),
+        *_precisions(shipped),
+        *_free(research),
+        *_validation(folder / "validation.json"),
+        "",
+        "## Figures of the shipped models",
+        "",
+        *_prose(
+            f"Figures of scans are on the test drives ({', '.join(sorted(TEST_DRIVES))}), on which nothing was trained "
+            "or chosen, and on simulated scans. All figures are percentages. In brackets: 95 % bootstrap intervals "
+            "over drives (over scenes for simulation), if two or more have the class. Do not average tables of real "
+            "and simulated scans. The figures are of each network alone, before the agreement of points, boxes and "
+            "cells. Simulated scans are of the streets at the time of the model's export. AP of boxes below still "
+            "counts true boxes as missed whose center lies where nothing is labeled: 1 of 57 on the test drives."
+        ),
+    ]
+    for variant in shipped:
+        fp32 = variant.precision == "fp32"
+        lines += ["", *_model(variant), *_figures_of(variant.card, tuple(BANDS) if fp32 else ALL_RANGES)]
+    lines += [
+        "",
+        "## Research models",
+        "",
+        *_prose(
+            "Teachers of the shipped models, the papers' own networks, and models trained on simulation alone. They "
+            "are in the repository and the source distribution, not in the wheel; use one by its path, `--model "
+            "models/research/NAME.onnx`."
+        ),
+    ]
+    for variant in research:
+        lines += ["", *_model(variant), *_figures_of(variant.card, ALL_RANGES)]
+    lines += _folds(_read(folder / "folds.json"))
+    lines += _ablations(_read(folder / "ablation.json"))
+    return "\n".join(lines) + "\n"
+
+
+def _read(path: Path) -> Any:
+    return json.loads(path.read_text()) if path.exists() else []
+
+
+def _prose(text: str) -> list[str]:
+    return textwrap.wrap(text, 116, break_long_words=False, break_on_hyphens=False)
+
+
+def _size(variant: Variant) -> str:
+    return f"{variant.path.stat().st_size / 1e6:.1f} MB"
+
+
+def _shipped(variants: Sequence[Variant]) -> Iterable[str]:
+    yield from _prose(
+        "A name stands for one network and its variants. `Perceiver()` and `edgeperc run PATH` take "
+        f"{' and '.join(f'`{name}`' for name in DEFAULT)}. `NAME:fp32` and `NAME:int8` ask for one variant."
+    )
+    yield from _head("name", ["task", "classes", "view", "files", "terms of the weights"])
+    for name in dict.fromkeys(variant.name for variant in variants):
+        own = [variant for variant in variants if variant.name == name]
+        card = own[0].card
+        task = "drivable area ahead" if not card.box_classes and card.view.kind == "top_view" else TASKS[card.view.kind]
+        files = ", ".join(f"{variant.precision} {_size(variant)}" for variant in own)
+        yield _row(f"`{name}`", task, ", ".join(card.classes), _view(card), files, card.training.get("licence", "-"))
+
+
+def _view(card: ModelCard) -> str:
+    view = card.view
+    if isinstance(view, TopViewGeometry):
+        (near, far), (right, left) = view.x_range_m, view.y_range_m
+        ranges = f"x {near:g} to {far:g} m, y {right:g} to {left:g} m"
+        return f"{view.height} x {view.width} cells of {view.cell_m:g} m, {ranges}"
+    if isinstance(view, CameraGeometry):
+        return f"{view.height} x {view.width} pixels, images are {view.fit}ed to it"
+    return (
+        f"{view.height} x {view.width} pixels, azimuth {view.azimuth_left_deg:g} to {view.azimuth_right_deg:g} degrees"
+    )
+
+
+def _precisions(variants: Sequence[Variant]) -> Iterable[str]:
+    yield from ("", "## Precision", "")
+    yield from _prose(
+        "Agreement of each precision with fp32, after post-processing, on labeled real scans or images. "
+        "`precision=auto` takes a reduced precision only if its loss (of mean IoU or of AP, whichever is larger) is "
+        f"at most {MAX_LOSS} points and the processor has instructions for it: int8 on the CPU provider and OpenVINO "
+        "(VNNI, AMX, or Arm's dot product), bf16 on OpenVINO (AMX or AVX-512). `precision=fp32` forbids it. "
+        "`perception.providers` shows what ran."
+    )
+    yield from _head("model", ["equal labels", "mean IoU", "fp32", "AP50", "fp32", "loss", "scans", "measured with"])
+    for variant in variants:
+        for precision, record in variant.card.precisions.items():
+            if precision != "fp32":
+                yield _row(
+                    *(f"{variant.name} {precision}", f"{100 * record['label_agreement']:.2f}"),
+                    *(_share(record[key], 2) for key in ("mean_iou", "fp32_mean_iou", "ap", "fp32_ap")),
+                    *(f"{record['loss']:.2f}", record["n_scans"], record["by"]),
+                )
+    commands = sorted({record["command"] for v in variants for record in v.card.precisions.values()})
+    yield ""
+    yield from _prose(
+        "Mean IoU is of points without background, of vehicles and road, or of the eleven classes of images. Made by "
+        f"{', '.join(f'`{command}`' for command in commands)}. Scans of SemanticKITTI are of a test drive; they serve "
+        "here only to compare precisions of one network."
+    )
+
+
+def _free(research: Sequence[Variant]) -> Iterable[str]:
+    free = [variant for variant in research if "KITTI" not in variant.card.training.get("licence", "")]
+    if not free:
+        return
+    options = " ".join(f"--model models/research/{variant.path.name}" for variant in reversed(free))
+    yield from ("", "## Weights free of KITTI's terms", "")
+    yield from _prose(
+        "The shipped models were trained on KITTI's scans, whose terms exclude commercial use. For commercial use "
+        "take the models that were trained on simulation alone, from the repository or the source distribution:"
+    )
+    yield from ("", f"    edgeperc run PATH {options}", "")
+    size = sum(variant.path.stat().st_size for variant in free) / 1e6
+    yield from _prose(
+        f"They are less accurate ({', '.join(variant.name for variant in free)} below). The wheel "
+        f"leaves out their {size:.1f} MB."
+    )
+
+
+def _validation(path: Path) -> Iterable[str]:
+    table = _read(path)
+    if not table:
+        return
+    rows = table["rows"]
+    yield from ("", "## How the shipped models were chosen", "")
+    yield from _prose(
+        f"Each name belongs to the network that is most accurate on {rows[0]['n_scans']} scans of "
+        f"{len(VALIDATION_DRIVES)} validation drives. These drives are neither training nor test drives "
+        "(`edgeperc/datasets/splits.py`). If two networks are equally accurate, the faster one is chosen. 107 of "
+        "the scans are of one drive, 2011_09_26_drive_0001, with 12 cars, 2 cyclists and 1 tram, so the intervals over "
+        "drives are wide. The drives' boxes, but not their scans, are among the layouts of the simulated training "
+        "scenes. Relative time: time of the network alone in stock onnxruntime with two threads, divided by the time "
+        "of the shipped fp32 file. Both were measured in turn on a busy computer (`bench/RESULTS.md` has times)."
+    )
+    for title, key, columns in (
+        ("points", "points", ("car", "pedestrian", "cyclist")),
+        ("vehicles", "vehicles", ("ap", "precision", "recall", "iou")),
+    ):
+        own = [row for row in rows if key in row]
+        if key == "points":
+            head = [f"IoU {name}" for name in columns]
+            counts = [f"{own[0][key][c]['n_points']:,} points of {own[0][key][c]['n_objects']} {c}s" for c in columns]
+        else:
+            head = ["AP50", "precision", "recall", "IoU of cells"]
+            counts = [f"{own[0][key]['n_boxes']} boxes", f"{own[0][key]['n_cells']:,} cells"]
+        yield from _head(f"{title} ({', '.join(counts)})", [*head, "relative time"])
+        for row in own:
+            if key == "points":
+                cells = [_percent(row[key][name], "iou") for name in columns]
+            else:
+                cells = [_percent(row[key], name) for name in columns]
+            yield _row(f"`{row['file']}`", *cells, f"{row['relative_time']:.1f}")
+    yield from ("", f"Made by `{_alone(table['command'])}`.")
+
+
+def _model(variant: Variant) -> Iterable[str]:
+    card, training = variant.card, variant.card.training
+    yield f"### {variant} {card.version}"
+    yield ""
+    yield f"- {_size(variant)}, SHA-256 `{digest([variant])}`"
+    yield f"- Input: {_view(card)}; channels {', '.join(card.input.channels)}. Outputs: " + ", ".join(
+        f"{output.name} ({output.kind})" for output in card.outputs
+    )
+    if "quantized" in training:
+        quantized = training["quantized"]
+        yield (
+            f"- Quantized from {quantized['from']} (fp32), calibrated on {quantized['calibration']}, weights of "
+            f"{quantized['weight_bits']} bits, {len(quantized['left_alone'])} convolutions in fp32"
+        )
+    else:
+        yield f"- Trained on {training.get('data', 'unknown data')}: {_recipe(training.get('recipe', {}))}"
+        for before in training.get("started_from", []):
+            yield f"- Started from: {_recipe(before)}"
+    yield f"- Terms of the weights: {training.get('licence', 'unknown')}"
+    yield f"- Parity with {'fp32' if 'quantized' in training else 'torch'}: {_flat(card.parity)}"
+
+
+def _recipe(recipe: Mapping[str, Any]) -> str:
+    """The options that differ from the defaults of `Recipe`."""
+    usual = {field.name: field.default for field in fields(Recipe)}
+    own = {name: tuple(value) if isinstance(value, list) else value for name, value in recipe.items()}
+    return _flat({name: value for name, value in own.items() if name not in usual or value != usual[name]})
+
+
+def _alone(command: str) -> str:
+    """The command for a network alone; earlier exports were evaluated before there was an agreement."""
+    return command if NO_AGREEMENT in command else f"{command} {NO_AGREEMENT}"
+
+
+def _figures_of(card: ModelCard, bands: Sequence[str]) -> Iterable[str]:
+    if "images" in card.metrics:
+        yield f"- Figures made by `{card.metrics['command']}`"
+        yield from _image_figures(card.metrics["images"])
+    elif "command" in card.metrics:
+        yield f"- Figures made by `{_alone(card.metrics['command'])}`"
+    for source, title in SOURCES.items():
+        if source in card.metrics:
+            of = card.metrics[source]
+            yield from _figures(of, f"{of['n_frames']} {title} scans", bands if source != "simulated" else ALL_RANGES)
+
+
+def _image_figures(figures: Mapping[str, Any]) -> Iterable[str]:
+    n_images = max(row["n_images"] for row in figures["classes"].values())
+    head = ["precision", "recall", "IoU", "pixels"]
+    yield from _head(f"pixels, {n_images} validation images, intervals over images", head)
+    yield _row("all, mean", "-", "-", _percent(figures["all"], "mean_iou"), f"{figures['all']['n_pixels']:,}")
+    for name, row in figures["classes"].items():
+        rates = [_percent(row, key) for key in ("precision", "recall", "iou")]
+        yield _row(name, *rates, f"{row['n_pixels']:,}")
+
+
+def _figures(figures: Mapping[str, Any], scans: str, bands: Sequence[str]) -> Iterable[str]:
+    if "points" in figures:
+        yield from _head(f"points, {scans}", ["range", "precision", "recall", "IoU", "points", "objects"])
+        for band, rows in _by_band(figures["points"], bands):
+            for name, row in rows.items():
+                rates = [_percent(row, key) for key in ("precision", "recall", "iou")]
+                yield _row(name, band, *rates, f"{row['n_points']:,}", row.get("n_objects") or "-")
+    for kind, of_kind in figures.get("boxes", {}).items():
+        head = ["range", "AP50", "precision", "recall", "mIoU@0.5", "mIoU@0.7", "boxes"]
+        yield from _head(f"{kind} boxes, {scans}", head)
+        for band, rows in _by_band(of_kind, bands):
+            yield _row("mean of classes (mAP50)", band, _percent(rows, "mean_ap"), *["-"] * 5)
+            for name, row in rows.items():
+                if isinstance(row, Mapping):
+                    keys = ("ap", "precision", "recall", "mean_iou_50", "mean_iou_70")
+                    yield _row(name, band, *(_percent(row, key) for key in keys), row["n_truth"])
+    for table, of_table in figures.get("segmentation", {}).items():
+        classes = list(next(iter(of_table.values()))["iou"])
+        yield from _head(
+            f"segmentation, {table}, {scans}", ["ACC", "mAP", "mIoU", *(f"IoU {c}" for c in classes), "cells"]
+        )
+        for band, row in _by_band(of_table, bands):
+            rates = [_percent(row, key) for key in ("accuracy", "mean_ap", "mean_iou")]
+            yield _row(band, *rates, *(_share(row["iou"][c]) for c in classes), f"{row['n_cells']:,}")
+    if "road" in figures:
+        yield from _head(f"road, {scans}", ["F1", "best F1", "AP", "ACC", "PRE", "REC", "IoU", "cells"])
+        for band, row in _by_band(figures["road"], bands):
+            rates = [_percent(row, k) for k in ("f1", "max_f1", "ap", "accuracy", "precision", "recall", "iou")]
+            yield _row(band, *rates, f"{row['n_cells']:,}")
+
+
+def _by_band(rows: Mapping[str, Any], bands: Sequence[str]) -> Iterable[tuple[str, Any]]:
+    """Rows in the order of the bands; a card sorts its keys."""
+    return ((band, rows[band]) for band in BANDS if band in rows and band in bands)
+
+
+def _folds(rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
+    """Figures on one fold of models that were trained without it."""
+    if not rows:
+        return
+    yield from ("", "## Cross-validation", "")
+    yield from _prose(
+        f"Each model was trained without one of the {len(FOLDS)} folds of the training drives, by `edgeperc-export "
+        "make NAME OUT --fold K --steps N`, and evaluated on frames of grade A of that fold. It had fewer steps and "
+        "fewer drives than the model of the same name."
+    )
+    for row in rows:
+        made = f"{row['name']} without fold {row['fold']}, {row['steps']} steps of {row['batch']}"
+        yield from _figures(row["real"], f"{made}, {row['real']['n_frames']} real scans", ALL_RANGES)
+
+
+def _ablations(rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
+    if not rows:
+        return
+    yield from ("", "## Ablations", "")
+    yield from _prose(
+        "Short runs from the weights trained on simulation alone (LoDNN: from scratch), each with one change, "
+        "evaluated on a fold outside its training set (`edgeperc-export ablate`): IoU of pixel labels, and AP50 of "
+        "all vehicles as one class."
+    )
+    for network, fold, steps in sorted({(r["network"], r["fold"], r["steps"]) for r in rows}):
+        here = [r for r in rows if (r["network"], r["fold"], r["steps"]) == (network, fold, steps)]
+        names = list(here[0]["figures"])
+        yield from _head(f"{network}, fold {fold}, {steps} steps", names)
+        for row in here:
+            yield _row(row["variant"], *(_share(row["figures"].get(name)) for name in names))
+
+
+def _head(first: str, rest: Sequence[str]) -> Iterable[str]:
+    yield from ("", _row(first, *rest), "|---" * (1 + len(rest)) + "|")
+
+
+def _row(*cells: object) -> str:
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def _share(value: float | None, digits: int = 1) -> str:
+    return "-" if value is None else f"{100.0 * value:.{digits}f}"
+
+
+def _percent(row: Mapping[str, Any], key: str) -> str:
+    interval = row.get(f"{key}_interval")
+    return _share(row[key]) + ("" if interval is None else f" ({' to '.join(map(_share, interval))})")
+
+
+def _flat(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())

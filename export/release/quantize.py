@@ -1,0 +1,698 @@
+"""The int8 variant of a model: written only if it is faster on this computer and as accurate.
+
+Weights become int8 per channel, activations uint8. Of the pairs that onnxruntime's CPU provider supports, u8s8 has the
+fast kernels (u8u8 took twice as long). Nearly all of the noise is of activations: with ssadnet's inner convolutions in
+int8 it is 32 dB below the outputs, with weights alone 44 dB. The range of a tensor is the one that makes least noise,
+clipping included; clipping one value in ten thousand instead gives 29 dB. The first and last convolutions stay in fp32,
+and also those that make most noise for the time they take.
+
+A top view is mostly empty, and all its empty cells have the same values, so rounding shifts them all in the same
+direction. Where the noise is above the limit, the bias of each convolution is corrected by the mean shift (Nagel et
+al., "Data-Free Quantization Through Weight Equalization and Bias Correction", 2019, section 4.2), and the channels of a
+tensor get the same size before (`equalize`). Together they lower ssadnet's noise from 29 to 34 dB with all inner
+convolutions in int8.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import re
+import tempfile
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+from numpy.typing import NDArray
+from onnxruntime.quantization import CalibrationMethod, QDQQuantizer, QuantType
+from onnxruntime.quantization.calibrate import TensorsData
+from tqdm import tqdm
+
+from edgeperc.datasets.kitti import SEQUENCE_DRIVES, KittiObjects, SemanticKitti, scan_hash
+from edgeperc.datasets.splits import in_split
+from edgeperc.errors import EdgepercError, ModelError, OptionError, PointsError, SplitError
+from edgeperc.evaluation.camvid import LabeledImages, evaluate_images, image_hash
+from edgeperc.evaluation.evaluate import evaluate
+from edgeperc.evaluation.judge import Judge
+from edgeperc.evaluation.tables import Record
+from edgeperc.evaluation.tables import figures as figures_of
+from edgeperc.evaluation.truth import Truth
+from edgeperc.inference.session import Session
+from edgeperc.readers.files import read_points
+from edgeperc.simulation import samples
+from edgeperc.simulation.samples import simulated_scan
+from edgeperc.system.machine import cpu_features
+from edgeperc.types.card import ModelCard
+from edgeperc.zoo import INT8_FEATURES
+
+from ..data.simulate import parity_images, parity_scans
+from .int8_graph import equalize, repeat_pixels
+from .to_onnx import pixel_labels, views, with_golden, write_card
+
+__all__ = ["RefusedError", "calibration_images", "calibration_scans", "quantize"]
+
+# Operators that onnxruntime's CPU provider computes in int8. It has no int8 kernel for ConvTranspose, Elu or Equal.
+ROUNDED_OPS = (
+    *("Add", "Concat", "Conv", "DepthToSpace", "MaxPool", "Mul", "Relu", "Reshape", "Resize", "Sigmoid", "Transpose"),
+)
+FIRST_SEED = 3 * 10**9  # seeds of training start at 0, of parity scans at 10**9, of evaluation at 2 * 10**9
+N_PROBES = 8
+# Powers of the channels' sizes that are made equal before the shift is corrected; None: neither. The first that keeps
+# the noise below the limit is taken, else the one with least noise.
+STRENGTHS = (None, 0.0, 0.5, 1.0)
+N_IMAGES = 64
+# Limit of `_noise`, 33 dB below the outputs of the probes. ssadnet has 4.4e-4 with all inner convolutions in int8, and
+# loses 1 of 255 boxes on the validation drives.
+MAX_NOISE = 5e-4
+# A loss counts if it is larger than this, and if its 95 % interval over drives is above 0. One lost box of 255 on the
+# validation drives changes F1 by 0.002; eleven-point AP changes by 0.09 where it costs the last level of recall.
+MAX_LOSS = 0.01
+N_RESAMPLES = 200
+CLIPPED_TO = tuple(np.geomspace(0.02, 1.0, 48).tolist())  # shares of the largest value that are tried as a range
+BIN_BITS = 13  # of a float32: sign, exponent and four bits of the mantissa
+N_RUNS = 40
+DRIVE = re.compile(r"\d{4}_\d\d_\d\d_drive_\d{4}")
+
+Race = Callable[[Path, Path, "int | None"], tuple[NDArray[np.float64], NDArray[np.float64]]]
+
+
+class RefusedError(EdgepercError):
+    """The int8 model is not faster on this computer, or less accurate; nothing was written."""
+
+
+def calibration_scans(
+    paths: Sequence[Path] = (), *, kitti: Path | None = None, n_simulated: int = 0
+) -> tuple[list[NDArray[np.float32]], list[str]]:
+    """Scans to calibrate on, and the hashes of the real ones.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Scans, or folders of ``.bin`` files.
+    kitti : Path or None
+        Root of a KITTI object set; 64 scans of its training drives are taken, evenly spread.
+    n_simulated : int
+        Number of simulated scans.
+
+    Returns
+    -------
+    scans : list of (n, 4) float32
+        The real scans first.
+    hashes : list of str
+        `edgeperc.datasets.kitti.scan_hash` of each real scan.
+
+    Raises
+    ------
+    SplitError
+        A scan is of a test or validation drive, according to its folders or the ``frames.csv`` above it.
+    PointsError
+        No scan was found.
+    """
+    files = [file for path in paths for file in (sorted(path.rglob("*.bin")) if path.is_dir() else [path])]
+    for file in files:
+        drive = _drive(file)
+        if drive is not None and not in_split(drive, "train"):
+            raise SplitError(f"{file} is of drive {drive}, which is kept for evaluation; calibrate on other drives")
+    real = [read_points(file) for file in files]
+    if kitti is not None:
+        objects = KittiObjects(kitti)
+        names = objects.names("train", grades="AB")
+        real += [objects.frame(name).points for name in names[:: max(1, len(names) // 64)][:64]]
+    scans = [*real, *(simulated_scan(FIRST_SEED + k).points for k in range(n_simulated))]
+    if not scans:
+        asked = f"{len(paths)} paths, KITTI root {kitti}, {n_simulated} simulated scans"
+        raise PointsError(f"no scan to calibrate on in {asked}; name scans, a root with training drives, or simulate")
+    return scans, [scan_hash(points) for points in real]
+
+
+def calibration_images(camvid: Path) -> tuple[list[NDArray[np.uint8]], list[str]]:
+    """64 training images of CamVid, evenly spread, and their `edgeperc.evaluation.camvid.image_hash`."""
+    data = LabeledImages(camvid)
+    files = data.files("train")
+    images = [data.read(file)[0] for file in files[:: max(1, len(files) // N_IMAGES)][:N_IMAGES]]
+    return images, [image_hash(image) for image in images]
+
+
+def _drive(file: Path) -> str | None:
+    """The KITTI drive of a scan; None if its folders do not show it."""
+    file = file.resolve()
+    if named := DRIVE.search(str(file)):
+        return named[0]
+    if file.parent.parent.parent.name == "sequences":
+        return SEQUENCE_DRIVES.get(file.parent.parent.name)
+    root = file.parent.parent.parent
+    return KittiObjects(root).drives.get(file.stem) if (root / "frames.csv").exists() else None
+
+
+def _saturates() -> bool:
+    """Whether this computer adds pairs of 8-bit products in 16 bits, which may saturate: x86 without VNNI."""
+    return platform.machine() in ("x86_64", "AMD64") and INT8_FEATURES.isdisjoint(cpu_features())
+
+
+def _folded(path: Path) -> onnx.ModelProto:
+    """The graph with folded constants (half-precision weights become fp32), and a name for every node."""
+    with tempfile.TemporaryDirectory() as folder:
+        options = onnxruntime.SessionOptions()
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+        options.optimized_model_filepath = f"{folder}/folded.onnx"
+        options.log_severity_level = 3
+        onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+        model = onnx.load(options.optimized_model_filepath)
+    for k, node in enumerate(model.graph.node):
+        node.name = node.name or f"node_{k}"
+    used = {node.domain for node in model.graph.node}
+    kept = [entry for entry in model.opset_import if entry.domain in used]
+    del model.opset_import[:]
+    model.opset_import.extend(kept)
+    return onnx.shape_inference.infer_shapes(model)
+
+
+@dataclass(frozen=True)
+class _Calibrated:
+    """A network in fp32, the range of each of its tensors, and its outputs for some images.
+
+    ``means`` are those of the convolutions whose shift is corrected.
+    """
+
+    card: ModelCard
+    model: onnx.ModelProto
+    ranges: TensorsData
+    images: Sequence[NDArray[np.float32]]
+    means: Mapping[str, NDArray[np.float64]]
+    probes: Sequence[NDArray[np.float32]]
+    outputs: Sequence[Mapping[str, NDArray[np.float32]]]
+    seven_bits: bool
+
+    @classmethod
+    def on(
+        cls,
+        path: Path,
+        card: ModelCard,
+        scans: Sequence[NDArray[Any]],
+        seven_bits: bool = False,
+        strength: float | None = None,
+    ) -> _Calibrated:
+        """Calibrate the model of a file on scans, or images, with one of `STRENGTHS`."""
+        model, images = _folded(path), [image[None] for image, _ in views(card, scans)]
+        probes = images[:: max(1, len(images) // N_PROBES)][:N_PROBES]
+        outputs = _outputs(model, card, probes)
+        names = [name for node in model.graph.node for name in node.output if name]
+        if strength:
+            sizes = {name: np.zeros(1) for name in names}
+            for tensors in _tensors(model, card, images, names):
+                sizes |= {name: np.maximum(sizes[name], _by_channel(abs(v)).max(1)) for name, v in tensors.items()}
+            equalize(model, {name: size**strength for name, size in sizes.items()})
+        made = [node.output[0] for node in model.graph.node if node.op_type == "Conv"]
+        means = {} if strength is None else _means(model, card, images, made)
+        return cls(card, model, _ranges(model, card, images), images, means, probes, outputs, seven_bits)
+
+    def rounded(self, convolutions: Collection[str]) -> onnx.ModelProto:
+        """The network with these convolutions, and the operators between them, in int8."""
+        model = onnx.ModelProto()
+        model.CopyFrom(self.model)
+        biases = {each.name: each for each in model.graph.initializer}
+        corrected = [node for node in model.graph.node if node.name in convolutions and node.output[0] in self.means]
+        for node in [node for node in corrected if len(node.input) > 2]:
+            rounded = self._rounded(model, convolutions)
+            (made,) = (each.output[0] for each in rounded.graph.node if each.name == node.name)
+            shift = _means(rounded, self.card, self.images, [made])[made] - self.means[node.output[0]]
+            bias = biases[node.input[2]]
+            values = onnx.numpy_helper.to_array(bias)
+            bias.CopyFrom(onnx.numpy_helper.from_array((values - shift).astype(values.dtype), bias.name))
+        rounded = self._rounded(model, convolutions)
+        repeat_pixels(rounded)
+        return rounded
+
+    def _rounded(self, fp32: onnx.ModelProto, convolutions: Collection[str]) -> onnx.ModelProto:
+        names = _between(fp32.graph, convolutions)
+        model = onnx.ModelProto()
+        model.CopyFrom(fp32)
+        if not names:
+            return model
+        quantizer = QDQQuantizer(
+            model,
+            True,
+            self.seven_bits,
+            QuantType.QInt8,
+            QuantType.QUInt8,
+            self.ranges,
+            [*names],
+            [],
+            [*ROUNDED_OPS],
+            {},
+        )
+        quantizer.quantize_model()
+        rounded: onnx.ModelProto = quantizer.model.model
+        _unround(rounded.graph, names)
+        return rounded
+
+    def noise(self, convolutions: Collection[str]) -> float:
+        """`_noise` of the outputs if these convolutions are in int8."""
+        return _noise(_outputs(self.rounded(convolutions), self.card, self.probes), self.outputs)
+
+
+def _ranges(model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]]) -> TensorsData:
+    """The range of every tensor of a network, from a histogram of its values over all images."""
+    names = [card.input.name, *(name for node in model.graph.node for name in node.output if name)]
+    counts = {name: np.zeros(1 << BIN_BITS, np.int64) for name in names}
+    for tensors in tqdm(_tensors(model, card, images, names), desc="calibrating", total=len(images), unit="scan"):
+        for name, values in tensors.items():
+            if values.dtype == np.float32:
+                bins = np.ascontiguousarray(values).view(np.uint32).ravel() >> (32 - BIN_BITS)
+                counts[name] += np.bincount(bins, minlength=1 << BIN_BITS)
+    ranges = {name: _range(count) for name, count in counts.items()}
+    data = {name: tuple(np.array(bound, np.float32) for bound in bounds) for name, bounds in ranges.items()}
+    return TensorsData(CalibrationMethod.MinMax, data)
+
+
+def _tensors(
+    model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]], names: Sequence[str]
+) -> Iterator[dict[str, NDArray[Any]]]:
+    """Inner tensors of a network by their names, for one image after the other."""
+    augmented = onnx.ModelProto()
+    augmented.CopyFrom(model)
+    known = {each.name for each in (*model.graph.input, *model.graph.output)}
+    augmented.graph.output.extend(onnx.helper.make_empty_tensor_value_info(name) for name in names if name not in known)
+    session = _session(augmented)
+    inner = [name for name in names if name != card.input.name]
+    for image in images:
+        own = {card.input.name: image} if len(inner) < len(names) else {}
+        yield own | dict(zip(inner, session.run(inner, {card.input.name: image}), strict=True))
+
+
+def _by_channel(values: NDArray[Any]) -> NDArray[Any]:
+    """The values of a tensor (1, C, ...) as (C, n)."""
+    return values.reshape(values.shape[1], -1) if values.ndim > 1 else values.reshape(1, -1)
+
+
+def _means(
+    model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]], names: Sequence[str]
+) -> dict[str, NDArray[np.float64]]:
+    """Mean of each channel of some tensors (1, C, ...) over all images."""
+    sums: dict[str, NDArray[np.float64]] = {}
+    for tensors in _tensors(model, card, images, names):
+        for name, values in tensors.items():
+            sums[name] = sums.get(name, 0.0) + _by_channel(values).mean(axis=1, dtype=np.float64) / len(images)
+    return sums
+
+
+def _range(counts: NDArray[np.int64]) -> tuple[float, float]:
+    """The range that makes least noise in 8 bits: squares of what is clipped, and of what is rounded inside."""
+    taken = np.flatnonzero(counts)
+    middle = (taken.astype(np.uint32) << np.uint32(32 - BIN_BITS)) + np.uint32(1 << (31 - BIN_BITS))
+    values, weights = middle.view(np.float32).astype(np.float64), counts[taken]
+    usual = np.isfinite(values) & (np.abs(values) > 1e-30)  # the rest are zeros
+    values, weights = values[usual], weights[usual]
+    least, most = min(values.min(initial=0.0), 0.0), max(values.max(initial=0.0), 0.0)
+    best, chosen = np.inf, (least, most)
+    for low in np.multiply(least, CLIPPED_TO if least < 0.0 else (1.0,)):
+        for high in np.multiply(most, CLIPPED_TO if most > 0.0 else (1.0,)):
+            step = (high - low) / 255.0
+            clipped = np.maximum(values - high, 0.0) + np.maximum(low - values, 0.0)
+            noise = float(weights @ np.where(clipped > 0.0, clipped**2, np.minimum(values**2, step**2 / 12.0)))
+            if noise < best:
+                best, chosen = noise, (float(low), float(high))
+    return chosen
+
+
+def _between(graph: onnx.GraphProto, convolutions: Collection[str]) -> set[str]:
+    """The convolutions, and the operators whose inputs all come from rounded operators."""
+    constants = {"", *(weight.name for weight in graph.initializer)}
+    names: set[str] = set()
+    tensors: set[str] = set()
+    for node in graph.node:
+        inner = node.op_type in ROUNDED_OPS and node.op_type != "Conv"
+        if node.name in convolutions or (inner and set(node.input) - constants <= tensors):
+            names.add(node.name)
+            tensors |= {*node.output}
+    return names
+
+
+def _unround(graph: onnx.GraphProto, rounded: Collection[str]) -> None:
+    """Connect operators in fp32 directly to outputs in fp32, without rounding in between.
+
+    SSADNet's unpooling compares a tensor with its maxima. With one side rounded, few values would be equal.
+    """
+    maker = {output: node for node in graph.node for output in node.output}
+    origin = {}
+    for node in graph.node:
+        if node.op_type == "DequantizeLinear" and (quantize := maker.get(node.input[0])) is not None:
+            made_by = maker.get(quantize.input[0])
+            if made_by is None or made_by.name not in rounded:
+                origin[node.output[0]] = quantize.input[0]
+    for node in graph.node:
+        if node.name not in rounded and node.op_type not in ("QuantizeLinear", "DequantizeLinear"):
+            node.input[:] = [origin.get(name, name) for name in node.input]
+
+
+def _session(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+
+
+def _outputs(
+    model: onnx.ModelProto, card: ModelCard, images: Sequence[NDArray[np.float32]]
+) -> list[dict[str, NDArray[np.float32]]]:
+    """Raw outputs by kind, without the batch axis."""
+    session = _session(model)
+    names, kinds = [o.name for o in card.outputs], [o.kind for o in card.outputs]
+    runs = (session.run(names, {card.input.name: image}) for image in images)
+    return [{kind: output[0] for kind, output in zip(kinds, run, strict=True)} for run in runs]
+
+
+def _noise(
+    outputs: Sequence[Mapping[str, NDArray[np.float32]]], expected: Sequence[Mapping[str, NDArray[np.float32]]]
+) -> float:
+    """Squared error as a share of the squares, of the output where it is largest.
+
+    It hardly depends on single labels or boxes, so that a few scans are enough to compare convolutions.
+    """
+    shares = []
+    for kind in expected[0]:
+        pairs = [(one[kind].astype(np.float64), other[kind]) for one, other in zip(expected, outputs, strict=True)]
+        error = sum(float(((right - own) ** 2).sum()) for right, own in pairs)
+        shares.append(error / max(sum(float((right**2).sum()) for right, _ in pairs), 1e-30))
+    return max(shares)
+
+
+def _candidates(graph: onnx.GraphProto, exclude: Collection[str]) -> list[str]:
+    """Convolutions that may be rounded: not excluded, not the first after an input or the last before an output."""
+    unknown = set(exclude) - {node.name for node in graph.node}
+    if unknown:
+        raise OptionError(f"no node is called {', '.join(sorted(unknown))}; expected names of the graph's nodes")
+    inputs, maker = {i.name for i in graph.input}, {output: node for node in graph.node for output in node.output}
+    last, pending = set(), [o.name for o in graph.output]
+    while pending:
+        node = maker.get(pending.pop())
+        if node is not None and node.op_type == "Conv":
+            last.add(node.name)
+        elif node is not None:
+            pending += node.input
+    convolutions = [node for node in graph.node if node.op_type == "Conv" and node.name not in last | set(exclude)]
+    return [node.name for node in convolutions if node.input[0] not in inputs]
+
+
+def _multiplications(model: onnx.ModelProto) -> dict[str, int]:
+    """Multiplications of each convolution, by its name."""
+    sizes = {weight.name: tuple(weight.dims) for weight in model.graph.initializer}
+    for value in (*model.graph.value_info, *model.graph.output):
+        sizes[value.name] = tuple(dim.dim_value for dim in value.type.tensor_type.shape.dim)
+    convolutions = [node for node in model.graph.node if node.op_type == "Conv"]
+    return {node.name: int(np.prod(sizes[node.input[1]]) * np.prod(sizes[node.output[0]][2:])) for node in convolutions}
+
+
+def _choose(fp32: _Calibrated, candidates: Sequence[str], limit: float, noise: float) -> tuple[list[str], float]:
+    """The convolutions to round, and their noise: all of them, which make ``noise``, or as many as the limit allows.
+
+    Those that make most noise for the time that they take, alone, are left out first. Takes at most n + log2(n) trials
+    for n convolutions.
+    """
+    if noise <= limit:
+        return [*candidates], noise
+    times = _multiplications(fp32.model)
+    alone = {
+        name: fp32.noise([name]) / times[name] for name in tqdm(candidates, desc="rounding one at a time", unit="layer")
+    }
+    ranked = sorted(candidates, key=lambda name: alone[name])
+    fewest, most, kept = 0, len(ranked), 0.0
+    while most - fewest > 1:
+        middle = (fewest + most) // 2
+        noise = fp32.noise(ranked[:middle])
+        if noise <= limit:
+            fewest, kept = middle, noise
+        else:
+            most = middle
+    return ranked[:fewest], kept
+
+
+def race(
+    one: Path, other: Path, n_threads: int | None, n_runs: int = N_RUNS
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times of the runs of two networks [ms], measured in turn; the first run of each turn is a warm-up."""
+    sessions = [Session(path, "cpu", n_threads=n_threads) for path in (one, other)]
+    times = np.empty((2, n_runs))
+    for run in range(n_runs):
+        for k, session in enumerate(sessions):
+            session.run()
+            start = time.perf_counter()
+            session.run()
+            times[k, run] = 1e3 * (time.perf_counter() - start)
+    return times[0], times[1]
+
+
+def _ratio(one: NDArray[np.float64], other: NDArray[np.float64]) -> tuple[float, float, float]:
+    """The median of paired ratios, and its 95 % interval by order statistics."""
+    ratios = np.sort(other / one)
+    half = int(np.ceil(0.98 * np.sqrt(len(ratios))))
+    middle = len(ratios) // 2
+    least, most = ratios[max(0, middle - half)], ratios[min(len(ratios) - 1, middle + half)]
+    return float(np.median(ratios)), float(least), float(most)
+
+
+def _scores(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """IoU of each class of points and cells, and F1 of boxes and road, over all ranges, by name."""
+    scores = {}
+    for block, of in figures.items():
+        for name, row in of.get("points", {}).get("all", {}).items():
+            scores[f"{block} {name} IoU"] = row["iou"]
+        for table, bands in of.get("segmentation", {}).items():
+            scores |= {f"{block} {table} {name} IoU": iou for name, iou in bands["all"]["iou"].items()}
+        for kind, bands in of.get("boxes", {}).items():
+            row = bands["all"]["vehicle"]
+            if row["precision"] and row["recall"]:
+                scores[f"{block} {kind} vehicle F1"] = 2.0 / (1.0 / row["precision"] + 1.0 / row["recall"])
+        if road := of.get("road"):
+            scores[f"{block} road F1"] = road["all"]["f1"]
+        if block == "images":
+            scores["image mean IoU"] = of["all"]["mean_iou"]
+    return {name: score for name, score in scores.items() if score is not None and np.isfinite(score)}
+
+
+def _compared(
+    before: Path, after: Path, kitti: Path | None, semantickitti: Path | None, n_simulated: int
+) -> list[dict[str, list[Record]]]:
+    """Counts of both models on KITTI's validation drives, on SemanticKITTI's roads and on simulated scans, by set."""
+    judges = [Judge([path], boxes_from="network", rules=()) for path in (before, after)]
+    read = judges[1]  # it was also calibrated on scans, which must not be among these
+    truths: list[tuple[str, Callable[[], Truth]]] = [
+        ("simulated", partial(read.simulated, samples.FIRST_SEED + k)) for k in range(n_simulated)
+    ]
+    if kitti is not None:
+        objects = KittiObjects(kitti)
+        names = objects.names("validation") or objects.names("test")  # a set of other drives has no validation drives
+        truths += [("real", partial(_later, read.kitti, objects.frame, name)) for name in names]
+    if semantickitti is not None and read.from_above is not None:
+        roads = SemanticKitti(semantickitti)
+        truths += [("road", partial(_later, read.semantickitti, roads.frame, name)) for name in roads.names("all")]
+    records: list[dict[str, list[Record]]] = [{}, {}]
+    for block, make in tqdm(truths, desc="comparing", unit="scan"):
+        truth = make()
+        for judge, of in zip(judges, records, strict=True):
+            of.setdefault(block, []).append(judge.record(truth)[0])
+    return records
+
+
+def _later(evaluate: Callable[[Any], Truth], read: Callable[[Any], Any], name: Any) -> Truth:
+    return evaluate(read(name))
+
+
+def _losses(
+    before: Mapping[str, Sequence[Record]], after: Mapping[str, Sequence[Record]]
+) -> dict[str, tuple[float, float, float, float]]:
+    """Scores before and after, and the 95 % interval of the loss over resampled drives, by the name of the score.
+
+    Both models are resampled alike, because they err on the same scans. With one drive the interval is the loss itself.
+    """
+    losses = {}
+    for block in before:
+        pairs = [_by_drive(of[block]) for of in (before, after)]
+        n_drives = len(pairs[0])
+        draws = np.random.default_rng(0).integers(n_drives, size=(N_RESAMPLES if n_drives > 1 else 0, n_drives))
+        whole, *drawn = (
+            [_scores({block: figures_of([drives[k] for k in draw], 0)}) for drives in pairs]
+            for draw in (np.arange(n_drives), *draws)
+        )
+        for name, score in whole[0].items():
+            own = whole[1].get(name, 0.0)
+            differences = [one[name] - other.get(name, 0.0) for one, other in drawn if name in one] or [score - own]
+            low, high = np.percentile(differences, (2.5, 97.5))
+            losses[name] = score, own, float(low), float(high)
+    return losses
+
+
+def _by_drive(records: Sequence[Record]) -> list[Record]:
+    """The sum of the records of each drive."""
+    sums: dict[str, dict[tuple[str, ...], Any]] = {}
+    for record in records:
+        own = sums.setdefault(record.drive, {})
+        own |= {key: own[key] + tally if key in own else tally for key, tally in record.tallies.items()}
+    return [Record(drive, drive, tallies) for drive, tallies in sums.items()]
+
+
+def quantize(
+    path: Path,
+    out: Path,
+    *,
+    scans: Sequence[NDArray[Any]],
+    hashes: Sequence[str] = (),
+    kitti: Path | None = None,
+    semantickitti: Path | None = None,
+    camvid: Path | None = None,
+    exclude: Sequence[str] = (),
+    seven_bits: bool | None = None,
+    n_evaluated: int = 48,
+    n_threads: int | None = None,
+    max_noise: float = MAX_NOISE,
+    race: Race = race,
+) -> ModelCard:
+    """Write the int8 variant of a model, with its own card and figures.
+
+    ``precision="auto"`` takes the variant only after `edgeperc_export.release.agree` has measured it.
+
+    Parameters
+    ----------
+    path, out : Path
+        The model in fp32, and the .onnx to write.
+    scans : sequence of (n, 4) float32
+        To calibrate on, from `calibration_scans`; of a camera's model images (H, W, 3) uint8, from
+        `calibration_images`.
+    hashes : sequence of str
+        Hashes of the real scans. The card lists them, so that the model is never evaluated on these scans.
+    kitti : Path or None
+        Root of a KITTI object set. Both models are compared on its validation drives; the card's figures are of its
+        test drives.
+    semantickitti : Path or None
+        Root of SemanticKITTI; both models are evaluated on its roads.
+    camvid : Path or None
+        Folder of CamVid; both models are evaluated on its validation images.
+    exclude : sequence of str
+        Nodes to keep in fp32.
+    seven_bits : bool or None
+        Use 7-bit weights. x86 without VNNI needs them, because its sums of 8-bit products saturate; None: if this
+        computer needs them.
+    n_evaluated : int
+        Number of simulated scans, other than those of the calibration, on which both models are evaluated.
+    n_threads : int or None
+        For timing; None leaves it to onnxruntime.
+    max_noise : float
+        Largest noise of the outputs, as a share of their variance; above it, convolutions stay in fp32.
+    race : callable
+        Two paths and ``n_threads`` -> times of paired runs of both models [ms].
+
+    Returns
+    -------
+    ModelCard
+
+    Raises
+    ------
+    RefusedError
+        The int8 model is not faster (95 % interval of the ratio of times), or an IoU or F1 is lower by more than one
+        point with a 95 % interval of the loss above 0. ``out`` is unchanged.
+    ModelError
+        The model is not in fp32.
+    PointsError, OptionError
+        No scans, or an excluded node that the graph does not have.
+    """
+    if not scans:
+        raise PointsError("no scan to calibrate on; expected at least one")
+    session = Session(path, "cpu")
+    card = session.card
+    if card.view.kind == "camera" and camvid is None:
+        raise OptionError(f"{path} is of a camera; give --camvid to calibrate and evaluate it on")
+    if card.precision != "fp32":
+        raise ModelError(f"{path} is in {card.precision}; quantize the model in fp32")
+    seven_bits = _saturates() if seven_bits is None else seven_bits
+    tried: list[tuple[float, _Calibrated]] = []
+    for strength in STRENGTHS:
+        fp32 = _Calibrated.on(path, card, scans, seven_bits, strength)
+        candidates = _candidates(fp32.model.graph, exclude)
+        tried.append((fp32.noise(candidates), fp32))
+        if tried[-1][0] <= max_noise:
+            break
+    noise, fp32 = min(tried, key=lambda each: each[0])
+    chosen, noise = _choose(fp32, candidates, max_noise, noise)
+    model = fp32.rounded(chosen)
+    model.producer_name, model.producer_version = "edgeperc", ""
+    kept = [n.name for n in fp32.model.graph.node if n.op_type == "Conv" and n.name not in chosen]
+    training = dict(card.training)
+    frames = training.get("frames")
+    training |= {
+        "frames": {**dict(zip(hashes, hashes, strict=True)), **(frames if isinstance(frames, Mapping) else {})},
+        "quantized": {
+            "from": f"{card.name} {card.version}",
+            "graph_sha256": hashlib.sha256(onnx.load(path).graph.SerializeToString(deterministic=True)).hexdigest(),
+            "calibration": f"{len(hashes)} images of CamVid"
+            if card.view.kind == "camera"
+            else f"{len(hashes)} real and {len(scans) - len(hashes)} simulated scans",
+            "left_alone": kept,
+            "noise": noise,
+            "weight_bits": 7 if seven_bits else 8,
+        },
+    }
+    card = replace(card, precision="int8", precisions={}, training=training, parity={}, metrics={})
+    card = with_golden(model, card)
+    trial = out.with_name(f".{out.name}.trial.onnx")
+    try:
+        write_card(model, card, trial)
+        share = f"{len(chosen)} of {len(chosen) + len(kept)} convolutions in int8"
+        one, other = race(path, trial, n_threads)
+        ratio, least, most = _ratio(one, other)
+        speed = (
+            f"{np.median(one):.1f} ms in fp32, {np.median(other):.1f} in int8, "
+            f"{ratio:.2f} times as long ({least:.2f} to {most:.2f})"
+        )
+        if most >= 1.0:
+            raise RefusedError(f"{path}: not faster here with {share}: {speed}; expected an interval below 1")
+        if card.view.kind == "camera":
+            assert camvid is not None
+            figures, before = (evaluate_images([camvid], each, split="validation") for each in (trial, path))
+            command = f"edgeperc eval CAMVID --split validation --model {out.name}"
+            fp32_scores, int8_scores = (_scores({"images": each["images"]}) for each in (before, figures))
+            lost = {
+                name: (score, own := int8_scores.get(name, 0.0), score - own) for name, score in fp32_scores.items()
+            }
+            losses = {name: (*each, each[2]) for name, each in lost.items()}
+        else:
+            losses = _losses(*_compared(path, trial, kitti, semantickitti, n_evaluated))
+            simulated = f"simulation:{n_evaluated}"
+            given = {"KITTI": kitti, "SEMANTICKITTI": semantickitti, simulated: simulated}
+            datasets = {name: root for name, root in given.items() if root is not None}
+            figures = evaluate([*datasets.values()], [trial], boxes_from="network", rules=())[0]
+            command = " ".join(["edgeperc eval", *datasets, f"--model {out.name}", "--no-agreement"])
+        lines = {
+            name: f"{name} {score:.3f} to {own:.3f} (loss {low:.3f} to {high:.3f})"
+            for name, (score, own, low, high) in losses.items()
+        }
+        worse = [lines[name] for name, (score, own, low, _) in losses.items() if score - own > MAX_LOSS and low > 0.0]
+        if worse:
+            raise RefusedError(f"{path}: more than {MAX_LOSS} lost with {share}: {'; '.join(worse)} ({speed})")
+        figures["command"] = command
+        worst = lines[max(losses, key=lambda name: losses[name][0] - losses[name][1])] if losses else "none"
+        parity = {**_parity(path, trial), "speed": speed, "largest_loss": worst}
+        card = replace(card, parity=parity, metrics=figures)
+        write_card(model, card, out)
+    finally:
+        trial.unlink(missing_ok=True)
+    return card
+
+
+def _parity(path: Path, rounded: Path) -> dict[str, float]:
+    """Smallest share of pixels with the same label as in fp32, on simulated scans outside training and calibration."""
+    sessions, agreement = [Session(each, "cpu") for each in (path, rounded)], 1.0
+    card = sessions[0].card
+    scans: Sequence[NDArray[Any]] = parity_images([]) if card.view.kind == "camera" else parity_scans([])
+    for image, _ in views(card, scans):
+        labels = []
+        for session in sessions:
+            session.input[:] = image
+            kind = next(o.kind for o in card.outputs if not o.kind.startswith("box_"))
+            labels.append(pixel_labels(session.run()[kind], kind))
+        agreement = min(agreement, float((labels[0] == labels[1]).mean()))
+    return {"n_scans": len(scans), "label_agreement": agreement}

@@ -1,0 +1,357 @@
+"""Export of a torch network to ONNX with a card, and verification of the file.
+
+A file is written only if onnxruntime reproduces the torch network's outputs on every scan tried: raw outputs within
+`MAX_DEVIATION`, and the same labels and boxes after post-processing.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from edgeperc.camera.image import ImageScaler
+from edgeperc.errors import EdgepercError
+from edgeperc.inference.decode import decode_classes, decode_top_view
+from edgeperc.inference.network_input import project
+from edgeperc.inference.projection import make_projector
+from edgeperc.inference.session import Session, golden_input
+from edgeperc.preprocess.fitness import FitnessProfile
+from edgeperc.system.atomic import open_atomic
+from edgeperc.types.card import CARD_KEY, CameraGeometry, Golden, ModelCard
+from edgeperc.types.perception import Box
+
+from ..networks.lodnn import LoDNN
+from ..networks.segnet import SegNet
+from ..networks.ssadnet import SSADNet
+from ..recipe import Recipe
+from ..training.checkpoint import build_network, read_checkpoint
+from .cards import card_of
+
+__all__ = [
+    "ParityError",
+    "export",
+    "load",
+    "pixel_labels",
+    "to_graph",
+    "verify",
+    "views",
+    "with_golden",
+    "write_card",
+]
+
+OPSET = 18
+# In standard deviations of the output. Measured: 1e-4 for fp32 convolutions summed in another order, and 0.1 or more
+# for a wrong operator.
+MAX_DEVIATION = 0.03
+# Quantile of the differences that is compared. If the two largest values of a pooling window differ by rounding only,
+# unpooling may swap their places. The cells around them then differ by 0.011 in a trained network, and by 0.5 with
+# random weights. Such places are few.
+COMPARED = 0.999
+# Weights in half precision changed 0.07 % of the labels of an untrained network, whose logits are close to each other,
+# and 0.006 % of a trained one's.
+MIN_AGREEMENT = 0.999
+# Smaller tensors, such as biases and scales, stay in fp32.
+FEWEST_HALVED = 1024
+# Networks that unpool stay in fp32: a rounded weight can move a maximum to another cell, which changed outputs by up to
+# 0.12 standard deviations.
+UNPOOLING = (LoDNN, SegNet, SSADNet)
+N_GOLDEN_VALUES = 64
+CAMVID_LICENCE = (
+    "terms of CamVid: free for research; cite Brostow, Fauqueur and Cipolla (2009), and Brostow et al. (2008)"
+)
+
+
+class ParityError(EdgepercError):
+    """The exported graph does not reproduce the network's outputs; nothing was written."""
+
+
+def load(checkpoint: Path) -> tuple[nn.Module, Recipe, dict[str, Any]]:
+    """The averaged network of a checkpoint in inference mode, its recipe, and notes on its training."""
+    state = read_checkpoint(checkpoint)
+    notes = {name: state[name] for name in ("frames", "n_simulated", "step", "before", "curve")}
+    return build_network(state, checkpoint).eval(), state["recipe"], notes
+
+
+def _training(recipe: Recipe, notes: Mapping[str, Any]) -> dict[str, Any]:
+    """The card's record of the training."""
+    frames = notes["frames"]
+    simulated = f"{notes['n_simulated']} simulated scans"
+    data = f"{len(frames)} real frames, {simulated}" if frames else f"{simulated}, no real frame"
+    licence = "terms of the data sets of the real frames; KITTI: CC BY-NC-SA 3.0" if frames else notes["licence"]
+    if recipe.task == "camera":
+        data, licence = f"{len(frames)} images of CamVid", CAMVID_LICENCE
+    return {
+        "data": data,
+        "frames": frames,
+        "licence": licence,
+        "recipe": json.loads(json.dumps(asdict(recipe))),  # as a card is read again: without tuples
+        "steps": notes["step"],
+        "started_from": notes["before"],
+        "curve": notes["curve"],
+    }
+
+
+def to_graph(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
+    """The network as an ONNX graph with its weights, without paths of this computer and without a card.
+
+    If the card's outputs have blocks, the graph ends where the network's ``blocks`` do.
+    """
+    exported = network
+    if any(output.block != (1, 1) for output in card.outputs):
+        exported = copy.copy(network)
+        exported.forward = network.blocks  # type: ignore[assignment]  # a method of the networks in edge.py
+    example = torch.from_numpy(golden_input(0, (1, len(card.input.channels), card.view.height, card.view.width)))
+    with warnings.catch_warnings():  # the exporter warns about its own future changes
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            exported.eval(),
+            (example,),
+            input_names=[card.input.name],
+            output_names=[o.name for o in card.outputs],
+            opset_version=OPSET,
+            dynamo=True,
+            external_data=False,
+            verbose=False,
+        )
+    assert program is not None
+    model = program.model_proto
+    # The exporter adds stack traces, with paths of this computer, to every node.
+    stripped = [model, model.graph, *model.graph.node, *model.graph.value_info, *model.graph.input]
+    for holder in [*stripped, *model.graph.output, *model.graph.initializer, *model.functions]:
+        if hasattr(holder, "metadata_props"):
+            del holder.metadata_props[:]
+        if hasattr(holder, "doc_string"):
+            holder.doc_string = ""
+    model.producer_name, model.producer_version = "edgeperc", ""
+    if not isinstance(network, UNPOOLING):
+        _halve(model.graph)
+    return model
+
+
+def _halve(graph: onnx.GraphProto) -> None:
+    """Store large weights in half precision, which halves the file; engines convert them to fp32 when they load it."""
+    casts = []
+    for weight in graph.initializer:
+        values = onnx.numpy_helper.to_array(weight)
+        if values.dtype != np.float32 or values.size < FEWEST_HALVED:
+            continue
+        name = weight.name
+        weight.CopyFrom(onnx.numpy_helper.from_array(values.astype(np.float16), f"{name}_half"))
+        casts.append(onnx.helper.make_node("Cast", [weight.name], [name], to=onnx.TensorProto.FLOAT))
+    kept = list(graph.node)
+    del graph.node[:]
+    graph.node.extend([*casts, *kept])
+
+
+def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
+    """Write a graph with its card, and read the card back through onnxruntime.
+
+    The graph may be of any network with a range image or a top view as input and outputs of the kinds of
+    `edgeperc.card.OutputSpec`. It is changed in place: a card in it is replaced.
+
+    Raises
+    ------
+    CardError, CardMismatchError, ModelFileError
+        The card does not fit the graph, or onnxruntime cannot load it. ``path`` is unchanged.
+    ParityError
+        The card in the file differs from the one given. ``path`` is unchanged.
+    """
+    kept = [p for p in model.metadata_props if p.key != CARD_KEY]
+    del model.metadata_props[:]
+    model.metadata_props.extend(kept)
+    model.metadata_props.add(key=CARD_KEY, value=card.to_json())
+    with open_atomic(path) as file:
+        file.write(model.SerializeToString(deterministic=True))
+        file.flush()
+        session = Session(Path(file.name), "cpu")
+        if session.card.to_json() != card.to_json():
+            raise ParityError(f"{path}: the card read back differs from the card written")
+
+
+def with_golden(model: onnx.ModelProto, card: ModelCard) -> ModelCard:
+    """The card with a golden record: a known input, and this computer's outputs for it."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    x = golden_input(0, (1, len(card.input.channels), card.view.height, card.view.width))
+    outputs = session.run([o.name for o in card.outputs], {card.input.name: x})
+    records = {}
+    for spec, output in zip(card.outputs, outputs, strict=True):
+        few = output.size <= N_GOLDEN_VALUES
+        at = np.arange(output.size) if few else np.random.default_rng(0).integers(output.size, size=N_GOLDEN_VALUES)
+        records[spec.name] = {
+            "sha256": hashlib.sha256(output.tobytes()).hexdigest(),
+            "std": float(output.std()),
+            "positions": [int(i) for i in at],
+            "values": [float(v) for v in output.reshape(-1)[at]],
+        }
+    return replace(card, golden=Golden(0, hashlib.sha256(x.tobytes()).hexdigest(), records))
+
+
+def views(card: ModelCard, samples: Sequence[NDArray[Any]]) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
+    """The network's input of each scan or image, (C, H, W) float32, and the pixels with a return, (H, W) bool."""
+    if isinstance(card.view, CameraGeometry):
+        scaler = ImageScaler(card.view, card.input)
+        for sample in samples:
+            image = np.empty(scaler.shape, np.float32)
+            scaler.fill(sample, image)
+            yield image, np.ones(image.shape[1:], np.bool_)
+        return
+    projector = make_projector(card.view, card.input)
+    for sample in samples:
+        projected = project(projector, np.ascontiguousarray(sample, np.float32))
+        yield projected.image.copy(), projected.index >= 0
+
+
+def pixel_labels(raw: NDArray[np.float32], kind: str) -> NDArray[np.uint8]:
+    """Labels (h, w) of raw outputs (C, h, w) of a kind of classes, at the outputs' own resolution."""
+    return raw.argmax(0).astype(np.uint8) if kind == "camera_logits" else decode_classes(raw, kind)[0]
+
+
+def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[Any]]) -> dict[str, float]:
+    """Compare an exported model with its torch network: raw outputs, and labels and boxes after post-processing.
+
+    Parameters
+    ----------
+    network : nn.Module
+    path : Path
+        The .onnx.
+    scans : sequence of (n, 4) float32
+        x, y, z [m] in the sensor frame, remission in 0..1. Of a camera's model: images (H, W, 3) uint8.
+
+    Returns
+    -------
+    dict
+        ``n_scans``; ``max_deviation``: the 99.9 % quantile of the differences of raw outputs, in standard deviations of
+        the output; ``label_agreement``: the smallest share of pixels with the same label; ``box_deviation``: the
+        largest difference of a center's coordinate or a size [m].
+
+    Raises
+    ------
+    ParityError
+        A difference exceeds its limit, or the boxes differ in number or class.
+    """
+    session = Session(path, "cpu")
+    card = session.card
+    worst, agreement, box_deviation = 0.0, 1.0, 0.0
+    for image, returned in views(card, scans):
+        with torch.no_grad():
+            outputs = network.eval()(torch.from_numpy(image[None]))
+        outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+        session.input[:] = image
+        actual = session.run()
+        expected = {o.kind: output[0].numpy() for o, output in zip(card.outputs, outputs, strict=True)}
+        for kind, values in expected.items():
+            difference = np.quantile(np.abs(actual[kind] - values), COMPARED)
+            worst = max(worst, float(difference) / max(float(values.std()), 1e-6))
+        if card.view.kind == "top_view":
+            (labels, boxes), (expected_labels, expected_boxes) = (
+                decode_top_view(card, returned, raw, card.score_threshold) for raw in (actual, expected)
+            )
+            kinds, expected_kinds = (sorted(box.label for box in found) for found in (boxes, expected_boxes))
+            if kinds != expected_kinds:
+                raise ParityError(f"{path}: onnxruntime finds the boxes {kinds}, torch {expected_kinds}")
+            box_deviation = max(box_deviation, _deviation(boxes, expected_boxes))
+        else:
+            ((kind, logits),) = expected.items()
+            labels, expected_labels = (pixel_labels(raw, kind) for raw in (actual[kind], logits))
+        agreement = min(agreement, float((labels == expected_labels).mean()))
+    if worst > MAX_DEVIATION or agreement < MIN_AGREEMENT or box_deviation > 0.05:
+        raise ParityError(
+            f"{path}: raw outputs differ by {worst:.3g} standard deviations (at most {MAX_DEVIATION}), labels "
+            f"agree on {agreement:.4%} of the pixels (at least {MIN_AGREEMENT:.2%}), boxes differ by up to "
+            f"{box_deviation:.3g} m (at most 0.05)"
+        )
+    return {
+        "n_scans": len(scans),
+        "max_deviation": worst,
+        "label_agreement": agreement,
+        "box_deviation": box_deviation,
+    }
+
+
+def _deviation(boxes: Sequence[Box], expected: Sequence[Box]) -> float:
+    """The largest difference of a center or a size [m]. Boxes of almost the same score may come in another order."""
+    left, worst = list(boxes), 0.0
+    for other in expected:
+        differences = [
+            (float(np.abs(np.subtract([*box.center, *box.size], [*other.center, *other.size])).max()), k)
+            for k, box in enumerate(left)
+            if box.label == other.label
+        ]
+        difference, k = min(differences)
+        worst = max(worst, difference)
+        del left[k]
+    return worst
+
+
+def export(
+    checkpoint: Path,
+    path: Path,
+    *,
+    scans: Sequence[NDArray[Any]],
+    fitness: FitnessProfile | None,
+    name: str | None = None,
+    version: str = "1.0.0",
+    metrics: Mapping[str, Any] | None = None,
+    licence: str = "Apache-2.0",
+) -> ModelCard:
+    """Export a checkpoint, verify the file, and write it with its card.
+
+    Parameters
+    ----------
+    checkpoint : Path
+    path : Path
+        The .onnx file to write.
+    scans : sequence of (n, 4) float32
+        Scans to verify on, as for `verify`.
+    fitness : FitnessProfile or None
+        Profile of the training scans, for the check of inputs at runtime; None for a camera's network.
+    name : str, optional
+        Name of the model; by default the network's.
+    version : str
+    metrics : mapping, optional
+        Figures to write into the card.
+    licence : str
+        License of weights trained on simulation alone; KITTI's applies to all others.
+
+    Returns
+    -------
+    ModelCard
+
+    Raises
+    ------
+    ParityError
+        The graph does not reproduce the network's outputs; ``path`` is unchanged.
+    """
+    network, recipe, notes = load(checkpoint)
+    card = card_of(
+        recipe,
+        name=name or recipe.network,
+        version=version,
+        fitness=None if fitness is None else fitness.to_dict(),
+        training=_training(recipe, notes | {"licence": licence}),
+        metrics=dict(metrics or {}),
+    )
+    model = to_graph(network, card)
+    card = with_golden(model, card)
+    trial = path.with_name(f".{path.name}.trial.onnx")
+    try:
+        write_card(model, card, trial)
+        card = replace(card, parity=verify(network, trial, scans))
+        write_card(model, card, path)
+    finally:
+        trial.unlink(missing_ok=True)
+    return card

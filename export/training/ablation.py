@@ -1,0 +1,185 @@
+"""The effect of each part of the data and of the training, measured on drives outside the training set.
+
+All variants are short runs from the same weights, which were trained on simulation alone (LoDNN's are random). Each
+variant changes one setting and is evaluated on a fold of the training drives. Test drives are not used. The teachers of
+the shipped models are not used either, because they may have been trained on the fold.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ..recipe import MODELS, PAPER, Recipe
+from .train import train
+
+__all__ = ["PAPERS", "VARIANTS", "ablate", "plot"]
+
+VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
+    "pointseg": {
+        "as shipped": {},
+        "nothing pasted": {"n_pasted": 0.0},
+        "no sector of another scan": {"swap": 0.0},
+        "a third of what is pasted cars": {"paste_cars": 0.33},
+        "never turned to a pedestrian or cyclist": {"turn_to_rare": 0.0},
+        "a third of the scans turned to any side": {"turn_anywhere": 0.33},
+        "no bad weather": {"weather": 0.0},
+        "no change to a scan at all": {
+            "augment": False, "n_pasted": 0.0, "swap": 0.0, "turn_to_rare": 0.0, "weather": 0.0,
+        },
+        "real scans alone": {"simulated_share": 0.0},
+        "simulated scans four times of five": {"simulated_share": 0.8},
+        "cross-entropy without Lovasz": {"lovasz_weight": 0.0},
+        "focal loss (gamma 2)": {"focal_gamma": 2.0},
+        "classes weighed alike": {"class_weights": False},
+        "deep supervision (0.4)": {"deep_supervision": 0.4},
+        "with the height above the ground": {"height_above_ground": True},
+        "weights not averaged": {"ema": 0.0},
+        "self-training on unlabelled scans": {"teacher": True},
+        "distilled from where it starts, mirrored too": {"teacher": True, "distil": 1.0},
+    },
+    "ssadnet": {
+        "as shipped": {},
+        "nothing pasted": {"n_pasted": 0.0},
+        "no change to a scan at all": {"augment": False, "n_pasted": 0.0, "weather": 0.0},
+        "real scans alone": {"simulated_share": 0.0},
+        "simulated scans four times of five": {"simulated_share": 0.8},
+        "classes weighed alike": {"class_weights": False},
+        "cross-entropy without Lovasz": {"lovasz_weight": 0.0},
+        "spatial dropout (0.25)": {"dropout": 0.25},
+        "batches of eight": {"batch": 8},
+        "weights not averaged": {"ema": 0.0},
+        "the front of boxes too": {"front": True},
+        "the paper's slots": {"head": "slots-paper"},
+    },
+    # The settings that the paper of LoDNN-I varies (Electronics 12, 3165, Figure 16).
+    "lodnn": {
+        "as shipped": {},
+        **{f"learning rate {rate:g}": {"learning_rate": rate} for rate in (1e-4, 3e-4, 1e-3, 1e-2, 3e-2)},
+        **{f"scans times {share:g}": {"scans": share} for share in (0.25, 0.5, 2.0)},
+        **{f"batches of {batch}": {"batch": batch} for batch in (1, 2, 8, 16)},
+    },
+}  # fmt: skip
+PAPERS = "the paper's recipe, from nothing, as many scans"
+SHIPPED = {"pointseg": "pointseg-full", "ssadnet": "ssadnet-full", "lodnn": "lodnn"}
+"""Network -> the model whose recipe is varied; it can be trained without a teacher."""
+
+
+def ablate(
+    network: str,
+    out: Path,
+    *,
+    kitti: Path,
+    simulated: Path,
+    start_from: Path | None,
+    fold: int,
+    steps: int,
+    variants: Sequence[str] = (),
+    n_threads: int | None = None,
+) -> list[dict[str, Any]]:
+    """Run variants and add their figures to ``out/ablation.json``; variants with figures there are not run again.
+
+    Parameters
+    ----------
+    network : str
+        ``"pointseg"``, ``"ssadnet"`` or ``"lodnn"``.
+    out : Path
+        Folder for the runs and ``ablation.json``.
+    kitti, simulated : Path
+        As for `edgeperc_export.training.train.train`.
+    start_from : Path or None
+        Checkpoint of the network's ``-sim`` model; None for ``"lodnn"``, which has none.
+    fold, steps : int
+        Fold to evaluate on; training steps of each run, for the shipped model's batch size.
+    variants : sequence of str
+        Names in `VARIANTS`, or `PAPERS`; by default all of them.
+    n_threads : int or None
+
+    Returns
+    -------
+    list of dict
+        ``network``, ``variant``, ``fold``, ``steps``, number of ``scans`` drawn, and ``figures`` at the end of the run.
+
+    Raises
+    ------
+    ValueError
+        The variant is unknown.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / "ablation.json"
+    rows: list[dict[str, Any]] = json.loads(path.read_text()) if path.exists() else []
+    done = {(row["network"], row["variant"], row["fold"], row["steps"]) for row in rows}
+    shipped = replace(MODELS[SHIPPED[network]].recipe, steps=steps, distil=0.0)
+    known = [*VARIANTS[network], PAPERS]
+    if unknown := [variant for variant in variants if variant not in known]:
+        raise ValueError(f"{network} has no variant {unknown[0]!r}; expected one of: {'; '.join(known)}")
+    for variant in variants or known:
+        if (network, variant, fold, steps) in done:
+            continue
+        changes = dict(VARIANTS[network].get(variant, {}))
+        teacher = start_from if changes.pop("teacher", False) else None
+        n_scans = steps * shipped.batch * changes.pop("scans", 1.0)
+        recipe: Recipe = replace(shipped, **changes)
+        start: Path | None = start_from
+        if variant == PAPERS:
+            recipe, start = replace(PAPER[network], context_width=shipped.context_width), None
+        recipe = replace(recipe, steps=max(1, int(n_scans) // recipe.batch))  # the same number of scans
+        folder = out / f"{network}-{fold}-{steps}-{'-'.join(variant.split())}"
+        train(
+            recipe, folder, kitti=kitti, simulated=simulated, fold=fold, start_from=start, teacher=teacher,
+            n_threads=n_threads, checkpoint_every=recipe.steps,
+        )  # fmt: skip
+        last = json.loads((folder / "log.jsonl").read_text().splitlines()[-1])
+        rows.append(
+            {
+                "network": network,
+                "variant": variant,
+                "fold": fold,
+                "steps": steps,
+                "scans": recipe.steps * recipe.batch,
+                "figures": last["validation"],
+            }
+        )
+        path.write_text(json.dumps(rows, indent=1) + "\n")
+    return rows
+
+
+def plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draw the search for LoDNN's learning rate, number of scans and batch size, like the paper's Figure 16.
+
+    Raises
+    ------
+    ValueError
+        ``rows``, from `ablate`, has no run of LoDNN.
+    """
+    from matplotlib.figure import Figure
+
+    rows = [row for row in rows if row["network"] == "lodnn"]
+    if not rows:
+        raise ValueError("no run of lodnn to draw; run: edgeperc-export ablate lodnn OUT")
+    (shipped,) = [row for row in rows if row["variant"] == "as shipped"]
+    recipe = MODELS[SHIPPED["lodnn"]].recipe
+    usual = {"learning rate": recipe.learning_rate, "scans times": 1.0, "batches of": float(recipe.batch)}
+    titles = {
+        "learning rate": "learning rate",
+        "scans times": f"scans drawn, times {shipped['scans']}",
+        "batches of": f"scans in a batch, {shipped['scans']} in all",
+    }
+    figure = Figure(figsize=(10.0, 3.2), layout="constrained")
+    for axes, (prefix, title) in zip(figure.subplots(1, 3, sharey=True), titles.items(), strict=True):
+        found = [(float(r["variant"].rsplit(" ", 1)[1]), r) for r in rows if r["variant"].startswith(prefix)]
+        found = sorted([*found, (usual[prefix], shipped)], key=lambda each: each[0])
+        values = [value for value, _ in found]
+        axes.plot(values, [100.0 * row["figures"]["drivable"] for _, row in found], "o-", color="#009e73")
+        axes.plot([usual[prefix]], [100.0 * shipped["figures"]["drivable"]], "o", color="#202020", label="as shipped")
+        axes.set_xscale("log")
+        axes.set_xticks(values, labels=[f"{value:g}" for value in values], minor=False, fontsize=8)
+        axes.set_xticks([], minor=True)
+        axes.set_xlabel(title)
+        axes.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("IoU of the road [%]")
+    figure.axes[0].legend(frameon=False)
+    figure.savefig(path, dpi=110, metadata={"Software": None})

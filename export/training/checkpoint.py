@@ -1,0 +1,122 @@
+"""Read the checkpoints of training runs, which may be damaged, of another program, or made to do harm."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from edgeperc.errors import ModelError
+
+from ..networks import build
+from ..recipe import Recipe
+
+__all__ = ["CheckpointError", "build_network", "read_checkpoint"]
+
+MAX_WIDTH = 4096
+_TEXTS = {"before": list, "curve": list, "frames": dict}  # entries that are JSON
+
+
+class CheckpointError(ModelError):
+    """A file is not a checkpoint of ``edgeperc-export train``, or is damaged."""
+
+
+def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str, Any]:
+    """Read a checkpoint. Only tensors and plain values are unpickled.
+
+    Parameters
+    ----------
+    path : Path
+    device : str or torch.device
+        Where its tensors go.
+
+    Returns
+    -------
+    dict
+        ``recipe`` (a Recipe), ``before`` and ``curve`` (lists), ``frames`` (dict), ``n_simulated`` and ``step`` (int),
+        ``averaged`` and ``best`` (weights by name; None if there was no best step), ``network`` and ``optimizer``.
+
+    Raises
+    ------
+    CheckpointError
+        The file is damaged or something else.
+    OSError
+        It cannot be read.
+    """
+    try:
+        state = torch.load(path, weights_only=True, map_location=device)
+    except Exception as exc:  # of torch, pickle, zipfile and struct
+        if isinstance(exc, OSError) and exc.filename is not None:
+            raise  # others are of a damaged file
+        reason = " ".join(str(exc).split())[:200] or type(exc).__name__
+        raise CheckpointError(f"{path} cannot be read as a checkpoint ({reason}); train again") from exc
+    try:
+        return {**state, "recipe": _recipe(state["recipe"]), **_checked(state)}
+    except (KeyError, RecursionError, TypeError, ValueError) as exc:
+        raise CheckpointError(
+            f"{path} is not a checkpoint of edgeperc-export train ({type(exc).__name__}: {exc}); train again"
+        ) from exc
+
+
+def build_network(state: Mapping[str, Any], path: Path) -> nn.Module:
+    """The averaged network of a checkpoint, of its best step.
+
+    Raises
+    ------
+    CheckpointError
+        Its weights do not fit the network of its recipe.
+    """
+    try:
+        network = build(state["recipe"])
+        network.load_state_dict(state["best"] or state["averaged"])
+    except (AttributeError, RuntimeError, TypeError, ValueError) as exc:
+        reason = " ".join(str(exc).split())[:300]
+        raise CheckpointError(
+            f"{path}: its weights do not fit {state['recipe'].network} ({reason}); train again"
+        ) from exc
+    return network
+
+
+def _recipe(text: str) -> Recipe:
+    given = json.loads(text)
+    recipe = Recipe(**{**given, "classes": tuple(given.get("classes", ()))})
+    if not all(isinstance(name, str) for name in recipe.classes):
+        raise ValueError(f"its recipe has classes {str(recipe.classes)[:60]}")
+    for field in fields(Recipe):
+        value, usual = getattr(recipe, field.name), getattr(Recipe, field.name, "")
+        kinds: Any = (int, float) if isinstance(usual, float) else type(usual)
+        if not isinstance(value, kinds) or isinstance(value, bool) != isinstance(usual, bool):
+            raise ValueError(f"its recipe has {field.name} {str(value)[:60]}")
+    if not (
+        1 <= recipe.context_width <= MAX_WIDTH
+        and 0.0 < recipe.width <= 8.0
+        and 0.0 <= recipe.dropout < 1.0
+        and 0 <= recipe.seed < 2**63
+    ):
+        raise ValueError("its recipe has a context_width, a dropout or a seed that is impossible")
+    return recipe
+
+
+def _checked(state: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries that are not tensors, and the weights once they are known to be tensors by name."""
+    texts = {name: json.loads(state[name]) for name in _TEXTS}
+    for name, content in texts.items():
+        if not isinstance(content, _TEXTS[name]):
+            raise TypeError(f"{name} is {str(content)[:60]}; expected a {_TEXTS[name].__name__}")
+    for name in ("n_simulated", "step"):
+        if not isinstance(state[name], int) or isinstance(state[name], bool):
+            raise TypeError(f"{name} is {str(state[name])[:60]}; expected a whole number")
+    for name in ("averaged", "best"):
+        weights = state[name]
+        if name == "best" and weights is None:
+            continue
+        if not isinstance(weights, Mapping) or not all(
+            isinstance(key, str) and isinstance(value, torch.Tensor) for key, value in weights.items()
+        ):
+            raise TypeError(f"{name} is {type(weights).__name__}; expected tensors by name")
+    return texts

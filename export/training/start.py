@@ -1,0 +1,215 @@
+"""Start a training run from the weights of a checkpoint or of an exported model.
+
+An exported model has no batch norm: it was folded into the convolutions. Here each batch norm gets the statistics of
+its input on training scans, and the scale and offset that cancel them, so that the network equals the model and can be
+trained further. Input channels, classes and box channels that the model lacks start with zero weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from torch import Tensor, nn
+
+from edgeperc.inference.session import golden_input
+from edgeperc.types.card import ModelCard
+
+from ..recipe import Recipe
+from ..release.cards import card_of
+from .checkpoint import read_checkpoint
+
+__all__ = ["folded_weights", "start"]
+
+
+def start(
+    network: nn.Module, recipe: Recipe, path: Path, images: Sequence[Tensor]
+) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """Copy the weights that a checkpoint or an exported model shares with the network.
+
+    Parameters
+    ----------
+    network : nn.Module
+        The network of ``recipe``; changed.
+    recipe : Recipe
+    path : Path
+        A checkpoint.pt, or a model.onnx in fp32 made by ``edgeperc-export export``.
+    images : sequence of (B, C, H, W) float32
+        Inputs to compute the statistics of batch norm from; used for an .onnx only.
+
+    Returns
+    -------
+    before : list of dict
+        The recipes of the earlier training runs, in order.
+    frames : dict of str to str
+        Name of each real scan that they were trained on -> its hash.
+
+    Raises
+    ------
+    ValueError
+        No weight fits, or an input channel is scaled otherwise.
+    CheckpointError, ModelError
+        The file is damaged or something else.
+    """
+    own_card = card_of(recipe, version="0")
+    if path.suffix == ".onnx":
+        card = ModelCard.read(path)
+        given, folded = folded_weights(path), True
+        training = card.training or {}
+        before, frames = list(training.get("started_from", ())), dict(training.get("frames", {}))
+        before += [dict(training["recipe"])] if "recipe" in training else []
+    else:
+        state = read_checkpoint(path)
+        card, folded = card_of(state["recipe"], version="0"), False
+        given = state["best"] or state["averaged"]
+        before, frames = [*state["before"], asdict(state["recipe"])], dict(state["frames"])
+    shape = (1, len(own_card.input.channels), own_card.view.height, own_card.view.width)
+    pairs, first = _layers(network, torch.from_numpy(golden_input(0, shape)))
+    own = network.state_dict()
+    common = {}
+    for name, weight in given.items():
+        value: Tensor | None = weight
+        if name in own and name in first:
+            value = _by_channel(weight, own[name], card, own_card, path)
+        elif name in own and weight.shape != own[name].shape:
+            value = _by_class(weight, own[name], card.classes, own_card.classes)
+        if name in own and value is not None and value.shape == own[name].shape:
+            common[name] = value
+    if not common:
+        raise ValueError(f"{path} has no weight in common with the network to train")
+    network.load_state_dict(common, strict=False)
+    if folded:
+        shared = {conv: norm for conv, norm in pairs.items() if f"{conv}.weight" in common}
+        _unfold(network, {norm: given.get(f"{conv}.weight_bias") for conv, norm in shared.items()}, images)
+    return before, frames
+
+
+def folded_weights(path: Path) -> dict[str, Tensor]:
+    """The weights of an exported model by name; ``NAME.weight_bias`` is the offset of a folded batch norm."""
+    weights = {}
+    for tensor in onnx.load(path).graph.initializer:
+        values = onnx.numpy_helper.to_array(tensor)
+        if values.dtype in (np.float16, np.float32):
+            weights[tensor.name.removesuffix("_half")] = torch.from_numpy(values.astype(np.float32))
+    return weights
+
+
+@torch.no_grad()
+def _layers(network: nn.Module, image: Tensor) -> tuple[dict[str, str], set[str]]:
+    """Each convolution that a batch norm follows -> the batch norm; and the weights of those that read the input."""
+    made: dict[int, tuple[str, Tensor]] = {}
+    pairs: dict[str, str] = {}
+    first: set[str] = set()
+
+    def convolved(name: str) -> Any:
+        def hook(module: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+            if torch.equal(inputs[0][:, : image.shape[1]], image):
+                first.add(f"{name}.weight")
+            made[id(output)] = (name, output)  # held, so that no other tensor gets its number
+
+        return hook
+
+    def normed(name: str) -> Any:
+        def hook(module: nn.Module, inputs: tuple[Tensor, ...]) -> None:
+            if id(inputs[0]) in made:
+                pairs[made[id(inputs[0])][0]] = name
+
+        return hook
+
+    hooks = []
+    for name, module in network.named_modules():
+        if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+            hooks.append(module.register_forward_hook(convolved(name)))
+        elif isinstance(module, nn.BatchNorm2d):
+            hooks.append(module.register_forward_pre_hook(normed(name)))
+    training = network.training
+    network.eval()(image)
+    network.train(training)
+    for hook in hooks:
+        hook.remove()
+    return pairs, first
+
+
+def _by_channel(given: Tensor, own: Tensor, card: ModelCard, own_card: ModelCard, path: Path) -> Tensor | None:
+    """The weights of a convolution that reads the input, channel by channel, and those of channels made from it."""
+    theirs, ours = card.input, own_card.input
+    n_made = own.shape[1] - len(ours.channels)
+    if given.shape[0] != own.shape[0] or given.shape[1] - len(theirs.channels) != n_made:
+        return None
+    value = torch.zeros_like(own)
+    value[:, len(ours.channels) :] = given[:, len(theirs.channels) :]
+    for k, name in enumerate(ours.channels):
+        if name not in theirs.channels:
+            continue
+        at = theirs.channels.index(name)
+        if not np.allclose((theirs.mean[at], theirs.std[at]), (ours.mean[k], ours.std[k])):
+            raise ValueError(
+                f"{path} scales its channel {name} by {theirs.mean[at]:g} and {theirs.std[at]:g}; "
+                f"expected {ours.mean[k]:g} and {ours.std[k]:g}"
+            )
+        value[:, k] = given[:, at]
+    return value
+
+
+def _by_class(given: Tensor, own: Tensor, classes: Sequence[str], own_classes: Sequence[str]) -> Tensor | None:
+    """Weights of more or other outputs: class by class, or with zeros for the channels at the end; None if unlike."""
+    if given.ndim != own.ndim or given.shape[1:] != own.shape[1:]:
+        return None
+    value = torch.zeros_like(own)
+    each, own_each = len(given) / len(classes), len(own) / len(own_classes)
+    if tuple(classes) != tuple(own_classes) and each == own_each == int(each):
+        for k, name in enumerate(own_classes):
+            if name in classes:
+                at, size = list(classes).index(name), int(each)
+                value[k * size : (k + 1) * size] = given[at * size : (at + 1) * size]
+        return value
+    if len(given) > len(own):
+        return None
+    value[: len(given)] = given
+    return value
+
+
+@torch.no_grad()
+def _unfold(network: nn.Module, offsets: Mapping[str, Tensor | None], images: Sequence[Tensor]) -> None:
+    """Give each batch norm the statistics of its input, with the scale and the offset that cancel them.
+
+    ``offsets``: name of a batch norm -> the offset folded into the convolution before it; None: it was not folded.
+    """
+    norms = {name: network.get_submodule(name) for name, offset in offsets.items() if offset is not None}
+    sums: dict[str, list[Tensor]] = {name: [] for name in norms}
+
+    def watched(name: str) -> Any:
+        def hook(module: nn.Module, inputs: tuple[Tensor, ...]) -> None:
+            values = inputs[0].transpose(0, 1).flatten(1).double()
+            sums[name].append(torch.stack([values.mean(1), values.square().mean(1)]))
+
+        return hook
+
+    hooks = []
+    for name, norm in norms.items():
+        assert isinstance(norm, nn.BatchNorm2d)
+        nn.init.ones_(norm.weight)
+        norm.bias.copy_(offsets[name])  # type: ignore[arg-type]  # not None
+        nn.init.zeros_(norm.running_mean)  # type: ignore[arg-type]  # it tracks them
+        norm.running_var.fill_(1.0 - norm.eps)  # type: ignore[union-attr]
+        hooks.append(norm.register_forward_pre_hook(watched(name)))
+    training = network.training
+    network.eval()
+    for image in images:
+        network(image)
+    network.train(training)
+    for hook in hooks:
+        hook.remove()
+    for name, norm in norms.items():
+        assert isinstance(norm, nn.BatchNorm2d)
+        mean, square = torch.stack(sums[name]).mean(0)
+        variance = (square - mean.square()).clamp(min=0.0)
+        norm.running_mean.copy_(mean)  # type: ignore[union-attr]
+        norm.running_var.copy_(variance)  # type: ignore[union-attr]
+        norm.weight.copy_((variance + norm.eps).sqrt())
+        norm.bias.copy_(offsets[name] + mean)

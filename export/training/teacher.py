@@ -1,0 +1,153 @@
+"""A teacher network's outputs as training targets: labels for unlabeled points, and class probabilities to distil from.
+
+KITTI labels only what its camera sees, and some scans not at all, but each scan covers the street on all sides. The
+teacher labels the points whose class it is sure of (pseudo-labels; Lee, 2013); all others stay unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from edgeperc.datasets.kitti import KittiObjects
+from edgeperc.inference.network_input import project
+from edgeperc.inference.projection import make_projector
+from edgeperc.inference.session import Session
+from edgeperc.readers.files import read_points
+from edgeperc.simulation.samples import IGNORE
+from edgeperc.types.card import InputSpec, ModelCard
+
+from ..data.scan_sets import seen_by_network
+from ..data.scans import SURFACE, LabeledScan, mirrored, turned
+from .task import Task
+
+__all__ = ["OnnxTeacher", "pseudo_labeled", "teach", "unlabeled_scans"]
+
+SURE = 0.9
+"""Smallest probability of a pseudo-label."""
+
+# The view covers 90 degrees. The directions overlap, so that no object lies only at the edge of a view.
+DIRECTIONS = np.radians([0.0, 80.0, 160.0, 200.0, 280.0])
+
+
+def unlabeled_scans(objects: KittiObjects, fold: int | None) -> list[LabeledScan]:
+    """The unlabeled scans of the training drives without those of ``fold``; every label is `IGNORE`."""
+    scans = []
+    for name in objects.unlabeled("train", fold=fold):
+        points = read_points(objects.root / "training/velodyne" / f"{name}.bin")
+        points = points[np.isfinite(points).all(axis=1)]
+        unknown = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
+        scans.append(LabeledScan(points, np.full(len(points), IGNORE, np.uint8), (), (), unknown))
+    return scans
+
+
+def pseudo_labeled(
+    network: nn.Module, task: Task, scans: Iterable[LabeledScan], sure: float = SURE
+) -> list[LabeledScan]:
+    """The scans, labeled by a network on all sides.
+
+    Parameters
+    ----------
+    network : nn.Module
+        A network that labels points.
+    task : Task
+        The network's task.
+    scans : iterable of LabeledScan
+        Their own labels are kept.
+    sure : float
+        An unlabeled point gets the network's label if its probability is at least this.
+    """
+    projector = make_projector(task.view, task.input)
+    network.eval()
+    labeled = []
+    for scan in tqdm(list(scans), desc="labeling", leave=False):
+        labels = scan.labels.copy()
+        for angle in DIRECTIONS:
+            projected = project(projector, np.ascontiguousarray(turned(scan, float(angle)).points))
+            with torch.no_grad():
+                p = network(torch.from_numpy(projected.image[None])).float().softmax(1)[0].numpy()
+            best: NDArray[np.uint8] = p.argmax(0).astype(np.uint8)
+            trusted = (p.max(0) >= sure) & (projected.index >= 0)
+            at = projected.index[trusted]
+            labels[at] = np.where(labels[at] == IGNORE, best[trusted], labels[at])
+        labeled.append(replace(scan, labels=labels, azimuths=(-np.pi, np.pi)))
+    return labeled
+
+
+class OnnxTeacher:
+    """An exported network as the teacher: it answers for each sample, in the process that makes the sample.
+
+    Parameters
+    ----------
+    path : Path
+        The .onnx file. Its own channels are projected from the same scan as the input of the network to train.
+    task : Task
+        That of the network to train.
+
+    Raises
+    ------
+    ValueError
+        The teacher has another view, or other classes.
+    """
+
+    def __init__(self, path: Path, task: Task) -> None:
+        self.path, self.card = path, ModelCard.read(path)
+        if self.card.view != task.view:
+            raise ValueError(f"{path} sees another view than {task.recipe.network}")
+        if task.recipe.task != "road" and self.card.classes != task.classes:
+            raise ValueError(
+                f"{path} has the classes {', '.join(self.card.classes)}; expected {', '.join(task.classes)}"
+            )
+        self.mirror = task.recipe.seen_twice
+        self.has_boxes = task.recipe.task == "vehicles" and task.recipe.head == "dense"
+        if self.has_boxes and "box_dense" not in [output.kind for output in self.card.outputs]:
+            raise ValueError(f'{path} has no dense boxes; give --teacher a network with head "dense"')
+        self.projector = make_projector(self.card.view, self.card.input)
+        self._session: Session | None = None
+
+    def __call__(self, scan: LabeledScan) -> tuple[NDArray[np.float32], ...]:
+        """Class probabilities (C, H, W) float32, and dense boxes if the network to train has them."""
+        if self._session is None:  # made in the process that uses it
+            self._session = Session(self.path, "cpu", n_threads=1)
+        p, boxes = self._answer(self._session, scan)
+        if self.mirror:
+            p = 0.5 * (p + self._answer(self._session, mirrored(scan))[0][:, :, ::-1])
+        return (p, boxes) if boxes is not None else (p,)
+
+    def _answer(self, session: Session, scan: LabeledScan) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        session.input[:] = seen_by_network(self.projector, scan)[1].image
+        raw = session.run()
+        p = np.array(raw["class_logits"] if "class_logits" in raw else raw["class_probabilities"])
+        if "class_logits" in raw:
+            p = np.exp(p - p.max(axis=0))
+            p /= p.sum(axis=0)
+        return p, np.array(raw["box_dense"]) if self.has_boxes else None
+
+
+@torch.no_grad()
+def teach(network: nn.Module, image: Tensor, inputs: InputSpec, *, mirror: bool) -> tuple[Tensor, Tensor | None]:
+    """A network's class probabilities (B, C, H, W) for a batch of inputs, and its boxes or None.
+
+    ``mirror`` averages the probabilities over each scene and its mirror image. In the mirror image, the channel y
+    changes its sign.
+    """
+    with torch.autocast(image.device.type, torch.bfloat16):
+        outputs = network(image)
+        logits, boxes = outputs if isinstance(outputs, tuple) else (outputs, None)
+        p = logits.float().softmax(1)
+        if mirror:
+            mirrored = image.flip(-1)
+            if "y" in inputs.channels:
+                mirrored = mirrored.clone()
+                mirrored[:, inputs.channels.index("y")] *= -1.0
+            outputs = network(mirrored)
+            other = outputs[0] if isinstance(outputs, tuple) else outputs
+            p = 0.5 * (p + other.float().softmax(1).flip(-1))
+    return p, boxes

@@ -1,0 +1,865 @@
+"""The command line: running, output files, data sets, help pages and wrong usage."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import os
+import shlex
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_captures import vlp16_packets, write_pcap
+
+from cli_helpers import POINTSEG, SSADNET, run, write_scan
+from edgeperc import __version__, zoo
+from edgeperc.cli.arguments import DEFAULT, PRECISIONS, PROVIDERS
+from edgeperc.cli.evaluation.scans import _figure_lines
+from edgeperc.cli.main import build_parser, in_options
+from edgeperc.cli.output import print_line, progress
+from edgeperc.cli.scans import find_scans, output_names
+from edgeperc.errors import InferenceError, ModelFileError, OptionError, PointsError
+from edgeperc.inference import session
+from edgeperc.readers import captures
+from edgeperc.types.perception import Box, Perception, PointLabels, TopView
+
+
+class FakePerceiver:
+    """Labels every second point a car; chokes where the first point's remission is 1."""
+
+    made: ClassVar[list[FakePerceiver]] = []
+
+    def __init__(
+        self, models, *, sensor="hdl-64e", provider="auto", n_threads=None, on_mismatch="warn", **more
+    ) -> None:
+        self.given = (list(models), sensor, provider, n_threads, on_mismatch)
+        self.sensor = sensor
+        self.more = more
+        known = {"pointseg": POINTSEG, "ssadnet": SSADNET}
+        for name in models:
+            if name not in known:
+                raise ModelFileError(f"no model is called {name!r}.\nShipped: pointseg, ssadnet.")
+        if len(set(models)) < len(self.given[0]):
+            raise OptionError(f"models {self.given[0]} have one view; n_threads is {n_threads}")
+        self.cards = tuple(known[name] for name in models)
+        FakePerceiver.made.append(self)
+
+    def __call__(self, points, stamp_s=None, *, image=None) -> Perception:
+        if len(points) and points[0, 3] == 1.0:
+            raise InferenceError("pointseg answered\nwith NaN")
+        if len(points) and points[0, 3] == 2.0:
+            raise KeyboardInterrupt
+        if len(points) and points[0, 3] == 3.0:
+            warnings.warn("the scan has 32 beams", stacklevel=2)
+        views = [card.view.kind for card in self.cards]
+        labels = np.arange(len(points), dtype=np.uint8) % 2
+        cells = np.zeros((400, 200), dtype=np.uint8)
+        cells[:100, :100] = 1
+        top_view = TopView(cells, SSADNET.classes, 0.1, (6.0, 46.0), (-10.0, 10.0), np.ones(cells.shape, bool))
+        box = Box("car", 0.912345, (20.0, -3.0, -0.9), (4.2, 1.8, 1.6), 0.3)
+        return Perception(
+            n_points=len(points),
+            n_dropped=0,
+            points=PointLabels(labels, np.ones(len(points), bool), POINTSEG.classes)
+            if "range_image" in views
+            else None,
+            top_view=top_view if "top_view" in views else None,
+            boxes=(box,) if "top_view" in views else (),
+            stage_ms={"project": 1.0, "infer": 20.25},
+            providers={card.name: "CPUExecutionProvider (fp32)" for card in self.cards},
+            fitness=("the scan has 32 beams",) if len(points) == 5 else (),
+            stamp_s=stamp_s,
+        )
+
+
+@pytest.fixture(autouse=True)
+def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakePerceiver]:
+    monkeypatch.setitem(sys.modules, "edgeperc.perceiver", SimpleNamespace(Perceiver=FakePerceiver))
+    monkeypatch.setattr(FakePerceiver, "made", [])
+    return FakePerceiver
+
+
+def usage_code(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as left:
+        run(*arguments)
+    assert isinstance(left.value.code, int)
+    return left.value.code
+
+
+def test_version_and_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    assert usage_code("--version") == 0
+    assert capsys.readouterr().out == f"edgeperc {__version__}\n"
+    assert usage_code() == 2
+    assert usage_code("run") == 2
+    assert usage_code("run", "x.bin", "--threads", "0") == 2
+    assert usage_code("run", "\0") == 2
+    assert "1 or more" in capsys.readouterr().err
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys, edgeperc.cli\n"
+        "try: edgeperc.cli.main(['run', '--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'numpy', 'numba', 'onnxruntime', 'matplotlib'} & set(sys.modules)\n"
+        "sys.exit(f'imported {heavy}' if heavy else 0)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "--on-mismatch" in done.stdout
+
+
+def test_help_of_eval_and_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    assert usage_code("eval", "--help") == 0
+    assert "95 % intervals over drives" in " ".join(capsys.readouterr().out.split())
+    assert usage_code("eval") == 2
+    assert usage_code("eval", "simulation:1", "--split", "some") == 2
+    assert "invalid choice: 'some'" in capsys.readouterr().err
+
+
+def test_eval_needs_matplotlib_for_a_picture_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert run("eval", "simulation:1", "--worst", tmp_path / "worst.png", "--json", tmp_path / "out" / "a.json") == 2
+    assert "pip install 'edgeperc[view]'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_eval_passes_its_options_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = []
+
+    def evaluate(datasets: list[str], models: tuple[str, ...], **options: object) -> tuple[dict, list]:
+        asked.append((datasets, models, options))
+        return {"models": {"x": "1"}, "providers": {"x": "x fp32, cpu"}, "split": "test", "fold": None}, []
+
+    monkeypatch.setitem(sys.modules, "edgeperc.evaluation.evaluate", SimpleNamespace(evaluate=evaluate))
+    assert run("eval", "KITTI", "simulation:2") == 0
+    assert (
+        run("eval", "x", "--model", "a", "--provider", "openvino", "--precision", "bf16", "--boxes-from", "network")
+        == 0
+    )
+    (datasets, models, first), (_, own, second) = asked
+    assert (datasets, models, own) == (["KITTI", "simulation:2"], zoo.DEFAULT, ["a"])
+    assert [first[key] for key in ("provider", "precision", "boxes_from")] == ["cpu", "auto", "both"]
+    assert [second[key] for key in ("provider", "precision", "boxes_from")] == ["openvino", "bf16", "network"]
+    assert capsys.readouterr().out.splitlines()[1] == "ran as x fp32, cpu"
+
+
+def test_tables_of_figures() -> None:
+    car = {"precision": 0.5, "recall": 0.25, "iou": 0.2, "iou_interval": [0.1, 0.3], "n_points": 1200, "n_objects": 3}
+    none = dict.fromkeys(car) | {"n_points": 0, "n_objects": 0}
+    boxes = {
+        "ap": 1.0,
+        "ap_interval": None,
+        "precision": None,
+        "recall": 0.0,
+        "n_truth": 2,
+        "n_predicted": 0,
+        "n_hits": 0,
+    }
+    figures = {
+        "models": {"pointseg": "1.2.3"},
+        "providers": {"pointseg": "pointseg int8, CPUExecutionProvider"},
+        "split": "validation",
+        "fold": 1,
+        "semantickitti": {
+            "n_frames": 1,
+            "n_drives": 1,
+            "points": {"all": {"car": car, "cyclist": none}, "0-15 m": {"car": none, "cyclist": none}},
+            "boxes": {"upright": {"all": {"mean_ap": 1.0, "car": boxes, "vehicle": boxes}}},
+        },
+    }
+    lines = _figure_lines(figures)
+    assert lines[0].startswith("pointseg 1.2.3; validation drives, fold 1")
+    assert lines[1] == "ran as pointseg int8, CPUExecutionProvider"
+    assert lines[3] == "== SemanticKITTI: 1 scan, 1 drive =="
+    words = [line.split() for line in lines[4:]]
+    assert ["all", "car", "20.0", "10.0-30.0", "-", "-", "50.0", "-", "25.0", "-", "1,200", "3", "-"] in words
+    assert ["all", "car", "100.0", "-", "-", "-", "0.0", *"-----", "2", "0", "0", "-", "-"] in words
+    assert ["mean", "100.0", *"--------------"] in words
+    assert not any("cyclist" in line for line in words)
+
+
+def test_run_prints_a_line_a_scan(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: type[FakePerceiver]
+) -> None:
+    scans = [write_scan(tmp_path / f"{k}.bin", n) for k, n in enumerate((40, 1200, 0 + 3))]
+    options = ("--sensor", "os1-64", "--provider", "cpu", "--threads", 2, "--on-mismatch", "ignore")
+    assert run("run", *scans, *options) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split("  ")[0] for line in lines] == [str(scan) for scan in scans]
+    assert "1,200 points" in lines[1]
+    assert "21.2 ms" in lines[1]
+    assert "drivable 100.0 m2" in lines[1]
+    assert "boxes: 1 car" in lines[1]
+    assert "car 600, pedestrian 0, cyclist 0" in lines[1]
+    assert fake.made[0].given == (["ssadnet", "pointseg"], "os1-64", "cpu", 2, "ignore")
+    options = ("--boxes-from", "clusters", "--full-turn", "--precision", "bf16", "--adapt", "none", "--trusted")
+    assert run("run", scans[0], *options, "--no-agreement") == 0
+    usual = {"precision": "auto", "adapt": "both", "boxes_from": "both", "full_turn": False, "agree": True}
+    other = {"precision": "bf16", "adapt": "none", "boxes_from": "clusters", "full_turn": True, "agree": False}
+    assert [one.more for one in fake.made] == [{**usual, "trusted": False}, {**other, "trusted": True}]
+
+
+def test_json_is_one_object_a_scan_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good, bad, short = tmp_path / "good.bin", tmp_path / "bad.bin", tmp_path / "short.bin"
+    write_scan(good, 5)
+    write_scan(bad, 40, first_remission=1.0)
+    short.write_bytes(b"123")
+    absent = tmp_path / "absent.bin"
+    assert run("run", bad, good, short, absent, "--json") == 1
+    captured = capsys.readouterr()
+    answers = [json.loads(line) for line in captured.out.splitlines()]
+    assert [answer["scan"] for answer in answers] == [str(path) for path in (bad, good, short, absent)]
+    assert ["error" in answer for answer in answers] == [True, False, True, True]
+    assert answers[0] == {"scan": str(bad), "error": "pointseg answered with NaN"}
+    assert answers[1] == {
+        "scan": str(good),
+        "stamp_s": None,
+        "live": None,
+        "n_points": 5,
+        "n_dropped": 0,
+        "dropped": {"not_finite": 0, "too_near": 0, "ego": 0},
+        "stage_ms": {"project": 1.0, "infer": 20.25},
+        "providers": {"ssadnet": "CPUExecutionProvider (fp32)", "pointseg": "CPUExecutionProvider (fp32)"},
+        "boxes": [
+            {
+                "label": "car",
+                "score": 0.9123,
+                "center": [20.0, -3.0, -0.9],
+                "size": [4.2, 1.8, 1.6],
+                "yaw": 0.3,
+                "front": None,
+            }
+        ],
+        "drivable_area_m2": 100.0,
+        "road": {
+            "outline": [[36.0, 0.0], [46.0, 0.0], [46.0, 10.0], [36.0, 10.0]],
+            "tolerance_m": 0.2,
+            "free_ahead_end": "edge of the road",
+            "free_ahead_m": 6.0,
+            "obstacle_ahead_m": None,
+            "edge_ahead_m": 6.0,
+            "unknown_ahead_m": None,
+            "view_ahead_m": 46.0,
+            "lane_width_m": None,
+        },
+        "point_counts": {"background": 3, "car": 2, "pedestrian": 0, "cyclist": 0},
+        "tracks": [],
+        "fitness": ["the scan has 32 beams"],
+        "mounting": {"height_m": 1.73, "roll_deg": 0.0, "pitch_deg": 0.66, "yaw_deg": 0.0, "origin_m": [0.0, 0.0]},
+        "remission": None,
+        "image": None,
+    }
+    complaints = captured.err.splitlines()
+    assert [line.startswith("edgeperc: ") for line in complaints] == [True, True, True, False]
+    assert complaints[3].startswith("4 scans, 3 failed")
+    assert captured.err.count(str(short)) == 1
+    assert "Traceback" not in captured.err
+
+
+def test_json_of_one_model_says_null_for_the_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan = write_scan(tmp_path / "a.bin")
+    assert run("run", scan, "--json", "--model", "pointseg") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["drivable_area_m2"] is None
+    assert answer["road"] is None
+    assert answer["boxes"] == []
+    assert run("run", scan, "--json", "--model", "ssadnet") == 0
+    assert json.loads(capsys.readouterr().out)["point_counts"] is None
+
+
+def test_folders_are_opened_and_sorted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "scans"
+    for name in ("b.bin", "a.BIN", ".hidden.bin", "deeper/c.bin"):
+        write_scan(folder / name)
+    np.save(folder / "c.npy", np.zeros((3, 4), np.float32))
+    (folder / "notes.txt").write_text("no scan")
+    (folder / "folder.bin").mkdir()
+    assert run("run", folder, folder / "b.bin", "--json") == 0
+    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [Path(answer["scan"]).name for answer in answers] == ["a.BIN", "b.bin", "c.npy"]
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    assert run("run", bare, folder / "b.bin", "--json") == 1
+    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert answers[0]["scan"] == str(bare)
+    assert "no scan in this folder" in answers[0]["error"]
+    assert answers[1]["n_points"] == 40
+
+
+def test_huge_scans_fail_and_the_others_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def perceive(self: FakePerceiver, points: np.ndarray, stamp_s: float | None = None) -> Perception:
+        if len(points) == 41:
+            raise MemoryError
+        return real(self, points, stamp_s)
+
+    real = FakePerceiver.__call__
+    monkeypatch.setattr(FakePerceiver, "__call__", perceive)
+    with (tmp_path / "a.bin").open("wb") as file:
+        file.truncate(100 << 30)  # sparse
+    write_scan(tmp_path / "b.bin", 41)
+    write_scan(tmp_path / "c.bin")
+    assert run("run", tmp_path) == 1
+    done, errors = capsys.readouterr()
+    assert "c.bin" in done
+    assert "a.bin: 107,374,182,400 bytes are too much for one scan; expected at most 268,435,456" in errors
+    assert "b.bin: 41 points take more memory than there is" in errors
+
+
+@pytest.mark.skipif(os.name == "nt", reason="file names cannot have these characters")
+@pytest.mark.parametrize("command", [("run",), ("run", "--json"), ("info",), ("info", "--json")])
+def test_names_of_files_do_not_reach_the_terminal_raw(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
+) -> None:
+    good = write_scan(tmp_path / "a\x1b]0;title\x07\n\u202eb.bin")
+    bad, capture = tmp_path / "c\x1b[2J\r.bin", tmp_path / "d\x9b1m.pcap"
+    bad.write_bytes(b"no scan")
+    capture.write_bytes(b"no capture")
+    assert run(*command, good, bad, capture) == 1
+    shown = "".join(capsys.readouterr())
+    assert all(name in shown for name in ("\\u001b]0;title", "\\u001b[2J", "1m.pcap"))
+    assert all(line.isprintable() for line in shown.split("\n"))
+
+
+@pytest.mark.parametrize(("option", "passed"), [((), "refuse"), (("--anyway",), "warn")])
+def test_anyway(tmp_path: Path, fake: type[FakePerceiver], option: tuple[str, ...], passed: str) -> None:
+    assert run("run", write_scan(tmp_path / "a.bin"), *option) == 0
+    assert fake.made[0].given[-1] == passed
+
+
+@pytest.fixture
+def capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A capture of three scans, cut short; the second of them makes the perceiver choke."""
+    path = write_pcap(tmp_path / "drive.pcap", vlp16_packets(0.1))
+
+    def read_scans(source: Path, topic: str | None = None) -> Iterator[tuple[float, np.ndarray]]:
+        if source != path:
+            yield from real(source, topic=topic)
+            return
+        for k in range(3):
+            points = np.full((10 + k, 4), 0.5, np.float32)
+            points[0, 3] = float(k == 1)
+            yield 100.0 + k, points
+        raise PointsError(f"{path}: cut short, topic {topic}")
+
+    real = captures.read_scans
+    monkeypatch.setattr(captures, "read_scans", read_scans)
+    return path
+
+
+def test_the_scans_of_a_capture_are_numbered(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan = write_scan(tmp_path / "in" / "a.bin")
+    out = tmp_path / "out"
+    assert run("run", capture, scan, "--json", "--labels", "--out", out, "--topic", "/left") == 1
+    captured = capsys.readouterr()
+    answers = [json.loads(line) for line in captured.out.splitlines()]
+    names = [*(str(capture / f"{k:06d}") for k in range(3)), str(capture), str(scan)]
+    assert [answer["scan"] for answer in answers] == names
+    assert [answer.get("n_points") for answer in answers] == [10, None, 12, None, 40]
+    assert [answer.get("stamp_s") for answer in answers] == [100.0, None, 102.0, None, None]
+    assert answers[1]["error"] == "pointseg answered with NaN"
+    assert answers[3]["error"].endswith("cut short, topic /left")
+    assert "5 scans, 2 failed" in captured.err
+    written = {file.relative_to(out).as_posix(): file.stat().st_size // 4 for file in out.rglob("*.label")}
+    assert written == {"drive/000000.label": 10, "drive/000002.label": 12, "a.label": 40}
+    assert run("info", capture) == 0
+    assert "10, of which 0 are not finite" in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("always:got a scan at")
+@pytest.mark.parametrize("live", [False, True])
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda k: 100.0 + 0.1 * k - 2.0 * (k > 4), "the clock jumped"),
+        (lambda k: 100.0 + 0.1 * k - 0.121 * (k == 5), "late or doubled"),
+        (lambda k: 0.0 if k == 0 else 100.0 + 0.1 * k, "the clock jumped"),
+        (lambda k: 100.0 + 0.1 * (k % 5), "the clock jumped"),
+        (lambda k: 100.0 + 0.1 * (k // 2), "late or doubled"),
+        (lambda k: 2147483651.0 if k == 4 else 100.0 + 0.1 * k, "the stamp before was wrong"),
+    ],
+)
+def test_every_scan_is_answered_whatever_the_clock_does(
+    wrong: Callable[[int], float],
+    said: str,
+    live: bool,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = write_pcap(tmp_path / "drive.pcap", vlp16_packets(0.1))
+
+    def read(source: Path, topic: str | None = None) -> Iterator[tuple[float, np.ndarray]]:
+        return ((wrong(k), np.full((10, 4), 0.5, np.float32)) for k in range(10))
+
+    for module in ("edgeperc.readers.captures", "edgeperc.live"):
+        monkeypatch.setattr(f"{module}.read_scans", read)
+    options = ["--live", "--rate", 20] if live else []
+    assert run("run", path, "--track", *options) == 0
+    captured = capsys.readouterr()
+    answers = captured.out.splitlines()
+    assert len(answers) == 10 or (live and answers)
+    assert all("tracks: " in answer for answer in answers)
+    if not live:
+        assert captured.err.count(said) == 1
+        assert all("boxes: 1 car" in answer for answer in answers)
+        assert answers[-2 if said.startswith("late") else -1].endswith("tracks: 1 object")
+
+
+def test_a_missing_reader_is_said_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n")
+    (tmp_path / "absent").mkdir()
+    (tmp_path / "absent" / "rosbags.py").write_text("raise ImportError('not installed')\n")
+    monkeypatch.syspath_prepend(tmp_path / "absent")  # the process that decodes captures has this process's path
+    assert run("run", tmp_path / "drive.bag") == 2
+    assert "pip install 'edgeperc[ros]'" in capsys.readouterr().err
+
+
+def test_live(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "scans"
+    for k in range(4):
+        write_scan(folder / f"{k}.bin", 10 + k)
+    assert run("run", folder, "--live", "--rate", 1000, "--json") == 0
+    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [answer["scan"] for answer in answers] == [str(folder / f"{a['n_points'] - 10}.bin") for a in answers]
+    assert answers[-1]["n_points"] == 13
+    assert answers[-1]["stamp_s"] == pytest.approx(0.003)
+    last = answers[-1]["live"]
+    assert last["scans"] == 4
+    assert last["dropped"] == 4 - len(answers)
+    assert last["health"] in {"OK", "LATE", "STALE"}
+    assert last["age_ms"] >= 0.0
+    (folder / "4.bin").write_bytes(b"123")
+    assert run("run", folder, "--live", "--rate", 1000) == 1
+    captured = capsys.readouterr()
+    assert "4.bin" in captured.err
+    words = captured.out.splitlines()[-1].split("  ")
+    assert words[0] == str(folder / "3.bin")
+    assert [word.split()[0] for word in words[1:5]] == ["age_ms", "health", "scans", "dropped"]
+    assert words[5] == "13 points"
+
+
+def test_live_goes_on_after_a_scan_that_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_scan(tmp_path / "a.bin", 10, first_remission=1.0)
+    assert run("run", tmp_path, "--live", "--json") == 1
+    (answer,) = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert answer == {"scan": str(tmp_path), "error": "pointseg answered with NaN"}
+    assert run("run", tmp_path / "absent", "--live") == 2
+    assert "there is no such file or folder" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_files_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan = write_scan(tmp_path / "in" / "000123.bin", 40)
+    out = tmp_path / "out"
+    assert run("run", scan, "--out", out, "--png", "--html", "--labels", "--ply", "--json") == 0
+    assert sorted(file.name for file in out.iterdir()) == ["000123.html", "000123.label", "000123.ply", "000123.png"]
+    np.testing.assert_array_equal(np.fromfile(out / "000123.label", "<u4"), np.arange(40) % 2 * 10)
+    assert (out / "000123.png").read_bytes().startswith(b"\x89PNG")
+    assert b"element vertex 40\n" in (out / "000123.ply").read_bytes()
+    assert "000123.bin" in (out / "000123.html").read_text(encoding="utf-8")
+    assert json.loads(capsys.readouterr().out)["n_points"] == 40
+
+
+def test_scans_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
+    for k, folder in enumerate(("day1/velodyne", "day2/velodyne")):
+        write_scan(tmp_path / folder / "000.bin", 10 + k)
+        write_scan(tmp_path / folder / "001.bin", 20 + k)
+    out = tmp_path / "out"
+    folders = [tmp_path / "day1" / "velodyne", tmp_path / "day2" / ".." / "day2" / "velodyne"]
+    assert run("run", *folders, "--out", out, "--labels") == 0
+    sizes = {file.relative_to(out).as_posix(): file.stat().st_size // 4 for file in out.rglob("*.label")}
+    assert sizes == {
+        "day1/000.label": 10,
+        "day1/001.label": 20,
+        "day2/000.label": 11,
+        "day2/001.label": 21,
+    }
+
+
+@pytest.mark.parametrize(
+    ("given", "names"),
+    [
+        (["/d/a.bin", "/d/b.pcd.bin"], ["a", "b"]),
+        (["/d/1699.25.bin", "/d/1699.50.bin"], ["1699.25", "1699.50"]),
+        (["/d/a.bin", "/d/a.pcd"], ["a.bin", "a.pcd"]),
+        (["/d/a.bin", "/d/a.pcd.bin", "/e/a.bin"], ["d/a.bin", "d/a.pcd.bin", "e/a.bin"]),
+        (["/d/A.bin", "/e/a.bin"], ["d/A", "e/a"]),
+        (["/x/d/a.bin", "/y/d/a.bin", "/y/d/b.bin"], ["x/d/a", "y/d/a", "y/d/b"]),
+        (["/a.bin", "/d/a.bin"], ["a", "d/a"]),
+        (["/00/velodyne/a.bin", "/01/velodyne/a.bin"], ["00/a", "01/a"]),
+        (["/d/velodyne/a.bin", "/d/a.bin"], ["velodyne/a", "d/a"]),
+        (["/d/.bin"], [".bin"]),
+        (["/d/..bin"], ["..bin"]),
+        ([], []),
+    ],
+)
+def testoutput_names(given: list[str], names: list[str]) -> None:
+    assert [name.as_posix() for name in output_names([Path(scan) for scan in given])] == names
+
+
+FOLDERS = st.lists(st.sampled_from(["a", "b", "velodyne", "data", "A"]), max_size=3)
+
+
+@given(
+    st.lists(st.tuples(FOLDERS, st.sampled_from(["0", "1", "x"]), st.sampled_from([".bin", ".pcd", ".pcd.bin"]))),
+    st.booleans(),
+)
+def test_output_names_never_collide(scans: list[tuple[list[str], str, str]], keep_folder: bool) -> None:
+    paths = [Path("/", *folders, stem + suffix) for folders, stem, suffix in scans]
+    paths = list({str(path).casefold(): path for path in paths}.values())
+    names = output_names(paths, keep_folder=keep_folder)
+    assert len({str(name).casefold() for name in names}) == len(paths)
+    for path, name in zip(paths, names, strict=True):
+        assert path.name.startswith(name.name)
+        assert not name.is_absolute()
+
+
+def test_a_scan_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan = write_scan(tmp_path / "scan.bin")
+    ply = tmp_path / "scan.ply"
+    assert run("run", scan, "--ply", "--out", tmp_path) == 0
+    before = ply.read_bytes()
+    assert usage_code("run", ply, "--ply", "--out", tmp_path) == 2
+    assert "would be overwritten" in capsys.readouterr().err
+    assert ply.read_bytes() == before
+
+
+def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: type[FakePerceiver]) -> None:
+    scan = write_scan(tmp_path / "a.bin")
+    for arguments, words in [
+        (("--png",), "add --out"),
+        (("--out", tmp_path / "out"), "add --png"),
+        (("--on-mismatch", "explode"), "invalid choice"),
+        (("--rate", "0"), "above 0"),
+        (("--rate", "nan"), "above 0"),
+        (("--live", "--ply", "--out", tmp_path / "out"), "--live writes no files; leave out --ply"),
+        ((scan, "--live"), f"--live replays one path, got 2: {scan}, {scan}"),
+        (("--deskew",), "--deskew needs --poses FILE or --track"),
+        (("--poses", scan), "--poses is of --deskew"),
+        (("--deskew", "--track", "--live"), "and no --live"),
+    ]:
+        assert usage_code("run", scan, *arguments) == 2
+        assert words in capsys.readouterr().err
+    for arguments, words in [
+        (("--model", "nonesuch"), "no model is called 'nonesuch'. Shipped: pointseg, ssadnet."),
+        (
+            ("--model", "pointseg", "--model", "pointseg"),
+            "--model ['pointseg', 'pointseg'] have one view; --threads is",
+        ),
+        (("--model", "ssadnet", "--labels", "--out", tmp_path / "out"), "add a range-image model"),
+    ]:
+        assert run("run", scan, *arguments) == 2
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.startswith("edgeperc: ")
+        assert captured.err.count("\n") == 1
+        assert words in captured.err
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "file").write_text("in the way")
+    assert run("run", scan, "--labels", "--out", tmp_path / "file") == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_file_that_cannot_be_written_fails_its_scan_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scans = [write_scan(tmp_path / name) for name in ("a.bin", "b.bin")]
+    (tmp_path / "out" / "a.label").mkdir(parents=True)
+    assert run("run", *scans, "--labels", "--out", tmp_path / "out") == 1
+    assert "a.label" in capsys.readouterr().err
+    assert (tmp_path / "out" / "b.label").stat().st_size == 160
+
+
+def test_missing_matplotlib_is_said_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, fake: type[FakePerceiver]
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert run("run", write_scan(tmp_path / "a.bin"), "--png", "--out", tmp_path / "out") == 2
+    assert "pip install 'edgeperc[view]'" in capsys.readouterr().err
+    assert fake.made == []
+
+
+def test_interrupted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scans = [write_scan(tmp_path / "a.bin"), write_scan(tmp_path / "b.bin", 40, first_remission=2.0)]
+    assert run("run", *scans, "--json") == 130
+    captured = capsys.readouterr()
+    assert len(captured.out.splitlines()) == 1
+    assert captured.err == "edgeperc: interrupted\n"
+
+
+@pytest.mark.filterwarnings("default::UserWarning")
+def test_warnings_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shown = warnings.showwarning
+    assert run("run", write_scan(tmp_path / "a.bin", 40, first_remission=3.0)) == 0
+    assert capsys.readouterr().err == "edgeperc: warning: the scan has 32 beams\n"
+    assert warnings.showwarning is shown
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes are told of differently elsewhere")
+def test_a_reader_that_goes_away_is_no_accident(tmp_path: Path) -> None:
+    for k in range(30):
+        write_scan(tmp_path / f"{k:02}.bin")
+    code = (
+        "import sys, types; sys.path.insert(0, sys.argv[1]); import test_cli\n"
+        "sys.modules['edgeperc.perceiver'] = types.SimpleNamespace(Perceiver=test_cli.FakePerceiver)\n"
+        "from edgeperc.cli import main; sys.exit(main(['run', sys.argv[2], '--json']))\n"
+    )
+    command = [sys.executable, "-c", code, str(Path(__file__).parent), str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    complaints = process.stderr.read().decode()
+    process.stderr.close()
+    assert process.wait() == 141
+    assert "Traceback" not in complaints
+    assert "BrokenPipe" not in complaints
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere file names are Unicode")
+def test_names_that_are_no_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan = tmp_path / os.fsdecode(b"caf\xe9.bin")
+    write_scan(scan)
+    assert run("run", scan) == 0
+    assert "\\udce9.bin" in capsys.readouterr().out
+    assert run("run", scan, "--html", "--out", tmp_path / "out") == 0
+    assert len(list((tmp_path / "out").iterdir())) == 1
+
+
+class Terminal(io.StringIO):
+    """Text that a terminal would show."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_progress_bar_is_drawn_on_a_terminal_below_the_lines(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("tqdm")
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with progress("file") as show:
+        show(0, 4)
+        show(2, 4)
+        print_line("a line")
+    shown = sys.stderr.getvalue()  # type: ignore[attr-defined]
+    assert "0/4" in shown
+    assert "2/4" in shown
+    assert "file" in shown
+    assert shown.endswith("\r")  # nothing of the bar stays
+    assert capsys.readouterr().out == "a line\n"
+
+
+@pytest.mark.parametrize("why", ["no terminal", "one thing", "no tqdm"])
+def test_no_progress_bar(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", io.StringIO() if why == "no terminal" else Terminal())
+    if why == "no tqdm":
+        monkeypatch.setitem(sys.modules, "tqdm", None)
+    with progress() as show:
+        show(0, 1 if why == "one thing" else 4)
+        show(1, 1 if why == "one thing" else 4)
+    assert sys.stderr.getvalue() == ""  # type: ignore[attr-defined]
+
+
+def test_run_shows_progress_beside_its_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("tqdm")
+    scans = [write_scan(tmp_path / f"{k}.bin") for k in range(3)]
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    assert run("run", *scans) == 0
+    assert "1/3" in sys.stderr.getvalue()  # type: ignore[attr-defined]
+    assert [line.split("  ")[0] for line in capsys.readouterr().out.splitlines()] == [str(scan) for scan in scans]
+
+
+@pytest.fixture
+def fake_street(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(0).uniform(-20.0, 20.0, (1000, 4)).astype(np.float32)
+    street = SimpleNamespace(points=points, labels=np.ones(1000, np.uint8))
+    made = SimpleNamespace(random_scene=lambda seed, environment: seed, simulate=lambda scene, sensor, seed: street)
+    monkeypatch.setitem(sys.modules, "edgeperc.simulation.drawn", made)
+    monkeypatch.setitem(sys.modules, "edgeperc.simulation.scene", made)
+
+
+@pytest.mark.usefixtures("fake_street", "matplotlib")
+def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("demo", "--out", tmp_path / "demo") == 0
+    out = capsys.readouterr().out
+    assert "100 m2 of the 40 x 20 m ahead" in out
+    assert "20.2 m away:  20.0 m ahead,  3.0 m right" in out
+    assert "heading   17 deg" in out
+    assert "(true: 1,000)" in out
+    assert "ssadnet: CPUExecutionProvider (fp32)" in out
+    for name in ("scene.png", "scene.html"):
+        assert str(tmp_path / "demo" / name) in out
+        assert (tmp_path / "demo" / name).stat().st_size > 10_000
+
+
+@pytest.mark.usefixtures("fake_street")
+def test_demo_without_matplotlib(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert run("demo", "--out", tmp_path / "demo", "--model", "ssadnet") == 0
+    out = capsys.readouterr().out
+    assert "pip install 'edgeperc[view]'" in out
+    assert "drivable" in out
+    assert [file.name for file in (tmp_path / "demo").iterdir()] == ["scene.html"]
+
+
+# --- data sets -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("files", "names"),
+    [
+        (
+            ["training/velodyne/000000.bin", "testing/velodyne/000000.bin", "training/label_2/000000.txt"],
+            ["training/000000", "testing/000000"],
+        ),
+        (["sequences/01/velodyne/000000.bin", "sequences/00/velodyne/000001.bin"], ["00/000001", "01/000000"]),
+        (["sequences/08/velodyne/000000.bin"], ["08/000000"]),
+        (["velodyne/0000/000000.bin", "velodyne/0001/000000.bin"], ["0000/000000", "0001/000000"]),
+        (["velodyne_points/data/0000000000.bin", "velodyne_points/timestamps.txt"], ["root/0000000000"]),
+        (["drive_1/velodyne_points/data/0.bin", "drive_2/velodyne_points/data/0.bin"], ["drive_1/0", "drive_2/0"]),
+        (["0.bin", "velodyne/1.bin"], ["0"]),
+    ],
+)
+def test_the_scans_of_a_data_set(files: list[str], names: list[str], tmp_path: Path) -> None:
+    for file in files:
+        write_scan(tmp_path / "root" / file)
+    assert run("run", tmp_path / "root", "--labels", "--out", tmp_path / "out") == 0
+    found = find_scans([tmp_path / "root"])
+    assert [n.as_posix() for n in output_names(found.paths, keep_folder=found.of_data_set)] == names
+    written = {file.relative_to(tmp_path / "out").as_posix() for file in (tmp_path / "out").rglob("*.label")}
+    assert written == {f"{name}.label" for name in names}
+
+
+def test_live_replays_the_one_folder_of_a_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan = write_scan(tmp_path / "sequences" / "00" / "velodyne" / "000000.bin")
+    assert run("run", tmp_path, "--live", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["scan"] == str(scan)
+    write_scan(tmp_path / "sequences" / "01" / "velodyne" / "000000.bin")
+    assert usage_code("run", tmp_path, "--live") == 2
+    assert "--live replays one folder of scans" in capsys.readouterr().err
+
+
+def test_live_names_the_scans_of_a_capture(capture: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    monkeypatch.setattr("edgeperc.live.read_scans", captures.read_scans)
+    assert run("run", capture, "--live", "--json") == 1
+    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    named = [answer["scan"] for answer in answers if "error" not in answer]
+    assert named
+    assert {*named} <= {str(capture / f"{k:06d}") for k in range(3)}
+
+
+# --- help and renamed words ------------------------------------------------------------------------------------------
+
+COMMANDS = (
+    *("demo", "run", "ros2", "info", "doctor", "models", "sensors", "providers", "eval", "eval-sensors"),
+    *("eval-tracking", "eval-painting", "fit-sensor", "completion"),
+)
+
+
+def parsers() -> dict[str, argparse.ArgumentParser]:
+    (commands,) = [action for action in build_parser()._actions if isinstance(action, argparse._SubParsersAction)]
+    return dict(commands.choices)
+
+
+def test_there_is_one_level_of_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    assert tuple(parsers()) == COMMANDS
+    assert usage_code("--help") == 0
+    out = capsys.readouterr().out
+    assert all(f"    {name}" in out for name in COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_help_page_fits_a_terminal_and_explains_every_option(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert usage_code(name, "--help") == 0
+    page = capsys.readouterr().out
+    assert max(map(len, page.splitlines())) <= 80
+    assert f"examples:\n  edgeperc {name}" in page
+    for action in parsers()[name]._actions:
+        if action.help is argparse.SUPPRESS:
+            continue
+        assert action.help, f"{action.option_strings or action.dest} has no help text"
+        if action.option_strings and action.nargs != 0 and not action.required:
+            assert "(default: " in action.help or "; default: " in action.help, f"{action.dest} names no default"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_examples_of_a_help_page_can_be_parsed(name: str) -> None:
+    parser = build_parser()
+    epilog = parsers()[name].epilog or ""
+    examples = [line for line in epilog.splitlines() if line.startswith("  edgeperc ")]
+    assert examples
+    for line in examples:
+        words = shlex.split(line.partition(" > ")[0].partition(" #")[0])
+        assert callable(parser.parse_args(words[1:]).command)
+
+
+def test_the_help_page_lists_what_there_is() -> None:
+    assert zoo.DEFAULT == DEFAULT
+    assert {*PROVIDERS} == {"auto", *session.PROVIDERS}
+    assert ("auto", *session.PRECISIONS) == PRECISIONS
+
+
+@pytest.mark.parametrize(
+    ("words", "new"),
+    [
+        (
+            ["eval", "sensors", "os1-64=simulation"],
+            "'eval sensors' is now 'eval-sensors': edgeperc eval-sensors os1-64=",
+        ),
+        (["eval", "tracking", "root", "--iou", "0.5"], "edgeperc eval-tracking root --iou 0.5"),
+        (["adapt", "fit", "a", "--sensor", "x", "--out", "b"], "edgeperc fit-sensor a --sensor x --out b"),
+        (["run", "a.bin", "--all-around"], "--all-around is now --full-turn"),
+        (["demo", "--all-around"], "--all-around is now --full-turn"),
+        (["run", "a.bin", "--adapt", "neither"], "neither is now none"),
+        (["run", "a.bin", "--precis", "int8"], "unrecognized arguments: --precis"),
+    ],
+)
+def test_old_words_are_refused_with_the_new_one(words: list[str], new: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert usage_code(*words) == 2
+    assert new in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        ("n_threads is 0; expected at least 1", "--threads is 0; expected at least 1"),
+        ("provider 'x' is unknown; expected auto", "--provider 'x' is unknown; expected auto"),
+        ("ask for provider 'openvino' and precision 'bf16'", "ask for --provider 'openvino' and --precision 'bf16'"),
+        ('pass precision="fp32", or adapt=none', "pass --precision fp32, or --adapt none"),
+        ("models ['a', 'b'] have views", "--model ['a', 'b'] have views"),
+        (
+            "the sensor gives no remission; the provider's choice",
+            "the sensor gives no remission; the provider's choice",
+        ),
+        ("--provider 'x' is given; no sensor 'y' is built in", "--provider 'x' is given; no --sensor 'y' is built in"),
+    ],
+)
+def test_messages_name_options(message: str, expected: str) -> None:
+    assert in_options(message) == expected
+
+
+def test_python_m_edgeperc() -> None:
+    done = subprocess.run([sys.executable, "-m", "edgeperc", "--version"], capture_output=True, text=True, check=False)
+    assert done.stdout == f"edgeperc {__version__}\n"

@@ -1,0 +1,167 @@
+"""Images on the command line: run, info, eval."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tiny_camera
+
+from cli_helpers import run, write_scan
+
+pillow = pytest.importorskip("PIL.Image")
+
+import edgeperc
+from edgeperc.errors import ImageError
+from edgeperc.simulation.camera import CAMERA_CLASSES
+from edgeperc.types.perception import ImageLabels, Perception
+from edgeperc.view import draw_image
+from edgeperc.view.colors import CAMERA_COLORS, CLASS_COLORS, color_of
+
+CPU = ("--provider", "cpu", "--threads", "1")
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    return tiny_camera.write_camera(tmp_path)
+
+
+def write_image(path: Path, color: tuple[int, int, int] = (200, 10, 20), width: int = 40, height: int = 30) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pillow.fromarray(np.full((height, width, 3), color, np.uint8)).save(path)
+    return path
+
+
+def records(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+
+
+def test_run_prints_a_line_an_image(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    red, green = write_image(tmp_path / "red.png"), write_image(tmp_path / "green.JPG", (10, 200, 20), 64, 48)
+    assert run("run", red, green, "--model", model, *CPU) == 0
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith(f"{red}  40 x 30 pixels: Road 100.0 %  ")
+    assert second.startswith(f"{green}  64 x 48 pixels: Tree 100.0 %  ")
+    assert first.endswith(" ms")
+
+
+def test_a_folder_of_images_is_sorted(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in "cab":
+        write_image(tmp_path / "images" / f"{name}.png")
+    (tmp_path / "images" / "notes.txt").write_text("no image")
+    assert run("run", tmp_path / "images", "--model", model, *CPU, "--json") == 0
+    files = [record["image"]["file"] for record in records(capsys)]
+    assert files == [str(tmp_path / "images" / f"{name}.png") for name in "abc"]
+
+
+def test_json_and_picture(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    image, out = write_image(tmp_path / "street.png"), tmp_path / "out"
+    assert run("run", image, "--model", model, *CPU, "--json", "--png", "--out", out) == 0
+    (record,) = records(capsys)
+    counts = {"Sky": 0, "Road": 1200, "Tree": 0}
+    seen = {"width": 40, "height": 30, "drivable_share": 1.0, "pixel_counts": counts}
+    assert record["image"] == {"file": str(image), **seen}
+    assert (record["scan"], record["boxes"], record["point_counts"]) == (None, [], None)
+    assert [file.name for file in out.iterdir()] == ["street.png"]
+    with pillow.open(out / "street.png") as picture:
+        assert picture.size[0] == 1600
+
+
+def test_an_image_with_its_scan(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    images = [write_image(tmp_path / f"{k}.png") for k in range(2)]
+    scans = [write_scan(tmp_path / f"{k}.bin", 40 + k) for k in range(2)]
+    options = ("--model", model, "--model", "pointseg", *CPU, "--on-mismatch", "ignore")
+    out = tmp_path / "out"
+    assert run("run", *images, "--scan", *scans, *options, "--json", "--png", "--labels", "--out", out) == 0
+    first, second = records(capsys)
+    assert (first["scan"], first["image"]["file"], first["n_points"]) == (str(scans[0]), str(images[0]), 40)
+    assert (second["n_points"], second["image"]["drivable_share"]) == (41, 1.0)
+    kinds = (".label", ".png", "_scan.png")
+    assert sorted(file.name for file in out.iterdir()) == sorted(f"{k}{kind}" for k in range(2) for kind in kinds)
+    assert run("run", images[0], "--scan", scans[0], *options) == 0
+    line = capsys.readouterr().out
+    assert "40 x 30 pixels: Road 100.0 %  40 points" in line
+
+
+def test_an_image_that_fails_leaves_the_others(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad, good = tmp_path / "bad.jpg", write_image(tmp_path / "good.png")
+    bad.write_bytes(b"\xff\xd8\xff")
+    assert run("run", bad, good, tmp_path / "none.png", "--model", model, *CPU, "--json") == 1
+    printed = capsys.readouterr()
+    failed, fine, missing = map(json.loads, printed.out.splitlines())
+    assert failed["image"] == {"file": str(bad)}
+    assert "cannot be read" in failed["error"]
+    assert fine["image"]["drivable_share"] == 1.0
+    assert "no such file" in missing["error"]
+    assert "3 images, 2 failed" in printed.err
+
+
+def test_wrong_usage(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image, scan = write_image(tmp_path / "a.png"), write_scan(tmp_path / "b.bin")
+    out = ("--out", tmp_path / "out")
+    for arguments, said in (
+        ((image, "--scan", scan, scan.with_name("c.bin"), "--model", model), "--scan: 2 scans for 1 image"),
+        ((scan, "--scan", scan), "--scan: 1 scan for 0 images"),
+        ((image, "--labels", *out), "--labels is of scans; add --scan"),
+        ((image, "--track"), "--track is of scans; add --scan"),
+        ((image, "--live"), f"--live is of scans, and {image} is an image"),
+        ((image, "--deskew", "--track"), "--deskew is of scans"),
+        ((image, "--png", "--out", tmp_path, "--model", model), "is one of the images and would be overwritten"),
+    ):
+        with pytest.raises(SystemExit, match="2"):
+            run("run", *arguments)
+        assert said in capsys.readouterr().err
+    for arguments, said in (
+        ((image, scan), "b.bin is not an image, and"),
+        ((image, "--model", "pointseg"), "images need a camera model; add --model camseg"),
+        ((image, "--model", "pointseg", "--model", model), "images alone need a camera model alone"),
+        ((scan, "--model", model), "scans without images need no camera model"),
+    ):
+        assert run("run", *arguments, *CPU) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_info_of_images_and_camera_models(tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image = write_image(tmp_path / "a.png")
+    assert run("info", image, model) == 0
+    said = capsys.readouterr().out
+    assert "40 x 30 pixels, upright" in said
+    assert "red 200, green 10, blue 20 of 255" in said
+    assert "camera: 32 x 24 pixels, images are stretched to it" in said
+    assert "a class for every pixel of a camera's image (3 classes)" in said
+    assert run("info", image, "--json") == 0
+    assert records(capsys)[0]["width"] == 40
+    assert run("info", tmp_path / "none.jpg") == 1
+
+
+def test_pictures_of_images(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    labels = np.arange(12, dtype=np.uint8).reshape(3, 4) % 3
+    perception = Perception(
+        0, 0, None, None, (), {"infer": 1.0}, {"m": "m"}, (), None, image=ImageLabels(labels, tuple("abc"))
+    )
+    image = np.zeros((3, 4, 3), np.uint8)
+    png = draw_image(perception, image, tmp_path / "a.png", title="a street")
+    assert (tmp_path / "a.png").read_bytes() == png
+    tall = Perception(
+        0, 0, None, None, (), {}, {}, (), None, image=ImageLabels(np.zeros((500, 2), np.uint8), ("a", "b"))
+    )
+    assert draw_image(tall, np.zeros((500, 2, 3), np.uint8)).startswith(b"\x89PNG")
+    with pytest.raises(ImageError, match="expected what was perceived"):
+        draw_image(perception, np.zeros((3, 5, 3), np.uint8))
+    with pytest.raises(ImageError, match="of a perception of no image"):
+        draw_image(Perception(0, 0, None, None, (), {}, {}, (), None), image)
+
+
+def test_classes_of_images_have_colors() -> None:
+    colors = [color_of(name) for name in CAMERA_CLASSES]
+    assert len({*colors}) == len(CAMERA_CLASSES) == 11
+    assert color_of("Car") == CLASS_COLORS["car"]
+    assert not CAMERA_COLORS.keys() & CLASS_COLORS.keys()
+    assert edgeperc.__all__

@@ -1,0 +1,334 @@
+"""The commands that list and explain: info, models, sensors, providers, completion."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli_helpers import POINTSEG, SSADNET, run, write_scan
+from edgeperc import zoo
+from edgeperc.errors import ModelFileError
+from edgeperc.inference import listing, session
+from edgeperc.preprocess.fitness import FitnessProfile
+from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.scene import simulate
+from edgeperc.system import machine
+from edgeperc.types.card import ModelCard
+from edgeperc.types.sensor import SENSORS, get_sensor
+from edgeperc.zoo import Variant
+
+
+@pytest.fixture
+def fake_models(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    file = tmp_path / "pointseg.onnx"
+    file.write_bytes(bytes(2_500_000))
+    file.with_stem("pointseg-int8").write_bytes(bytes(700_000))
+    file.with_stem("ssadnet").write_bytes(bytes(10))
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "cache"))
+
+    def listed() -> tuple[Variant, ...]:
+        return (
+            Variant(file, POINTSEG),
+            Variant(file.with_stem("pointseg-int8"), replace(POINTSEG, precision="int8")),
+            Variant(file.with_stem("ssadnet"), SSADNET),
+        )
+
+    def resolve(model: str) -> tuple[Variant, ...]:
+        found = tuple(each for each in listed() if each.name in (Path(model).stem, model))
+        if not found:
+            raise ModelFileError(f"no model is called {model!r}")
+        return found
+
+    monkeypatch.setattr(zoo, "listed", listed)
+    monkeypatch.setattr(listing, "listed", listed)
+    monkeypatch.setattr(zoo, "resolve", resolve)
+
+
+def rows_of(text: str) -> dict[str, str]:
+    """First words of lines, and what follows."""
+    return dict((*line.split(None, 1), "")[:2] for line in text.splitlines())
+
+
+@pytest.mark.usefixtures("fake_models")
+@pytest.mark.parametrize("thing", ["pointseg", "pointseg.onnx"])
+def test_info_of_a_model(thing: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info", thing if thing == "pointseg" else tmp_path / thing) == 0
+    rows = rows_of(capsys.readouterr().out)
+    assert rows["model"] == "pointseg 1.2.3: a class for every point (car, pedestrian, cyclist)"
+    assert rows["variants"] == "fp32 2.5 MB, int8 0.7 MB"
+    assert rows["sha256"] == hashlib.sha256(bytes(2_500_000)).hexdigest()
+    assert rows["view"] == "range_image: 3 beams from 2 to -10 deg, azimuths 45 to -45 deg"
+    assert rows["input"] == "3 x 3 x 8: x, y, z"
+    assert rows["outputs"] == "logits (class_logits)"
+    assert rows["classes"] == "background, car, pedestrian, cyclist"
+    assert rows["data"] == "streets"
+    assert rows["licence"] == "CC0"
+    assert rows["on"] == "KITTI  21 scans, %: IoU car 65.1"
+    assert rows["int8"] == "99.95 % of the labels as in fp32, 0.1 points lost"
+    assert "frames" not in rows
+
+
+@pytest.mark.parametrize("name", zoo.shipped_models())
+def test_info_of_a_shipped_model_fits_a_screen(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info", name) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert 8 < len(lines) <= 24
+    assert max(map(len, lines)) <= 100
+
+
+def test_info_folds_what_is_long(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    card = replace(POINTSEG, training={"data": "street " * 100}, classes=tuple(f"class {k}" for k in range(250)))
+    monkeypatch.setattr(zoo, "resolve", lambda model: (Variant(Path(__file__), card),))
+    assert run("info", "pointseg") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 24
+    assert max(map(len, lines)) <= 100
+    assert sum(line.endswith(" ...") for line in lines) == 3  # classes are in two rows
+
+
+@pytest.mark.usefixtures("fake_models")
+def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+
+    checked = []
+
+    def check_fitness(points, profile, sensor) -> tuple[str, ...]:
+        checked.append((points, profile, sensor.name))
+        return ("it has 32 beams",)
+
+    monkeypatch.setattr("edgeperc.preprocess.fitness.check_fitness", check_fitness)
+    monkeypatch.setattr(FitnessProfile, "from_dict", dict)
+    monkeypatch.setattr(sys.modules[__name__], "POINTSEG", replace(POINTSEG, fitness={"n_beams": 64}))
+    points = np.array([[3, 4, 0, 10], [0, 10, 10, 255], [-6, 0, 8, 51], [np.nan, 0, 0, 0]], np.float32)
+    np.save(tmp_path / "scan.npy", points)
+    assert run("info", tmp_path / "scan.npy", "--sensor", "os1-64") == 0
+    rows = rows_of(capsys.readouterr().out)
+    assert rows["points"] == "4, of which 1 are not finite"
+    assert rows["extent"] == "x -6.0 .. 3.0, y 0.0 .. 10.0, z 0.0 .. 10.0 m"
+    assert rows["range"] == "5.0 .. 14.1 m, median 10.0 m"
+    assert rows["remission"].startswith("min 10, 5 % ")
+    assert rows["beams"].endswith("rows of points (os1-64: 64)")
+    assert rows["pointseg"] == "as a scan of os1-64: it has 32 beams"
+    assert rows["ssadnet"].startswith("its card does not describe")
+    ((scaled, profile, sensor),) = checked
+    np.testing.assert_allclose(scaled[:3, 3], np.array([10, 255, 51]) / 255, rtol=1e-6)
+    assert (profile, sensor) == ({"n_beams": 64}, "os1-64")
+    assert run("info", tmp_path / "scan.npy", "--sensor", "os1-64", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["range_m"] == pytest.approx([5.0, 10.0, 14.1421], abs=1e-4)
+    assert (document["n_points"], document["n_not_finite"]) == (4, 1)
+    assert document["models"] == {"pointseg": ["it has 32 beams"], "ssadnet": None}
+
+
+def test_info_prints_a_card_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info", "ssadnet", "--json") == 0
+    assert ModelCard.from_json(capsys.readouterr().out).to_json() == zoo.resolve("ssadnet")[0].card.to_json()
+
+
+@pytest.mark.usefixtures("fake_models")
+def test_info_goes_on_after_what_it_does_not_know(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    empty = tmp_path / "empty.npy"
+    np.save(empty, np.zeros((0, 4), np.float32))
+    assert run("info", "nonesuch", tmp_path / "absent.bin", empty, "ssadnet") == 1
+    captured = capsys.readouterr()
+    assert [line.split(":")[0] for line in captured.err.splitlines()] == ["edgeperc", "edgeperc"]
+    assert "0, of which 0 are not finite" in captured.out
+    assert "top_view: x 6..46 m, y -10..10 m, cells of 0.1 m" in captured.out
+    assert "car, van, score from 0.3" in captured.out
+    assert run("info", empty, "--sensor", "nonesuch") == 2
+    assert "nonesuch" in capsys.readouterr().err
+
+
+def test_info_and_lists_need_no_onnxruntime(tmp_path: Path) -> None:
+    scan = write_scan(tmp_path / "a.bin", 40)
+    code = (
+        "import sys; from edgeperc.cli import main\n"
+        f"for words in (['info', 'pointseg', {str(scan)!r}], ['models'], ['sensors']): assert main(words) == 0\n"
+        "sys.exit('opened' if 'onnxruntime' in sys.modules else 0)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+# --- models, sensors, providers, completion --------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("fake_models")
+def test_models_are_listed_with_what_was_measured_here(capsys: pytest.CaptureFixture[str]) -> None:
+    entry = {"provider": "cpu", "precision": "int8", "n_threads": 2, "p50_ms": 7.25}
+    digest = zoo.digest(zoo.resolve("pointseg"))
+    machine.write_settings(machine.settings_path(), machine.fingerprint(), {digest: entry})
+    assert run("models") == 0
+    heading, pointseg, ssadnet = capsys.readouterr().out.splitlines()
+    assert heading.split()[:2] == ["name", "default"]
+    assert pointseg.split()[:2] == ["pointseg", "yes"]
+    assert "fp32 2.5, int8 0.7" in pointseg
+    assert "7.2 ms, cpu int8" in pointseg
+    assert pointseg.endswith("CC0")
+    assert "boxes of car, van" in ssadnet
+    assert run("models", "--json") == 0
+    first, second = map(json.loads, capsys.readouterr().out.splitlines())
+    assert (first["name"], first["measured"], first["default"]) == ("pointseg", entry, True)
+    assert first["variants"] == {"fp32": 2.5, "int8": 0.7}
+    assert second["measured"] is None
+
+
+def test_sensors_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("sensors") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[1:]] == [*SENSORS]
+    assert [line.split()[0] for line in lines[1:] if line.split()[1] == "yes"] == ["hdl-64e"]
+    assert run("sensors", "--json") == 0
+    records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [record["name"] for record in records] == [*SENSORS]
+    assert records[0]["beams"] == 64
+
+
+def test_providers_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("onnxruntime")
+    assert run("providers", "--json") == 0
+    records = {record["name"]: record for record in map(json.loads, capsys.readouterr().out.splitlines())}
+    assert {*records} == {*session.PROVIDERS}
+    assert records["cpu"]["available"]
+    assert run("providers") == 0
+    assert len(capsys.readouterr().out.splitlines()) == 1 + len(records)
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
+def test_completion_knows_commands_options_and_names(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("shtab")
+    assert run("completion", shell) == 0
+    script = capsys.readouterr().out
+    for word in ("eval-tracking", "full-turn", "os1-64", "ssadnet", "openvino", "bf16"):
+        assert word in script
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["mod"], {"models"}),
+        (["run", "--full"], {"--full-turn"}),
+        (["run", "--precision", "b"], {"bf16"}),
+        (["run", "--model", "ssad"], {"ssadnet"}),
+        (["run", "--sensor", "pandarx"], {"pandarxt-32"}),
+        (["run", "--model", "ssadnet", "sca"], {"scan.bin"}),
+        (["info", "sca"], {"scan.bin"}),
+        (["eval-tracking", "--gif", "sca"], {"scan.bin"}),
+    ],
+)
+def test_bash_completes(words: list[str], found: set[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("shtab")
+    assert run("completion", "bash") == 0
+    (tmp_path / "scan.bin").touch()
+    (tmp_path / "completion").write_text(capsys.readouterr().out)
+    code = (
+        f"source ./completion; COMP_WORDS=(edgeperc {' '.join(words)}); COMP_CWORD={len(words)}; "
+        '_shtab_edgeperc 2>/dev/null; printf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(["bash", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert {*done.stdout.split()} == found, done.stderr
+
+
+def test_completion_names_its_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert run("completion", "bash") == 2
+    assert "pip install 'edgeperc[completion]'" in capsys.readouterr().err
+
+
+# --- how a sensor is mounted -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    """Three simulated scans of a sensor 2.4 m above the road; the second shows nothing near the vehicle."""
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    for k in range(3):
+        scan = simulate(random_scene(k, "urban"), "hdl-64e", seed=k).points - np.float32([0.0, 0.0, 0.67, 0.0])
+        kept = np.hypot(scan[:, 0], scan[:, 1]) > (13.0 if k == 1 else 0.0)
+        scan[kept].tofile(folder / f"{k}.bin")
+    return folder
+
+
+def test_info_prints_the_mounting_and_writes_a_profile(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written = tmp_path / "mine.json"
+    assert run("info", *sorted(drive.iterdir()), "--write", written) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("cannot be estimated: the scan shows no ground") == 1
+    assert "hdl-64e, by 2 scans" in printed
+    mounting = get_sensor(written).mounting
+    assert mounting.is_known
+    assert mounting.height_m == pytest.approx(2.4, abs=0.1)
+    assert replace(get_sensor(written), mounting=get_sensor("hdl-64e").mounting) == get_sensor("hdl-64e")
+
+    assert run("info", drive / "0.bin", "--json", "--mount-height", "2.0") == 0
+    estimate = json.loads(capsys.readouterr().out)["mounting"]
+    assert (estimate["mounting"]["height_m"], estimate["height_sd_m"]) == (2.0, 0.0)
+    assert estimate["roll_sd_deg"] > 0.0
+
+
+def test_scans_of_a_recording_that_show_no_ground_are_left_out(drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info", drive, "--json") == 0
+    estimate = json.loads(capsys.readouterr().out)["mounting"]
+    assert estimate["n_scans"] == 2
+    assert estimate["mounting"]["height_m"] == pytest.approx(2.4, abs=0.1)
+
+
+def test_no_profile_is_written_without_ground_or_of_two_sensors(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written = tmp_path / "mine.json"
+    assert run("info", drive / "1.bin", "--write", written) == 1
+    assert "no scan shows the ground" in capsys.readouterr().err
+    assert run("info", "pointseg", "--write", written) == 1
+    assert "the scans are of 0 sensors" in capsys.readouterr().err
+    assert not written.exists()
+    with pytest.raises(SystemExit):
+        run("info", drive / "0.bin", "--write", tmp_path / "mine.txt")
+    assert "ends in .json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "mounting"),
+    [
+        (["--mount-height", "2.1"], {"height_m": 2.1}),
+        (["--turn", "-90"], {"yaw_deg": -90.0}),
+        (["--extrinsic", "T.json"], {"height_m": 1.9, "roll_deg": 0.0, "pitch_deg": 0.0, "yaw_deg": -90.0}),
+        (["--extrinsic", "T.json", "--mount-height", "3"], {"height_m": 3.0, "yaw_deg": -90.0}),
+    ],
+)
+def test_run_uses_the_given_mounting(
+    options: list[str],
+    mounting: dict[str, float],
+    drive: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(drive)
+    (drive / "T.json").write_text("[[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 1.9], [0, 0, 0, 1]]")
+    arguments = ["0.bin", "--json", "--model", "pointseg", "--provider", "cpu", "--on-mismatch", "ignore"]
+    assert run("run", *arguments, *options) == 0
+    used = json.loads(capsys.readouterr().out)["mounting"]
+    assert {name: round(used[name], 6) for name in mounting} == mounting
+
+
+@pytest.mark.parametrize(
+    "options", [["--mount-height", "nan"], ["--turn", "left"], ["--mount-height", "1e9"], ["--extrinsic", "absent"]]
+)
+def test_impossible_mountings_are_refused(options: list[str], drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with contextlib.suppress(SystemExit):  # argparse
+        assert run("run", drive / "0.bin", *options) != 0
+    error = capsys.readouterr().err
+    assert options[0] in error or "mounting" in error or "extrinsic" in error
+    assert "Traceback" not in error

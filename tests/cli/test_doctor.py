@@ -1,0 +1,279 @@
+"""``edgeperc doctor`` on installations that are whole, damaged or incomplete."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import shutil
+import subprocess
+import sys
+from email.message import Message
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cli_helpers import run
+from edgeperc import zoo
+from edgeperc.cli import doctor
+from edgeperc.errors import ProviderError
+from edgeperc.inference import listing, session
+from edgeperc.system.kernel_cache import KernelCache
+
+posix = pytest.mark.skipif(os.name != "posix", reason="Windows' folders have access lists")
+
+
+RUNS = doctor._runs
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A cache of its own; only the tests of the models open them."""
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(doctor, "_runs", lambda found: iter(()))
+
+
+def report(capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, dict[str, str]]]:
+    """Exit code, and the findings by name."""
+    code = run("doctor", "--json")
+    found = json.loads(capsys.readouterr().out)
+    assert found["works"] == (code == 0)
+    return code, {finding.pop("name"): finding for finding in found["findings"]}
+
+
+def broken(found: dict[str, dict[str, str]]) -> set[str]:
+    return {name for name, finding in found.items() if finding["state"] == "broken"}
+
+
+def test_an_installation_that_works(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("onnxruntime")
+    monkeypatch.setattr(doctor, "_runs", RUNS)
+    monkeypatch.setenv("ORT_DISABLE_TELEMETRY", "1")
+    code, found = report(capsys)
+    assert (code, broken(found)) == (0, set())
+    assert {"python", "platform", "processor", "int8", "bf16", "numpy", "numba", "kernels", "cache folder"} <= {*found}
+    assert "cpu" in found["providers"]["found"]
+    assert found["telemetry"]["state"] == "ok"
+    for name in zoo.DEFAULT:
+        assert found[f"model {name}.onnx"]["found"].endswith("as in MODELS.md")
+        assert name in found[f"runs {name}"]["found"]
+    assert run("doctor") == 0
+    lines = capsys.readouterr().out.splitlines()
+    for name in found:  # and "compiled models", if the first report made them
+        assert any(line.startswith(f"{name}  ") for line in lines), name
+    assert lines[-1] == "What edgeperc needs is here and works."
+
+
+@pytest.mark.parametrize("package", ["numpy", "numba", "onnxruntime"])
+def test_a_package_that_cannot_be_imported(package: str, tmp_path: Path) -> None:
+    """In a process of its own, where nothing has imported it before."""
+    (tmp_path / f"{package}.py").write_text("raise ImportError('libfoo.so.3: cannot open shared object file')\n")
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys; from edgeperc.cli import main; sys.exit(main(['doctor', '--json']))"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1, done.stderr
+    found = {finding["name"]: finding for finding in json.loads(done.stdout)["findings"]}
+    assert "libfoo.so.3" in found[package]["found"]
+    assert found[package]["advice"].startswith("pip install ")
+    assert found["python"]["state"] == "ok"
+    assert package in broken(found)
+    if package == "onnxruntime":
+        assert broken(found) == {"onnxruntime"}
+        assert found["model ssadnet.onnx"]["state"] == "ok"
+
+
+def test_no_onnxruntime(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    monkeypatch.setattr(doctor, "_installed", lambda prefix="": {})
+    code, found = report(capsys)
+    assert code == 1
+    assert found["onnxruntime"] == {
+        "state": "broken",
+        "found": "not installed",
+        "advice": "pip install 'edgeperc[cpu]'",
+    }
+    assert run("doctor") == 1
+    assert "BROKEN" in (out := capsys.readouterr().out)
+    assert "onnxruntime" in out.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("versions", "features", "state", "text"),
+    [
+        ({"onnxruntime": "1.31.1", "onnxruntime-gpu": "1.31.1"}, (), "broken", "overwrite one another"),
+        ({"onnxruntime": "1.24.4"}, ("sme",), "note", "leaks memory"),
+        ({"onnxruntime": "1.24.4"}, (), "ok", "onnxruntime 1.24.4"),
+        ({"onnxruntime": "1.27.0"}, ("sme",), "ok", "onnxruntime 1.27.0"),
+    ],
+)
+def test_builds_of_onnxruntime(
+    versions: dict[str, str], features: tuple[str, ...], state: str, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "runtime_version", lambda: versions["onnxruntime"])
+    monkeypatch.setattr(doctor, "_installed", lambda prefix="": versions)
+    monkeypatch.setattr(doctor, "_has_sme", lambda: "sme" in features)
+    found = {finding.name: finding for finding in doctor._packages()}
+    assert found["onnxruntime"].state == state
+    assert text in found["onnxruntime"].found
+
+
+@pytest.mark.parametrize(
+    ("value", "state", "text"), [("1", "ok", "off"), ("0", "note", "=0"), ("", "note", "imported")]
+)
+def test_telemetry(value: str, state: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "runtime_version", lambda: "1.31.1")
+    monkeypatch.setenv("ORT_DISABLE_TELEMETRY", value)
+    if not value:
+        monkeypatch.delenv("ORT_DISABLE_TELEMETRY")
+    found = {finding.name: finding for finding in doctor._packages()}["telemetry"]
+    assert found.state == state
+    assert text in found.found
+
+
+def test_a_plugin_that_does_not_load(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def providers() -> Any:
+        raise ProviderError("the plugin for provider 'openvino' is installed but does not load: no symbol")
+
+    monkeypatch.setattr(listing, "providers", providers)
+    code, found = report(capsys)
+    assert code == 1
+    assert "does not load" in found["providers"]["found"]
+
+
+# --- caches ----------------------------------------------------------------------------------------------------------
+
+
+def test_kernels_that_are_not_kept(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(KernelCache, "cache_path", None)
+    _, found = report(capsys)
+    assert found["kernels"]["state"] == "note"
+    assert "NUMBA_CACHE_DIR" in found["kernels"]["advice"]
+
+
+def test_a_cache_that_is_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "file" / "cache"))
+    _, found = report(capsys)
+    assert found["cache folder"]["state"] == "note"
+    assert "is not a folder" in found["cache folder"]["found"]
+    assert "EDGEPERC_CACHE_DIR" in found["cache folder"]["advice"]
+
+
+@posix
+def test_a_cache_that_others_can_write(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "cache" / "compiled").mkdir(parents=True)
+    (tmp_path / "cache" / "compiled" / "blob").write_bytes(bytes(2_000_000))
+    (tmp_path / "cache" / "compiled").chmod(0o777)
+    _, found = report(capsys)
+    assert found["cache folder"]["state"] == "ok"
+    assert "2.0 MB in 1 file, writable" in found["cache folder"]["found"]
+    assert found["compiled models"]["state"] == "note"
+    assert "other users can write it" in found["compiled models"]["found"]
+
+
+def test_settings_that_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "cache" / "settings.json").write_text("no json")
+    _, found = report(capsys)
+    assert found["settings"]["state"] == "note"
+    assert "cannot be read as settings" in found["settings"]["found"]
+
+
+# --- models ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the folder of the models, in its place."""
+    folder = tmp_path / "zoo"
+    folder.mkdir()
+    source = Path(zoo.__file__).parent
+    for file in (*source.glob("*.onnx"), source / "MODELS.md"):
+        shutil.copy(file, folder)
+    monkeypatch.setattr(doctor.resources, "files", lambda package: folder)
+    return folder
+
+
+def test_damaged_and_missing_models(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    content = bytearray((folder / "pointseg.onnx").read_bytes())
+    content[len(content) // 2] ^= 1  # among the weights: the card can still be read
+    (folder / "pointseg.onnx").write_bytes(content)
+    (folder / "pointseg-int8.onnx").write_bytes(b"no model")
+    for file in folder.glob("ssadnet*"):
+        file.unlink()
+    code, found = report(capsys)
+    assert code == 1
+    assert "not the file of this release" in found["model pointseg.onnx"]["found"]
+    assert {"model pointseg.onnx", "model pointseg-int8.onnx", "model ssadnet"} <= broken(found)
+    assert found["model ssadnet"]["found"] == "missing"
+    assert found["model lodnn.onnx"]["state"] == "ok"
+    assert "pip install" in found["model pointseg.onnx"]["advice"]
+
+
+def test_without_the_page_hashes_are_not_compared(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "MODELS.md").unlink()
+    _, found = report(capsys)
+    assert found["MODELS.md"]["state"] == "note"
+    assert found["model lodnn.onnx"]["found"].endswith("not compared")
+
+
+# --- extras ----------------------------------------------------------------------------------------------------------
+
+REQUIRES = (
+    "numpy>=1.24",
+    'onnxruntime>=1.18; extra == "cpu"',
+    'onnxruntime-gpu>=1.18; extra == "gpu"',
+    'matplotlib>=3.8; extra == "view"',
+    'winonly>=1; sys_platform == "nowhere" and extra == "view"',
+    'rosbags>=0.9; extra == "ros"',
+    'edgeperc[ros,view]; extra == "both"',
+    'sphinx; extra == "docs"',
+)
+
+
+def extras(monkeypatch: pytest.MonkeyPatch, versions: dict[str, str]) -> dict[str, doctor.Finding]:
+    pytest.importorskip("packaging")
+    metadata = Message()
+    for text in REQUIRES:
+        metadata["Requires-Dist"] = text
+    for extra in ("both", "cpu", "docs", "gpu", "ros", "view"):
+        metadata["Provides-Extra"] = extra
+    monkeypatch.setattr(importlib.metadata, "metadata", lambda name: metadata)
+    monkeypatch.setattr(doctor, "_installed", lambda prefix="": versions)
+    return {finding.name: finding for finding in doctor._extras()}
+
+
+def test_missing_extras_come_with_the_line_that_installs_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = extras(monkeypatch, {"numpy": "2.1", "onnxruntime": "1.31", "matplotlib": "3.9"})
+    assert found["extras"].found == "cpu, view"
+    assert (found["extra ros"].found, found["extra ros"].advice) == (
+        "rosbags is missing",
+        "pip install 'edgeperc[ros]'",
+    )
+    assert found["extra both"].advice == "pip install 'edgeperc[both]'"
+    assert "providers" in found["extra gpu"].advice
+    assert {*found} == {"extra both", "extra gpu", "extra ros", "extras"}
+
+
+def test_versions_that_are_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = extras(monkeypatch, {"numpy": "1.20", "matplotlib": "3.7.5", "rosbags": "0.11"})
+    assert found["numpy>=1.24"].state == "broken"
+    assert found["numpy>=1.24"].found == "numpy is 1.20, expected >=1.24"
+    assert found["extra view"].state == "note"
+    assert found["extra view"].found == "matplotlib is 3.7.5, expected >=3.8"
+    assert found["extras"].found == "ros"
+
+
+def test_a_package_that_pip_did_not_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    def metadata(name: str) -> Any:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "metadata", metadata)
+    (found,) = doctor._extras()
+    assert (found.name, found.state) == ("extras", "note")

@@ -1,0 +1,325 @@
+"""The three programs print texts from outside safely, and end as a shell expects."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edgeperc.cli.output import print_columns, print_error, print_line, print_rows, table_lines
+from edgeperc.cli.program import Parser, run_program
+from edgeperc.errors import PointsError
+from edgeperc.system.printable import printable
+
+PROGRAMS = ("edgeperc", "edgeperc-bench", "edgeperc-export")
+ESCAPES = "a\x1b[2J\x1b]0;title\x07\x9b31m\x7f\u202egpj\u2066\u2028\x00b"
+ANY = st.text(st.characters(exclude_categories=()))  # lone surrogates too
+posix = pytest.mark.skipif(os.name != "posix", reason="signals and pipes differ elsewhere")
+
+
+def is_safe(out: str) -> bool:
+    return all(line.isprintable() for line in out.split("\n"))
+
+
+# --- printing --------------------------------------------------------------------------------------------------------
+
+
+@given(ANY)
+def test_any_text_becomes_printable(text: str) -> None:
+    shown = printable(text)
+    assert shown.isprintable()
+    shown.encode()
+    assert printable(shown) == shown
+    assert (shown == text) == text.isprintable()
+
+
+@given(st.recursive(ANY | st.integers(), lambda inner: st.lists(inner) | st.dictionaries(ANY, inner)))
+def test_json_stays_the_same(value: Any) -> None:
+    assert json.loads(printable(json.dumps(value))) == value
+
+
+@pytest.mark.parametrize("name", ["scan.bin", "Straße 漢字 Ж é", "C:\\scans\\new", "$x_1$ {0} %s", "😀"])
+def test_readable_names_are_not_changed(name: str) -> None:
+    assert printable(name) == name
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("\x1b[31m", "\\u001b[31m"),
+        ("a\nb\r\tc", "a\\u000ab\\u000d\\u0009c"),
+        ("\x9b\x7f", "\\u009b\\u007f"),
+        ("\u202egpj.exe", "\\u202egpj.exe"),
+        (os.fsdecode(b"\xff.bin"), "\\udcff.bin"),
+        ("\U000e0041", "\\U000e0041"),
+        (Path("a\x07"), "a\\u0007"),
+    ],
+)
+def test_other_characters_are_shown_by_number(text: object, shown: str) -> None:
+    assert printable(text) == shown
+
+
+@given(st.text(st.characters(exclude_categories=()), min_size=1))
+def test_every_way_to_print_is_safe(text: str) -> None:
+    out, shown = io.StringIO(), sys.stdout
+    sys.stdout, errors, sys.stderr = out, sys.stderr, out
+    try:
+        print_line(text)
+        print_error(text)
+        print_rows([(text, text), ("name", text)])
+        print_columns((text, "b"), [(text, text)])
+    finally:
+        sys.stdout, sys.stderr = shown, errors
+    lines = out.getvalue().split("\n")
+    assert len(lines) == 2 + 2 + 2 + 1
+    assert is_safe(out.getvalue())
+    assert all(map(str.isprintable, table_lines("title", [(text, "k")], [((text, text), {"k": 0.5})])))
+
+
+def test_columns_are_aligned_with_what_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    print_rows([("\x1b", "first"), ("name", "second")])
+    print_columns(("a", "b"), [("\x1b\x1b", "first"), ("name", "second")])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].index("first") == lines[1].index("second")
+    assert lines[3].index("first") == lines[4].index("second") == lines[2].index("b")
+
+
+def test_a_parser_quotes_safely(capsys: pytest.CaptureFixture[str]) -> None:
+    parser = Parser(prog="program")
+    parser.add_subparsers(required=True).add_parser("command").add_argument("path")
+    for given_arguments in (["command", "a", ESCAPES], [ESCAPES], ["command", "a", f"--{ESCAPES}"]):
+        with pytest.raises(SystemExit) as caught:
+            parser.parse_args(given_arguments)
+        assert caught.value.code == 2
+        assert is_safe(capsys.readouterr().err)
+    assert isinstance(parser, argparse.ArgumentParser)
+
+
+# --- how a program ends ----------------------------------------------------------------------------------------------
+
+
+def test_errors_and_warnings_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    def command() -> int:
+        warnings.warn(f"careful\nwith {ESCAPES}", UserWarning, stacklevel=1)
+        raise PointsError(f"{ESCAPES}\nis damaged")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert run_program("program", command) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert is_safe(captured.err)
+    assert [line.split()[:2] for line in captured.err.splitlines()] == [
+        ["program:", "warning:"],
+        ["program:", printable("a\x1b[2J\x1b]0;title\x07\x9b31m\x7f\u202egpj\u2066")],
+    ]
+
+
+@posix
+def test_signals_raise_and_their_handlers_are_restored(capsys: pytest.CaptureFixture[str]) -> None:
+    done: list[str] = []
+
+    def command(number: int) -> int:
+        try:
+            signal.raise_signal(number)
+            return 0
+        finally:
+            done.append("closed")
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    try:
+        assert run_program("program", lambda: command(signal.SIGINT)) == 130
+        assert run_program("program", lambda: command(signal.SIGTERM)) == 143
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert done == ["closed", "closed"]
+    assert capsys.readouterr().err == "program: interrupted\nprogram: terminated\n"
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+@posix
+def test_a_signal_waits_for_the_end_of_an_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A native module would turn the exception into an ImportError, and LLVM's callbacks would lose it."""
+    (tmp_path / "imported_slowly.py").write_text(
+        "import signal, time\nsignal.raise_signal(signal.SIGTERM)\ntime.sleep(0.3)\ndone = True\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    done: list[bool] = []
+
+    def command() -> int:
+        module = importlib.import_module("imported_slowly")
+        done.append(module.done)
+        threading.Event().wait(60.0)
+        return 0
+
+    assert run_program("program", command) == 143
+    assert done == [True]
+
+
+@posix
+def test_a_host_keeps_its_own_handler() -> None:
+    caught: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, _: caught.append(number))
+    try:
+
+        def command() -> int:
+            signal.raise_signal(signal.SIGTERM)
+            return 7
+
+        assert run_program("program", command) == 7
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert caught == [signal.SIGTERM]
+
+
+def test_a_program_runs_in_any_thread() -> None:
+    codes: list[int] = []
+    thread = threading.Thread(target=lambda: codes.append(run_program("program", lambda: 3)))
+    thread.start()
+    thread.join()
+    assert codes == [3]
+
+
+@posix
+def test_a_broken_pipe_to_a_process_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    """Only a closed stdout or stderr is quiet."""
+
+    def command() -> int:
+        raise BrokenPipeError(32, "Broken pipe")
+
+    assert run_program("program", command) == 2
+    assert "Broken pipe" in capsys.readouterr().err
+
+
+MAINS = {
+    "edgeperc": "edgeperc.cli",
+    "edgeperc-bench": "edgeperc_bench.cli",
+    "edgeperc-export": "edgeperc_export.cli",
+}
+
+
+def start(program: str, *arguments: str, before: str = "", **how: Any) -> subprocess.Popen[bytes]:
+    code = f"import sys; {before}\nfrom {MAINS[program]} import main\nsys.exit(main(sys.argv[1:]))"
+    how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | how
+    return subprocess.Popen([sys.executable, "-c", code, *arguments], **how)
+
+
+# A command that says that it runs, and then waits.
+WAITING = (
+    "import argparse, time\n"
+    "def wait(*_):\n    print('runs', flush=True)\n    time.sleep(600)\n"
+    "class Known(argparse.Namespace): command = run = wait\n"
+    "argparse.ArgumentParser.parse_args = lambda *_, **__: Known()"
+)
+
+
+@posix
+@pytest.mark.parametrize("program", PROGRAMS)
+@pytest.mark.parametrize(
+    ("number", "code", "word"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
+)
+def test_every_program_ends_by_a_signal_in_one_line(program: str, number: int, code: int, word: str) -> None:
+    def with_signals() -> None:  # a shell starts programs in the background with SIGINT ignored
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    with start(program, before=WAITING, preexec_fn=with_signals) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"runs\n"
+        time.sleep(0.2)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=120)
+    assert (process.returncode, errors.decode()) == (code, f"{program}: {word}\n")
+
+
+@posix
+@pytest.mark.parametrize("program", PROGRAMS)
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_every_program_is_quiet_when_nobody_reads(program: str, stream: str) -> None:
+    talking = (
+        "import argparse\n"
+        "from edgeperc.cli.output import print_error, print_line\n"
+        "def talk(*_):\n"
+        f"    for _ in range(10_000): {'print_line' if stream == 'stdout' else 'print_error'}('line')\n"
+        "    return 0\n"
+        "class Known(argparse.Namespace): command = run = talk\n"
+        "argparse.ArgumentParser.parse_args = lambda *_, **__: Known()"
+    )
+    with start(program, before=talking) as process:
+        closed, other = (process.stdout, process.stderr) if stream == "stdout" else (process.stderr, process.stdout)
+        assert closed is not None
+        assert other is not None
+        closed.close()
+        assert other.read() == b""
+    assert process.returncode == 141
+
+
+@posix
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_help_is_quiet_when_nobody_reads(program: str) -> None:
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    with start(program, "--help", env=buffered) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 141
+
+
+@posix
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_a_closed_stdout_is_no_error(program: str) -> None:
+    with start(program, "--version", stdout=None, preexec_fn=lambda: os.close(1)) as process:
+        _, errors = process.communicate(timeout=120)
+    assert process.returncode == 0
+    assert b"Traceback" not in errors
+
+
+@posix
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere file names are Unicode")
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+@pytest.mark.parametrize(
+    ("program", "arguments"),
+    [
+        ("edgeperc", ["info", "NAME"]),
+        ("edgeperc", ["run", "NAME"]),
+        ("edgeperc", ["NAME"]),
+        ("edgeperc", ["models", "--NAME"]),
+        ("edgeperc-bench", ["compare", "NAME", "NAME"]),
+        ("edgeperc-bench", ["compare", "a", "b", "NAME"]),
+        ("edgeperc-export", ["database-check", "NAME"]),
+        ("edgeperc-export", ["card", "NAME", "NAME", "NAME"]),
+        ("edgeperc-export", ["NAME"]),
+    ],
+)
+def test_names_of_files_cannot_control_the_terminal(
+    program: str, arguments: list[str], encoding: str, tmp_path: Path
+) -> None:
+    for command, module in (("database-check", "PIL"), ("card", "onnx")):
+        if command in arguments:
+            pytest.importorskip(module)
+    name = ESCAPES.replace("\x00", "").encode() + b"\xff\n.bin"
+    (tmp_path / os.fsdecode(name)).write_bytes(b"no scan")
+    typed = [os.fsdecode(argument.encode().replace(b"NAME", name)) for argument in arguments]
+    environment = os.environ | {"PYTHONIOENCODING": encoding}
+    with start(program, *typed, cwd=tmp_path, env=environment) as process:
+        out, errors = process.communicate(timeout=300)
+    assert process.returncode in (1, 2)
+    assert b"Traceback" not in errors
+    shown = (out + errors).decode(encoding)
+    assert is_safe(shown)
+    assert "\\u001b[2J" in shown or "\\x1b[2J" in shown

@@ -1,0 +1,692 @@
+"""Labeled scans of any sensor: the plain layout, its description, evaluation and training from it."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+pytest.importorskip("tqdm")
+
+from edgeperc import Perceiver, cli
+from edgeperc.datasets.kitti import scan_hash
+from edgeperc.datasets.scan_folder import _KEYS, ScanFolder, ScanLayout, class_number, known_layouts, read_layout
+from edgeperc.errors import MountingError, OptionError, PointsError, SensorError
+from edgeperc.evaluation.evaluate import evaluate
+from edgeperc.evaluation.truth import cells_inside, folder_truth, road_cells
+from edgeperc.inference.projection import make_projector
+from edgeperc.simulation.samples import IGNORE, simulated_scan
+from edgeperc.types.card import TopViewGeometry
+from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
+from edgeperc.types.perception import Box
+from edgeperc.types.sensor import get_sensor
+from edgeperc_export.data.scan_sets import read_scan_set, seen_by_network
+from edgeperc_export.data.scans import SURFACE, LabeledScan
+
+BOXES = {"Car": "car", "Van": "van", "Rider": "ignore", "Cyclist": "cyclist", "Digger": "digger", "Cone": "background"}
+NAMES = {"1": "Road", "2": "Car", "3": "Ghost", "4": "Tree"}
+POINTS = {"Road": "drivable", "Car": "car", "Ghost": "ignore", "Tree": "background"}
+DESCRIPTION = {"schema": 1, "sensor": "hdl-64e", "boxes": BOXES, "points": POINTS}
+
+PLACES = np.array([[10, 0, -1, 0.5], [20, 0, -1, 0.5], [-15, 5, -1, 0.5], [30, 9, -1, 0.5]], np.float32)
+LINES = "Car 10 0 -1 4 2 1.6 0 9\nRider 20 0 -1 1 1 1.8 0\n\nCyclist 20 0 -1 2 1 1.8 0.5 3\nDigger 30 9 -1 6 3 3 0\n"
+
+
+def folder_of(root: Path, description: Any = DESCRIPTION, *, points: np.ndarray = PLACES, **files: str) -> Path:
+    """A folder with one scan and the files, by their path below it with ``__`` for ``/`` and ``_dot_`` for ``.``."""
+    (root / "velodyne").mkdir(parents=True, exist_ok=True)
+    points.astype(np.float32).tofile(root / "velodyne" / "a.bin")
+    (root / "scans.json").write_text(description if isinstance(description, str) else json.dumps(description))
+    for name, text in files.items():
+        path = root / name.replace("__", "/").replace("_dot_", ".")
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    return root
+
+
+def with_classes(root: Path, numbers: list[int], dtype: type = np.uint8, **changes: Any) -> Path:
+    folder_of(root, {**DESCRIPTION, **changes}, semseg_classes_dot_json=json.dumps(NAMES))
+    (root / "semseg").mkdir(exist_ok=True)
+    np.array(numbers, dtype).tofile(root / "semseg" / ("a.u8" if dtype is np.uint8 else "a.label"))
+    return root
+
+
+def test_boxes_and_the_labels_of_points_by_them(tmp_path: Path) -> None:
+    folder = ScanFolder(folder_of(tmp_path, label__a_dot_txt=LINES + "Cone 30 9 -1 6 3 3 0\n"))
+    frame = folder.frame("a")
+    assert frame.boxes is not None
+    assert [box.label for box in frame.boxes] == ["car", "ignore", "cyclist", "digger"]  # a cone is background
+    assert frame.boxes[0] == Box("car", 1.0, (10, 0, -1), (4, 2, 1.6), 0.0)
+    assert frame.returns == (1, 0, 1, 1)
+    # The box of the rider alone lies in the cyclist's; a digger is no class of the shipped networks.
+    assert frame.labels().tolist() == [1, 3, 0, IGNORE]
+    assert frame.labels(("background", "digger", "cyclist")).tolist() == [IGNORE, 2, 0, 1]
+    assert frame.known_at(PLACES).all()
+    with pytest.raises(PointsError, match="no labels by points"):
+        frame.labels(by="points")
+    with pytest.raises(PointsError, match="no labeled scan 'b'"):
+        folder.frame("b")
+
+
+def test_class_numbers() -> None:
+    names = ["background", "drivable", "car", "van", "person_sitting", "digger", "ignore"]
+    assert [class_number(name) for name in names] == [0, 0, 1, 1, 2, IGNORE, IGNORE]
+    own = ("background", "van", "drivable")
+    assert [class_number(name, own) for name in names] == [0, 2, IGNORE, 1, IGNORE, IGNORE, IGNORE]
+
+
+def test_truth_ends_where_nobody_labeled(tmp_path: Path) -> None:
+    description = {**DESCRIPTION, "labeled_deg": [-30, 30], "labeled_m": 25, "min_points": 2}
+    frame = ScanFolder(folder_of(tmp_path, description, label__a_dot_txt=LINES)).frame("a")
+    assert frame.known_at(PLACES).tolist() == [True, True, False, False]
+    assert frame.labels().tolist() == [1, 3, IGNORE, IGNORE]
+    assert frame.returns == (0, 0, 0, 0)
+    behind = {**DESCRIPTION, "labeled_deg": [150, 210]}
+    frame = ScanFolder(folder_of(tmp_path, behind, label__a_dot_txt=LINES)).frame("a")
+    assert frame.known_at(PLACES).tolist() == [False, False, True, False]
+    assert not frame.known_at(np.full((1, 3), np.nan)).any()
+
+
+def test_columns_in_another_order(tmp_path: Path) -> None:
+    columns = ["x", "y", "z", "-", "w", "l", "h", "yaw", "class"]
+    root = folder_of(
+        tmp_path, {**DESCRIPTION, "box_columns": columns}, label__a_dot_txt="10 0 -1 99 2 4 1.6 0.5 Car more\n"
+    )
+    assert ScanFolder(root).frame("a").boxes == (Box("car", 1.0, (10, 0, -1), (4, 2, 1.6), 0.5),)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint32])
+def test_classes_of_points(tmp_path: Path, dtype: type) -> None:
+    numbers = [1, 2, 3, 0] if dtype is np.uint8 else [1, 2 + (7 << 16), 3, 0]
+    frame = ScanFolder(with_classes(tmp_path, numbers, dtype)).frame("a")
+    assert frame.boxes is None
+    assert frame.labels().tolist() == [0, 1, IGNORE, IGNORE]  # 0 is unlabeled
+    road = frame.road_labels()
+    assert road is not None
+    assert road.tolist() == [1, 2, IGNORE, IGNORE]
+    assert not frame.known_at(PLACES).any()  # objects without boxes
+
+
+def test_names_of_classes_in_the_description(tmp_path: Path) -> None:
+    root = with_classes(tmp_path, [9, 300, 9, 300], np.uint32, point_names={"9": "Tree", "300": "Car"})
+    assert ScanFolder(root).frame("a").labels().tolist() == [0, 1, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "dtype", "changes", "message"),
+    [
+        ([1, 2], np.uint8, {}, "2 labels for a scan of 4 points"),
+        ([1, 2, 3, 9], np.uint8, {}, "no name for 9"),
+        ([1, 2, 3, 3], np.uint8, {"points": {"Road": "drivable", "*": "car"}}, None),
+        ([1, 2, 3, 3], np.uint8, {"points": {"Road": "drivable"}}, "no class for 'Car'"),
+        ([1, 2, 3, 3], np.uint8, {"points": {}}, "no 'points'"),
+        ([1, 2, 3, 70_000], np.uint32, {"point_names": {"1": "Road"}}, "no name for 2"),
+    ],
+)
+def test_classes_of_points_that_are_wrong(
+    tmp_path: Path, numbers: list[int], dtype: type, changes: dict[str, Any], message: str | None
+) -> None:
+    root = with_classes(tmp_path, numbers, dtype, **changes)
+    if message is None:
+        ScanFolder(root).frame("a")
+        return
+    with pytest.raises(PointsError, match=message):
+        ScanFolder(root).frame("a")
+
+
+def test_label_files_of_half_a_number_and_names_that_are_none(tmp_path: Path) -> None:
+    root = with_classes(tmp_path, [1, 2, 3, 4], np.uint32)
+    (root / "semseg/a.label").write_bytes(b"12345")
+    with pytest.raises(PointsError, match="5 bytes are no uint32 labels"):
+        ScanFolder(root).frame("a")
+    np.array([1, 2, 3, 4], np.uint32).tofile(root / "semseg/a.label")
+    for text in ("[1]", "{", '{"-1": "Road"}', '{"1": 2}'):
+        (root / "semseg_classes.json").write_text(text)
+        with pytest.raises(PointsError, match="expected names by number"):
+            ScanFolder(root).frame("a")
+    (root / "semseg_classes.json").unlink()
+    with pytest.raises(PointsError, match="cannot be read"):
+        ScanFolder(root).frame("a")
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["Car 1 2 3", "Car 1 2 3 4 5 six 0", "Car 1 2 3 4 5 inf 0", "Car 1 2 3 4 0 1 0", "Car nan 2 3 4 1 1 0"],
+)
+def test_lines_that_are_no_boxes(tmp_path: Path, line: str) -> None:
+    folder = ScanFolder(folder_of(tmp_path, label__a_dot_txt=f"Car 10 0 -1 4 2 1.6 0\n{line}\n"))
+    with pytest.raises(PointsError, match=r"label.a\.txt, line 2: .*expected"):
+        folder.frame("a")
+
+
+def test_boxes_of_a_class_that_is_not_mapped(tmp_path: Path) -> None:
+    root = folder_of(tmp_path, label__a_dot_txt="Tank 10 0 -1 4 2 1.6 0\n")
+    with pytest.raises(PointsError, match="no class for 'Tank'; add it to boxes"):
+        ScanFolder(root).frame("a")
+    folder_of(root, {**DESCRIPTION, "boxes": {"*": "truck"}})
+    assert [box.label for box in ScanFolder(root).frame("a").boxes or ()] == ["truck"]
+    folder_of(root, {"schema": 1, "sensor": "hdl-64e"})
+    with pytest.raises(PointsError, match="no 'boxes'"):
+        ScanFolder(root)
+
+
+def test_kittis_own_labels(tmp_path: Path) -> None:
+    calibration = (
+        "P2: 721.5 0 609.5 0 0 721.5 172.9 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
+        "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27\n"
+    )
+    root = folder_of(
+        tmp_path,
+        {**DESCRIPTION, "box_format": "kitti"},
+        label_2__a_dot_txt="Car 0 0 0 600 150 700 250 1.6 2 4 0 1.72 9.73 -1.5708\n",
+        calib__a_dot_txt=calibration,
+    )
+    frame = ScanFolder(root).frame("a")
+    assert frame.labels().tolist() == [1, 0, IGNORE, 0]  # behind the camera nothing is labeled
+    assert frame.azimuths == pytest.approx((-0.7196, 0.7012), abs=1e-3)
+    assert ScanFolder(root).frame("a").boxes is not None
+
+
+# --- files of a folder ------------------------------------------------------------------------------------------------
+
+
+def test_scans_of_any_format(tmp_path: Path) -> None:
+    root = folder_of(tmp_path, label__a_dot_txt="", label__b_dot_txt="")
+    np.save(root / "velodyne/b.npy", PLACES)
+    np.save(root / "velodyne/unlabeled.npy", PLACES)
+    (root / "velodyne/.hidden").touch()
+    folder = ScanFolder(root)
+    assert folder.drives == {"a": "a", "b": "b"}
+    np.testing.assert_array_equal(folder.frame("b").points, PLACES)
+    np.save(root / "velodyne/a.npy", PLACES)
+    with pytest.raises(PointsError, match="one name"):
+        ScanFolder(root)
+    (root / "velodyne/a.npy").rename(root / "velodyne/a.txt")
+    with pytest.raises(PointsError, match="no scan by its name"):
+        ScanFolder(root)
+
+
+def test_the_tree_of_semantickitti(tmp_path: Path) -> None:
+    with pytest.raises(PointsError, match="expected sequences/SEQ/velodyne"):
+        ScanFolder(tmp_path, "semantickitti")
+    for sequence in ("00", "08"):
+        for part in ("velodyne", "labels"):
+            (tmp_path / "sequences" / sequence / part).mkdir(parents=True)
+        PLACES.tofile(tmp_path / "sequences" / sequence / "velodyne/000003.bin")
+        numbers = np.array([10 + (7 << 16), 40, 254, 0], np.uint32)
+        numbers.tofile(tmp_path / "sequences" / sequence / "labels/000003.label")
+    folder = ScanFolder(tmp_path, "semantickitti")
+    assert folder.drives == {"00/000003": "2011_10_03_drive_0027", "08/000003": "2011_09_30_drive_0028"}
+    assert folder.names("train") == ["08/000003"]  # sequence 00 is a test drive
+    frame = folder.frame("08/000003")
+    assert frame.labels().tolist() == [1, 0, 2, IGNORE]
+    assert frame.boxes is None
+    with pytest.raises(PointsError, match="no labels by boxes"):
+        frame.labels(by="boxes")
+
+
+def test_folders_without_scans_labels_or_description(tmp_path: Path) -> None:
+    with pytest.raises(PointsError, match="no such folder"):
+        ScanFolder(tmp_path / "none")
+    with pytest.raises(PointsError, match=r"no scans\.json.*FOLDER:pandaset"):
+        ScanFolder(tmp_path)
+    with pytest.raises(PointsError, match="no scans; expected velodyne/NAME"):
+        ScanFolder(tmp_path, "pandaset")
+    with pytest.raises(PointsError, match="no labels for its scans"):
+        ScanFolder(folder_of(tmp_path))
+    with pytest.raises(PointsError, match="no layout 'pandar'"):
+        ScanFolder(tmp_path, "pandar")
+    with pytest.raises(PointsError, match="no layout 'pandar'; expected av2"):
+        ScanFolder.parse(f"{tmp_path}:pandar")
+    with pytest.raises(PointsError, match="the description cannot be read"):
+        ScanFolder.parse(f"{tmp_path}:{tmp_path / 'mine.json'}")
+
+
+def test_a_layout_is_named_and_never_guessed(tmp_path: Path) -> None:
+    root = folder_of(tmp_path / "pandaset", label__a_dot_txt="Car 10 0 -1 4 2 1.6 0\n")
+    assert ScanFolder.parse(root).layout.name == "scans"
+    assert ScanFolder.parse(f"{root}:lyft").layout.name == "lyft"
+    assert ScanFolder.parse(f"{root}:{root / 'scans.json'}").layout == ScanFolder(root).layout
+
+
+def test_drives_and_splits(tmp_path: Path) -> None:
+    root = folder_of(tmp_path, **{f"label__{name}_dot_txt": "" for name in "abcd"})
+    for name in "bcd":
+        np.save(root / f"velodyne/{name}.npy", PLACES)
+    assert ScanFolder(root).drives == {name: name for name in "abcd"}
+    (root / "frames.csv").write_text("drive,name\ny,a\nx,b\nx,c\nz,d\n")
+    splits = {"train": ["x"], "validation": ["z"]}
+    folder_of(root, {**DESCRIPTION, "splits": splits})
+    folder = ScanFolder(root)
+    assert folder.names("all") == ["b", "c", "a", "d"]  # drive by drive
+    assert folder.names("train") == ["b", "c", "a"]  # the description does not list y
+    assert folder.names("validation") == ["d"]
+    assert folder.names("validation", fold=0) == []
+    assert folder.names("train", fold=0) == ["b", "c", "a"]
+    assert folder.names("test") == ["a"]
+    folder_of(root, {**DESCRIPTION, "splits": {"train": ["x"], "test": ["*"]}})
+    assert ScanFolder(root).names("train") == ["b", "c"]
+    assert ScanFolder(root).names("test") == ["a", "d"]
+    folder_of(root, {**DESCRIPTION, "drives": "one"})
+    assert set(ScanFolder(root).drives.values()) == {"scans"}
+    folder_of(root, {**DESCRIPTION, "drives": "scan"})
+    assert ScanFolder(root).drives == {name: name for name in "abcd"}
+    with pytest.raises(ValueError, match="expected train, validation, test or all"):
+        folder.names("both")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("name,drive\n", "both filled"), ("name,drive\na,\n", "both filled"), ("name,drive\nb,x\n", "no drive of a")],
+)
+def test_tables_without_drives(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(PointsError, match=message):
+        ScanFolder(folder_of(tmp_path, label__a_dot_txt="", frames_dot_csv=text))
+
+
+@pytest.mark.parametrize("text", ["{", "3", "[[[0, 0], [1, 1]]]", '[[["a", 0]]]', "[[[0,0],[1,1],[1e999,0]]]", "[7]"])
+def test_polygons_that_are_none(tmp_path: Path, text: str) -> None:
+    folder = ScanFolder(folder_of(tmp_path, drivable__a_dot_json=text))
+    with pytest.raises(PointsError, match="polygon"):
+        folder.frame("a")
+
+
+# --- descriptions -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"schema": 2}, "has schema 2"),
+        ({"box": {}}, "unknown entries box"),
+        ({"name": ""}, "name is ''"),
+        ({"name": 3}, "name is 3"),
+        ({"sensor": None}, "sensor is None"),
+        ({"sensor": "hdl-65"}, "no sensor 'hdl-65'"),
+        ({"sensor": "mine.json"}, "cannot be read"),
+        ({"sensor": {"columns": 3}}, "sensor: expected 'like'"),
+        ({"sensor": {"like": "hdl-64e", "beams": 3}}, "sensor is"),
+        ({"sensor": {"like": "hdl-64e", "columns": "x"}}, "not a number"),
+        ({"sensor": {"name": "x", "elevations_deg": [0, 1], "columns": 9}}, "must strictly decrease"),
+        ({"mounting": {"height": 2}}, "mounting is"),
+        ({"mounting": {"height_m": "2"}}, "height_m is '2'"),
+        ({"boxes": ["car"]}, "boxes is"),
+        ({"boxes": {"Car": 1}}, "boxes is"),
+        ({"boxes": {"Car": "Car"}}, "'Car' is mapped to 'Car'"),
+        ({"boxes": {"Car": "car", "CAR": "car"}}, "boxes has a class twice"),
+        ({"boxes": {"Road": "drivable"}}, "cannot be drivable"),
+        ({"points": {"Car": ""}}, "points: 'Car' is mapped to ''"),
+        ({"point_names": {"x": "Car"}}, "point_names"),
+        ({"point_names": {"70000": "Car"}}, "point_names"),
+        ({"files": "coco"}, "files is 'coco'"),
+        ({"box_format": "coco"}, "box_format is 'coco'"),
+        ({"box_format": []}, "box_format is"),
+        ({"box_columns": ["class"]}, "expected x, y, z"),
+        ({"box_columns": "class"}, "expected a list of str"),
+        ({"labeled_deg": [30, -30]}, "labeled_deg is"),
+        ({"labeled_deg": [-300, 300]}, "labeled_deg is"),
+        ({"labeled_deg": 30}, "expected two numbers"),
+        ({"labeled_deg": [True, 30]}, "expected a number"),
+        ({"labeled_m": 0}, "labeled_m is 0"),
+        ({"labeled_m": "far"}, "labeled_m is 'far'"),
+        ({"min_points": -1}, "min_points is -1"),
+        ({"min_points": 1.5}, "min_points is 1.5"),
+        ({"drives": "all"}, "drives is 'all'"),
+        ({"splits": ["x"]}, "splits is"),
+        ({"splits": {"train": "x"}}, "expected a list of str"),
+        ({"splits": {"training": []}}, "splits is"),
+        ({"splits": {"train": ["x"], "test": ["x"]}}, "lists x twice"),
+    ],
+)
+def test_descriptions_that_are_wrong(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    path = folder_of(tmp_path, {**DESCRIPTION, **changes}) / "scans.json"
+    with pytest.raises((PointsError, SensorError), match=message) as error:
+        read_layout(path)
+    assert str(error.value).startswith(str(path))
+
+
+@pytest.mark.parametrize("text", ["", "[", "3", "null", "[" * 100_000, '{"schema": NaN}'])
+def test_texts_that_are_no_description(text: str) -> None:
+    with pytest.raises(PointsError, match="the description"):
+        ScanLayout.from_json(text)
+
+
+def test_a_sensor_of_its_own_and_what_is_known_of_its_mounting(tmp_path: Path) -> None:
+    (tmp_path / "mine.json").write_text(get_sensor("vlp-16").to_json())
+    given = {**DESCRIPTION, "mounting": {"height_m": 2, "yaw_deg": -90}}
+    sensor = ScanLayout.from_json(json.dumps({**given, "sensor": "mine.json"}), tmp_path).sensor
+    assert sensor == replace(get_sensor("vlp-16"), mounting=Mounting(2.0, None, None, -90.0))
+    like = {"like": "hdl-64e", "name": "byte", "remission_range": [0, 255]}
+    sensor = ScanLayout.from_json(json.dumps({**DESCRIPTION, "sensor": like})).sensor
+    assert sensor == replace(get_sensor("hdl-64e"), name="byte", remission_range=(0.0, 255.0))
+    own = {"name": "own", "elevations_deg": [2, 0, -2], "columns": 900}
+    assert ScanLayout.from_json(json.dumps({**DESCRIPTION, "sensor": own})).sensor.n_beams == 3
+
+
+def test_the_description_in_the_documentation() -> None:
+    page = (Path(__file__).parent.parent / "docs/howto/train.md").read_text("utf-8")
+    (block,) = re.findall(r"^```json\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE)
+    layout = ScanLayout.from_json(block)
+    assert layout.sensor.mounting == Mounting(1.9)
+    assert layout.boxes["forklift"] == layout.points["forklift"] == "forklift"
+    table = page.partition("| entry |")[2].partition("\n\n")[0]
+    entries = re.findall(r"^\| (`.*?) \|", table, flags=re.MULTILINE)
+    named = {name for entry in entries for name in re.findall(r"`(\w+)`", entry)}
+    assert named | {"name", "about"} == _KEYS
+
+
+JSON = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=6)
+    | st.sampled_from(["car", "*", "lyft"]),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=6), inner, max_size=4),
+    max_leaves=8,
+)
+KEYS = st.sampled_from(
+    [
+        *("schema", "name", "about", "sensor", "mounting", "boxes", "box_format", "box_columns", "points"),
+        *("point_names", "labeled_deg", "labeled_m", "min_points", "drives", "splits", "other"),
+    ]
+)
+PARTS = st.sampled_from(
+    [
+        *({"like": "vlp-16"}, {"height_m": 1.0}, {"Car": "car"}, {"train": ["x"]}, [-30, 30], "one", "kitti", 7),
+        {"like": "vlp-16", "elevations_deg": [1e308, 1, "x"]},
+    ]
+)
+
+
+@settings(max_examples=300)
+@given(st.dictionaries(KEYS, JSON | PARTS, max_size=5))
+def test_any_description_is_read_or_refused(changes: dict[str, Any]) -> None:
+    try:
+        layout = ScanLayout.from_json(json.dumps({**DESCRIPTION, **changes}))
+    except (PointsError, SensorError):
+        return
+    assert layout.min_points >= 0
+    assert layout.labeled_m > 0.0
+    assert all(isinstance(name, str) for name in (*layout.boxes.values(), *layout.points.values()))
+
+
+@settings(max_examples=100)
+@given(st.text(max_size=60))
+def test_any_text_is_read_or_refused(text: str) -> None:
+    with pytest.raises(PointsError):
+        ScanLayout.from_json(text)
+
+
+def test_descriptions_of_public_sets() -> None:
+    assert known_layouts() == ("av2", "ddad", "lyft", "pandaset", "semantickitti", "vod")
+    for name in known_layouts():
+        layout = read_layout(name)
+        assert layout.name == name
+        assert {"car", "pedestrian"} <= {*(layout.boxes or layout.points).values()}
+    assert read_layout("ddad").in_split("anything", "test")
+    assert not read_layout("ddad").in_split("anything", "train")
+    assert read_layout("pandaset").in_split("pandaset_002", "train")
+    assert not read_layout("pandaset").in_split("pandaset_002", "test")
+    assert not read_layout("pandaset").in_split("pandaset_001", "train")
+    assert read_layout("vod").labeled_deg == (-30.0, 30.0)
+
+
+# --- truth ------------------------------------------------------------------------------------------------------------
+
+VIEW = TopViewGeometry()
+SMALL = TopViewGeometry(x_range_m=(0.0, 4.0), y_range_m=(-2.0, 2.0), cell_m=0.5)
+CORNER = st.tuples(st.floats(-1.0, 5.0), st.floats(-3.0, 3.0))
+
+
+@settings(max_examples=60)
+@given(st.lists(st.lists(CORNER, min_size=3, max_size=6), max_size=3))
+def test_cells_in_polygons(polygons: list[list[tuple[float, float]]]) -> None:
+    found = cells_inside([np.array(ring) for ring in polygons], SMALL)
+    x, y = (centers.ravel().tolist() for centers in SMALL.cell_centers())
+    for row, px in enumerate(x):
+        for col, py in enumerate(y):
+            inside = False
+            for ring in polygons:
+                crossings = 0
+                for (x0, y0), (x1, y1) in zip(ring, [*ring[1:], ring[0]], strict=True):
+                    if (x0 > px) != (x1 > px):
+                        crossings += py < y0 + (px - x0) / (x1 - x0) * (y1 - y0)
+                inside |= crossings % 2 == 1
+            assert found[row, col] == inside
+
+
+CARS = [Box("car", 1.0, (x, y, -0.95), (4.2, 1.8, 1.5), 0.1) for x, y in ((9, 4), (16, -4), (22, 4), (-12, 4), (30, 1))]
+
+
+def street(root: Path, sensor: str = "vlp-32c", seeds: tuple[int, ...] = (3,), **changes: Any) -> tuple[Path, Any]:
+    """Simulated scans of a sensor whose frame has its origin 0.4 m above the road, with labels of every kind."""
+    for part in ("velodyne", "label", "semseg"):
+        (root / part).mkdir(parents=True)
+    shift = np.array([0.0, 0.0, get_sensor(sensor).mount_height_m - 0.4], np.float32)
+    for seed in seeds:
+        scan = simulated_scan(seed, sensor, CARS)
+        points = scan.points.copy()
+        points[:, :3] += shift
+        points[:, 3] *= 255.0
+        points.tofile(root / f"velodyne/{seed}.bin")
+        lines = [
+            " ".join(map(str, (box.label, *(np.array(box.center) + shift).round(3), *box.size, round(box.yaw, 4))))
+            for box, n in zip(scan.boxes, scan.box_points, strict=True)
+            if n
+        ]
+        (root / f"label/{seed}.txt").write_text("\n".join(lines))
+        truth = scan.top_view_labels(SURFACE)
+        row, col, covered = SURFACE.cells(points[:, 0], points[:, 1])
+        on_road = (truth[row % SURFACE.height, col % SURFACE.width] == 1) & covered & (np.abs(points[:, 2] + 0.4) < 0.4)
+        numbers = np.where(scan.labels > 0, scan.labels + 1, np.where(on_road, 1, 0)) + 1
+        numbers.astype(np.uint8).tofile(root / f"semseg/{seed}.u8")
+    names = {"1": "other", "2": "road", "3": "car", "4": "pedestrian", "5": "cyclist"}
+    description = {
+        "schema": 1,
+        "name": "street",
+        "sensor": {"like": sensor, "remission_range": [0, 255]},
+        "boxes": {name: name for name in ("car", "van", "truck", "pedestrian", "cyclist")} | {"*": "ignore"},
+        "points": {"other": "background", "road": "drivable", "car": "car", "*": "ignore"}
+        | {name: name for name in ("pedestrian", "cyclist")},
+        "point_names": names,
+        "drives": "one",
+        **changes,
+    }
+    (root / "scans.json").write_text(json.dumps(description))
+    return root, scan
+
+
+def test_truth_lies_in_the_frame_of_the_models(tmp_path: Path) -> None:
+    root, scan = street(tmp_path, "hdl-64e")
+    frame = ScanFolder(root).frame("3")
+    mounting = Mounting(0.4, 0.0, MODEL_MOUNTING.pitch_deg, 0.0)
+    truth = folder_truth(frame, mounting, VIEW)
+    assert frame.boxes is not None
+    np.testing.assert_allclose(truth.points[:, :3], scan.points[:, :3], atol=0.02)  # raised along the pitched axis
+    np.testing.assert_array_equal(truth.labels, frame.labels())
+    assert truth.boxes[0].center[2] == pytest.approx(frame.boxes[0].center[2] - 1.33, abs=0.01)
+    assert truth.road == ("observed cells", "road")
+    classes, cells = truth.cells["observed cells"]
+    right = scan.top_view_labels(VIEW)
+    both = (cells != IGNORE) & (cells != 2) & (right < 2)
+    assert np.count_nonzero(both) > 500
+    assert np.mean((cells == 1)[both] == (right == 1)[both]) > 0.85
+    assert classes == ("other", "road", "vehicle")
+    assert "vehicles from 3-D boxes" in truth.cells
+    assert truth.known(np.array([[10.0, 0.0, 0.0]])).all()
+    turned = folder_truth(frame, replace(mounting, yaw_deg=90.0), None)
+    assert turned.points[0, 0] == pytest.approx(-truth.points[0, 1], abs=0.05)
+    assert not turned.cells
+
+
+def test_polygons_are_the_road_where_the_scan_sees_it(tmp_path: Path) -> None:
+    root, _ = street(tmp_path, "hdl-64e")
+    for path in (root / "semseg").iterdir():
+        path.unlink()
+    (root / "drivable").mkdir()
+    (root / "drivable/3.json").write_text("[[[6, -3], [46, -3], [46, 3], [6, 3]]]")
+    cells = road_cells(ScanFolder(root).frame("3"), Mounting(0.4, 0.0, MODEL_MOUNTING.pitch_deg, 0.0), VIEW)
+    assert cells is not None
+    seen = cells != IGNORE
+    assert 0.1 < seen.mean() < 1.0
+    _, y = np.broadcast_arrays(*VIEW.cell_centers())
+    empty = seen & (cells != 2)
+    np.testing.assert_array_equal(cells[empty] == 1, np.abs(y[empty]) < 3.0)
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+
+def test_scans_to_train_on(tmp_path: Path) -> None:
+    root, _ = street(tmp_path, seeds=(3, 4), min_points=3)
+    folder = ScanFolder(root)
+    scans, weights, hashes = read_scan_set(folder, "train")
+    assert weights == pytest.approx([2**-0.5] * 2)
+    assert hashes == {f"street/{name}": scan_hash(folder.frame(name).points) for name in ("3", "4")}
+    for name, scan in zip(("3", "4"), scans, strict=True):
+        frame = folder.frame(name)
+        assert scan.sensor == folder.layout.sensor
+        assert scan.azimuths == (-math.pi, math.pi)
+        np.testing.assert_array_equal(scan.labels, frame.labels())
+        assert 0.0 <= scan.points[:, 3].min() < scan.points[:, 3].max() <= 1.0
+        road = scan.points[(frame.road_labels() == 1) & (np.hypot(*scan.points[:, :2].T) < 10.0)]
+        assert np.median(road[:, 2]) == pytest.approx(-1.73, abs=0.25)  # the mounting was estimated
+        assert scan.counts == frame.returns
+        assert {0, 1, IGNORE} == {*np.unique(scan.surface)}
+    own, _, _ = read_scan_set(folder, "train", classes=("background", "cyclist", "car"))
+    assert set(np.unique(own[0].labels)) <= {0, 1, 2, IGNORE}
+    assert np.count_nonzero(own[0].labels == 2) == np.count_nonzero(scans[0].labels == 1)
+    assert read_scan_set(folder, "validation") == ([], [], {})
+
+
+def test_road_between_the_returns_is_road(tmp_path: Path) -> None:
+    root, scan = street(tmp_path, "hdl-64e")
+    folder = ScanFolder(root)
+    (labeled,), _, _ = read_scan_set(folder, "all")
+    measured = road_cells(folder.frame("3"), Mounting(0.4, 0.0, MODEL_MOUNTING.pitch_deg, 0.0), SURFACE)
+    assert measured is not None
+    truth = scan.top_view_labels(SURFACE)
+    assert np.count_nonzero(labeled.surface == 1) > 1.5 * np.count_nonzero(measured == 1)
+    assert np.mean(truth[labeled.surface == 1] == 1) > 0.95 * np.mean(truth[measured == 1] == 1)
+
+
+def test_a_drive_without_ground_needs_a_mounting(tmp_path: Path) -> None:
+    root = folder_of(tmp_path, label__a_dot_txt=LINES)
+    with pytest.raises(MountingError, match="give height_m, roll_deg and pitch_deg"):
+        read_scan_set(ScanFolder(root), "all")
+    folder_of(root, {**DESCRIPTION, "mounting": MODEL_MOUNTING.to_dict(), "labeled_deg": [-30, 30]})
+    (scan,), _, _ = read_scan_set(ScanFolder(root), "all")
+    np.testing.assert_allclose(scan.points, PLACES, atol=1e-6)
+    assert scan.azimuths == pytest.approx((-math.pi / 6, math.pi / 6))
+    assert (scan.surface == IGNORE).all()
+
+
+def test_training_sees_what_the_vehicle_sees(tmp_path: Path) -> None:
+    """The image of a coarser sensor is the one that a Perceiver gives the network, and its pixels have labels."""
+    root, _ = street(tmp_path)
+    folder = ScanFolder(root)
+    frame = folder.frame("3")
+    (scan,), _, _ = read_scan_set(folder, "all")
+    perceive = Perceiver("pointseg:fp32", sensor=folder.layout.sensor, provider="cpu", on_mismatch="ignore")
+    perceive(frame.points)
+    (session,) = perceive.sessions
+    projector = make_projector(session.card.view, session.card.input)
+    seen, projected = seen_by_network(projector, scan)
+    np.testing.assert_allclose(projected.image, session.input, atol=1e-4)
+    n = len(scan.points)
+    interpolated = projected.index >= n
+    assert np.count_nonzero(interpolated) > 1000
+    assert len(seen.points) == len(seen.labels) > n
+    np.testing.assert_array_equal(seen.labels[:n], scan.labels)
+    new = seen.labels[projected.index[interpolated]]
+    assert set(np.unique(new)) <= {*np.unique(scan.labels), IGNORE}
+    assert np.mean(new == IGNORE) < 0.2
+    # An interpolated point lies on the line between two measured ones, so near points of its class are close.
+    own = seen.points[projected.index[interpolated]][new == 1]
+    cars = scan.points[scan.labels == 1]
+    for point in own[::20]:
+        assert np.linalg.norm(cars[:, :3] - point[:3], axis=1).min() < 1.0
+    for other in (replace(scan, sensor=None), replace(scan, sensor=get_sensor("hdl-64e"))):
+        again, plain = seen_by_network(projector, other)
+        assert again is other
+        assert int(plain.index.max()) < n
+
+
+def test_the_sensor_of_a_scan_is_stored(tmp_path: Path) -> None:
+    scan = LabeledScan.from_simulation(simulated_scan(3))
+    for sensor in (None, get_sensor("vlp-16")):
+        replace(scan, sensor=sensor).save(tmp_path / "scan.npz")
+        assert LabeledScan.load(tmp_path / "scan.npz").sensor == sensor
+
+
+# --- evaluation -------------------------------------------------------------------------------------------------------
+
+
+def test_folders_are_evaluated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root, _ = street(tmp_path / "set", "hdl-64e", (3, 4))
+    for name in ("ssadnet-sim", "pointseg-sim"):
+        assert (Path(__file__).parent.parent / "models/research" / f"{name}.onnx").exists()
+    out = tmp_path / "figures.json"
+    models = ["--model", "ssadnet", "--model", "pointseg"]
+    assert cli.main(["eval", str(root), *models, "--boxes-from", "both", "--json", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "== street: 2 scans, 1 drive ==" in printed
+    figures = json.loads(out.read_text())
+    assert "real" not in figures
+    found = figures["folders"]["street"]
+    assert found["points"]["all"]["car"]["iou"] > 0.5
+    assert found["road"]["all"]["f1"] > 0.8
+    assert "pixels" not in found  # all sectors are evaluated, and only the last one's pixels are known
+    assert cli.main(["eval", str(root), "--split", "validation"]) == 2
+    assert "no scans of the validation drives" in capsys.readouterr().err
+    with pytest.raises(OptionError, match="mounted and road_by are for KITTI"):
+        evaluate([root], ["pointseg"], mounted=Mounting(2.0, 0.0, 0.0))
+
+
+def test_other_sensors_are_compared_by_the_same_reader(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root, _ = street(tmp_path / "set", "hdl-64e")
+    out = tmp_path / "figures.json"
+    datasets = [str(root), f"hdl-64e={root}"]
+    assert cli.main(["eval-sensors", *datasets, "--json", str(out)]) == 0
+    figures = json.loads(out.read_text())
+    assert [figures[name]["n_scans"] for name in datasets] == [1, 1]
+    assert figures[datasets[0]]["both"]["iou"]["car"] > 0.5
+    capsys.readouterr()
+    for source in (str(tmp_path / "set/velodyne"), f"{root}:pandar"):
+        assert cli.main(["eval-sensors", source]) == 2
+        assert "SENSOR=simulation:N" in capsys.readouterr().err
+
+
+# --- real data --------------------------------------------------------------------------------------------------------
+
+
+def test_public_sets(data_root: Callable[[str], Path]) -> None:
+    pandaset = ScanFolder(data_root("pandaset"), "pandaset")
+    assert [len(pandaset.names(split)) for split in ("train", "validation", "test", "all")] == [28, 0, 6, 34]
+    frame = pandaset.frame("001_00")
+    by_points, by_boxes = frame.labels(), frame.labels(by="boxes")
+    both = (by_points != IGNORE) & (by_boxes != IGNORE)
+    assert 0.95 < np.mean(by_points[both] == by_boxes[both]) < 1.0
+    road = frame.points[frame.road_labels() == 1]
+    assert np.median(road[np.hypot(*road[:, :2].T) < 10.0, 2]) == pytest.approx(-0.4, abs=0.3)
+    for name, n_scans in {"av2": 3, "vod": 3, "ddad": 6, "lyft": 12}.items():
+        folder = ScanFolder(data_root("other_roads") / name, name)
+        assert (len(folder.names("train")), len(folder.names("test"))) == (0, n_scans)
+        scans, _, _ = read_scan_set(folder, "test")
+        near = scans[0].points[(np.hypot(*scans[0].points[:, :2].T) < 12.0) & (np.abs(scans[0].points[:, 1]) < 3.0)]
+        ground = near[near[:, 2] < -1.4]
+        assert len(ground) > 100
+        assert np.median(ground[:, 2]) == pytest.approx(-1.73, abs=0.2)
+        if name == "vod":  # the box of a cyclist holds that of the rider
+            assert not (scans[0].labels == 1).any()
+            assert (scans[0].labels == 3).sum() > 500

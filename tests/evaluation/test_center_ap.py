@@ -1,0 +1,92 @@
+"""Average precision by the distance of centers: scenes made by hand, and nuScenes' steps on random scenes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edgeperc.evaluation.center_ap import CLASSES, CenterTable, center_scores, count_centers
+from edgeperc.types.perception import Box
+from twins import center_ap as twin
+
+
+def car(x: float, y: float = 0.0, score: float = 1.0, yaw: float = 0.0, label: str = "car") -> Box:
+    return Box(label, score, (x, y, -1.0), (4.0, 2.0, 1.5), yaw)
+
+
+def table_of(*scans: tuple[list[Box], list[Box]], ignored: tuple[Box, ...] = ()) -> CenterTable:
+    table = CenterTable()
+    for k, (rights, guesses) in enumerate(scans):
+        table += count_centers(guesses, rights, ignored, f"drive {k}")
+    return table
+
+
+def test_perfect_boxes_have_a_precision_of_one_and_no_errors() -> None:
+    cars = [car(10.0 + 5.0 * k) for k in range(6)]
+    assert center_scores(table_of((cars, cars)), "car") == pytest.approx(
+        {"ap": 1.0, "ap_0.5": 1.0, "ap_1": 1.0, "ap_2": 1.0, "ap_4": 1.0, "ate": 0.0, "ase": 0.0, "aoe": 0.0}
+    )
+
+
+def test_shifted_boxes_match_from_their_distance_on() -> None:
+    cars = [car(10.0 + 9.0 * k) for k in range(4)]
+    guesses = [replace(c, center=(c.center[0], 1.5, -1.0), size=(4.0, 2.0, 3.0), yaw=math.pi / 2) for c in cars]
+    scores = center_scores(table_of((cars, guesses)), "car")
+    assert [scores[f"ap_{d}"] for d in ("0.5", "1", "2", "4")] == [0.0, 0.0, pytest.approx(1.0), pytest.approx(1.0)]
+    assert scores["ap"] == pytest.approx(0.5)
+    assert (scores["ate"], scores["ase"], scores["aoe"]) == pytest.approx((1.5, 0.5, math.pi / 2))
+
+
+def test_ignored_and_unknown_objects_excuse_a_detection_near_them() -> None:
+    cars, few, unknown = [car(10.0)], car(20.0), car(30.0, label="ignore")
+    guesses = [car(10.0), car(20.5), car(30.5), car(40.0)]
+    table = table_of((cars, guesses), ignored=(few, unknown))
+    assert [hit for _, hit, *_ in table.guesses["car", 2.0]] == [True, False]
+    assert len(table.objects["car"]) == 1
+
+
+def test_objects_and_detections_beyond_the_range_of_the_class_do_not_count() -> None:
+    table = table_of(([car(51.0), car(10.0)], [car(51.0), car(52.0)]))
+    assert len(table.objects["car"]) == 1
+    assert table.guesses["car", 4.0] == ()
+
+
+def test_without_objects_there_are_no_scores_and_without_hits_errors_are_one() -> None:
+    assert all(math.isnan(v) for v in center_scores(table_of(([], [car(10.0)])), "car").values())
+    scores = center_scores(table_of(([car(10.0)], [])), "car")
+    assert (scores["ap"], scores["ate"], scores["ase"], scores["aoe"]) == (0.0, 1.0, 1.0, 1.0)
+
+
+@st.composite
+def scans(draw: st.DrawFn) -> tuple[list[Box], list[Box]]:
+    rights, guesses = [], []
+    for _ in range(draw(st.integers(0, 6))):
+        label, x, y = draw(st.sampled_from(["car", "pedestrian"])), draw(st.floats(2, 55)), draw(st.floats(-9, 9))
+        right = car(x, y, yaw=draw(st.floats(-3.1, 3.1)), label=label)
+        rights.append(right)
+        for _ in range(draw(st.integers(0, 2))):
+            dx, dy, turn = (draw(st.floats(-2.5, 2.5)) for _ in range(3))
+            size = (4.0 + 0.5 * dx, 2.0, 1.5)
+            guess = replace(right, center=(x + dx, y + dy, -1.0), size=size, yaw=right.yaw + turn)
+            guesses.append(replace(guess, score=draw(st.integers(1, 50)) / 50))
+    return rights, guesses
+
+
+@settings(deadline=None, max_examples=150)
+@given(st.lists(scans(), min_size=1, max_size=4))
+def test_the_steps_of_nuscenes_give_the_same_numbers(given_scans: list[tuple[list[Box], list[Box]]]) -> None:
+    # Scores apart, because the order of equal scores in different scans is a matter of sorting.
+    n = 0
+    apart = []
+    for rights, guesses in given_scans:
+        apart.append((rights, [replace(g, score=g.score - 1e-6 * (n + k)) for k, g in enumerate(guesses)]))
+        n += len(guesses)
+    table = table_of(*apart)
+    for label in ("car", "pedestrian"):
+        if table.objects[label]:
+            expected = twin.scores(apart, label, CLASSES[label])
+            assert center_scores(table, label) == pytest.approx(expected, abs=1e-9)

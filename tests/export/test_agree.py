@@ -1,0 +1,76 @@
+"""Agreement of reduced precisions with fp32: measured after post-processing, and written into the cards."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+onnx = pytest.importorskip("onnx")
+
+from edgeperc.errors import ModelError, PointsError
+from edgeperc.inference.session import Session
+from edgeperc.system.machine import cpu_features
+from edgeperc.zoo import BF16_FEATURES, model_path, resolve
+from edgeperc_export.release import agree as module
+from edgeperc_export.release.agree import agree, summary
+
+
+def measured(labels: list[int], mean_iou: float, ap: float | None) -> module._Measured:
+    return module._Measured([np.array(labels, np.uint8)], mean_iou, ap, "an engine")
+
+
+@pytest.mark.parametrize(
+    ("mean_iou", "ap", "loss"),
+    [(0.8, 0.6, 0.0), (0.79, 0.6, 1.0), (0.9, 0.58, 2.0), (0.79, 0.58, 2.0), (0.9, 0.7, 0.0)],
+)
+def test_the_loss_is_the_larger_one_of_iou_and_ap_in_points(mean_iou: float, ap: float, loss: float) -> None:
+    record = module._record(measured([0, 1, 2, 3], mean_iou, ap), measured([0, 1, 2, 2], 0.8, 0.6), "a command")
+    assert record["loss"] == pytest.approx(loss)
+    assert (record["label_agreement"], record["n_scans"]) == (0.75, 1)
+    assert (record["mean_iou"], record["fp32_mean_iou"], record["ap"], record["fp32_ap"]) == (mean_iou, 0.8, ap, 0.6)
+    (line,) = summary({"int8": record})
+    assert line.startswith("int8: labels agree on 75.000%")
+
+
+def test_a_network_without_boxes_has_no_ap() -> None:
+    record = module._record(measured([0], 0.5, None), measured([0], 0.6, None), "a command")
+    assert (record["loss"], record["ap"], record["fp32_ap"]) == (10.0, None, None)
+    assert "AP" not in summary({"int8": record})[0]
+
+
+@pytest.mark.parametrize("models", [["pointseg:fp32", "ssadnet:int8"], ["pointseg:int8"]])
+def test_files_must_be_of_one_network_and_one_in_fp32(models: list[str]) -> None:
+    with pytest.raises(ModelError, match="expected files of one network, one of them in fp32"):
+        agree(models, kitti=None)
+
+
+def test_labeled_scans_are_required(tmp_path: Path) -> None:
+    path = tmp_path / "pointseg.onnx"
+    shutil.copy(model_path("pointseg"), path)
+    with pytest.raises(PointsError, match="name a KITTI object set"):
+        agree([path], kitti=None)
+    assert path.read_bytes() == model_path("pointseg").read_bytes()
+
+
+def test_every_precision_is_measured_and_recorded(kitti_root: Path, tmp_path: Path) -> None:
+    paths = [tmp_path / "a.onnx", tmp_path / "b.onnx"]  # the names of the files have no effect
+    for variant, path in zip(resolve("pointseg"), paths, strict=True):
+        shutil.copy(variant.path, path)
+    has_bf16 = importlib.util.find_spec("openvino") is not None and not BF16_FEATURES.isdisjoint(cpu_features())
+    records = agree(paths, kitti=kitti_root, split="test", n_scans=2)
+    assert set(records) == {"fp32", "int8"} | ({"bf16"} if has_bf16 else set())
+    assert (records["fp32"]["label_agreement"], records["fp32"]["loss"]) == (1.0, 0.0)
+    for record in records.values():
+        assert record["label_agreement"] > 0.99
+        assert record["n_scans"] == 2
+        assert record["command"] == "edgeperc-export agree pointseg --kitti KITTI --split test --scans 2"
+    fp32, int8 = (Session(path, "cpu").card for path in paths)
+    assert fp32.precisions == {precision: records[precision] for precision in records if precision != "int8"}
+    assert int8.precisions == {"int8": records["int8"]}
+    for variant, path in zip(resolve("pointseg"), paths, strict=True):
+        assert onnx.load(path).graph == onnx.load(variant.path).graph

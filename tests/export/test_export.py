@@ -1,0 +1,962 @@
+"""Training resumes bit for bit, exports are verified, and third-party networks run with a card."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+import shutil
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+onnx = pytest.importorskip("onnx")
+
+from torch import Tensor, nn
+
+from edgeperc import Perceiver
+from edgeperc.datasets.kitti import KittiObjects, scan_hash
+from edgeperc.datasets.splits import fold_of
+from edgeperc.errors import CardMismatchError
+from edgeperc.evaluation.evaluate import evaluate
+from edgeperc.inference.network_input import project
+from edgeperc.inference.projection import make_projector
+from edgeperc.inference.session import Session
+from edgeperc.preprocess.fitness import FitnessProfile
+from edgeperc.simulation.samples import FIRST_SEED, IGNORE, simulated_scan
+from edgeperc.simulation.scene import SimulatedScan
+from edgeperc.types.card import CARD_KEY, InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc_export import make as make_module
+from edgeperc_export.cli import main
+from edgeperc_export.data.augment import ObjectBank
+from edgeperc_export.data.roads import DRAWN, drawn_roads
+from edgeperc_export.data.samples import Recent, Samples, loaded, real_scans
+from edgeperc_export.data.scans import LabeledScan, mirrored
+from edgeperc_export.data.simulate import parity_scans, simulate
+from edgeperc_export.networks import build
+from edgeperc_export.recipe import MODELS, PAPER, SCAN_NETWORKS, TASKS, Recipe, Stage
+from edgeperc_export.release import cards, to_onnx
+from edgeperc_export.release.cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT
+from edgeperc_export.release.models_page import models_page
+from edgeperc_export.release.to_onnx import ParityError, export, load, to_graph, verify, write_card
+from edgeperc_export.training.ablation import PAPERS, SHIPPED, VARIANTS, ablate, plot
+from edgeperc_export.training.curve import curve_table
+from edgeperc_export.training.start import start
+from edgeperc_export.training.task import Task, task_of
+from edgeperc_export.training.teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
+from edgeperc_export.training.train import _optimizer, _schedule, train
+from edgeperc_export.training.watch import Watch
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[np.ndarray]:
+    return [simulated_scan(10**9 + k).points for k in range(2)]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _scans_are_simulated_once() -> Iterator[None]:
+    """Verification and profiles need many simulated scans. Here they get four, which are simulated once."""
+    once = functools.cache(simulated_scan)
+
+    def cached(seed: int, sensor: str = "hdl-64e", boxes: object = None) -> SimulatedScan:
+        seed = seed if seed < 10**9 else 10**9 + seed % 4
+        return once(seed, sensor) if boxes is None else simulated_scan(seed, sensor, boxes)  # type: ignore[arg-type]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("edgeperc_export.data.simulate.simulated_scan", cached)
+        yield
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("simulated")
+    simulate(out, 2)
+    return out
+
+
+@pytest.fixture
+def small_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views with a quarter of the beams and columns, or with the 16 x 8 m ahead: a sixteenth of the arithmetic."""
+    beams = RANGE_IMAGE.row_elevations_deg[::4]
+    monkeypatch.setattr(cards, "RANGE_IMAGE", replace(RANGE_IMAGE, row_elevations_deg=beams, width=128))
+    monkeypatch.setattr(cards, "TOP_VIEW", TopViewGeometry((6.0, 22.0), (-4.0, 4.0)))
+
+
+def small(network: str, **changes: object) -> Recipe:
+    return replace(Recipe(network, steps=4, batch=1, context_width=8), **changes)  # type: ignore[arg-type]
+
+
+def untrained(network: str, folder: Path, **changes: object) -> Path:
+    """A checkpoint of random weights, with batch statistics of two random inputs."""
+    recipe = small(network, **changes)
+    task, net = task_of(recipe), build(recipe).train()
+    with torch.no_grad():
+        for _ in range(2):
+            net(torch.rand(1, len(task.input.channels), task.view.height, task.view.width))
+    state = {k: v for k, v in net.state_dict().items()}
+    path = folder / f"{network}-{recipe.head}.pt"
+    notes = {"frames": "{}", "before": "[]", "curve": "[]", "n_simulated": 2, "step": 0}
+    torch.save({"averaged": state, "best": None, "recipe": json.dumps(recipe.__dict__), **notes}, path)
+    return path
+
+
+def weights(path: Path) -> dict[str, Tensor]:
+    return torch.load(path, weights_only=True)["averaged"]
+
+
+@pytest.mark.usefixtures("small_views")
+@pytest.mark.parametrize(
+    ("network", "head", "n_workers"),
+    [
+        ("lodnn", "dense", 0),
+        ("pointseg", "dense", 0),
+        ("pointseg", "dense", 1),
+        ("ssadnet", "dense", 2),
+        ("ssadnet", "slots", 0),
+    ],
+)
+def test_a_resumed_run_equals_an_uninterrupted_one(
+    tmp_path: Path, simulated: Path, network: str, head: str, n_workers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = small(network, head=head, redraw_every=1)
+    arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "checkpoint_every": 2}
+    whole = train(recipe, tmp_path / "whole", **arguments)  # without workers: they change nothing
+    arguments["n_workers"] = n_workers
+
+    # Killed in the third step, when there is a checkpoint of the second.
+    kind = type(task_of(recipe))
+    loss, calls = kind.loss, 0
+
+    def dying(task: Task, *given: object) -> Tensor:
+        nonlocal calls
+        calls += 1
+        if calls == 3:
+            raise KeyboardInterrupt
+        return loss(task, *given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(kind, "loss", dying)
+    with pytest.raises(KeyboardInterrupt):
+        train(recipe, tmp_path / "cut", **arguments)
+    monkeypatch.setattr(kind, "loss", loss)
+    resumed = weights(train(recipe, tmp_path / "cut", **arguments))
+    for name, value in weights(whole).items():
+        assert torch.equal(value, resumed[name]), name
+    log = [json.loads(line) for line in (tmp_path / "whole/log.jsonl").read_text().splitlines()]
+    assert all(np.isfinite(line["loss"]) for line in log)
+
+
+@pytest.mark.usefixtures("small_views")
+def test_reused_samples_are_drawn_from_the_newest(tmp_path: Path, simulated: Path) -> None:
+    recipe = small("pointseg", steps=7, batch=2, reuse=3, redraw_every=0)
+    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    batches = [[part.clone() for part in batch] for batch in loaded(samples, 0, recipe.steps, 0)]
+    assert len(batches) == recipe.steps
+    seen: list[Tensor] = []
+    for step, (image, *_) in enumerate(batches):
+        if step % recipe.reuse == 0:
+            np.testing.assert_array_equal(image, samples.batch(step)[0])
+            seen += list(image)
+        else:
+            numbers = [next(k for k, other in enumerate(seen) if torch.equal(one, other)) for one in image]
+            assert len(set(numbers)) == 2
+    assert train(recipe, tmp_path, kitti=None, simulated=simulated, n_threads=1).exists()
+
+
+def test_recent_samples_replace_the_oldest() -> None:
+    recent = Recent(4)
+    for number in range(5):
+        recent.add([torch.full((2, 1), float(number)), torch.full((2,), number)])
+        found, labels = recent.draw(4, torch.Generator().manual_seed(number))
+        expected = sorted([number, number, *([number - 1] * 2 if number else [])])
+        assert sorted(labels.tolist()) == expected
+        assert found[:, 0].tolist() == labels.tolist()
+
+
+def test_workers_simulate_the_same_scans_and_cut_out_the_same_objects(tmp_path: Path) -> None:
+    for n_workers in (0, 2):
+        simulate(tmp_path / str(n_workers), 3, n_workers=n_workers)
+    ours, theirs = (sorted((tmp_path / folder).glob("*.npz")) for folder in ("0", "2"))
+    assert [path.name for path in ours] == [path.name for path in theirs]
+    assert all(one.read_bytes() == other.read_bytes() for one, other in zip(ours, theirs, strict=True))
+    scans = [LabeledScan.load(path) for path in ours]
+    bank, other_bank = (ObjectBank.of(scans, n_workers=n_workers) for n_workers in (0, 2))
+    assert list(bank.objects) == list(other_bank.objects)
+    for name, objects in bank.objects.items():
+        for (box, points), (other_box, other_points) in zip(objects, other_bank.objects[name], strict=True):
+            assert box == other_box
+            np.testing.assert_array_equal(points, other_points)
+
+
+@pytest.mark.usefixtures("small_views")
+def test_another_recipe_does_not_resume(tmp_path: Path, simulated: Path) -> None:
+    train(small("pointseg", steps=1), tmp_path, kitti=None, simulated=simulated, n_threads=1)
+    with pytest.raises(ValueError, match="of another recipe"):
+        train(small("pointseg", steps=2), tmp_path, kitti=None, simulated=simulated, n_threads=1)
+
+
+@pytest.mark.usefixtures("small_views")
+def test_a_longer_run_starts_like_a_shorter_one(tmp_path: Path, simulated: Path) -> None:
+    arguments = {"kitti": None, "simulated": simulated, "n_threads": 1, "checkpoint_every": 2}
+    train(small("pointseg", steps=4, cooldown=0.5), tmp_path / "short", **arguments)
+    train(small("pointseg", steps=10, cooldown=0.5), tmp_path / "long", **arguments)
+    one, other = (
+        [json.loads(line)["loss"] for line in (tmp_path / run / "log.jsonl").read_text().splitlines()]
+        for run in ("short", "long")
+    )
+    assert one[0] == other[0]  # of steps 1 and 2, before either cools down
+    assert len(other) == 5
+
+
+def test_the_learning_rate_rises_stays_and_falls() -> None:
+    recipe = Recipe("pointseg", steps=1000, cooldown=0.4)
+    rates = [_schedule(recipe, step) for step in range(1000)]
+    assert rates[0] == 0.01
+    assert set(rates[99:600]) == {1.0}
+    assert all(a > b for a, b in itertools.pairwise(rates[600:]))
+    assert rates[-1] < 1e-4
+    assert {_schedule(PAPER["ssadnet"], step) for step in (0, 30_000, 64_999)} == {1.0}
+
+
+def test_a_run_starts_from_the_weights_it_shares_with_a_checkpoint(tmp_path: Path, simulated: Path) -> None:
+    dense = untrained("ssadnet", tmp_path)
+    slots = build(small("ssadnet", head="slots", seed=5))
+    before = {name: value.clone() for name, value in slots.state_dict().items()}
+    recipes, frames = start(slots, small("ssadnet", head="slots", seed=5), dense, [])
+    assert recipes[-1]["head"] == "dense"
+    assert frames == {}
+    given = weights(dense)
+    for name, value in slots.state_dict().items():
+        origin = given.get(name) if name.startswith("segmentation") else before[name]
+        assert torch.equal(value, origin), name
+    with pytest.raises(ValueError, match="no weight in common"):
+        start(build(small("pointseg")), small("pointseg"), dense, [])
+
+
+SHIPPED_MODELS = Path(__file__).resolve().parent.parent / "models"
+
+
+@pytest.mark.parametrize(
+    ("model", "recipe"),
+    [
+        ("pointseg", Recipe("pointseg", edge=True, height_above_ground=True, batch=1)),
+        ("ssadnet", Recipe("ssadnet", edge=True, front=True, width=0.75, batch=1)),
+        ("lodnn", Recipe("lodnn", edge=True, batch=1)),
+        ("research/kulseg", Recipe("kulseg", height_above_ground=True, batch=1)),
+    ],
+)
+def test_a_run_that_starts_from_a_model_starts_with_its_outputs(
+    simulated: Path, scans: list[np.ndarray], model: str, recipe: Recipe
+) -> None:
+    path, network = SHIPPED_MODELS / f"{model}.onnx", build(recipe)
+    task = task_of(recipe)
+    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    image = torch.from_numpy(samples.batch(0)[0])
+    before, frames = start(network, recipe, path, [image])
+    session = Session(path, "cpu", n_threads=1)
+    assert frames == session.card.training["frames"]
+    assert before[-1] == session.card.training["recipe"]
+    theirs, ours = (make_projector(card.view, card.input) for card in (session.card, task.card))
+    for points in scans:
+        session.input[:] = project(theirs, np.ascontiguousarray(points)).image
+        with torch.no_grad():
+            outputs = network.eval()(torch.from_numpy(project(ours, np.ascontiguousarray(points)).image[None]))
+        for output, expected in zip(as_tuple(outputs), session.run().values(), strict=True):
+            value = output[0].numpy()
+            assert np.abs(value[: len(expected)] - expected).max() < 1e-4 * expected.std()
+            assert not value[len(expected) :].any()  # the vector to the front
+    # In training, batch norm uses the statistics of the batch, here those of the one that it started with.
+    for module in network.train().modules():
+        if isinstance(module, nn.Dropout2d):
+            module.eval()
+    with torch.no_grad():
+        trained = as_tuple(network(image))[0]
+        expected = as_tuple(network.eval()(image))[0]
+    assert (trained - expected).abs().max() < 1e-2 * expected.std()
+
+
+def as_tuple(outputs: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    return outputs if isinstance(outputs, tuple) else (outputs,)
+
+
+def test_classes_of_a_start_keep_their_weights(simulated: Path) -> None:
+    path = SHIPPED_MODELS / "pointseg.onnx"
+    recipe = Recipe("pointseg", edge=True, batch=1, classes=("background", "cone", "pedestrian"))
+    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    assert set(np.unique(samples.batch(0)[1])) <= {0, 2, IGNORE}  # cars are of no class of this network
+    image = torch.from_numpy(samples.batch(0)[0])
+    own, shipped = build(recipe), build(replace(recipe, classes=()))
+    start(own, recipe, path, [image])
+    start(shipped, replace(recipe, classes=()), path, [image])
+    with torch.no_grad():
+        ours, theirs = own.eval()(image), shipped.eval()(image)
+    assert torch.equal(ours[:, [0, 2]], theirs[:, [0, 2]])
+    assert not ours[:, 1].any()
+
+
+@pytest.mark.usefixtures("small_views")
+def test_head_only_trains_only_the_head(tmp_path: Path, simulated: Path) -> None:
+    start = untrained("ssadnet", tmp_path)
+    recipe = small("ssadnet", head="slots", head_only=True, steps=2, ema=0.0)
+    state = torch.load(
+        train(recipe, tmp_path / "run", kitti=None, simulated=simulated, start_from=start, n_threads=1),
+        weights_only=True,
+    )["network"]
+    drawn, given = build(recipe).state_dict(), weights(start)
+    for name, value in state.items():
+        if name.startswith("segmentation"):
+            assert torch.equal(value, given[name]), name
+    assert any(not torch.equal(value, drawn[name]) for name, value in state.items() if name.startswith("detection"))
+
+
+def test_the_papers_recipes_match_the_papers() -> None:
+    """SSADNet 3.2, PointSeg 5 and LoDNN-I 3.3 to 3.6, without settings that they do not mention."""
+    ssadnet, pointseg = PAPER["ssadnet"], PAPER["pointseg"]
+    assert (ssadnet.head, ssadnet.optimizer, ssadnet.learning_rate) == ("slots-paper", "adam", 1e-5)
+    assert ssadnet.batch == 8
+    assert ssadnet.halve_after == 100
+    assert (pointseg.optimizer, pointseg.learning_rate, pointseg.batch, pointseg.steps) == ("adagrad", 1e-3, 32, 50_000)
+    for recipe in (ssadnet, pointseg):
+        assert not recipe.augment
+        assert recipe.n_pasted == recipe.swap == recipe.ema == recipe.lovasz_weight == recipe.simulated_share == 0.0
+    lodnn = PAPER["lodnn"]
+    assert (lodnn.optimizer, lodnn.learning_rate, lodnn.batch, lodnn.context_width) == ("adam", 1e-3, 16, 128)
+    assert lodnn.steps == 22 * 300 * 8 // 16  # epochs, scenes, variations
+    assert lodnn.drawn_roads
+    assert lodnn.augment
+    assert lodnn.n_pasted == lodnn.ema == lodnn.lovasz_weight == lodnn.simulated_share == lodnn.distil == 0.0
+    assert not any(isinstance(m, nn.BatchNorm2d) for m in build(lodnn).modules())
+    assert not any(isinstance(m, nn.BatchNorm2d) for m in build(ssadnet).segmentation.modules())  # type: ignore[union-attr, operator]
+    optimizer = _optimizer(pointseg, build(pointseg))
+    assert type(optimizer) is torch.optim.Adagrad
+
+
+@pytest.fixture(scope="module")
+def kitti(tmp_path_factory: pytest.TempPathFactory, scans: list[np.ndarray]) -> Path:
+    """A simulated KITTI object set: labeled frames of fold 0, of fold 1 and of a test drive, and an unlabeled frame."""
+    root = tmp_path_factory.mktemp("kitti")
+    for part in ("velodyne", "label_2", "calib"):
+        (root / "training" / part).mkdir(parents=True)
+    calibration = "P2: 700 0 620 0 0 700 180 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
+    calibration += "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
+    rows = ["name,drive"]
+    for k, drive in enumerate(["0005", "0048", "0048", "0011"]):
+        scan = simulated_scan(10**9 + (0, 1, 0, 3)[k])
+        scan.points.tofile(root / "training/velodyne" / f"{k:06d}.bin")
+        rows.append(f"{k:06d},2011_09_26_drive_{drive}")
+        if k == 2:
+            continue
+        lines = []
+        for box, count in zip(scan.boxes, scan.box_points, strict=True):
+            (x, y, z), (length, width, height) = box.center, box.size
+            if count and x > 1.0:
+                turn = -box.yaw - np.pi / 2
+                shape = f"{height} {width} {length} {-y} {-z + height / 2} {x} {turn}"
+                lines.append(f"{box.label.capitalize()} 0 0 0 0 0 0 0 {shape}")
+        (root / "training/label_2" / f"{k:06d}.txt").write_text("\n".join(lines) + "\n")
+        (root / "training/calib" / f"{k:06d}.txt").write_text(calibration)
+    (root / "frames.csv").write_text("\n".join(rows) + "\n")
+    return root
+
+
+@pytest.mark.parametrize("network", ["kulseg", "lodnn", "pointseg", "ssadnet"])
+def test_a_fold_is_for_validation_and_not_for_training(
+    tmp_path: Path, kitti: Path, simulated: Path, network: str
+) -> None:
+    arguments = {"kitti": kitti, "simulated": simulated, "fold": 1, "n_threads": 1, "checkpoint_every": 1}
+    checkpoint = train(small(network, steps=2, n_pasted=0.0), tmp_path, **arguments)
+    state = torch.load(checkpoint, weights_only=True)
+    assert json.loads(state["frames"]).keys() == {"000000"}  # of fold 0
+    curve = json.loads(state["curve"])
+    assert [line["step"] for line in curve] == [1, 2]
+    assert all(0.0 <= line["validation"]["background"] <= 1.0 for line in curve)
+    assert all(np.isfinite(line["validation_loss"]) for line in curve)
+    assert state["best"].keys() == state["averaged"].keys()
+    network_, _, notes = load(checkpoint)
+    assert notes["curve"] == curve
+    for name, value in network_.state_dict().items():
+        assert torch.equal(value, state["best"][name])
+
+
+def test_drawn_roads_are_of_training_drives() -> None:
+    pytest.importorskip("faster_coco_eval")
+    images = json.loads(DRAWN.read_text())["images"]
+    assert len(images) == len({image["scan"] for image in images}) >= 8
+    assert all(fold_of(image["drive"]) is not None for image in images)
+    masks = drawn_roads()
+    assert masks.keys() == {image["scan"] for image in images}
+    for mask in masks.values():
+        assert 0.1 < mask.mean() < 0.8
+        assert mask[390:, 95:105].all()  # the vehicle stands on it
+
+
+def test_a_drawn_road_is_the_ground_truth_of_its_scan(kitti: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    objects, road = KittiObjects(kitti), np.zeros((400, 200), np.uint8)
+    road[100:, 60:150] = 1
+    digest = scan_hash(objects.frame("000000").points)
+    monkeypatch.setattr("edgeperc_export.data.samples.drawn_roads", lambda: {digest: road})
+    (scan, other), weights, hashes = real_scans(objects, ["000000", "000001"], drawn=True)
+    assert weights == [1.0, 1.0]
+    assert hashes["000000"] == digest
+    ((plain, _), _, _) = real_scans(objects, ["000000", "000001"])
+    truth, without = scan.top_view_truth(TOP_VIEW), plain.top_view_truth(TOP_VIEW)
+    known = np.isin(truth, (0, 1)) & (without < 2)
+    assert (truth[known] == road[known]).mean() > 0.99  # cells of 0.2 m, half a cell aside
+    assert np.isin(truth, (0, 1, IGNORE)).mean() > 0.9
+    assert (without == IGNORE).mean() > (truth == IGNORE).mean() + 0.1
+    np.testing.assert_array_equal(other.surface, real_scans(objects, ["000001"])[0][0].surface)
+    # Outside the drawing, the certain cells of the scan remain.
+    np.testing.assert_array_equal(scan.surface[:20], plain.surface[:20])
+
+
+def test_lodnn_learns_only_road(simulated: Path) -> None:
+    recipe = small("lodnn", edge=True)
+    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    scan = LabeledScan.load(samples.simulated[0])
+    image, truth = samples.sample(scan)
+    assert image.shape == (3, 400, 200)
+    whole = scan.top_view_truth(TOP_VIEW)
+    np.testing.assert_array_equal(truth == 1, whole == 1)
+    np.testing.assert_array_equal(truth == IGNORE, whole == IGNORE)
+    assert (truth[(whole > 1) & (whole != IGNORE)] == 0).all()
+    labels = torch.from_numpy(truth[None])
+    right = torch.stack([labels == 0, labels == 1], dim=1).float() * 20.0
+    assert samples.task.loss(right, [labels]) < 1e-3
+    assert samples.task.loss(-right, [labels]) > 10.0
+
+
+@pytest.mark.usefixtures("small_views")
+def test_a_simulated_share_of_1_uses_no_real_frame(tmp_path: Path, kitti: Path, simulated: Path) -> None:
+    recipe = small("pointseg", steps=1, simulated_share=1.0, n_pasted=0.0)
+    checkpoint = train(recipe, tmp_path, kitti=kitti, simulated=simulated, n_threads=1)
+    assert load(checkpoint)[2]["frames"] == {}
+    assert json.loads(torch.load(checkpoint, weights_only=True)["curve"])[0]["validation"].keys() >= {"car"}
+
+
+@pytest.mark.usefixtures("small_views")
+def test_the_learning_rate_is_halved_after_epochs_without_improvement(
+    tmp_path: Path, kitti: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Watch, "validate", lambda self, network: (0.5, 1.0, {"car": 0.5}))
+    recipe = small("pointseg", steps=4, halve_after=2, n_pasted=0.0)
+    checkpoint = train(recipe, tmp_path, kitti=kitti, simulated=simulated, fold=1, n_threads=1, checkpoint_every=1)
+    state = torch.load(checkpoint, weights_only=True)
+    assert state["watched"][-1] == 1  # at step 3, two epochs of one step after the first and best
+    assert state["optimizer"]["param_groups"][0]["lr"] < 0.6 * recipe.learning_rate
+
+
+class AlwaysCar(nn.Module):
+    """Labels everything as car."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        out = torch.zeros(x.shape[0], 4, *x.shape[2:])
+        out[:, 1] = 9.0
+        return out
+
+
+def test_a_teacher_labels_unlabeled_points(kitti: Path) -> None:
+    objects = KittiObjects(kitti)
+    (unlabeled,) = unlabeled_scans(objects, fold=0)
+    assert not unlabeled_scans(objects, fold=1)  # its drive is in the excluded fold
+    frame = LabeledScan.from_frame(objects.frame("000000"))
+    task = task_of(Recipe("pointseg"))
+    ahead, all_around = pseudo_labeled(AlwaysCar(), task, [frame, unlabeled])
+    own = frame.labels != IGNORE
+    np.testing.assert_array_equal(ahead.labels[own], frame.labels[own])
+    assert (ahead.labels[~own] == 1).mean() > 0.5
+    azimuth = np.degrees(np.arctan2(all_around.points[:, 1], all_around.points[:, 0]))
+    for left in range(-180, 180, 15):
+        sector = all_around.labels[(azimuth >= left) & (azimuth < left + 15)]
+        assert (sector == 1).mean() > 0.5 if len(sector) > 50 else True
+    unsure = pseudo_labeled(AlwaysCar(), task, [unlabeled], sure=1.1)[0]
+    assert (unsure.labels == IGNORE).all()
+
+
+@pytest.mark.usefixtures("small_views")
+def test_deep_supervision_is_only_for_training(simulated: Path) -> None:
+    recipe = small("pointseg", deep_supervision=0.4)
+    network = build(recipe)
+    inputs, truth = (torch.from_numpy(a) for a in Samples(recipe, [], [], sorted(simulated.glob("*.npz"))).batch(0))
+    logits, early = network.train()(inputs)
+    assert early.shape == (1, 4, 16, 32)
+    plain = task_of(replace(recipe, deep_supervision=0.0)).loss(logits, [truth])
+    assert task_of(recipe).loss((logits, early), [truth]) > plain
+    assert isinstance(network.eval()(inputs), Tensor)
+
+
+def test_a_teacher_averages_a_scene_and_its_mirror_image() -> None:
+    class Outward(nn.Module):
+        """Predicts class 1 where y points away from the middle column; it tells left from right by the column index."""
+
+        def forward(self, image: Tensor) -> Tensor:
+            side = torch.tensor([1.0] * 4 + [-1.0] * 4)
+            away = 10.0 * (image[:, 1:2] * side).sign()
+            return torch.cat([-away, away], dim=1)
+
+    image = torch.randn(2, 5, 3, 8)
+    p, boxes = teach(Outward(), image, RANGE_IMAGE_INPUT, mirror=True)
+    assert boxes is None
+    assert torch.equal(p.argmax(1), Outward()(image).argmax(1))
+    assert p.max(1).values.min() > 0.99
+    # A top view has no channel y to negate, so the two predictions contradict each other here.
+    p, _ = teach(Outward(), image, TOP_VIEW_INPUT, mirror=True)
+    assert torch.allclose(p, torch.full((2, 2, 3, 8), 0.5))
+    p, _ = teach(Outward(), image, TOP_VIEW_INPUT, mirror=False)
+    assert torch.equal(p.argmax(1), Outward()(image).argmax(1))
+
+
+@pytest.mark.usefixtures("small_views")
+@pytest.mark.parametrize(
+    ("network", "edge", "teacher_network"),
+    [
+        ("pointseg", False, "pointseg"),
+        ("pointseg", True, "pointseg"),
+        ("kulseg", False, "pointseg"),
+        ("ssadnet", True, "ssadnet"),
+        ("lodnn", False, "ssadnet"),
+        ("lodnn", True, "ssadnet"),
+    ],
+)
+def test_a_network_is_distilled_from_a_teacher(
+    tmp_path: Path, simulated: Path, network: str, edge: bool, teacher_network: str
+) -> None:
+    recipe = small(network, steps=1, distil=1.0, edge=edge)
+    teacher = untrained(teacher_network, tmp_path, seed=9)
+    arguments = {"kitti": None, "simulated": simulated, "n_threads": 1}
+    with pytest.raises(ValueError, match=r"distils \(1\) but there is no teacher; give --teacher"):
+        train(recipe, tmp_path / "none", **arguments)
+    losses = []
+    for distil in (0.0, 1.0):
+        out = tmp_path / f"distil{distil:g}"
+        train(replace(recipe, distil=distil), out, teacher=teacher if distil else None, **arguments)
+        losses.append(json.loads((out / "log.jsonl").read_text())["loss"])
+    assert losses[1] > losses[0] + 0.1
+
+
+def test_an_unused_or_unsuitable_teacher_is_refused(tmp_path: Path, simulated: Path) -> None:
+    arguments = {"kitti": None, "simulated": simulated, "teacher": untrained("pointseg", tmp_path, edge=True)}
+    with pytest.raises(ValueError, match="the teacher is not used; give --distil"):
+        train(small("pointseg"), tmp_path, **arguments)
+    with pytest.raises(ValueError, match="is of pointseg, which sees another view than lodnn"):
+        train(small("lodnn", distil=1.0), tmp_path, **arguments)
+    slots = untrained("ssadnet", tmp_path, head="slots")
+    with pytest.raises(ValueError, match="the teacher has no dense boxes"):
+        train(small("ssadnet", edge=True, distil=1.0, n_pasted=0.0), tmp_path, **arguments | {"teacher": slots})
+
+
+@pytest.mark.parametrize("network", ["pointseg", "ssadnet", "lodnn"])
+def test_an_exported_teacher_answers_with_each_sample(simulated: Path, network: str) -> None:
+    path = SHIPPED_MODELS / ("pointseg.onnx" if network == "pointseg" else "ssadnet.onnx")
+    recipe = small(network, edge=True, distil=1.0, seen_twice=False, height_above_ground=network == "pointseg")
+    task = task_of(recipe)
+    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")), OnnxTeacher(path, task))
+    arrays = [torch.from_numpy(array) for array in samples.batch(0)]
+    image, taught = arrays[0], arrays[1 + samples.n_targets :]
+    assert len(taught) == (2 if network == "ssadnet" else 1)
+    assert float((taught[0].sum(1) - 1.0).abs().max()) < 1e-5
+    # The teacher reads the same channels of the same scan.
+    session = Session(path, "cpu", n_threads=1)
+    session.input[:] = image[0].numpy()
+    raw = session.run()
+    assert torch.allclose(torch.from_numpy(raw["class_logits"]).softmax(0), taught[0][0], atol=1e-6)
+    outputs = build(recipe).eval()(image)
+    assert torch.isfinite(task.distillation(outputs, *taught))
+    twice = OnnxTeacher(path, task_of(replace(recipe, seen_twice=True)))
+    scan = LabeledScan.load(samples.simulated[0])
+    np.testing.assert_allclose(twice(scan)[0], twice(mirrored(scan))[0][:, :, ::-1], atol=0.02)
+
+
+@pytest.mark.usefixtures("small_views")
+def test_a_run_with_an_exported_teacher_equals_one_with_workers(
+    tmp_path: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint = train(small("pointseg", edge=True, steps=1), tmp_path / "teacher", kitti=None, simulated=simulated)
+    monkeypatch.setattr(to_onnx, "MIN_AGREEMENT", 0.9)
+    teacher = tmp_path / "teacher.onnx"
+    export(checkpoint, teacher, scans=parity_scans([])[:1], fitness=None)
+    recipe = small("pointseg", edge=True, distil=1.0, steps=2)
+    arguments = {"kitti": None, "simulated": simulated, "teacher": teacher, "n_threads": 1}
+    one, other = (weights(train(recipe, tmp_path / f"with-{n}", n_workers=n, **arguments)) for n in (0, 1))
+    assert all(torch.equal(value, other[name]) for name, value in one.items())
+    with pytest.raises(ValueError, match="sees another view than lodnn"):
+        OnnxTeacher(teacher, task_of(small("lodnn")))
+
+
+def test_scans_with_false_objects_are_drawn_more_often(kitti: Path, simulated: Path) -> None:
+    scans, scan_weights, _ = real_scans(KittiObjects(kitti), ["000000", "000001"])
+    samples = Samples(small("pointseg", n_pasted=0.0), scans, scan_weights, sorted(simulated.glob("*.npz")))
+
+    class Blind(nn.Module):
+        """Calls everything farther away than a distance a pedestrian."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.weight = nn.Parameter(torch.zeros(1))
+
+        def forward(self, x: Tensor) -> Tensor:
+            far = (x[:, 4] > self.weight + 1.0).float()
+            return torch.stack([1.0 - far, 0.0 * far, far, 0.0 * far], dim=1)
+
+    samples.redraw(Blind(), 1000)
+    for name in ("real", "simulated"):
+        odds = samples.odds[name]
+        loads = [samples.real[k] if name == "real" else samples._load(k) for k in range(2)]
+        false = [int(((far := samples.sample(s))[0][4] > 1.0)[far[1] == 0].sum()) for s in loads]
+        assert odds[int(np.argmax(false))] > odds[int(np.argmin(false))]
+    again = Samples(small("pointseg", n_pasted=0.0), scans, scan_weights, sorted(simulated.glob("*.npz")))
+    again.redraw(Blind(), 1000)
+    for name in ("real", "simulated"):
+        np.testing.assert_array_equal(samples.odds[name], again.odds[name])
+
+
+@pytest.mark.usefixtures("small_views")
+def test_the_curve_of_a_run_is_a_table(tmp_path: Path, kitti: Path, simulated: Path) -> None:
+    train(small("pointseg"), tmp_path, kitti=kitti, simulated=simulated, fold=1, n_threads=1, checkpoint_every=1)
+    with (tmp_path / "log.jsonl").open("a") as log:  # as after a stop
+        log.write((tmp_path / "log.jsonl").read_text().splitlines()[-1] + "\n")
+    head, names, *rows, gain = curve_table(tmp_path, 2)
+    assert head == f"{tmp_path}: 4 lines of the log, means of 2"
+    assert names.split() == ["samples", "loss", "car", "pedestrian", "cyclist"]
+    assert [row.split()[0] for row in rows] == ["2", "4"]
+    assert gain.split()[:2] == ["last", "quarter"]
+    with pytest.raises(ValueError, match="has no line"):
+        list(curve_table(tmp_path / "nothing"))
+
+
+@pytest.mark.usefixtures("small_views")
+def test_each_variant_of_an_ablation_changes_its_setting(tmp_path: Path, kitti: Path, simulated: Path) -> None:
+    for network, variants in VARIANTS.items():
+        whole = MODELS[SHIPPED[network]].recipe
+        for name, changes in variants.items():
+            changed = replace(whole, **{k: v for k, v in changes.items() if k not in ("teacher", "scans")})
+            assert name == "as shipped" or changes.keys() & {"teacher", "scans"} or changed != whole
+    start = untrained("pointseg", tmp_path)
+    arguments = {"kitti": kitti, "simulated": simulated, "start_from": start, "fold": 1, "steps": 1, "n_threads": 1}
+    asked = ["nothing pasted", PAPERS]
+    rows = ablate("pointseg", tmp_path / "out", **arguments, variants=asked)
+    assert [row["variant"] for row in rows] == asked
+    assert ablate("pointseg", tmp_path / "out", **arguments, variants=asked) == rows
+    assert all(row["figures"].keys() == {"background", "car", "pedestrian", "cyclist"} for row in rows)
+    asked = ["as shipped", "learning rate 0.001", "scans times 2", "batches of 2"]
+    rows = ablate("lodnn", tmp_path / "lodnn", **{**arguments, "start_from": None}, variants=asked)
+    assert [row["scans"] for row in rows] == [4, 4, 8, 4]
+    pytest.importorskip("matplotlib")
+    plot(rows, tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").read_bytes()[:4] == b"\x89PNG"
+    with pytest.raises(ValueError, match="no run of lodnn to draw"):
+        plot([], tmp_path / "none.png")
+
+
+@pytest.mark.usefixtures("small_views")
+def test_make_also_makes_the_models_that_it_starts_from(
+    tmp_path: Path, kitti: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    layouts = tmp_path / "layouts"
+    shutil.copytree(kitti / "training", layouts)
+    rows = (kitti / "frames.csv").read_text().splitlines()
+    (layouts / "frames.csv").write_text("\n".join(row for row in rows if "000002" not in row))  # it has no labels
+    base = Stage(small("pointseg", simulated_share=1.0, steps=1, n_pasted=1.0))
+    full = small("pointseg", steps=3, n_pasted=1.0)
+    stages = {
+        "pointseg-sim": base,
+        "pointseg-full": Stage(full, after="pointseg-sim"),
+        "pointseg": Stage(replace(full, edge=True, distil=1.0, steps=1), teacher="pointseg-full"),
+    }
+    evaluated = []
+
+    def recorded_evaluate(
+        datasets: list[object], *args: object, **kwargs: object
+    ) -> tuple[dict[str, object], list[object]]:
+        evaluated.append([*map(str, datasets)])
+        return evaluate(["simulation:1" if d == "simulation" else d for d in datasets], *args, **kwargs)
+
+    monkeypatch.setattr(make_module, "MODELS", stages)
+    monkeypatch.setattr(make_module, "N_SIMULATED", 2)
+    monkeypatch.setattr(make_module, "evaluate", recorded_evaluate)
+    monkeypatch.setattr(to_onnx, "MIN_AGREEMENT", 0.99)  # after so few steps, the logits of many pixels are close
+    out = tmp_path / "out"
+    arguments = {"kitti": kitti, "layouts": layouts, "n_threads": 1}
+    made = make_module.make("pointseg-full", out, fold=0, steps=1, **arguments)
+    assert made == out / "pointseg-full-fold0.onnx"
+    assert evaluated == [[str(kitti), "simulation"]] * 2
+    cards = [Session(path, "cpu").card for path in (out / "pointseg-sim.onnx", made)]
+    assert [card.training["recipe"]["steps"] for card in cards] == [1, 1]
+    assert [bool(card.training["frames"]) for card in cards] == [False, True]
+    assert [card.metrics["command"] for card in cards] == [
+        "edgeperc eval KITTI simulation --model pointseg-sim --no-agreement",
+        "edgeperc eval KITTI simulation --model pointseg-full --fold 0 --no-agreement",
+    ]
+    assert cards[1].training["started_from"] == [cards[0].training["recipe"]]
+    assert json.loads(made.with_suffix(".json").read_text())["real"]["n_frames"] == 1
+    taught = make_module.make("pointseg", out, fold=0, **arguments)
+    assert len(evaluated) == 3  # the teacher of this fold was made already
+    assert taught.stat().st_size < 0.6 * made.stat().st_size
+    with pytest.raises(ValueError, match="trained on real scans too; give --kitti and --layouts"):
+        make_module.make("pointseg", out, kitti=None, layouts=None)
+
+
+@pytest.mark.usefixtures("small_views")
+@pytest.mark.parametrize(("network", "focal_gamma"), [("pointseg", 0.0), ("kulseg", 2.0), ("squeezesegv2", 2.0)])
+def test_training_lowers_the_loss(simulated: Path, network: str, focal_gamma: float) -> None:
+    recipe = small(network, steps=12, learning_rate=3e-3, focal_gamma=focal_gamma)
+    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    inputs, truth = (torch.from_numpy(a) for a in samples.batch(0))
+    net = build(recipe)
+    optimizer = torch.optim.Adam(net.parameters(), 3e-3)
+    losses = []
+    for _ in range(8):
+        loss = samples.task.loss(net(inputs), [truth])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.8 * losses[0]
+
+
+@pytest.mark.usefixtures("small_views")
+def test_a_step_always_draws_the_same_samples(simulated: Path) -> None:
+    samples = Samples(small("ssadnet"), [], [], sorted(simulated.glob("*.npz")))
+    for one, other in zip(samples.batch(5), samples.batch(5), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert not np.array_equal(samples.batch(5)[0], samples.batch(6)[0])
+
+
+def test_an_empty_scan_is_a_sample_without_ground_truth(simulated: Path) -> None:
+    files = sorted(simulated.glob("*.npz"))
+    scan = LabeledScan.load(files[0])
+    nothing = replace(scan, points=scan.points[:0], labels=scan.labels[:0])
+    image, truth = Samples(small("pointseg"), [], [], files).sample(nothing)
+    assert not image.any()
+    assert (truth == IGNORE).all()
+    full_image, full_truth = Samples(small("pointseg"), [], [], files).sample(scan)
+    empty = (full_image == 0.0).all(axis=0)
+    assert (full_truth[empty] == IGNORE).all()
+    # Without a point of unknown class, such as those of a tram, every other pixel is labeled.
+    known = replace(scan, labels=np.where(scan.labels == IGNORE, 0, scan.labels).astype(np.uint8))
+    assert ((Samples(small("pointseg"), [], [], files).sample(known)[1] == IGNORE) == empty).all()
+
+
+def test_a_stopped_simulation_resumes(tmp_path: Path) -> None:
+    simulate(tmp_path, 1)
+    stamp = (tmp_path / "000000.npz").stat().st_mtime_ns
+    simulate(tmp_path, 2)
+    assert (tmp_path / "000000.npz").stat().st_mtime_ns == stamp
+    assert len(LabeledScan.load(tmp_path / "000001.npz").points) > 50_000
+
+
+Exported = Callable[[str, str], tuple[Path, Path, ModelCard]]
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory, scans: Sequence[np.ndarray]) -> Exported:
+    """Export an untrained network, once: its checkpoint, the model, and the card."""
+
+    @functools.cache
+    def of(network: str, head: str = "dense") -> tuple[Path, Path, ModelCard]:
+        folder = tmp_path_factory.mktemp(network)
+        checkpoint, path = untrained(network, folder, head=head), folder / "model.onnx"
+        fitness = FitnessProfile.from_scans(scans)
+        return checkpoint, path, export(checkpoint, path, scans=scans, fitness=fitness, version="0.0.1")
+
+    return of
+
+
+@pytest.mark.parametrize(
+    ("network", "head"),
+    [
+        ("kulseg", "dense"),
+        ("lodnn", "dense"),
+        ("pointseg", "dense"),
+        ("ssadnet", "dense"),
+        ("ssadnet", "slots"),
+        ("ssadnet", "slots-paper"),
+    ],
+)
+def test_an_export_is_verified(exported: Exported, scans: Sequence[np.ndarray], network: str, head: str) -> None:
+    checkpoint, path, card = exported(network, head)
+    assert card.parity["n_scans"] == 2
+    assert card.parity["max_deviation"] < 0.02  # from rounded weights, or from maxima that rounding moves
+    session = Session(path, "cpu")
+    assert session.card == card
+    assert session.golden_deviation < 1e-3
+    blob = path.read_bytes()
+    assert str(path.parent).encode() not in blob
+    assert b"site-packages" not in blob
+    answer = Perceiver(path, provider="cpu", on_mismatch="ignore")(scans[0])
+    assert (answer.points is None) == (network in ("lodnn", "ssadnet"))
+    if network == "lodnn":
+        assert answer.top_view is not None
+        assert answer.top_view.classes == ("background", "drivable")
+        assert answer.boxes == ()
+    if network == "kulseg":  # batch norm is folded, and every operator has a kernel in all engines
+        plain = {"Add", "Cast", "Concat", "Conv", "ConvTranspose", "MaxPool", "Mul", "Relu", "Sigmoid"}
+        mask = {"Abs", "ReduceMax", "Greater"}
+        assert {node.op_type for node in onnx.load(path).graph.node} == plain | mask
+    assert sorted(p.name for p in path.parent.iterdir()) == sorted([checkpoint.name, "model.onnx"])
+
+
+def test_a_graph_that_disagrees_is_not_written(
+    tmp_path: Path, exported: Exported, scans: Sequence[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint, right, _ = exported("pointseg", "dense")
+    path = tmp_path / "model.onnx"
+    path.write_bytes(b"the model before")
+
+    def broken(network: nn.Module, card: ModelCard) -> onnx.ModelProto:
+        model = onnx.load(right)
+        largest = max(model.graph.initializer, key=lambda t: len(t.raw_data))
+        wrong = onnx.numpy_helper.to_array(largest) * np.float16(1.5)
+        largest.CopyFrom(onnx.numpy_helper.from_array(wrong, largest.name))
+        return model
+
+    monkeypatch.setattr(to_onnx, "to_graph", broken)
+    with pytest.raises(ParityError, match=r"raw outputs differ by \S+ standard deviations"):
+        export(checkpoint, path, scans=scans, fitness=None)
+    assert path.read_bytes() == b"the model before"
+    assert [p.name for p in tmp_path.iterdir()] == ["model.onnx"]
+
+
+def test_verify_detects_another_network(exported: Exported, scans: Sequence[np.ndarray]) -> None:
+    checkpoint, path, _ = exported("pointseg", "dense")
+    network = load(checkpoint)[0]
+    assert verify(network, path, scans)["label_agreement"] > 0.999
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.mul_(1.01)
+    with pytest.raises(ParityError):
+        verify(network, path, scans)
+
+
+def test_figures_written_later_change_only_the_card(tmp_path: Path, exported: Exported) -> None:
+    """`make.finish` adds figures after evaluation: the bytes equal those of an export with these figures."""
+    checkpoint, path, card = exported("lodnn", "dense")
+    figures = {"command": "edgeperc eval simulation --model lodnn", "simulated": {"n_frames": 24}}
+    with_figures = replace(card, metrics=figures)
+    write_card(onnx.load(path), with_figures, tmp_path / "later.onnx")
+    write_card(to_graph(load(checkpoint)[0], card), with_figures, tmp_path / "at-once.onnx")
+    assert (tmp_path / "later.onnx").read_bytes() == (tmp_path / "at-once.onnx").read_bytes()
+    assert ModelCard.read(tmp_path / "later.onnx") == with_figures
+
+
+class ThirdParty(nn.Module):
+    """A third-party range-image network: two channels, a full turn, probabilities as output."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.body = nn.Sequential(nn.Conv2d(2, 8, 3, padding=1), nn.LeakyReLU(), nn.Conv2d(8, 3, 1))
+
+    def forward(self, scan: Tensor) -> Tensor:
+        return torch.softmax(self.body(scan), dim=1)
+
+
+@pytest.fixture(scope="module")
+def third_party(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ModelCard]:
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("elsewhere") / "elsewhere.onnx"
+    example = (torch.zeros(1, 2, 32, 1024),)
+    names = {"input_names": ["scan"], "output_names": ["probabilities"]}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(ThirdParty(), example, path, dynamo=True, external_data=False, verbose=False, **names)
+    card = ModelCard(
+        name="elsewhere",
+        version="2",
+        view=RangeImageGeometry(
+            tuple(np.linspace(10.0, -30.0, 32)), width=1024, azimuth_left_deg=180.0, azimuth_right_deg=-180.0
+        ),
+        input=InputSpec("scan", ("range", "remission"), (15.0, 0.3), (10.0, 0.2)),
+        outputs=(OutputSpec("probabilities", "class_probabilities"),),
+        classes=("nothing", "tree", "car"),
+    )
+    return path, card
+
+
+def test_a_third_party_network_runs_with_a_card(
+    tmp_path: Path, scans: Sequence[np.ndarray], third_party: tuple[Path, ModelCard]
+) -> None:
+    path, card = third_party
+    (tmp_path / "card.json").write_text(card.to_json())
+    out = tmp_path / "carded.onnx"
+    assert main(["card", str(path), str(tmp_path / "card.json"), str(out)]) == 0
+    answer = Perceiver(out, provider="cpu")(scans[0])
+    assert answer.points is not None
+    assert answer.points.classes == ("nothing", "tree", "car")
+    assert answer.points.in_view.mean() > 0.9  # all around
+    assert len(np.unique(answer.points.labels[answer.points.in_view])) > 1
+
+
+def test_a_card_that_does_not_fit_writes_nothing(tmp_path: Path, third_party: tuple[Path, ModelCard]) -> None:
+    path, card = third_party
+    wrong = replace(card, classes=("nothing", "car"))
+    with pytest.raises(CardMismatchError, match=r"'probabilities' is tensor\(float\) of shape \(1, 3, 32, 1024\)"):
+        write_card(onnx.load(path), wrong, tmp_path / "out.onnx")
+    assert not (tmp_path / "out.onnx").exists()
+    (tmp_path / "card.json").write_text(wrong.to_json())
+    assert main(["card", str(path), str(tmp_path / "card.json"), str(tmp_path / "out.onnx")]) == 2
+
+
+def test_a_card_replaces_an_existing_one(tmp_path: Path, third_party: tuple[Path, ModelCard]) -> None:
+    path, card = third_party
+    write_card(onnx.load(path), card, tmp_path / "one.onnx")
+    write_card(onnx.load(tmp_path / "one.onnx"), replace(card, version="3"), tmp_path / "two.onnx")
+    assert [p.key for p in onnx.load(tmp_path / "two.onnx").metadata_props].count(CARD_KEY) == 1
+    assert Session(tmp_path / "two.onnx", "cpu").card.version == "3"
+
+
+@pytest.mark.usefixtures("small_views")
+def test_the_command_line_from_scans_to_a_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, run, model = tmp_path / "data", tmp_path / "run", tmp_path / "pointseg.onnx"
+    assert main(["simulate", str(data), "-n", "2"]) == 0
+    arguments = ["--steps", "1", "--batch", "1", "--threads", "1"]
+    assert main(["train", "pointseg", str(run), "--simulated", str(data), *arguments]) == 0
+    assert main(["export", str(run / "checkpoint.pt"), str(model)]) == 0
+    assert main(["verify", str(run / "checkpoint.pt"), str(model)]) == 0
+    shown = capsys.readouterr().out
+    assert "parity" in shown
+    assert '"n_scans": 4' in shown
+    assert Session(model, "cpu").card.fitness is not None
+
+
+@pytest.mark.parametrize("network", SCAN_NETWORKS)
+def test_a_network_has_one_task(network: str, simulated: Path) -> None:
+    """Targets fit the outputs: the loss is finite, and lower for correct labels than for wrong ones."""
+    recipe = small(network)
+    task = task_of(recipe)
+    assert [network in networks for networks in TASKS.values()].count(True) == 1
+    samples = Samples(recipe, [], [], sorted(simulated.glob("*.npz")))
+    image, labels, *boxes = samples.sample(LabeledScan.load(samples.simulated[0]))
+    assert image.shape == (len(task.input.channels), task.view.height, task.view.width)
+    assert labels.shape == image.shape[1:]
+    assert {*np.unique(labels)} <= {*range(len(task.classes)), IGNORE}
+    known = torch.from_numpy(np.where(labels == IGNORE, 0, labels).astype(np.int64))
+    right = 20.0 * torch.nn.functional.one_hot(known, len(task.classes)).movedim(-1, 0)[None].float()
+    targets = [torch.from_numpy(target[None]) for target in (labels, *boxes)]
+    losses = []
+    for logits in (right, -right):
+        outputs = (logits, targets[1]) if boxes else logits
+        losses.append(float(task.loss(outputs, targets)))
+    assert np.isfinite(losses).all()
+    assert losses[0] + 5.0 < losses[1]
+
+
+def test_the_models_page_matches_the_cards() -> None:
+    folder = Path(__file__).resolve().parent.parent / "models"
+    assert (folder / "MODELS.md").read_text() == models_page(folder), "run: edgeperc-export models models"
+
+
+def test_parity_scans_are_no_training_scans(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: list[int] = []
+    scan = simulated_scan(0)
+
+    def recorded(seed: int, *_: object) -> object:
+        seeds.append(seed)
+        return scan
+
+    monkeypatch.setattr("edgeperc_export.data.simulate.simulated_scan", recorded)
+    assert len(parity_scans([])) == len({*seeds}) == 4
+    # Seeds of training scenes start at 0 (a set has thousands), seeds of evaluation scenes at `FIRST_SEED`.
+    assert 10**8 < min(seeds) <= max(seeds) < FIRST_SEED - 10**8

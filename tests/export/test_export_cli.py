@@ -1,0 +1,130 @@
+"""The command line of edgeperc-export: commands, options and wrong usage."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+onnx = pytest.importorskip("onnx")
+
+
+from edgeperc_export.cli import _recipe, build_parser, main
+from edgeperc_export.networks import build
+from edgeperc_export.recipe import MODELS, NETWORKS, Recipe
+from edgeperc_export.training.ablation import ablate
+
+
+def parsers(parser: argparse.ArgumentParser | None = None, name: str = "") -> Iterator[tuple[str, object]]:
+    """Name and parser of every command, and of the program itself."""
+    parser = parser or build_parser()
+    yield name, parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for command, inner in action.choices.items():
+                yield from parsers(inner, f"{name} {command}".strip())
+
+
+def test_every_model_can_be_made() -> None:
+    for name in MODELS:
+        if not name.endswith("-start"):
+            assert build_parser().parse_args(["make", name, "out"]).name == name
+
+
+def test_every_option_has_a_help_text() -> None:
+    commands = dict(parsers())
+    assert all(name.count(" ") == 0 for name in commands)  # one level
+    for name, parser in commands.items():
+        for action in parser._actions:
+            if not isinstance(action, argparse._SubParsersAction):
+                assert action.help, f"{name} {action.option_strings or action.dest} has no help"
+                assert len(action.help.split()) > 1, f"{name} {action.option_strings}: {action.help}"
+        parser.format_help()  # raises ValueError for a stray % in a help text
+
+
+@pytest.mark.parametrize("command", ["build", "label", "coco", "check"])
+def test_the_old_database_commands_name_the_new_ones(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["database", command, "out"])
+    assert caught.value.code == 2
+    assert f'"database {command}" is now written database-{command}' in capsys.readouterr().err
+
+
+def test_help_and_recipes_load_no_torch() -> None:
+    code = """
+import sys
+from edgeperc_export import recipe
+assert recipe.MODELS and recipe.PAPER
+assert not {"torch", "numpy", "onnx"} & {*sys.modules}, "recipe"
+from edgeperc_export.cli import main
+for arguments in (["--help"], ["train", "--help"], ["database-build", "--help"]):
+    try:
+        main(arguments)
+    except SystemExit as end:
+        assert end.code == 0
+assert not {"torch", "numba", "onnx"} & {*sys.modules}, "--help"
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_field_of_a_recipe_is_an_option() -> None:
+    train = dict(parsers())["train"]
+    options = {action.dest: action for action in train._actions}
+    for field in dataclasses.fields(Recipe):
+        if field.name != "network":
+            assert field.metadata["help"] in str(options[field.name].help)
+            assert {*field.metadata["networks"]} <= {*NETWORKS}
+    # All options of a network, given with their defaults, result in the default recipe.
+    for network in NETWORKS:
+        arguments = ["train", network, "out"]
+        for field in dataclasses.fields(Recipe):
+            if field.metadata and network in field.metadata["networks"]:
+                option = f"--{field.name.replace('_', '-')}"
+                if isinstance(field.default, bool):
+                    arguments += [option if field.default else option.replace("--", "--no-", 1)]
+                else:
+                    arguments += [option, "" if field.default == () else str(field.default)]
+        assert _recipe(build_parser().parse_args(arguments)) == Recipe(network)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["pointseg", "--head", "slots"], "--head has no effect on pointseg, only on ssadnet"),
+        (["lodnn", "--no-class-weights"], "--class-weights has no effect on lodnn"),
+        (["kulseg", "--edge"], "--edge has no effect on kulseg, only on lodnn, pointseg, ssadnet"),
+        (["ssadnet", "--swap", "0.1"], "--swap has no effect on ssadnet"),
+        (
+            ["ssadnet", "--edge", "--context-width", "8"],
+            "--context-width has no effect on a network for small computers",
+        ),
+        (["kulseg", "--recipe", "paper"], "--recipe paper is for ssadnet, pointseg, lodnn, fcn16,"),
+        (["pointseg"], "no scans to train on"),
+    ],
+)
+def test_an_option_without_effect_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert main(["train", arguments[0], str(tmp_path), *arguments[1:]]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_wrong_usage_is_reported_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(
+        ValueError, match="kulseg has no network for small computers; expected lodnn or pointseg or ssadnet"
+    ):
+        build(Recipe("kulseg", edge=True))
+    with pytest.raises(ValueError, match="network is 'yolo'; expected camseg, fcn16, fcn8, kulseg, lodnn, pointseg"):
+        build(Recipe("yolo"))
+    assert main(["verify", str(tmp_path / "no.pt"), str(tmp_path / "no.onnx")]) == 2
+    assert "no.pt" in capsys.readouterr().err
+    arguments = {"kitti": tmp_path, "simulated": tmp_path, "start_from": None, "fold": 0, "steps": 1}
+    with pytest.raises(ValueError, match="pointseg has no variant 'half'; expected one of: as shipped; nothing pasted"):
+        ablate("pointseg", tmp_path, **arguments, variants=["half"])

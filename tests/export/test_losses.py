@@ -1,0 +1,594 @@
+"""Targets and losses compared with plain numpy."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from edgeperc.inference.decode import decode_dense, decode_scored_slots, decode_slots
+from edgeperc.simulation.samples import IGNORE
+from edgeperc.simulation.scene import TOP_VIEW_CLASSES
+from edgeperc.types.card import TopViewGeometry
+from edgeperc.types.perception import Box
+from edgeperc_export.data.scans import LabeledScan, mirrored, turned
+from edgeperc_export.data.targets import REGRESSED_FROM, dense_targets, paper_slot_targets, slot_targets
+from edgeperc_export.training.losses import (
+    FRONT_WEIGHT,
+    GEOMETRY_WEIGHTS,
+    box_distillation_loss,
+    cross_entropy,
+    dense_loss,
+    distillation_loss,
+    lovasz_softmax,
+    paper_slots_loss,
+    pointseg_loss,
+    slots_loss,
+    ssadnet_loss,
+)
+
+VIEW = TopViewGeometry()  # x 6..46 m, y -10..10 m, 0.1 m cells
+CAR = (26.0, 2.0, -1.0, 4.0, 1.6, 1.5, 0.0)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def log_softmax(logits):
+    shifted = logits - logits.max(1, keepdims=True)
+    return shifted - np.log(np.exp(shifted).sum(1, keepdims=True))
+
+
+def random_maps(rng, n_classes=5, shape=(2, 6, 7), ignored=0.2):
+    logits = rng.normal(size=(shape[0], n_classes, *shape[1:])).astype(np.float32)
+    labels = rng.integers(n_classes, size=shape).astype(np.uint8)
+    labels[rng.random(shape) < ignored] = IGNORE
+    return logits, labels
+
+
+# --- paper_slot_targets ---------------------------------------------------------------------------------------------
+
+
+def test_slot_of_a_box_ahead():
+    (slot,) = paper_slot_targets([CAR], VIEW, 1)
+    # Row (46 - 26) / 0.1 = 200 of 400, column (10 - 2) / 0.1 = 80 of 200; 16 columns across, 40 rows along.
+    np.testing.assert_allclose(slot, [80 / 200, 200 / 400, 16 / 200, 40 / 400], rtol=1e-6)
+
+
+def test_slots_of_rotated_boxes_contain_the_footprint(rng):
+    for _ in range(20):
+        yaw = rng.uniform(-np.pi, np.pi)
+        box = np.array([rng.uniform(12, 40), rng.uniform(-5, 5), 0.0, rng.uniform(1, 9), rng.uniform(1, 3), 1.5, yaw])
+        corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * box[3:5] / 2
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        corners = corners @ turn.T + box[:2]
+        rows, cols = (46 - corners[:, 0]) / 0.1, (10 - corners[:, 1]) / 0.1
+        expected = [
+            (cols.min() + cols.max()) / 2 / 200,
+            (rows.min() + rows.max()) / 2 / 400,
+            np.ptp(cols) / 200,
+            np.ptp(rows) / 400,
+        ]
+        np.testing.assert_allclose(paper_slot_targets([box], VIEW, 1)[0], expected, rtol=1e-5)
+
+
+def test_slots_are_nearest_first_and_the_farthest_are_dropped():
+    boxes = [(x, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0) for x in (30.0, 10.0, 40.0, 20.0)]
+    target = paper_slot_targets(boxes, VIEW, 3)
+    np.testing.assert_allclose(target[:, 1], [0.9, 0.65, 0.4], rtol=1e-6)
+
+
+def test_empty_slots_are_zero():
+    assert paper_slot_targets([CAR], VIEW, 4)[1:].tolist() == [[0.0] * 4] * 3
+    assert paper_slot_targets([], VIEW, 2).tolist() == [[0.0] * 4] * 2
+    assert paper_slot_targets(np.empty((0, 7)), VIEW, 2).dtype == np.float32
+
+
+# --- slot_targets ---------------------------------------------------------------------------------------------------
+
+
+def test_a_slot_has_the_box_centered_in_its_square():
+    target = slot_targets([CAR], VIEW).reshape(12, 6, 5)
+    # Row 200 is in the square of rows 192 to 223, column 80 in that of columns 64 to 95.
+    np.testing.assert_allclose(target[6, 2], [80 / 200, 200 / 400, 16 / 200, 40 / 400, 1.0], rtol=1e-6)
+    assert np.count_nonzero(target) == 5
+
+
+def test_the_last_squares_get_the_cells_left_over():
+    target = slot_targets([(6.05, -9.95, 0.0, 4.0, 2.0, 1.5, 0.0)], VIEW).reshape(12, 6, 5)
+    np.testing.assert_allclose(target[11, 5, :2], [199.5 / 200, 399.5 / 400], rtol=1e-6)
+    assert np.count_nonzero(target[..., 4]) == 1
+
+
+def test_of_two_objects_in_a_square_the_slot_gets_the_nearer():
+    near, far = (26.0, 1.0, 0.0, 2.0, 1.0, 1.5, 0.0), (26.5, 3.0, 0.0, 3.0, 1.0, 1.5, 0.0)
+    for boxes in ([near, far], [far, near]):
+        np.testing.assert_array_equal(slot_targets(boxes, VIEW), slot_targets([near], VIEW))
+
+
+def test_squares_with_unlabeled_cells_or_unsure_objects_are_not_learned():
+    labeled = np.ones((400, 200), bool)
+    labeled[399, 0] = False  # beyond the last whole square
+    labeled[200, 80] = False  # in the square of the car, which is learned anyway
+    labeled[0, 33] = False
+    unsure = [(46.0 - 0.1 * 330, 10.0 - 0.1 * 100, 0.0, 4.0, 2.0, 1.5, 0.0)]
+    presence = slot_targets([CAR], VIEW, labeled=labeled, unsure=unsure).reshape(12, 6, 5)[..., 4]
+    assert {tuple(at) for at in np.argwhere(presence == -1.0)} == {(11, 0), (0, 1), (10, 3)}
+    assert np.argwhere(presence == 1.0).tolist() == [[6, 2]]
+    assert slot_targets([CAR], VIEW, unsure=[CAR])[:, 4].max() == 1.0
+    assert slot_targets([], VIEW, unsure=np.empty((0, 7))).shape == (72, 5)
+
+
+@pytest.mark.parametrize("center", [(5.9, 0.0), (46.1, 0.0), (20.0, 10.1), (20.0, -10.1), (6.0, 0.0), (np.nan, 0.0)])
+def test_boxes_centered_outside_the_view_are_left_out(center):
+    box = [(*center, *CAR[2:])]
+    assert not paper_slot_targets(box, VIEW, 2).any()
+    assert not slot_targets(box, VIEW).any()
+    assert not dense_targets(box, VIEW).any()
+
+
+@pytest.mark.parametrize(
+    "targets",
+    [lambda b: paper_slot_targets(b, VIEW, 1), lambda b: slot_targets(b, VIEW), lambda b: dense_targets(b, VIEW)],
+)
+def test_boxes_without_extent_are_refused(targets):
+    with pytest.raises(ValueError, match="has no extent"):
+        targets([(20.0, 0.0, 0.0, 4.0, 0.0, 1.5, 0.0)])
+
+
+# --- dense_targets --------------------------------------------------------------------------------------------------
+
+
+def test_dense_target_of_one_box():
+    yaw = 0.3
+    target = dense_targets([(26.13, 2.27, -0.8, 4.1, 1.7, 1.5, yaw)], VIEW)
+    assert target.shape == (11, 100, 50)
+    assert target.dtype == np.float32
+    ((row, col),) = np.argwhere(target[0] == 1.0)
+    assert (row, col) == (49, 19)  # (46 - 26.13) / 0.4 = 49.675, (10 - 2.27) / 0.4 = 19.325
+    expected = [0.175, -0.175, np.log(4.1), np.log(1.7), np.sin(2 * yaw), np.cos(2 * yaw), -0.8, np.log(1.5)]
+    np.testing.assert_allclose(target[1:, row, col], [*expected, np.cos(yaw), np.sin(yaw)], atol=1e-5)
+
+
+@pytest.mark.parametrize("degrees", [0, 89, -89, 90, 91, -91, 179, -179, 180, 271, 361, -541])
+def test_the_front_that_is_learned_is_decoded(degrees):
+    target = dense_targets([(26.13, 2.27, -0.8, 4.1, 1.7, 1.5, np.radians(degrees))], VIEW)
+    learned = target[0] >= REGRESSED_FROM
+    assert learned.sum() > 1
+    np.testing.assert_allclose(target[9] ** 2 + target[10] ** 2, learned, atol=1e-6)
+    dense = np.concatenate([np.where(target[:1] == 1.0, 5.0, -5.0), target[1:9], 9.0 * target[9:]])[None]
+    classes = np.zeros((1, len(TOP_VIEW_CLASSES), VIEW.height, VIEW.width), np.float32)
+    (box,) = decode_dense(dense.astype(np.float32), classes, "class_logits", VIEW, TOP_VIEW_CLASSES, ("car",))
+    assert np.cos(box.yaw - np.radians(degrees)) == pytest.approx(1.0, abs=1e-6)
+    assert box.front == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    "change", [lambda scan: turned(scan, 2.5), mirrored, lambda scan: mirrored(turned(scan, -1.0))]
+)
+def test_the_front_stays_right_when_a_scan_is_turned_or_mirrored(change):
+    """A car's nose, a point 2 m ahead of its center, stays ahead of its yaw."""
+    box = Box("car", 1.0, (10.0, 3.0, -1.0), (4.0, 1.7, 1.5), 2.0)
+    nose = np.float32([[10.0 + 2.0 * np.cos(2.0), 3.0 + 2.0 * np.sin(2.0), -1.0, 0.0]])
+    scan = change(LabeledScan(nose, np.zeros(1, np.uint8), (box,), (1,), np.zeros((500, 500), np.uint8)))
+    (moved,) = scan.boxes
+    x, y = scan.points[0, :2] - moved.center[:2]
+    assert np.cos(moved.yaw - np.arctan2(y, x)) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_every_learned_cell_points_to_the_same_center():
+    target = dense_targets([(26.13, 2.27, -0.8, 9.0, 3.0, 1.5, 0.3)], VIEW)
+    rows, cols = np.nonzero(target[0] >= REGRESSED_FROM)
+    assert len(rows) > 5
+    np.testing.assert_allclose(rows + 0.5 + target[1, rows, cols], 49.675, atol=1e-4)
+    np.testing.assert_allclose(cols + 0.5 + target[2, rows, cols], 19.325, atol=1e-4)
+    assert not target[1:, target[0] < REGRESSED_FROM].any()
+
+
+def test_heat_lies_along_the_box():
+    # 45 degrees to the left: ahead (up a row) goes with left (down a column).
+    heat = dense_targets([(26.0, 0.0, 0.0, 8.0, 2.0, 1.5, np.pi / 4)], VIEW)[0]
+    ((row, col),) = np.argwhere(heat == 1.0)
+    assert heat[row - 2, col - 2] == pytest.approx(heat[row + 2, col + 2])
+    assert heat[row - 2, col - 2] > 0.5 > 0.1 > heat[row - 2, col + 2]
+    # The edge of the footprint, 4 m from the center, is three standard deviations away.
+    ahead = dense_targets([(26.0, 0.0, 0.0, 8.0, 2.0, 1.5, 0.0)], VIEW)[0]
+    ((row, col),) = np.argwhere(ahead == 1.0)
+    assert ahead[row - 10, col] == pytest.approx(np.exp(-4.5), rel=1e-5)
+
+
+def test_neighbors_keep_their_own_geometry():
+    near, far = (20.0, 0.1, -1.0, 4.0, 1.6, 1.5, 0.0), (21.7, 0.1, -0.5, 8.0, 2.4, 3.0, 0.0)
+    for boxes in ([near, far], [far, near]):
+        target = dense_targets(boxes, VIEW)
+        centers = np.argwhere(target[0] == 1.0)
+        assert len(centers) == 2
+        (far_row, far_col), (near_row, near_col) = centers  # farther ahead is higher up
+        assert target[7, far_row, far_col] == pytest.approx(-0.5)
+        assert target[7, near_row, near_col] == pytest.approx(-1.0)
+        alone = np.maximum(dense_targets([near], VIEW)[0], dense_targets([far], VIEW)[0])
+        np.testing.assert_array_equal(target[0], alone)
+
+
+def test_unlabeled_cells_learn_nothing():
+    labeled = np.ones((400, 200), bool)
+    labeled[:101] = False  # the 26th output row is only partly labeled
+    heat = dense_targets([CAR, (44.0, 0.0, *CAR[2:])], VIEW, labeled=labeled)[0]
+    assert (heat[26:] >= 0.0).all()
+    assert set(np.unique(heat[:26])) - {-1.0} == set(np.unique(heat[:26][heat[:26] >= REGRESSED_FROM]))
+    assert (heat == 1.0).sum() == 2  # a labeled box counts in any cell
+
+
+def test_unsure_boxes_are_not_learned():
+    unsure = (26.0, -4.0, *CAR[2:])
+    target = dense_targets([CAR], VIEW, unsure=[unsure])
+    np.testing.assert_array_equal(target[0] == -1.0, dense_targets([unsure], VIEW)[0] > 0.1)
+    np.testing.assert_array_equal(target[1:], dense_targets([CAR], VIEW)[1:])
+    np.testing.assert_array_equal(
+        dense_targets([CAR], VIEW, unsure=[CAR])[0] == 1.0, dense_targets([CAR], VIEW)[0] == 1.0
+    )
+    assert (dense_targets([], VIEW, unsure=np.empty((0, 7))) == 0.0).all()
+
+
+# --- The runtime decodes the training targets -------------------------------------------------------------------------
+
+CLASSES = ("background", "drivable", "car", "van", "truck")
+ROUND_TRIP = {  # nearest first, as slots are
+    "car": (9.37, -4.21, -0.91, 3.9, 1.6, 1.5, np.pi / 2),
+    "van": (22.04, 3.33, -0.62, 5.1, 1.9, 2.2, 0.0),
+    "truck": (38.81, -2.4, -0.1, 10.0, 2.6, 3.3, 0.0),
+}
+
+
+def painted(boxes):
+    """Labels (400, 200) of upright boxes, by class."""
+    labels = np.zeros((400, 200), np.uint8)
+    for label, box in boxes.items():
+        col, row, width, height = paper_slot_targets([box], VIEW, 1)[0] * [200, 400, 200, 400]
+        rows, cols = np.ogrid[:400, :200]
+        inside = (np.abs(rows + 0.5 - row) <= height / 2) & (np.abs(cols + 0.5 - col) <= width / 2)
+        labels[inside] = CLASSES.index(label)
+    return labels
+
+
+def same_boxes(found, boxes, *, atol):
+    assert sorted(box.label for box in found) == sorted(boxes)
+    for box in found:
+        x, y, z, length, width, height, yaw = boxes[box.label]
+        np.testing.assert_allclose(box.center, (x, y, z), atol=atol)
+        np.testing.assert_allclose(box.size, (length, width, height), atol=atol)
+        assert abs(np.sin(box.yaw - yaw)) < 1e-4  # front and rear look alike
+
+
+def test_slots_survive_the_round_trip():
+    priors = {label: box[3:6] for label, box in ROUND_TRIP.items()}
+    slots = paper_slot_targets(list(ROUND_TRIP.values()), VIEW, 8)[None]
+    scores = np.full((400, 200), 0.5, np.float32)
+    found = decode_slots(slots, painted(ROUND_TRIP), scores, VIEW, CLASSES, CLASSES[2:], priors, 1.73)
+    standing = {label: (*box[:2], box[5] / 2 - 1.73, *box[3:]) for label, box in ROUND_TRIP.items()}
+    same_boxes(found, standing, atol=1e-4)
+
+
+def test_scored_slots_survive_the_round_trip():
+    priors = {label: box[3:6] for label, box in ROUND_TRIP.items()}
+    slots = slot_targets(list(ROUND_TRIP.values()), VIEW)
+    slots[:, 4] = 8.0 * slots[:, 4] - 4.0  # logits
+    probabilities = np.eye(5, dtype=np.float32)[painted(ROUND_TRIP)].transpose(2, 0, 1)
+    found = decode_scored_slots(
+        slots[None], probabilities, "class_probabilities", VIEW, CLASSES, CLASSES[2:], priors, 1.73
+    )
+    standing = {label: (*box[:2], box[5] / 2 - 1.73, *box[3:]) for label, box in ROUND_TRIP.items()}
+    same_boxes(found, standing, atol=1e-4)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, 1.0, 2.2, -0.8, -2.9])
+def test_dense_boxes_survive_the_round_trip(turn):
+    boxes = {label: (*box[:6], box[6] + turn) for label, box in ROUND_TRIP.items()}
+    dense = dense_targets(list(boxes.values()), VIEW)
+    heat = dense[0].clip(1e-6, 1.0 - 1e-6)
+    dense[0] = np.log(heat) - np.log1p(-heat)
+    probabilities = np.eye(5, dtype=np.float32)[painted(boxes)].transpose(2, 0, 1)
+    found = decode_dense(dense, probabilities, "class_probabilities", VIEW, CLASSES, CLASSES[2:])
+    same_boxes(found, boxes, atol=1e-4)
+    assert all(box.score > 0.999 for box in found)
+
+
+# --- Cross-entropy (equation 4), focal, Lovász ----------------------------------------------------------------------
+
+
+def test_segmentation_loss_is_equation_4(rng):
+    logits, labels = random_maps(rng, ignored=0.0)
+    n, height, width = labels.shape
+    y_true = np.eye(5)[labels].transpose(0, 3, 1, 2)
+    expected = -(y_true * log_softmax(logits)).sum() / (n * width * height)
+    assert cross_entropy(torch.tensor(logits), torch.tensor(labels)).item() == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("gamma", [0.0, 2.0])
+@pytest.mark.parametrize("weights", [None, [0.1, 1.0, 2.0, 0.0, 5.0]])
+def test_weighted_cross_entropy_with_ignored_pixels(rng, weights, gamma):
+    logits, labels = random_maps(rng)
+    total = share = 0.0
+    log_p = log_softmax(logits)
+    for (n, r, c), label in np.ndenumerate(labels):
+        if label != IGNORE:
+            weight = 1.0 if weights is None else weights[label]
+            p = np.exp(log_p[n, label, r, c])
+            total -= weight * (1 - p) ** gamma * log_p[n, label, r, c]
+            share += weight
+    tensor = None if weights is None else torch.tensor(weights)
+    loss = cross_entropy(torch.tensor(logits), torch.tensor(labels), tensor, focal_gamma=gamma)
+    assert loss.item() == pytest.approx(total / share, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("p", "gamma", "expected"),
+    [(0.5, 2.0, 0.25 * np.log(2.0)), (0.9, 2.0, -0.01 * np.log(0.9)), (0.1, 0.5, -(0.9**0.5) * np.log(0.1))],
+)
+def test_the_focal_loss_of_a_pixel_is_its_formula(p, gamma, expected):
+    logits = torch.tensor([np.log(p), np.log(1.0 - p)], dtype=torch.float32).view(1, 2, 1, 1)
+    loss = cross_entropy(logits, torch.zeros((1, 1, 1), dtype=torch.uint8), focal_gamma=gamma)
+    assert loss.item() == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("loss", [cross_entropy, lovasz_softmax, lambda x, y: pointseg_loss(x, y, lovasz_weight=1.0)])
+def test_the_loss_without_labels_is_0(loss):
+    logits = torch.randn(2, 4, 3, 3, requires_grad=True)
+    value = loss(logits, torch.full((2, 3, 3), IGNORE, dtype=torch.uint8))
+    value.backward()
+    assert value.item() == 0.0
+    assert not logits.grad.any()
+
+
+@pytest.mark.parametrize("loss", [cross_entropy, lovasz_softmax])
+def test_ignored_pixels_get_no_gradient(rng, loss):
+    logits, labels = random_maps(rng)
+    tensor = torch.tensor(logits, requires_grad=True)
+    loss(tensor, torch.tensor(labels)).backward()
+    gradient = tensor.grad.abs().sum(1).numpy()
+    assert not gradient[labels == IGNORE].any()
+    assert gradient[labels != IGNORE].any()
+
+
+def test_distillation_is_lowest_at_the_teachers_probabilities(rng):
+    logits, _ = random_maps(rng)
+    teacher = np.exp(log_softmax(rng.normal(size=logits.shape)))
+    expected = -(teacher * log_softmax(logits.astype(np.float64))).sum(1).mean()
+    loss = distillation_loss(torch.from_numpy(logits), torch.from_numpy(teacher))
+    assert float(loss) == pytest.approx(expected, rel=1e-5)
+    assert distillation_loss(torch.from_numpy(np.log(teacher)), torch.from_numpy(teacher)) < loss
+
+
+@pytest.mark.parametrize(("n_taught", "n_own"), [(9, 9), (9, 11), (11, 9), (11, 11)])
+def test_distillation_of_boxes_is_weighted_by_the_teachers_heat(rng, n_taught, n_own):
+    taught = rng.normal(size=(2, n_taught, 3, 4)).astype(np.float32)
+    own = rng.normal(size=(2, n_own, 3, 4)).astype(np.float32)
+    heat = 1.0 / (1.0 + np.exp(-taught[:, 0].astype(np.float64)))
+    p = 1.0 / (1.0 + np.exp(-own[:, 0].astype(np.float64)))
+    share = heat * (heat >= REGRESSED_FROM)
+    assert share.sum() > 1.0
+    cross = -(heat * np.log(p) + (1.0 - heat) * np.log(1.0 - p)).sum()
+    apart = (np.abs(own[:, :9] - taught[:, :9])[:, 1:] * np.array(GEOMETRY_WEIGHTS).reshape(1, -1, 1, 1)).sum(1)
+    if n_taught == n_own == 11:
+        yaw = 0.5 * np.arctan2(taught[:, 5], taught[:, 6])
+        theirs, ours = (front[:, 9] * np.cos(yaw) + front[:, 10] * np.sin(yaw) for front in (taught, own))
+        apart += FRONT_WEIGHT * cross_of_logits(ours, 1.0 / (1.0 + np.exp(-theirs.astype(np.float64))))
+    expected = (cross + (apart * share).sum()) / share.sum()
+    loss = box_distillation_loss(torch.from_numpy(own), torch.from_numpy(taught))
+    assert loss.item() == pytest.approx(expected, rel=1e-5)
+    nothing = torch.from_numpy(taught).clone()
+    nothing[:, 0] = -50.0
+    assert torch.isfinite(box_distillation_loss(torch.from_numpy(own), nothing))
+
+
+def test_lovasz_of_hard_predictions_is_one_minus_mean_iou(rng):
+    _, labels = random_maps(rng, n_classes=3)
+    predicted = rng.integers(3, size=labels.shape)
+    known = labels != IGNORE
+    ious = [
+        ((predicted == c) & (labels == c))[known].sum() / ((predicted == c) | (labels == c))[known].sum()
+        for c in range(3)
+    ]
+    logits = 1e4 * np.eye(3, dtype=np.float32)[predicted].transpose(0, 3, 1, 2)
+    loss = lovasz_softmax(torch.tensor(logits), torch.tensor(labels))
+    assert loss.item() == pytest.approx(1.0 - np.mean(ious), abs=1e-5)
+
+
+def test_lovasz_is_the_extension_of_the_jaccard_loss(rng):
+    """Its definition: the Jaccard loss of each set of largest errors, weighted by the steps between the errors."""
+    logits, labels = random_maps(rng, n_classes=2, shape=(1, 3, 4), ignored=0.0)
+    p = np.exp(log_softmax(logits))[0]
+    expected = []
+    for c in range(2):
+        truth = labels[0] == c
+        errors = np.abs(truth - p[c]).ravel()
+        levels = np.append(np.sort(errors)[::-1], 0.0)
+        value = 0.0
+        for higher, lower in itertools.pairwise(levels):
+            wrong = (errors >= higher).reshape(truth.shape)
+            value += (higher - lower) * wrong.sum() / (truth | wrong).sum()
+        expected.append(value)
+    loss = lovasz_softmax(torch.tensor(logits), torch.tensor(labels))
+    assert loss.item() == pytest.approx(np.mean(expected), rel=1e-5)
+
+
+def test_pointseg_loss_is_the_sum_of_its_parts(rng):
+    logits, labels = (torch.tensor(a) for a in random_maps(rng, n_classes=4))
+    weights = torch.tensor([0.1, 1.0, 2.0, 3.0])
+    total = pointseg_loss(logits, labels, weights, focal_gamma=1.5, lovasz_weight=0.7)
+    parts = cross_entropy(logits, labels, weights, focal_gamma=1.5) + 0.7 * lovasz_softmax(logits, labels)
+    torch.testing.assert_close(total, parts)
+    torch.testing.assert_close(pointseg_loss(logits, labels), cross_entropy(logits, labels))
+
+
+# --- Boxes ----------------------------------------------------------------------------------------------------------
+
+
+def test_paper_slots_loss_is_equations_5_and_6(rng):
+    predicted, target = rng.random((2, 3, 6, 4)).astype(np.float32)
+    n, k, _ = target.shape
+    mean_squared = [((target[..., i] - predicted[..., i]) ** 2).sum() / (n * k) for i in range(4)]
+    assert paper_slots_loss(torch.tensor(predicted), torch.tensor(target)).item() == pytest.approx(sum(mean_squared))
+
+
+def test_negative_slots_are_not_learned(rng):
+    predicted, target = (torch.tensor(a.astype(np.float32)) for a in rng.random((2, 2, 6, 4)))
+    target[1] = -1.0
+    torch.testing.assert_close(paper_slots_loss(predicted, target), paper_slots_loss(predicted[:1], target[:1]))
+    assert paper_slots_loss(predicted[1:], target[1:]).item() == 0.0
+
+
+def slots_case(rng):
+    target = np.stack([slot_targets([CAR, (15.0, -3.0, 0.0, 6.0, 2.0, 2.0, 0.7)], VIEW), slot_targets([], VIEW)])
+    target[:, :9, 4] = -1.0
+    predicted = rng.uniform(0.02, 0.3, target.shape)
+    predicted[..., :2] += target[..., :2] - 0.15
+    predicted[..., 4] = rng.normal(size=target.shape[:2])
+    return predicted.astype(np.float32), target
+
+
+def test_slots_loss_is_the_presence_and_the_error_of_each_box(rng):
+    predicted, target = slots_case(rng)
+    presence, boxes = slots_loss(torch.tensor(predicted), torch.tensor(target))
+    learned = target[..., 4] >= 0.0
+    cross = cross_of_logits(predicted[..., 4], target[..., 4] == 1.0)
+    assert presence.item() == pytest.approx(cross[learned].sum() / 2, rel=1e-5)
+    expected = 0.0
+    present = target[..., 4] == 1.0
+    for (x, y, w, h, _), (tx, ty, tw, th, _) in zip(predicted[present], target[present], strict=True):
+        across = min(x + w / 2, tx + tw / 2) - max(x - w / 2, tx - tw / 2)
+        along = min(y + h / 2, ty + th / 2) - max(y - h / 2, ty - th / 2)
+        shared = max(across, 0.0) * max(along, 0.0)
+        error = abs(x - tx) / tw + abs(y - ty) / th + abs(np.log(w / tw)) + abs(np.log(h / th))
+        expected += error + 1.0 - shared / (w * h + tw * th - shared)
+    assert boxes.item() == pytest.approx(expected / 2, rel=1e-4)
+
+
+def test_slots_loss_ignores_unlearned_slots_and_boxes_of_empty_ones(rng):
+    predicted, target = slots_case(rng)
+    tensor = torch.tensor(predicted, requires_grad=True)
+    sum(slots_loss(tensor, torch.tensor(target))).backward()
+    gradient = tensor.grad.numpy()
+    assert (gradient[..., 4].astype(bool) == (target[..., 4] >= 0.0)).all()
+    assert (gradient[..., :4].any(-1) == (target[..., 4] == 1.0)).all()
+
+
+def test_slots_loss_of_the_truth_is_small_and_of_no_objects_is_finite(rng):
+    _, target = slots_case(rng)
+    perfect = torch.tensor(target)
+    perfect[..., 4] = torch.where(perfect[..., 4] == 1.0, 30.0, -30.0)
+    presence, boxes = slots_loss(perfect, torch.tensor(target))
+    assert presence.item() < 1e-6
+    assert boxes.item() < 1e-5
+    for value in (0.0, -1e30, 1e30):
+        extreme = torch.full((1, 72, 5), value, requires_grad=True)
+        loss = sum(slots_loss(extreme, torch.tensor(target[1:])))
+        loss.backward()
+        assert extreme.grad.isfinite().all()
+        assert loss.isfinite()
+
+
+def cross_of_logits(logits, truth):
+    p = 1.0 / (1.0 + np.exp(-logits.astype(np.float64)))
+    return -(truth * np.log(p) + (1.0 - truth) * np.log(1.0 - p))
+
+
+def dense_case(rng):
+    target = np.stack([dense_targets([CAR, (15.0, -3.0, 0.0, 6.0, 2.0, 2.0, 0.7)], VIEW), dense_targets([], VIEW)])
+    target[:, 0, :20] = -1.0
+    return rng.normal(size=target.shape).astype(np.float32), target
+
+
+def test_dense_loss(rng):
+    predicted, target = dense_case(rng)
+    heat, p = target[:, 0], 1.0 / (1.0 + np.exp(-predicted[:, 0].astype(np.float64)))
+    hit = (1 - p) ** 2 * np.log(p)
+    miss = (1 - heat) ** 4 * p**2 * np.log(1 - p)
+    expected_heat = -(hit[heat == 1].sum() + miss[(heat >= 0) & (heat < 1)].sum()) / 2
+    share = np.where(heat >= REGRESSED_FROM, heat, 0.0)
+    error = (np.abs(predicted - target)[:, 1:9] * np.reshape(GEOMETRY_WEIGHTS, (1, 8, 1, 1))).sum(1)
+    heat_loss, geometry_loss = dense_loss(torch.tensor(predicted[:, :9]), torch.tensor(target))
+    assert heat_loss.item() == pytest.approx(expected_heat, rel=1e-4)
+    assert geometry_loss.item() == pytest.approx((error * share).sum() / share.sum(), rel=1e-4)
+    error += FRONT_WEIGHT * cross_of_logits((predicted * target)[:, 9:].sum(1), 1.0)
+    with_front = dense_loss(torch.tensor(predicted), torch.tensor(target))
+    assert with_front[0].item() == heat_loss.item()
+    assert with_front[1].item() == pytest.approx((error * share).sum() / share.sum(), rel=1e-4)
+
+
+def test_dense_loss_ignores_unlearned_cells(rng):
+    predicted, target = dense_case(rng)
+    tensor = torch.tensor(predicted, requires_grad=True)
+    sum(dense_loss(tensor, torch.tensor(target))).backward()
+    gradient = tensor.grad.numpy()
+    assert not gradient[:, 0][target[:, 0] == -1.0].any()
+    assert not gradient[:, 1:].any(1)[target[:, 0] < REGRESSED_FROM].any()
+    assert gradient[:, 1:].any(1)[target[:, 0] >= REGRESSED_FROM].all()
+
+
+def test_dense_loss_of_the_truth_is_small_and_of_no_boxes_is_finite():
+    target = torch.tensor(dense_targets([CAR], VIEW))[None]
+    perfect = target.clone()
+    perfect[:, 0] = torch.where(target[:, 0] == 1.0, 30.0, -30.0)
+    perfect[:, 9] = torch.where(target[:, 9] == 1.0, 30.0, -30.0)
+    heat_loss, geometry_loss = dense_loss(perfect, target)
+    assert heat_loss.item() < 1e-6
+    assert geometry_loss.item() < 1e-6
+    extreme = torch.full((1, 10, 100, 50), 200.0, requires_grad=True)
+    heat_loss, geometry_loss = dense_loss(extreme, torch.zeros(1, 10, 100, 50))
+    (heat_loss + geometry_loss).backward()
+    assert torch.isfinite(heat_loss)
+    assert geometry_loss.item() == 0.0
+    assert torch.isfinite(extreme.grad).all()
+
+
+@pytest.mark.parametrize("head", ["slots-paper", "slots", "dense"])
+def test_ssadnet_loss_is_equation_3(rng, head):
+    logits, labels = (torch.tensor(a) for a in random_maps(rng))
+    if head == "slots":
+        boxes, targets = (torch.tensor(a) for a in slots_case(rng))
+        detection = sum(slots_loss(boxes, targets))
+    elif head == "slots-paper":
+        boxes, targets = (torch.tensor(a.astype(np.float32)) for a in rng.random((2, 2, 6, 4)))
+        detection = paper_slots_loss(boxes, targets)
+    else:
+        boxes, targets = (torch.tensor(a) for a in dense_case(rng))
+        detection = sum(dense_loss(boxes, targets))
+    segmentation = cross_entropy(logits, labels)
+    total, parts = ssadnet_loss(logits, boxes, labels, targets)
+    torch.testing.assert_close(total, 1.0 * segmentation + 0.1 * detection)
+    own = {"slots-paper": {"det"}, "slots": {"presence", "geometry"}, "dense": {"heat", "geometry"}}
+    assert set(parts) == {"seg", *own[head]}
+    total, _ = ssadnet_loss(logits, boxes, labels, targets, lw_seg=2.0, lw_det=0.5)
+    torch.testing.assert_close(total, 2.0 * segmentation + 0.5 * detection)
+
+
+@pytest.mark.parametrize("shape", [(2, 6, 4), (2, 6, 5), (2, 9, 4, 3), (2, 10, 4, 3)])
+def test_a_batch_without_ground_truth_is_not_learned(shape):
+    logits, boxes = torch.randn(2, 5, 16, 12, requires_grad=True), torch.randn(shape, requires_grad=True)
+    labels = torch.full((2, 16, 12), IGNORE, dtype=torch.uint8)
+    total, _ = ssadnet_loss(logits, boxes, labels, torch.full(shape, -1.0), class_weights=torch.rand(5))
+    total.backward()
+    assert total.item() == 0.0
+    assert not logits.grad.any()
+    assert not boxes.grad.any()
+
+
+def test_losses_take_bfloat16(rng):
+    logits, labels = (torch.tensor(a) for a in random_maps(rng))
+    assert cross_entropy(logits.bfloat16(), labels).dtype == torch.float32
+    assert cross_entropy(logits.bfloat16(), labels).item() == pytest.approx(
+        cross_entropy(logits, labels).item(), rel=0.02
+    )
+
+
+@pytest.mark.parametrize("gamma", [0.5, 1.0, 2.0])
+def test_a_certain_pixel_has_a_finite_gradient(gamma):
+    logits = torch.tensor([[[[30.0]], [[0.0]]]], requires_grad=True)
+    cross_entropy(logits, torch.zeros((1, 1, 1), dtype=torch.uint8), focal_gamma=gamma).backward()
+    assert torch.isfinite(logits.grad).all()

@@ -1,0 +1,363 @@
+"""int8 models: layers whose rounding is harmless are rounded; slower or less accurate models are refused."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+onnx = pytest.importorskip("onnx")
+
+from torch import Tensor, nn
+
+from edgeperc.datasets.kitti import KittiObjects
+from edgeperc.datasets.splits import in_split
+from edgeperc.errors import ModelError, PointsError, SplitError
+from edgeperc.evaluation.metrics import Confusion
+from edgeperc.evaluation.tables import Record
+from edgeperc.inference.session import Session
+from edgeperc.simulation.samples import simulated_scan
+from edgeperc.simulation.scene import POINT_CLASSES
+from edgeperc.types.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry
+from edgeperc_export import cli
+from edgeperc_export.release import quantize as module
+from edgeperc_export.release.quantize import RefusedError, calibration_scans, quantize
+from edgeperc_export.release.to_onnx import to_graph, with_golden, write_card
+
+
+class Fragile(nn.Module):
+    """Labels everything as car, by an activation of 1 among values of 10,000 and more, which int8 rounds to 0."""
+
+    def __init__(self, spoil: float) -> None:
+        super().__init__()
+        self.first, self.good, self.spoil = nn.Conv2d(5, 8, 3, padding=1), nn.Conv2d(8, 8, 1), nn.Conv2d(8, 8, 1)
+        self.last = nn.Conv2d(8, 4, 1)
+        with torch.no_grad():
+            for layer in (self.good, self.spoil):
+                layer.weight[:] = torch.eye(8)[:, :, None, None]
+                layer.bias[:] = 0.0
+            self.first.bias[0] = 1.0
+            self.first.weight[0] = 0.0
+            self.spoil.weight[1, 1] = spoil
+            self.last.weight[:] = 0.0
+            self.last.weight[1, 0] = 1.0
+            self.last.bias[:] = torch.tensor([0.5, 0.0, 0.0, 0.0])
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.first(x).relu()
+        x = self.spoil(self.good(x).relu()).relu()
+        return self.last(x)
+
+
+class Small(nn.Module):
+    """The parts of networks for small computers: residual blocks, upsampling, channels moved to pixels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(5, 16, 3, stride=2, padding=1)
+        self.down, self.context = nn.Conv2d(16, 16, 3, stride=2, padding=1), nn.Conv2d(16, 16, 3, padding=1)
+        self.merge, self.last = nn.Conv2d(16, 16, 3, padding=1), nn.Conv2d(16, 16, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.stem(x).relu()
+        low = self.down(x).relu()
+        low = (low + self.context(low)).relu()
+        x = self.merge((x + nn.functional.interpolate(low, size=x.shape[-2:], mode="nearest")).relu()).relu()
+        return nn.functional.pixel_shuffle(self.last(x), 2)
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[np.ndarray]:
+    return [simulated_scan(10**9 + k).points for k in range(2)]
+
+
+def written(network: nn.Module, path: Path) -> Path:
+    card = ModelCard(
+        name="small",
+        version="1.0.0",
+        view=RangeImageGeometry(tuple(np.linspace(2.0, -24.0, 16)), width=128),
+        input=InputSpec("image", ("x", "y", "z", "remission", "range"), (0.0,) * 5, (10.0, 10.0, 2.0, 1.0, 10.0)),
+        outputs=(OutputSpec("logits", "class_logits"),),
+        classes=POINT_CLASSES,
+        training={"licence": "Apache-2.0", "frames": {"known": "0123456789abcdef"}},
+    )
+    model = to_graph(network.eval(), card)
+    write_card(model, with_golden(model, card), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(2)
+    return written(Small(), tmp_path_factory.mktemp("small") / "small.onnx")
+
+
+def timed(fp32_ms: float, int8_ms: float) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    def race(one: Path, other: Path, n_threads: int | None) -> tuple[np.ndarray, np.ndarray]:
+        Session(one), Session(other)
+        noise = np.random.default_rng(0).normal(0.0, 0.1, (2, 40))
+        return fp32_ms + noise[0], int8_ms + noise[1]
+
+    return race
+
+
+FASTER = timed(10.0, 5.0)
+
+
+def convolutions(path: Path) -> dict[str, int]:
+    """The type of every convolution's weight, by the weight's name in fp32."""
+    graph = onnx.load(path).graph
+    types = {weight.name: weight.data_type for weight in graph.initializer}
+    types |= {
+        n.output[0]: types[n.input[0]] for n in graph.node if n.op_type == "DequantizeLinear" and n.input[0] in types
+    }
+    return {n.input[1].split(".")[0]: types[n.input[1]] for n in graph.node if n.op_type == "Conv"}
+
+
+def test_inner_layers_become_int8_and_the_card_says_so(tmp_path: Path, small: Path, scans: list[np.ndarray]) -> None:
+    out = tmp_path / "small-int8.onnx"
+    before = Session(small).card
+    card = quantize(small, out, scans=scans, hashes=["f" * 16], n_evaluated=1, max_noise=9.0, race=FASTER)
+    int8, fp32 = onnx.TensorProto.INT8, onnx.TensorProto.FLOAT
+    assert convolutions(out) == {"stem": fp32, "down": int8, "context": int8, "merge": int8, "last": fp32}
+    nodes = onnx.load(out).graph.node
+    zeros = {w.name: w.data_type for w in onnx.load(out).graph.initializer}
+    assert {zeros[n.input[2]] for n in nodes if n.op_type == "QuantizeLinear"} == {onnx.TensorProto.UINT8}
+
+    session = Session(out, "cpu")
+    assert session.description == "small int8, CPUExecutionProvider"
+    assert session.card.to_json() == card.to_json()
+    assert (card.name, card.version, card.view, card.outputs) == ("small", "1.0.0", before.view, before.outputs)
+    assert (card.precision, card.precisions) == ("int8", {})
+    assert session.golden_deviation == 0.0
+    assert card.golden != before.golden
+    assert card.training["licence"] == "Apache-2.0"
+    assert set(card.training["frames"].values()) == {"f" * 16, "0123456789abcdef"}
+    assert len(card.training["quantized"]["left_alone"]) == 2
+    with pytest.raises(ModelError, match="quantize the model in fp32"):
+        quantize(out, out, scans=scans)
+    assert card.parity["label_agreement"] > 0.9
+    assert card.metrics["simulated"]["n_frames"] == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["small-int8.onnx"]
+
+
+@pytest.mark.parametrize(("seven_bits", "most"), [(True, 64), (False, 127)])
+def test_weights_have_seven_bits_on_request(
+    tmp_path: Path, small: Path, scans: list[np.ndarray], seven_bits: bool, most: int
+) -> None:
+    out = tmp_path / "int8.onnx"
+    card = quantize(small, out, scans=scans, n_evaluated=1, max_noise=9.0, seven_bits=seven_bits, race=FASTER)
+    weights = [onnx.numpy_helper.to_array(w) for w in onnx.load(out).graph.initializer]
+    assert max(int(abs(w.astype(int)).max()) for w in weights if w.dtype == np.int8) == most
+    assert card.training["quantized"]["weight_bits"] == (7 if seven_bits else 8)
+
+
+@pytest.mark.parametrize("equalized", [False, True])
+def test_layers_that_rounding_harms_stay_in_fp32(
+    tmp_path: Path, scans: list[np.ndarray], monkeypatch: pytest.MonkeyPatch, equalized: bool
+) -> None:
+    """Unless equalized channels make the layer harmless."""
+    if not equalized:
+        monkeypatch.setattr(module, "STRENGTHS", (None,))
+    path, out = written(Fragile(1e4), tmp_path / "spoilt.onnx"), tmp_path / "int8.onnx"
+    card = quantize(path, out, scans=scans, n_evaluated=1, race=FASTER)
+    types = convolutions(out)
+    assert types["good"] == onnx.TensorProto.INT8
+    assert types["spoil"] == (onnx.TensorProto.INT8 if equalized else onnx.TensorProto.FLOAT)
+    assert card.parity["label_agreement"] == 1.0
+
+
+def test_a_less_accurate_model_is_refused(tmp_path: Path, scans: list[np.ndarray]) -> None:
+    path = written(Fragile(1e4), tmp_path / "spoilt.onnx")
+    with pytest.raises(RefusedError, match=r"simulated car IoU 0\.\d+ to 0\.000"):
+        quantize(path, tmp_path / "int8.onnx", scans=scans, n_evaluated=1, max_noise=9.0, race=FASTER)
+    assert [p.name for p in tmp_path.iterdir()] == ["spoilt.onnx"]
+
+
+@pytest.mark.parametrize("int8_ms", [20.0, 10.0, 9.99])
+def test_a_model_that_is_not_faster_is_refused(
+    tmp_path: Path, small: Path, scans: list[np.ndarray], int8_ms: float
+) -> None:
+    out = tmp_path / "int8.onnx"
+    out.write_bytes(b"of another day")
+    with pytest.raises(RefusedError, match=rf"not faster here .* 10\.0 ms in fp32, {int8_ms:.1f} in int8"):
+        quantize(small, out, scans=scans, max_noise=9.0, race=timed(10.0, int8_ms))
+    assert out.read_bytes() == b"of another day"
+    assert [p.name for p in tmp_path.iterdir()] == ["int8.onnx"]
+
+
+def test_the_interval_of_a_loss_is_over_drives() -> None:
+    def of(*shares: float) -> dict[str, list[Record]]:
+        records = []
+        for k, share in enumerate(shares):
+            counted = Confusion(("background", "car"))
+            counted.update((np.arange(100) < 100 * share).astype(np.uint8), np.ones(100, np.uint8))
+            records.append(
+                Record(f"{k}", f"drive {k // 2}", {("points", "all"): counted, ("objects", "all"): Counter()})
+            )
+        return {"real": records}
+
+    right = of(*[1.0] * 12)
+    one_drive = module._losses(right, of(*[1.0] * 11, 0.4))["real car IoU"]
+    assert one_drive[:2] == pytest.approx((1.0, 0.95))
+    assert one_drive[2] == 0.0 < one_drive[3]
+    every_drive = module._losses(right, of(*[0.8] * 12))["real car IoU"]
+    assert every_drive == pytest.approx((1.0, 0.8, 0.2, 0.2))
+    alone = module._losses(of(1.0, 1.0), of(0.9, 0.9))["real car IoU"]
+    assert alone == pytest.approx((1.0, 0.9, 0.1, 0.1))
+
+
+def test_a_range_clips_what_costs_less_than_it_saves() -> None:
+    values = np.abs(np.random.default_rng(0).normal(0.0, 1.0, 100_000)).astype(np.float32)
+    values[0] = 1000.0
+
+    def range_of(values: np.ndarray) -> tuple[float, float]:
+        bins = values.view(np.uint32) >> (32 - module.BIN_BITS)
+        return module._range(np.bincount(bins, minlength=1 << module.BIN_BITS))
+
+    low, high = range_of(values[1:])
+    assert low == 0.0
+    assert 3.0 < high < 5.0
+    assert range_of(values)[1] > 500.0  # a single value of a million squares is no outlier to clip
+    assert range_of(-values[1:])[1] == 0.0
+    assert range_of(np.zeros(9, np.float32)) == (0.0, 0.0)
+
+
+def test_the_race_runs_both_models_equally_often(small: Path) -> None:
+    one, other = module.race(small, small, 1, n_runs=3)
+    assert one.shape == other.shape == (3,)
+    assert (one > 0).all()
+    assert (other > 0).all()
+
+
+def test_excluded_nodes_stay_in_fp32(tmp_path: Path, small: Path, scans: list[np.ndarray]) -> None:
+    out = tmp_path / "int8.onnx"
+    name = next(n.name for n in onnx.load(small).graph.node if "down.weight" in n.input)
+    quantize(small, out, scans=scans, exclude=[name], n_evaluated=1, max_noise=9.0, race=FASTER)
+    assert convolutions(out)["down"] == onnx.TensorProto.FLOAT
+    with pytest.raises(ValueError, match="no node is called nothing"):
+        quantize(small, out, scans=scans, exclude=["nothing"], race=FASTER)
+
+
+def test_unpooling_is_not_rounded_on_one_side(tmp_path: Path, scans: list[np.ndarray]) -> None:
+    class Unpooling(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.first, self.inner, self.last = (nn.Conv2d(c, d, 1) for c, d in ((5, 8), (8, 8), (8, 4)))
+
+        def forward(self, x: Tensor) -> Tensor:
+            x = nn.functional.elu(self.first(x))
+            pooled = nn.functional.max_pool2d(x, 2)
+            mask = x == nn.functional.interpolate(pooled, scale_factor=2, mode="nearest")
+            inner = nn.functional.interpolate(self.inner(pooled), scale_factor=2, mode="nearest")
+            return self.last(inner * mask)
+
+    torch.manual_seed(0)
+    path = written(Unpooling(), tmp_path / "unpooling.onnx")
+    fp32 = module._Calibrated.on(path, Session(path).card, scans)
+    assert fp32.noise([n.name for n in fp32.model.graph.node if "inner.weight" in n.input]) < 0.1
+
+
+def test_no_scans_is_an_error(tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(PointsError, match="no scan to calibrate on"):
+        calibration_scans([])
+    (tmp_path / "empty").mkdir()
+    arguments = ["quantize", "m.onnx", str(tmp_path / "o.onnx"), "--scans", str(tmp_path / "empty"), "--simulated", "0"]
+    assert cli.main(arguments) == 2
+    assert "no scan to calibrate on in 1 paths" in capsys.readouterr().err
+    with pytest.raises(PointsError, match="expected at least one"):
+        quantize(small, tmp_path / "o.onnx", scans=[])
+
+
+def test_calibration_never_sees_test_drives(tmp_path: Path, scans: list[np.ndarray]) -> None:
+    raw = tmp_path / "2011_09_26_drive_0011_sync/velodyne_points/data/0000000000.bin"
+    objects = tmp_path / "objects/training/velodyne/000007.bin"
+    sequence = tmp_path / "sequences/00/velodyne/000000.bin"
+    training = tmp_path / "2011_09_26_drive_0005_sync/velodyne_points/data/0000000000.bin"
+    nowhere = tmp_path / "own/0.bin"
+    for file in (raw, objects, sequence, training, nowhere):
+        file.parent.mkdir(parents=True)
+        scans[0].tofile(file)
+    labels = tmp_path / "objects/training/label_2"
+    labels.mkdir()
+    (labels / "000007.txt").touch()
+    (tmp_path / "objects/frames.csv").write_text("name,drive\n000007,2011_09_26_drive_0015\n")
+    for file, drive in ((raw, "26_drive_0011"), (objects, "26_drive_0015"), (sequence, "03_drive_0027")):
+        with pytest.raises(SplitError, match=f"is of drive .*{drive}"):
+            calibration_scans([file])
+        with pytest.raises(SplitError, match=f"is of drive .*{drive}"):
+            calibration_scans([file.parents[2]], n_simulated=1)
+    found, hashes = calibration_scans([training, nowhere.parent])
+    assert [len(points) for points in found] == [len(scans[0])] * 2
+    assert len(hashes) == 2
+
+
+def test_calibration_on_kitti_takes_only_training_drives(kitti_root: Path) -> None:
+    objects = KittiObjects(kitti_root)
+    names = [name for name, drive in objects.drives.items() if not in_split(drive, "train")]
+    test = {module.scan_hash(objects.frame(name).points) for name in objects.names("test") if name in names}
+    found, hashes = calibration_scans(kitti=kitti_root)
+    assert 0 < len(found) == len(hashes) <= 64
+    assert test
+    assert not test & set(hashes)
+
+
+def test_the_command_exits_with_1_if_it_refuses_and_0_if_it_writes(
+    tmp_path: Path,
+    small: Path,
+    scans: list[np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out, scan = tmp_path / "int8.onnx", tmp_path / "scan.bin"
+    scans[0].tofile(scan)
+    arguments = ["quantize", str(small), str(out), "--scans", str(scan), "--simulated", "2", "--evaluate-on", "1"]
+    monkeypatch.setattr(module.quantize, "__kwdefaults__", {**quantize.__kwdefaults__, "race": timed(5.0, 5.0)})
+    assert cli.main(arguments) == 1
+    assert "not faster here" in capsys.readouterr().err
+    assert not out.exists()
+    settings = {**quantize.__kwdefaults__, "race": FASTER, "max_noise": 9.0}
+    monkeypatch.setattr(module.quantize, "__kwdefaults__", settings)
+    assert cli.main(arguments) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert "small 1.0.0, kept in fp32: " in printed[0]
+    assert json.loads(printed[1])["n_scans"] == 4
+
+
+def test_the_mean_of_every_channel_is_that_of_fp32(small: Path, scans: list[np.ndarray]) -> None:
+    card = Session(small).card
+    shifts = {}
+    for strength in (None, 0.0, 1.0):
+        fp32 = module._Calibrated.on(small, card, scans, strength=strength)
+        candidates = module._candidates(fp32.model.graph, ())
+        rounded = fp32.rounded(candidates)
+        made = {n.name: n.output[0] for n in rounded.graph.node if n.name in candidates}
+        means = module._means(rounded, card, fp32.images, [*made.values()])
+        right = {n.name: n.output[0] for n in fp32.model.graph.node if n.name in candidates}
+        expected = module._means(fp32.model, card, fp32.images, [*right.values()])
+        own = {name: expected[output] for name, output in right.items()}
+        shifts[strength] = max(abs(means[made[name]] - own[name]).max() / own[name].std() for name in candidates)
+    assert shifts[0.0] < 0.2 * shifts[None]
+    assert shifts[1.0] < 0.2 * shifts[None]
+
+
+def test_the_shift_is_corrected_where_the_noise_is_above_the_limit(
+    tmp_path: Path, small: Path, scans: list[np.ndarray]
+) -> None:
+    card = Session(small).card
+    fp32 = module._Calibrated.on(small, card, scans)
+    noise = fp32.noise(module._candidates(fp32.model.graph, ()))
+    written = []
+    for limit in (1.01 * noise, 0.99 * noise):
+        quantized = quantize(
+            small, tmp_path / "int8.onnx", scans=scans, n_evaluated=1, max_noise=limit, race=FASTER
+        ).training["quantized"]
+        written.append(quantized)
+    assert written[0]["noise"] == pytest.approx(noise)
+    assert written[1]["noise"] < noise
+    assert len(written[1]["left_alone"]) == 2  # nothing was left out

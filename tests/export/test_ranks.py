@@ -1,0 +1,138 @@
+"""Training under torchrun: two processes give what one gives."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("onnx")
+
+from edgeperc_export.data.simulate import simulate
+from edgeperc_export.training.ranks import RankError, Ranks
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="gloo and torchrun on Windows are not tested")
+
+# Views with a quarter of the beams and columns, or with the 16 x 8 m ahead, as in test_export.
+SCRIPT = """
+import json, os, signal, sys
+from dataclasses import replace
+from pathlib import Path
+import torch
+from edgeperc.card import TopViewGeometry
+from edgeperc_export import cards, ranks
+from edgeperc_export.recipe import Recipe
+from edgeperc_export.training.train import train
+
+cards.RANGE_IMAGE = replace(
+    cards.RANGE_IMAGE, row_elevations_deg=cards.RANGE_IMAGE.row_elevations_deg[::4], width=128
+)
+cards.TOP_VIEW = TopViewGeometry((6.0, 22.0), (-4.0, 4.0))
+# Rounding is that of double precision: gradients of an untrained network have an error of 2 % in fp32.
+autocast, from_numpy, part = torch.autocast, torch.from_numpy, ranks.Ranks.part
+torch.autocast = lambda device, kind: autocast(device, kind, enabled=False)
+torch.set_default_dtype(torch.float64)
+torch.from_numpy = lambda array: from_numpy(array.astype("float64") if array.dtype == "float32" else array)
+ranks.Ranks.part = lambda self, batch: part(self, batch).double()
+runs, simulated, dies = sys.argv[1:]
+if dies == os.environ.get("RANK"):
+    add, calls = ranks.Ranks.add_gradients, []
+    def dying(self, network):
+        calls.append(1)
+        if len(calls) == 4:
+            os.kill(os.getpid(), signal.SIGKILL)
+        add(self, network)
+    ranks.Ranks.add_gradients = dying
+for out, changes in json.loads(runs).items():
+    recipe = Recipe(**{"steps": 6, "batch": 4, "context_width": 8, "redraw_every": 3, **changes})
+    train(recipe, Path(out), kitti=None, simulated=Path(simulated), n_threads=1, checkpoint_every=2)
+"""
+
+RUNS = {
+    "pointseg": {"network": "pointseg", "accumulate": 2},
+    "ssadnet": {"network": "ssadnet", "edge": True, "width": 0.25, "front": True},
+    "lodnn": {"network": "lodnn", "learning_rate": 1e-3},
+}
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("simulated")
+    simulate(out, 3)
+    return out
+
+
+def trained(
+    folder: Path, runs: dict[str, dict], simulated: Path, world: int, dies: str = ""
+) -> subprocess.CompletedProcess[str]:
+    """Train one after the other in ``world`` processes; rank ``dies`` is killed in its fourth step."""
+    folder.mkdir(exist_ok=True)
+    script = folder / "train.py"
+    script.write_text(SCRIPT)
+    command = [sys.executable]
+    if world > 1:
+        command += ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={world}"]
+    outs = {str(folder / name): changes for name, changes in runs.items()}
+    command += [str(script), json.dumps(outs), str(simulated), dies]
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+
+
+def checkpoint(out: Path) -> dict[str, torch.Tensor]:
+    return torch.load(out / "checkpoint.pt", weights_only=True)
+
+
+def distance(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> float:
+    """Euclidean distance of the weights, without the statistics of batch norm."""
+    names = [name for name in one if "running" not in name and one[name].is_floating_point()]
+    return float(torch.cat([(one[name].double() - other[name].double()).flatten() for name in names]).norm())
+
+
+def test_two_ranks_train_what_one_trains(tmp_path: Path, simulated: Path) -> None:
+    # One process trains all, which saves seconds for each. torchrun connects its processes only once.
+    starts = {f"{name}-start": {**run, "learning_rate": 0.0, "steps": 1} for name, run in RUNS.items()}
+    done = trained(tmp_path / "one", RUNS | starts, simulated, 1)
+    assert done.returncode == 0, done.stderr
+    for network, run in RUNS.items():
+        done = trained(tmp_path / "two", {network: run}, simulated, 2)
+        assert done.returncode == 0, done.stderr
+        one, two = states = [checkpoint(tmp_path / world / network) for world in ("one", "two")]
+        moved = distance(checkpoint(tmp_path / f"one/{network}-start")["network"], one["network"])
+        apart = distance(one["network"], two["network"])
+        print(network, moved, apart)
+        assert apart < 1e-3 * moved
+        losses = [[row["loss"] for row in json.loads(state["curve"])] for state in states]
+        assert losses[1] == pytest.approx(losses[0], rel=1e-4)
+        assert {*one["odds"]} == {*two["odds"]}
+        lines = (tmp_path / "two" / network / "log.jsonl").read_text().splitlines()
+        assert [json.loads(line)["step"] for line in lines] == [2, 4, 6]
+
+
+def test_a_killed_rank_ends_the_run_and_it_resumes(tmp_path: Path, simulated: Path) -> None:
+    runs = {"ssadnet": RUNS["ssadnet"]}
+    whole = trained(tmp_path / "whole", runs, simulated, 2)
+    assert whole.returncode == 0, whole.stderr
+    cut = trained(tmp_path / "cut", runs, simulated, 2, dies="1")
+    assert cut.returncode != 0
+    assert "another rank" in cut.stderr or re.search("Signal 9|exitcode: -9", cut.stderr), cut.stderr
+    assert checkpoint(tmp_path / "cut/ssadnet")["step"] == 2
+    resumed = trained(tmp_path / "cut", runs, simulated, 2)
+    assert resumed.returncode == 0, resumed.stderr
+    one, other = (checkpoint(tmp_path / name / "ssadnet")["network"] for name in ("whole", "cut"))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_what_ranks_cannot_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    Ranks().check(7, 1, True)
+    monkeypatch.setenv("RANK", "0")
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    Ranks().check(8, 2, False)
+    with pytest.raises(RankError, match="multiple of 8"):
+        Ranks().check(12, 2, False)
+    with pytest.raises(RankError, match="--compile"):
+        Ranks().check(8, 1, True)

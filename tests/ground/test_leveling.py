@@ -1,0 +1,394 @@
+"""How a sensor is mounted: given, estimated from scans, and moved into the frame of the models."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import twins.frame
+from edgeperc import Box, FitnessError, ModelFrame, Mounting, MountingError, OptionError, Perceiver, SensorError
+from edgeperc.ground.leveling import FROZEN_AFTER, MountingEstimator
+from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.scene import Scene, simulate
+from edgeperc.types.frame import fill_moved, turned
+from edgeperc.types.mounting import MODEL_MOUNTING
+from edgeperc.types.sensor import SensorProfile, get_sensor
+
+angles = st.floats(-60.0, 60.0)
+mountings = st.builds(
+    Mounting,
+    height_m=st.floats(-1.0, 5.0),
+    roll_deg=angles,
+    pitch_deg=angles,
+    yaw_deg=st.floats(-180.0, 180.0),
+    origin_m=st.tuples(st.floats(-100.0, 100.0), st.floats(-100.0, 100.0)),
+)
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[NDArray[np.float32]]:
+    """Simulated scans, 1.73 m above a level road."""
+    return [simulate(flat(random_scene(seed, "urban")), "hdl-64e", seed=seed).points for seed in (1, 2, 3)]
+
+
+def flat(scene: Scene) -> Scene:
+    terrain = np.zeros_like(scene.terrain)
+    terrain[15:] = scene.terrain[15:]  # heights of kerbs and the like
+    return replace(scene, terrain=terrain)
+
+
+def seen_by(mounting: Mounting, points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A scan of a level sensor, 1.73 m above the road, in the frame of a sensor mounted otherwise."""
+    assert mounting.height_m is not None
+    on_road = points[:, :3] + [0.0, 0.0, 1.73]
+    moved = points.copy()
+    moved[:, :3] = (on_road - [0.0, 0.0, mounting.height_m]) @ mounting.rotation() + [*mounting.origin_m, 0.0]
+    return moved
+
+
+# --- what is given ---------------------------------------------------------------------------------------------------
+
+
+@given(mountings)
+def test_matrix_and_dict_give_the_mounting_back(mounting: Mounting) -> None:
+    assert mounting.height_m is not None
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[2, 3] = mounting.rotation(), mounting.height_m
+    again = Mounting.from_matrix(matrix)
+    np.testing.assert_allclose(again.rotation(), mounting.rotation(), atol=1e-9)
+    assert again.height_m == mounting.height_m
+    assert Mounting.from_dict(json.loads(json.dumps(mounting.to_dict()))) == mounting
+
+
+def test_directions_of_the_angles() -> None:
+    down, left_up, right = (Mounting(1.0, *a).rotation() for a in ((0, 10, 0), (10, 0, 0), (0, 0, -90)))
+    assert down[2, 0] < 0.0  # pitch: x points down
+    assert left_up[2, 1] > 0.0  # roll: the left side is up
+    np.testing.assert_allclose(right @ [1, 0, 0], [0, -1, 0], atol=1e-12)  # x points right
+    np.testing.assert_allclose(right @ [0, 1, 0], [1, 0, 0], atol=1e-12)  # y points ahead
+
+
+@pytest.mark.parametrize(
+    ("text", "mounting"),
+    [
+        ("[[1,0,0,9],[0,1,0,9],[0,0,1,2.5],[0,0,0,1]]", Mounting(2.5, 0.0, 0.0, 0.0)),
+        ('{"T_vehicle_sensor": [[0,1,0,0],[-1,0,0,0],[0,0,1,2],[0,0,0,1]]}', Mounting(2.0, 0.0, 0.0, -90.0)),
+        ("1 0 0 0\n0 1 0 0\n0 0 1 1.2\n0 0 0 1\n", Mounting(1.2, 0.0, 0.0, 0.0)),
+        ("1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 1.2", Mounting(1.2, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_extrinsic_files(tmp_path: Path, text: str, mounting: Mounting) -> None:
+    (tmp_path / "extrinsic").write_text(text)
+    assert Mounting.from_file(tmp_path / "extrinsic") == mounting
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "1 2 3",
+        "a b c",
+        "[[1,0],[0,1]]",
+        '{"T": 1}',
+        "nan " * 16,
+        "1 " * 16,
+        "[" * 100_000,
+        "2 0 0 0 0 2 0 0 0 0 2 0",
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "extrinsic").write_text(text)
+    with pytest.raises(SensorError, match="extrinsic"):
+        Mounting.from_file(tmp_path / "extrinsic")
+    with pytest.raises(SensorError, match="cannot be read"):
+        Mounting.from_file(tmp_path / "absent")
+
+
+@given(st.text(max_size=200))
+def test_any_text_is_a_mounting_or_an_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    file = tmp_path_factory.getbasetemp() / "any"
+    file.write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(SensorError):
+        Mounting.from_file(file)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"height_m": math.nan},
+        {"height_m": 1e6},
+        {"roll_deg": 91.0},
+        {"pitch_deg": "3"},
+        {"yaw_deg": 361.0},
+        {"yaw_deg": True},
+        {"origin_m": (0.0,)},
+        {"origin_m": (0.0, math.inf)},
+        {"origin_m": "00"},
+        {"height_m": 10**400},
+        {"roll_deg": [1]},
+    ],
+)
+def test_impossible_mountings_are_refused(values: dict[str, object]) -> None:
+    with pytest.raises(SensorError, match="mounting"):
+        Mounting(**values)  # type: ignore[arg-type]
+
+
+def test_profiles_keep_their_mounting() -> None:
+    profile = replace(get_sensor("vlp-16"), mounting=Mounting(2.0, 1.0, None, -3.0, (1.5, 0.0)))
+    assert SensorProfile.from_json(profile.to_json()) == profile
+    assert profile.mount_height_m == 2.0
+    with pytest.raises(SensorError, match="mounting"):
+        replace(profile, mounting=1.7)  # type: ignore[arg-type]
+    broken = json.loads(profile.to_json())
+    broken["mounting"]["height_m"] = "high"
+    with pytest.raises(SensorError, match="height_m"):
+        SensorProfile.from_json(json.dumps(broken))
+    broken["mounting"] = {"height_m": 1.0}
+    with pytest.raises(SensorError, match="exactly"):
+        SensorProfile.from_json(json.dumps(broken))
+
+
+# --- the frame of the models -----------------------------------------------------------------------------------------
+
+
+def test_scans_of_the_training_vehicle_are_not_moved(scans: list[NDArray[np.float32]]) -> None:
+    frame = ModelFrame(MODEL_MOUNTING)
+    assert frame.is_identity
+    assert frame.move(scans[0]) is scans[0]
+
+
+@given(mountings, st.integers(0, 2**32 - 1))
+def test_moved_points_lie_where_the_rule_says(mounting: Mounting, seed: int) -> None:
+    """v = R (p - origin) + height in the vehicle frame; the models' frame is the training vehicle's sensor."""
+    points = np.random.default_rng(seed).normal(0.0, 20.0, (50, 4)).astype(np.float32)
+    points[::7] = np.nan
+    assert mounting.height_m is not None
+    vehicle = (points[:, :3] - [*mounting.origin_m, 0.0]) @ mounting.rotation().T + [0.0, 0.0, mounting.height_m]
+    expected = (vehicle - [0.0, 0.0, 1.73]) @ MODEL_MOUNTING.rotation()
+    moved = ModelFrame(mounting).move(points)
+    np.testing.assert_allclose(moved[:, :3], expected, atol=1e-3)
+    np.testing.assert_array_equal(moved[:, 3], points[:, 3])
+    assert moved.dtype == np.float32
+    assert len(ModelFrame(mounting).move(points[:0])) == 0
+
+
+@pytest.mark.parametrize("kind", ["random", "empty", "one", "not finite", "huge"])
+def test_the_kernel_agrees_with_its_twin(kind: str) -> None:
+    points = np.random.default_rng(1).normal(0.0, 30.0, (200, 4)).astype(np.float32)
+    if kind == "huge":
+        points *= np.float32(3e36)
+    if kind == "not finite":
+        points[::3, 1], points[::5, 3] = np.inf, np.nan
+    points = points[: {"empty": 0, "one": 1}.get(kind, 200)]
+    frame = ModelFrame(Mounting(2.0, 3.0, -5.0, 70.0, (1.0, 2.0)))
+    found = np.empty_like(points)
+    fill_moved(points, frame.R, frame.t, found)
+    np.testing.assert_array_equal(found, twins.frame.moved(points, frame.R, frame.t))
+    for angle_rad in (0.0, math.pi / 2, math.pi, 2.0):
+        np.testing.assert_array_equal(turned(points, angle_rad), twins.frame.turned(points, angle_rad))
+
+
+@given(mountings, st.floats(-3.0, 3.0))
+def test_boxes_come_back(mounting: Mounting, yaw: float) -> None:
+    box = Box("car", 0.5, (12.0, -3.0, -0.9), (4.0, 1.8, 1.5), yaw)
+    frame = ModelFrame(replace(mounting, roll_deg=0.0, pitch_deg=0.66))
+    (back,) = frame.boxes_back(frame.move_boxes([box]))
+    np.testing.assert_allclose(back.center, box.center, atol=1e-6)
+    assert math.remainder(back.yaw - box.yaw, 2 * math.pi) == pytest.approx(0.0, abs=0.02)
+    assert (back.label, back.score, back.size) == (box.label, box.score, box.size)
+
+
+# --- what scans show -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "mounting",
+    [
+        Mounting(1.73, 0.0, 0.0, 0.0),
+        Mounting(2.9, 4.0, -6.0, 0.0),
+        Mounting(0.6, -5.0, 3.0, 0.0),
+        Mounting(-0.3, 2.0, 2.0, 0.0),
+        Mounting(3.8, 0.0, 8.0, 0.0),
+    ],
+)
+def test_height_and_tilt_are_found(scans: list[NDArray[np.float32]], mounting: Mounting) -> None:
+    estimator = MountingEstimator(Mounting())
+    for scan in scans:
+        estimator = estimator.add(seen_by(mounting, scan))
+        found = estimator.estimate()
+    assert found.n_scans == 3
+    assert found.mounting.height_m == pytest.approx(mounting.height_m, abs=0.05)
+    assert found.mounting.roll_deg == pytest.approx(mounting.roll_deg, abs=0.5)
+    assert found.mounting.pitch_deg == pytest.approx(mounting.pitch_deg, abs=0.5)
+    assert found.mounting.yaw_deg == 0.0
+    assert found.yaw_sd_deg == 0.0 < min(found.height_sd_m, found.roll_sd_deg, found.pitch_sd_deg)
+    assert "height" in str(found)
+
+
+def test_real_scans_give_the_applied_mounting_and_an_honest_uncertainty(kitti_root: Path) -> None:
+    """Single scans of 26 drives, as recorded, and as a tilted and raised sensor would have recorded them."""
+    files = sorted((kitti_root / "training" / "velodyne").glob("*.bin"))[254:374:2]
+    rng = np.random.default_rng(0)
+    errors, changes = [], []
+    for file in files:
+        scan = np.fromfile(file, np.float32).reshape(-1, 4)
+        own = MountingEstimator(Mounting()).add(scan).estimate()
+        m = own.mounting
+        assert m.height_m is not None
+        assert m.roll_deg is not None
+        assert m.pitch_deg is not None
+        sds = np.array([own.height_sd_m, own.roll_sd_deg, own.pitch_sd_deg])
+        errors.append((np.array([m.height_m, m.roll_deg, m.pitch_deg]) - [1.75, -0.2, 0.66]) / sds)
+        applied = Mounting(rng.uniform(0.8, 3.0), rng.uniform(-8.0, 8.0), rng.uniform(-8.0, 8.0), 0.0)
+        moved = MountingEstimator(Mounting()).add(seen_by(applied, scan)).estimate().mounting
+        whole = Mounting.from_matrix(np.block([[m.rotation() @ applied.rotation(), np.zeros((3, 1))], [np.eye(4)[3:]]]))
+        assert applied.height_m is not None
+        raised = m.height_m + applied.height_m - 1.73
+        changes.append(
+            [(moved.height_m or 0.0) - raised, (moved.roll_deg or 0.0) - (whole.roll_deg or 0.0),
+             (moved.pitch_deg or 0.0) - (whole.pitch_deg or 0.0)]
+        )  # fmt: skip
+    near = np.abs(np.array(changes)) < [0.05, 0.5, 0.5]
+    assert (near.mean(axis=0) >= 0.95).all(), near.mean(axis=0)
+    within = np.abs(np.array(errors)) < 2.0
+    assert (within.mean(axis=0) >= 0.9).all(), within.mean(axis=0)
+
+
+def test_given_values_are_kept(scans: list[NDArray[np.float32]]) -> None:
+    known = Mounting(height_m=2.0, yaw_deg=0.0)
+    found = MountingEstimator(known).add(seen_by(Mounting(2.6, 3.0, 0.0, 0.0), scans[0])).estimate()
+    assert found.mounting.height_m == 2.0
+    assert found.height_sd_m == 0.0
+    assert found.mounting.roll_deg == pytest.approx(3.0, abs=0.5)
+    whole = MountingEstimator(MODEL_MOUNTING)
+    assert whole.is_complete
+    assert whole.add(scans[0]) is whole
+    assert whole.estimate().mounting == MODEL_MOUNTING
+
+
+@pytest.mark.parametrize("yaw_deg", [-70.0, -20.0, 0.0, 35.0])
+def test_the_street_gives_the_yaw_when_asked(scans: list[NDArray[np.float32]], yaw_deg: float) -> None:
+    turned = seen_by(Mounting(2.0, 2.0, -2.0, yaw_deg), scans[0])
+    found = MountingEstimator(Mounting(yaw_deg=None)).add(turned).estimate()
+    assert found.mounting.yaw_deg == pytest.approx(yaw_deg, abs=5.0)
+    assert found.yaw_sd_deg > 0.0
+
+
+def test_a_few_scans_settle_it(scans: list[NDArray[np.float32]]) -> None:
+    estimator = MountingEstimator(Mounting())
+    for _ in range(FROZEN_AFTER):
+        assert not estimator.is_complete
+        estimator = estimator.add(scans[0])
+    assert estimator.is_complete
+    assert estimator.add(seen_by(Mounting(3.0, 0.0, 0.0, 0.0), scans[0])) is estimator
+
+
+def no_ground(kind: str) -> NDArray[np.float32]:
+    rng = np.random.default_rng(0)
+    scan = rng.normal(0.0, 10.0, (20_000, 4)).astype(np.float32)
+    if kind == "wall":
+        scan[:, 0] = 8.0
+    elif kind == "few":
+        scan = scan[:5]
+    elif kind == "one":
+        scan = scan[:1]
+    elif kind == "empty":
+        scan = scan[:0]
+    elif kind == "not finite":
+        scan[:] = np.nan
+    elif kind == "identical":
+        scan[:] = scan[0]
+    elif kind == "huge":
+        scan *= np.float32(1e30)
+    return scan
+
+
+@pytest.mark.parametrize("kind", ["cloud", "wall", "few", "one", "empty", "not finite", "identical", "huge"])
+def test_scans_without_ground_are_refused(kind: str) -> None:
+    estimator = MountingEstimator(Mounting(yaw_deg=None))
+    with pytest.raises(MountingError, match="ground"):
+        estimator.add(no_ground(kind))
+    with pytest.raises(MountingError, match="ground"):
+        estimator.estimate()
+    assert estimator.mounting() == MODEL_MOUNTING
+
+
+def test_what_streets_differ_by_is_not_corrected(scans: list[NDArray[np.float32]]) -> None:
+    nearly, clearly = (
+        MountingEstimator(Mounting()).add(seen_by(Mounting(1.8, 1.0, 0.5 + extra, 0.0), scans[0])).mounting()
+        for extra in (0.0, 2.0)
+    )
+    assert nearly == MODEL_MOUNTING
+    assert clearly.pitch_deg == pytest.approx(2.5, abs=0.5)
+
+
+# --- through the perceiver -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "mounting",
+    [Mounting(2.5, 0.0, 0.0, 0.0), Mounting(1.73, 5.0, -4.0, 0.0), Mounting(-0.2, -3.0, 2.0, -90.0)],
+    ids=["raised", "tilted", "of a vehicle frame, turned"],
+)
+def test_answers_do_not_depend_on_the_mounting(scans: list[NDArray[np.float32]], mounting: Mounting) -> None:
+    """Found or given: nearly the same labels, and boxes in the frame of the scan."""
+    usual = Perceiver(mounting=Mounting(1.73, 0.0, 0.0, 0.0), provider="cpu", on_mismatch="raise")(scans[0])
+    scan = seen_by(mounting, scans[0])
+    estimated = Perceiver(mounting=Mounting(yaw_deg=mounting.yaw_deg), provider="cpu", on_mismatch="raise")
+    assert estimated.mounting is None
+    for perceive in (estimated, Perceiver(mounting=mounting, provider="cpu", on_mismatch="raise")):
+        found = perceive(scan)
+        assert found.points is not None
+        assert usual.points is not None
+        objects = usual.points.labels > 0
+        assert (found.points.labels == usual.points.labels).mean() > 0.97
+        assert (found.points.labels[objects] == usual.points.labels[objects]).mean() > 0.85
+        assert found.top_view is not None
+        assert usual.top_view is not None
+        assert found.top_view.drivable_area_m2 == pytest.approx(usual.top_view.drivable_area_m2, rel=0.1)
+        assert found.mounting.height_m == pytest.approx(mounting.height_m, abs=0.1)
+        assert found.to_dict()["mounting"] == found.mounting.to_dict()
+        assert perceive.mounting is not None
+        # Vehicles that both are sure of lie in the same place of the scan.
+        sure = [box for box in usual.boxes if box.label == "car" and box.score > 0.55]
+        assert sure
+        places = seen_by(mounting, np.array([[*box.center, 0.0] for box in sure], np.float32))[:, :3]
+        centers = np.array([box.center for box in found.boxes])
+        near = np.linalg.norm(places[:, None] - centers, axis=2).min(axis=1)
+        assert (near < 0.5).mean() >= 0.75
+
+
+def test_the_mounting_is_settled_over_scans_and_refused_scans_teach_nothing(
+    scans: list[NDArray[np.float32]],
+) -> None:
+    perceive = Perceiver("pointseg", provider="cpu")
+    raised = seen_by(Mounting(2.6, 0.0, 0.66, 0.0), scans[0])
+    for _ in range(FROZEN_AFTER):
+        perceive(raised)
+    assert perceive.mounting is not None
+    assert perceive.mounting.n_scans == FROZEN_AFTER
+    assert perceive(scans[0]).mounting.height_m == pytest.approx(2.6, abs=0.05)
+    other = Perceiver("pointseg", provider="cpu", on_mismatch="raise")
+    bad = raised.copy()
+    bad[:, 3] = 255.0
+    with pytest.raises(FitnessError):
+        other(bad)
+    assert other.mounting is None
+
+
+def test_a_scan_without_ground_is_told_of(scans: list[NDArray[np.float32]]) -> None:
+    scan = scans[0][np.hypot(*scans[0][:, :2].T) > 13.0]  # none of the road near the vehicle
+    perceive = Perceiver("pointseg", provider="cpu", on_mismatch="warn")
+    with pytest.warns(UserWarning, match="--mount-height"):
+        found = perceive(scan)
+    assert found.mounting == MODEL_MOUNTING
+    with pytest.raises(OptionError, match="expected a Mounting"):
+        Perceiver("pointseg", mounting=1.7, provider="cpu")  # type: ignore[arg-type]

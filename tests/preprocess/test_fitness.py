@@ -1,0 +1,202 @@
+"""Which differences from the training scans are gross: results would be meaningless, and a scan is refused."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from edgeperc.preprocess.condition import condition
+from edgeperc.preprocess.fitness import Finding, FitnessProfile, check_fitness
+from edgeperc.readers.files import read_points
+from edgeperc.simulation.samples import simulated_scan
+from edgeperc.types.sensor import SENSORS, get_sensor
+from edgeperc.zoo import listed
+
+Points = NDArray[np.float32]
+
+KITTI = get_sensor("hdl-64e")
+PROFILES = [FitnessProfile.from_dict(v.card.fitness) for v in listed() if v.card.fitness]
+SEEDS = range(4)
+
+
+@cache
+def street(seed: int, sensor: str = "hdl-64e") -> Points:
+    """A simulated scan, whose remission is in 0..1 for every sensor."""
+    scaled = replace(get_sensor(sensor), remission_range=(0.0, 1.0), remission=None)
+    return condition(simulated_scan(seed, sensor).points, scaled)[0]
+
+
+def gross(points: Points, sensor: str = "hdl-64e") -> list[str]:
+    """The gross differences to the training scans of any shipped model."""
+    scan = np.ascontiguousarray(points, np.float32)
+    return [f for profile in PROFILES for f in check_fitness(scan, profile, get_sensor(sensor)) if f.gross]
+
+
+def test_a_finding_is_its_sentence() -> None:
+    finding = Finding("The scan is empty.", True)
+    assert finding == "The scan is empty."
+    copy = pickle.loads(pickle.dumps(finding))
+    assert (copy, copy.gross) == (finding, True)
+    assert not Finding("few rows").gross
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_simulated_scans_of_every_built_in_sensor_are_accepted(sensor: str) -> None:
+    for seed in SEEDS:
+        assert gross(street(seed, sensor), sensor) == []
+
+
+DIRECTIONS = st.sampled_from([-1.0, 1.0])
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.sampled_from(SEEDS), st.floats(500.0, 2000.0))
+def test_millimeters(seed: int, factor: float) -> None:
+    found = gross(street(seed) * np.float32([factor, factor, factor, 1]))
+    assert any("convert them to meters" in sentence for sentence in found)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.sampled_from(SEEDS), st.permutations(range(3)), DIRECTIONS, DIRECTIONS, DIRECTIONS)
+def test_swapped_axes(seed: int, order: list[int], a: float, b: float, c: float) -> None:
+    """Unless z still points up: then the scan is only turned or mirrored."""
+    sign = np.float32([a, b, c, 1])
+    points = street(seed)[:, [*order, 3]] * sign
+    assert bool(gross(points)) == (order[2] != 2 or c < 0.0)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.sampled_from(SEEDS), st.floats(0.0, 360.0))
+def test_upside_down(seed: int, turned_deg: float) -> None:
+    cos, sin = np.cos(np.radians(turned_deg)), np.sin(np.radians(turned_deg))
+    x, y, z, remission = street(seed).T
+    assert gross(np.column_stack([cos * x + sin * y, sin * x - cos * y, -z, remission]))
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.sampled_from(SEEDS), st.floats(0.05, 10.0), st.booleans())
+def test_z_as_the_number_of_a_row(seed: int, scale: float, from_top: bool) -> None:
+    points = street(seed).copy()
+    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+    row = np.abs(elevation[:, None] - np.array(KITTI.elevations_deg)[None]).argmin(axis=1)
+    points[:, 2] = scale * (row if from_top else 63 - row)
+    assert gross(points)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.sampled_from(SEEDS), st.floats(-1.0, 300.0))
+def test_constant_remission(seed: int, value: float) -> None:
+    points = street(seed).copy()
+    points[:, 3] = value
+    assert any("Remission" in sentence for sentence in gross(points))
+
+
+@pytest.mark.parametrize("factor", [255.0, 1 / 255, 65535.0, 0.0])
+def test_another_scale_of_remission(factor: float) -> None:
+    for seed in SEEDS:
+        assert any("emission" in sentence for sentence in gross(street(seed) * np.float32([1, 1, 1, factor])))
+
+
+def room(half_m: float, height_m: float) -> Points:
+    """The walls, floor and ceiling of a room, as a VLP-16 in its middle sees them."""
+    elevation, azimuth = np.meshgrid(np.radians(np.arange(-15.0, 16.0, 2.0)), np.radians(np.arange(0.0, 360.0, 0.2)))
+    way = np.column_stack(
+        [
+            (np.cos(elevation) * np.cos(azimuth)).ravel(),
+            (np.cos(elevation) * np.sin(azimuth)).ravel(),
+            np.sin(elevation).ravel(),
+        ]
+    )
+    with np.errstate(divide="ignore"):
+        distance = np.min(np.float64([half_m, half_m, height_m / 2]) / np.abs(way), axis=1)
+    remission = np.random.default_rng(0).uniform(0.1, 0.6, len(way))
+    return np.column_stack([way * distance[:, None], remission]).astype(np.float32)
+
+
+def test_a_room() -> None:
+    assert any("a room" in sentence for sentence in gross(room(2.0, 2.4), "vlp-16"))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda p: p[::100], "is the scan complete"),
+        (lambda p: np.tile(p, (40, 1)), "one turn"),
+        (lambda p: p[np.abs(p[:, 1]) > 1.5 * p[:, 0]], "of the model's view"),
+        (lambda p: p + np.float32([0, 0, 1.73, 0]), "another height"),
+        (lambda p: p - np.float32([0, 0, 3.0, 0]), "another height"),
+        (lambda p: np.full((5, 4), np.nan, np.float32), "no finite point"),
+        (lambda p: rows_of(p, 4), "rows of points"),
+    ],
+)
+def test_other_gross_differences(change: Callable[[Points], Points], sentence: str) -> None:
+    for seed in SEEDS:
+        assert any(sentence in found for found in gross(change(street(seed))))
+
+
+def rows_of(points: Points, n: int) -> Points:
+    """The points of every so-many-th beam, and as many as before."""
+    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+    row = np.abs(elevation[:, None] - np.array(KITTI.elevations_deg)[None]).argmin(axis=1)
+    return np.tile(points[row % (64 // n) == 0], (64 // n, 1))
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.sampled_from(SEEDS), st.floats(-0.5, 0.5), st.floats(-5.0, 5.0), st.floats(-5.0, 5.0))
+def test_ordinary_mountings_are_accepted(seed: int, raised_m: float, pitch_deg: float, roll_deg: float) -> None:
+    """Before they are leveled, too."""
+    pitch, roll = np.radians([pitch_deg, roll_deg])
+    about_y = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
+    about_x = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
+    points = street(seed)
+    moved = points[:, :3] @ (about_x @ about_y).T.astype(np.float32) + np.float32([0, 0, raised_m])
+    assert gross(np.column_stack([moved, points[:, 3]])) == []
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.sampled_from(SEEDS), st.floats(20.0, 60.0), st.integers(1, 3), st.randoms(use_true_random=False))
+def test_crops_and_thinned_scans_are_accepted(seed: int, half_deg: float, every: int, chance: object) -> None:
+    points = street(seed)
+    ahead = np.abs(np.degrees(np.arctan2(points[:, 1], points[:, 0]))) < half_deg
+    assert gross(points[ahead][::every]) == []
+
+
+# --- real scans ------------------------------------------------------------------------------------------------------
+
+FAULTS: dict[str, Callable[[Points], Points]] = {
+    "millimeters": lambda p: p * np.float32([1e3, 1e3, 1e3, 1]),
+    "upside down": lambda p: p * np.float32([1, -1, -1, 1]),
+    "no remission": lambda p: p * np.float32([1, 1, 1, 0]),
+    "remission to 255": lambda p: p * np.float32([1, 1, 1, 255]),
+    "constant remission": lambda p: np.column_stack([p[:, :3], np.full(len(p), 0.3)]),
+    **{f"axes {a}{b}{c}": lambda p, order=(a, b, c): p[:, [*order, 3]] for a, b, c in permutations(range(3)) if c != 2},
+}
+
+
+def test_no_real_scan_of_the_training_sensor_is_refused(kitti_root: Path, semantickitti_root: Path) -> None:
+    files = [*kitti_root.glob("training/velodyne/*.bin"), *semantickitti_root.glob("sequences/00/velodyne/*.bin")]
+    assert len(files) == 497
+    assert {file.name: found for file in sorted(files) if (found := gross(read_points(file)))} == {}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_spoilt_real_scans_are_refused(kitti_root: Path, fault: str) -> None:
+    files = sorted(kitti_root.glob("training/velodyne/*.bin"))[::16]
+    assert [file.name for file in files if not gross(FAULTS[fault](read_points(file)))] == []
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.sampled_from(SEEDS), st.floats(0.0, 360.0), st.floats(60.0, 200.0))
+def test_the_frame_of_a_map(seed: int, direction_deg: float, distance_m: float) -> None:
+    away = distance_m * np.array([np.cos(np.radians(direction_deg)), np.sin(np.radians(direction_deg)), 0.0, 0.0])
+    assert any("is not at the" in sentence for sentence in gross(street(seed) + away))

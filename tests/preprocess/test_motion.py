@@ -1,0 +1,210 @@
+"""Motion during a scan and scans of several sensors: kernels against their twins, and worlds that are known."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from numpy.typing import NDArray
+
+import edgeperc
+import twins.motion
+from edgeperc import Motion, OptionError, PointsError, SensorError, StampError, TrackingError, Trajectory, deskew, merge
+from edgeperc.preprocess.motion import fill_deskewed
+
+RATES = st.tuples(*3 * [st.floats(-4.0, 4.0)])
+NUMBERS = st.one_of(st.floats(-90, 90, width=32), st.sampled_from([math.nan, math.inf, -math.inf]))
+
+
+@given(st.integers(0, 9), RATES, RATES, st.data())
+def test_points_are_moved_as_by_the_twin(n: int, velocity: Any, rate: Any, data: st.DataObject) -> None:
+    points = data.draw(npst.arrays(np.float32, (n, 4), elements=NUMBERS))
+    after_s = data.draw(npst.arrays(np.float64, n, elements=st.one_of(st.floats(-0.5, 0.5), st.just(math.nan))))
+    moved = np.empty_like(points)
+    fill_deskewed(points, after_s, np.array(velocity), np.array(rate), moved)
+    expected = twins.motion.deskewed(points, after_s, velocity, rate)
+    good = np.isfinite(points[:, :3]).all(axis=1) & np.isfinite(after_s)
+    np.testing.assert_allclose(moved[good], expected[good], rtol=1e-6, atol=1e-5)
+    assert not np.isfinite(moved[~good, :3]).all(axis=1).any()
+
+
+@given(RATES, RATES, st.floats(0.05, 0.4))
+def test_the_motion_between_two_poses(velocity: Any, rate: Any, seconds: float) -> None:
+    start = twins.motion.exponential(twins.motion.screw((30.0, -7.0, 2.0), (0.3, -0.2, 1.4)))
+    end = start @ twins.motion.exponential(twins.motion.screw(velocity, rate) * seconds)
+    found = Motion.between(start, 5.0, end, 5.0 + seconds)
+    np.testing.assert_allclose(found.velocity_mps, velocity, atol=1e-6)
+    np.testing.assert_allclose(found.rate_radps, rate, atol=1e-6)
+
+
+def room(n: int = 3600) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points on the walls of a room 40 x 30 m, in the order in which a spinning sensor meets them, and their times."""
+    turn = np.linspace(math.pi, -math.pi, n, endpoint=False)
+    reach = np.minimum(20.0 / np.maximum(np.abs(np.cos(turn)), 1e-9), 15.0 / np.maximum(np.abs(np.sin(turn)), 1e-9))
+    return np.column_stack([reach * np.cos(turn), reach * np.sin(turn), 0.2 * np.cos(5 * turn)]), np.linspace(0, 0.1, n)
+
+
+@pytest.mark.parametrize("at_s", [None, 1000.0, 1000.05])
+def test_walls_are_straight_again(at_s: float | None) -> None:
+    world, times = room()
+    times = times + 1000.0
+    motion = Motion((18.0, 0.5, 0.0), (0.02, -0.03, 0.6))
+    screw = twins.motion.screw(motion.velocity_mps, motion.rate_radps)
+    # What the sensor sees while it moves: each point in the frame of its own time. The world is its frame at at_s.
+    at = times.max() if at_s is None else at_s
+    seen = np.array(
+        [
+            np.linalg.solve(twins.motion.exponential(screw * (t - at)), [*p, 1.0])[:3]
+            for p, t in zip(world, times, strict=True)
+        ]
+    )
+    assert np.abs(seen - world).max() > 0.7
+    scan = np.column_stack([seen, np.full(len(seen), 0.5)]).astype(np.float32)
+    found = deskew(scan, times, motion, at_s=at_s)
+    np.testing.assert_allclose(found[:, :3], world, atol=1e-4)
+    assert (found[:, 3] == 0.5).all()
+    assert found.dtype == np.float32
+
+
+def test_without_motion_nothing_moves() -> None:
+    world, times = room(90)
+    np.testing.assert_array_equal(deskew(world, times, Motion((0, 0, 0)))[:, :3], world.astype(np.float32))
+    assert np.isnan(deskew(world, np.full(90, math.nan), Motion((0, 0, 0)))[:, :3]).all()
+    assert deskew(np.empty((0, 4)), [], Motion((1, 0, 0))).shape == (0, 4)
+
+
+@given(RATES, st.integers(1, 4), st.integers(0, 99))
+def test_merged_scans_lie_in_the_vehicles_frame(rate: Any, n_sensors: int, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    vehicle = [random.uniform(-50, 50, (random.integers(0, 20), 3)) for _ in range(n_sensors)]
+    poses = [twins.motion.exponential(twins.motion.screw((k, -0.5 * k, 1.6), rate)) for k in range(n_sensors)]
+    scans = [
+        np.column_stack([(p - T[:3, 3]) @ T[:3, :3], np.full(len(p), k)])
+        for k, (p, T) in enumerate(zip(vehicle, poses, strict=True))
+    ]
+    merged = merge(scans, poses)
+    np.testing.assert_allclose(merged[:, :3], np.concatenate(vehicle), atol=1e-4)
+    assert merged[:, 3].tolist() == [k for k, p in enumerate(vehicle) for _ in p]
+
+
+def test_errors_name_the_reason() -> None:
+    world, times = room(9)
+    still = Motion((0, 0, 0))
+    for wrong in (times[1:], times[:, None], "soon"):
+        with pytest.raises(PointsError, match="got times"):
+            deskew(world, wrong, still)
+    with pytest.raises(PointsError):
+        deskew(world[:, :2], times, still)
+    with pytest.raises(StampError, match="at_s is nan"):
+        deskew(world, times, still, at_s=math.nan)
+    with pytest.raises(OptionError, match="expected a Motion"):
+        deskew(world, times, (1, 0, 0))  # type: ignore[arg-type]
+    for velocity in ((1, 2), "abc", (math.nan, 0, 0), (1e5, 0, 0), None):
+        with pytest.raises(OptionError, match=r"velocity_mps is .*expected three numbers"):
+            Motion(velocity)  # type: ignore[arg-type]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        still.velocity_mps = (1, 0, 0)  # type: ignore[misc]
+    eye = np.eye(4)
+    for pose in (2 * eye, np.diag([1, 1, -1, 1]), np.full((4, 4), math.nan), np.eye(3), "T"):
+        with pytest.raises(TrackingError, match="T_world_second"):
+            Motion.between(eye, 0.0, pose, 1.0)
+        with pytest.raises(SensorError, match=r"T_vehicle_sensor\[1\]"):
+            merge([world, world], [eye, pose])
+    for stamps in ((1.0, 1.0), (2.0, 1.0), (0.0, math.nan), (0.0, math.inf)):
+        with pytest.raises(StampError, match="expected a second one that is later"):
+            Motion.between(eye, stamps[0], eye, stamps[1])
+    with pytest.raises(TrackingError, match="180 degrees"):
+        Motion.between(eye, 0.0, np.diag([-1.0, -1.0, 1.0, 1.0]), 1.0)
+    with pytest.raises(PointsError, match="no scan"):
+        merge([], [])
+    with pytest.raises(SensorError, match="1 poses for 2 scans"):
+        merge([world, world], [eye])
+    assert edgeperc.deskew is deskew
+
+
+# --- poses -----------------------------------------------------------------------------------------------------------
+
+
+def quaternion(R: NDArray[np.float64]) -> tuple[float, ...]:
+    """x, y, z, w of a rotation by less than half a turn."""
+    w = math.sqrt(1.0 + np.trace(R)) / 2.0
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    return x / (4 * w), y / (4 * w), z / (4 * w), w
+
+
+def write_tum(path: Path, times: Any, poses: Any) -> Path:
+    lines = ["# time x y z qx qy qz qw"]
+    for t, T in zip(times, poses, strict=True):
+        lines.append(" ".join(f"{value:.17g}" for value in (t, *T[:3, 3], *quaternion(T[:3, :3]))))
+    path.write_text("\n".join(lines))
+    return path
+
+
+@given(st.tuples(*3 * [st.floats(-3.0, 3.0)]), RATES)
+def test_poses_are_read_as_they_were_written(rate: Any, velocity: Any) -> None:
+    screw = twins.motion.screw(velocity, np.array(rate) / 3.0)
+    poses = [twins.motion.exponential(screw * t) for t in (0.0, 0.5, 1.0)]
+    with tempfile.TemporaryDirectory() as folder:
+        found = Trajectory.from_tum(write_tum(Path(folder) / "poses.txt", (10.0, 10.5, 11.0), poses))
+    np.testing.assert_allclose(found.T_world_sensor, poses, atol=1e-12)
+    for first_s, last_s in ((10.1, 10.2), (10.4, 10.6), (9.9, 10.0), (11.0, 11.2), (10.5, 10.5)):
+        motion = found.motion(first_s, last_s)
+        np.testing.assert_allclose(motion.velocity_mps, velocity, atol=1e-9)
+        np.testing.assert_allclose(motion.rate_radps, np.array(rate) / 3.0, atol=1e-9)
+
+
+def test_the_poses_around_a_scan_count() -> None:
+    """A sensor that stands, drives at 10 m/s for a second and stands again."""
+    x = np.array([0.0, 0.0, 10.0, 10.0])
+    poses = np.broadcast_to(np.eye(4), (4, 4, 4)).copy()
+    poses[:, 0, 3] = x
+    drive = Trajectory(np.arange(4.0), poses)
+    assert [drive.motion(t, t + 0.1).velocity_mps[0] for t in (0.2, 1.0, 1.5, 1.9, 2.0)] == [0, 10, 10, 10, 0]
+    assert drive.motion(0.95, 1.05).velocity_mps[0] == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize(
+    ("first_s", "last_s"), [(-1.0, 0.5), (0.5, 9.0), (math.nan, 1.0), (0.0, math.nan), (1.7e9, 1.7e9), (0.8, 0.7)]
+)
+def test_poses_of_another_time_are_refused(first_s: float, last_s: float) -> None:
+    with pytest.raises(StampError, match=r"the poses are of 0\.000\.\.1\.000 s"):
+        Trajectory(np.arange(2.0), np.stack([np.eye(4)] * 2)).motion(first_s, last_s)
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("", "cannot be read as poses|2 or more|two or more"),
+        ("no numbers", "cannot be read as poses"),
+        ("0 0 0 0 0 0 0", "7 numbers in a line"),
+        ("0 0 0 0 0 0 0 1", "two or more"),
+        ("0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1", "that rise"),
+        ("0 0 0 0 0 0 0 1\nnan 0 0 0 0 0 0 1", "that rise"),
+        ("0 0 0 0 0 0 0 2\n1 0 0 0 0 0 0 1", "line 1 has not length 1"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 nan", "line 2 has not length 1"),
+        ("0 0 0 0 0 0 0 1\n1 inf 0 0 0 0 0 1", "expected \\(4, 4\\) finite"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0", "cannot be read as poses"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:loadtxt")
+def test_files_that_are_no_poses_are_refused(text: str, error: str, tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text(text)
+    with pytest.raises(TrackingError, match=error):
+        Trajectory.from_tum(tmp_path / "poses.txt")
+    with pytest.raises(TrackingError, match="cannot be read"):
+        Trajectory.from_tum(tmp_path / "absent.txt")
+
+
+def test_impossible_trajectories_are_refused() -> None:
+    with pytest.raises(TrackingError, match="of shape"):
+        Trajectory(np.arange(3.0), np.stack([np.eye(4)] * 2))
+    with pytest.raises(TrackingError, match="not rigid"):
+        Trajectory(np.arange(2.0), np.stack([np.eye(4), 2 * np.eye(4)]))

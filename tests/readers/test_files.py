@@ -1,0 +1,486 @@
+"""Files and arrays become points, or `PointsError` says why not."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+import twins.points
+from edgeperc.errors import PointsError
+from edgeperc.readers.files import read_points
+from edgeperc.readers.pcd import fill_unpacked_lzf
+from edgeperc.types.points import as_points
+
+POINTS = np.array(
+    [[12.5, -3.25, -1.75, 0.25], [40.0, 8.5, 2.0, 0.99], [np.nan, 1.0, 1.0, 0.5], [5.0, np.inf, 0.0, 0.0]], np.float32
+)
+FORMATS = (".bin", ".pcd.bin", ".npy", ".npz", ".pcd", ".ply", ".unknown")
+
+
+def save(folder, name, content):
+    path = folder / name
+    path.write_bytes(content)
+    return path
+
+
+def pcd(fields, types, sizes, counts, n, encoding, body, width=None):
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
+        f"FIELDS {fields}\nSIZE {sizes}\nTYPE {types}\nCOUNT {counts}\nWIDTH {n if width is None else width}\n"
+        f"HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA {encoding}\n"
+    )
+    return header.encode() + body
+
+
+def lzf_literals(data):
+    return b"".join(bytes([len(data[i : i + 32]) - 1]) + data[i : i + 32] for i in range(0, len(data), 32))
+
+
+def packed_pcd(points, packed=None, size=None):
+    plain = points.T.astype("<f4").tobytes()
+    packed = lzf_literals(plain) if packed is None else packed
+    sizes = struct.pack("<II", len(packed), len(plain) if size is None else size)
+    return pcd("x y z intensity", "F F F F", "4 4 4 4", "1 1 1 1", len(points), "binary_compressed", sizes + packed)
+
+
+def ply(encoding, body, n=4, before="", properties=None):
+    properties = properties or "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
+    return (
+        f"ply\nformat {encoding} 1.0\ncomment c\n{before}element vertex {n}\n{properties}end_header\n".encode() + body
+    )
+
+
+def text_rows(points):
+    return "".join(" ".join(f"{float(v)!r}" for v in row) + "\n" for row in points).encode()
+
+
+def npy(array):
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+def npz(compressed=True, **arrays):
+    stream = io.BytesIO()
+    (np.savez_compressed if compressed else np.savez)(stream, **arrays)
+    return stream.getvalue()
+
+
+RINGS = np.arange(len(POINTS), dtype=np.float32)[:, None]
+PADDED = np.zeros(len(POINTS), dtype="<f4, <f8, V3, <u2, <f4, <i4, <f4")
+for _k, _name in enumerate(("f6", "f1", "f4", "f0")):
+    PADDED[_name] = POINTS[:, _k]
+PADDED["f3"] = 7
+BIG = POINTS.astype(">f4")
+FILES = {
+    "kitti.bin": POINTS.tobytes(),
+    "nuscenes.pcd.bin": np.hstack([POINTS, RINGS]).tobytes(),
+    "plain.npy": npy(POINTS),
+    "fortran.npy": npy(np.asfortranarray(POINTS)),
+    "double.npy": npy(POINTS.astype(np.float64)),
+    "big_endian.npy": npy(BIG),
+    "magic_counts_not_the_name.bin": npy(POINTS),
+    "packed.npz": npz(scan=POINTS),
+    "named.npz": npz(points=POINTS, labels=np.zeros(4)),
+    "plain.npz": npz(compressed=False, scan=POINTS),
+    "binary.pcd": pcd("x y z intensity", "F F F F", "4 4 4 4", "1 1 1 1", 4, "binary", POINTS.tobytes()),
+    "padded.pcd": pcd(
+        "intensity y _ ring z _ x", "F F U U F I F", "4 8 1 2 4 4 4", "1 1 3 1 1 1 1", 4, "binary", PADDED.tobytes()
+    ),
+    "ascii.pcd": pcd("x y z i", "F F F F", "4 4 4 4", "1 1 1 1", 4, "ascii", text_rows(POINTS)),
+    "ascii_histogram.pcd": pcd(
+        "h x y z i",
+        "F F F F F",
+        "4 4 4 4 4",
+        "2 1 1 1 1",
+        4,
+        "ascii",
+        b"".join(b"8 9 " + row + b"\n" for row in text_rows(POINTS).splitlines()),
+    ),
+    "compressed.pcd": packed_pcd(POINTS),
+    "no_hash.pcd": pcd("x y z i", "F F F F", "4 4 4 4", "1 1 1 1", 4, "binary", POINTS.tobytes()).split(b"\n", 1)[1],
+    "little.ply": ply("binary_little_endian", POINTS.tobytes()),
+    "big.ply": ply("binary_big_endian", BIG.tobytes()),
+    "ascii.ply": ply("ascii", text_rows(POINTS) + b"3 0 1 2\n"),
+    "cloud_compare.ply": ply(
+        "binary_little_endian",
+        POINTS.tobytes(),
+        properties="property float x\nproperty float y\nproperty float z\nproperty float scalar_Intensity\n",
+    ),
+    "element_before.ply": ply(
+        "binary_little_endian",
+        b"\1" * 9 + POINTS.tobytes(),
+        before="element camera 3\nproperty uchar a\nproperty ushort b\n",
+    ),
+    "element_before_ascii.ply": ply(
+        "ascii", b"1 2\n3 4\n" + text_rows(POINTS), before="element camera 2\nproperty uchar a\nproperty int b\n"
+    ),
+    "list_before.ply": ply(
+        "binary_big_endian", b"\2aabb\0\1cc" + BIG.tobytes(), before="element face 3\nproperty list uchar short a\n"
+    ),
+    "list_in_vertex.ply": ply(
+        "binary_little_endian",
+        b"".join(row[:2].tobytes() + bytes([k, *([9] * k)]) + row[2:].tobytes() for k, row in enumerate(POINTS)),
+        properties="property float x\nproperty float y\nproperty list uchar uchar l\nproperty float z\n"
+        "property float remission\n",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_format_gives_the_same_points_in_the_same_order(tmp_path, name):
+    points = read_points(save(tmp_path, name, FILES[name]))
+    assert points.dtype == np.float32
+    assert points.flags.c_contiguous
+    np.testing.assert_array_equal(points, POINTS)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_cut_anywhere_is_an_error_or_at_most_fewer_points(tmp_path, name):
+    content = FILES[name]
+    for end in range(0, len(content), 7):
+        try:
+            points = read_points(save(tmp_path, name, content[:end]))
+        except PointsError as exc:
+            assert name in str(exc)  # noqa: PT017
+        else:
+            # Only formats without a count can lose points unseen; trailing faces are not ours.
+            assert name.endswith(".bin") or len(points) == len(POINTS) or end == len(content)
+
+
+def test_str_path_and_columns(tmp_path):
+    path = save(tmp_path, "six.raw", np.arange(24, dtype="<f4").tobytes())
+    np.testing.assert_array_equal(read_points(str(path), columns=6)[1], [6, 7, 8, 9])
+    np.testing.assert_array_equal(read_points(path, columns=3)[1], [3, 4, 5, 0])
+    with pytest.raises(PointsError, match=r"six\.raw.*columns=4"):
+        read_points(path)
+    for columns in (2, 65, 4.0, True):
+        with pytest.raises(PointsError, match="3 to 64"):
+            read_points(path, columns=columns)
+
+
+def test_remission_is_not_scaled_and_missing_remission_is_zero(tmp_path):
+    raw = np.array([[1, 2, 3, 255], [4, 5, 6, 0]], np.uint16)
+    np.testing.assert_array_equal(read_points(raw)[:, 3], [255, 0])
+    body = POINTS[:, :3].tobytes()
+    for name, content in {
+        "a.pcd": pcd("x y z", "F F F", "4 4 4", "1 1 1", 4, "binary", body),
+        "a.ply": ply("binary_little_endian", body, properties="property float x\nproperty float y\nproperty float z\n"),
+        "a.npy": npy(POINTS[:, :3]),
+    }.items():
+        points = read_points(save(tmp_path, name, content))
+        np.testing.assert_array_equal(points[:, :3], POINTS[:, :3])
+        assert (points[:, 3] == 0).all()
+
+
+def test_remission_field_chooses(tmp_path):
+    content = pcd("x y z reflectivity intensity", "F F F F F", "4 4 4 4 4", "1 1 1 1 1", 1, "ascii", b"1 2 3 4 5\n")
+    path = save(tmp_path, "ouster.pcd", content)
+    assert read_points(path)[0, 3] == 5
+    assert read_points(path, remission_field="reflectivity")[0, 3] == 4
+    with pytest.raises(PointsError, match="'signal'"):
+        read_points(path, remission_field="signal")
+
+
+def test_scan_without_points_is_valid_if_its_header_says_so(tmp_path):
+    fields = ("x y z intensity", "F F F F", "4 4 4 4", "1 1 1 1", 0)
+    for name, content in {
+        "a.npy": npy(POINTS[:0]),
+        "a.ply": ply("binary_little_endian", b"", n=0),
+        "b.ply": ply("ascii", b"", n=0),
+        "a.pcd": pcd(*fields, "binary", b""),
+        "b.pcd": pcd(*fields, "ascii", b""),
+        "c.pcd": pcd(*fields, "binary_compressed", b""),
+    }.items():
+        assert read_points(save(tmp_path, name, content)).shape == (0, 4)
+    assert as_points(np.zeros((0, 4))).shape == (0, 4)
+    assert as_points(np.zeros((0, 3), np.int8)).shape == (0, 4)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_empty_file_is_an_error(tmp_path, suffix):
+    with pytest.raises(PointsError, match="empty"):
+        read_points(save(tmp_path, f"scan{suffix}", b""))
+
+
+def test_unreadable_paths(tmp_path):
+    with pytest.raises(PointsError, match="no such file"):
+        read_points(tmp_path / "absent.bin")
+    with pytest.raises(PointsError, match="no such file"):
+        read_points(tmp_path)
+    with pytest.raises(PointsError):
+        read_points("a\0b.bin")
+
+
+BAD_FILES = {
+    "cut.bin": (POINTS.tobytes()[:-3], "cut short"),
+    "text.bin": (b"12.0 3.0 1.0 0.5\n" * 16, "text"),
+    "double.bin": (np.random.default_rng(0).normal(0, 20, (500, 4)).tobytes(), "not coordinates"),
+    "big_endian.bin": (np.random.default_rng(0).normal(0, 20, (500, 4)).astype(">f4").tobytes(), "not coordinates"),
+    "five.bin": (
+        np.random.default_rng(0).normal(0, 20, (500, 5)).astype("<f4") * [1, 1, 1, 1, 0] + [0, 0, 0, 0, 3],
+        "columns=5",
+    ),
+    "four.pcd.bin": (POINTS[:3].tobytes(), "columns="),
+    "objects.npy": (npy(np.array([{}, []], dtype=object)), "never unpickled"),
+    "strings.npy": (npy(np.array([["1", "2", "3", "4"]])), "<U1"),
+    "complex.npy": (npy(POINTS.astype(np.complex64)), "complex64"),
+    "bool.npy": (npy(np.ones((3, 4), dtype=bool)), "bool"),
+    "flat.npy": (npy(POINTS.ravel()), r"shape \(16,\)"),
+    "wide.npy": (npy(np.zeros((9, 5))), r"points\[:, :4\]"),
+    "turned.npy": (npy(np.zeros((4, 9))), r"points\.T"),
+    "huge.npy": (npy(POINTS).replace(b"(4, 4)", b"(10**9, 4)"[:6]), "header"),
+    "many.npy": (npy(POINTS).replace(b"(4, 4), }    ", b"(4000000000, 4), }"[:13]), "header"),
+    "two.npz": (npz(a=POINTS, b=POINTS), "none called points"),
+    "zip.npz": (b"PK\3\4" + b"\0" * 60, "cannot be read"),
+    "names.pcd": (pcd("a b c", "F F F", "4 4 4", "1 1 1", 1, "ascii", b"1 2 3\n"), "x, y, z"),
+    "vector.pcd": (pcd("x y z", "F F F", "4 4 4", "2 1 1", 1, "ascii", b"1 2 3 4\n"), "no numeric field x"),
+    "half.pcd": (pcd("x y z", "F F F", "2 4 4", "1 1 1", 1, "ascii", b"1 2 3\n"), "TYPE and SIZE"),
+    "counts.pcd": (pcd("x y z", "F F F", "4 4", "1 1 1", 1, "ascii", b"1 2 3\n"), "equal length"),
+    "zero.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 0", 1, "ascii", b"1 2 3\n"), "COUNT"),
+    "text.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 1, "ascii", b"1 two 3\n"), "row"),
+    "ragged.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 2, "ascii", b"1 2 3\n1 2\n"), "row"),
+    "blank.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 2, "ascii", b"\n\n\n"), "none are there"),
+    "disagree.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 2, "ascii", b"1 2 3\n", width=3), "must agree"),
+    "declared.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 1 << 60, "binary", b"\0" * 24), "cut short"),
+    "declared_ascii.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 1 << 60, "ascii", b"1 2 3\n"), "cut short"),
+    "beyond.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 1 << 80, "binary", b""), "64 bits"),
+    "encoding.pcd": (pcd("x y z", "F F F", "4 4 4", "1 1 1", 1, "zstd", b"\0" * 24), "zstd"),
+    "header.pcd": (b"# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\n", "DATA line"),
+    "bomb.pcd": (
+        pcd(
+            "x y z",
+            "F F F",
+            "4 4 4",
+            "1 1 1",
+            10**8,
+            "binary_compressed",
+            struct.pack("<II", 8, 12 * 10**8) + b"12345678",
+        ),
+        "claim to unpack",
+    ),
+    "lzf.pcd": (packed_pcd(POINTS, packed=b"\xff" * 40), "damaged"),
+    "lzf_short.pcd": (packed_pcd(POINTS, packed=lzf_literals(b"\0" * 32)), "damaged"),
+    "lzf_size.pcd": (packed_pcd(POINTS, size=65), "need 64"),
+    "no_vertex.ply": (b"ply\nformat ascii 1.0\nend_header\n", "no vertex"),
+    "no_end.ply": (b"ply\nformat ascii 1.0\n", "end_header"),
+    "type.ply": (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty quad x\nend_header\n", "quad"),
+    "orphan.ply": (b"ply\nformat ascii 1.0\nproperty float x\nend_header\n", "property float x"),
+    "negative.ply": (ply("ascii", b"", n=-1), "negative"),
+    "declared.ply": (ply("binary_little_endian", b"\0" * 64, n=1 << 60), "cut short"),
+    "format.ply": (ply("binary_middle_endian", b"\0" * 64), "middle"),
+    "list.ply": (
+        ply("binary_little_endian", b"\xff\xff\xff\xff" * 4, before="element f 1\nproperty list uint double a\n"),
+        "past the file",
+    ),
+    "ascii_list.ply": (
+        ply(
+            "ascii",
+            b"1 2 3 0\n",
+            n=1,
+            properties="property float x\nproperty float y\nproperty float z\nproperty list uchar int l\n",
+        ),
+        "save it as binary",
+    ),
+    "picture.pcd": (b"\x89PNG\r\n\x1a\n" + b"\0" * 64, "first bytes"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_bad_file_names_the_fault(tmp_path, name):
+    content, match = BAD_FILES[name]
+    if not isinstance(content, bytes):
+        content = content.astype("<f4").tobytes()
+    with pytest.raises(PointsError, match=match) as caught:
+        read_points(save(tmp_path, name, content))
+    assert name in str(caught.value)
+
+
+def test_a_zip_bomb_is_not_unpacked(tmp_path):
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", npy(np.zeros((5_000_000, 4), np.float32)))
+    with pytest.raises(PointsError, match="not unpacked"):
+        read_points(save(tmp_path, "bomb.npz", stream.getvalue()))
+
+
+def test_pickles_do_not_run(tmp_path):
+    class Bad:
+        def __reduce__(self):
+            return (pytest.fail, ("a pickle was loaded",))
+
+    with pytest.raises(PointsError, match="never unpickled"):
+        read_points(save(tmp_path, "bad.npy", npy(np.array([Bad()], dtype=object))))
+
+
+# --- arrays ----------------------------------------------------------------------------------------------------------
+
+
+def test_points_pass_uncopied():
+    assert as_points(POINTS) is POINTS
+    assert read_points(POINTS) is POINTS
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        POINTS.astype(np.float64),
+        POINTS.astype(">f8"),
+        np.asfortranarray(POINTS),
+        np.repeat(POINTS, 2, axis=0)[::2],
+        np.hstack([POINTS, POINTS])[:, :4],
+        POINTS[::-1].copy()[::-1],
+        np.frombuffer(b"\0" + POINTS.tobytes(), np.uint8)[1:].view(np.float32).reshape(4, 4),
+        POINTS.tolist(),
+    ],
+)
+def test_any_layout_and_dtype(array):
+    if isinstance(array, np.ndarray):
+        array.flags.writeable = False
+    points = as_points(array)
+    assert points.dtype == np.float32
+    assert points.dtype.isnative
+    assert points.flags.c_contiguous
+    assert points.flags.aligned
+    np.testing.assert_array_equal(points, POINTS)
+
+
+def test_values_beyond_float32_become_infinite():
+    assert np.isinf(as_points([[1e300, 0.0, 0.0, 0.0]])[0, 0])
+    assert np.isinf(as_points([[1e300, 0.0, 0.0]])[0, 0])
+
+
+def test_structured_arrays_with_padding_and_rows_of_an_organized_cloud():
+    layout = np.dtype(
+        {
+            "names": ["x", "y", "z", "intensity", "ring", "rgb"],
+            "formats": ["<f4", "<f4", "<f4", "<f4", "<u2", ("u1", 3)],
+            "offsets": [0, 4, 8, 16, 20, 22],
+            "itemsize": 32,
+        }
+    )
+    cloud = np.zeros((2, 2), layout)
+    for k, name in enumerate(("x", "y", "z", "intensity")):
+        cloud[name] = POINTS[:, k].reshape(2, 2)
+    np.testing.assert_array_equal(as_points(cloud), POINTS)
+    np.testing.assert_array_equal(as_points(cloud[["x", "y", "z"]])[:, :3], POINTS[:, :3])
+    with pytest.raises(PointsError, match=r"field z among x, y"):
+        as_points(cloud[["x", "y"]])
+    with pytest.raises(PointsError, match="no numeric field"):
+        as_points(np.zeros(3, [("x", "O"), ("y", "f4"), ("z", "f4")]))
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        None,
+        "scan",
+        [],
+        [[1, 2], [3]],
+        np.zeros(4),
+        np.zeros((2, 2)),
+        np.zeros((1, 3, 4)),
+        np.zeros((3, 4), complex),
+        np.zeros((3, 4), "U3"),
+        np.zeros((3, 4), object),
+        np.zeros((3, 4), "datetime64[s]"),
+        np.ma.zeros((3, 4)),
+        object(),
+    ],
+)
+def test_arrays_that_are_not_scans_are_refused(array):
+    with pytest.raises(PointsError):
+        as_points(array)
+
+
+def test_ten_million_points(tmp_path):
+    many = np.zeros((10_000_000, 4), np.float32)
+    many[:, 0] = np.arange(len(many)) % 100 + 1
+    path = tmp_path / "many.bin"
+    many.tofile(path)
+    points = read_points(path)
+    assert points.shape == many.shape
+    assert points[-1, 0] == many[-1, 0]
+
+
+# --- anything at all -------------------------------------------------------------------------------------------------
+
+PREFIXES = [
+    b"",
+    b"\x93NUMPY\1\0v\0{'descr': '<f4', 'fortran_order': False, 'shape': (",
+    b"PK\3\4",
+    b"# .PCD v0.7\nVERSION 0.7\nFIELDS x y z i\nSIZE 4 4 4 4\nTYPE F F F F\n",
+    b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA ascii\n",
+    b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA binary_compressed\n",
+    b"ply\n",
+    b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n",
+    b"ply\nformat binary_big_endian 1.0\nelement f 2\nproperty list char short l\nelement vertex 2\n"
+    b"property float x\nproperty float y\nproperty float z\nend_header\n",
+]
+
+
+def check_points_or_error(path):
+    try:
+        points = read_points(path)
+    except PointsError:
+        return
+    assert points.dtype == np.float32
+    assert points.ndim == 2
+    assert points.shape[1] == 4
+    assert points.flags.c_contiguous
+
+
+@settings(deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(FORMATS), st.sampled_from(PREFIXES), st.binary(max_size=300))
+@example(".npy", b"\x93NUMPY\1\0", b"\x10\0" + b"(" * 16)
+def test_any_bytes_give_points_or_points_error(tmp_path, suffix, prefix, tail):
+    check_points_or_error(save(tmp_path, f"scan{suffix}", prefix + tail))
+
+
+@settings(deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(sorted(FILES)), st.data())
+def test_damaged_files_give_points_or_points_error(tmp_path, name, data):
+    content = bytearray(FILES[name])
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        content[at : at + data.draw(st.integers(0, 8))] = data.draw(st.binary(max_size=8))
+    check_points_or_error(save(tmp_path, name, bytes(content)))
+
+
+@settings(deadline=None)
+@given(
+    hnp.arrays(
+        st.one_of(hnp.floating_dtypes(), hnp.integer_dtypes(), hnp.complex_number_dtypes(), hnp.boolean_dtypes()),
+        hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=5),
+    )
+)
+def test_any_array_gives_points_or_points_error(array):
+    try:
+        points = as_points(array)
+    except PointsError:
+        assert array.ndim != 2 or array.shape[1] not in (3, 4) or array.dtype.kind in "cb"
+    else:
+        assert points.shape == (len(array), 4)
+        with np.errstate(over="ignore"):
+            np.testing.assert_array_equal(points[:, :3], array[:, :3].astype(np.float32))
+
+
+@settings(deadline=None, max_examples=300)
+@given(st.binary(max_size=60), st.integers(0, 200))
+@example(b"\0a\xe0\xff\0", 300)
+@example(b"\0a\x20\0", 4)
+def test_lzf_agrees_with_the_twin(packed, size):
+    unpacked = np.zeros(size, np.uint8)
+    written = fill_unpacked_lzf(np.frombuffer(packed, np.uint8), unpacked)
+    expected = twins.points.unpack_lzf(packed, size)
+    if expected is None:
+        assert written == -1
+    else:
+        assert unpacked[:written].tobytes() == expected

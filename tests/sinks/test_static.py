@@ -1,0 +1,178 @@
+"""Scans without what moves, in the format of the scan."""
+
+from __future__ import annotations
+
+import math
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cli_helpers import POINTSEG, run
+from edgeperc import Box, OptionError, Perception, PointLabels, PointsError, Tracker, Tracks, read_points
+from edgeperc.cli.main import build_parser
+from edgeperc.cli.sinks import open_sinks
+from edgeperc.sinks import PerceivedScan
+from edgeperc.sinks.static import StaticSink
+from edgeperc.types.sensor import get_sensor
+
+AHEAD = Box("car", 0.99, (12.0, 0.0, -0.9), (4.0, 1.8, 1.5), 0.0)
+BESIDE = Box("car", 0.99, (9.0, 6.0, -0.9), (4.0, 1.8, 1.5), 0.0)
+
+
+def scan_points() -> NDArray[np.float32]:
+    """Points of a car ahead, of one beside, of a road below, and one that is not finite."""
+    rng = np.random.default_rng(0)
+    cars = [rng.uniform([-1.9, -0.8, -0.7, 0.0], [1.9, 0.8, 0.7, 1.0], (30, 4)) for _ in range(2)]
+    cars[0][:, :3] += AHEAD.center
+    cars[1][:, :3] += BESIDE.center
+    road = rng.uniform([3.0, -9.0, -2.5, 0.0], [30.0, 9.0, -2.4, 1.0], (200, 4))
+    whole = np.concatenate([*cars, road, [[math.nan, 0.0, 0.0, 0.5]]])
+    return rng.permutation(whole).astype(np.float32)
+
+
+def tracks_of(k: int) -> Tracks:
+    """The car ahead drives as fast as the sensor; the one beside is parked."""
+    tracker = Tracker()
+    for i in range(k + 1):
+        pose = np.eye(4)
+        pose[0, 3] = 0.8 * i
+        boxes = [AHEAD, Box("car", 0.99, (9.0 + 0.8 * (k - i), 6.0, -0.9), (4.0, 1.8, 1.5), 0.0)]
+        tracks = tracker.update(boxes, 0.1 * i, pose)
+    return tracks
+
+
+POINTS, TRACKS = scan_points(), tracks_of(15)
+
+
+def perceived(name: str, tracks: Tracks | None = TRACKS, points: NDArray[np.float32] = POINTS) -> PerceivedScan:
+    labels = PointLabels(np.zeros(len(points), np.uint8), np.ones(len(points), np.bool_), POINTSEG.classes)
+    perception = Perception(len(points), 1, labels, None, (AHEAD, BESIDE), {}, {}, (), None)
+    return PerceivedScan(name, 0.1, points, perception, tracks, get_sensor("hdl-64e"))
+
+
+def expected(*boxes: Box) -> NDArray[np.float32]:
+    gone = np.zeros(len(POINTS), np.bool_)
+    for box in boxes:
+        half = np.array(box.size) / 2.0 + 0.3  # the car in the track is a little larger or smaller than the box
+        gone |= (np.abs(POINTS[:, :3] - np.array(box.center)) <= half).all(axis=1)
+    return POINTS[~gone]
+
+
+@pytest.mark.parametrize("name", ["a/000007.bin", "a/000007.npy", "a/000007.npz", "a/000007.PCD", "a/000007.ply"])
+def test_a_file_has_the_name_and_the_format_of_the_scans(tmp_path: Path, name: str) -> None:
+    sink = StaticSink(tmp_path / "out")
+    sink.write(perceived(name))
+    sink.close()
+    (file,) = (tmp_path / "out").iterdir()
+    assert file.name == Path(name).name
+    np.testing.assert_array_equal(read_points(file), expected(AHEAD))
+    assert (sink.n_points, sink.n_removed) == (261, 261 - len(expected(AHEAD)))
+    assert sink.n_removed >= 30
+
+
+def test_what_could_move_goes_too_if_it_is_wished(tmp_path: Path) -> None:
+    for tracks in (None, TRACKS):
+        sink = StaticSink(tmp_path, without="movable")
+        sink.write(perceived("x.bin", tracks))
+        np.testing.assert_array_equal(read_points(tmp_path / "x.bin"), expected(AHEAD, BESIDE))
+
+
+def test_of_a_scan_that_came_twice_what_could_move_goes(tmp_path: Path) -> None:
+    tracker = Tracker()
+    tracker.update([], 1.0)
+    with pytest.warns(UserWarning, match="late or doubled"):
+        late = tracker.update([], 1.0)
+    for without, tracks in (("moving", late), ("movable", None)):
+        StaticSink(tmp_path / without, without=without).write(perceived("x.bin", tracks))  # type: ignore[arg-type]
+    assert (tmp_path / "moving" / "x.bin").read_bytes() == (tmp_path / "movable" / "x.bin").read_bytes()
+
+
+def test_scans_of_captures_and_of_images_become_raw_files(tmp_path: Path) -> None:
+    sink = StaticSink(tmp_path)
+    for name in ("drive.pcap/000003", "image_2/street.png"):
+        sink.write(perceived(name))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["000003.bin", "street.bin"]
+    assert (tmp_path / "000003.bin").read_bytes() == expected(AHEAD).tobytes()
+
+
+def test_the_ring_of_nuscenes_files_stays(tmp_path: Path) -> None:
+    source = tmp_path / "sweep.pcd.bin"
+    rings = np.arange(len(POINTS), dtype=np.float32)
+    np.column_stack([POINTS, rings]).astype(np.float32).tofile(source)
+    sink = StaticSink(tmp_path / "out")
+    sink.write(perceived(str(source)))
+    rows = np.fromfile(tmp_path / "out/sweep.pcd.bin", np.float32).reshape(-1, 5)
+    np.testing.assert_array_equal(rows[:, :4], expected(AHEAD))
+    np.testing.assert_array_equal(POINTS[rows[:, 4].astype(int)], rows[:, :4])
+    source.write_bytes(source.read_bytes()[:-20])
+    with pytest.raises(PointsError, match="expected 5 for each point"):
+        sink.write(perceived(str(source)))
+
+
+def test_errors_name_the_reason(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="expected 'moving' or 'movable'"):
+        StaticSink(tmp_path, without="cars")  # type: ignore[arg-type]
+    sink = StaticSink(tmp_path)
+    with pytest.raises(OptionError, match="--track"):
+        sink.write(perceived("x.bin", None))
+    sink.write(perceived("a/x.bin"))
+    sink.write(perceived("a/x.bin"))  # the same scan again replaces its file
+    with pytest.raises(OptionError, match=r"already the file of a/x\.bin"):
+        sink.write(perceived("b/x.bin"))
+    with pytest.raises(OptionError, match="is the scan itself"):
+        sink.write(perceived(str(tmp_path / "y.bin")))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["x.bin"]
+
+
+class Standing:
+    """Perceives a car that drives with the sensor, and four that are parked beside its way."""
+
+    def __init__(self, models: Any, *, sensor: str, **_: Any) -> None:
+        self.sensor, self.cards, self._k = get_sensor(sensor), (POINTSEG,), 0
+
+    def __call__(self, points: NDArray[np.float32], stamp_s: float | None = None, **_: Any) -> Perception:
+        parked = [
+            Box("car", 0.99, (x - 0.8 * self._k, y, -0.9), (4.0, 1.8, 1.5), 0.0)
+            for x, y in ((20, 6), (27, -6), (34, 6), (41, -6))
+        ]
+        self._k += 1
+        return Perception(len(points), 1, None, None, (AHEAD, *parked), {}, {}, (), stamp_s)
+
+
+def test_the_command_writes_every_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "edgeperc.perceiver", SimpleNamespace(Perceiver=Standing))
+    (tmp_path / "drive").mkdir()
+    for k in range(12):
+        POINTS.tofile(tmp_path / f"drive/{k:06d}.bin")
+    assert run("run", tmp_path / "drive", "--track", "--static", tmp_path / "out") == 0
+    written = sorted((tmp_path / "out").iterdir())
+    assert [path.name for path in written] == [f"{k:06d}.bin" for k in range(12)]
+    assert written[0].read_bytes() == POINTS.tobytes()  # as yet nothing is known to move
+    np.testing.assert_array_equal(read_points(written[-1]), expected(AHEAD))
+    assert run("run", tmp_path / "drive", "--movable", "--static", tmp_path / "out") == 0
+    assert len(read_points(tmp_path / "out/000000.bin")) == len(expected(AHEAD))
+    assert run("run", tmp_path / "drive", "--movable", "--static", tmp_path / "drive") == 1
+    assert (tmp_path / "drive/000003.bin").read_bytes() == POINTS.tobytes()
+    for wrong in (["--static", tmp_path / "out"], ["--movable"]):
+        with pytest.raises(SystemExit) as left:
+            run("run", tmp_path / "drive", *wrong)
+        assert left.value.code == 2
+
+
+def test_a_sink_made_before_one_that_cannot_be_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    closed = []
+    monkeypatch.setattr("edgeperc.sinks.page.PageSink.close", lambda self: closed.append(self))
+    (tmp_path / "file").write_bytes(b"")
+    options = ["--play", str(tmp_path / "play.html"), "--static", str(tmp_path / "file"), "--movable"]
+    arguments = build_parser().parse_args(["run", str(tmp_path), *options])
+    with ExitStack() as stack:
+        with pytest.raises(OSError, match="file"):
+            open_sinks(arguments, stack)
+        assert not closed
+    assert len(closed) == 1

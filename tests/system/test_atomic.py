@@ -1,0 +1,81 @@
+"""A file is there as a whole, or as it was before."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from edgeperc.system.atomic import open_atomic, write_atomic
+
+
+def test_a_written_file_replaces_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "file.bin"
+    for content in (b"old", b"new", b""):
+        write_atomic(str(path), content)
+        assert path.read_bytes() == content
+    assert [*tmp_path.iterdir()] == [path]
+
+
+def test_readers_see_the_old_file_until_the_new_one_is_complete(tmp_path: Path) -> None:
+    path = tmp_path / "file.txt"
+    write_atomic(path, b"old")
+    with open_atomic(path, "w") as file:
+        file.write("Straße")
+        file.flush()
+        assert path.read_bytes() == b"old"
+    assert path.read_bytes() == "Straße".encode()
+
+
+def write_half(path: Path) -> None:
+    with open_atomic(path) as file:
+        file.write(b"half")
+        raise KeyError
+
+
+def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "file.bin"
+    write_atomic(path, b"old")
+    with pytest.raises(KeyError):
+        write_half(path)
+    assert path.read_bytes() == b"old"
+    assert [*tmp_path.iterdir()] == [path]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no such files")
+def test_a_link_is_followed_and_a_pipe_is_written(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "file.bin")
+    write_atomic(tmp_path / "link", b"through")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "file.bin").read_bytes() == b"through"
+    os.mkfifo(tmp_path / "pipe")
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    write_atomic(tmp_path / "pipe", b"flows")
+    assert os.read(reader, 10) == b"flows"
+    os.close(reader)
+    assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_a_full_device_is_an_os_error() -> None:
+    with pytest.raises(OSError, match="No space left"):
+        write_atomic("/dev/full", b"x" * 100_000)
+    assert stat.S_ISCHR(Path("/dev/full").stat().st_mode)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has access lists")
+def test_permissions_are_reduced_by_the_umask(tmp_path: Path) -> None:
+    umask = os.umask(0o027)
+    try:
+        write_atomic(tmp_path / "given", b"", 0o644)
+        write_atomic(tmp_path / "usual", b"")
+    finally:
+        os.umask(umask)
+    assert [stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("given", "usual")] == [0o640, 0o640]
+
+
+def test_missing_folder_is_an_os_error(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="nowhere"):
+        write_atomic(tmp_path / "nowhere" / "file.bin", b"")

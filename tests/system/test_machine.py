@@ -1,0 +1,240 @@
+"""What a computer keeps between starts."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edgeperc import SettingsError
+from edgeperc.inference.session import Session
+from edgeperc.system import machine as settings
+from edgeperc.system.machine import (
+    cache_folder,
+    compiled_folder,
+    cpu_model,
+    fingerprint,
+    read_setting,
+    settings_path,
+    write_settings,
+)
+from edgeperc.zoo import digest, resolve
+
+CPU_2 = {"provider": "cpu", "precision": "int8", "n_threads": 2}
+CPU_4 = {"provider": "cpu", "precision": "fp32", "n_threads": 4}
+OPENVINO = {"provider": "openvino", "precision": "bf16", "n_threads": None}
+CUDA = {"provider": "cuda", "precision": "fp32", "n_threads": 1}
+
+
+def test_file_holds_settings_of_several_computers_and_models(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "settings.json"
+    assert read_setting(path, "m", "s") is None
+    write_settings(path, "m", {"s": CPU_2})
+    write_settings(path, "m", {"t": OPENVINO})
+    write_settings(path, "n", {"s": CUDA})
+    write_settings(path, "m", {"s": CPU_4})
+    assert read_setting(path, "m", "s") == CPU_4
+    assert read_setting(path, "m", "t") == OPENVINO
+    assert read_setting(path, "n", "t") is None
+    assert [*path.parent.iterdir()] == [path]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("[]", "{", '{"schema": 9, "machines": {}}', '{"schema": 2}', '{"schema": 2, "machines": {"m": 3}}'),
+        '{"schema": 1, "machines": {"m": {"s": {"provider": "openvino:bf16", "n_threads": 2}}}}',
+        '{"schema": 2, "machines": {"m": {"s": "cpu"}}}',
+        '{"schema": 2, "machines": {"m": {"s": {"provider": 3, "precision": "fp32"}}}}',
+        '{"schema": 2, "machines": {"m": {"s": {"provider": "cpu", "n_threads": 2}}}}',
+        '{"schema": 2, "machines": {"m": {"s": {"provider": "cpu", "precision": "fp32", "n_threads": 0}}}}',
+    ],
+)
+def test_malformed_settings_are_named(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "settings.json"
+    path.write_text(text)
+    with pytest.raises(SettingsError, match=r"settings\.json.*delete it"):
+        read_setting(path, "m", "s")
+
+
+NESTED = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(st.characters(), max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=6,
+)
+EDITS = st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 3), st.binary(min_size=1, max_size=6)), max_size=4)
+
+
+def check_settings(path: Path, content: bytes) -> None:
+    """Whatever a file holds, reading and writing give a setting that can be used, or a SettingsError."""
+    path.write_bytes(content)
+    entry, message = None, "delete it"
+    try:
+        entry = read_setting(path, "m", "s")
+    except SettingsError as exc:
+        message = str(exc)
+    else:
+        assert entry is None or (isinstance(entry["provider"], str) and isinstance(entry["precision"], str))
+        assert entry is None or entry["n_threads"] is None or 1 <= entry["n_threads"] <= settings.MAX_THREADS
+    assert "delete it" in message
+    assert len(message) < 1000
+    try:
+        write_settings(path, "m", {"s": CPU_2})
+    except SettingsError:
+        assert path.read_bytes() == content
+    else:
+        assert read_setting(path, "m", "s") == CPU_2
+
+
+@given(EDITS)
+def test_damaged_settings_have_a_typed_error(tmp_path_factory: pytest.TempPathFactory, edits: list[Any]) -> None:
+    content = json.dumps({"schema": 2, "machines": {"m": {"s": CPU_2, "t": OPENVINO}, "n": {"s": CUDA}}}, indent=1)
+    damaged = bytearray(content.encode())
+    for at, kind, new in edits:
+        at %= len(damaged) + 1
+        if kind == 0:
+            damaged[at : at + 1] = new  # replaced
+        elif kind == 1:
+            damaged[at:at] = new
+        elif kind == 2:
+            del damaged[at : at + len(new)]
+        else:
+            damaged = damaged[:at] or bytearray(b" ")
+    check_settings(tmp_path_factory.getbasetemp() / "damaged.json", bytes(damaged))
+
+
+@given(
+    NESTED,
+    st.sampled_from(["document", "schema", "machines", "m", "s", "provider", "precision", "n_threads", "p50_ms"]),
+)
+def test_settings_of_other_types_have_a_typed_error(
+    tmp_path_factory: pytest.TempPathFactory, value: object, where: str
+) -> None:
+    entry = {**CPU_2, where: value} if where in ("provider", "precision", "n_threads", "p50_ms") else CPU_2
+    machines: object = {"m": value if where == "m" else {"s": value if where == "s" else entry}}
+    document = {"schema": value if where == "schema" else 2, "machines": value if where == "machines" else machines}
+    text = json.dumps(value if where == "document" else document)  # with NaN and Infinity, as Python writes them
+    check_settings(tmp_path_factory.getbasetemp() / "other.json", text.encode())
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        pytest.param(b"[" * 200_000, id="deep"),
+        pytest.param(b'{"schema": 2, "machines": {"m": ' + b'{"s":' * 900 + b"1" + b"}" * 902, id="deep entry"),
+        pytest.param(
+            b'{"schema": 2, "machines": {"x": {"s": ' + b"[" * 400 + b"]" * 400 + b"}}}", id="deep other entry"
+        ),
+        pytest.param(b'{"schema": 2, "machines": {"m": {"s": ' + b"9" * 10_000 + b"}}}", id="huge number"),
+        pytest.param(b'{"schema": 2, "machines": {"x": {"s": 1e999}}}', id="infinite"),
+        pytest.param(b" " * ((1 << 24) + 1), id="large"),
+        pytest.param(b"\xff\xfe" * 100, id="utf-16"),
+        pytest.param(b"\0" * 100, id="zeros"),
+        pytest.param(b"", id="empty"),
+    ],
+)
+def test_extreme_settings_have_a_typed_error(tmp_path: Path, content: bytes) -> None:
+    check_settings(tmp_path / "settings.json", content)
+
+
+@pytest.mark.parametrize(("kind", "message"), [("folder", "not a regular file"), ("pipe", "not a regular file")])
+def test_settings_that_are_no_file_are_named(tmp_path: Path, kind: str, message: str) -> None:
+    path = tmp_path / "settings.json"
+    if kind == "folder":
+        path.mkdir()
+    elif os.name == "posix":
+        os.mkfifo(path)  # reading it would wait for ever
+    else:
+        pytest.skip("no named pipes")
+    with pytest.raises(SettingsError, match=rf"settings\.json.*{message}.*delete it"):
+        read_setting(path, "m", "s")
+
+
+@pytest.mark.parametrize("provider", ["\ud800", "\x1b[31m", "n" * 100_000])
+def test_a_start_survives_strange_settings(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str], provider: str
+) -> None:
+    """The log names what was skipped, in characters that every terminal can show."""
+    pytest.importorskip("onnxruntime")
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
+    entry = {"provider": provider, "precision": "fp32", "n_threads": 1}
+    write_settings(settings_path(), fingerprint(), {digest(resolve("pointseg")): entry})
+    assert Session("pointseg").card.name == "pointseg"
+    assert "\x1b" not in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no passwd")
+def test_no_home_is_a_typed_error(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    def missing() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("EDGEPERC_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", missing)
+    with pytest.raises(SettingsError, match="no home folder; set EDGEPERC_CACHE_DIR"):
+        settings_path()
+    assert compiled_folder("a", "f" * 64, "fp32") is None
+    assert "the compiled model is not kept" in caplog.text
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has access lists")
+def test_compiled_models_that_others_can_write_are_not_used(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
+    umask = os.umask(0o022)
+    folder = compiled_folder("a", "f" * 64, "fp32")
+    os.umask(umask)
+    assert folder is not None
+    for each in (folder, folder.parent):
+        each.chmod(0o777)
+        assert compiled_folder("a", "f" * 64, "fp32") is None
+        assert "other users can write it (mode 777)" in caplog.messages[-1]
+        each.chmod(0o755)
+    assert compiled_folder("a", "f" * 64, "fp32") == folder
+
+
+def test_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "here"))
+    assert cache_folder() == tmp_path / "here"
+    assert settings_path() == tmp_path / "here" / "settings.json"
+    assert not (tmp_path / "here").exists()
+    monkeypatch.delenv("EDGEPERC_CACHE_DIR")
+    if sys.platform.startswith("linux"):
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        assert cache_folder() == tmp_path / "edgeperc"
+
+
+def test_compiled_folder_depends_on_engine_model_and_precision(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
+    asked = [("a 1", "f" * 64, "fp32"), ("a 2", "f" * 64, "fp32"), ("a 1", "e" * 64, "fp32"), ("a 1", "f" * 64, "bf16")]
+    folders = [compiled_folder(*each) for each in asked]
+    assert len(set(folders)) == len(asked)
+    assert all(folder is not None and folder.is_dir() for folder in folders)
+    assert compiled_folder(*asked[0]) == folders[0]
+    monkeypatch.setattr(settings, "fingerprint", lambda: "another computer")
+    assert compiled_folder(*asked[0]) not in folders
+
+
+def test_read_only_cache_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path / "file" / "below"))
+    assert compiled_folder("a", "f" * 64, "fp32") is None
+    monkeypatch.setenv("EDGEPERC_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert compiled_folder("a", "f" * 64, "fp32") is None
+
+
+def test_equal_computers_have_one_fingerprint(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cpu_model()
+    assert len(fingerprint()) == 16
+    assert fingerprint() == fingerprint()
+    before = fingerprint()
+    monkeypatch.setattr(settings, "cpu_model", lambda: "another")
+    assert fingerprint() != before

@@ -1,0 +1,292 @@
+"""``--engine ray`` gives what ``--engine local`` gives; scans and results at URLs."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.request import Request, urlopen
+
+import numpy as np
+import pytest
+
+from edgeperc import cli
+from edgeperc.errors import MissingExtraError, OptionError, PointsError
+from edgeperc.perceiver import Perceiver
+from edgeperc.simulation.drawn import random_scene
+from edgeperc.simulation.scene import simulate
+from edgeperc.system.ray_cluster import Lost, map_on_ray
+from edgeperc.system.remote import Remote, location
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # of Ray, boto and aiohttp
+
+N_SCANS = 9
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Nine scans; the eighth is damaged, and the last two have no remission."""
+    folder = tmp_path_factory.mktemp("scans")
+    for k in range(N_SCANS):
+        points = simulate(random_scene(k, "urban"), "hdl-64e", seed=k).points[::3].copy()
+        if k >= 7:
+            points[:, 3] = 0.0
+        points.tofile(folder / f"{k}.bin")
+    (folder / "6.bin").write_bytes(b"no scan")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[None]:
+    """A Ray cluster of two processes, for all tests here: starting one takes seconds."""
+    ray = pytest.importorskip("ray")
+    pytest.importorskip("pyarrow")
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=2**28)
+    yield
+    ray.shutdown()
+
+
+def run(*arguments: str | Path) -> tuple[int, list[dict[str, Any]], str]:
+    """Exit code, records without times, and stderr of ``edgeperc run --json``."""
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
+        code = cli.main(["run", *map(str, arguments), "--json", "--threads", "1"])
+    records = [json.loads(line) for line in out.getvalue().splitlines()]
+    for record in records:
+        record.pop("stage_ms", None)
+    return code, records, err.getvalue()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and ".run" not in path.parts
+    }
+
+
+@pytest.mark.usefixtures("cluster")
+def test_ray_gives_the_same_bytes_and_resumes(scans: Path, tmp_path: Path) -> None:
+    files = ("--labels", "--ply")  # a page and a picture show times
+    code, records, said = run(scans, "--out", tmp_path / "local", *files)
+    assert code == 1
+    assert [bool(record.get("error")) for record in records] == [k == 6 for k in range(N_SCANS)]
+    assert "no remission" in " ".join(records[7]["fitness"])
+    assert not records[8]["fitness"]  # said once
+    there = tmp_path / "ray"
+    assert run(scans, "--out", there, *files, "--engine", "ray", "--workers", "2")[:2] == (code, records)
+    assert contents(there) == contents(tmp_path / "local")
+    assert len(contents(there)) == 2 * (N_SCANS - 1)
+    assert "6.bin" in said
+
+    # What is complete is kept; what is missing, cut short, or of a scan that changed since is made again.
+    (there / "5.ply").unlink()
+    (there / "7.label").write_bytes(b"cut")
+    again = run(scans, "--out", there, *files, "--engine", "ray", "--workers", "2")
+    assert again[:2] == (code, records)
+    assert "1 scan of an earlier run kept" in again[2]
+    assert contents(there) == contents(tmp_path / "local")
+    other = run(scans, "--out", there, *files, "--engine", "ray", "--workers", "2", "--boxes-from", "network")
+    assert "kept" not in other[2]
+    assert other[1] != records
+
+
+@pytest.mark.usefixtures("cluster")
+def test_ray_gives_the_same_figures(tmp_path: Path) -> None:
+    found = {}
+    for engine in ("local", "ray"):
+        file = tmp_path / f"{engine}.json"
+        with contextlib.redirect_stdout(io.StringIO()) as out:
+            assert cli.main(["eval", "simulation:3", "--engine", engine, "--json", str(file)]) == 0
+        figures = json.loads(file.read_text())
+        del figures["command"]
+        found[engine] = figures, out.getvalue()
+    assert found["ray"] == found["local"]
+
+
+@pytest.mark.usefixtures("cluster")
+def test_an_item_that_kills_its_process_is_lost_alone() -> None:
+
+    def make(factor: int) -> Callable[[int], int]:  # inside, because a worker cannot import this file
+        def function(item: int) -> int:
+            if item == 5:
+                os._exit(1)
+            if item == 7:
+                raise ValueError("seven")
+            return factor * item
+
+        return function
+
+    found = list(map_on_ray(make, (10,), range(40), workers=1))
+    assert len(found) == 40
+    assert isinstance(found[5], Lost)
+    assert "died" in found[5].reason
+    assert "ValueError: seven" in found[7].reason
+    assert [each for each in found if not isinstance(each, Lost)] == [10 * k for k in range(40) if k not in (5, 7)]
+
+
+def test_a_perceiver_starts_from_what_another_learned(scans: Path) -> None:
+    """The mounting is that of the first scans; the perceiver has its own otherwise."""
+    one, other = (Perceiver("pointseg", sensor="vlp-16", provider="cpu", on_mismatch="ignore") for _ in range(2))
+    points = np.fromfile(scans / "0.bin", np.float32).reshape(-1, 4) * np.float32([1, 1, 1, 255])
+    points[:, 2] += 0.9
+    for _ in range(5):
+        one(points)
+    assert one.learned.is_settled
+    assert not other.learned.is_settled
+    other.start_from(one.learned)
+    assert other.learned == one.learned
+    assert other(points).mounting == one(points).mounting
+
+
+@pytest.mark.parametrize("option", ["--track", "--live", "--static=out"])
+def test_what_needs_an_order_is_refused(scans: Path, option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["run", str(scans), "--engine", "ray", option])
+    assert "in their order" in capsys.readouterr().err
+
+
+def test_captures_and_lone_workers_are_refused(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["run", str(scans), "--workers", "2"])
+    assert "--engine ray" in capsys.readouterr().err
+    (tmp_path / "drive.pcap").write_bytes(b"\xd4\xc3\xb2\xa1" + bytes(20))
+    with pytest.raises(SystemExit):
+        cli.main(["run", str(tmp_path / "drive.pcap"), "--engine", "ray", "--model", "pointseg"])
+    assert "capture" in capsys.readouterr().err
+
+
+def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingExtraError, match=r"edgeperc\[ray\]"):
+        list(map_on_ray(int, (), [1]))
+
+
+# --- URLs ------------------------------------------------------------------------------------------------------------
+
+
+def test_paths_stay_paths(tmp_path: Path) -> None:
+    assert location("a/b.bin") == Path("a/b.bin")
+    assert location(tmp_path.as_uri()) == tmp_path
+    assert location("s3://bucket/a/") == Remote("s3://bucket/a")
+    url = Remote("s3://bucket/a/0.pcd.bin")
+    assert (url.name, url.suffix, url.place) == ("0.pcd.bin", ".bin", "/bucket/a/0.pcd.bin")
+    assert (str(url.parent / Path("b/c")), url.with_name("x")) == ("s3://bucket/a/b/c", Remote("s3://bucket/a/x"))
+
+
+def _results_at_urls_are_those_of_paths(root: str, scans: Path, tmp_path: Path) -> None:
+    """Scans below ``root`` and results there are those of local folders."""
+    local = tmp_path / "scans"
+    for k, part in ((0, "a"), (1, "a"), (0, "b"), (6, "b")):
+        (local / part).mkdir(parents=True, exist_ok=True)
+        shutil.copy(scans / f"{k}.bin", local / part)
+        Remote(f"{root}/scans/{part}/{k}.bin").write_bytes((scans / f"{k}.bin").read_bytes())
+    Remote(f"{root}/scans/.hidden/0.bin").write_bytes(b"")
+    code, records, _ = run(local / "a", local / "b", "--out", tmp_path / "out", "--labels", "--ply")
+    there = run(f"{root}/scans", "--out", f"{root}/out", "--labels", "--ply")
+    assert there[0] == code == 1
+    for record, other in zip(there[1], records, strict=True):
+        assert record.pop("scan").endswith(other.pop("scan").removeprefix(str(tmp_path)))
+    assert "scans/b/6.bin: " in there[2]
+    found = {url: Remote(f"{root}/out/{url}").read_bytes() for url in contents(tmp_path / "out")}
+    assert found == contents(tmp_path / "out")
+    assert len(found) == 6
+    back = run(f"{root}/scans/a/0.bin", "--out", tmp_path / "back", "--labels")
+    assert contents(tmp_path / "back") == {"0.label": contents(tmp_path / "out")["a/0.label"]}
+    assert back[0] == 0
+
+
+def test_scans_in_memory(scans: Path, tmp_path: Path) -> None:
+    pytest.importorskip("fsspec")
+    _results_at_urls_are_those_of_paths("memory://edgeperc", scans, tmp_path)
+
+
+@pytest.fixture
+def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A bucket of a local S3 server."""
+    server = pytest.importorskip("moto.server")
+    s3fs = pytest.importorskip("s3fs")
+    import boto3
+
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "test")
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+    s3 = server.ThreadedMotoServer(ip_address="127.0.0.1", port=0)
+    s3.start()
+    host, port = s3.get_host_and_port()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+    urlopen(Request(f"http://{host}:{port}/moto-api/reset", method="POST")).close()  # what an earlier server had
+    boto3.client("s3").create_bucket(Bucket="edgeperc")
+    yield "s3://edgeperc"
+    s3fs.S3FileSystem.clear_instance_cache()  # they know this server
+    s3.stop()
+
+
+def test_scans_at_s3(bucket: str, scans: Path, tmp_path: Path) -> None:
+    _results_at_urls_are_those_of_paths(bucket, scans, tmp_path)
+    with pytest.raises(PointsError, match="no such file"):
+        Remote(f"{bucket}/nothing.bin").fetch(tmp_path)
+    with pytest.raises(OSError, match="nobody"):
+        Remote("s3://nobody/scan.bin").read_bytes()
+
+
+def test_ray_reads_from_and_writes_to_s3(bucket: str, scans: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    pytest.importorskip("pyarrow")
+    for path in scans.iterdir():
+        Remote(f"{bucket}/scans/{path.name}").write_bytes(path.read_bytes())
+    code, records, _ = run(scans, "--out", tmp_path, "--labels", "--ply")
+    # Workers have the environment that the cluster was started with, so this one has its own.
+    arguments = [f"{bucket}/scans", "--out", f"{bucket}/out", "--labels", "--ply", "--json", "--threads", "1"]
+    command = [sys.executable, "-m", "edgeperc", "run", *arguments, "--engine", "ray", "--workers", "2"]
+    done = [subprocess.run(command, capture_output=True, text=True, timeout=300) for _ in range(2)]
+    for each in done:
+        assert each.returncode == code == 1, each.stderr
+        there = [json.loads(line) for line in each.stdout.splitlines()]
+        assert len(there) == len(records)
+        for record, other in zip(there, records, strict=True):
+            assert record.pop("scan") == f"{bucket}/scans/{Path(other['scan']).name}"
+            if "error" in record:
+                assert f"{bucket}/scans/6.bin" in record.pop("error")
+            expected = {key: value for key, value in other.items() if key not in ("scan", "error")}
+            assert {key: value for key, value in record.items() if key != "stage_ms"} == expected
+    assert "kept" not in done[0].stderr
+    assert "kept" in done[1].stderr
+    found = {name: Remote(f"{bucket}/out/{name}").read_bytes() for name in contents(tmp_path)}
+    assert found == contents(tmp_path)
+    assert len(found) == 2 * (N_SCANS - 1)
+
+
+def test_large_files_are_not_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("fsspec")
+    monkeypatch.setattr("edgeperc.system.remote.MOST_BYTES", 10)
+    large = Remote("memory://edgeperc/large.pcap")
+    large.write_bytes(bytes(11))
+    with pytest.raises(PointsError, match="11 bytes are not fetched"):
+        large.fetch(tmp_path)
+
+
+def test_the_package_of_a_protocol_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("fsspec")
+    monkeypatch.setitem(sys.modules, "adlfs", None)
+    with pytest.raises(OptionError, match="adlfs"):
+        Remote("abfs://container/scan.bin").read_bytes()
+    with pytest.raises(OptionError, match="nosuch"):
+        Remote("nosuch://container/scan.bin").read_bytes()
+    monkeypatch.setitem(sys.modules, "fsspec.core", None)
+    with pytest.raises(MissingExtraError, match=r"edgeperc\[remote\]"):
+        Remote("s3://bucket/scan.bin").read_bytes()
+
+
+@pytest.mark.parametrize("arguments", [["--gif", "--track", "--out", "s3://b/out"], ["--live"]])
+def test_what_urls_cannot_do(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["run", "s3://bucket/scans", *arguments])
+    assert "takes no URL" in capsys.readouterr().err

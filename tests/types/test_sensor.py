@@ -1,0 +1,360 @@
+"""Sensor profiles are possible sensors; scans unlike the training's are reported, ordinary ones are not."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import FrozenInstanceError, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+import twins.fitness
+from edgeperc.errors import CardError, PointsError, SensorError
+from edgeperc.preprocess.fitness import FitnessProfile, check_fitness, fill_scan_sums
+from edgeperc.readers.files import read_points
+from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
+
+# --- profiles --------------------------------------------------------------------------------------------------------
+
+
+def test_built_in_profiles():
+    beams = {name: profile.n_beams for name, profile in SENSORS.items()}
+    assert beams == {
+        **{"hdl-64e": 64, "hdl-32e": 32, "vlp-16": 16, "vlp-32c": 32, "pandar64": 64, "pandarxt-32": 32},
+        **{f"{model}-{n}": n for model in ("os0", "os1", "os2") for n in (32, 64, 128)},
+    }
+    for name, profile in SENSORS.items():
+        assert get_sensor(name) is profile
+        assert profile.name == name
+        assert profile.fov_up_deg > 0 > profile.fov_down_deg
+        assert profile.azimuth_resolution_deg * profile.columns == pytest.approx(360)
+        raw = np.array(profile.remission_range)
+        np.testing.assert_allclose((raw + profile.remission_offset) * profile.remission_scale, [0, 1])
+
+
+def test_vlp_16_is_evenly_spaced():
+    np.testing.assert_allclose(get_sensor("vlp-16").elevations_deg, np.arange(15, -16, -2))
+
+
+def test_own_and_changed_profiles():
+    own = SensorProfile.uniform("mine", 40, 7.0, -16.0, columns=1800, remission_range=(10, 110))
+    assert get_sensor(own) is own
+    assert (own.n_beams, own.fov_up_deg, own.fov_down_deg) == (40, 7.0, -16.0)
+    assert (60 + own.remission_offset) * own.remission_scale == 0.5
+    assert replace(own, remission_range=(0, 65535)).remission_scale == 1 / 65535
+    assert SensorProfile("list", [1, -1], 10).elevations_deg == (1.0, -1.0)
+    with pytest.raises(FrozenInstanceError):
+        own.columns = 3
+
+
+@pytest.mark.parametrize("name", ["hdl64", "HDL-64E", "", None, ["vlp-16"]])
+def test_an_unknown_sensor_lists_the_known(name):
+    with pytest.raises(SensorError, match=r"hdl-64e.*pandarxt-32"):
+        get_sensor(name)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"name": ""},
+        {"elevations_deg": ()},
+        {"elevations_deg": (1.0, 1.0)},
+        {"elevations_deg": (-1.0, 1.0)},
+        {"elevations_deg": (90.0, 1.0)},
+        {"elevations_deg": (1.0, float("nan"))},
+        {"elevations_deg": ("up", "down")},
+        {"elevations_deg": 3},
+        {"columns": 0},
+        {"columns": 1.5},
+        {"columns": float("nan")},
+        {"remission_range": (1, 0)},
+        {"remission_range": (0, float("inf"))},
+        {"remission_range": (0, 1, 2)},
+        {"min_range_m": -1.0},
+        {"max_range_m": 0.5},
+        {"max_range_m": float("inf")},
+        {"max_range_m": None},
+    ],
+)
+def test_impossible_sensors_are_refused(change):
+    with pytest.raises(SensorError):
+        replace(get_sensor("vlp-16"), **change)
+
+
+@pytest.mark.parametrize("beams", [0, -1, 2.0, True, 5000])
+def test_impossible_numbers_of_beams_are_refused(beams):
+    with pytest.raises(SensorError, match=r"1\.\.4096"):
+        SensorProfile.uniform("mine", beams, 1, -1)
+    with pytest.raises(SensorError, match="finite"):
+        SensorProfile.uniform("mine", 3, float("nan"), -1)
+
+
+# --- a street --------------------------------------------------------------------------------------------------------
+
+SENSOR = get_sensor("hdl-64e")
+
+
+def street(seed, sensor=SENSOR, columns=1000):
+    """A road along x between facades, with a crossing road and parked cars, as the sensor sees it."""
+    rng = np.random.default_rng(seed)
+    elevation, azimuth = np.meshgrid(
+        np.radians(sensor.elevations_deg), np.linspace(-np.pi, np.pi, columns, endpoint=False), indexing="ij"
+    )
+    azimuth = azimuth + rng.uniform(0, 0.006)
+    direction = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1
+    ).reshape(-1, 3)
+    ground = -sensor.mount_height_m
+    with np.errstate(divide="ignore", over="ignore"):
+        distance = np.where(direction[:, 2] < 0, ground / direction[:, 2], np.inf)
+    reflectance = np.full(distance.shape, 0.25)
+    crossing = rng.uniform(20, 60) * rng.choice([-1, 1])
+    for side in (rng.uniform(6, 14), -rng.uniform(6, 14)):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            t = np.where(side / direction[:, 1] > 0, side / direction[:, 1], np.inf)
+            x, z = t * direction[:, 0], t * direction[:, 2]
+        hit = (t < distance) & (np.abs(x - crossing) > 6) & (z < 10)
+        distance[hit], reflectance[hit] = t[hit], rng.uniform(0.2, 0.5)
+    for _ in range(12):
+        low = np.array([rng.uniform(-40, 40), rng.choice([-5.5, 3.7]), ground])
+        high = low + np.array([4.2, 1.8, 1.5])
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            slabs = np.stack([low / direction, high / direction])
+        enter, leave = np.nanmax(slabs.min(axis=0), axis=1), np.nanmin(slabs.max(axis=0), axis=1)
+        hit = (enter > 0) & (enter < leave) & (enter < distance)
+        distance[hit], reflectance[hit] = enter[hit], rng.uniform(0.3, 0.9)
+    kept = (distance > 2) & (distance < sensor.max_range_m) & (rng.random(len(distance)) > 0.05)
+    noisy = distance[kept] + rng.normal(0, 0.01, kept.sum())
+    remission = np.clip(rng.normal(reflectance[kept], 0.1), 0, 1)
+    remission[rng.random(len(remission)) < 0.1] = 0
+    return np.column_stack([direction[kept] * noisy[:, None], remission]).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def streets():
+    return [street(seed) for seed in range(6)]
+
+
+@pytest.fixture(scope="module")
+def profile(streets):
+    return FitnessProfile.from_scans(streets[:3])
+
+
+def columns(*parts):
+    return np.column_stack(parts).astype(np.float32)
+
+
+def in_camera_axes(p):
+    return columns(-p[:, 1], -p[:, 2], p[:, 0], p[:, 3])
+
+
+def in_nuscenes_axes(p):
+    return columns(-p[:, 1], p[:, 0], p[:, 2:])
+
+
+def cropped(p):
+    return p[(p[:, 0] > 0) & (np.abs(p[:, 1]) < 0.8 * p[:, 0]) & (p[:, 2] > -0.26 * p[:, 0])]
+
+
+def rescaled(factors):
+    return lambda p: p * np.float32(factors)
+
+
+FAULTS = {
+    "x and y swapped": (lambda p: p[:, [1, 0, 2, 3]], "as if the road ran along y"),
+    "nuScenes' axes": (in_nuscenes_axes, "--turn -90"),
+    "a camera's axes": (in_camera_axes, "pass z, -x, -y"),
+    "upside down": (rescaled([1, -1, -1, 1]), "upside down"),
+    "ground at zero": (lambda p: p + np.float32([0, 0, 1.73, 0]), "another height"),
+    "millimeters": (rescaled([1e3, 1e3, 1e3, 1]), "millimeters"),
+    "kilometers": (rescaled([1e-3, 1e-3, 1e-3, 1]), "kilometers"),
+    "a crop turned away": (lambda p: in_nuscenes_axes(cropped(p)), "Only 0% of the model's view"),
+    "remission to 255": (rescaled([1, 1, 1, 255]), r"remission_range is \(0, 255\)"),
+    "remission to 65535": (rescaled([1, 1, 1, 65535]), r"remission_range is \(0, 65535\)"),
+    "remission scaled twice": (rescaled([1, 1, 1, 1 / 255]), "hardly exceeds"),
+    "negative remission": (lambda p: p - np.float32([0, 0, 0, 0.5]), "Remission runs from -0.5"),
+    "no remission": (rescaled([1, 1, 1, 0]), "Remission is 0 for 100%"),
+    "constant remission": (lambda p: columns(p[:, :3], np.full(len(p), 0.4)), "the same for 100%"),
+    "dark remission": (lambda p: columns(p[:, :3], p[:, 3] ** 4), "median remission"),
+    "almost empty": (lambda p: p[::100], "is the scan complete"),
+    "a hundred points": (lambda p: p[::500], "is the scan complete"),
+    "many turns": (lambda p: np.tile(p, (8, 1)), "one turn"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_reported(streets, profile, fault):
+    spoil, expected_text = FAULTS[fault]
+    for scan in streets[3:]:
+        findings = check_fitness(np.ascontiguousarray(spoil(scan)), profile, SENSOR)
+        assert findings
+        assert re.search(expected_text, " ".join(findings)), findings
+
+
+@pytest.mark.parametrize(
+    ("name", "expected_text"), [("vlp-16", "about 1[4-7] rows"), ("hdl-32e", "about (2[89]|3[0-3]) rows")]
+)
+def test_fewer_beams_are_reported(profile, name, expected_text):
+    sensor = get_sensor(name)
+    findings = " ".join(check_fitness(street(9, sensor), profile, sensor))
+    assert re.search(expected_text, findings), findings
+    assert f"{name}: {sensor.n_beams}" in findings
+
+
+def test_ordinary_scans_pass(streets, profile):
+    rng = np.random.default_rng(0)
+    for scan in streets:
+        assert check_fitness(scan, profile, SENSOR) == ()
+        assert check_fitness(rng.permutation(scan), profile, SENSOR) == ()
+        assert check_fitness(cropped(scan), profile, SENSOR) == ()
+        spoilt = np.insert(scan, slice(0, None, 20), np.float32(np.nan), axis=0)
+        assert check_fitness(spoilt, profile, SENSOR) == ()
+
+
+def test_scan_without_finite_points_is_reported(profile):
+    for scan in (np.empty((0, 4), np.float32), np.full((9, 4), np.nan, np.float32)):
+        assert "no finite point" in check_fitness(scan, profile, SENSOR)[0]
+    assert check_fitness(np.zeros((1, 4), np.float32), profile, SENSOR)
+    with pytest.raises(PointsError, match="shape"):
+        check_fitness(np.zeros((5, 3), np.float32), profile, SENSOR)
+
+
+def test_profile_is_read_back_from_json(profile):
+    assert FitnessProfile.from_dict(json.loads(json.dumps(profile.to_dict(), allow_nan=False))) == profile
+    crops_only = FitnessProfile.from_scans([cropped(street(1))])
+    assert crops_only.road_ahead is None
+    assert FitnessProfile.from_dict(json.loads(json.dumps(crops_only.to_dict(), allow_nan=False))) == crops_only
+    assert check_fitness(street(2), crops_only, SENSOR) == ()
+
+
+@pytest.mark.parametrize(
+    "change", [{"beams": None}, {"beams": 3}, {"beams": [1, "x"]}, {"beams": [1, float("nan")]}, {"more": [0, 1]}]
+)
+def test_a_damaged_profile_is_refused(profile, change):
+    with pytest.raises(CardError):
+        FitnessProfile.from_dict(profile.to_dict() | change)
+    with pytest.raises(CardError):
+        FitnessProfile.from_dict({})
+
+
+def test_a_profile_needs_scans():
+    with pytest.raises(PointsError, match="training scans"):
+        FitnessProfile.from_scans([np.empty((0, 4), np.float32)])
+
+
+@pytest.mark.parametrize("azimuth_deg", [(45.0, -45.0), (180.0, -180.0), (120.0, -30.0)])
+def test_the_view_holds_its_share_of_the_points(azimuth_deg):
+    scan = street(4)
+    measured = FitnessProfile.from_scans([scan], azimuth_deg)
+    azimuth = np.degrees(np.arctan2(scan[:, 1], scan[:, 0]))
+    inside = np.count_nonzero((azimuth <= azimuth_deg[0]) & (azimuth >= azimuth_deg[1]))
+    assert measured.points_in_view[0] == pytest.approx(inside, rel=0.03)
+    assert measured.ground_m == pytest.approx((-1.73, -1.73), abs=0.11)
+    assert measured.beams[0] == pytest.approx(64, abs=6)
+
+
+# --- the kernel ------------------------------------------------------------------------------------------------------
+
+
+def check_against_twin(points, step, beam_step, view):
+    out = [np.full(size, 99, np.int64) for size in (258, 360, 200, (3, 100))]
+    rows, n_rows, sums = np.full((8, 1024), 99.0), np.full(8, 99, np.int64), np.full(9, 99.0)
+    fill_scan_sums(points, step, beam_step, *view, *out, rows, n_rows, sums)
+    *expected, expected_rows, expected_sums = twins.fitness.scan_sums(points, step, beam_step, *view)
+    for got, wanted in zip(out, expected, strict=True):
+        np.testing.assert_array_equal(got, wanted)
+    for row, count, wanted in zip(rows, n_rows, expected_rows, strict=True):
+        np.testing.assert_allclose(row[:count], wanted, atol=1e-9)
+    np.testing.assert_allclose(sums, expected_sums, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(("step", "beam_step"), [(1, 1), (7, 2)])
+def test_scan_sums_agree_with_the_twin_on_a_street(step, beam_step):
+    check_against_twin(street(5, columns=200), step, beam_step, (-0.5, 0.5))
+
+
+@settings(deadline=None, max_examples=200)
+@given(
+    hnp.arrays(
+        np.float32,
+        st.tuples(st.integers(0, 20), st.just(4)),
+        # Hundredths, off the edges of every bin, and whatever is not finite.
+        elements=st.one_of(
+            st.integers(-4000, 4000).map(lambda v: v / 100 + 0.0037),
+            st.sampled_from([0.0, 1.0, np.inf, -np.inf, np.nan, 3e38]),
+        ),
+    ),
+    st.integers(1, 3),
+)
+def test_scan_sums_agree_with_the_twin_on_random_scans(points, step):
+    with np.errstate(invalid="ignore", over="ignore"):
+        check_against_twin(points, step, 1, (-0.5, 0.5))
+
+
+# --- real scans ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def kitti_scans(kitti_root):
+    with (kitti_root / "frames.csv").open() as file:
+        frames = list(csv.DictReader(file))
+    return frames, [read_points(kitti_root / "training" / "velodyne" / f"{frame['name']}.bin") for frame in frames]
+
+
+@pytest.fixture(scope="module")
+def kitti_profile(kitti_scans):
+    return FitnessProfile.from_scans(kitti_scans[1][:154:10] + kitti_scans[1][254:307:8])
+
+
+def test_every_kitti_scan_passes(kitti_scans, kitti_profile, semantickitti_root):
+    frames, scans = kitti_scans
+    assert len(scans) == 314
+    found = {
+        frame["name"]: findings
+        for frame, scan in zip(frames, scans, strict=True)
+        if (findings := check_fitness(scan, kitti_profile, SENSOR))
+    }
+    more = sorted((semantickitti_root / "sequences" / "00" / "velodyne").glob("*.bin"))
+    assert len(more) == 16
+    found |= {
+        path.name: findings for path in more if (findings := check_fitness(read_points(path), kitti_profile, SENSOR))
+    }
+    assert found == {}
+
+
+def test_kitti_scans_turned_by_90_degrees_are_mostly_reported(kitti_scans, kitti_profile):
+    full = [scan for frame, scan in zip(*kitti_scans, strict=True) if frame["crop"] == "0"]
+    found = sum(bool(check_fitness(in_nuscenes_axes(scan), kitti_profile, SENSOR)) for scan in full)
+    assert found / len(full) > 0.85
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "a camera's axes",
+        "upside down",
+        "ground at zero",
+        "millimeters",
+        "remission to 255",
+        "no remission",
+        "almost empty",
+    ],
+)
+def test_corrupted_kitti_scans_are_reported(kitti_scans, kitti_profile, fault):
+    spoil, expected_text = FAULTS[fault]
+    for frame, scan in list(zip(*kitti_scans, strict=True))[:307:9]:
+        findings = check_fitness(np.ascontiguousarray(spoil(scan)), kitti_profile, SENSOR)
+        expected = "another height|not the sensor" if fault == "ground at zero" else expected_text
+        assert re.search(expected, " ".join(findings)), (frame["name"], findings)
+
+
+def test_nuscenes_sweep_is_reported(data_root, kitti_profile):
+    (path,) = (data_root("other_sensors") / "nuscenes_sweep").glob("*.bin")
+    findings = " ".join(check_fitness(read_points(path), kitti_profile, SENSOR))
+    for expected_text in ("--turn -90", "(0, 255)", "rows of points"):
+        assert expected_text in findings

@@ -1,0 +1,560 @@
+from __future__ import annotations
+
+import base64
+import io
+import itertools
+import json
+import re
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edgeperc import Tracker, view
+from edgeperc.errors import MissingExtraError, PointsError, TrackingError
+from edgeperc.evaluation.mistakes import Mistakes
+from edgeperc.types.perception import Box, Perception, PointLabels, TopView
+from edgeperc.view import draw_mistakes, draw_tracks, flatten_scan, write_html, write_labels, write_ply
+from edgeperc.view.canvas import Label, add_axes, free_place, new_figure, place_labels, shorten, wrap
+from edgeperc.view.colors import CLASS_COLORS, FALSE, FOUND, MISSED
+from edgeperc.view.content import fit_ground, paint_points
+
+POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
+TOP_CLASSES = ("background", "drivable", "car", "van", "truck")
+CAR = Box("car", 0.9, (20.0, 3.0, -0.9), (4.2, 1.8, 1.6), 0.3)
+VAN = Box("van", 0.6, (30.0, -4.0, -0.7), (5.1, 2.0, 2.2), -2.9)
+
+
+def a_scan() -> np.ndarray:
+    """Ground all around, a block of returns in each box, a pole-like pedestrian, and a row that is not finite."""
+    rng = np.random.default_rng(0)
+    azimuth, distance = rng.uniform(-np.pi, np.pi, 6000), rng.uniform(3.0, 50.0, 6000)
+    ground = np.column_stack([distance * np.cos(azimuth), distance * np.sin(azimuth), np.full(6000, -1.73)])
+    blocks = [rng.uniform(-0.5, 0.5, (300, 3)) * [3.5, 1.5, 1.4] + box.center for box in (CAR, VAN)]
+    walker = rng.uniform(-0.5, 0.5, (100, 3)) * [0.4, 0.4, 1.7] + [12.0, -3.0, -0.9]
+    xyz = np.concatenate([ground, *blocks, walker, [[np.nan, 0.0, 0.0]]])
+    return np.column_stack([xyz, rng.uniform(0.0, 1.0, len(xyz))]).astype(np.float32)
+
+
+def a_perception(points: np.ndarray) -> Perception:
+    labels = np.zeros(len(points), dtype=np.uint8)
+    labels[6000:6600], labels[6600:6700] = 1, 2
+    cells = np.zeros((400, 200), dtype=np.uint8)
+    cells[150:400, 60:140] = 1
+    cells[250:290, 60:80] = 2
+    return Perception(
+        n_points=len(points),
+        n_dropped=1,
+        points=PointLabels(labels, np.isfinite(points).all(axis=1) & (points[:, 0] > 0), POINT_CLASSES),
+        top_view=TopView(cells, TOP_CLASSES, 0.1, (6.0, 46.0), (-10.0, 10.0), np.ones_like(cells, bool)),
+        boxes=(CAR, VAN),
+        stage_ms={"project": 1.0, "infer": 30.0},
+        providers={"ssadnet": "CPUExecutionProvider (fp32)"},
+        fitness=("the scan has 32 beams, the training scans had 64",),
+        stamp_s=None,
+    )
+
+
+@pytest.fixture
+def scan() -> np.ndarray:
+    return a_scan()
+
+
+@pytest.fixture
+def perception(scan: np.ndarray) -> Perception:
+    return a_perception(scan)
+
+
+def pixels(png: bytes) -> np.ndarray:
+    from PIL import Image  # comes with matplotlib
+
+    with Image.open(io.BytesIO(png)) as opened:
+        assert opened.format == "PNG"
+        return np.asarray(opened.convert("RGB")).astype(np.int16)
+
+
+def near(picture: np.ndarray, name: str, tolerance: int = 12) -> np.ndarray:
+    wanted = [int(CLASS_COLORS[name][k : k + 2], 16) for k in (1, 3, 5)]
+    return (np.abs(picture - wanted) <= tolerance).all(axis=2)
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_picture_shows_classes_where_they_are(scan: np.ndarray, perception: Perception) -> None:
+    picture = pixels(view.draw(perception, scan, title="a scan"))
+    assert picture.shape == (1106, 1600, 3)
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 500
+    # The panel from above begins at pixel column 90 and row 128 with x = 48 and y = 14, 14.65 pixels a meter.
+    for box in (CAR, VAN):
+        row, col = 128 + (48.0 - box.center[0]) * 14.65, 90 + (14.0 - box.center[1]) * 14.65
+        around = near(picture[int(row) - 45 : int(row) + 45, int(col) - 45 : int(col) + 45], box.label)
+        assert around.sum() > 100, box.label
+        empty = picture[600:860, 95:200]
+        assert not near(empty, box.label).any()
+    # A pedestrian shows from behind and as the sensor sees it, right of the middle.
+    right_half = near(picture, "pedestrian")[:, 1050:]
+    assert right_half[128:648].sum() > 20
+    assert right_half[700:868].sum() > 20
+    # Legend squares.
+    assert all(near(picture[910:1010], name).sum() > 60 for name in {*POINT_CLASSES, *TOP_CLASSES})
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_picture_grows_with_its_warnings(scan: np.ndarray, perception: Perception) -> None:
+    quiet = pixels(view.draw(replace(perception, fitness=()), scan))
+    assert quiet.shape == (1080, 1600, 3)
+    many = pixels(view.draw(replace(perception, fitness=("a warning", "words " * 100)), scan))
+    assert many.shape[0] > 1080 + 3 * 26
+    amber = (np.abs(many - [0xFF, 0xC4, 0x6B]) <= 12).all(axis=2)
+    assert not amber[1080 - 60 :, 1572:].any()
+    rows = [amber[at : at + 26].any() for at in range(1080 - 20, many.shape[0] - 26, 26)]
+    assert sum(rows) >= 3
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_picture_of_one_view(scan: np.ndarray, perception: Perception) -> None:
+    points_alone = pixels(view.draw(replace(perception, top_view=None, boxes=()), scan))
+    assert near(points_alone, "pedestrian").sum() > 100
+    assert not near(points_alone, "drivable").any()
+    top_alone = pixels(view.draw(replace(perception, points=None), scan))
+    assert near(top_alone, "van").sum() > 100
+    assert not near(top_alone, "pedestrian").any()
+    assert points_alone.shape[1] == top_alone.shape[1] == 1600
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_road_that_was_not_observed_is_gray(scan: np.ndarray, perception: Perception) -> None:
+    assert perception.top_view is not None
+    bare = replace(perception, n_points=0, points=None, boxes=())
+    observed = np.ones((400, 200), bool)
+    observed[:250] = False  # from 21 m on
+    half = replace(bare, top_view=replace(perception.top_view, observed=observed))
+    gray, green = (pixels(view.draw(each, scan[:0])) for each in (half, bare))
+    # The panel from above: 2 to 3.5 m left of the sensor, 28 to 24 m and 18 to 10 m ahead. Beside the arrow.
+    far, close = (slice(421, 480), slice(245, 266)), (slice(568, 684), slice(245, 266))
+    for picture, place, is_green in ((green, far, True), (green, close, True), (gray, close, True), (gray, far, False)):
+        red, more, _ = picture[place].mean(axis=(0, 1))
+        assert (more > red + 30) == is_green
+    assert gray[far].mean() > 30  # gray, not black like observed background
+    # From behind, the road is green only where it was observed.
+    strong = [(p[128:648, 540:, 1] > p[128:648, 540:, 0] + 30).sum() for p in (gray, green)]
+    assert 0 < strong[0] < 0.95 * strong[1]
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_picture_is_the_same_again_and_in_other_threads(scan: np.ndarray, perception: Perception) -> None:
+    wanted = view.draw(perception, scan)
+    got: list[bytes] = []
+    threads = [threading.Thread(target=lambda: got.append(view.draw(perception, scan))) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [png == wanted for png in got] == [True, True, True]
+
+
+@pytest.mark.parametrize("n", [0, 1])
+@pytest.mark.usefixtures("matplotlib")
+def test_tiny_scans(n: int, tmp_path, scan: np.ndarray) -> None:
+    whole = a_perception(scan)
+    for points in (scan[:n], np.full((n, 4), np.nan, dtype=np.float32)):
+        labels = PointLabels(np.zeros(n, np.uint8), np.zeros(n, bool), POINT_CLASSES)
+        perception = replace(whole, n_points=n, points=labels, stage_ms={}, providers={}, fitness=())
+        assert pixels(view.draw(perception, points)).shape == (1080, 1600, 3)
+        write_html(perception, points, tmp_path / "page.html")
+        write_ply(perception, points, tmp_path / "points.ply")
+        write_labels(perception, tmp_path / "points.label")
+        assert (tmp_path / "points.label").stat().st_size == 4 * n
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_strange_titles_and_classes(scan: np.ndarray, perception: Perception, tmp_path) -> None:
+    strange = "$\\frac{ <script>alert(1)</script> 走 \n \udcff @@SCENE@@" + "x" * 200
+    classes = (*POINT_CLASSES[:3], "</script> & tram\nelement vertex 3")
+    perception = replace(perception, points=replace(perception.points, classes=classes))
+    assert pixels(view.draw(perception, scan, title=strange)).shape[1] == 1600
+    write_html(perception, scan, tmp_path / "page.html", title=strange)
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert text.count("<script") == 2
+    assert text.count("</script>") == 2
+    assert "&lt;script&gt;alert(1)" in text
+    write_ply(perception, scan, tmp_path / "points.ply")
+    header = (tmp_path / "points.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
+    assert [line for line in header if line.startswith("element")] == [f"element vertex {len(scan)}"]
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_file_is_replaced_whole(scan: np.ndarray, perception: Perception, tmp_path) -> None:
+    target = tmp_path / "scan.png"
+    target.write_bytes(b"old")
+    png = view.draw(perception, scan, target)
+    assert target.read_bytes() == png
+    with pytest.raises(OSError, match="absent"):
+        view.draw(perception, scan, tmp_path / "absent" / "scan.png")
+    folder = tmp_path / "scan.label"
+    folder.mkdir()
+    with pytest.raises(OSError, match=r"scan\.label"):
+        write_labels(perception, folder)
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["scan.label", "scan.png"]
+
+
+def test_html_holds_every_finite_point_and_no_address(scan: np.ndarray, perception: Perception, tmp_path) -> None:
+    bright = scan * np.array([1, 1, 1, 200], dtype=np.float32)
+    write_html(perception, bright, tmp_path / "page.html", title="a scan")
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert not re.search(r"https?:|src=|@@", text)
+    scene = json.loads(re.search(r'type="application/json">(.*?)</script>', text, re.DOTALL).group(1))
+    (shown,) = scene["scans"]
+    xyz = np.frombuffer(base64.b64decode(shown["xyz"]), dtype="<f4").reshape(-1, 3)
+    label = np.frombuffer(base64.b64decode(shown["label"]), dtype=np.uint8)
+    remission = np.frombuffer(base64.b64decode(shown["remission"]), dtype=np.uint8)
+    np.testing.assert_array_equal(xyz, scan[:-1, :3])
+    assert len(remission) == len(label) == len(xyz)
+    assert remission.max() == 255
+    names = [one["name"] for one in scene["classes"]]
+    assert names == [*POINT_CLASSES, "drivable", "van", "truck"]
+    assert (label[6000:6600] == names.index("car")).all()
+    road = label == names.index("drivable")
+    assert road.sum() > 100
+    assert (np.abs(xyz[road, 1]) <= 4.01).all()
+    assert shown["ground"] == pytest.approx([-1.73, 0.0, 0.0], abs=0.01)
+    facts = {names[int(k)]: texts for k, texts in shown["facts"].items()}
+    assert facts["drivable"] == [f"{perception.top_view.drivable_area_m2:.0f} m²"]
+    assert facts["car"] == ["1 box", "600 points"]
+    assert facts["van"] == ["1 box"]
+    road_cells = np.zeros_like(perception.top_view.drivable)
+    for row, first, last in shown["road"]["strips"]:
+        road_cells[row, first:last] = True
+    np.testing.assert_array_equal(road_cells, perception.top_view.drivable)
+    corners = np.array(shown["boxes"][0]["corners"])
+    np.testing.assert_allclose(corners.mean(axis=0), CAR.center, atol=2e-3)
+    assert np.ptp(corners[:, 2]) == pytest.approx(CAR.size[2], abs=2e-3)
+
+
+def test_leaves_above_the_road_are_not_road(perception: Perception) -> None:
+    points = np.array([[20.0, 0.0, -1.7, 0.1]] * 60 + [[20.0, 0.0, 2.0, 0.1]], dtype=np.float32)
+    bare = PointLabels(np.zeros(61, np.uint8), np.ones(61, bool), POINT_CLASSES)
+    names, painted = paint_points(points, replace(perception, n_points=61, points=bare))
+    assert (painted[:60] == names.index("drivable")).all()
+    assert painted[60] == 0
+
+
+def test_ply_reads_back(scan: np.ndarray, perception: Perception, tmp_path) -> None:
+    write_ply(perception, scan, tmp_path / "points.ply")
+    header, body = (tmp_path / "points.ply").read_bytes().split(b"end_header\n", 1)
+    kinds = {"float": "<f4", "uchar": "u1"}
+    properties = re.findall(r"property (\w+) (\w+)", header.decode("ascii"))
+    rows = np.frombuffer(body, dtype=[(name, kinds[kind]) for kind, name in properties])
+    assert rows.dtype.names == ("x", "y", "z", "remission", "label", "red", "green", "blue")
+    assert len(rows) == len(scan)
+    for k, name in enumerate(("x", "y", "z", "remission")):
+        np.testing.assert_array_equal(rows[name], scan[:, k])
+    np.testing.assert_array_equal(rows["label"], perception.points.labels)
+    car = rows[rows["label"] == 1][0]
+    assert "#{:02x}{:02x}{:02x}".format(*(car[c] for c in ("red", "green", "blue"))) == CLASS_COLORS["car"]
+
+
+def test_labels_are_semantickitti_ids(scan: np.ndarray, perception: Perception, tmp_path) -> None:
+    labels = np.arange(len(scan), dtype=np.uint8) % 4
+    named = replace(perception.points, labels=labels, classes=("background", "car", "cyclist", "tram"))
+    write_labels(replace(perception, points=named), tmp_path / "scan.label")
+    raw = np.fromfile(tmp_path / "scan.label", dtype="<u4")
+    np.testing.assert_array_equal(raw, np.array([0, 10, 31, 99])[labels])
+
+
+def test_refusals(scan: np.ndarray, perception: Perception, tmp_path) -> None:
+    top_alone = replace(perception, points=None)
+    with pytest.raises(PointsError, match="pointseg"):
+        write_labels(top_alone, tmp_path / "a.label")
+    with pytest.raises(PointsError, match="pointseg"):
+        write_ply(top_alone, scan, tmp_path / "a.ply")
+    for writer in (write_html, write_ply, view.draw):
+        with pytest.raises(PointsError, match="expected the scan that was perceived"):
+            writer(perception, scan[1:], tmp_path / "a")
+        with pytest.raises(PointsError, match=r"\(n, 4\)"):
+            writer(perception, scan[:, :3], tmp_path / "a")
+    assert not list(tmp_path.iterdir())
+
+
+def test_missing_matplotlib_names_the_line(scan: np.ndarray, perception: Perception, monkeypatch) -> None:
+    for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'edgeperc\[view\]'"):
+        view.draw(perception, scan)
+
+
+def test_import_loads_no_matplotlib() -> None:
+    code = "import edgeperc.view, sys; sys.exit(any(m.startswith(('matplotlib', 'PIL')) for m in sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_drawing_uses_no_pyplot(scan: np.ndarray, perception: Perception) -> None:
+    before = "matplotlib.pyplot" in sys.modules
+    view.draw(perception, scan)
+    assert ("matplotlib.pyplot" in sys.modules) == before
+
+
+def some_mistakes(points: np.ndarray, **given) -> Mistakes:
+    return Mistakes("000123", "drive_0011", points, np.zeros(len(points), np.uint8), **given)
+
+
+def amount(picture: np.ndarray, color: str) -> int:
+    wanted = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
+    return int((np.abs(picture - wanted) <= 12).all(axis=2).sum())
+
+
+def test_mistakes_are_summed_up(scan: np.ndarray) -> None:
+    mistakes = some_mistakes(scan, missed=((CAR, 300), (VAN, 1040), (CAR, 5)), false=(VAN,), wrong_share=0.25)
+    assert mistakes.summary == "missed: 2 car, 1 van (1,345 points); false: 1 van"
+    assert mistakes.n_errors == 4.25
+    assert some_mistakes(scan, found=(CAR,)).summary == "no mistake"
+    assert some_mistakes(scan, found=(CAR,)).n_errors == 0.0
+    wrong = replace(some_mistakes(scan), wrong=np.where(np.arange(len(scan)) == 7, 2, 0).astype(np.uint8))
+    assert wrong.summary == "1 point wrong"
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_mistakes_alone_are_drawn(scan: np.ndarray, tmp_path) -> None:
+    right = some_mistakes(scan, found=(CAR, VAN))
+    missed = some_mistakes(scan, found=(CAR,), missed=((VAN, 300),))
+    false = some_mistakes(scan, found=(CAR, VAN), false=(replace(CAR, center=(40.0, -12.0, -1.0)),))
+    points = replace(
+        right, wrong=np.where(np.arange(len(scan)) < 3000, 1, 0).astype(np.uint8), found=(), wrong_share=0.1
+    )
+    png = draw_mistakes([right, missed, false, points], tmp_path / "worst.png", title="a title", columns=2)
+    assert (tmp_path / "worst.png").read_bytes() == png
+    picture = pixels(png)
+    # Three panels: the first scan has no mistake. Two are 762 pixels wide and 776 high, below 168 of legend.
+    assert picture.shape == (168 + 2 * (776 + 84 + 20), 1600, 3)
+    panels = [
+        picture[248 + 880 * k : 248 + 880 * k + 776, 28 + 782 * m : 28 + 782 * m + 762] for k in (0, 1) for m in (0, 1)
+    ]
+    red, yellow, faint = ([amount(panel, color) for panel in panels] for color in (MISSED, FALSE, FOUND))
+    assert red[0] > 100
+    assert red[1] == red[3] == 0
+    blended = panels[2][..., 0] - panels[2][..., 1] > 100  # points are about as large as pixels
+    assert np.count_nonzero(blended) > 1000
+    assert yellow[0] == yellow[2] == yellow[3] == 0
+    assert yellow[1] > 50
+    assert faint[0] > 20
+    assert faint[1] > 40
+    assert faint[2] + faint[3] < 10  # a few of the ground's edges
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_no_mistakes_to_draw(scan: np.ndarray) -> None:
+    right = some_mistakes(scan, found=(CAR, VAN))
+    for scans in ([], [right], [some_mistakes(scan[:0])]):
+        picture = pixels(draw_mistakes(scans, title="none"))
+        assert picture.shape == (258, 1600, 3)
+        assert (picture[180:230] > 200).any()  # the sentence that says so
+
+
+def test_mistakes_need_matplotlib(monkeypatch: pytest.MonkeyPatch, scan: np.ndarray) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.backends.backend_agg", None)
+    with pytest.raises(MissingExtraError, match=r"edgeperc\[view\]"):
+        draw_mistakes([some_mistakes(scan)])
+
+
+# --- anything may be drawn -------------------------------------------------------------------------------------------
+
+wild = st.floats(allow_nan=True, allow_infinity=True) | st.sampled_from([0.0, -0.0, 1e30, -1e308, 1e-300, 5.0, 20.0])
+wild_boxes = st.builds(
+    Box,
+    st.sampled_from(["car", "van", "tram", "$x", "", "\udcff"]),
+    wild,
+    st.tuples(wild, wild, wild),
+    st.tuples(wild, wild, wild),
+    wild,
+)
+wild_points = st.lists(
+    st.tuples(*[st.floats(width=32) | st.sampled_from([0.0, 8.0, -3.0, 1e30])] * 4), max_size=60
+).map(lambda rows: np.array(rows, dtype=np.float32).reshape(-1, 4))
+
+
+@pytest.mark.usefixtures("matplotlib")
+@settings(deadline=None, max_examples=10)
+@given(wild_points, st.lists(wild_boxes, max_size=8))
+def test_anything_is_drawn(tmp_path_factory, points: np.ndarray, boxes: list[Box]) -> None:
+    folder = tmp_path_factory.mktemp("drawn")
+    n = len(points)
+    labels = PointLabels((np.arange(n) % 4).astype(np.uint8), np.ones(n, bool), POINT_CLASSES)
+    perception = replace(a_perception(a_scan()), n_points=n, points=labels, boxes=tuple(boxes))
+    assert pixels(view.draw(perception, points)).shape[1] == 1600
+    write_html(perception, points, folder / "page.html")
+    write_ply(perception, points, folder / "points.ply")
+    assert flatten_scan(points, perception)
+    mistakes = some_mistakes(points, found=tuple(boxes), missed=tuple((box, 3) for box in boxes), false=tuple(boxes))
+    assert pixels(draw_mistakes([mistakes])).shape[1] == 1600
+
+
+def test_boxes_reach_behind_the_camera(scan: np.ndarray, perception: Perception) -> None:
+    pytest.importorskip("matplotlib")
+    long = Box("truck", 0.5, (0.0, 0.0, 0.0), (60.0, 3.0, 3.0), 0.0)
+    picture = pixels(view.draw(replace(perception, boxes=(long,)), scan))
+    assert near(picture[128:648, 560:], "truck").sum() > 200
+
+
+# --- text ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("matplotlib")
+@settings(deadline=None, max_examples=30)
+@given(st.text(max_size=120), st.floats(60.0, 900.0))
+def test_wrapped_text_is_whole_and_fits(text: str, width: float) -> None:
+    figure = new_figure(1000, 100)
+    lines = wrap(figure, text, width, fontsize=13.0)
+    assert "".join("".join(lines).split()) == "".join(text.split())
+    assert len(lines) <= len(text)
+    for line in lines:
+        assert shorten(figure, line, width, fontsize=13.0) == line
+    assert not figure.texts
+
+
+rectangles = st.tuples(st.floats(0, 950), st.floats(0, 550), st.floats(0.5, 300), st.floats(0.5, 300)).map(
+    lambda r: (r[0], r[1], min(r[0] + r[2], 1000.0), min(r[1] + r[3], 600.0))
+)
+
+
+@settings(deadline=None)
+@given(rectangles, st.lists(rectangles, max_size=12), st.floats(5, 120), st.floats(5, 20))
+def test_free_place_is_free(area, others, width: float, height: float) -> None:
+    half, taken = np.array([width, height]), np.array([area, *others])
+    found = free_place(area, half, taken, (0.0, 0.0, 1000.0, 600.0))
+    if found is None:
+        return
+    middle, apart = found
+    low, high = middle - half, middle + half
+    assert (low >= 0.0).all()
+    assert (high <= [1000.0, 600.0]).all()
+    assert not ((taken[:, :2] < high).all(axis=1) & (taken[:, 2:] > low).all(axis=1)).any()
+    assert apart == pytest.approx(np.hypot(*np.maximum(0.0, np.maximum(taken[0, :2] - high, low - taken[0, 2:]))))
+
+
+def test_free_place_is_the_nearest() -> None:
+    area, half = (400.0, 300.0, 440.0, 320.0), np.array([30.0, 8.0])
+    _, apart = free_place(area, half, np.array([area]), (0.0, 0.0, 1000.0, 600.0))
+    assert apart < 6.0
+    wall = [(0.0, 200.0, 1000.0, 420.0)]  # above and below are taken, as far as a label may be
+    assert free_place(area, half, np.array([area, *wall]), (0.0, 0.0, 1000.0, 600.0))[1] > 80.0
+    assert free_place(area, half, np.array([(0.0, 0.0, 1000.0, 600.0)]), (0.0, 0.0, 1000.0, 600.0)) is None
+
+
+@pytest.mark.usefixtures("matplotlib")
+def test_labels_lie_on_nothing() -> None:
+    rng = np.random.default_rng(3)
+    figure = new_figure(900, 700)
+    axes = add_axes(figure, 20, 20, 860, 660)
+    corner = rng.uniform(30, 600, (30, 2))
+    areas = np.hstack([corner, corner + rng.uniform(10, 60, (30, 2))])
+    n_omitted = place_labels(axes, [Label(tuple(area), f"car {k}", "#ffffff") for k, area in enumerate(areas)])
+    texts = [text.get_window_extent() for text in figure.texts]
+    assert len(texts) + n_omitted == 30
+    assert len(texts) >= 15
+    for a, b in itertools.combinations(texts, 2):
+        assert not a.overlaps(b)
+    for text in texts:
+        assert not any(text.x0 < x1 and x0 < text.x1 and text.y0 < y1 and y0 < text.y1 for x0, y0, x1, y1 in areas)
+
+
+def test_classes_differ_for_color_blind_readers() -> None:
+    """Distances in CIELAB after the simulation of Machado, Oliveira and Fernandes (2009), severity 1."""
+    seen_by = {
+        "all": np.eye(3),
+        "deuteranopes": [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]],
+        "protanopes": [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]],
+        "tritanopes": [[1.256, -0.077, -0.179], [-0.078, 0.931, 0.148], [0.005, 0.691, 0.304]],
+    }
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    srgb = np.array([[int(color[k : k + 2], 16) / 255 for k in (1, 3, 5)] for color in CLASS_COLORS.values()])
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    for who, matrix in seen_by.items():
+        xyz = (linear @ np.array(matrix).T).clip(0, 1) @ to_xyz.T / [0.9505, 1.0, 1.089]
+        f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+        lab = np.column_stack([116 * f[:, 1] - 16, 500 * (f[:, 0] - f[:, 1]), 200 * (f[:, 1] - f[:, 2])])
+        for (a, one), (b, other) in itertools.combinations(zip(CLASS_COLORS, lab, strict=True), 2):
+            assert np.linalg.norm(one - other) > 20.0, (who, a, b)
+
+
+def test_ground_is_a_plane_through_the_road() -> None:
+    rng = np.random.default_rng(0)
+    xy = rng.uniform((5.0, -8.0), (45.0, 8.0), (500, 2))
+    z = -1.7 + 0.03 * xy[:, 0] - 0.01 * xy[:, 1]
+    z[:40] += 1.5  # what stands on it
+    points = np.column_stack([xy, z, np.zeros(500)]).astype(np.float32)
+    names, painted = ["background", "drivable"], np.ones(500, np.uint8)
+    assert fit_ground(points, names, painted) == pytest.approx((-1.7, 0.03, -0.01), abs=0.01)
+    same = np.repeat(points[100:101], 60, axis=0)
+    assert fit_ground(same, names, painted[:60]) == pytest.approx((float(z[100]), 0.0, 0.0), abs=1e-5)
+    assert fit_ground(points[:0], names, painted[:0]) == (-1.73, 0.0, 0.0)
+
+
+# --- the page in a browser -------------------------------------------------------------------------------------------
+
+
+def test_page_shows_and_hides(scan: np.ndarray, perception: Perception, browser: Any, tmp_path: Path) -> None:
+    write_html(perception, scan, tmp_path / "page.html", title="a <b>scan</b>")
+    wrong: list[str] = []
+    page = browser.new_page(viewport={"width": 1000, "height": 700})
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("console", lambda message: wrong.append(message.text))
+    page.on("request", lambda request: request.url.startswith("file:") or wrong.append(request.url))
+    page.goto((tmp_path / "page.html").as_uri())
+    if not page.evaluate("!!document.createElement('canvas').getContext('webgl')"):
+        pytest.skip("this browser offers no WebGL")
+    assert page.inner_text("h1") == "a <b>scan</b>"
+
+    def shown(name: str) -> int:
+        page.wait_for_timeout(300)
+        return int(near(pixels(page.screenshot()), name)[:, 340:].sum())
+
+    assert shown("pedestrian") > 20
+    page.get_by_label(re.compile("^pedestrian")).uncheck()
+    assert shown("pedestrian") == 0
+    assert shown("van") > 20
+    page.keyboard.press("b")
+    assert shown("van") == 0
+    assert not page.get_by_label("boxes", exact=True).is_checked()
+    page.get_by_label("road surface").uncheck()
+    page.keyboard.press("a")
+    page.get_by_role("button", name="height").click()
+    assert shown("drivable") == 0
+    page.close()
+    assert not wrong
+
+
+# --- tracks ----------------------------------------------------------------------------------------------------------
+
+
+def test_tracks_lie_on_the_scan(scan: np.ndarray, perception: Perception, tmp_path) -> None:
+    image = pytest.importorskip("PIL.Image")
+    tracker = Tracker()
+    cars = [replace(CAR, center=(20.0 + 0.8 * k, 3.0, -0.9), yaw=0.0) for k in range(6)]
+    tracks = [tracker.update([car], 0.1 * (k + 1)) for k, car in enumerate(cars)]
+    flat = flatten_scan(scan, perception)
+    content = draw_tracks(tracks, tmp_path / "tracks.gif", under=[flat] * 6, title="a drive \udcff")
+    bare = draw_tracks(tracks, title="a drive")
+    assert (tmp_path / "tracks.gif").read_bytes() == content
+
+    def last(gif: bytes) -> np.ndarray:
+        with image.open(io.BytesIO(gif)) as animation:
+            assert (animation.size, animation.n_frames) == ((960, 642), 6)
+            animation.seek(5)
+            return np.asarray(animation.convert("RGB")).astype(np.int16)
+
+    with_scan, alone = last(content), last(bare)
+    assert near(alone, "car").sum() > 150  # the box, at x = 24, y = 3: pixel 460, 294
+    assert near(alone[270:318, 420:500], "car").sum() > 100
+    road = np.abs(with_scan - alone).sum(axis=2)[44:604] > 30
+    assert road[240:320, 285:600].mean() > 0.5  # 6 to 46 m ahead, 4 m to each side
+    assert not road[:100].all()
+    with pytest.raises(TrackingError, match="one for each"):
+        draw_tracks(tracks, under=[flat])
