@@ -12,7 +12,7 @@ from edgeperc.evaluation.metrics import BoxEvaluator, Confusion, boxes_to_find
 from edgeperc.evaluation.tables import VEHICLES
 from edgeperc.simulation.samples import IGNORE, labels_by_boxes
 from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES, SimulatedScan
-from edgeperc.types.card import TopViewGeometry
+from edgeperc.types.views import TopViewGeometry
 
 from .worker import Prediction
 

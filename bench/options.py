@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
-from edgeperc.inference.session import PRECISIONS, PROVIDERS
+from edgeperc.inference.providers import PROVIDERS
+from edgeperc.inference.session import PRECISIONS
 from edgeperc.zoo import DEFAULT
 
 __all__ = [

@@ -22,20 +22,23 @@ from .camera.image import ImageScaler, as_image, label_pixels
 from .errors import EdgepercError, FitnessError, ImageError, MountingError, OptionError, PointsError
 from .ground.leveling import MountingEstimate, MountingEstimator
 from .inference.session import Session
-from .objects.cluster import MIN_SCORE
+from .objects.boxes import MIN_SCORE
 from .pipeline import BoxesFrom, Options, Pipeline, RangeImageNetwork, TopViewNetwork
-from .preprocess.condition import Interpolator, scale
-from .preprocess.fitness import Finding, FitnessProfile, check_dropped, check_profiles
+from .preprocess.condition import scale
+from .preprocess.findings import Finding, check_dropped, check_profiles
+from .preprocess.fitness import FitnessProfile
+from .preprocess.interpolation import Interpolator
 from .preprocess.remission import RemissionMatcher
 from .preprocess.returns import about_too_near, returns
 from .system.compilation import Compilation, kernels_of
 from .system.lanes import Lanes, Stopwatch
-from .types.card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
+from .types.card import ModelCard
 from .types.frame import ModelFrame
 from .types.mounting import Mounting
 from .types.perception import ImageLabels, Perception
 from .types.points import as_points
 from .types.sensor import SensorProfile, get_sensor
+from .types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
 from .warm_up import Rehearsed, n_processes, warm_up
 from .zoo import CAMERA, DEFAULT, resolve
 
@@ -155,7 +158,7 @@ class Perceiver:
         nothing.
     provider : str
         ``"auto"``, ``"cpu"``, ``"openvino"``, ... Any other value than ``"auto"`` is required, without fallback
-        (`edgeperc.inference.session.PROVIDERS`).
+        (`edgeperc.inference.providers.PROVIDERS`).
     precision : {"auto", "fp32", "bf16", "int8"}
         Precision of the networks. ``"auto"`` takes a reduced precision if the processor computes it natively and the
         card shows a loss of at most 0.3 points (`edgeperc.zoo.choose`). Any other value is required.

@@ -17,20 +17,20 @@ from .ground.planes import GroundFit, fit_ground
 from .ground.scan import Scan
 from .inference.crop import Crop, sectors_of_turn, spread
 from .inference.decode import decode_boxes, decode_cells, decode_labels
-from .inference.network_input import input_heights
-from .inference.projection import RangeImageProjector, make_projector
+from .inference.projection import RangeImageProjector, input_heights, make_projector
 from .inference.session import Session
-from .objects.cluster import join_boxes, objects_from_points, sort_points
+from .objects.boxes import join_boxes, objects_from_points
+from .objects.cluster import sort_points
 from .objects.linkage import Strips
 from .objects.refine import label_points, remove_outliers
-from .preprocess.condition import Interpolator
+from .preprocess.interpolation import Interpolator
 from .system.lanes import Lanes, Once, Stopwatch
-from .types.card import RangeImageGeometry, TopViewGeometry
 from .types.frame import turned
 from .types.geometry import oriented_iou, rectangles, shared_area
 from .types.mounting import MODEL_HEIGHT_M, Mounting
 from .types.perception import Box, PointLabels, TopView
 from .types.sensor import SensorProfile
+from .types.views import RangeImageGeometry, TopViewGeometry
 
 __all__ = ["BoxesFrom", "Options", "Parts", "Pipeline", "RangeImageNetwork", "TopViewNetwork", "weigh"]
 

@@ -1,21 +1,27 @@
-"""The JSON of a scan: what ``edgeperc run --json`` writes and ``edgeperc eval-tracking --boxes`` reads."""
+"""A scan with its answer, what writes it, and its JSON, which ``edgeperc run --json`` writes.
+
+``edgeperc eval-tracking --boxes`` reads that JSON.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from .errors import TrackingError
-from .road.ahead import road_ahead
-from .types.perception import Box
 
 if TYPE_CHECKING:
-    from .tracking.tracks import Tracks
-    from .types.perception import Perception
+    import numpy as np
+    from numpy.typing import NDArray
 
-__all__ = ["SCAN_KEYS", "read_boxes", "scan_record"]
+    from .tracking.tracks import Tracks
+    from .types.perception import Box, Perception
+    from .types.sensor import SensorProfile
+
+__all__ = ["SCAN_KEYS", "PerceivedScan", "Sink", "read_boxes", "scan_record"]
 
 SCAN_KEYS = (
     "n_points",
@@ -58,6 +64,8 @@ def scan_record(perception: Perception, tracks: Tracks | None = None) -> dict[st
 def _road_record(perception: Perception) -> dict[str, Any] | None:
     if perception.top_view is None:
         return None
+    from .road.ahead import road_ahead  # numba, for who reads records alone
+
     road = road_ahead(perception.top_view, perception.boxes)
     ahead = road.free_ahead()
     lengths = {
@@ -96,8 +104,60 @@ def read_boxes(path: Path | str) -> list[list[Box]]:
     OSError
         The file cannot be read.
     """
+    from .types.perception import Box
+
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
         return [[Box.from_dict(box) for box in json.loads(line)["boxes"]] for line in lines]
     except (KeyError, RecursionError, TypeError, ValueError) as exc:
         raise TrackingError(f"{path} holds no boxes ({exc}); expected what edgeperc run --json printed") from exc
+
+
+@dataclass(frozen=True, eq=False)
+class PerceivedScan:
+    """A scan with its answer.
+
+    Attributes
+    ----------
+    name : str
+        The scan's file, or its capture and number.
+    stamp_s : float
+        Time of the scan [s]; without a time stamp, its number in the run divided by the rate.
+    points : (n, 3 or more) floating
+        x, y, z [m] in the sensor's frame; then remission, if the scan has it.
+    perception : Perception
+    tracks : Tracks or None
+        None without a tracker; empty for a late or doubled scan (`Tracks.is_late`).
+    sensor : SensorProfile
+    health : str or None
+        ``"OK"``, ``"LATE"`` or ``"STALE"`` of a live answer; None for a scan that was read from a file.
+    """
+
+    name: str
+    stamp_s: float
+    points: NDArray[np.floating]
+    perception: Perception
+    tracks: Tracks | None
+    sensor: SensorProfile
+    health: str | None = None
+
+    @property
+    def tracked(self) -> Tracks | None:
+        """The tracks; None without a tracker, and for a late or doubled scan, of which only the boxes are known."""
+        return None if self.tracks is None or self.tracks.is_late else self.tracks
+
+
+class Sink(Protocol):
+    """Writes perceived scans."""
+
+    def write(self, scan: PerceivedScan) -> None:
+        """Write one scan.
+
+        Raises
+        ------
+        EdgepercError or OSError
+            The scan could not be written; the next one may be.
+        """
+
+    def close(self) -> None:
+        """Finish the file; nothing is written afterwards. Called after an error, too."""

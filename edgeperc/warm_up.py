@@ -51,11 +51,12 @@ from .ground.leveling import MountingEstimator
 from .ground.planes import Ground, fill_planes, find_ground
 from .ground.scan import Scan
 from .inference.session import Session
-from .objects.cluster import fill_rectangle, join_boxes, objects_from_points
+from .objects.boxes import fill_rectangle, join_boxes, objects_from_points
 from .objects.linkage import fill_clusters
 from .pipeline import Pipeline, RangeImageNetwork, TopViewNetwork, View
 from .preprocess.condition import render
-from .preprocess.fitness import FitnessProfile, check_profiles
+from .preprocess.findings import check_profiles
+from .preprocess.fitness import FitnessProfile
 from .preprocess.remission import NO_REMISSION
 from .preprocess.returns import returns
 from .road.ahead import compile_kernels

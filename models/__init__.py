@@ -186,7 +186,7 @@ def choose(
     variants : sequence of Variant
         Of one network, from `resolve`.
     provider : str
-        A key of `edgeperc.inference.session.PROVIDERS`.
+        A key of `edgeperc.inference.providers.PROVIDERS`.
     precision : {"auto", "fp32", "bf16", "int8"}
     features : collection of str
         Flags of the processor (`machine.cpu_features`); empty if they are not known. ``"auto"`` then takes

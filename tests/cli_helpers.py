@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from edgeperc import cli
-from edgeperc.types.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
+from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 
 POINTSEG = ModelCard(
     name="pointseg",

@@ -11,8 +11,9 @@ import onnx
 from PIL import Image
 
 from edgeperc.simulation.samples import simulated_scan
-from edgeperc.types.card import CARD_KEY, InputSpec, ModelCard, OutputSpec, TopViewGeometry
+from edgeperc.types.card import CARD_KEY, InputSpec, ModelCard, OutputSpec
 from edgeperc.types.perception import Box
+from edgeperc.types.views import TopViewGeometry
 from edgeperc_export.database.scenes import Plan
 
 DRIVES = ("0005", "0005", "0005", "0048", "0029", "0013", "0014", "0011")

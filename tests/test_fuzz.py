@@ -35,8 +35,9 @@ from edgeperc.inference.session import Session
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.records import read_boxes
 from edgeperc.system.machine import read_setting
-from edgeperc.types.card import ModelCard, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.card import ModelCard
 from edgeperc.types.sensor import get_sensor
+from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 
 CORPUS = files("", "tests/fuzz/corpus")
 

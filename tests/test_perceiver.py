@@ -38,18 +38,17 @@ from edgeperc.ground import planes
 from edgeperc.inference import decode, projection, session
 from edgeperc.objects import cluster, refine
 from edgeperc.pipeline import weigh
-from edgeperc.preprocess import condition
-from edgeperc.preprocess import fitness
+from edgeperc.preprocess import condition, fitness
 from edgeperc.road import ahead
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import SimulatedScan, simulate
 from edgeperc.system.lanes import Stopwatch
 from edgeperc.types import geometry
-from edgeperc.types.card import RangeImageGeometry, TopViewGeometry
 from edgeperc.types.geometry import inside, oriented_iou
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.perception import PointLabels
 from edgeperc.types.sensor import get_sensor
+from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 from edgeperc.zoo import model_path, shipped_models
 
 

@@ -22,7 +22,8 @@ import pytest
 from numpy.typing import NDArray
 
 from edgeperc import EdgepercError, Perceiver
-from edgeperc.inference.session import Session, available_providers
+from edgeperc.inference.providers import available_providers
+from edgeperc.inference.session import Session
 from edgeperc.simulation import random_scene, simulate
 
 posix = pytest.mark.skipif(os.name != "posix", reason="forks, signals and limits differ elsewhere")

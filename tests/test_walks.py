@@ -12,9 +12,9 @@ from edgeperc import Perceiver
 from edgeperc.simulation.raycast import CROWN, SLOPE_X, SLOPE_Y, WAVE_X, WAVE_Y
 from edgeperc.simulation.scene import SimulatedScan, simulate
 from edgeperc.simulation.street import Street, random_terrain, strip_row
-from edgeperc.types.card import RangeImageGeometry, TopViewGeometry
 from edgeperc.types.geometry import oriented_iou, rectangles
 from edgeperc.types.mounting import MODEL_MOUNTING
+from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 
 SIZES = {"car": (4.1, 1.7, 1.5), "truck": (8.0, 2.5, 3.2), "pedestrian": (0.8, 0.6, 1.75)}
 BOXES_OF = {kind: ("car", "van", "truck") for kind in ("car", "truck")} | {"pedestrian": ("pedestrian", "cyclist")}

@@ -10,7 +10,8 @@ import tiny_model
 from tiny_model import field, node, number, shaped, tensor
 
 from edgeperc.inference.session import golden_input
-from edgeperc.types.card import CameraGeometry, Golden, InputSpec, ModelCard, OutputSpec
+from edgeperc.types.card import Golden, InputSpec, ModelCard, OutputSpec
+from edgeperc.types.views import CameraGeometry
 
 __all__ = ["CLASSES", "camera_card", "camera_model", "write_camera"]
 

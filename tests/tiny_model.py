@@ -7,7 +7,8 @@ import hashlib
 import numpy as np
 
 from edgeperc.inference.session import golden_input
-from edgeperc.types.card import CARD_KEY, Golden, InputSpec, ModelCard, OutputSpec, TopViewGeometry
+from edgeperc.types.card import CARD_KEY, Golden, InputSpec, ModelCard, OutputSpec
+from edgeperc.types.views import TopViewGeometry
 
 __all__ = [
     "CONVOLUTION",

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgeperc import EdgepercError
-from edgeperc.inference.session import PRECISIONS, PROVIDERS, available_providers
+from edgeperc.inference.providers import PROVIDERS, available_providers
+from edgeperc.inference.session import PRECISIONS
 from edgeperc.system.machine import cpu_features, settings_path, write_settings
 from edgeperc.zoo import DEFAULT, choose, resolve
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from edgeperc import ImageLabels
 from edgeperc.simulation.camera import forward_camera, render
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
-from edgeperc.types.card import CHANNELS, CameraGeometry, ModelCard
+from edgeperc.types.card import CHANNELS, ModelCard
+from edgeperc.types.views import CameraGeometry
 
 from ..worker import Prediction
 from .engines import Engine

@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from edgeperc.camera.image import ImageScaler
-from edgeperc.inference.network_input import project
-from edgeperc.inference.projection import make_projector
-from edgeperc.inference.session import available_providers
+from edgeperc.inference.projection import make_projector, project
+from edgeperc.inference.providers import available_providers
 from edgeperc.preprocess.condition import condition
-from edgeperc.types.card import CameraGeometry, ModelCard
+from edgeperc.types.card import ModelCard
 from edgeperc.types.sensor import get_sensor
+from edgeperc.types.views import CameraGeometry
 from edgeperc.zoo import DEFAULT, Variant, listed, resolve
 
 from ..samples import percentile

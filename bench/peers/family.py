@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from edgeperc.evaluation.evaluate import evaluate
-from edgeperc.inference.network_input import project
-from edgeperc.inference.projection import make_projector
+from edgeperc.inference.projection import make_projector, project
 from edgeperc.simulation.samples import simulated_scan
-from edgeperc.types.card import CameraGeometry, ModelCard
+from edgeperc.types.card import ModelCard
+from edgeperc.types.views import CameraGeometry
 from edgeperc.zoo import listed
 
 from ..plots import as_svg

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from edgeperc import ModelError
-from edgeperc.types.card import TopViewGeometry
+from edgeperc.types.views import TopViewGeometry
 from edgeperc.zoo import resolve
 
 __all__ = ["resized"]

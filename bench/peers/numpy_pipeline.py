@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from edgeperc import Box, PointLabels, TopView
 from edgeperc.ground.planes import find_ground
-from edgeperc.types.card import ModelCard, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.card import ModelCard
 from edgeperc.types.geometry import draw_footprints
 from edgeperc.types.mounting import MODEL_HEIGHT_M
 from edgeperc.types.sensor import SensorProfile
+from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 
 from ..worker import Prediction
 from .engines import Engine
@@ -87,7 +88,7 @@ class NumpyPipeline:
 
 
 def spread(values: NDArray[np.float32], block: tuple[int, int]) -> NDArray[np.float32]:
-    """`edgeperc.inference.blocks.fill_pixels` in numpy."""
+    """`edgeperc.inference.decode.fill_pixels` in numpy."""
     (rows, cols), (n, height, width) = block, values.shape
     parts = values.reshape(n // (rows * cols), rows, cols, height, width)
     return parts.transpose(0, 3, 1, 4, 2).reshape(-1, height * rows, width * cols)
@@ -125,7 +126,7 @@ def _heights(projector: NumpyTopView | NumpyRangeImage, points: NDArray[np.float
 
 
 def dense_boxes(card: ModelCard, logits: NDArray[np.float32], dense: NDArray[np.float32]) -> list[Box]:
-    """`edgeperc.inference.decode.decode_dense` in numpy."""
+    """`edgeperc.inference.box_heads.decode_dense` in numpy."""
     view = card.view
     assert isinstance(view, TopViewGeometry)
     heat = dense[0]

@@ -36,8 +36,9 @@ from edgeperc.inference.projection import (
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
-from edgeperc.types.card import InputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.card import InputSpec
 from edgeperc.types.sensor import get_sensor
+from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 
 from ..render import Section, number, text
 from .rounds import measure, versions

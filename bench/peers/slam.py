@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 from edgeperc import Box, Perceiver, Perception, Tracker, movable_points, moving_points
 from edgeperc.datasets.kitti import KittiCalibration, KittiObjects, read_objects
 from edgeperc.errors import SplitError
-from edgeperc.evaluation.unseen import check_unseen, training_scans_of
+from edgeperc.evaluation.judge import check_unseen, training_scans_of
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate_sequence

@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CardMismatchError, ImageError, InferenceError
 from ..system.kernel_cache import njit
-from ..types.card import CHANNELS, CameraGeometry, InputSpec
+from ..types.card import CHANNELS, InputSpec
 from ..types.points import read_only
+from ..types.views import CameraGeometry
 
 __all__ = ["MAX_EDGE", "MAX_PIXELS", "ImageScaler", "as_image", "check_size", "label_pixels"]
 

@@ -18,12 +18,12 @@ from ..errors import CalibrationError, ImageError, OptionError, PointsError
 from ..ground.planes import find_ground
 from ..preprocess.returns import returns
 from ..system.kernel_cache import njit
-from ..types.card import TopViewGeometry
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.perception import ImageLabels, Perception, TopView
 from ..types.points import read_only
 from ..types.sensor import SensorProfile, get_sensor
+from ..types.views import TopViewGeometry
 from .calibration import Calibration
 
 __all__ = ["UNSEEN", "camera_road", "fill_nearest", "fill_painted", "paint"]

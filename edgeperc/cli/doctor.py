@@ -151,7 +151,7 @@ def _packages() -> Iterator[Finding]:
             yield Finding(name, "ok", str(import_module(name).__version__))
         except Exception as exc:  # a wheel for another processor or numpy raises other errors than ImportError
             yield _broken(name, exc, f"pip install --force-reinstall {name}")
-    from ..inference.session import runtime_version
+    from ..inference.providers import runtime_version
 
     versions = _installed("onnxruntime")
     builds = [name for name in _BUILDS if name in versions]
@@ -212,7 +212,7 @@ def _providers() -> Iterator[Finding]:
     present = [provider.name for provider in providers() if provider.available]
     if not present:
         return  # without onnxruntime, which `_packages` reports
-    from ..inference.session import PLUGINS, devices
+    from ..inference.providers import PLUGINS, devices
 
     for short, package in PLUGINS.items():
         if short not in present and find_spec(package) is not None:

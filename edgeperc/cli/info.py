@@ -213,7 +213,7 @@ def _folded(rows: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
 def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
     """Rows that describe a model; accuracy and geometry come from the card of its first variant."""
     from ..inference.listing import purpose
-    from ..types.card import CameraGeometry, TopViewGeometry
+    from ..types.views import CameraGeometry, TopViewGeometry
 
     path, card = variants[0].path, variants[0].card
     size = ", ".join(f"{variant.precision} {_megabytes(variant.path)}" for variant in variants)
@@ -337,7 +337,8 @@ def _scan_rows(
 
     from ..ground.leveling import FROZEN_AFTER, MountingEstimator
     from ..preprocess.condition import scale
-    from ..preprocess.fitness import FitnessProfile, check_dropped, check_fitness
+    from ..preprocess.findings import check_dropped, check_fitness
+    from ..preprocess.fitness import FitnessProfile
     from ..preprocess.remission import RemissionMatcher
     from ..preprocess.returns import returns
     from ..readers.captures import read_scans

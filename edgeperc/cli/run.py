@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import EdgepercError, ImageError, ModelError, PointsError
-from ..sinks import PerceivedScan, Sink
+from ..records import PerceivedScan, Sink
 from ..system.extras import require
 from ..system.remote import Remote, location
 from .arguments import (

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from .output import print_line
 
 if TYPE_CHECKING:
-    from ..sinks import Sink
+    from ..records import Sink
 
 __all__ = ["SINKS", "add_sinks", "open_sinks", "wanted_sinks"]
 

@@ -26,7 +26,7 @@ class Straightener:
     Parameters
     ----------
     poses : Path, optional
-        A file for `edgeperc.preprocess.motion.Trajectory.from_tum`; by default the motion is that between the last two scans
+        A file for `edgeperc.Trajectory.from_tum`; by default the motion is that between the last two scans
         that were tracked.
 
     Raises

@@ -22,9 +22,9 @@ from ..readers.files import read_points
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASS_OF
 from ..system.names import check_file
-from ..types.card import TopViewGeometry
 from ..types.geometry import inside
 from ..types.perception import Box
+from ..types.views import TopViewGeometry
 from .splits import TEST_DRIVES, in_split
 
 __all__ = [

@@ -7,8 +7,6 @@ over drives would be wider; CamVid's validation images are of a single drive.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -17,115 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import CardMismatchError, ImageError, OptionError, SplitError
+from ..datasets.images import FOLDERS, IGNORE, LEVEL, LabeledImages, image_hash
+from ..errors import CardMismatchError, OptionError, SplitError
 from ..perceiver import Perceiver
-from ..readers.images import IMAGE_SUFFIXES, read_image
-from ..system.extras import require
+from .judge import training_scans_of
 from .metrics import Confusion
-from .unseen import training_scans_of
 
-__all__ = ["LabeledImages", "evaluate_images", "image_figures", "image_hash"]
-
-FOLDERS = {"train": "train", "validation": "val", "test": "test"}
-UNLABELED = ("unlabelled", "unlabeled", "void")
-IGNORE = 255
-LEVEL = 0.95
-
-
-class LabeledImages:
-    """Images and the classes of their pixels: ``{train,val,test}/NAME``, ``{...}annot/NAME.png`` and ``classes.json``.
-
-    Parameters
-    ----------
-    root : Path
-
-    Attributes
-    ----------
-    classes : tuple of str
-        By id, without the one of unlabeled pixels.
-
-    Raises
-    ------
-    ImageError
-        ``classes.json`` cannot be read, or holds something else.
-    """
-
-    def __init__(self, root: Path) -> None:
-        self.root = root
-        try:
-            document = json.loads((root / "classes.json").read_text("utf-8"))
-            names = [str(document[str(k)]) for k in range(len(document))]
-        except (KeyError, OSError, RecursionError, TypeError, ValueError) as exc:
-            raise ImageError(
-                f"{root / 'classes.json'}: expected an object of id and name, ids from 0 ({type(exc).__name__}: {exc})"
-            ) from exc
-        self.classes = tuple(name for name in names if name.casefold() not in UNLABELED)
-        self._of_id = np.full(256, IGNORE, np.uint8)
-        for k, name in enumerate(names[:256]):
-            self._of_id[k] = self.classes.index(name) if name in self.classes else IGNORE
-
-    @staticmethod
-    def is_one(root: Path) -> bool:
-        """Whether a folder has this layout."""
-        annotated = any((root / f"{folder}annot").is_dir() for folder in FOLDERS.values())
-        return annotated and (root / "classes.json").is_file()
-
-    def files(self, split: str) -> list[Path]:
-        """The images of ``"train"``, ``"validation"``, ``"test"``, ``"held-back"`` (the last two) or ``"all"``, sorted.
-
-        Raises
-        ------
-        ImageError
-            There is none.
-        """
-        parts = {"held-back": ("validation", "test"), "all": tuple(FOLDERS)}.get(split, (split,))
-        folders = [self.root / FOLDERS[part] for part in parts]
-        found = [
-            file
-            for folder in folders
-            if folder.is_dir()
-            for file in sorted(folder.iterdir())
-            if file.suffix.lower() in IMAGE_SUFFIXES
-        ]
-        if not found:
-            raise ImageError(f"{self.root} has no images of split {split}; expected some in {folders[0]}")
-        return found
-
-    def read(self, file: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Read an image and its labels.
-
-        Returns
-        -------
-        image : (H, W, 3) uint8
-        labels : (H, W) uint8
-            Index into ``classes``; 255 where unlabeled.
-
-        Raises
-        ------
-        ImageError
-            A file cannot be read, or the sizes differ.
-        """
-        image = read_image(file)
-        path = file.parent.with_name(f"{file.parent.name}annot") / f"{file.stem}.png"
-        pillow = require("PIL.Image", "camera", "Reading an image", package="pillow")
-        try:
-            with pillow.open(path, formats=("PNG",)) as opened:
-                if opened.size != (image.shape[1], image.shape[0]) or opened.mode not in ("L", "P"):
-                    raise ImageError(
-                        f"{path}: {opened.size[0]} x {opened.size[1]} pixels of mode {opened.mode}; expected an id for "
-                        f"each of the {image.shape[1]} x {image.shape[0]} pixels of {file.name}"
-                    )
-                ids = np.asarray(opened)
-        except ImageError:
-            raise
-        except Exception as exc:  # on damaged files, Pillow's decoders raise nearly every kind of error
-            raise ImageError(f"{path}: the labels cannot be read ({type(exc).__name__}: {exc})") from exc
-        return image, self._of_id[ids]
-
-
-def image_hash(image: NDArray[np.uint8]) -> str:
-    """SHA-256 of an image's size and pixels, which a card records of the training images."""
-    return hashlib.sha256(f"{image.shape}".encode() + np.ascontiguousarray(image).tobytes()).hexdigest()
+__all__ = ["evaluate_images", "image_figures"]
 
 
 def evaluate_images(

@@ -15,7 +15,8 @@ from typing import Any, Literal
 
 from ..agreement.rules import RULES
 from ..datasets.kitti import KittiObjects, SemanticKitti
-from ..datasets.scan_folder import ScanFolder, known_layouts
+from ..datasets.layout import known_layouts
+from ..datasets.scan_folder import ScanFolder
 from ..errors import EdgepercError, OptionError, PointsError
 from ..perceiver import BoxesFrom, Learned, Perceiver
 from ..simulation.samples import FIRST_SEED

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,24 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..agreement.rules import RULES
-from ..datasets.kitti import Frame, RoadFrame
-from ..datasets.scan_folder import IGNORED, ScanFrame, box_label, class_number
-from ..errors import ModelError
+from ..datasets.kitti import Frame, RoadFrame, scan_hash
+from ..datasets.layout import IGNORED, box_label, class_number
+from ..datasets.scan_folder import ScanFrame
+from ..errors import ModelError, SplitError
 from ..ground.planes import find_ground
 from ..inference.decode import decode_classes
-from ..inference.network_input import project
-from ..inference.projection import make_projector
+from ..inference.projection import make_projector, project
 from ..inference.session import Session
-from ..objects.cluster import classes_of_boxes
+from ..objects.boxes import classes_of_boxes
 from ..perceiver import BoxesFrom, Perceiver
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASSES
-from ..types.card import TopViewGeometry
+from ..types.card import ModelCard
 from ..types.frame import ModelFrame
 from ..types.geometry import inside
 from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.perception import Box, Perception, PointLabels, TopView
 from ..types.sensor import SensorProfile
+from ..types.views import TopViewGeometry
 from .causes import count_causes
 from .center_ap import count_centers
 from .kitti_ap import count_all_round, count_in_image
@@ -38,9 +39,8 @@ from .metrics import FEWEST_RETURNS, BoxEvaluator, ProbabilitySweep, boxes_to_fi
 from .mistakes import Mistakes
 from .tables import ALL_ROUND, BANDS, SITTING, VEHICLES, Record, banded, within
 from .truth import Truth, folder_truth, kitti_truth, semantickitti_truth, simulated_truth
-from .unseen import check_unseen, training_scans_of
 
-__all__ = ["Judge"]
+__all__ = ["Judge", "check_unseen", "training_scans_of"]
 
 FARTHEST_M = 46.0  # farther objects are evaluated by their points, but never listed as mistakes
 
@@ -427,3 +427,20 @@ def _renamed(labels: NDArray[np.uint8], names: Sequence[str], classes: Sequence[
     coarse = {"drivable": "road", **dict.fromkeys(VEHICLES, "vehicle")}
     own = [name if name in classes else coarse.get(name, "") for name in names]
     return np.array([classes.index(name) if name in classes else 0 for name in own], np.uint8)[labels]
+
+
+def training_scans_of(cards: Sequence[ModelCard]) -> dict[str, set[str]]:
+    """Read from cards the `scan_hash` of every real training scan, by name and version of the model."""
+    frames = {f"{card.name} {card.version}": card.training.get("frames", {}) for card in cards}
+    return {name: set(of.values()) if isinstance(of, Mapping) else set() for name, of in frames.items()}
+
+
+def check_unseen(trained_on: Mapping[str, set[str]], name: str, drive: str, points: NDArray[np.float32]) -> None:
+    """Raise `SplitError` if one of the models was trained on this scan (see `training_scans_of`)."""
+    digest = scan_hash(points)
+    for model, hashes in trained_on.items():
+        if digest in hashes:
+            raise SplitError(
+                f"{model} was trained on scan {name} of drive {drive}, so figures on it are too good; evaluate the "
+                "test split, or a model trained without this drive, or ask for split 'train'"
+            )

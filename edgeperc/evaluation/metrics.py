@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
-from ..types.card import TopViewGeometry
 from ..types.geometry import bounding_rectangles, oriented_iou, rectangles, shared_area
 from ..types.perception import Box
+from ..types.views import TopViewGeometry
 
 __all__ = [
     "FEWEST_RETURNS",

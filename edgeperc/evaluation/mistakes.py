@@ -2,16 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..types.perception import Box
+from ..view.canvas import (
+    Label,
+    add_axes,
+    area_of,
+    as_png,
+    new_figure,
+    place_labels,
+    shorten,
+    wrap,
+    write_at,
+    write_text,
+)
+from ..view.colors import FAINT, FALSE, FOUND, INK, MISSED
+from ..view.content import drawable_boxes, drawable_points
 
-__all__ = ["Mistakes"]
+__all__ = ["Mistakes", "draw_mistakes"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,3 +83,114 @@ class Mistakes:
         if n_wrong:
             parts.append(f"{n_wrong:,} point{'s' * (n_wrong != 1)} wrong")
         return "; ".join(parts) or "no mistake"
+
+
+# Sizes in pixels; the view reaches 27 m to each side and 52 m ahead.
+_WIDTH, _MARGIN, _TOP, _GAP, _CAPTION = 1600, 28, 168, 20, 84
+_RIGHT_M, _FAR_M = 27.0, 52.0
+_LEGEND = (
+    (
+        MISSED,
+        "missed",
+        "object that was not found, with its number of points; dots: points of objects with another label",
+    ),
+    (FALSE, "false", "box where there is no object; dots: background points with the label of an object"),
+    (FOUND, "found", "object that was found"),
+)
+
+
+def draw_mistakes(
+    scans: Sequence[Mistakes], path: str | Path | None = None, *, title: str = "", columns: int = 3
+) -> bytes:
+    """Draw missed objects and false detections from above, one panel for each scan.
+
+    Parameters
+    ----------
+    scans : sequence of Mistakes
+        Drawn in this order. Scans without a mistake are only counted in the heading.
+    path : str or Path, optional
+        File to write as well; an existing file is replaced atomically.
+    title : str
+        For example the names of the models.
+    columns : int
+        Largest number of panels side by side.
+
+    Returns
+    -------
+    png : bytes
+        1600 pixels wide.
+
+    Raises
+    ------
+    MissingExtraError
+        matplotlib is not installed.
+    OSError
+        The file cannot be written.
+    """
+    wrong = [scan for scan in scans if scan.n_errors > 0]
+    columns = max(1, min(columns, max(1, len(wrong))))
+    # A single panel takes half of the width.
+    width = (_WIDTH - 2 * _MARGIN - (columns - 1) * _GAP) // max(columns, 2)
+    height = round(width * (_FAR_M + 3.0) / (2.0 * _RIGHT_M))
+    rows = -(-len(wrong) // columns)
+    figure = new_figure(_WIDTH, _TOP + (rows * (height + _CAPTION + _GAP) if wrong else 90))
+    heading = f"{len(wrong)} scan{'s' * (len(wrong) != 1)} with mistakes"
+    if len(wrong) < len(scans):
+        heading += f", {len(scans) - len(wrong)} without"
+    style = {"fontsize": 21.0, "fontweight": "bold"}
+    end = write_at(figure, _MARGIN, 42, heading, **style) + 18
+    write_at(figure, end, 43, shorten(figure, title, _WIDTH - _MARGIN - end, fontsize=16.0), fontsize=16.0, color=FAINT)
+    for k, (color, name, meaning) in enumerate(_LEGEND):
+        end = write_at(figure, _MARGIN, 84 + 27 * k, "■", fontsize=17.0, color=color)
+        write_at(figure, end + 8, 84 + 27 * k, name, fontsize=14.0, fontweight="bold")
+        write_at(figure, _MARGIN + 128, 84 + 27 * k, meaning, fontsize=14.0, color=FAINT)
+    if not wrong:
+        text = (
+            "No mistakes: every object was found, and there are no false detections."
+            if scans
+            else "No scans were given."
+        )
+        write_at(figure, _MARGIN, _TOP + 36, text, fontsize=17.0)
+    for k, scan in enumerate(wrong):
+        left = _MARGIN + k % columns * (width + _GAP)
+        top = _TOP + k // columns * (height + _CAPTION + _GAP)
+        name = "  ".join(dict.fromkeys((scan.name, scan.drive)))
+        style = {"fontsize": 14.5, "fontweight": "bold"}
+        write_at(figure, left, top + 16, shorten(figure, name, width, **style), **style)
+        lines = wrap(figure, scan.summary, width, fontsize=12.0)
+        if len(lines) > 2:
+            lines = [lines[0], f"{lines[1]} …"]
+        for line, text in enumerate(lines):
+            write_at(figure, left, top + 40 + 22 * line, text, fontsize=12.0, color=FAINT)
+        _draw_panel(add_axes(figure, left, top + _CAPTION - 8, width, height), scan)
+    return as_png(figure, path)
+
+
+def _draw_panel(axes: Any, scan: Mistakes) -> None:
+    from matplotlib.patches import Polygon
+
+    axes.set_xlim(_RIGHT_M, -_RIGHT_M)  # y grows to the left
+    axes.set_ylim(-3.0, _FAR_M)
+    for ring in (15.0, 30.0, 45.0):
+        turn = np.linspace(-math.pi / 2.0, math.pi / 2.0, 90)
+        axes.plot(ring * np.sin(turn), ring * np.cos(turn), color=INK, alpha=0.16, linewidth=0.8)
+        write_text(axes, 0.0, ring, f"{ring:.0f} m", color=FAINT, fontsize=10.5, ha="center", va="bottom", alpha=0.8)
+    sensor = np.array([[0.0, 1.0], [0.8, -1.2], [-0.8, -1.2]])
+    axes.add_patch(Polygon(sensor, closed=True, facecolor=INK))
+    seen = drawable_points(scan.points)
+    for kind, color, size, alpha in ((0, "#66737f", 0.7, 0.6), (2, FALSE, 7.0, 0.9), (1, MISSED, 7.0, 0.9)):
+        shown = scan.points[seen & (scan.wrong == kind)]
+        axes.scatter(shown[:, 1], shown[:, 0], s=size, c=color, alpha=alpha, linewidths=0, zorder=2 + (kind > 0))
+    boxes = [(box, FOUND, "-", "") for box in scan.found]
+    boxes += [(box, FALSE, "--", box.label) for box in scan.false]
+    boxes += [(box, MISSED, "-", f"{box.label} · {n:,}") for box, n in scan.missed]
+    labels = []
+    for box, color, line, text in boxes:
+        if not drawable_boxes([box]):
+            continue
+        footprint = box.corners()[:, ::-1]
+        style = {"edgecolor": color, "linestyle": line, "linewidth": 2.2 if text else 1.2, "zorder": 5 if text else 4}
+        axes.add_patch(Polygon(footprint, closed=True, fill=False, **style))
+        if text and abs(box.center[1]) < _RIGHT_M and -3.0 < box.center[0] < _FAR_M:
+            labels.append(Label(area_of(axes, footprint), text, color))
+    place_labels(axes, labels, [area_of(axes, sensor)], fontsize=12.0)

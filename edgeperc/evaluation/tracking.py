@@ -24,8 +24,8 @@ from ..tracking.tracks import ClassParameters, Tracks
 from ..types.perception import Box
 from .ab3dmot import SETTINGS, Ab3dmot
 from .headings import Headings, count_headings
+from .judge import check_unseen, training_scans_of
 from .tracking_metrics import FrameTracks, FrameTruth, evaluate_tracks
-from .unseen import check_unseen, training_scans_of
 
 __all__ = [
     "CLASSES",

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.scan_folder import ScanFolder, ScanFrame, class_number
+from ..datasets.layout import class_number
+from ..datasets.scan_folder import ScanFolder, ScanFrame
 from ..errors import ModelError, PointsError
 from ..perceiver import ADAPTATIONS, Perceiver
 from ..preprocess.sensor_fit import fit_sensor
@@ -19,10 +20,9 @@ from ..simulation.scene import POINT_CLASSES
 from ..types.perception import Box
 from ..types.sensor import SensorProfile, get_sensor
 from ..zoo import DEFAULT
-from .judge import Judge
+from .judge import Judge, check_unseen, training_scans_of
 from .metrics import FEWEST_RETURNS, Confusion, ObjectKey, object_key
 from .tables import FEWEST_OBJECTS, figures
-from .unseen import check_unseen, training_scans_of
 
 __all__ = ["Scan", "compare"]
 

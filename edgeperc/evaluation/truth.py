@@ -13,12 +13,12 @@ from ..datasets.scan_folder import ScanFrame
 from ..ground.observed import Observer
 from ..simulation.samples import IGNORE, labels_by_boxes, simulated_scan
 from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES, TOP_VIEW_CLASSES
-from ..types.card import TopViewGeometry
 from ..types.frame import ModelFrame
 from ..types.geometry import draw_footprints, inside
 from ..types.mounting import Mounting
 from ..types.perception import Box
 from ..types.points import read_only
+from ..types.views import TopViewGeometry
 from .kitti_ap import FrontTruth, image_size_of
 from .tables import VEHICLES
 

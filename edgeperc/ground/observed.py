@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..system.kernel_cache import njit
-from ..types.card import TopViewGeometry
 from ..types.frame import ModelFrame
 from ..types.mounting import MODEL_MOUNTING, Mounting
 from ..types.points import read_only
 from ..types.sensor import SensorProfile
+from ..types.views import TopViewGeometry
 
 __all__ = [
     "BRIDGE_M",

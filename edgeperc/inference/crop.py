@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from ..ground.observed import FARTHER
 from ..system.kernel_cache import njit
-from ..types.card import RangeImageGeometry, TopViewGeometry
 from ..types.perception import PointLabels
 from ..types.points import read_only
+from ..types.views import RangeImageGeometry, TopViewGeometry
 
 __all__ = ["MARGIN_M", "Crop", "fill_rows", "fill_spread", "sectors_of_turn", "spread"]
 

@@ -11,7 +11,7 @@ from ..errors import MissingExtraError
 from ..types.card import ModelCard
 from ..types.sensor import SENSORS
 from ..zoo import DEFAULT, listed
-from .session import PROVIDERS, available_providers
+from .providers import PROVIDERS, available_providers
 
 __all__ = ["ModelInfo", "ProviderInfo", "SensorInfo", "models", "providers", "purpose", "sensors"]
 

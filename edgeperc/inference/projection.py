@@ -16,9 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CardError, PointsError
+from ..ground.planes import find_ground
 from ..system.kernel_cache import njit
-from ..types.card import InputSpec, RangeImageGeometry, TopViewGeometry
+from ..types.card import InputSpec
+from ..types.mounting import MODEL_HEIGHT_M
 from ..types.points import read_only
+from ..types.views import RangeImageGeometry, TopViewGeometry
 
 __all__ = [
     "HEIGHT_RANGE_M",
@@ -26,7 +29,9 @@ __all__ = [
     "RangeImageProjector",
     "TopViewProjector",
     "column_edges",
+    "input_heights",
     "make_projector",
+    "project",
     "row_edges",
     "tabulate",
 ]
@@ -617,7 +622,7 @@ def _heights(needed: bool, n: int, height_m: NDArray[np.float32] | None) -> NDAr
     if height_m is None:
         raise PointsError(
             "the input has the channel height_above_ground and height_m is missing; pass height_m of "
-            "edgeperc.ground.planes.find_ground, or use edgeperc.inference.network_input.project"
+            "edgeperc.ground.planes.find_ground, or use edgeperc.inference.projection.project"
         )
     if height_m.shape != (n,) or height_m.dtype != np.float32:
         raise PointsError(f"height_m is {height_m.shape} {height_m.dtype} for {n} points; expected ({n},) float32")
@@ -647,3 +652,31 @@ def _project(
     )
     projector.fill(points, projection.image, projection.index, projection.pixel, height_m)
     return projection
+
+
+def input_heights(
+    projector: TopViewProjector | RangeImageProjector, points: NDArray[np.float32]
+) -> NDArray[np.float32] | None:
+    """Heights of points of the models' frame above the ground, (n,) float32 [m]; None if the projector needs none."""
+    return find_ground(points, mount_height_m=MODEL_HEIGHT_M).height_m if projector.needs_ground else None
+
+
+def project(projector: TopViewProjector | RangeImageProjector, points: NDArray[np.float32]) -> Projection:
+    """Project a scan and, if the projector needs it, find the ground first, as a `Perceiver` does.
+
+    Parameters
+    ----------
+    projector : TopViewProjector or RangeImageProjector
+    points : (n, 4) float32, C-contiguous
+        x, y, z [m] in the frame of the models, remission in 0..1.
+
+    Returns
+    -------
+    Projection
+
+    Raises
+    ------
+    PointsError
+        ``points`` has another shape, dtype or layout.
+    """
+    return projector.project(points, input_heights(projector, points))

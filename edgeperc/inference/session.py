@@ -9,8 +9,6 @@ golden outputs. `edgeperc.zoo.choose` selects the variant of a network and its p
 from __future__ import annotations
 
 import hashlib
-import importlib
-import importlib.metadata
 import json
 import logging
 import os
@@ -32,7 +30,6 @@ from ..errors import (
     ProviderError,
     SettingsError,
 )
-from ..system.extras import require, without_telemetry
 from ..system.machine import (
     MAX_THREADS,
     compiled_folder,
@@ -45,33 +42,13 @@ from ..system.machine import (
 from ..system.printable import printable
 from ..types.onnx_file import check_graph, read_model
 from ..zoo import Variant, choose, digest, resolve
-from .blocks import fill_pixels
+from .decode import fill_pixels
+from .providers import AUTO, PLUGINS, PROVIDERS, SHARING, available_providers, load_onnxruntime, plugin_devices, version
 
-__all__ = ["PRECISIONS", "PROVIDERS", "Session", "available_providers", "devices", "golden_input", "runtime_version"]
+__all__ = ["PRECISIONS", "Session", "golden_input"]
 
 logger = logging.getLogger(__name__)
 
-PROVIDERS: Mapping[str, str] = {
-    "tensorrt-rtx": "NvTensorRTRTXExecutionProvider",
-    "tensorrt": "TensorrtExecutionProvider",
-    "cuda": "CUDAExecutionProvider",
-    "openvino": "OpenVINOExecutionProvider",
-    "coreml": "CoreMLExecutionProvider",
-    "directml": "DmlExecutionProvider",
-    "qnn": "QNNExecutionProvider",
-    "webgpu": "WebGpuExecutionProvider",
-    "cpu": "CPUExecutionProvider",
-}
-AUTO = ("cuda", "openvino", "cpu")
-# Providers that come as plugins beside stock onnxruntime: provider, then the package with its library.
-PLUGINS = {
-    "openvino": "onnxruntime_ep_openvino",
-    "tensorrt-rtx": "onnxruntime_ep_nv_tensorrt_rtx",
-    "qnn": "onnxruntime_qnn",
-    "webgpu": "onnxruntime_ep_webgpu",
-}
-# Providers that run on the processor's cores and take a number of threads.
-SHARING = ("cpu", "openvino")
 PRECISIONS = ("fp32", "bf16", "int8")
 # Largest accepted deviation, in standard deviations of an output. The same graph in fp32 differs by 1e-5 between
 # engines; tripled weights of one layer give 0.5.
@@ -81,89 +58,6 @@ MAX_GOLDEN_DEVIATION = {"fp32": 0.02, "bf16": 0.5, "int8": 0.5}
 GOLDEN_SHARE = 0.9
 # The largest network of this project takes 0.2 s on one core of a server.
 MAX_FIRST_RUN_S = 30.0
-
-
-def _onnxruntime() -> Any:
-    without_telemetry()
-    ort = require("onnxruntime", "cpu", "Running a model")
-    ort.set_default_logger_severity(4)  # its exceptions contain the messages, and ours repeat them
-    return ort
-
-
-def _version(package: str) -> str:
-    return importlib.metadata.version(package.replace("_", "-"))
-
-
-def _plugin_devices(ort: Any, short: str) -> list[Any]:
-    """Devices of a plugin provider on this computer; empty if its package is not installed or finds none.
-
-    Of Qualcomm's, the NPU comes first: its plugin also offers the GPU and the processor.
-    """
-    if not hasattr(ort, "get_ep_devices"):
-        return []
-    name = PROVIDERS[short]
-
-    def devices() -> list[Any]:
-        found = [d for d in ort.get_ep_devices() if d.ep_name == name]
-        return sorted(found, key=lambda d: d.device.type.name != "NPU") if short == "qnn" else found
-
-    if not devices():
-        try:
-            library = importlib.import_module(PLUGINS[short]).get_library_path()
-            ort.register_execution_provider_library(name, library)
-        except ImportError:
-            return []
-        except Exception as exc:  # onnxruntime's errors share no base but Exception
-            if "already registered" not in str(exc):
-                raise ProviderError(f"the plugin for provider {short!r} is installed but does not load: {exc}") from exc
-    return devices()
-
-
-def available_providers() -> tuple[str, ...]:
-    """The providers that ``Perceiver(provider=...)`` accepts on this computer, as keys of `PROVIDERS`.
-
-    Raises
-    ------
-    MissingExtraError
-        onnxruntime is not installed.
-    ProviderError
-        The plugin of a provider is installed but does not load.
-    """
-    ort = _onnxruntime()
-    stock = ort.get_available_providers()
-    return tuple(s for s, name in PROVIDERS.items() if name in stock or (s in PLUGINS and _plugin_devices(ort, s)))
-
-
-def runtime_version() -> str:
-    """The version of the installed onnxruntime.
-
-    Raises
-    ------
-    MissingExtraError
-        onnxruntime cannot be imported; the cause says why.
-    """
-    return str(_onnxruntime().__version__)
-
-
-def devices() -> tuple[str, ...]:
-    """The devices that onnxruntime and its installed plugins offer here, such as ``"cpu: CPU Intel"``.
-
-    Empty if onnxruntime is older than 1.23, which does not list them.
-
-    Raises
-    ------
-    MissingExtraError, ProviderError
-        As `available_providers`.
-    """
-    present, ort = available_providers(), _onnxruntime()  # in this order, which loads the plugins
-    found = ort.get_ep_devices() if hasattr(ort, "get_ep_devices") else ()
-    names = {PROVIDERS[short]: short for short in present}
-    listed = (
-        f"{names.get(each.ep_name.partition('.')[0], each.ep_name)}: "  # such as OpenVINOExecutionProvider.AUTO
-        f"{each.device.type.name} {each.device.vendor or each.ep_vendor}"
-        for each in found
-    )
-    return tuple(dict.fromkeys(each.strip() for each in listed))
 
 
 _Attempt = tuple[str, Variant, str, int | None]
@@ -268,7 +162,7 @@ class Session:
         _check_names(provider, precision)
         self._trusted, self._at_once = trusted, at_once
         self._made_in, self._running_in = os.getpid(), 0
-        ort = _onnxruntime()
+        ort = load_onnxruntime()
         variants = resolve(model)
         self.digest = digest(variants)
         attempts = self._attempts(variants, provider, precision, n_threads)
@@ -371,7 +265,7 @@ class Session:
             entries["session.disable_cpu_ep_fallback"] = "1"
         for key, value in entries.items():
             options.add_session_config_entry(key, value)
-        plugin = _plugin_devices(ort, short) if short in PLUGINS else []
+        plugin = plugin_devices(ort, short) if short in PLUGINS else []
         settings: dict[str, str] = {}
         try:
             if plugin:
@@ -382,7 +276,7 @@ class Session:
                         cpu["INFERENCE_NUM_THREADS"] = str(n_threads)
                     if self.shares_cores:  # else the threads of both sessions are tied to the same cores
                         cpu["ENABLE_CPU_PINNING"] = "NO"
-                    engine = f"onnxruntime {ort.__version__}, {_version(PLUGINS[short])}"
+                    engine = f"onnxruntime {ort.__version__}, {version(PLUGINS[short])}"
                     compiled = compiled_folder(engine, self.sha256, precision)
                     if compiled is not None:
                         cpu["CACHE_DIR"] = str(compiled)
@@ -547,7 +441,7 @@ class Session:
             return Session(self.path, self.short, precision=self.precision, at_once=at_once, trusted=trusted)
         twin = object.__new__(Session)
         vars(twin).update(vars(self))
-        with _terminated(_onnxruntime(), None) as run_options:
+        with _terminated(load_onnxruntime(), None) as run_options:
             twin._bind(run_options)
         return twin
 

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 
 from ..errors import CardError, PointsError
 from ..system.kernel_cache import njit
-from ..types.perception import DroppedPoints
 from ..types.points import read_only
-from ..types.sensor import SensorProfile
 
-__all__ = ["Finding", "FitnessProfile", "check_dropped", "check_fitness", "check_profiles", "fill_scan_sums"]
+__all__ = ["FitnessProfile", "fill_scan_sums"]
 
 # About 6,000 points are enough. Steps are prime, so that they do not align with the rows of an organized scan.
 _STEPS = np.array([1, 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 53, 61, 71, 83, 97, 127, 167, 223, 307, 401])
@@ -196,7 +194,7 @@ def fill_scan_sums(
 
 
 @dataclass(frozen=True)
-class _Measures:
+class Measures:
     """Statistics of one scan; None where the scan does not determine a value."""
 
     points_in_view: float
@@ -235,7 +233,7 @@ def _quantile(histogram: NDArray[np.int64], share: float) -> float:
     return float(np.searchsorted(total, share * total[-1], side="right")) + 0.5
 
 
-def _measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> _Measures | None:
+def measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> Measures | None:
     """Statistics of one scan; None if no point is finite."""
     if points.ndim != 2 or points.shape[1] != 4:
         raise PointsError(f"got an array of shape {points.shape}; expected (n, 4): x, y, z, remission")
@@ -263,7 +261,7 @@ def _measure(points: NDArray[np.float32], azimuth_deg: tuple[float, float]) -> _
     peaks = heights.max(axis=1) / max(1.0, sums[7])
     flattest = int(peaks.argmax())
     has_ground = bool(peaks[2] >= _GROUND_SHARE)
-    return _Measures(
+    return Measures(
         points_in_view=float(sums[1]) * step,
         view_covered=float(sums[3]),
         remission_median=min(max((_quantile(remissions, 0.5) - 1.0) / 256.0, 0.0), 1.0),
@@ -355,11 +353,11 @@ class FitnessProfile:
         PointsError
             No scan has a finite point, or an array is not a scan.
         """
-        measures = [measure for scan in scans if (measure := _measure(scan, azimuth_deg)) is not None]
+        measures = [measured for scan in scans if (measured := measure(scan, azimuth_deg)) is not None]
         if not measures:
             raise PointsError("no scan with a finite point was given; a profile needs the training scans")
         seen: dict[str, Range | None] = {}
-        for name in _MEASURED:
+        for name in MEASURED:
             values = [value for measure in measures if (value := getattr(measure, name)) is not None]
             seen[name] = (round(min(values), 4), round(max(values), 4)) if values else None
         return cls(n_scans=len(measures), azimuth_deg=(float(azimuth_deg[0]), float(azimuth_deg[1])), **seen)  # type: ignore[arg-type]
@@ -429,350 +427,4 @@ def _range(name: str, value: Any) -> Range:
     return first, second
 
 
-_MEASURED = tuple(field.name for field in fields(FitnessProfile) if field.name not in ("n_scans", "azimuth_deg"))
-
-
-class Finding(str):
-    """A sentence about how a scan differs from the training scans.
-
-    Attributes
-    ----------
-    gross : bool
-        The scan is so different that results would be meaningless; a `Perceiver` refuses it by default.
-    """
-
-    gross: bool
-
-    def __new__(cls, text: str, gross: bool = False) -> Finding:
-        """Make a finding from its sentence."""
-        finding = super().__new__(cls, text)
-        finding.gross = gross
-        return finding
-
-
-def check_fitness(points: NDArray[np.float32], profile: FitnessProfile, sensor: SensorProfile) -> tuple[Finding, ...]:
-    """Describe how a scan differs from the scans that a model was trained on, and what to do about it.
-
-    Margins are wide: the check finds gross mistakes (axes, units, remission scale, another sensor) and accepts ordinary
-    scans of the right sensor, including scans cropped to the model's view. It does not find scans turned by 180 degrees
-    or mirrored left to right, and misses one of nine scans turned by 90 degrees (measured on KITTI).
-
-    Parameters
-    ----------
-    points : (n, 4) float32
-        x, y, z [m], remission scaled to 0..1 by ``sensor``. Points that are not finite are skipped.
-    profile : FitnessProfile
-    sensor : SensorProfile
-        The sensor that the caller says recorded the scan. If its remission function is constant, because the scan has
-        no remission, remission is not checked.
-
-    Returns
-    -------
-    tuple of Finding
-        One sentence for each difference; empty if there is none. Gross are: another unit; a vertical axis that is not
-        z, or points down; ground more than 1.3 m from where it lay in training; no points below the horizon; points
-        far above the sensor's field of view; points in less than a quarter of the model's view; half of the points as
-        near as in a room; less than 1/20 of the fewest or more than 20 times the most points in training; fewer than
-        eight rows of points; remission that is constant, missing or off the sensor's range.
-
-    Raises
-    ------
-    PointsError
-        ``points`` has another shape.
-    """
-    return check_profiles(points, [profile], sensor)
-
-
-def check_profiles(
-    points: NDArray[np.float32], profiles: Iterable[FitnessProfile], sensor: SensorProfile
-) -> tuple[Finding, ...]:
-    """Describe how a scan differs from the training scans of several models, each difference once.
-
-    Parameters
-    ----------
-    points, sensor
-        As in `check_fitness`.
-    profiles : iterable of FitnessProfile
-        The scan is measured once for all profiles of the same view.
-
-    Returns
-    -------
-    tuple of Finding
-
-    Raises
-    ------
-    PointsError
-        ``points`` has another shape.
-    """
-    measured: dict[Range, _Measures | None] = {}
-    found: dict[Finding, None] = {}
-    for profile in profiles:
-        if profile.azimuth_deg not in measured:
-            measured[profile.azimuth_deg] = _measure(points, profile.azimuth_deg)
-        found |= dict.fromkeys(_findings(measured[profile.azimuth_deg], profile, sensor))
-    return tuple(found)
-
-
-def _findings(scan: _Measures | None, profile: FitnessProfile, sensor: SensorProfile) -> tuple[Finding, ...]:
-    if scan is None:
-        return (Finding("The scan holds no finite point: is the sensor connected and its driver running?", True),)
-    if scan.n_sampled < 300.0 and scan.points_in_view < 0.2 * profile.points_in_view[0]:
-        return (_too_few(scan, profile),)  # too few points for the other checks
-    findings = _geometry_findings(scan, profile, sensor)
-    if sensor.remission is None or any(sensor.remission.coefficients[1:]):
-        findings += _remission_findings(scan, profile, sensor)
-    return tuple(findings)
-
-
-def _too_few(scan: _Measures, profile: FitnessProfile) -> Finding:
-    fewest = profile.points_in_view[0]
-    return Finding(
-        f"The model's view holds about {scan.points_in_view:.0f} points, in training it held at least {fewest:.0f}: is "
-        "the scan complete, and the sensor clean?",
-        scan.points_in_view < fewest / 20.0,
-    )
-
-
-_NEARLY_ALL = 10  # near points for each that is left; also empty beams may be more than the returns
-_USUAL_M = 9.0  # median distance in a street
-
-
-def check_dropped(points: NDArray[np.float32], dropped: DroppedPoints, sensor: SensorProfile) -> tuple[Finding, ...]:
-    """Describe a scan of which nearly all is nearer than the sensor measures: a street in another unit, or no returns.
-
-    Parameters
-    ----------
-    points : (n, 4) float32
-        The scan before anything was dropped.
-    dropped : DroppedPoints
-        What `edgeperc.preprocess.returns.returns` dropped of it.
-    sensor : SensorProfile
-    """
-    n_left = len(points) - dropped.total
-    if dropped.too_near <= _NEARLY_ALL * n_left:
-        return ()
-    with np.errstate(over="ignore", invalid="ignore"):
-        flat_m = np.hypot(points[:, 0], points[:, 1])
-        known = np.isfinite(points).all(axis=1) & np.isfinite(flat_m) & (flat_m > 0.0)
-        median_m = float(np.median(flat_m[known])) if known.any() else math.inf
-        factors = np.array([*[_USUAL_M / median_m] * 3, 1.0], np.float32)
-        street = _measure(points[known] * factors, (180.0, -180.0))
-    # Empty beams are on one ray, or at ranges that show no ground.
-    if street is not None and street.ground_m is not None and street.beams >= min(_FEWEST_ROWS, sensor.n_beams):
-        return (
-            Finding(
-                f"The median distance is {median_m:.3g}, and {dropped.too_near / len(points):.0%} of the points are "
-                f"nearer than the {sensor.name} measures ({sensor.min_range_m:g} m): the coordinates seem to be in "
-                "another unit; convert them to meters.",
-                True,
-            ),
-        )
-    if n_left:
-        return ()
-    return (
-        Finding(
-            f"The scan holds no return: {dropped.too_near:,} of its {len(points):,} points are at most "
-            f"{sensor.min_range_m:g} m from the sensor, beams without a return. Is the sensor covered, or the profile "
-            f"{sensor.name} another sensor's?",
-            True,
-        ),
-    )
-
-
-_UNITS = (("millimeters", 1e3), ("centimeters", 1e2), ("kilometers", 1e-3))
-
-# Bounds of a gross difference.
-# Less than the height of a sensor on a car, so that an origin on the road is found. The ground of 481
-# KITTI scans varies by 0.4 m.
-_GROUND_OFF_M = 1.3
-# Points this far above the sensor's field of view and that of training. At most 2 deg in KITTI and PandaSet; 16 deg if
-# PandaSet's origin is on the road.
-_TOO_HIGH_DEG = 12.0
-# A spinning sensor has as many returns in all directions: the fullest of 64 sectors has at most 2.6 times the mean in
-# KITTI, PandaSet, Argoverse 2, Lyft, DDAD, nuScenes and View of Delft; 6 and more if the origin is 45 m off.
-_MOST_UNEVEN = 4.0
-_NEAREST_M = 25.0  # of 99 % of the points; at most 10 m in these data
-# Fewer rows than a sensor of 16 beams has (12 to 13 are counted).
-_FEWEST_ROWS = 8.0
-
-
-def _geometry_findings(scan: _Measures, profile: FitnessProfile, sensor: SensorProfile) -> list[Finding]:
-    near, far = profile.range_median_m
-    if not near / 20.0 <= scan.range_median_m <= far * 20.0:
-        factor = scan.range_median_m / math.sqrt(near * far)
-        unit = next((name for name, size in _UNITS if 0.2 * size < factor < 5.0 * size), "another unit")
-        return [
-            Finding(
-                f"The median distance is {scan.range_median_m:.3g}, in training it was {near:.0f} to {far:.0f} m: "
-                f"the coordinates seem to be in {unit}; convert them to meters.",
-                True,
-            )
-        ]
-    if scan.flat_axis is not None:
-        towards = ("+" if scan.flat_m > 0.0 else "-") + "xyz"[scan.flat_axis]
-        advice = "" if towards != "+y" else " They may be a camera's (x right, y down, z forward): pass z, -x, -y."
-        return [
-            Finding(
-                f"The ground seems to lie towards {towards}, where the model expects it towards -z: the axes are not "
-                f"x forward, y left, z up.{advice}",
-                True,
-            )
-        ]
-
-    if scan.unevenness > _MOST_UNEVEN or scan.nearest_m > _NEAREST_M:
-        return [
-            Finding(
-                f"One direction holds {scan.unevenness:.1f} times as many points as the mean one, and the nearest "
-                f"points are {scan.nearest_m:.0f} m away: the sensor is not at the origin, as in the frame of a map; "
-                "subtract the sensor's position from the points.",
-                True,
-            )
-        ]
-
-    findings: list[Finding] = []
-    has_ground = scan.ground_m is not None and profile.ground_m is not None
-    if scan.ground_m is not None and profile.ground_m is not None:
-        low, high = profile.ground_m
-        if scan.ground_m > 0.5 and high < 0.0:
-            return [
-                Finding(
-                    f"The ground lies {scan.ground_m:.1f} m above the sensor: it is mounted upside down, or z points "
-                    "down; turn the points by 180 degrees about x (negate y and z).",
-                    True,
-                )
-            ]
-        if not low - 0.6 <= scan.ground_m <= high + 0.6:
-            has_ground = False
-            findings.append(
-                Finding(
-                    f"The ground lies at z = {scan.ground_m:.1f} m, in training it lay at {low:.1f} to {high:.1f} m: "
-                    "the sensor is mounted at another height: pass the right mounting (--mount-height), or none, "
-                    "so that it is found.",
-                    not low - _GROUND_OFF_M <= scan.ground_m <= high + _GROUND_OFF_M,
-                )
-            )
-
-    low, high = profile.elevation_p01_deg[1], profile.elevation_p99_deg[1]
-    # The lowest beams are missing from a crop to a camera's view (9 deg) and from a scan cut short (up to 13).
-    unlike = scan.elevation_p01_deg > low + 13.0 or scan.elevation_p99_deg > high + 8.0
-    if unlike and scan.elevation_p01_deg < scan.elevation_p99_deg:  # both are 0 if no point is far
-        findings.append(
-            Finding(
-                f"The points lie between {scan.elevation_p01_deg:.0f} and {scan.elevation_p99_deg:.0f} deg of "
-                f"elevation, in training between {low:.0f} and {high:.0f}: this is a sensor of another field of view, "
-                "or the origin is not the sensor, or it is not level.",
-                scan.elevation_p01_deg > 0.0 or scan.elevation_p99_deg > max(high, sensor.fov_up_deg) + _TOO_HIGH_DEG,
-            )
-        )
-
-    left, right = profile.azimuth_deg
-    if scan.view_covered < 0.6 * profile.view_covered[0]:
-        findings.append(
-            Finding(
-                f"Only {scan.view_covered:.0%} of the model's view ({left:.0f} to {right:.0f} deg of azimuth) holds "
-                "points: the scan is cropped, or x does not point forward.",
-                scan.view_covered < 0.25 * profile.view_covered[0],
-            )
-        )
-    elif (
-        scan.road_ahead is not None
-        and profile.road_ahead is not None
-        and scan.road_ahead < min(-0.5, profile.road_ahead[0] - 0.3)
-    ):
-        findings.append(
-            Finding(
-                "There are more obstacles ahead and behind than to the sides, as if the road ran along y: if x does "
-                "not point forward, pass its direction: Mounting(yaw_deg=-90), --turn -90, for x right, y forward. "
-                "If the vehicle stands across the road, ignore this."
-            )
-        )
-
-    # The smallest median in 481 KITTI scans is 3.8 m, above half of `near`; in two captures of a room 1.3 and 2.1 m.
-    if scan.ground_m is None and scan.range_median_m < near / 2.0:
-        findings.append(
-            Finding(
-                f"Half of the points are nearer than {scan.range_median_m:.1f} m, in training {near:.0f} to "
-                f"{far:.0f} m, and no ground was found: this seems to be a room, or the sensor is covered; the models "
-                "know roads.",
-                True,
-            )
-        )
-
-    few_rows = scan.beams < 0.75 * profile.beams[0] and scan.beams_per_deg < 0.65 * profile.beams_per_deg[0]
-    too_few_rows = scan.beams < min(_FEWEST_ROWS, sensor.n_beams)
-    if (few_rows and has_ground) or too_few_rows:  # rows cannot be separated if the origin is wrong
-        findings.append(
-            Finding(
-                f"The scan has about {scan.beams:.0f} rows of points (sensor {sensor.name}: {sensor.n_beams}), in "
-                f"training it had at least {profile.beams[0]:.0f}: expect to lose far and small objects, or use a "
-                "model trained for it.",
-                too_few_rows,
-            )
-        )
-
-    if scan.points_in_view < 0.2 * profile.points_in_view[0]:
-        findings.append(_too_few(scan, profile))
-    elif scan.points_in_view > 5.0 * profile.points_in_view[1]:
-        findings.append(
-            Finding(
-                f"The model's view holds about {scan.points_in_view:.0f} points, in training it held at most "
-                f"{profile.points_in_view[1]:.0f}: pass one turn of the sensor at a time.",
-                scan.points_in_view > 20.0 * profile.points_in_view[1],
-            )
-        )
-    return findings
-
-
-def _remission_findings(scan: _Measures, profile: FitnessProfile, sensor: SensorProfile) -> list[Finding]:
-    # Without remission, 36 % of the car points and 74 % of the road cells remain (intersection over union with the
-    # results with remission, 20 KITTI scans, default models); with a constant one, 15 % and 32 %.
-    low, high = sensor.remission_range
-    raw_low, raw_high, raw_p99 = (
-        value * (high - low) + low for value in (scan.remission_low, scan.remission_high, scan.remission_p99)
-    )
-    stated = f"the profile {sensor.name} has {low:g} to {high:g}"
-    useless = max(0.9, profile.remission_zeros[1] + 0.05)
-    if scan.remission_beyond > 0.01 or scan.remission_low < -0.05:
-        likely = next((f"(0, {top})" for top in (1, 255, 65535) if raw_low >= 0.0 and raw_high <= top), "that")
-        return [
-            Finding(
-                f"Remission runs from {raw_low:g} to {raw_high:g}, but {stated}: pass sensor= a profile whose "
-                f"remission_range is {likely}.",
-                True,
-            )
-        ]
-    if scan.remission_zeros > useless:
-        return [
-            Finding(
-                f"Remission is 0 for {scan.remission_zeros:.0%} of the points: the field is missing or was not read; "
-                "the model needs it.",
-                True,
-            )
-        ]
-    # Data in 0..1 has 0.004 of a full scale of 255, which is one bin too.
-    in_one_bin = scan.remission_p99 < 0.02 and scan.remission_low < scan.remission_high
-    if scan.remission_alike > useless and not in_one_bin:
-        return [
-            Finding(
-                f"Remission is the same for {scan.remission_alike:.0%} of the points ({raw_high:g}): the field holds "
-                "something else; the model needs it.",
-                True,
-            )
-        ]
-    if scan.remission_p99 < 0.2 * profile.remission_p99[0]:
-        return [
-            Finding(
-                f"Remission hardly exceeds {raw_p99:.2g}, but {stated}: pass sensor= a profile with the "
-                "remission_range of this data, (0, 1) if it is scaled already.",
-                scan.remission_p99 < 0.02,
-            )
-        ]
-    darkest, brightest = profile.remission_median
-    if not darkest / 4.0 <= scan.remission_median <= brightest * 2.5:
-        return [
-            Finding(
-                f"The median remission is {scan.remission_median:.2f} of full scale, in training it was {darkest:.2f} "
-                f"to {brightest:.2f}: sensors differ in remission; fit a profile with edgeperc fit-sensor."
-            )
-        ]
-    return []
+MEASURED = tuple(field.name for field in fields(FitnessProfile) if field.name not in ("n_scans", "azimuth_deg"))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..errors import SensorError
 from ..types.sensor import RemissionFunction, SensorProfile
 from .condition import scale
-from .fitness import Finding
+from .findings import Finding
 from .sensor_fit import (
     RANGE_EDGES_M,
     REFERENCES,

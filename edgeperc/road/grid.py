@@ -17,13 +17,13 @@ from ..ground.planes import find_ground
 from ..preprocess.returns import returns
 from ..system.atomic import write_atomic
 from ..system.kernel_cache import njit
-from ..types.card import TopViewGeometry
 from ..types.frame import ModelFrame
 from ..types.geometry import draw_footprints
 from ..types.mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from ..types.perception import Perception, TopView
 from ..types.points import as_points, read_only
 from ..types.sensor import SensorProfile, get_sensor
+from ..types.views import TopViewGeometry
 
 __all__ = ["OccupancyGrid", "fill_standing", "occupancy_grid"]
 

@@ -25,7 +25,7 @@ from ..view.colors import color_of, rgb
 from ..view.content import EDGES, box_corners
 
 if TYPE_CHECKING:
-    from ..sinks import PerceivedScan
+    from ..records import PerceivedScan
     from ..types.perception import Box
 
 __all__ = ["CLOUD", "OUTPUTS", "RosMessages", "nanoseconds"]

@@ -13,7 +13,7 @@ from ..errors import MissingExtraError, ModelError, OptionError, PointsError, Pr
 from ..live import stream
 from ..readers.decoders import cloud_points, describe_cloud
 from ..readers.tables import MAX_SCAN_BYTES
-from ..sinks import PerceivedScan
+from ..records import PerceivedScan
 from ..system.names import check_text
 from .graph import RELIABLE, Graph, Output
 from .messages import CLOUD, DIAGNOSTICS, OUTPUTS, RosMessages

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
-from ..types.card import TopViewGeometry
 from ..types.geometry import draw_footprints, wrapped
 from ..types.perception import Box
 from ..types.sensor import SensorProfile, get_sensor
+from ..types.views import TopViewGeometry
 from .raycast import (
     fill_bounds,
     fill_cast,

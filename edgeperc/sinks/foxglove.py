@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionError
+from ..records import PerceivedScan
 from ..system.atomic import open_atomic
 from ..system.extras import require
 from ..system.lanes import returns
@@ -37,7 +38,6 @@ from ..types.frame import quaternion
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, TopView
 from ..view.content import EDGES, box_corners, box_text, track_text
-from . import PerceivedScan
 from .kept_file import KeptFile
 from .relay import MAX_VIEWERS, Relay
 from .scene import (

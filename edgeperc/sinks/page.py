@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..records import PerceivedScan
 from ..types.points import as_points
 from ..view.page import DrivePage
-from . import PerceivedScan
 from .scene import checked_target
 
 __all__ = ["PageSink"]

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from ..camera.calibration import read_kitti_calibration
 from ..errors import OptionError
+from ..records import PerceivedScan
 from ..system.atomic import open_atomic, write_atomic
 from ..types.geometry import wrapped
 from ..types.perception import Box
-from . import PerceivedScan
 from .names import ScanFiles, stem_of
 
 __all__ = ["KINDS", "PrelabelSink"]

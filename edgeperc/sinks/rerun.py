@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..records import PerceivedScan
 from ..system.atomic import open_atomic
 from ..system.extras import require
 from ..system.printable import printable
 from ..types.mounting import MODEL_HEIGHT_M
 from ..types.perception import Box, TopView
 from ..view.content import box_text, track_text
-from . import PerceivedScan
 from .scene import Trails, base_pose, byte_colors, checked_target, colored_points, nanoseconds
 
 __all__ = ["RerunSink"]

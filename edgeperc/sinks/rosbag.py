@@ -12,7 +12,7 @@ from ..ros2.messages import OUTPUTS, RosMessages, nanoseconds
 from ..system.extras import require
 
 if TYPE_CHECKING:
-    from . import PerceivedScan
+    from ..records import PerceivedScan
 
 __all__ = ["TOPICS", "BagSink"]
 

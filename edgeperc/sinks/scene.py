@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
+from ..records import PerceivedScan
 from ..tracking.tracks import Tracks
 from ..types.frame import ModelFrame
 from ..types.points import as_points
 from ..view.colors import color_of, rgb
 from ..view.content import check_points, in_model_frame, paint_points
-from . import PerceivedScan
 
 __all__ = [
     "BASE",

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionError, PointsError
+from ..records import PerceivedScan
 from ..system.atomic import write_atomic
 from ..tracking.moving import movable_points, moving_points
 from ..types.points import as_points
-from . import PerceivedScan
 from .names import ScanFiles, stem_of
 
 __all__ = ["StaticSink"]

@@ -31,30 +31,35 @@ PACKAGE = "edgeperc"
 # Kernels that Python calls, by what needs them; tests compare them with what is compiled.
 KERNELS: Mapping[str, str] = MappingProxyType(
     {
-        "scans": "preprocess.returns.fill_returns preprocess.returns.has_returns_only preprocess.condition.fill_rendered "
-        "inference.decode.fill_labels types.frame.fill_moved ground.planes.fill_lowest "
-        "ground.planes.fit_first_plane inference.projection.fill_image",
+        "scans": "ground.planes.fill_lowest ground.planes.fit_first_plane inference.decode.fill_labels "
+        "inference.projection.fill_image preprocess.condition.fill_rendered "
+        "preprocess.returns.fill_returns preprocess.returns.has_returns_only types.frame.fill_moved",
         "fitness": "preprocess.fitness.fill_scan_sums",
         "crop": "inference.crop.fill_rows",
-        "gaps": "preprocess.condition.fill_between",
+        "gaps": "preprocess.interpolation.fill_between",
         "turn": "types.frame.fill_turned",
-        "ground": "ground.planes.fill_heights ground.planes.fill_heights_above_plane ground.planes.fill_levels ground.planes.fill_planes",
-        "points": "inference.projection.mark_range_image objects.refine.fill_point_labels objects.refine.fill_without_outliers",
+        "ground": "ground.planes.fill_heights ground.planes.fill_heights_above_plane ground.planes.fill_levels "
+        "ground.planes.fill_planes",
+        "points": "inference.projection.mark_range_image objects.refine.fill_point_labels "
+        "objects.refine.fill_without_outliers",
         "points outside": "inference.crop.fill_spread",
         "clusters": "objects.linkage.chain_points objects.linkage.fill_clusters",
-        "boxes": "objects.cluster.fill_cluster_labels objects.cluster.fill_groups objects.cluster.fill_rectangle types.geometry.fill_oriented_iou "
-        "types.geometry.mark_nms objects.persons.fill_person_groups objects.persons.fill_persons",
-        "agreement": "agreement.rules.clear_columns agreement.rules.clear_ground agreement.rules.count_inside agreement.rules.fill_support "
-        "objects.persons.complete_persons agreement.votes.apply_verdicts agreement.votes.fill_tallies agreement.votes.fill_verdicts agreement.votes.fill_votes",
-        "standing": "agreement.rules.sum_inside",
-        "road": "road.ahead.fill_corridor road.ahead.fill_first_cells "
-        "types.geometry.fill_footprints ground.observed.fill_lowest_returns "
-        "ground.observed.follow_rays ground.observed.mark_cells road.outline.fill_grown road.outline.fill_rings road.outline.mark_connected "
-        "road.outline.mark_needed road.outline.merge_corners road.outline.resolve_contacts inference.projection.mark_top_view",
-        "cells": "agreement.cells.clear_cells agreement.cells.fill_marks",
-        "detections": "inference.decode.clear_empty inference.decode.count_not_finite inference.decode.fill_footprint_sums inference.decode.mark_peaks "
+        "boxes": "objects.boxes.fill_rectangle objects.cluster.fill_cluster_labels objects.cluster.fill_groups "
+        "objects.persons.fill_person_groups objects.persons.fill_persons types.geometry.fill_oriented_iou "
         "types.geometry.mark_nms",
-        "blocks": "inference.blocks.fill_pixels",
+        "agreement": "agreement.rules.clear_columns agreement.rules.clear_ground agreement.rules.count_inside "
+        "agreement.rules.fill_support agreement.votes.apply_verdicts agreement.votes.fill_tallies "
+        "agreement.votes.fill_verdicts agreement.votes.fill_votes objects.persons.complete_persons",
+        "standing": "agreement.rules.sum_inside",
+        "road": "ground.observed.fill_lowest_returns ground.observed.follow_rays ground.observed.mark_cells "
+        "inference.projection.mark_top_view road.ahead.fill_corridor road.ahead.fill_first_cells "
+        "road.outline.fill_grown road.outline.fill_rings road.outline.mark_connected "
+        "road.outline.mark_needed road.outline.merge_corners road.outline.resolve_contacts "
+        "types.geometry.fill_footprints",
+        "cells": "agreement.cells.clear_cells agreement.cells.fill_marks",
+        "detections": "inference.box_heads.count_not_finite inference.box_heads.fill_footprint_sums "
+        "inference.box_heads.mark_peaks inference.decode.clear_empty types.geometry.mark_nms",
+        "blocks": "inference.decode.fill_pixels",
         "image": "camera.image.fill_image_labels camera.image.fill_scaled",
     }
 )

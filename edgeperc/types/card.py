@@ -5,32 +5,20 @@ A card is stored in the model file, under one ``metadata_props`` key, so that it
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import os
 import reprlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
-
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CardError
 from ..system.names import check_name, check_text
 from .onnx_file import read_metadata
+from .views import CameraGeometry, RangeImageGeometry, TopViewGeometry, check, check_each
 
-__all__ = [
-    "CARD_KEY",
-    "CameraGeometry",
-    "Golden",
-    "InputSpec",
-    "ModelCard",
-    "OutputSpec",
-    "RangeImageGeometry",
-    "TopViewGeometry",
-]
+__all__ = ["CARD_KEY", "Golden", "InputSpec", "ModelCard", "OutputSpec"]
 
 CARD_KEY = "edgeperc.card"
 Precision = Literal["fp32", "int8"]
@@ -38,10 +26,8 @@ SCHEMA = 3
 MAX_CHARACTERS = 16 * 10**6
 MAX_DEPTH = 32
 MAX_TEXT = 100_000  # characters of one text of the free-form metadata
-MAX_ROWS, MAX_COLUMNS, MAX_PIXELS = 4096, 65_536, 16 * 10**6
 MAX_CHANNELS = 16
 MAX_BLOCK = 16
-MIN_SECTOR_DEG = 1.0
 MIN_GOLDEN_VALUES, MAX_GOLDEN_VALUES = 16, 100_000
 OUTPUT_KINDS = ("class_logits", "class_probabilities", "box_slots", "box_dense", "camera_logits")
 CHANNELS = {
@@ -50,172 +36,6 @@ CHANNELS = {
     "range_image": ("x", "y", "z", "remission", "range", "height_above_ground"),
 }
 N_DENSE_CHANNELS, N_FRONT_CHANNELS = 9, 2
-
-
-def _check(field: str, value: float, low: float, high: float) -> None:
-    """Refuse a number of the card that is out of its bounds, or not finite."""
-    if not low <= value <= high:
-        raise CardError(f"{field} is {reprlib.repr(value)}; expected a number from {low:g} to {high:g}")
-
-
-def _check_each(field: str, values: Iterable[float], low: float, high: float) -> None:
-    for index, value in enumerate(values):
-        _check(f"{field}[{index}]", value, low, high)
-
-
-def _check_size(rows: int, columns: int) -> None:
-    if not (1 <= rows <= MAX_ROWS and 1 <= columns <= MAX_COLUMNS and rows * columns <= MAX_PIXELS):
-        raise CardError(
-            f"the view has {reprlib.repr(rows)} rows and {reprlib.repr(columns)} columns; expected 1 to {MAX_ROWS} "
-            f"rows, 1 to {MAX_COLUMNS} columns and at most {MAX_PIXELS} pixels"
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class TopViewGeometry:
-    """The ground ahead as an image (SSADNet 2.1.2). Row 0 is farthest ahead, column 0 leftmost.
-
-    Attributes
-    ----------
-    x_range_m, y_range_m, z_range_m : tuple of 2 float
-        Bounds of the view [m] in the sensor frame, lower first.
-    cell_m : float
-        Edge of a cell [m].
-    """
-
-    x_range_m: tuple[float, float] = (6.0, 46.0)
-    y_range_m: tuple[float, float] = (-10.0, 10.0)
-    z_range_m: tuple[float, float] = (-2.5, 2.5)
-    cell_m: float = 0.1
-
-    def __post_init__(self) -> None:
-        for name in ("x_range_m", "y_range_m", "z_range_m"):
-            low, high = getattr(self, name)
-            _check_each(f"view.{name}", (low, high), -1e4, 1e4)
-            if not high - low >= 1e-3:
-                raise CardError(f"view.{name} is {(low, high)}; expected two finite numbers, the lower first")
-        _check("view.cell_m", self.cell_m, 1e-3, 100.0)
-        _check_size(self.height, self.width)
-
-    @property
-    def kind(self) -> str:
-        return "top_view"
-
-    @property
-    def height(self) -> int:
-        """Rows, along x."""
-        return round((self.x_range_m[1] - self.x_range_m[0]) / self.cell_m)
-
-    @property
-    def width(self) -> int:
-        """Columns, along y."""
-        return round((self.y_range_m[1] - self.y_range_m[0]) / self.cell_m)
-
-    def holds(self, x: float, y: float) -> bool:
-        """Whether a position x, y [m] in the sensor frame is in view."""
-        (near, far), (right, left) = self.x_range_m, self.y_range_m
-        return near <= x < far and right <= y < left
-
-    def cells(self, x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-        """Find the cells that contain some positions.
-
-        Parameters
-        ----------
-        x, y : array_like
-            Positions in the sensor frame [m]; their shapes must broadcast.
-
-        Returns
-        -------
-        rows, cols : ndarray of int64
-        in_view : ndarray of bool
-            False if a position is out of view or not finite; its row and column are then not valid.
-        """
-        row = np.floor((self.x_range_m[1] - np.asarray(x)) / self.cell_m)
-        col = np.floor((self.y_range_m[1] - np.asarray(y)) / self.cell_m)
-        in_view = (row >= 0) & (row < self.height) & (col >= 0) & (col < self.width)
-        with np.errstate(invalid="ignore"):  # NaN and what int64 cannot hold are out of view
-            return row.astype(np.int64), col.astype(np.int64), in_view
-
-    def cell_centers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centers of the cells in the sensor frame [m]: x (rows, 1) and y (1, columns)."""
-        # np.float64, because older type stubs of numpy widen the type of a product with a Python float
-        cell_m = np.float64(self.cell_m)
-        x = np.float64(self.x_range_m[1]) - (np.arange(self.height, dtype=np.float64)[:, None] + 0.5) * cell_m
-        y = np.float64(self.y_range_m[1]) - (np.arange(self.width, dtype=np.float64)[None, :] + 0.5) * cell_m
-        return x, y
-
-
-@dataclass(frozen=True, slots=True)
-class RangeImageGeometry:
-    """The scan as seen from the sensor (PointSeg 3.1). Row 0 is the top beam, column 0 leftmost.
-
-    Attributes
-    ----------
-    row_elevations_deg : tuple of float
-        Elevation of every row [deg], top to bottom, strictly decreasing, not necessarily evenly spaced.
-    width : int
-        Columns, evenly spread over the azimuths.
-    azimuth_left_deg, azimuth_right_deg : float
-        Azimuths of the image's left and right edges [deg], counter-clockwise from +x; 180 and -180 for a full turn.
-    """
-
-    row_elevations_deg: tuple[float, ...]
-    width: int = 512
-    azimuth_left_deg: float = 45.0
-    azimuth_right_deg: float = -45.0
-
-    def __post_init__(self) -> None:
-        rows = self.row_elevations_deg
-        falling = all(a > b for a, b in itertools.pairwise(rows))
-        if len(rows) < 2 or not falling or not all(-90.0 < e < 90.0 for e in rows):
-            raise CardError(
-                f"view.row_elevations_deg holds {len(rows)} values; expected two or more, strictly decreasing, "
-                "between -90 and 90 degrees"
-            )
-        _check_size(len(rows), self.width)
-        left, right = self.azimuth_left_deg, self.azimuth_right_deg
-        # A full turn takes a run of the network for each sector.
-        if not (right >= -180.0 and right + MIN_SECTOR_DEG <= left and left <= 180.0):
-            raise CardError(
-                f"view azimuths are left {left}, right {right}; expected -180 <= right < left <= 180, at least "
-                f"{MIN_SECTOR_DEG:g} degree apart"
-            )
-
-    @property
-    def kind(self) -> str:
-        return "range_image"
-
-    @property
-    def height(self) -> int:
-        """Rows, one per beam."""
-        return len(self.row_elevations_deg)
-
-
-@dataclass(frozen=True, slots=True)
-class CameraGeometry:
-    """The image of a camera, scaled to the network's input. Row 0 is the top, column 0 leftmost.
-
-    Attributes
-    ----------
-    width, height : int
-        Columns and rows of the input.
-    fit : {"stretch"}
-        How an image of another size gets there: all of it is scaled to ``width`` and ``height``, bilinearly with
-        half-pixel centers (`edgeperc.camera.image.ImageScaler`), whatever its aspect; nothing is cropped or padded.
-    """
-
-    width: int
-    height: int
-    fit: Literal["stretch"] = "stretch"
-
-    def __post_init__(self) -> None:
-        if self.fit != "stretch":
-            raise CardError(f"view.fit is {reprlib.repr(self.fit)}; expected stretch")
-        _check_size(self.height, self.width)
-
-    @property
-    def kind(self) -> str:
-        return "camera"
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,10 +69,10 @@ class InputSpec:
                 f"input has {len(self.channels)} channels, {len(self.mean)} means and {len(self.std)} standard "
                 "deviations; expected as many of each, at least one"
             )
-        _check("the number of input channels", len(self.channels), 1, MAX_CHANNELS)
+        check("the number of input channels", len(self.channels), 1, MAX_CHANNELS)
         check_text("input.name", self.name, CardError)
-        _check_each("input.mean", self.mean, -1e6, 1e6)
-        _check_each("input.std", self.std, 1e-6, 1e6)
+        check_each("input.mean", self.mean, -1e6, 1e6)
+        check_each("input.std", self.std, 1e-6, 1e6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,8 +140,8 @@ class Golden:
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**64:
             raise CardError(f"golden.seed is {reprlib.repr(self.seed)}; expected a whole number from 0 to 2**64 - 1")
-        _check("the length of golden.input_sha256", len(self.input_sha256), 0, 64)
-        _check("the number of golden.outputs", len(self.outputs), 1, MAX_CHANNELS)
+        check("the length of golden.input_sha256", len(self.input_sha256), 0, 64)
+        check("the number of golden.outputs", len(self.outputs), 1, MAX_CHANNELS)
         for name, record in self.outputs.items():
             field = f"golden.outputs[{reprlib.repr(name)}]"
             missing = {"std", "positions", "values"} - record.keys()
@@ -330,11 +150,11 @@ class Golden:
             positions, values = record["positions"], record["values"]
             if not isinstance(positions, list) or not isinstance(values, list) or len(positions) != len(values):
                 raise CardError(f"{field} holds positions and values that are not lists of one length")
-            _check(f"the number of {field}.values", len(values), 1, MAX_GOLDEN_VALUES)
-            _check(f"{field}.std", _float(f"{field}.std", record["std"]), 0.0, 1e30)
+            check(f"the number of {field}.values", len(values), 1, MAX_GOLDEN_VALUES)
+            check(f"{field}.std", _float(f"{field}.std", record["std"]), 0.0, 1e30)
             for index, (position, value) in enumerate(zip(positions, values, strict=True)):
-                _check(f"{field}.positions[{index}]", _int(f"{field}.positions", position), 0, 2**40)
-                _check(f"{field}.values[{index}]", _float(f"{field}.values", value), -1e30, 1e30)
+                check(f"{field}.positions[{index}]", _int(f"{field}.positions", position), 0, 2**40)
+                check(f"{field}.values[{index}]", _float(f"{field}.values", value), -1e30, 1e30)
 
     def check_output(self, name: str, size: int) -> None:
         """Check the record of an output against the number of its values.
@@ -461,16 +281,16 @@ class ModelCard:
                 f"box_size_spreads of {[*self.box_size_spreads]}; expected a spread and a prior for each box class"
             )
         for name, sizes in self.box_size_priors.items():
-            _check_each(f"box_size_priors.{name}", sizes, 0.01, 100.0)
+            check_each(f"box_size_priors.{name}", sizes, 0.01, 100.0)
         for name, spreads in self.box_size_spreads.items():
-            _check_each(f"box_size_spreads.{reprlib.repr(name)}", spreads, 1e-6, 10.0)
-        _check("score_threshold", self.score_threshold, 0.0, 1.0)
-        _check("nms_iou", self.nms_iou, 0.0, 1.0)
-        _check("mount_height_m", self.mount_height_m, -100.0, 100.0)
+            check_each(f"box_size_spreads.{reprlib.repr(name)}", spreads, 1e-6, 10.0)
+        check("score_threshold", self.score_threshold, 0.0, 1.0)
+        check("nms_iou", self.nms_iou, 0.0, 1.0)
+        check("mount_height_m", self.mount_height_m, -100.0, 100.0)
         for name, record in self.precisions.items():
             check_text("the precision", name, CardError)
             if "loss" in record:
-                _check(f"precisions.{name}.loss", _float(f"precisions.{name}.loss", record["loss"]), 0.0, 100.0)
+                check(f"precisions.{name}.loss", _float(f"precisions.{name}.loss", record["loss"]), 0.0, 100.0)
         if self.golden is not None:
             for output in self.outputs:
                 shape = self.output_shape(output.kind)

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import PointsError
 from ..system.kernel_cache import njit
-from .card import TopViewGeometry
 from .perception import Box
 from .points import read_only
+from .views import TopViewGeometry
 
 __all__ = [
     "bounding_rectangles",

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PointsError
-from .card import TopViewGeometry
 from .mounting import MODEL_MOUNTING, Mounting
 from .sensor import RemissionFunction
+from .views import TopViewGeometry
 
 __all__ = ["Box", "DroppedPoints", "ImageLabels", "Perception", "PointLabels", "TopView"]
 

@@ -7,7 +7,6 @@ existing file atomically. Pictures are also returned as bytes; their ``path`` is
 from __future__ import annotations
 
 from .files import write_labels, write_ply
-from .mistakes import draw_mistakes
 from .page import DrivePage, write_html
 from .painted import draw_painted
 from .picture import draw, draw_image
@@ -17,7 +16,6 @@ __all__ = [
     "DrivePage",
     "draw",
     "draw_image",
-    "draw_mistakes",
     "draw_painted",
     "draw_tracks",
     "flatten_scan",

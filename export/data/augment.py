@@ -11,20 +11,20 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeperc.datasets.scan_folder import class_number
+from edgeperc.datasets.layout import class_number
 from edgeperc.ground.planes import find_ground
 from edgeperc.inference.projection import row_edges
 from edgeperc.objects.cluster import find_clusters
 from edgeperc.preprocess.remission import NO_REMISSION
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES
-from edgeperc.types.card import RangeImageGeometry
 from edgeperc.types.geometry import inside
 from edgeperc.types.mounting import MODEL_HEIGHT_M
 from edgeperc.types.perception import Box
 from edgeperc.types.sensor import SensorProfile, get_sensor
+from edgeperc.types.views import RangeImageGeometry
 
-from ..training.processes import mapped
+from .processes import mapped
 from .scans import LabeledScan, mirrored, turned, turned_box
 
 __all__ = [

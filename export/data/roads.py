@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edgeperc.errors import EdgepercError, MissingExtraError
 from edgeperc.simulation.samples import IGNORE
-from edgeperc.types.card import TopViewGeometry
+from edgeperc.types.views import TopViewGeometry
 
 from .scans import SURFACE
 

@@ -18,21 +18,22 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from edgeperc.datasets.kitti import scan_hash
-from edgeperc.datasets.scan_folder import IGNORED, ScanFolder, ScanFrame
+from edgeperc.datasets.layout import IGNORED
+from edgeperc.datasets.scan_folder import ScanFolder, ScanFrame
 from edgeperc.errors import MountingError
 from edgeperc.evaluation.truth import road_cells
 from edgeperc.ground.leveling import MountingEstimator
-from edgeperc.inference.network_input import input_heights, project
-from edgeperc.inference.projection import Projection, RangeImageProjector, TopViewProjector
-from edgeperc.preprocess.condition import Interpolator, condition
+from edgeperc.inference.projection import Projection, RangeImageProjector, TopViewProjector, input_heights, project
+from edgeperc.preprocess.condition import condition
+from edgeperc.preprocess.interpolation import Interpolator
 from edgeperc.preprocess.remission import NO_REMISSION, RemissionMatcher, is_missing
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES
-from edgeperc.types.card import RangeImageGeometry
 from edgeperc.types.frame import ModelFrame
 from edgeperc.types.geometry import draw_footprints
 from edgeperc.types.mounting import Mounting
 from edgeperc.types.sensor import SensorProfile
+from edgeperc.types.views import RangeImageGeometry
 
 from .roads import box_sums
 from .scans import SURFACE, LabeledScan

@@ -13,10 +13,10 @@ from edgeperc.datasets.kitti import Frame
 from edgeperc.simulation.samples import IGNORE, labels_by_boxes
 from edgeperc.simulation.scene import TOP_VIEW_CLASSES, SimulatedScan
 from edgeperc.system.atomic import open_atomic
-from edgeperc.types.card import TopViewGeometry
 from edgeperc.types.geometry import draw_footprints, inside
 from edgeperc.types.perception import Box
 from edgeperc.types.sensor import SensorProfile
+from edgeperc.types.views import TopViewGeometry
 
 __all__ = ["SURFACE", "LabeledScan", "mirrored", "turned", "turned_box"]
 

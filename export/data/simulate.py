@@ -18,7 +18,7 @@ from edgeperc.simulation.camera import forward_camera, render
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.perception import Box
 
-from ..training.processes import mapped
+from .processes import mapped
 from .scans import LabeledScan
 
 __all__ = ["fitness_of", "parity_images", "parity_scans", "simulate"]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edgeperc.types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS, TopViewGeometry
+from edgeperc.types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
+from edgeperc.types.views import TopViewGeometry
 
 __all__ = ["REGRESSED_FROM", "SLOT_CELLS", "dense_targets", "paper_slot_targets", "slot_targets"]
 

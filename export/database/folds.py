@@ -22,10 +22,10 @@ from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.types.card import ModelCard
 
 from ..data.roads import DatabaseError, mask_of, with_road
-from ..data.samples import RealScans
 from ..data.scans import LabeledScan
 from ..recipe import Recipe
 from ..release.to_onnx import export, write_card
+from ..training.samples import RealScans
 from ..training.train import train
 from .files import N_FOLDS
 

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import nn
 
+from ..cards import card_of
 from ..recipe import Recipe, task_name
-from ..release.cards import card_of
 from .camseg import CamSeg
 from .edge import PointSegEdge, SSADNetEdge
 from .fcn import FCN

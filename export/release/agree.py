@@ -17,9 +17,9 @@ import onnx
 import onnxruntime
 from numpy.typing import NDArray
 
+from edgeperc.datasets.images import LabeledImages
 from edgeperc.datasets.kitti import KittiObjects, SemanticKitti
 from edgeperc.errors import ModelError, PointsError
-from edgeperc.evaluation.camvid import LabeledImages
 from edgeperc.evaluation.judge import Judge
 from edgeperc.evaluation.metrics import Confusion
 from edgeperc.evaluation.tables import Record, figures
@@ -74,7 +74,7 @@ def agree(
         Folder of CamVid, for a network of a camera; then the other sets are not used.
     split : str
         Drives of the KITTI object set (`edgeperc.datasets.splits.in_split`), or images of CamVid
-        (`edgeperc.evaluation.camvid.LabeledImages.files`).
+        (`edgeperc.datasets.images.LabeledImages.files`).
     n_scans : int or None
         At most this many scans, or images, of each set, evenly spread; None takes all.
     on_scan : callable

@@ -11,7 +11,8 @@ from typing import Any
 
 from edgeperc.datasets.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES
 from edgeperc.evaluation.tables import BANDS
-from edgeperc.types.card import CameraGeometry, ModelCard, TopViewGeometry
+from edgeperc.types.card import ModelCard
+from edgeperc.types.views import CameraGeometry, TopViewGeometry
 from edgeperc.zoo import DEFAULT, MAX_LOSS, Variant, digest, resolve
 
 from ..recipe import Recipe

@@ -34,10 +34,11 @@ from onnxruntime.quantization import CalibrationMethod, QDQQuantizer, QuantType
 from onnxruntime.quantization.calibrate import TensorsData
 from tqdm import tqdm
 
+from edgeperc.datasets.images import LabeledImages, image_hash
 from edgeperc.datasets.kitti import SEQUENCE_DRIVES, KittiObjects, SemanticKitti, scan_hash
 from edgeperc.datasets.splits import in_split
 from edgeperc.errors import EdgepercError, ModelError, OptionError, PointsError, SplitError
-from edgeperc.evaluation.camvid import LabeledImages, evaluate_images, image_hash
+from edgeperc.evaluation.camvid import evaluate_images
 from edgeperc.evaluation.evaluate import evaluate
 from edgeperc.evaluation.judge import Judge
 from edgeperc.evaluation.tables import Record
@@ -132,7 +133,7 @@ def calibration_scans(
 
 
 def calibration_images(camvid: Path) -> tuple[list[NDArray[np.uint8]], list[str]]:
-    """64 training images of CamVid, evenly spread, and their `edgeperc.evaluation.camvid.image_hash`."""
+    """64 training images of CamVid, evenly spread, and their `edgeperc.datasets.images.image_hash`."""
     data = LabeledImages(camvid)
     files = data.files("train")
     images = [data.read(file)[0] for file in files[:: max(1, len(files) // N_IMAGES)][:N_IMAGES]]

@@ -24,20 +24,20 @@ from torch import nn
 from edgeperc.camera.image import ImageScaler
 from edgeperc.errors import EdgepercError
 from edgeperc.inference.decode import decode_classes, decode_top_view
-from edgeperc.inference.network_input import project
-from edgeperc.inference.projection import make_projector
+from edgeperc.inference.projection import make_projector, project
 from edgeperc.inference.session import Session, golden_input
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.system.atomic import open_atomic
-from edgeperc.types.card import CARD_KEY, CameraGeometry, Golden, ModelCard
+from edgeperc.types.card import CARD_KEY, Golden, ModelCard
 from edgeperc.types.perception import Box
+from edgeperc.types.views import CameraGeometry
 
+from ..cards import card_of
 from ..networks.lodnn import LoDNN
 from ..networks.segnet import SegNet
 from ..networks.ssadnet import SSADNet
 from ..recipe import Recipe
 from ..training.checkpoint import build_network, read_checkpoint
-from .cards import card_of
 
 __all__ = [
     "ParityError",

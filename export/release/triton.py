@@ -12,8 +12,9 @@ from pathlib import Path
 
 from edgeperc.errors import ModelError
 from edgeperc.system.atomic import write_atomic
-from edgeperc.types.card import CameraGeometry, ModelCard, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.card import ModelCard
 from edgeperc.types.sensor import get_sensor
+from edgeperc.types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
 from edgeperc.zoo import DEFAULT, model_path
 
 from . import triton_model

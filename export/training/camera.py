@@ -11,10 +11,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from edgeperc.types.card import CameraGeometry, InputSpec, ModelCard
+from edgeperc.types.card import InputSpec, ModelCard
+from edgeperc.types.views import CameraGeometry
 
+from ..cards import card_of
 from ..recipe import Recipe
-from ..release.cards import card_of
 from .losses import cross_entropy, lovasz_softmax
 
 __all__ = ["CLASS_SHARES", "Camera", "ImageOutputs", "class_weights", "upsampled"]

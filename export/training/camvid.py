@@ -25,10 +25,10 @@ from edgeperc.evaluation.camvid import image_figures
 from edgeperc.evaluation.metrics import Confusion
 from edgeperc.system.atomic import open_atomic
 
-from ..data.images import camvid_samples, confusions, read_camvid
 from ..recipe import PAPER
 from .camera import Camera
 from .checkpoint import build_network, read_checkpoint
+from .images import camvid_samples, confusions, read_camvid
 from .train import train
 
 __all__ = ["ELEVEN", "FIGURES", "PAPER_ROWS", "ablate_camvid", "figures_of", "plot_camvid", "show_camvid", "table"]

@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from edgeperc.inference.session import golden_input
 from edgeperc.types.card import ModelCard
 
+from ..cards import card_of
 from ..recipe import Recipe
-from ..release.cards import card_of
 from .checkpoint import read_checkpoint
 
 __all__ = ["folded_weights", "start"]

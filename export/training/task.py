@@ -21,13 +21,14 @@ from edgeperc.evaluation.metrics import FEWEST_RETURNS, BoxEvaluator, Confusion,
 from edgeperc.inference.decode import decode_top_view
 from edgeperc.inference.projection import Projection
 from edgeperc.simulation.samples import IGNORE
-from edgeperc.types.card import CameraGeometry, InputSpec, ModelCard, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.card import InputSpec, ModelCard
 from edgeperc.types.perception import Box
+from edgeperc.types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
 
+from ..cards import card_of
 from ..data.scans import LabeledScan
 from ..data.targets import dense_targets, paper_slot_targets, slot_targets
 from ..recipe import Recipe
-from ..release.cards import card_of
 from .losses import box_distillation_loss, distillation_loss, pointseg_loss, road_loss, ssadnet_loss
 
 __all__ = ["Outputs", "Points", "Road", "Tally", "Targets", "Task", "Vehicles", "task_of"]

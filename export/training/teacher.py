@@ -17,8 +17,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from edgeperc.datasets.kitti import KittiObjects
-from edgeperc.inference.network_input import project
-from edgeperc.inference.projection import make_projector
+from edgeperc.inference.projection import make_projector, project
 from edgeperc.inference.session import Session
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import IGNORE

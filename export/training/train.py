@@ -27,15 +27,15 @@ from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.simulation.scene import POINT_CLASSES
 from edgeperc.system.atomic import open_atomic
 
-from ..data.images import ImageSamples, ImageWatch, camvid_samples
-from ..data.samples import RealScans, Samples, loaded, real_scans
 from ..data.scan_sets import read_scan_set
 from ..data.scans import LabeledScan
 from ..networks import build
 from ..recipe import Recipe
 from .camera import Camera
 from .checkpoint import build_network, read_checkpoint
+from .images import ImageSamples, ImageWatch, camvid_samples
 from .ranks import Ranks
+from .samples import RealScans, Samples, loaded, real_scans
 from .start import start
 from .task import Task, task_of
 from .teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from ..data.samples import Samples
 from ..data.scan_sets import seen_by_network
 from ..data.scans import LabeledScan
+from .samples import Samples
 
 __all__ = ["Watch"]
 

@@ -42,12 +42,13 @@ from edgeperc.agreement.votes import (
 from edgeperc.cli import arguments
 from edgeperc.ground.planes import Ground, find_ground
 from edgeperc.ground.scan import Scan
-from edgeperc.objects.cluster import find_clusters, objects_from_points, sort_points
+from edgeperc.objects.boxes import objects_from_points
+from edgeperc.objects.cluster import find_clusters, sort_points
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
-from edgeperc.types.card import TopViewGeometry
 from edgeperc.types.geometry import inside
 from edgeperc.types.points import read_only
+from edgeperc.types.views import TopViewGeometry
 
 CLASSES = ("background", "car", "pedestrian", "cyclist")
 ROLES = np.array([0, 1, 2, 2], np.uint8)

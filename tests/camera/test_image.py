@@ -24,7 +24,8 @@ from edgeperc.camera.image import (
     label_pixels,
 )
 from edgeperc.errors import CardMismatchError, ImageError, InferenceError
-from edgeperc.types.card import CameraGeometry, InputSpec
+from edgeperc.types.card import InputSpec
+from edgeperc.types.views import CameraGeometry
 
 SPEC = InputSpec("x", ("red", "green", "blue"), (120.0, 110.0, 100.0), (60.0, 61.0, 62.0))
 PLAIN = InputSpec("x", ("red", "green", "blue"), (0.0,) * 3, (1.0,) * 3)

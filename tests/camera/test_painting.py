@@ -37,8 +37,8 @@ from edgeperc.evaluation.painting import _beside_edges, count_painting
 from edgeperc.simulation.camera import CAMERA_CLASSES, VOID, CameraImage, forward_camera, render
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import SimulatedScan, simulate
-from edgeperc.types.card import TopViewGeometry
 from edgeperc.types.mounting import MODEL_MOUNTING
+from edgeperc.types.views import TopViewGeometry
 from edgeperc.view import draw_painted
 from edgeperc.view.colors import color_of, rgb
 

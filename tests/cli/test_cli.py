@@ -617,7 +617,7 @@ def test_a_reader_that_goes_away_is_no_accident(tmp_path: Path) -> None:
         "sys.modules['edgeperc.perceiver'] = types.SimpleNamespace(Perceiver=test_cli.FakePerceiver)\n"
         "from edgeperc.cli import main; sys.exit(main(['run', sys.argv[2], '--json']))\n"
     )
-    command = [sys.executable, "-c", code, str(Path(__file__).parent), str(tmp_path)]
+    command = [sys.executable, "-c", code, str(Path(__file__).parent.parent), str(tmp_path)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None
     assert process.stderr is not None

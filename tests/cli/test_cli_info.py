@@ -104,7 +104,7 @@ def test_info_of_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
         checked.append((points, profile, sensor.name))
         return ("it has 32 beams",)
 
-    monkeypatch.setattr("edgeperc.preprocess.fitness.check_fitness", check_fitness)
+    monkeypatch.setattr("edgeperc.preprocess.findings.check_fitness", check_fitness)
     monkeypatch.setattr(FitnessProfile, "from_dict", dict)
     monkeypatch.setattr(sys.modules[__name__], "POINTSEG", replace(POINTSEG, fitness={"n_beams": 64}))
     points = np.array([[3, 4, 0, 10], [0, 10, 10, 255], [-6, 0, 8, 51], [np.nan, 0, 0, 0]], np.float32)

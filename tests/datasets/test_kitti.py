@@ -25,9 +25,9 @@ from edgeperc.datasets.splits import FOLDS, TEST_DRIVES, VALIDATION_DRIVES, fold
 from edgeperc.errors import CalibrationError, OptionError, PointsError
 from edgeperc.simulation.samples import IGNORE, simulated_scan
 from edgeperc.simulation.scene import TOP_VIEW_CLASSES
-from edgeperc.types.card import TopViewGeometry
 from edgeperc.types.geometry import draw_footprints, inside
 from edgeperc.types.perception import Box
+from edgeperc.types.views import TopViewGeometry
 from edgeperc_export.data.augment import augmented
 from edgeperc_export.data.roads import ground_plane, sure_surface
 from edgeperc_export.data.scans import SURFACE, LabeledScan, mirrored, turned

@@ -17,18 +17,20 @@ from hypothesis import strategies as st
 
 pytest.importorskip("tqdm")
 
+from checkout import REPOSITORY
 from edgeperc import Perceiver, cli
 from edgeperc.datasets.kitti import scan_hash
-from edgeperc.datasets.scan_folder import _KEYS, ScanFolder, ScanLayout, class_number, known_layouts, read_layout
+from edgeperc.datasets.layout import _KEYS, ScanLayout, class_number, known_layouts, read_layout
+from edgeperc.datasets.scan_folder import ScanFolder
 from edgeperc.errors import MountingError, OptionError, PointsError, SensorError
 from edgeperc.evaluation.evaluate import evaluate
 from edgeperc.evaluation.truth import cells_inside, folder_truth, road_cells
 from edgeperc.inference.projection import make_projector
 from edgeperc.simulation.samples import IGNORE, simulated_scan
-from edgeperc.types.card import TopViewGeometry
 from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.types.perception import Box
 from edgeperc.types.sensor import get_sensor
+from edgeperc.types.views import TopViewGeometry
 from edgeperc_export.data.scan_sets import read_scan_set, seen_by_network
 from edgeperc_export.data.scans import SURFACE, LabeledScan
 
@@ -373,7 +375,7 @@ def test_a_sensor_of_its_own_and_what_is_known_of_its_mounting(tmp_path: Path) -
 
 
 def test_the_description_in_the_documentation() -> None:
-    page = (Path(__file__).parent.parent / "docs/howto/train.md").read_text("utf-8")
+    page = (REPOSITORY / "docs/howto/train.md").read_text("utf-8")
     (block,) = re.findall(r"^```json\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE)
     layout = ScanLayout.from_json(block)
     assert layout.sensor.mounting == Mounting(1.9)
@@ -635,7 +637,7 @@ def test_the_sensor_of_a_scan_is_stored(tmp_path: Path) -> None:
 def test_folders_are_evaluated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root, _ = street(tmp_path / "set", "hdl-64e", (3, 4))
     for name in ("ssadnet-sim", "pointseg-sim"):
-        assert (Path(__file__).parent.parent / "models/research" / f"{name}.onnx").exists()
+        assert (REPOSITORY / "models/research" / f"{name}.onnx").exists()
     out = tmp_path / "figures.json"
     models = ["--model", "ssadnet", "--model", "pointseg"]
     assert cli.main(["eval", str(root), *models, "--boxes-from", "both", "--json", str(out)]) == 0

@@ -17,7 +17,8 @@ from cli_helpers import run
 pillow = pytest.importorskip("PIL.Image")
 
 from edgeperc import CardMismatchError, ImageError, OptionError, SplitError
-from edgeperc.evaluation.camvid import LabeledImages, evaluate_images, image_figures, image_hash
+from edgeperc.datasets.images import LabeledImages, image_hash
+from edgeperc.evaluation.camvid import evaluate_images, image_figures
 
 COLORS = np.uint8([[20, 10, 200], [200, 10, 20], [10, 200, 20]])  # of sky, road and tree, as the tiny model has them
 HEIGHT, WIDTH = 24, 32

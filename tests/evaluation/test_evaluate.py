@@ -35,13 +35,13 @@ from edgeperc.datasets.kitti import (
 from edgeperc.errors import ModelError, PointsError, SplitError
 from edgeperc.evaluation import evaluate
 from edgeperc.evaluation.causes import count_causes
-from edgeperc.evaluation.judge import Judge
+from edgeperc.evaluation.judge import Judge, training_scans_of
 from edgeperc.evaluation.metrics import BoxEvaluator, Confusion
 from edgeperc.evaluation.tables import BANDS, FEWEST_OBJECTS, Record, banded, figures
-from edgeperc.evaluation.unseen import training_scans_of
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE
-from edgeperc.types.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
+from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 from edgeperc.zoo import shipped_models
 
 VIEW = TopViewGeometry()

@@ -24,14 +24,6 @@ from edgeperc.readers.images import read_image
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.street import CAMERA_CLASSES
 from edgeperc.types.card import ModelCard
-from edgeperc_export.data.images import (
-    ImageSamples,
-    augmented_images,
-    camvid_samples,
-    confusions,
-    normalized,
-    read_camvid,
-)
 from edgeperc_export.data.simulate import parity_images
 from edgeperc_export.networks import build
 from edgeperc_export.networks.camseg import CamSeg
@@ -53,6 +45,14 @@ from edgeperc_export.training.camvid import (
     table,
 )
 from edgeperc_export.training.checkpoint import read_checkpoint
+from edgeperc_export.training.images import (
+    ImageSamples,
+    augmented_images,
+    camvid_samples,
+    confusions,
+    normalized,
+    read_camvid,
+)
 from edgeperc_export.training.losses import _lovasz_at_once, cross_entropy, lovasz_softmax
 from edgeperc_export.training.train import _last, train
 

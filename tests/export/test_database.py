@@ -36,8 +36,9 @@ from edgeperc.errors import CardMismatchError, MissingExtraError
 from edgeperc.inference.projection import make_projector
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.system.atomic import write_atomic
-from edgeperc.types.card import ModelCard, TopViewGeometry
+from edgeperc.types.card import ModelCard
 from edgeperc.types.perception import Box
+from edgeperc.types.views import TopViewGeometry
 from edgeperc_export.cli import main
 from edgeperc_export.data.roads import CLASSES, VIEW, DatabaseError, mask_of, read_coco, write_coco
 from edgeperc_export.database import build as build_module

@@ -19,33 +19,35 @@ onnx = pytest.importorskip("onnx")
 
 from torch import Tensor, nn
 
+from checkout import REPOSITORY
 from edgeperc import Perceiver
 from edgeperc.datasets.kitti import KittiObjects, scan_hash
 from edgeperc.datasets.splits import fold_of
 from edgeperc.errors import CardMismatchError
 from edgeperc.evaluation.evaluate import evaluate
-from edgeperc.inference.network_input import project
-from edgeperc.inference.projection import make_projector
+from edgeperc.inference.projection import make_projector, project
 from edgeperc.inference.session import Session
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.simulation.samples import FIRST_SEED, IGNORE, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
-from edgeperc.types.card import CARD_KEY, InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.card import CARD_KEY, InputSpec, ModelCard, OutputSpec
+from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
+from edgeperc_export import cards
 from edgeperc_export import make as make_module
+from edgeperc_export.cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT
 from edgeperc_export.cli import main
 from edgeperc_export.data.augment import ObjectBank
 from edgeperc_export.data.roads import DRAWN, drawn_roads
-from edgeperc_export.data.samples import Recent, Samples, loaded, real_scans
 from edgeperc_export.data.scans import LabeledScan, mirrored
 from edgeperc_export.data.simulate import parity_scans, simulate
 from edgeperc_export.networks import build
 from edgeperc_export.recipe import MODELS, PAPER, SCAN_NETWORKS, TASKS, Recipe, Stage
-from edgeperc_export.release import cards, to_onnx
-from edgeperc_export.release.cards import RANGE_IMAGE, RANGE_IMAGE_INPUT, TOP_VIEW, TOP_VIEW_INPUT
+from edgeperc_export.release import to_onnx
 from edgeperc_export.release.models_page import models_page
 from edgeperc_export.release.to_onnx import ParityError, export, load, to_graph, verify, write_card
 from edgeperc_export.training.ablation import PAPERS, SHIPPED, VARIANTS, ablate, plot
 from edgeperc_export.training.curve import curve_table
+from edgeperc_export.training.samples import Recent, Samples, loaded, real_scans
 from edgeperc_export.training.start import start
 from edgeperc_export.training.task import Task, task_of
 from edgeperc_export.training.teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
@@ -237,7 +239,7 @@ def test_a_run_starts_from_the_weights_it_shares_with_a_checkpoint(tmp_path: Pat
         start(build(small("pointseg")), small("pointseg"), dense, [])
 
 
-SHIPPED_MODELS = Path(__file__).resolve().parent.parent / "models"
+SHIPPED_MODELS = REPOSITORY / "models"
 
 
 @pytest.mark.parametrize(
@@ -398,7 +400,7 @@ def test_a_drawn_road_is_the_ground_truth_of_its_scan(kitti: Path, monkeypatch: 
     objects, road = KittiObjects(kitti), np.zeros((400, 200), np.uint8)
     road[100:, 60:150] = 1
     digest = scan_hash(objects.frame("000000").points)
-    monkeypatch.setattr("edgeperc_export.data.samples.drawn_roads", lambda: {digest: road})
+    monkeypatch.setattr("edgeperc_export.training.samples.drawn_roads", lambda: {digest: road})
     (scan, other), weights, hashes = real_scans(objects, ["000000", "000001"], drawn=True)
     assert weights == [1.0, 1.0]
     assert hashes["000000"] == digest
@@ -944,7 +946,7 @@ def test_a_network_has_one_task(network: str, simulated: Path) -> None:
 
 
 def test_the_models_page_matches_the_cards() -> None:
-    folder = Path(__file__).resolve().parent.parent / "models"
+    folder = REPOSITORY / "models"
     assert (folder / "MODELS.md").read_text() == models_page(folder), "run: edgeperc-export models models"
 
 

@@ -31,7 +31,7 @@ for package in ("faster_coco_eval", "filelock", "tqdm", "onnx", "onnxruntime"):
 from database_helpers import TRAPEZIUM, drawn, plan_of, road_network, simulated_kitti
 
 from edgeperc.system.printable import printable
-from edgeperc.types.card import TopViewGeometry
+from edgeperc.types.views import TopViewGeometry
 from edgeperc_export.data.roads import DatabaseError, mask_of, read_coco
 from edgeperc_export.database import label_page
 from edgeperc_export.database.build import build

@@ -9,11 +9,11 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from edgeperc.inference.decode import decode_dense, decode_scored_slots, decode_slots
+from edgeperc.inference.box_heads import decode_dense, decode_scored_slots, decode_slots
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import TOP_VIEW_CLASSES
-from edgeperc.types.card import TopViewGeometry
 from edgeperc.types.perception import Box
+from edgeperc.types.views import TopViewGeometry
 from edgeperc_export.data.scans import LabeledScan, mirrored, turned
 from edgeperc_export.data.targets import REGRESSED_FROM, dense_targets, paper_slot_targets, slot_targets
 from edgeperc_export.training.losses import (

@@ -23,7 +23,8 @@ from edgeperc.evaluation.tables import Record
 from edgeperc.inference.session import Session
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.simulation.scene import POINT_CLASSES
-from edgeperc.types.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry
+from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
+from edgeperc.types.views import RangeImageGeometry
 from edgeperc_export import cli
 from edgeperc_export.release import quantize as module
 from edgeperc_export.release.quantize import RefusedError, calibration_scans, quantize

@@ -228,8 +228,8 @@ def _run(arguments: list[str]) -> tuple[int, str]:
 
 # Imported before the processes are forked, which would each spend 0.1 s on them.
 IMPORTED = (
-    "edgeperc.evaluation.tracking", "edgeperc.inference.listing", "edgeperc.readers.captures", "edgeperc.readers.images",
-    "edgeperc.simulation.samples", "numba.np.arraymath", "onnxruntime",
+    "edgeperc.evaluation.tracking", "edgeperc.inference.listing", "edgeperc.readers.captures",
+    "edgeperc.readers.images", "edgeperc.simulation.samples", "numba.np.arraymath", "onnxruntime",
 )  # fmt: skip
 
 

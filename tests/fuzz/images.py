@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 import edgeperc.perceiver as perceiver_module
 from edgeperc import Perceiver, Perception
 from edgeperc.camera.image import MAX_EDGE, MAX_PIXELS
+from edgeperc.datasets.images import LabeledImages
 from edgeperc.errors import EdgepercError
-from edgeperc.evaluation.camvid import LabeledImages
 from edgeperc.readers.images import read_image
-from edgeperc.types.card import CameraGeometry
+from edgeperc.types.views import CameraGeometry
 
 from .mutate import mutated_bytes, mutated_document
 from .running import Case, check

@@ -15,12 +15,13 @@ import edgeperc.perceiver as perceiver_module
 from edgeperc import Box, Perceiver, Perception, SensorProfile, Tracker, Tracks, road_ahead
 from edgeperc.errors import EdgepercError, FitnessError
 from edgeperc.records import scan_record
-from edgeperc.types.card import InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
 from edgeperc.types.frame import ModelFrame
 from edgeperc.types.geometry import draw_footprints
 from edgeperc.types.mounting import MODEL_MOUNTING, Mounting
 from edgeperc.types.points import as_points
 from edgeperc.types.sensor import SENSORS
+from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 from edgeperc.view import draw, write_html, write_labels, write_ply
 from edgeperc.zoo import resolve
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import tiny_model
 
-from edgeperc.types.card import CHANNELS, InputSpec, ModelCard, OutputSpec, RangeImageGeometry
+from edgeperc.types.card import CHANNELS, InputSpec, ModelCard, OutputSpec
+from edgeperc.types.views import RangeImageGeometry
 from edgeperc.zoo import resolve
 
 __all__ = ["CARD", "GRAPH", "boxed_card", "image_card", "model"]

@@ -23,10 +23,11 @@ from edgeperc.ground.observed import (
 )
 from edgeperc.inference.projection import TopViewProjector
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
-from edgeperc.types.card import InputSpec, TopViewGeometry
+from edgeperc.types.card import InputSpec
 from edgeperc.types.frame import ModelFrame
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.sensor import SensorProfile, get_sensor
+from edgeperc.types.views import TopViewGeometry
 
 VIEW = TopViewGeometry()
 SMALL = TopViewGeometry((2.0, 10.0), (-3.0, 3.0), cell_m=0.5)

@@ -12,7 +12,7 @@ import pytest
 import twins.blocks
 from cli_helpers import POINTSEG
 from edgeperc.errors import CardError, CardMismatchError
-from edgeperc.inference.blocks import fill_pixels
+from edgeperc.inference.decode import fill_pixels
 from edgeperc.inference.session import Session
 from edgeperc.types.card import ModelCard, OutputSpec
 from edgeperc.zoo import model_path

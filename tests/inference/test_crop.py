@@ -19,9 +19,9 @@ from edgeperc.inference.crop import MARGIN_M, Crop, fill_rows, spread
 from edgeperc.inference.projection import make_projector
 from edgeperc.pipeline import Pipeline
 from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
-from edgeperc.types.card import RangeImageGeometry, TopViewGeometry
 from edgeperc.types.perception import PointLabels
 from edgeperc.types.sensor import get_sensor
+from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 
 AHEAD = RangeImageGeometry((2.0, -10.0, -24.0))
 TOP = TopViewGeometry()

@@ -8,13 +8,14 @@ import pytest
 
 import twins.decode
 from edgeperc.errors import CardMismatchError, InferenceError
-from edgeperc.inference import decode
-from edgeperc.inference.decode import decode_classes, decode_dense, decode_scored_slots, decode_slots, decode_top_view
-from edgeperc.types.card import TopViewGeometry
+from edgeperc.inference import box_heads, decode
+from edgeperc.inference.box_heads import decode_dense, decode_scored_slots, decode_slots
+from edgeperc.inference.decode import decode_classes, decode_top_view
 from edgeperc.types.geometry import draw_footprints
 from edgeperc.types.points import read_only
+from edgeperc.types.views import TopViewGeometry
+from edgeperc_export.cards import card_of
 from edgeperc_export.recipe import Recipe
-from edgeperc_export.release.cards import card_of
 
 CLASSES = ("background", "drivable", "car", "van", "truck")
 VEHICLES = CLASSES[2:]
@@ -80,9 +81,9 @@ def test_cells_without_a_return_lose_a_class_of_boxes(shape):
 
 def test_values_that_are_not_finite_are_counted():
     values = np.linspace(-3e38, 3e38, 1000, dtype=np.float32)
-    assert decode.count_not_finite(values) == decode.count_not_finite(values[:0]) == 0
+    assert box_heads.count_not_finite(values) == box_heads.count_not_finite(values[:0]) == 0
     values[::7], values[1::70], values[-1] = np.nan, np.inf, -np.inf
-    assert decode.count_not_finite(values) == np.count_nonzero(~np.isfinite(values))
+    assert box_heads.count_not_finite(values) == np.count_nonzero(~np.isfinite(values))
 
 
 def test_classes_of_another_shape_or_kind_raise():
@@ -427,7 +428,7 @@ def test_peaks_agree_with_the_twin(shape):
     for heat in (rng.normal(size=shape), rng.integers(0, 3, shape), np.zeros(shape)):
         heat = heat.astype(np.float32)
         peak = np.empty(shape, dtype=np.bool_)
-        decode.mark_peaks(heat, 0.0, peak)
+        box_heads.mark_peaks(heat, 0.0, peak)
         np.testing.assert_array_equal(peak, twins.decode.peaks(heat, 0.0))
         assert peak.any() or (heat < 0.0).all()
 
@@ -441,7 +442,7 @@ def test_footprint_sums_agree_with_the_twin(are_logits):
     )
     rectangles[-1] = [500.0, -500.0, 1.0, 1.0, 0.0]  # far out of view
     sums = np.empty((12, 5))
-    decode.fill_footprint_sums(values, are_logits, rectangles, 8.0, 1.5, 0.1, sums)
+    box_heads.fill_footprint_sums(values, are_logits, rectangles, 8.0, 1.5, 0.1, sums)
     np.testing.assert_allclose(
         sums, twins.decode.footprint_sums(values, are_logits, rectangles, 8.0, 1.5, 0.1), rtol=1e-9, atol=1e-9
     )
@@ -451,7 +452,7 @@ def test_huge_footprints_are_sampled():
     values = np.random.default_rng(7).normal(0.0, 3.0, (20, 150, 150)).astype(np.float32)
     rectangles = np.array([[7.5, 0.0, 15.0, 14.0, 0.3], [7.5, 0.0, 4.0, 2.0, 0.3]])
     sums = np.empty((2, 20))
-    decode.fill_footprint_sums(values, True, rectangles, 15.0, 7.5, 0.1, sums)
+    box_heads.fill_footprint_sums(values, True, rectangles, 15.0, 7.5, 0.1, sums)
     expected = twins.decode.footprint_sums(values, True, rectangles, 15.0, 7.5, 0.1)
     np.testing.assert_allclose(sums, expected, rtol=1e-9)
     assert sums.sum(axis=1).max() < 150 * 140 / 3  # every second row and column

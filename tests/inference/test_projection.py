@@ -12,8 +12,9 @@ from edgeperc.errors import CardError, PointsError
 from edgeperc.ground.planes import find_ground
 from edgeperc.inference import network_input, projection
 from edgeperc.inference.projection import column_edges, make_projector, row_edges, tabulate
-from edgeperc.types.card import CHANNELS, InputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.card import CHANNELS, InputSpec
 from edgeperc.types.sensor import get_sensor
+from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 from edgeperc_bench.peers.projection import contenders, fill_copy
 
 KERNELS = ("mark_top_view", "mark_range_image", "fill_image")

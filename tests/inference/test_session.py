@@ -24,7 +24,8 @@ from edgeperc.errors import (
     OptionError,
     ProviderError,
 )
-from edgeperc.inference.session import PROVIDERS, Session, available_providers, golden_input
+from edgeperc.inference.providers import PROVIDERS, available_providers
+from edgeperc.inference.session import Session, golden_input
 from edgeperc.system.machine import fingerprint, settings_path, write_settings
 from edgeperc.types.card import CARD_KEY
 from edgeperc.zoo import Variant, digest, listed, model_path, resolve

@@ -11,15 +11,8 @@ from hypothesis import strategies as st
 import twins.cluster
 from edgeperc.errors import PointsError
 from edgeperc.objects import cluster, linkage
-from edgeperc.objects.cluster import (
-    OBJECT_SIZE_M,
-    classes_of_boxes,
-    cluster_labels,
-    find_clusters,
-    join_boxes,
-    objects_from_points,
-    sort_points,
-)
+from edgeperc.objects.boxes import OBJECT_SIZE_M, classes_of_boxes, join_boxes, objects_from_points
+from edgeperc.objects.cluster import cluster_labels, find_clusters, sort_points
 from edgeperc.types.geometry import oriented_iou, rectangles
 from edgeperc.types.points import read_only
 

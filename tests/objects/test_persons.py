@@ -15,7 +15,8 @@ from edgeperc.agreement.rules import RULES
 from edgeperc.agreement.votes import fill_tallies
 from edgeperc.ground.planes import Ground
 from edgeperc.objects import persons
-from edgeperc.objects.cluster import OBJECT_SIZE_M, fill_groups, find_clusters, join_boxes, objects_from_points
+from edgeperc.objects.boxes import OBJECT_SIZE_M, join_boxes, objects_from_points
+from edgeperc.objects.cluster import fill_groups, find_clusters
 from edgeperc.types.geometry import oriented_iou
 from edgeperc.types.perception import Box, PointLabels
 

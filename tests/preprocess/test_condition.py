@@ -19,7 +19,8 @@ from edgeperc.datasets.kitti import scan_hash
 from edgeperc.errors import PointsError, SensorError, SplitError
 from edgeperc.evaluation.transfer import compare
 from edgeperc.inference.projection import RangeImageProjector
-from edgeperc.preprocess.condition import Interpolator, condition, render
+from edgeperc.preprocess.condition import condition, render
+from edgeperc.preprocess.interpolation import Interpolator
 from edgeperc.preprocess.sensor_fit import (
     N_SHARES,
     N_STRATA,
@@ -33,9 +34,10 @@ from edgeperc.preprocess.sensor_fit import (
 )
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
-from edgeperc.types.card import InputSpec, RangeImageGeometry
+from edgeperc.types.card import InputSpec
 from edgeperc.types.mounting import MODEL_MOUNTING
 from edgeperc.types.sensor import SENSORS, RemissionFunction, SensorProfile, get_sensor
+from edgeperc.types.views import RangeImageGeometry
 
 HDL = get_sensor("hdl-64e")
 VIEW = RangeImageGeometry(HDL.elevations_deg)

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from edgeperc.preprocess.condition import condition
-from edgeperc.preprocess.fitness import Finding, FitnessProfile, check_fitness
+from edgeperc.preprocess.findings import Finding, check_fitness
+from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.readers.files import read_points
 from edgeperc.simulation.samples import simulated_scan
 from edgeperc.types.sensor import SENSORS, get_sensor

@@ -26,15 +26,15 @@ from ros2_helpers import MESSAGES, TIMEOUT_S, Perceive, cloud, scans, until
 
 from edgeperc import MissingExtraError, OptionError, Perceiver, Tracker
 from edgeperc.cli.main import main
+from edgeperc.records import PerceivedScan
 from edgeperc.ros2.graph import RELIABLE, SENSOR_DATA
 from edgeperc.ros2.messages import CLOUD, DIAGNOSTICS, OUTPUTS
 from edgeperc.ros2.node import PerceptionNode
 from edgeperc.ros2.rclpy_graph import RclpyGraph
 from edgeperc.ros2.zenoh_graph import CONFIG_VARIABLE, ZenohGraph, attachment, qos_key, type_key
-from edgeperc.sinks import PerceivedScan
 from edgeperc.types.sensor import get_sensor
 
-TESTS = Path(__file__).resolve().parent
+TESTS = Path(__file__).resolve().parent.parent
 PAGE = TESTS.parent / "docs" / "howto" / "ros2.md"
 POINT_CLOUD = (
     "sensor_msgs::msg::dds_::PointCloud2_/RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"

@@ -33,8 +33,8 @@ from edgeperc import (
     read_scans,
 )
 from edgeperc.readers.decoders import cloud_points
+from edgeperc.records import PerceivedScan
 from edgeperc.ros2.messages import CLOUD, OUTPUTS, RosMessages, nanoseconds
-from edgeperc.sinks import PerceivedScan
 from edgeperc.sinks.rosbag import TOPICS, BagSink
 from edgeperc.types.sensor import get_sensor
 

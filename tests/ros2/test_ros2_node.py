@@ -20,11 +20,11 @@ from ros2_helpers import FIELDS, MESSAGES, TIMEOUT_S, Perceive, cloud, until
 
 from edgeperc import Box, ModelFileError, OptionError, Perception, PointsError, Tracker
 from edgeperc.readers.decoders import cloud_points
+from edgeperc.records import PerceivedScan
 from edgeperc.ros2 import node as node_module
 from edgeperc.ros2.graph import RELIABLE, Qos, full_name
 from edgeperc.ros2.messages import CLOUD, DIAGNOSTICS, OUTPUTS
 from edgeperc.ros2.node import PerceptionNode
-from edgeperc.sinks import PerceivedScan
 
 SLOW_HZ = 0.01  # no answer is late
 

@@ -31,10 +31,10 @@ from edgeperc.simulation.scene import (
 )
 from edgeperc.simulation.shapes import block
 from edgeperc.simulation.street import SIZES, Street
-from edgeperc.types.card import TopViewGeometry
 from edgeperc.types.mounting import Mounting
 from edgeperc.types.perception import Box
 from edgeperc.types.sensor import SensorProfile
+from edgeperc.types.views import TopViewGeometry
 
 SMALL = SensorProfile.uniform("small", 24, 4.0, -24.0, columns=240)
 TALL = SensorProfile.uniform("tall", 48, 20.0, -24.0, columns=360)

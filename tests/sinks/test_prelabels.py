@@ -21,7 +21,7 @@ from edgeperc import Box, CalibrationError, OptionError, Perception, PointsError
 from edgeperc.cli.main import build_parser
 from edgeperc.datasets.annotations import read_labelcloud, read_sustechpoints
 from edgeperc.datasets.scan_folder import ScanFolder
-from edgeperc.sinks import PerceivedScan
+from edgeperc.records import PerceivedScan
 from edgeperc.sinks.prelabels import KINDS, PrelabelSink
 from edgeperc.types.sensor import get_sensor
 

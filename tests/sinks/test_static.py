@@ -17,7 +17,7 @@ from cli_helpers import POINTSEG, run
 from edgeperc import Box, OptionError, Perception, PointLabels, PointsError, Tracker, Tracks, read_points
 from edgeperc.cli.main import build_parser
 from edgeperc.cli.sinks import open_sinks
-from edgeperc.sinks import PerceivedScan
+from edgeperc.records import PerceivedScan
 from edgeperc.sinks.static import StaticSink
 from edgeperc.types.sensor import get_sensor
 

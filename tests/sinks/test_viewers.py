@@ -25,9 +25,9 @@ from test_pictures import CAR, VAN, a_perception, a_scan
 
 from edgeperc import Mounting, Tracker, cli
 from edgeperc.errors import MissingExtraError, OptionError, PointsError
+from edgeperc.records import PerceivedScan, Sink
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate_sequence
-from edgeperc.sinks import PerceivedScan, Sink
 from edgeperc.sinks.page import PageSink
 from edgeperc.sinks.scene import colored_points, nanoseconds
 from edgeperc.types.frame import ModelFrame, quaternion

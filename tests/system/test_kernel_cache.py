@@ -32,8 +32,7 @@ from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 
 import edgeperc
-from edgeperc.system import kernel_cache, kernel_stamp
-from edgeperc.system import machine
+from edgeperc.system import kernel_cache, kernel_stamp, machine
 from edgeperc.system.kernel_cache import KernelCache
 from edgeperc.system.machine import unsafe_because
 

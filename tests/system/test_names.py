@@ -19,7 +19,7 @@ from tiny_model import CONVOLUTION, INITIALIZER, graph, model, tiny_card
 from cli_helpers import POINTSEG
 from edgeperc.datasets.kitti import KittiObjects
 from edgeperc.errors import CardError, OptionError, PointsError, SensorError
-from edgeperc.sinks import PerceivedScan
+from edgeperc.records import PerceivedScan
 from edgeperc.sinks.names import stem_of
 from edgeperc.sinks.prelabels import KINDS, PrelabelSink
 from edgeperc.system.names import check_file, check_name, check_text

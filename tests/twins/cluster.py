@@ -42,7 +42,7 @@ def votes(clusters, labels, min_share, part_of):
 
 
 def rectangle(members, l_shaped):
-    """Twin of `edgeperc.objects.cluster.fill_rectangle`: x, y, extent along, across, heading."""
+    """Twin of `edgeperc.objects.boxes.fill_rectangle`: x, y, extent along, across, heading."""
     voting = members[:: -(-len(members) // 256)]
 
     def turned(points, angle):

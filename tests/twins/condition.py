@@ -37,7 +37,7 @@ def one_surface(p, q, ground_z):
 
 
 def between(points, index, elevations, azimuths, row_reach, col_reach, ground_z):
-    """Twin of `edgeperc.preprocess.condition.Interpolator.fill`: points, index, and the two neighbors of every new point."""
+    """Twin of `Interpolator.fill`: points, index, and the two neighbors of every new point."""
     points, index, parents = [p.astype(np.float64) for p in points], index.copy(), []
     height, width = index.shape
 

@@ -82,7 +82,7 @@ def classes(values, are_logits):
 
 
 def peaks(heat, threshold):
-    """Twin of `edgeperc.inference.decode.mark_peaks`."""
+    """Twin of `edgeperc.inference.box_heads.mark_peaks`."""
     padded = np.pad(heat.astype(np.float64), 1, constant_values=-np.inf)
     height, width = heat.shape
     peak = heat >= threshold
@@ -97,7 +97,7 @@ def peaks(heat, threshold):
 
 
 def facing(yaw, x, y):
-    """Twin of `edgeperc.inference.decode._facing` for one box: the yaw of the likelier front, and its probability."""
+    """Twin of `box_heads._facing` for one box: the yaw of the likelier front, and its probability."""
     logit = np.dot([np.cos(yaw), np.sin(yaw)], [x, y])
     with np.errstate(over="ignore"):
         front = 1.0 / (1.0 + np.exp(-np.float64(logit)))
@@ -107,7 +107,7 @@ def facing(yaw, x, y):
 
 
 def footprint_sums(values, are_logits, rectangles, x_far, y_left, cell, max_summed=2**18):
-    """Twin of `edgeperc.inference.decode.fill_footprint_sums`."""
+    """Twin of `edgeperc.inference.box_heads.fill_footprint_sums`."""
     probabilities = softmax(values) if are_logits else values.astype(np.float64)
     _, height, width = values.shape
     x = x_far - (np.arange(height)[:, None] + 0.5) * cell

@@ -40,7 +40,7 @@ def range_image_pixel(point, view, row_edges, col_edges):
 
 
 def project(points, view, edges, spec, height_m=None):
-    """Twin of `inference.projection`'s kernels: image, index, pixel. ``edges``: a range image's, of rows and columns."""
+    """Twin of the kernels: image, index, pixel. ``edges``: a range image's, of rows and columns."""
     image = np.zeros((len(spec.channels), view.height * view.width), np.float32)
     index = np.full(view.height * view.width, -1, np.int32)
     pixel = np.full(len(points), -1, np.int32)

@@ -17,16 +17,8 @@ from tiny_model import entry, field, varint
 
 from checkout import files
 from edgeperc.errors import CardError, ModelFileError
-from edgeperc.types.card import (
-    CARD_KEY,
-    CameraGeometry,
-    Golden,
-    InputSpec,
-    ModelCard,
-    OutputSpec,
-    RangeImageGeometry,
-    TopViewGeometry,
-)
+from edgeperc.types.card import CARD_KEY, Golden, InputSpec, ModelCard, OutputSpec
+from edgeperc.types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
 
 TOP_VIEW_CARD = ModelCard(
     name="network",

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 import twins.decode
 from edgeperc.errors import PointsError
 from edgeperc.types import geometry
-from edgeperc.types.card import TopViewGeometry
 from edgeperc.types.geometry import (
     bounding_rectangles,
     draw_footprints,
@@ -19,6 +18,7 @@ from edgeperc.types.geometry import (
     suppress_overlaps,
 )
 from edgeperc.types.perception import Box
+from edgeperc.types.views import TopViewGeometry
 
 
 def some_rectangles(rng, n):

@@ -15,7 +15,8 @@ from hypothesis.extra import numpy as hnp
 
 import twins.fitness
 from edgeperc.errors import CardError, PointsError, SensorError
-from edgeperc.preprocess.fitness import FitnessProfile, check_fitness, fill_scan_sums
+from edgeperc.preprocess.findings import check_fitness
+from edgeperc.preprocess.fitness import FitnessProfile, fill_scan_sums
 from edgeperc.readers.files import read_points
 from edgeperc.types.sensor import SENSORS, SensorProfile, get_sensor
 

@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from test_pictures import a_perception, a_scan
 
 from edgeperc import Tracker
-from edgeperc.evaluation.mistakes import Mistakes
+from edgeperc.evaluation.mistakes import Mistakes, draw_mistakes
 from edgeperc.system.printable import printable
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
-from edgeperc.view import draw, draw_mistakes, draw_tracks, write_html
+from edgeperc.view import draw, draw_tracks, write_html
 from edgeperc_bench.render import Section, html_page, markdown, text
 
 RUN = "window.stolen = 1"

@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 
 from edgeperc import Tracker, view
 from edgeperc.errors import MissingExtraError, PointsError, TrackingError
-from edgeperc.evaluation.mistakes import Mistakes
+from edgeperc.evaluation.mistakes import Mistakes, draw_mistakes
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
-from edgeperc.view import draw_mistakes, draw_tracks, flatten_scan, write_html, write_labels, write_ply
+from edgeperc.view import draw_tracks, flatten_scan, write_html, write_labels, write_ply
 from edgeperc.view.canvas import Label, add_axes, free_place, new_figure, place_labels, shorten, wrap
 from edgeperc.view.colors import CLASS_COLORS, FALSE, FOUND, MISSED
 from edgeperc.view.content import fit_ground, paint_points

@@ -118,7 +118,7 @@ def eval_command(arguments: argparse.Namespace) -> int:
         require("matplotlib", "view", "Drawing a picture")
     for file in filter(None, (arguments.json, arguments.worst)):
         file.parent.mkdir(parents=True, exist_ok=True)
-    from ...evaluation.camvid import LabeledImages
+    from ...datasets.images import LabeledImages
 
     of_images = [Path(dataset) for dataset in arguments.datasets if LabeledImages.is_one(Path(dataset))]
     if of_images:
@@ -146,7 +146,7 @@ def eval_command(arguments: argparse.Namespace) -> int:
         print_line(line, gray=FEW in line)
     write_figures(arguments, figures)
     if arguments.worst is not None:
-        from ...view.mistakes import draw_mistakes
+        from ...evaluation.mistakes import draw_mistakes
 
         models = ", ".join(f"{name} {version}" for name, version in figures["models"].items())
         draw_mistakes(mistakes, arguments.worst, title=models)

@@ -16,20 +16,20 @@ from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from edgeperc.datasets.kitti import KittiObjects, scan_hash
-from edgeperc.datasets.scan_folder import class_number
+from edgeperc.datasets.layout import class_number
 from edgeperc.inference.projection import make_projector
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.scene import POINT_CLASSES
 
+from ..data.augment import NEGATIVES, ObjectBank, augmented, swapped, with_ground_ahead
+from ..data.processes import CONTEXT
+from ..data.roads import drawn_roads, sure_surface, with_road
+from ..data.scan_sets import seen_by_network
+from ..data.scans import LabeledScan
 from ..recipe import Recipe
-from ..training.processes import CONTEXT
-from ..training.ranks import Ranks
-from ..training.task import Targets, task_of
-from ..training.teacher import OnnxTeacher
-from .augment import NEGATIVES, ObjectBank, augmented, swapped, with_ground_ahead
-from .roads import drawn_roads, sure_surface, with_road
-from .scan_sets import seen_by_network
-from .scans import LabeledScan
+from .ranks import Ranks
+from .task import Targets, task_of
+from .teacher import OnnxTeacher
 
 __all__ = ["RealScans", "Recent", "Samples", "loaded", "real_scans"]
 

@@ -6,10 +6,11 @@ from typing import Any
 
 from edgeperc.simulation.scene import POINT_CLASSES, TOP_VIEW_CLASSES
 from edgeperc.simulation.street import CAMERA_CLASSES
-from edgeperc.types.card import CameraGeometry, InputSpec, ModelCard, OutputSpec, RangeImageGeometry, TopViewGeometry
+from edgeperc.types.card import InputSpec, ModelCard, OutputSpec
 from edgeperc.types.sensor import get_sensor
+from edgeperc.types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
 
-from ..recipe import EDGE_BLOCKS, Recipe
+from .recipe import EDGE_BLOCKS, Recipe
 
 __all__ = [
     "CAMERA_INPUT",

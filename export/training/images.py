@@ -17,15 +17,15 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from edgeperc.datasets.images import LabeledImages, image_hash
 from edgeperc.errors import ImageError
-from edgeperc.evaluation.camvid import LabeledImages, image_hash
 from edgeperc.evaluation.metrics import Confusion
 from edgeperc.simulation.samples import IGNORE
 from edgeperc.simulation.street import CAMERA_CLASSES
 from edgeperc.types.card import InputSpec
 
-from ..training.camera import Camera, upsampled
-from ..training.losses import cross_entropy
+from .camera import Camera, upsampled
+from .losses import cross_entropy
 
 __all__ = ["ImageSamples", "ImageWatch", "LabeledImages", "augmented_images", "confusions", "normalized", "read_camvid"]
 
@@ -42,7 +42,7 @@ class ImageSet(NamedTuple):
     Attributes
     ----------
     hashes : dict of str to str
-        Name of each image -> its `edgeperc.evaluation.camvid.image_hash`.
+        Name of each image -> its `edgeperc.datasets.images.image_hash`.
     images : (n, 3, H, W) uint8
         Red, green, blue.
     labels : (n, H, W) uint8
@@ -77,7 +77,7 @@ def read_camvid(root: Path, split: str) -> ImageSet:
     Parameters
     ----------
     root : Path
-        As for `edgeperc.evaluation.camvid.LabeledImages`.
+        As for `edgeperc.datasets.images.LabeledImages`.
     split : {"train", "validation"}
 
     Raises

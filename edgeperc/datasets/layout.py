@@ -1,0 +1,330 @@
+"""The layout of a folder of labeled scans, as its description (scans.json) says it."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from ..errors import PointsError, SensorError
+from ..simulation.samples import IGNORE
+from ..simulation.scene import POINT_CLASS_OF, POINT_CLASSES
+from ..system.names import check_name
+from ..types.mounting import Mounting
+from ..types.sensor import SensorProfile, get_sensor
+from .splits import in_split
+
+__all__ = ["SCHEMA", "ScanLayout", "box_label", "class_number", "known_layouts", "read_layout"]
+
+BOX_COLUMNS = ("class", "x", "y", "z", "l", "w", "h", "yaw")
+BOX_FILES = {
+    "kitti": "label_2/{}.txt",
+    "labelcloud": "labels/{}.json",
+    "sustechpoints": "label/{}.json",
+    "cvat": "annotations/default.json",
+}
+COARSE = {"van": "car", "truck": "car", "person_sitting": "pedestrian"}
+SCHEMA = 1
+LAYOUTS = Path(__file__).with_name("layouts")
+BACKGROUND, DRIVABLE, IGNORED, ANY = "background", "drivable", "ignore", "*"
+SUFFIXES = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".ply")
+_SENSOR_KEYS = {"like", "name", "elevations_deg", "columns", "remission_range", "min_range_m", "max_range_m"}
+_CLASS_NAME = re.compile(r"[a-z][a-z0-9 _-]{0,30}")
+_KEYS = {
+    *("schema", "name", "about", "files", "sensor", "mounting", "boxes", "box_format", "box_columns"),
+    *("points", "point_names", "labeled_deg", "labeled_m", "min_points", "drives", "splits"),
+}
+
+
+def class_number(name: str, classes: Sequence[str] = POINT_CLASSES) -> int:
+    """Label of a class of a description among the classes of points of a network.
+
+    Parameters
+    ----------
+    name : str
+        A value of `ScanLayout.boxes` or `ScanLayout.points`.
+    classes : sequence of str
+        Classes of the network, the background first.
+
+    Returns
+    -------
+    int
+        Its index. Vans and trucks count as cars and sitting persons as pedestrians, if ``classes`` lacks them;
+        ``drivable`` is background. `IGNORE` for a class that the network does not have.
+    """
+    if name in classes:
+        return classes.index(name)
+    if name in (BACKGROUND, DRIVABLE):
+        return 0
+    coarse = COARSE.get(name)
+    return classes.index(coarse) if coarse in classes else IGNORE
+
+
+@dataclass(frozen=True)
+class ScanLayout:
+    """What ``scans.json`` says of the scans of a folder.
+
+    Attributes
+    ----------
+    name : str
+        Name of the set, in tables and in cards.
+    files : str
+        ``"plain"``, or ``"semantickitti"``: the tree of that set; a scan is called ``SEQ/NAME``, and its drive is that
+        of its sequence (`datasets.SEQUENCE_DRIVES`).
+    sensor : SensorProfile
+        Its ``mounting`` is what is known of the mounting.
+    boxes, points : mapping of str to str
+        Class of a label file, in lower case -> class of edgeperc: ``car``, ``van``, ``truck``, ``pedestrian``,
+        ``person_sitting``, ``cyclist``, ``background``, a new name, or ``ignore`` (objects and points of which nothing
+        is known); for points also ``drivable``. The key ``*`` stands for all other classes.
+    box_format : str
+        ``"plain"``: ``label/NAME.txt``; ``"kitti"``: ``label_2/NAME.txt`` with ``calib/NAME.txt``; or what an
+        annotation tool saves: ``"labelcloud"``: ``labels/NAME.json``, ``"sustechpoints"``: ``label/NAME.json``,
+        ``"cvat"``: ``annotations/default.json`` of its format "Datumaro 3D".
+    box_columns : tuple of str
+        Columns of ``label/NAME.txt``. Columns that are not among `BOX_COLUMNS` are skipped; columns after the listed
+        ones are too.
+    point_names : mapping of int to str, or None
+        Names of the numbers in ``semseg``; None: ``semseg_classes.json`` has them.
+    labeled_deg : tuple of 2 float
+        Sector in which all objects have boxes, as azimuths counter-clockwise from x [deg].
+    labeled_m : float
+        Distance up to which all objects have boxes [m].
+    min_points : int
+        A box with fewer points need not be detected, and its object is not counted.
+    drives : str
+        ``"table"``: ``frames.csv`` names them, and without that file each scan is a drive of its own; ``"scan"``: each
+        scan is a drive of its own; ``"one"``: all scans are of one drive.
+    splits : mapping of str to tuple of str
+        ``"train"``, ``"validation"`` or ``"test"`` -> drives; ``*`` stands for all drives that are not listed. Drives
+        that no entry covers are for training and testing, as in `splits.in_split`.
+    """
+
+    name: str
+    sensor: SensorProfile
+    boxes: Mapping[str, str]
+    points: Mapping[str, str]
+    files: str = "plain"
+    box_format: str = "plain"
+    box_columns: tuple[str, ...] = BOX_COLUMNS
+    point_names: Mapping[int, str] | None = None
+    labeled_deg: tuple[float, float] = (-180.0, 180.0)
+    labeled_m: float = math.inf
+    min_points: int = 1
+    drives: str = "table"
+    splits: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @classmethod
+    def from_json(cls, text: str, folder: Path | None = None) -> ScanLayout:
+        """Read a description.
+
+        Parameters
+        ----------
+        text : str
+            JSON.
+        folder : Path or None
+            Folder of the profile that ``sensor`` names, if it is a file.
+
+        Raises
+        ------
+        PointsError
+            Not JSON, another schema, or an entry that is missing, unknown or of another type.
+        SensorError
+            The sensor is unknown, or the mounting impossible.
+        """
+        try:
+            given = json.loads(text)
+        except (RecursionError, ValueError) as exc:
+            raise PointsError(f"the description is not JSON ({exc}); expected an object with schema {SCHEMA}") from exc
+        if not isinstance(given, dict) or given.get("schema") != SCHEMA:
+            found = given.get("schema") if isinstance(given, dict) else type(given).__name__
+            raise PointsError(f"the description has schema {found!r:.60}; this edgeperc reads an object with {SCHEMA}")
+        if unknown := sorted(given.keys() - _KEYS):
+            raise PointsError(
+                f"unknown entries {', '.join(unknown)[:200]}; expected some of {', '.join(sorted(_KEYS))}"
+            )
+        boxes, points = (_classes(given, key) for key in ("boxes", "points"))
+        if DRIVABLE in boxes.values():
+            raise PointsError("boxes: a class of boxes cannot be drivable; give the area in drivable/, or by points")
+        name = given.get("name", "scans")
+        if not isinstance(name, str) or not re.fullmatch(r"[\w.-]{1,40}", name):
+            raise PointsError(f"name is {name!r:.60}; expected 1 to 40 letters, digits, '.', '_' or '-'")
+        check_name("name", name, PointsError)
+        own: dict[str, Any] = {"name": name, "sensor": _sensor(given, folder), "boxes": boxes, "points": points}
+        allowed = {"files": ("plain", "semantickitti"), "box_format": ("plain", *BOX_FILES)}
+        for key, choices in {**allowed, "drives": ("table", "scan", "one")}.items():
+            if key in given and given[key] not in choices:
+                raise PointsError(f"{key} is {given[key]!r:.60}; expected {' or '.join(choices)}")
+            own |= {key: given[key]} if key in given else {}
+        if "box_columns" in given:
+            own["box_columns"] = columns = tuple(map(str, _listed(given, "box_columns", str)))
+            if missing := [column for column in BOX_COLUMNS if columns.count(column) != 1]:
+                raise PointsError(f"box_columns is {columns}; expected {', '.join(missing)} once each")
+        if "point_names" in given:
+            own["point_names"] = _point_names(given["point_names"], "point_names")
+        if "labeled_deg" in given:
+            low, high = own["labeled_deg"] = _pair(given, "labeled_deg")
+            if not -360.0 <= low < high <= 360.0 or high - low > 360.0:
+                raise PointsError(f"labeled_deg is {[low, high]}; expected the right and the left end, up to 360 apart")
+        if "labeled_m" in given:
+            own["labeled_m"] = _number(given["labeled_m"], "labeled_m")
+            if own["labeled_m"] <= 0.0:
+                raise PointsError(f"labeled_m is {given['labeled_m']}; expected a distance above 0")
+        if "min_points" in given:
+            own["min_points"] = least = given["min_points"]
+            if isinstance(least, bool) or not isinstance(least, int) or not 0 <= least <= 10**6:
+                raise PointsError(f"min_points is {least!r:.60}; expected a whole number from 0")
+        if "splits" in given:
+            own["splits"] = _splits(given["splits"])
+        return cls(**own)
+
+    def in_split(self, drive: str, split: str, fold: int | None = None) -> bool:
+        """Whether a drive belongs to a split, as `splits.in_split` says, with the description's own lists first.
+
+        Drives that a description lists are in no fold: with a ``fold``, its validation drives stay out.
+        """
+        unlisted = in_split(drive, split, fold)  # checks the arguments too
+        listed = next((key for key, drives in self.splits.items() if drive in drives), None)
+        listed = listed or next((key for key, drives in self.splits.items() if ANY in drives), None)
+        if listed is None:
+            return unlisted
+        return split == "all" or (split == listed and not (listed == "validation" and fold is not None))
+
+
+def box_label(name: str, labels: Collection[str]) -> str:
+    """Class of a detection in a set that tells ``labels`` apart: a van is a car in a set without vans."""
+    return name if name in labels else COARSE.get(name, name)
+
+
+def known_layouts() -> tuple[str, ...]:
+    """Names of the public sets that have a description."""
+    return tuple(sorted(path.stem for path in LAYOUTS.glob("*.json")))
+
+
+def read_layout(layout: str | Path) -> ScanLayout:
+    """Read a description by the name of a public set, or from a file (a Path, or a str that ends in ``.json``).
+
+    Raises
+    ------
+    PointsError, SensorError
+        As `ScanLayout.from_json`; the file cannot be read, or no public set has this name.
+    """
+    if isinstance(layout, str) and not layout.endswith(".json"):
+        if layout not in known_layouts():
+            raise PointsError(f"no layout {layout!r}; expected {', '.join(known_layouts())}, or a .json file")
+        layout = LAYOUTS / f"{layout}.json"
+    path = Path(layout)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as exc:
+        raise PointsError(f"{path}: the description cannot be read ({exc})") from exc
+    try:
+        return ScanLayout.from_json(text, path.parent)
+    except SensorError as exc:
+        raise SensorError(f"{path}: {exc}") from exc
+    except PointsError as exc:
+        raise PointsError(f"{path}: {exc}") from exc
+
+
+def _point_class_names(layout: ScanLayout) -> tuple[str, ...]:
+    """Classes of points by number, ``ignore`` first."""
+    return (IGNORED, *sorted(set(layout.points.values()) - {IGNORED}))
+
+
+def _class_of(name: str, classes: Mapping[str, str], path: Path, kind: str) -> str:
+    key = name.lower()
+    if key not in classes and ANY not in classes:
+        raise PointsError(
+            f"{path}: no class for {name!r:.60}; add it to {kind} of the description, with a class or 'ignore', or add "
+            "'*' for all others"
+        )
+    return classes[key] if key in classes else classes[ANY]
+
+
+def _classes(given: Mapping[str, Any], key: str) -> Mapping[str, str]:
+    entries = given.get(key, {})
+    if not isinstance(entries, dict) or not all(isinstance(value, str) for value in entries.values()):
+        raise PointsError(
+            f'{key} is {entries!r:.80}; expected classes of the labels with ours, such as {{"Car": "car"}}'
+        )
+    classes = {name.lower(): value for name, value in entries.items()}
+    if len(classes) < len(entries):
+        raise PointsError(f"{key} has a class twice, in lower and upper case; give it once")
+    for name, value in entries.items():
+        if not _CLASS_NAME.fullmatch(value):
+            raise PointsError(
+                f"{key}: {name!r:.60} is mapped to {value!r:.60}; expected {', '.join(POINT_CLASS_OF)}, {BACKGROUND}, "
+                f"{DRIVABLE} (points), {IGNORED}, or a new name of lower-case letters, digits, spaces, _ and -"
+            )
+    return MappingProxyType(classes)
+
+
+def _sensor(given: Mapping[str, Any], folder: Path | None) -> SensorProfile:
+    named = given.get("sensor")
+    if isinstance(named, str) and named.isprintable():
+        sensor = get_sensor(named if not named.endswith(".json") or folder is None else folder / named)
+    elif isinstance(named, dict) and named.keys() <= _SENSOR_KEYS:
+        values = {key: value for key, value in named.items() if key != "like"}
+        if "like" in named:
+            sensor = replace(get_sensor(str(named["like"])), **values)
+        elif {"name", "elevations_deg", "columns"} <= values.keys():
+            sensor = SensorProfile(**values)
+        else:
+            raise PointsError("sensor: expected 'like' with the name of a sensor, or name, elevations_deg and columns")
+    else:
+        raise PointsError(
+            f"sensor is {named!r:.80}; expected the name of a sensor, the .json file of a profile, or an object with "
+            f"some of {', '.join(sorted(_SENSOR_KEYS))}"
+        )
+    if "mounting" in given:
+        known, names = given["mounting"], {each.name for each in fields(Mounting)}
+        if not isinstance(known, dict) or not known.keys() <= names:
+            raise PointsError(f"mounting is {known!r:.80}; expected what is known of {', '.join(sorted(names))}")
+        sensor = replace(sensor, mounting=Mounting(**known))
+    return sensor
+
+
+def _splits(given: object) -> Mapping[str, tuple[str, ...]]:
+    if not isinstance(given, dict) or not given.keys() <= {"train", "validation", "test"}:
+        raise PointsError(f"splits is {given!r:.80}; expected lists of drives for train, validation and test")
+    splits = {split: tuple(map(str, _listed(given, split, str))) for split in given}
+    drives = [drive for of_split in splits.values() for drive in of_split]
+    if twice := sorted({drive for drive in drives if drives.count(drive) > 1}):
+        raise PointsError(f"splits lists {', '.join(twice)[:80]} twice; whole drives belong to one split")
+    return MappingProxyType(splits)
+
+
+def _point_names(given: object, source: str) -> Mapping[int, str]:
+    valid = isinstance(given, dict) and all(
+        isinstance(name, str) and re.fullmatch(r"[0-9]{1,5}", str(number)) and int(number) <= 0xFFFF
+        for number, name in given.items()
+    )
+    if not valid:
+        raise PointsError(f'{source}: {given!r:.80}; expected names by number up to 65535, such as {{"1": "Road"}}')
+    assert isinstance(given, dict)
+    return MappingProxyType({int(number): name for number, name in given.items()})
+
+
+def _listed(given: Mapping[str, Any], key: str, kind: type) -> list[Any]:
+    values = given[key]
+    if not isinstance(values, list) or not all(isinstance(value, kind) for value in values):
+        raise PointsError(f"{key} is {values!r:.80}; expected a list of {kind.__name__}")
+    return values
+
+
+def _pair(given: Mapping[str, Any], key: str) -> tuple[float, float]:
+    values = given[key]
+    if not isinstance(values, list) or len(values) != 2:
+        raise PointsError(f"{key} is {values!r:.80}; expected two numbers")
+    return _number(values[0], key), _number(values[1], key)
+
+
+def _number(value: object, key: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1e9:
+        raise PointsError(f"{key} is {value!r:.60}; expected a number")
+    return float(value)

@@ -1,0 +1,117 @@
+"""Execution providers of onnxruntime on this computer."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Mapping
+from typing import Any
+
+from ..errors import ProviderError
+from ..system.extras import require, without_telemetry
+
+__all__ = ["PROVIDERS", "available_providers", "devices", "runtime_version"]
+
+PROVIDERS: Mapping[str, str] = {
+    "tensorrt-rtx": "NvTensorRTRTXExecutionProvider",
+    "tensorrt": "TensorrtExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "openvino": "OpenVINOExecutionProvider",
+    "coreml": "CoreMLExecutionProvider",
+    "directml": "DmlExecutionProvider",
+    "qnn": "QNNExecutionProvider",
+    "webgpu": "WebGpuExecutionProvider",
+    "cpu": "CPUExecutionProvider",
+}
+AUTO = ("cuda", "openvino", "cpu")
+# Providers that come as plugins beside stock onnxruntime: provider, then the package with its library.
+PLUGINS = {
+    "openvino": "onnxruntime_ep_openvino",
+    "tensorrt-rtx": "onnxruntime_ep_nv_tensorrt_rtx",
+    "qnn": "onnxruntime_qnn",
+    "webgpu": "onnxruntime_ep_webgpu",
+}
+# Providers that run on the processor's cores and take a number of threads.
+SHARING = ("cpu", "openvino")
+
+
+def load_onnxruntime() -> Any:
+    without_telemetry()
+    ort = require("onnxruntime", "cpu", "Running a model")
+    ort.set_default_logger_severity(4)  # its exceptions contain the messages, and ours repeat them
+    return ort
+
+
+def version(package: str) -> str:
+    return importlib.metadata.version(package.replace("_", "-"))
+
+
+def plugin_devices(ort: Any, short: str) -> list[Any]:
+    """Devices of a plugin provider on this computer; empty if its package is not installed or finds none.
+
+    Of Qualcomm's, the NPU comes first: its plugin also offers the GPU and the processor.
+    """
+    if not hasattr(ort, "get_ep_devices"):
+        return []
+    name = PROVIDERS[short]
+
+    def devices() -> list[Any]:
+        found = [d for d in ort.get_ep_devices() if d.ep_name == name]
+        return sorted(found, key=lambda d: d.device.type.name != "NPU") if short == "qnn" else found
+
+    if not devices():
+        try:
+            library = importlib.import_module(PLUGINS[short]).get_library_path()
+            ort.register_execution_provider_library(name, library)
+        except ImportError:
+            return []
+        except Exception as exc:  # onnxruntime's errors share no base but Exception
+            if "already registered" not in str(exc):
+                raise ProviderError(f"the plugin for provider {short!r} is installed but does not load: {exc}") from exc
+    return devices()
+
+
+def available_providers() -> tuple[str, ...]:
+    """The providers that ``Perceiver(provider=...)`` accepts on this computer, as keys of `PROVIDERS`.
+
+    Raises
+    ------
+    MissingExtraError
+        onnxruntime is not installed.
+    ProviderError
+        The plugin of a provider is installed but does not load.
+    """
+    ort = load_onnxruntime()
+    stock = ort.get_available_providers()
+    return tuple(s for s, name in PROVIDERS.items() if name in stock or (s in PLUGINS and plugin_devices(ort, s)))
+
+
+def runtime_version() -> str:
+    """The version of the installed onnxruntime.
+
+    Raises
+    ------
+    MissingExtraError
+        onnxruntime cannot be imported; the cause says why.
+    """
+    return str(load_onnxruntime().__version__)
+
+
+def devices() -> tuple[str, ...]:
+    """The devices that onnxruntime and its installed plugins offer here, such as ``"cpu: CPU Intel"``.
+
+    Empty if onnxruntime is older than 1.23, which does not list them.
+
+    Raises
+    ------
+    MissingExtraError, ProviderError
+        As `available_providers`.
+    """
+    present, ort = available_providers(), load_onnxruntime()  # in this order, which loads the plugins
+    found = ort.get_ep_devices() if hasattr(ort, "get_ep_devices") else ()
+    names = {PROVIDERS[short]: short for short in present}
+    listed = (
+        f"{names.get(each.ep_name.partition('.')[0], each.ep_name)}: "  # such as OpenVINOExecutionProvider.AUTO
+        f"{each.device.type.name} {each.device.vendor or each.ep_vendor}"
+        for each in found
+    )
+    return tuple(dict.fromkeys(each.strip() for each in listed))

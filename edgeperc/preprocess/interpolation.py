@@ -1,0 +1,215 @@
+"""Points between the beams of a sensor that has fewer than the training sensor."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PointsError
+from ..system.kernel_cache import njit
+from ..types.mounting import MODEL_HEIGHT_M
+from ..types.sensor import SensorProfile
+from ..types.views import RangeImageGeometry
+
+__all__ = ["Interpolator"]
+
+# Two returns lie on one surface if the line between them is at least MIN_ANGLE_DEG off the ray and their ranges differ
+# by at most MAX_STEP_M. On objects in 48 simulated scans of three sensors, 5 to 7 % of the interpolated points are more
+# than 0.3 m from the true surface. With steps up to 2 m it would be 8 to 13 %.
+MIN_ANGLE_DEG = 5.0
+MAX_STEP_M = 0.5
+# Neighboring rings on the road are meters apart. They are joined if both are near the ground and the line between them
+# is level.
+GROUND_M = 0.3
+GROUND_PER_M = 0.02  # of range; neither the sensor nor the road is exactly level
+GROUND_SLOPE = 0.1
+# Neighboring beams or columns that are at most this many pixels apart leave no gap to fill.
+NO_GAP = 1.1
+
+
+class Interpolator:
+    """Fills the pixels of a range image between neighboring beams and columns of a coarser sensor (KUL-Seg 5).
+
+    Parameters
+    ----------
+    view : RangeImageGeometry
+        The model's view.
+    sensor : SensorProfile
+        The sensor that takes the scans. The ground is where it is in the frame of the models.
+
+    Attributes
+    ----------
+    shape : tuple of 2 int
+        Height and width of the range image.
+    needed : bool
+        Whether the sensor is coarser than some part of the view.
+    """
+
+    def __init__(self, view: RangeImageGeometry, sensor: SensorProfile) -> None:
+        rows = np.array(view.row_elevations_deg)
+        column_deg = (view.azimuth_left_deg - view.azimuth_right_deg) / view.width
+        azimuths = np.radians(view.azimuth_left_deg - (np.arange(view.width) + 0.5) * column_deg)
+        self._row_slopes = np.tan(np.radians(rows))
+        self._directions = np.stack([np.cos(azimuths), np.sin(azimuths)])
+        self._ground_z = -MODEL_HEIGHT_M
+        # Row coordinates of the beams; then, for each row, how many rows below it the next beam's return may be.
+        places = np.interp(-np.array(sensor.elevations_deg), -rows, np.arange(len(rows)), left=-1.0, right=len(rows))
+        self._row_reach = np.zeros(len(rows), np.int64)
+        for upper, lower in pairwise(places.tolist()):
+            if lower - upper > NO_GAP and upper >= 0.0 and lower < len(rows):
+                between = self._row_reach[math.floor(upper) : math.ceil(lower) + 1]
+                between[:] = np.maximum(between, math.ceil(lower - upper) + 1)
+        step = sensor.azimuth_resolution_deg / column_deg
+        self._col_reach = math.floor(step) + 1 if step > NO_GAP else 0
+        self.shape = (view.height, view.width)
+        self.needed = bool(self._row_reach.any() or self._col_reach)
+
+    def fill(
+        self, points: NDArray[np.float32], index: NDArray[np.int32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        """Interpolate points in the gaps of a range image.
+
+        Parameters
+        ----------
+        points : (n, 4) float32
+        index : (H, W) int32
+            Row of ``points`` at each pixel; -1 without a return.
+
+        Returns
+        -------
+        points : (n + m, 4) float32
+            The given points, then the interpolated ones: each on the line between two neighbors, in the middle of its
+            pixel.
+        index : (H, W) int32
+            Row of the returned points at each pixel, -1 if empty. Rows from n on are interpolated points.
+
+        Raises
+        ------
+        PointsError
+            An array has another shape, or ``index`` refers to rows that ``points`` does not have.
+        """
+        if points.ndim != 2 or points.shape[1] != 4 or points.dtype != np.float32:
+            raise PointsError(f"got points of shape {points.shape} and {points.dtype}; expected (n, 4) float32")
+        if index.shape != self.shape or (index.size and int(index.max()) >= len(points)):
+            raise PointsError(
+                f"got index of shape {index.shape} for {len(points)} points; expected {self.shape}, "
+                "rows of these points"
+            )
+        dense = np.empty((len(points) + index.size, 4), np.float32)
+        dense[: len(points)] = points
+        filled = np.array(index, np.int32, order="C")
+        n = fill_between(
+            dense, len(points), filled, self._row_slopes, self._directions, self._row_reach, self._col_reach,
+            self._ground_z,
+        )  # fmt: skip
+        return dense[:n], filled
+
+
+@njit(cache=True, nogil=True)
+def on_one_surface(points: NDArray[np.float32], i: int, j: int, ground_z: float) -> bool:
+    """Whether two neighboring returns lie on one surface, or both on the ground."""
+    xi, yi, zi = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+    xj, yj, zj = np.float64(points[j, 0]), np.float64(points[j, 1]), np.float64(points[j, 2])
+    range_i = math.sqrt(xi * xi + yi * yi + zi * zi)
+    range_j = math.sqrt(xj * xj + yj * yj + zj * zj)
+    dx, dy, dz = xj - xi, yj - yi, zj - zi
+    apart = math.sqrt(dx * dx + dy * dy + dz * dz)
+    step = abs(range_j - range_i)
+    if step <= MAX_STEP_M and step <= math.cos(math.radians(MIN_ANGLE_DEG)) * apart:
+        return True
+    return bool(
+        abs(zi - ground_z) <= GROUND_M + GROUND_PER_M * range_i
+        and abs(zj - ground_z) <= GROUND_M + GROUND_PER_M * range_j
+        and abs(dz) <= GROUND_SLOPE * apart
+    )
+
+
+@njit(cache=True, nogil=True)
+def fill_between(
+    points: NDArray[np.float32],
+    n: int,
+    index: NDArray[np.int32],
+    row_slopes: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    row_reach: NDArray[np.int64],
+    col_reach: int,
+    ground_z: float,
+) -> int:
+    """Fill the empty pixels between two returns of one surface, first along rows, then along columns.
+
+    Parameters
+    ----------
+    points : (n + H * W, 4) float32
+        The first ``n`` rows are the input; the rows after them are overwritten.
+    n : int
+    index : (H, W) int32
+        Row of points, -1 if empty; empty pixels are overwritten.
+    row_slopes : (H,) float64
+        Tangent of each row's elevation.
+    directions : (2, W) float64
+        Cosine and sine of each column's azimuth.
+    row_reach : (H,) int64
+        How many rows below each row the next beam's return may be.
+    col_reach : int
+        How many columns to the right the next return may be.
+    ground_z : float
+        Height of the ground in the sensor frame [m].
+
+    Returns
+    -------
+    int
+        Number of points, with the interpolated ones.
+    """
+    height, width = index.shape
+    for row in range(height if col_reach > 1 else 0):
+        last = -1
+        for col in range(width):
+            if index[row, col] < 0:
+                continue
+            if (
+                last >= 0
+                and 1 < col - last <= col_reach
+                and on_one_surface(points, index[row, last], index[row, col], ground_z)
+            ):
+                i, j = index[row, last], index[row, col]
+                for k in range(last + 1, col):
+                    cos, sin = directions[0, k], directions[1, k]
+                    # Signed distances of the two returns from the vertical plane through the middle of the column.
+                    side_i = np.float64(points[i, 0]) * sin - np.float64(points[i, 1]) * cos
+                    side_j = np.float64(points[j, 0]) * sin - np.float64(points[j, 1]) * cos
+                    if side_i * side_j < 0.0:
+                        share = side_i / (side_i - side_j)
+                        for c in range(4):
+                            start = np.float64(points[i, c])
+                            points[n, c] = start + share * (np.float64(points[j, c]) - start)
+                        index[row, k] = n
+                        n += 1
+            last = col
+    for col in range(width):
+        last = -1
+        for row in range(height):
+            if index[row, col] < 0:
+                continue
+            if (
+                last >= 0
+                and 1 < row - last <= row_reach[last]
+                and on_one_surface(points, index[last, col], index[row, col], ground_z)
+            ):
+                i, j = index[last, col], index[row, col]
+                flat_i = math.hypot(np.float64(points[i, 0]), np.float64(points[i, 1]))
+                flat_j = math.hypot(np.float64(points[j, 0]), np.float64(points[j, 1]))
+                for k in range(last + 1, row):
+                    above_i = np.float64(points[i, 2]) - row_slopes[k] * flat_i
+                    above_j = np.float64(points[j, 2]) - row_slopes[k] * flat_j
+                    if above_i * above_j < 0.0:
+                        share = above_i / (above_i - above_j)
+                        for c in range(4):
+                            start = np.float64(points[i, c])
+                            points[n, c] = start + share * (np.float64(points[j, c]) - start)
+                        index[k, col] = n
+                        n += 1
+            last = row
+    return n

@@ -1,0 +1,185 @@
+"""How a network sees its input: top view, range image, camera image."""
+
+from __future__ import annotations
+
+import itertools
+import reprlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import CardError
+
+__all__ = ["CameraGeometry", "RangeImageGeometry", "TopViewGeometry"]
+
+MAX_ROWS, MAX_COLUMNS, MAX_PIXELS = 4096, 65_536, 16 * 10**6
+MIN_SECTOR_DEG = 1.0
+
+
+def check(field: str, value: float, low: float, high: float) -> None:
+    """Refuse a number of the card that is out of its bounds, or not finite."""
+    if not low <= value <= high:
+        raise CardError(f"{field} is {reprlib.repr(value)}; expected a number from {low:g} to {high:g}")
+
+
+def check_each(field: str, values: Iterable[float], low: float, high: float) -> None:
+    for index, value in enumerate(values):
+        check(f"{field}[{index}]", value, low, high)
+
+
+def check_size(rows: int, columns: int) -> None:
+    if not (1 <= rows <= MAX_ROWS and 1 <= columns <= MAX_COLUMNS and rows * columns <= MAX_PIXELS):
+        raise CardError(
+            f"the view has {reprlib.repr(rows)} rows and {reprlib.repr(columns)} columns; expected 1 to {MAX_ROWS} "
+            f"rows, 1 to {MAX_COLUMNS} columns and at most {MAX_PIXELS} pixels"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class TopViewGeometry:
+    """The ground ahead as an image (SSADNet 2.1.2). Row 0 is farthest ahead, column 0 leftmost.
+
+    Attributes
+    ----------
+    x_range_m, y_range_m, z_range_m : tuple of 2 float
+        Bounds of the view [m] in the sensor frame, lower first.
+    cell_m : float
+        Edge of a cell [m].
+    """
+
+    x_range_m: tuple[float, float] = (6.0, 46.0)
+    y_range_m: tuple[float, float] = (-10.0, 10.0)
+    z_range_m: tuple[float, float] = (-2.5, 2.5)
+    cell_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("x_range_m", "y_range_m", "z_range_m"):
+            low, high = getattr(self, name)
+            check_each(f"view.{name}", (low, high), -1e4, 1e4)
+            if not high - low >= 1e-3:
+                raise CardError(f"view.{name} is {(low, high)}; expected two finite numbers, the lower first")
+        check("view.cell_m", self.cell_m, 1e-3, 100.0)
+        check_size(self.height, self.width)
+
+    @property
+    def kind(self) -> str:
+        return "top_view"
+
+    @property
+    def height(self) -> int:
+        """Rows, along x."""
+        return round((self.x_range_m[1] - self.x_range_m[0]) / self.cell_m)
+
+    @property
+    def width(self) -> int:
+        """Columns, along y."""
+        return round((self.y_range_m[1] - self.y_range_m[0]) / self.cell_m)
+
+    def holds(self, x: float, y: float) -> bool:
+        """Whether a position x, y [m] in the sensor frame is in view."""
+        (near, far), (right, left) = self.x_range_m, self.y_range_m
+        return near <= x < far and right <= y < left
+
+    def cells(self, x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        """Find the cells that contain some positions.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Positions in the sensor frame [m]; their shapes must broadcast.
+
+        Returns
+        -------
+        rows, cols : ndarray of int64
+        in_view : ndarray of bool
+            False if a position is out of view or not finite; its row and column are then not valid.
+        """
+        row = np.floor((self.x_range_m[1] - np.asarray(x)) / self.cell_m)
+        col = np.floor((self.y_range_m[1] - np.asarray(y)) / self.cell_m)
+        in_view = (row >= 0) & (row < self.height) & (col >= 0) & (col < self.width)
+        with np.errstate(invalid="ignore"):  # NaN and what int64 cannot hold are out of view
+            return row.astype(np.int64), col.astype(np.int64), in_view
+
+    def cell_centers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Centers of the cells in the sensor frame [m]: x (rows, 1) and y (1, columns)."""
+        # np.float64, because older type stubs of numpy widen the type of a product with a Python float
+        cell_m = np.float64(self.cell_m)
+        x = np.float64(self.x_range_m[1]) - (np.arange(self.height, dtype=np.float64)[:, None] + 0.5) * cell_m
+        y = np.float64(self.y_range_m[1]) - (np.arange(self.width, dtype=np.float64)[None, :] + 0.5) * cell_m
+        return x, y
+
+
+@dataclass(frozen=True, slots=True)
+class RangeImageGeometry:
+    """The scan as seen from the sensor (PointSeg 3.1). Row 0 is the top beam, column 0 leftmost.
+
+    Attributes
+    ----------
+    row_elevations_deg : tuple of float
+        Elevation of every row [deg], top to bottom, strictly decreasing, not necessarily evenly spaced.
+    width : int
+        Columns, evenly spread over the azimuths.
+    azimuth_left_deg, azimuth_right_deg : float
+        Azimuths of the image's left and right edges [deg], counter-clockwise from +x; 180 and -180 for a full turn.
+    """
+
+    row_elevations_deg: tuple[float, ...]
+    width: int = 512
+    azimuth_left_deg: float = 45.0
+    azimuth_right_deg: float = -45.0
+
+    def __post_init__(self) -> None:
+        rows = self.row_elevations_deg
+        falling = all(a > b for a, b in itertools.pairwise(rows))
+        if len(rows) < 2 or not falling or not all(-90.0 < e < 90.0 for e in rows):
+            raise CardError(
+                f"view.row_elevations_deg holds {len(rows)} values; expected two or more, strictly decreasing, "
+                "between -90 and 90 degrees"
+            )
+        check_size(len(rows), self.width)
+        left, right = self.azimuth_left_deg, self.azimuth_right_deg
+        # A full turn takes a run of the network for each sector.
+        if not (right >= -180.0 and right + MIN_SECTOR_DEG <= left and left <= 180.0):
+            raise CardError(
+                f"view azimuths are left {left}, right {right}; expected -180 <= right < left <= 180, at least "
+                f"{MIN_SECTOR_DEG:g} degree apart"
+            )
+
+    @property
+    def kind(self) -> str:
+        return "range_image"
+
+    @property
+    def height(self) -> int:
+        """Rows, one per beam."""
+        return len(self.row_elevations_deg)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraGeometry:
+    """The image of a camera, scaled to the network's input. Row 0 is the top, column 0 leftmost.
+
+    Attributes
+    ----------
+    width, height : int
+        Columns and rows of the input.
+    fit : {"stretch"}
+        How an image of another size gets there: all of it is scaled to ``width`` and ``height``, bilinearly with
+        half-pixel centers (`edgeperc.camera.image.ImageScaler`), whatever its aspect; nothing is cropped or padded.
+    """
+
+    width: int
+    height: int
+    fit: Literal["stretch"] = "stretch"
+
+    def __post_init__(self) -> None:
+        if self.fit != "stretch":
+            raise CardError(f"view.fit is {reprlib.repr(self.fit)}; expected stretch")
+        check_size(self.height, self.width)
+
+    @property
+    def kind(self) -> str:
+        return "camera"
