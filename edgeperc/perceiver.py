@@ -168,7 +168,7 @@ class Perceiver:
         not depend on it.
     on_mismatch : {"refuse", "warn", "raise", "ignore"}
         What to do when one of the first five scans is unlike the training scans. ``"refuse"``: raise FitnessError,
-        before anything is perceived, if a difference is gross (`fitness.check_fitness` lists them), and warn
+        before anything is perceived, if a difference is gross (`findings.check_fitness` lists them), and warn
         of others. ``"warn"``: warn of all. ``"raise"``: raise FitnessError for any. ``"ignore"``: skip the check.
     score_threshold : float or None
         Lowest score of a box, in 0..1. None takes the card's threshold for boxes of a network, and 0.3 for boxes of
@@ -181,9 +181,10 @@ class Perceiver:
     boxes_from : {"both", "network", "clusters"}
         ``"network"``: boxes of a top-view model, vehicles ahead. ``"clusters"``: boxes around clusters of labeled
         points above the ground, of every class and everywhere in the range image
-        (`cluster.objects_from_points`). ``"both"``: use both. A cluster's box is dropped if it overlaps a
-        network's box, unless it is a person's with the better score. Otherwise it stays wherever it is: a network that
-        detects its class, and sees it, but has not found it, halves its score, in part if it sees the object in part.
+        (`edgeperc.objects.boxes.objects_from_points`). ``"both"``: use both. A cluster's box is dropped if it overlaps
+        a network's box, unless it is a person's with the better score. Otherwise it stays wherever it is: a network
+        that detects its class, and sees it, but has not found it, halves its score, in part if it sees the object in
+        part.
     full_turn : bool
         Run a range-image model once for each sector, four times for the shipped models. Every point then has a class,
         and there are boxes beside and behind the vehicle.

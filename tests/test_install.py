@@ -25,8 +25,9 @@ USE_KERNELS = """
 import json, pathlib
 import numpy as np
 from numba.core.dispatcher import Dispatcher
-from edgeperc import projection
-from edgeperc.card import InputSpec, TopViewGeometry
+from edgeperc.inference import projection
+from edgeperc.types.card import InputSpec
+from edgeperc.types.views import TopViewGeometry
 
 channels = ("distance", "remission", "height")
 view = TopViewGeometry()
@@ -95,8 +96,9 @@ def home(folder: Path) -> dict[str, str]:
 
 
 def forbid_writing(site: Path) -> None:
-    """Make the package's cache folder impossible to create; permissions would not stop root."""
-    (site / "edgeperc" / "__pycache__").write_bytes(b"")
+    """Make the package's cache folders impossible to create; permissions would not stop root."""
+    for folder in {source.parent for source in (site / "edgeperc").rglob("*.py")}:
+        (folder / "__pycache__").write_bytes(b"")
 
 
 @needs_compiler
@@ -105,8 +107,8 @@ def test_the_second_process_compiles_nothing_and_an_edited_kernel_is_compiled_ag
     assert (first["hits"], first["misses"]) == (0, first["kernels"])
     assert (second["hits"], second["misses"]) == (second["kernels"], 0)
     assert second["sum"] == first["sum"]
-    assert first["folders"] == [str(site / "edgeperc" / "__pycache__")]
-    source = site / "edgeperc" / "projection.py"
+    assert first["folders"] == [str(site / "edgeperc" / "inference" / "__pycache__")]
+    source = site / "edgeperc" / "inference" / "projection.py"
     text = source.read_text("utf-8")
     source.write_text(text + "\n# edited\n", "utf-8")
     assert use_kernels(site)["misses"] == 0  # the same machine code

@@ -35,7 +35,7 @@ from edgeperc import (
     pipeline,
 )
 from edgeperc.ground import planes
-from edgeperc.inference import decode, projection, session
+from edgeperc.inference import decode, projection, providers, session
 from edgeperc.objects import cluster, refine
 from edgeperc.pipeline import weigh
 from edgeperc.preprocess import condition, fitness
@@ -147,7 +147,7 @@ def test_networks_at_once_give_the_results_of_one_after_the_other(
 def test_openvino_runs_both_networks_at_once_too(
     monkeypatch: pytest.MonkeyPatch, scan: SimulatedScan, full_turn: bool
 ) -> None:
-    if "openvino" not in session.available_providers():
+    if "openvino" not in providers.available_providers():
         pytest.skip("the OpenVINO plugin is absent, or finds no device of Intel's")
     monkeypatch.setattr(session, "usable_cores", lambda: 2)
     options: dict[str, Any] = {"provider": "openvino", "full_turn": full_turn, "on_mismatch": "ignore"}
@@ -229,7 +229,7 @@ def test_networks_run_one_after_the_other_where_no_thread_can_be_started(
 def test_a_forked_child_runs_both_networks_at_once() -> None:
     code = """
 import os, edgeperc, numpy as np
-from edgeperc import session
+from edgeperc.inference import session
 session.usable_cores = lambda: 2
 perceive = edgeperc.Perceiver(["ssadnet", "pointseg"], provider="cpu", on_mismatch="ignore")
 assert all(each.shares_cores for each in perceive.sessions)

@@ -338,7 +338,7 @@ def test_without_a_home_kernels_are_compiled_and_it_is_said(tmp_path: Path) -> N
         pytest.skip("nothing is compiled with the JIT off")
     package = Path(sys.modules["edgeperc"].__file__ or "").parent
     shutil.copytree(package, tmp_path / "edgeperc", ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "edgeperc" / "__pycache__").write_bytes(b"")
+    (tmp_path / "edgeperc" / "types" / "__pycache__").write_bytes(b"")
     code = WITHOUT_PASSWD.partition("from edgeperc")[0] + (
         "import numpy as np\n"
         "from edgeperc.types.geometry import oriented_iou\n"
@@ -350,4 +350,4 @@ def test_without_a_home_kernels_are_compiled_and_it_is_said(tmp_path: Path) -> N
     assert (done.returncode, done.stdout) == (0, "[[1.]]\n"), done.stderr
     (line,) = done.stderr.splitlines()
     assert "compiled kernels are not kept" in line
-    assert str(tmp_path / "edgeperc" / "__pycache__") in line
+    assert str(tmp_path / "edgeperc" / "types" / "__pycache__") in line

@@ -17,7 +17,7 @@ import edgeperc
 import edgeperc.errors
 import edgeperc.zoo
 from edgeperc.errors import ModelFileError
-from edgeperc.inference import listing, session
+from edgeperc.inference import listing, providers
 from edgeperc.types.sensor import SENSORS
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -49,8 +49,13 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 def test_exported_names_exist_and_are_documented(module_name: str) -> None:
     module = importlib.import_module(module_name)
     assert module.__doc__, f"{module_name} does not say what it is"
-    assert len({*module.__all__}) == len(module.__all__)
-    for name in module.__all__:
+    public = getattr(module, "__all__", None) or [
+        name
+        for name, thing in vars(module).items()
+        if getattr(thing, "__module__", None) == module_name and name[0] != "_"
+    ]
+    assert len({*public}) == len(public)
+    for name in public:
         thing = getattr(module, name)
         if not inspect.isclass(thing) and not inspect.isroutine(thing):
             continue
@@ -114,14 +119,14 @@ def test_sensors_agree_with_the_profiles() -> None:
 
 def test_providers_agree_with_onnxruntime(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("onnxruntime")
-    assert tuple(p.name for p in edgeperc.providers() if p.available) == session.available_providers()
+    assert tuple(p.name for p in edgeperc.providers() if p.available) == providers.available_providers()
     assert {p.name: p.installed_by for p in edgeperc.providers()} == {**listing.INSTALLED_BY}
-    assert {*listing.INSTALLED_BY} == {*session.PROVIDERS}
+    assert {*listing.INSTALLED_BY} == {*providers.PROVIDERS}
 
     def missing() -> None:
         raise edgeperc.MissingExtraError("onnxruntime", "cpu", "Running a model")
 
-    monkeypatch.setattr(session, "_onnxruntime", missing)
+    monkeypatch.setattr(providers, "load_onnxruntime", missing)
     assert not any(provider.available for provider in edgeperc.providers())
 
 

@@ -127,7 +127,7 @@ def find_voters(
 
     Labeled points of clusters in which too few points can have a label are in cluster -2: such a cluster is not
     searched further as soon as that is certain, so a forest is not searched because of a few labels in it. The results
-    of `agree_on_points` and of `cluster.objects_from_points` are those for complete clusters. ``strips`` are
+    of `agree_on_points` and of `boxes.objects_from_points` are those for complete clusters. ``strips`` are
     the points above the ground from `edgeperc.objects.cluster.sort_points`, with the same ``distance_per_m``.
     """
     roles = roles_of(labels.classes)

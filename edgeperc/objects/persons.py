@@ -1,6 +1,6 @@
 """The kernels of boxes around persons: which labeled points are one person, and how much room that person takes.
 
-`cluster.objects_from_points` calls them. A cluster of points is often more than one person: two people who
+`boxes.objects_from_points` calls them. A cluster of points is often more than one person: two people who
 walk side by side, or a person beside a wall. Groups of points are measured along their principal axis, seen from above.
 """
 

@@ -83,7 +83,7 @@ def agree(
     Returns
     -------
     precisions : dict
-        Precision -> its record (`edgeperc.card.ModelCard`, ``precisions``).
+        Precision -> its record (`edgeperc.ModelCard`, ``precisions``).
 
     Raises
     ------

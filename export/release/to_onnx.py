@@ -159,7 +159,7 @@ def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
     """Write a graph with its card, and read the card back through onnxruntime.
 
     The graph may be of any network with a range image or a top view as input and outputs of the kinds of
-    `edgeperc.card.OutputSpec`. It is changed in place: a card in it is replaced.
+    `edgeperc.types.card.OutputSpec`. It is changed in place: a card in it is replaced.
 
     Raises
     ------

@@ -114,7 +114,7 @@ def test_columns_match_the_twin(given: list) -> None:
     scene, limits = Scene(given), np.array([0.0, 0.0, 2.0, 2.2])
     found = scene.labels.copy()
     clear_columns(scene.points, read_only(scene.height), limits, found)
-    np.testing.assert_array_equal(found, twins.agreement.columns(scene.points, scene.height, limits, scene.labels))
+    np.testing.assert_array_equal(found, twins.rules.columns(scene.points, scene.height, limits, scene.labels))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -129,7 +129,7 @@ def test_dense_columns_match_the_twin(seed: int) -> None:
     labels, limits = rng.integers(0, 4, n).astype(np.uint8), np.array([0.0, 0.0, 2.0, 2.2])
     found = labels.copy()
     clear_columns(read_only(points), read_only(height), limits, found)
-    right = twins.agreement.columns(points, height, limits, labels)
+    right = twins.rules.columns(points, height, limits, labels)
     np.testing.assert_array_equal(found, right)
     assert np.count_nonzero(found != labels) > 0
 
@@ -143,7 +143,7 @@ def test_tallies_match_the_twin(given: list, shape: tuple[int, int]) -> None:
     args = scene.points, scene.height, scene.in_view, scene.labels, scene.clusters, cells, np.arange(256) % 5 > 1
     grid = np.array([16.0, 8.0, 0.4])
     fill_tallies(*map_read_only(args), grid, *found)
-    for own, right in zip(found, twins.agreement.tallies(*args, grid, 6, 4), strict=True):
+    for own, right in zip(found, twins.rules.tallies(*args, grid, 6, 4), strict=True):
         np.testing.assert_array_equal(own, right)
 
 
@@ -161,16 +161,16 @@ def test_boxes_around_points_match_the_twin(given: list, boxes: list[Box]) -> No
     among = read_only(scene.in_view & ~scene.on_ground, np.bool_)
     labels = read_only(scene.labels, np.uint8)
     fill_support(*arrays[:2], among, labels, ROLES, as_rows, of_box, scores, names)
-    right_scores, right_names = twins.agreement.support(*arrays[:2], ~among, labels, ROLES, as_rows, of_box)
+    right_scores, right_names = twins.rules.support(*arrays[:2], ~among, labels, ROLES, as_rows, of_box)
     np.testing.assert_array_equal(scores, right_scores)
     np.testing.assert_array_equal(names, right_names)
     counts = np.empty((len(boxes), 3), np.int64)
     more = *arrays, *map_read_only((scene.in_view, scene.labels))
     count_inside(*more, ROLES, as_rows, counts)
-    np.testing.assert_array_equal(counts, twins.agreement.inside_counts(*more, ROLES, as_rows))
+    np.testing.assert_array_equal(counts, twins.rules.inside_counts(*more, ROLES, as_rows))
     sums = np.empty((len(boxes), 3))
     sum_inside(*more, ROLES, as_rows, sums)
-    np.testing.assert_array_equal(sums, twins.agreement.inside_sums(*more, ROLES, as_rows))
+    np.testing.assert_array_equal(sums, twins.rules.inside_sums(*more, ROLES, as_rows))
 
 
 @patient
@@ -183,11 +183,11 @@ def test_verdicts_match_the_twin(given: list, seed: int) -> None:
     in_view, clusters = map_read_only((scene.in_view, scene.clusters))
     found = scene.labels.copy()
     apply_verdicts(in_view, clusters, table, ROLES, scores, names, found)
-    right = twins.agreement.verdicts(in_view, clusters, table, ROLES, scores, names, scene.labels)
+    right = twins.rules.verdicts(in_view, clusters, table, ROLES, scores, names, scene.labels)
     np.testing.assert_array_equal(found, right)
     votes = np.empty(n, np.uint8)
     fill_votes(in_view, read_only(scene.labels, np.uint8), ROLES, scores, votes)
-    np.testing.assert_array_equal(votes, twins.agreement.votes(scene.in_view, scene.labels, ROLES, scores))
+    np.testing.assert_array_equal(votes, twins.rules.votes(scene.in_view, scene.labels, ROLES, scores))
 
 
 @patient
@@ -204,7 +204,7 @@ def test_what_becomes_of_clusters_matches_the_twin(
     bounds = bounds.astype(np.float32)
     parts, refused, found = np.array([[2, 3]]), rng.random(n) < 0.2, np.empty((n, 4), np.uint8)
     fill_verdicts(counts, bounds, refused, ROLES, parts, *rules, found)
-    np.testing.assert_array_equal(found, twins.agreement.verdict_table(counts, bounds, refused, ROLES, parts, *rules))
+    np.testing.assert_array_equal(found, twins.rules.verdict_table(counts, bounds, refused, ROLES, parts, *rules))
 
 
 def crowded(seed: int) -> tuple[NDArray[np.float32], PointLabels, Ground, list[Box]]:
@@ -272,7 +272,7 @@ def test_cleared_ground_matches_the_twin(given: list) -> None:
     found = scene.labels.copy()
     arrays = map_read_only((scene.points, scene.height, scene.on_ground))
     clear_ground(*arrays, ROLES, found)
-    np.testing.assert_array_equal(found, twins.agreement.ground(*arrays, ROLES, scene.labels))
+    np.testing.assert_array_equal(found, twins.rules.ground(*arrays, ROLES, scene.labels))
 
 
 @patient
@@ -287,7 +287,7 @@ def test_cleared_cells_match_the_twin(given: list, by_height: bool, of_road: boo
     fill_marks(*arrays, ROLES, by_height, grid, is_vehicle, read_only(cells, np.uint8), marks)
     clear_cells(marks, np.flatnonzero(marks), drivable, is_vehicle, in_box, found)
     args = *arrays, ROLES, by_height, grid, drivable, is_vehicle, in_box, cells
-    np.testing.assert_array_equal(found, twins.agreement.cells(*args))
+    np.testing.assert_array_equal(found, twins.rules.cells(*args))
 
 
 # --- what always holds
@@ -305,7 +305,7 @@ def test_points_keep_their_view_and_meet_the_rules(given: list, boxes: list[Box]
     assert not agreed.labels[~scene.in_view].any()
     boxed = np.zeros(len(scene.points), np.bool_)
     for box in boxes:
-        own = twins.agreement.inside(scene.points, scene.height, scene.on_ground, _as_rows([box])[0])
+        own = twins.rules.inside(scene.points, scene.height, scene.on_ground, _as_rows([box])[0])
         boxed |= own & (box.score >= 0.3)
     for k in range(6):
         own = scene.clusters == k
@@ -350,7 +350,7 @@ def test_only_uncertain_boxes_without_labels_are_dropped(given: list, boxes: lis
     kept = agree_on_boxes(boxes, Scan.of(scene.points, scene.ground), scene.found)
     assert [box for box in boxes if box in kept] == [*kept]
     for box in boxes:
-        own = twins.agreement.inside(scene.points, scene.height, scene.on_ground, _as_rows([box])[0])
+        own = twins.rules.inside(scene.points, scene.height, scene.on_ground, _as_rows([box])[0])
         is_right = np.count_nonzero(own & (scene.labels == 1)) >= 0.1 * np.count_nonzero(own & scene.in_view)
         assert (box in kept) == (box.score >= 0.5 or (own.any() and (is_right or not (own & scene.in_view).any())))
 

@@ -29,7 +29,7 @@ from edgeperc.cli.main import build_parser, in_options
 from edgeperc.cli.output import print_line, progress
 from edgeperc.cli.scans import find_scans, output_names
 from edgeperc.errors import InferenceError, ModelFileError, OptionError, PointsError
-from edgeperc.inference import session
+from edgeperc.inference import providers, session
 from edgeperc.readers import captures
 from edgeperc.types.perception import Box, Perception, PointLabels, TopView
 
@@ -817,7 +817,7 @@ def test_the_examples_of_a_help_page_can_be_parsed(name: str) -> None:
 
 def test_the_help_page_lists_what_there_is() -> None:
     assert zoo.DEFAULT == DEFAULT
-    assert {*PROVIDERS} == {"auto", *session.PROVIDERS}
+    assert {*PROVIDERS} == {"auto", *providers.PROVIDERS}
     assert ("auto", *session.PRECISIONS) == PRECISIONS
 
 

@@ -17,7 +17,7 @@ import pytest
 from cli_helpers import POINTSEG, SSADNET, run, write_scan
 from edgeperc import zoo
 from edgeperc.errors import ModelFileError
-from edgeperc.inference import listing, session
+from edgeperc.inference import listing, providers
 from edgeperc.preprocess.fitness import FitnessProfile
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import simulate
@@ -196,7 +196,7 @@ def test_providers_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("onnxruntime")
     assert run("providers", "--json") == 0
     records = {record["name"]: record for record in map(json.loads, capsys.readouterr().out.splitlines())}
-    assert {*records} == {*session.PROVIDERS}
+    assert {*records} == {*providers.PROVIDERS}
     assert records["cpu"]["available"]
     assert run("providers") == 0
     assert len(capsys.readouterr().out.splitlines()) == 1 + len(records)

@@ -18,7 +18,7 @@ from cli_helpers import run
 from edgeperc import zoo
 from edgeperc.cli import doctor
 from edgeperc.errors import ProviderError
-from edgeperc.inference import listing, session
+from edgeperc.inference import listing, providers
 from edgeperc.system.kernel_cache import KernelCache
 
 posix = pytest.mark.skipif(os.name != "posix", reason="Windows' folders have access lists")
@@ -113,7 +113,7 @@ def test_no_onnxruntime(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.
 def test_builds_of_onnxruntime(
     versions: dict[str, str], features: tuple[str, ...], state: str, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "runtime_version", lambda: versions["onnxruntime"])
+    monkeypatch.setattr(providers, "runtime_version", lambda: versions["onnxruntime"])
     monkeypatch.setattr(doctor, "_installed", lambda prefix="": versions)
     monkeypatch.setattr(doctor, "_has_sme", lambda: "sme" in features)
     found = {finding.name: finding for finding in doctor._packages()}
@@ -125,7 +125,7 @@ def test_builds_of_onnxruntime(
     ("value", "state", "text"), [("1", "ok", "off"), ("0", "note", "=0"), ("", "note", "imported")]
 )
 def test_telemetry(value: str, state: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "runtime_version", lambda: "1.31.1")
+    monkeypatch.setattr(providers, "runtime_version", lambda: "1.31.1")
     monkeypatch.setenv("ORT_DISABLE_TELEMETRY", value)
     if not value:
         monkeypatch.delenv("ORT_DISABLE_TELEMETRY")
@@ -135,10 +135,10 @@ def test_telemetry(value: str, state: str, text: str, monkeypatch: pytest.Monkey
 
 
 def test_a_plugin_that_does_not_load(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    def providers() -> Any:
+    def broken() -> Any:
         raise ProviderError("the plugin for provider 'openvino' is installed but does not load: no symbol")
 
-    monkeypatch.setattr(listing, "providers", providers)
+    monkeypatch.setattr(listing, "providers", broken)
     code, found = report(capsys)
     assert code == 1
     assert "does not load" in found["providers"]["found"]

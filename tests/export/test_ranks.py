@@ -25,7 +25,7 @@ import json, os, signal, sys
 from dataclasses import replace
 from pathlib import Path
 import torch
-from edgeperc.card import TopViewGeometry
+from edgeperc.types.views import TopViewGeometry
 from edgeperc_export import cards, ranks
 from edgeperc_export.recipe import Recipe
 from edgeperc_export.training.train import train

@@ -124,7 +124,7 @@ def test_heights_agree_with_the_twin(seed, regions):
     points, _ = street(rng, n=1500, slope_x=0.05, kerb=0.12 * seed, reach=[20.0, 45.0, 70.0, 90.0][seed])
     points[rng.random(len(points)) < 0.02] *= np.float32(3.0)
     points[rng.integers(0, len(points), 5), rng.integers(0, 3, 5)] = np.nan
-    heights, plane = twins.ground.ground_heights(points, 1.73, regions)
+    heights, plane = twins.planes.ground_heights(points, 1.73, regions)
     ground = find_ground(points, regions=regions)
     np.testing.assert_allclose(ground.plane, plane, atol=1e-9)
     np.testing.assert_allclose(ground.height_m, heights, atol=1e-5, rtol=1e-6)
@@ -141,7 +141,7 @@ def test_random_scans_match_the_twin(rows, regions):
     x, y = np.meshgrid(np.arange(-10.0, 10.0, 2.5), np.arange(-10.0, 10.0, 2.5))
     floor = np.column_stack([x.ravel(), y.ravel(), 0.03 * x.ravel() - 1.7])
     points = np.concatenate([np.array(rows).reshape(-1, 3), floor]).astype(np.float32)
-    heights, plane = twins.ground.ground_heights(points, 1.73, regions)
+    heights, plane = twins.planes.ground_heights(points, 1.73, regions)
     ground = find_ground(points, regions=regions)
     np.testing.assert_allclose(ground.plane, plane, atol=1e-9)
     np.testing.assert_allclose(ground.height_m, heights, atol=1e-4, rtol=1e-6)

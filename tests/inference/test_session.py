@@ -24,6 +24,7 @@ from edgeperc.errors import (
     OptionError,
     ProviderError,
 )
+from edgeperc.inference import providers
 from edgeperc.inference.providers import PROVIDERS, available_providers
 from edgeperc.inference.session import Session, golden_input
 from edgeperc.system.machine import fingerprint, settings_path, write_settings
@@ -256,7 +257,7 @@ class FakePlugins:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, devices: Sequence[tuple[str, str]]) -> None:
         self.libraries: list[str] = []
         self.chosen: list[tuple[str, dict[str, str]]] = []
-        self.ort = ort = session_module._onnxruntime()
+        self.ort = ort = session_module.load_onnxruntime()
         fakes = [
             SimpleNamespace(ep_name=name, device=SimpleNamespace(type=SimpleNamespace(name=kind)))
             for name, kind in devices
@@ -304,7 +305,8 @@ class FakePlugins:
                 assert name in {device.ep_name for device in fakes}
                 plugins.libraries.append(library)
 
-        monkeypatch.setattr(session_module, "_onnxruntime", Ort)
+        for module in (providers, session_module):
+            monkeypatch.setattr(module, "load_onnxruntime", Ort)
         for short, package in session_module.PLUGINS.items():
             offered = PROVIDERS[short] in {name for name, _ in devices}
             fake = SimpleNamespace(get_library_path=lambda package=package: f"{package}.so") if offered else None

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 import twins.cluster
 from edgeperc.errors import PointsError
-from edgeperc.objects import cluster, linkage
+from edgeperc.objects import boxes as object_boxes
+from edgeperc.objects import linkage
 from edgeperc.objects.boxes import OBJECT_SIZE_M, classes_of_boxes, join_boxes, objects_from_points
 from edgeperc.objects.cluster import cluster_labels, find_clusters, sort_points
 from edgeperc.types.geometry import oriented_iou, rectangles
@@ -335,7 +336,7 @@ def test_rectangles_agree_with_the_twin(n, seed, l_shaped):
     height, rows = rng.uniform(-1, 2, n).astype(np.float32), rng.permutation(n)[: rng.integers(1, n + 1)]
     rectangle, levels = np.empty(5), np.empty(len(rows))
     args = read_only(points), read_only(height), rows.astype(np.int32), l_shaped
-    assert cluster.fill_rectangle(*args, rectangle, levels) == points[rows, 2].max()
+    assert object_boxes.fill_rectangle(*args, rectangle, levels) == points[rows, 2].max()
     expected = twins.cluster.rectangle(points[rows, :2].astype(np.float64), l_shaped)
     np.testing.assert_allclose(rectangle, expected, atol=1e-8)
     np.testing.assert_array_equal(levels, points[rows, 2].astype(np.float64) - height[rows])
@@ -415,11 +416,11 @@ def test_what_stands_beside_a_vehicle_does_not_widen_its_box(x, y, yaw):
     clusters = np.zeros(len(points), np.int32)
     (alone,) = objects_from_points(as_points(car), labels[: len(car)], CLASSES, clusters=clusters[: len(car)])
     (box,) = objects_from_points(points, labels, CLASSES, clusters=clusters)
-    assert min(cluster_extents(points, box.yaw)) > cluster.MAX_WIDTH_M
+    assert min(cluster_extents(points, box.yaw)) > object_boxes.MAX_WIDTH_M
     assert oriented_iou(rectangles([box]), rectangles([alone]))[0, 0] > 0.8
     # A class that is no vehicle may be as wide as its points.
     (wide,) = objects_from_points(points, labels, ("background", "shed"), clusters=clusters)
-    assert min(wide.size[:2]) > cluster.MAX_WIDTH_M
+    assert min(wide.size[:2]) > object_boxes.MAX_WIDTH_M
 
 
 def cluster_extents(points, yaw):
@@ -539,7 +540,7 @@ def test_at_most_1000_clusters_get_a_box():
     places = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     points = as_points((places[:, None] + person).reshape(-1, 3))
     boxes = objects_from_points(points, np.full(len(points), 2, np.uint8), CLASSES, min_score=0.0)
-    assert find_clusters(points).max() + 1 == x.size > len(boxes) == cluster.MAX_OBJECTS == 1000
+    assert find_clusters(points).max() + 1 == x.size > len(boxes) == object_boxes.MAX_OBJECTS == 1000
 
 
 def test_objects_below_the_ground_are_dropped():
@@ -563,7 +564,7 @@ def test_pole_scores_lower_than_a_person():
 def test_class_without_usual_size_has_the_size_of_its_points():
     points = as_points(side((8.0, -6.0), (8.0, -4.0), z=(-1.7, 0.0)))
     (box,) = objects_from_points(points, np.ones(len(points), np.uint8), ("background", "sign"))
-    np.testing.assert_allclose(box.size, (2.0, cluster.MIN_SIDE_M, 1.7), atol=1e-5)
+    np.testing.assert_allclose(box.size, (2.0, object_boxes.MIN_SIDE_M, 1.7), atol=1e-5)
     assert abs(box.yaw) == pytest.approx(math.pi / 2)
 
 

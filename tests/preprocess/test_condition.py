@@ -210,7 +210,7 @@ def test_rendering_agrees_with_the_twin(function: RemissionFunction, points: np.
     sensor = replace(get_sensor("vlp-16"), remission_range=(5.0, 105.0), remission=function)
     before = points.copy()
     with np.errstate(over="ignore", invalid="ignore"):
-        wanted = twins.adapt.rendered(points, function, sensor.remission_range)
+        wanted = twins.condition.rendered(points, function, sensor.remission_range)
     found = render(points, sensor)
     np.testing.assert_array_equal(points, before)
     np.testing.assert_array_equal(found[:, :3], points[:, :3])
@@ -327,7 +327,7 @@ def twin(points: np.ndarray, index: np.ndarray, view: RangeImageGeometry, sensor
     azimuths = np.radians(view.azimuth_left_deg - (np.arange(view.width) + 0.5) * step)
     across = 360.0 / sensor.columns / step
     col_reach = int(across) + 1 if across > 1.1 else 0
-    return twins.adapt.between(points, index, np.radians(rows), azimuths, reach, col_reach, -1.73)
+    return twins.condition.between(points, index, np.radians(rows), azimuths, reach, col_reach, -1.73)
 
 
 SMALL = RangeImageGeometry(tuple(np.linspace(2.0, -24.0, 14)), width=24, azimuth_left_deg=20.0, azimuth_right_deg=-20.0)
@@ -364,7 +364,7 @@ def test_interpolation_agrees_with_the_twin_and_its_documentation(seed: int, n: 
     assert sorted(filled[filled >= n].tolist()) == list(range(n, len(dense)))  # each in one pixel
     for k, (i, j) in enumerate(parents, start=n):
         one, other = dense[i].astype(np.float64), dense[j].astype(np.float64)
-        assert twins.adapt.one_surface(one, other, -1.73)
+        assert twins.condition.one_surface(one, other, -1.73)
         low, high = np.minimum(one, other) - 1e-4, np.maximum(one, other) + 1e-4
         assert ((dense[k] >= low) & (dense[k] <= high)).all()  # between them in every coordinate, remission included
 

@@ -48,7 +48,7 @@ def test_cells_are_counted_from_the_near_edge_to_the_first_of_each_kind(cells: N
     objects, road = np.roll(cells, 1, axis=0) & np.roll(cells, 1, axis=1), np.ascontiguousarray(cells[::-1])
     firsts = np.full((3, cells.shape[1]), 99)
     fill_first_cells(objects, cells, road, firsts)
-    assert firsts.tolist() == twins.drivable.first_cells(objects, cells, road)
+    assert firsts.tolist() == twins.ahead.first_cells(objects, cells, road)
 
 
 @patient
@@ -56,7 +56,7 @@ def test_cells_are_counted_from_the_near_edge_to_the_first_of_each_kind(cells: N
 def test_the_corridor_follows_the_largest_overlap(cells: NDArray[np.bool_], first: float, width: float) -> None:
     bounds = np.full((len(cells), 2), 99)
     fill_corridor(cells, first, first + width, bounds)
-    np.testing.assert_array_equal(bounds, twins.drivable.corridor(cells, first, first + width))
+    np.testing.assert_array_equal(bounds, twins.ahead.corridor(cells, first, first + width))
 
 
 # --- the polygon -----------------------------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ def test_what_stands_in_a_cell(n: int, data: st.DataObject) -> None:
     corner = np.array([2.0, 1.5, 0.5])
     highest, tallest = np.empty((5, 4), np.int32), np.empty((5, 4), np.float32)
     fill_standing(points, height_m, corner, 0.25, 2.0, highest, tallest)
-    expected = twins.occupancy.standing(points, height_m, corner, 0.25, 2.0, (5, 4))
+    expected = twins.grid.standing(points, height_m, corner, 0.25, 2.0, (5, 4))
     np.testing.assert_array_equal(highest, expected[0])
     np.testing.assert_array_equal(tallest, expected[1])
 

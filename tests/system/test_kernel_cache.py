@@ -694,8 +694,9 @@ def test_caches_of_other_libraries_are_untouched(place: Place) -> None:
 
 START = """
 import numpy as np
-from edgeperc import projection
-from edgeperc.card import InputSpec, TopViewGeometry
+from edgeperc.inference import projection
+from edgeperc.types.card import InputSpec
+from edgeperc.types.views import TopViewGeometry
 
 channels = ("distance", "remission", "height")
 points = np.random.default_rng(7).uniform(-2.0, 40.0, (1000, 4)).astype(np.float32)
