@@ -16,8 +16,6 @@ from edgeperc.types.views import TopViewGeometry
 
 from .worker import Prediction
 
-__all__ = ["agreement", "agrees", "correctness"]
-
 # Results agree if nearly all labels and boxes equal the reference's, and no value of `correctness` falls by 0.01.
 LEAST_EQUAL = 0.99
 LEAST_BOX_F1 = 0.9
@@ -27,12 +25,9 @@ MOST_LOST = 0.01
 def agreement(reference: Sequence[Prediction], found: Sequence[Prediction]) -> dict[str, Any]:
     """Compare predictions with those of the reference on the same scans.
 
-    Returns
-    -------
-    dict
-        ``"n_scans"``; for ``"points"`` in view, ``"cells"`` and ``"pixels"`` of images: the share of ``equal`` labels,
-        and ``mean_iou`` with the reference as ground truth; for ``"boxes"``: ``n_reference``, ``n_found``, ``n_both``
-        (IoU at least 0.5) and ``f1``. An entry is None if the models do not predict it.
+    Returns: ``"n_scans"``; for ``"points"`` in view, ``"cells"`` and ``"pixels"`` of images: the share of ``equal``
+        labels, and ``mean_iou`` with the reference as ground truth; for ``"boxes"``: ``n_reference``, ``n_found``,
+        ``n_both`` (IoU at least 0.5) and ``f1``. An entry is None if the models do not predict it.
     """
     result: dict[str, Any] = {"n_scans": len(reference), "points": None, "cells": None, "pixels": None, "boxes": None}
     points, cells, pixels = [], [], []
@@ -93,10 +88,7 @@ def correctness(predictions: Sequence[Prediction], truth: Sequence[SimulatedScan
 def agrees(accuracy: Mapping[str, Any]) -> bool:
     """Whether predictions are as good as the reference's.
 
-    Parameters
-    ----------
-    accuracy : mapping
-        ``"agreement"`` from `agreement`; ``"truth"`` and ``"reference_truth"`` from `correctness`, or None.
+    accuracy : ``"agreement"`` from `agreement`; ``"truth"`` and ``"reference_truth"`` from `correctness`, or None.
     """
     same = accuracy["agreement"]
     if any(same[kind] is not None and same[kind]["equal"] < LEAST_EQUAL for kind in ("points", "cells")):

@@ -13,19 +13,13 @@ from numpy.typing import NDArray
 from edgeperc import Perceiver, Perception, Tracker, draw, stream
 from edgeperc.records import scan_record
 
-__all__ = ["Application"]
-
 PERIOD_S = 0.1
 
 
 class Application:
     """Called in place of a Perceiver: each scan goes through a live stream with a tracker, and every answer is used.
 
-    Parameters
-    ----------
-    perceive : Perceiver
-    draw_every : int
-        Every this many scans a picture is drawn; 0: never.
+    draw_every : every this many scans a picture is drawn; 0: never.
     """
 
     def __init__(self, perceive: Perceiver, draw_every: int = 100) -> None:

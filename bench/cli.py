@@ -17,23 +17,14 @@ from edgeperc.cli.program import Parser, run_program
 
 from .commands import compare, matrix, peers, run, scaling, soak
 
-__all__ = ["build_parser", "main", "with_command"]
-
 COMMANDS = {"run": run, "compare": compare, "matrix": matrix, "scaling": scaling, "soak": soak, "peers": peers}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments without the program's name; by default those of this process.
-
-    Returns
-    -------
-    code : int
-        The exit code. Wrong usage raises argparse's ``SystemExit(2)``.
+    argv : arguments without the program's name; by default those of this process.
+    Returns code: The exit code. Wrong usage raises argparse's ``SystemExit(2)``.
     """
     typed = with_command(sys.argv[1:] if argv is None else argv)
     return run_program("edgeperc-bench", lambda: _run(typed))

@@ -18,18 +18,6 @@ from edgeperc import __version__
 from edgeperc.system.extras import require
 from edgeperc.system.machine import cpu_model
 
-__all__ = [
-    "EnergyMeter",
-    "busiest",
-    "conditions",
-    "disturbances",
-    "lasting_disturbances",
-    "machine",
-    "peak_rss_mb",
-    "rss_mb",
-    "software",
-]
-
 PACKAGES = (
     *("numpy", "numba", "onnxruntime", "onnxruntime-gpu", "onnxruntime-ep-openvino", "onnxruntime-ep-nv-tensorrt-rtx"),
     "mlcommons-loadgen",
@@ -167,14 +155,9 @@ def disturbances(
 ) -> list[str]:
     """List what disturbed the samples between two `conditions`, one sentence each.
 
-    Parameters
-    ----------
-    hardware : mapping
-        From `machine`.
-    before, after : mapping
-        From `conditions`.
-    own_cpu_s : float
-        CPU time of the measured process itself [s].
+    hardware : from `machine`.
+    before, after : from `conditions`.
+    own_cpu_s : CPU time of the measured process itself [s].
     """
     found = []
     wall_s = max(after["at_s"] - before["at_s"], 1e-9)

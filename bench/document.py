@@ -19,20 +19,6 @@ from edgeperc.system.atomic import write_atomic
 
 from .samples import noise_floor, percentile, summary
 
-__all__ = [
-    "KINDS",
-    "SCHEMA",
-    "ReportError",
-    "latency",
-    "pooled",
-    "read_report",
-    "repeats_ms",
-    "scenario_names",
-    "setting_label",
-    "stage_medians",
-    "write_report",
-]
-
 SCHEMA = 2  # 2: provider and precision are two settings
 KINDS = ("run", "matrix", "scaling", "soak", "peers")
 
@@ -49,10 +35,7 @@ def write_report(document: Mapping[str, Any], path: Path) -> None:
 def read_report(path: Path) -> dict[str, Any]:
     """Read what `write_report` wrote.
 
-    Raises
-    ------
-    ReportError
-        The file is not a report, or has another schema.
+    Raises ReportError.
     """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))

@@ -17,8 +17,6 @@ from edgeperc.simulation.samples import FIRST_SEED, simulated_scan
 from edgeperc.simulation.scene import SimulatedScan
 from edgeperc.types.sensor import get_sensor
 
-__all__ = ["Input", "crowd", "raw", "read_input", "simulated_input", "sized", "store"]
-
 
 @dataclass(frozen=True)
 class Input:
@@ -58,10 +56,7 @@ def raw(points: NDArray[np.float32], sensor: str) -> NDArray[np.float32]:
 def read_input(folder: Path, paths: Sequence[Path], sensor: str) -> Input:
     """The user's scans: files, and all scan files of folders.
 
-    Raises
-    ------
-    PointsError
-        A file is not a scan, or a folder holds none.
+    Raises PointsError.
     """
     get_sensor(sensor)
     files: list[Path] = []

@@ -15,8 +15,6 @@ from edgeperc.system.extras import require
 
 from .scenarios import KeepGoing, Limits, Perceive, Timings, back_to_back
 
-__all__ = ["load", "read_summary", "single_stream"]
-
 SUMMARY = "mlperf_log_summary.txt"
 # MLPerf's early stopping needs this many queries for a 99.9th percentile.
 QUERIES_FOR_P999 = 6636
@@ -38,17 +36,9 @@ def single_stream(
 ) -> Timings:
     """MLPerf's single stream: LoadGen draws a scan, waits for its answer, draws the next.
 
-    Parameters
-    ----------
-    folder : Path
-        Where LoadGen writes ``mlperf_log_summary.txt``, ``mlperf_log_detail.txt`` and so on.
-    perceive, scans, limits, keep_going, on_start
-        As in `back_to_back`, but a test cannot be stopped once it runs.
-
-    Returns
-    -------
-    Timings
-        The calls as measured here, for the stages; LoadGen's own results are in its logs (`read_summary`).
+    folder : where LoadGen writes ``mlperf_log_summary.txt``, ``mlperf_log_detail.txt`` and so on.
+    perceive, scans, limits, keep_going, on_start : as in `back_to_back`, but a test cannot be stopped once it runs.
+    Returns: The calls as measured here, for the stages; LoadGen's own results are in its logs (`read_summary`).
     """
     loadgen = load()
     timings = back_to_back(perceive, scans, Limits(0, 0.0, limits.warm_up_scans), keep_going=keep_going)

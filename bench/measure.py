@@ -21,8 +21,6 @@ from .context import conditions, disturbances
 from .scenarios import Limits, throughput
 from .worker import Job, OnTick, Prediction, Scenario, WorkerError, measure, perceiver_arguments
 
-__all__ = ["Reference", "accuracy_of", "cold_starts", "new_setting", "offline", "reference", "repeat"]
-
 
 def new_setting(job: Job) -> dict[str, Any]:
     """The record of one setting as asked for, with nothing measured yet."""
@@ -46,15 +44,8 @@ def repeat(
 ) -> list[Prediction]:
     """Do a job in this many fresh processes, one after the other; each is recorded in ``setting`` when it is done.
 
-    Returns
-    -------
-    predictions : list of Prediction
-        Of the first process.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        Interrupted; the results so far are in ``setting``.
+    Returns predictions: Of the first process.
+    Raises KeyboardInterrupt.
     """
     predictions: list[Prediction] = []
     for k in range(n_repeats):

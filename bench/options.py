@@ -12,22 +12,6 @@ from edgeperc.inference.providers import PROVIDERS
 from edgeperc.inference.session import PRECISIONS
 from edgeperc.zoo import DEFAULT
 
-__all__ = [
-    "SINGLE_STREAM",
-    "Subparsers",
-    "add_limits",
-    "at_least",
-    "choices",
-    "engine_options",
-    "model_options",
-    "numbers",
-    "output_options",
-    "provider",
-    "scan_options",
-    "scenario",
-    "seconds",
-]
-
 SINGLE_STREAM = "single-stream"
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 

@@ -12,8 +12,6 @@ import numpy as np
 from .document import pooled, scenario_names, stage_medians
 from .samples import percentile
 
-__all__ = ["BLUE", "as_svg", "pictures"]
-
 BLUE = "#3b6ea8"
 
 

@@ -15,8 +15,6 @@ from edgeperc.system.printable import printable
 
 from .samples import summary
 
-__all__ = ["QUANTILES", "LiveTable", "Section", "html_page", "markdown", "number", "share", "text"]
-
 TEXT_WIDTH = 24  # a column with a longer cell is a text column, aligned left
 QUANTILES = ("p50", "p90", "p99", "p99.9", "max")
 
@@ -89,12 +87,7 @@ POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri
 def html_page(parts: Iterable[Section], title: str, pictures: Sequence[str] = ()) -> str:
     """Format sections as an HTML page without external files.
 
-    Parameters
-    ----------
-    parts : iterable of Section
-    title : str
-    pictures : sequence of str
-        ``<svg>`` elements; shown after the second section.
+    pictures : ``<svg>`` elements; shown after the second section.
     """
     escape, title = html.escape, printable(title)
     body = [f"<h1>{escape(title)}</h1>"]

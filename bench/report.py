@@ -10,8 +10,6 @@ from .document import latency, pooled, scenario_names, setting_label, stage_medi
 from .render import QUANTILES, Section, number, share
 from .samples import percentile
 
-__all__ = ["sections"]
-
 
 def sections(document: Mapping[str, Any]) -> list[Section]:
     """Every section of a document, in the order in which they are shown."""

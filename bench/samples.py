@@ -16,8 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["PERCENTILES", "Trend", "Verdict", "compare", "noise_floor", "percentile", "summary", "supported", "trend"]
-
 PERCENTILES = (50.0, 90.0, 99.0, 99.9)
 SAMPLES_ABOVE = 10
 N_BLOCKS = 20
@@ -79,17 +77,9 @@ def compare(a: Sequence[ArrayLike], b: Sequence[ArrayLike], seed: int = 0) -> Ve
     because neighbors in time are correlated. The second condition is needed because the bootstrap alone is
     overconfident with three repeats.
 
-    Parameters
-    ----------
-    a, b : sequence of array_like
-        Milliseconds of each repeat, in the order of measuring.
-    seed : int
-        Seed of the bootstrap.
-
-    Returns
-    -------
-    Verdict
-        ``"unusable"`` if a run has fewer than two repeats, because its noise is unknown.
+    a, b : sequence of array_like; milliseconds of each repeat, in the order of measuring.
+    seed : seed of the bootstrap.
+    Returns: ``"unusable"`` if a run has fewer than two repeats, because its noise is unknown.
     """
     noises = [noise_floor(a), noise_floor(b)]
     if None in noises:

@@ -15,8 +15,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Clock", "KeepGoing", "Limits", "Perceive", "Timings", "back_to_back", "paced", "throughput"]
-
 Perceive = Callable[[NDArray[np.float32]], Any]
 
 
@@ -135,16 +133,8 @@ def back_to_back(
 ) -> Timings:
     """Perceive one scan after the other, the next as soon as there is a result (MLPerf's single stream).
 
-    Parameters
-    ----------
-    perceive : callable
-    scans : sequence of (n, 4) float32
-        Used in turn.
-    limits : Limits
-    clock : Clock, optional
-    keep_going : callable
-    on_start : callable
-        Called between the warm-up and the first scan that counts.
+    scans : sequence of (n, 4) float32; used in turn.
+    on_start : called between the warm-up and the first scan that counts.
     """
     clock = clock or Clock()
     timings = _warm_up(perceive, scans, limits, clock, keep_going)
@@ -175,11 +165,7 @@ def paced(
     then the thread sleeps, so that cores idle and clocks fall as they do in a vehicle. After a late result, the newest
     scan that has arrived is next and those before it are skipped.
 
-    Parameters
-    ----------
-    rate_hz : float
-    perceive, scans, limits, clock, keep_going, on_start
-        As in `back_to_back`. Warm-up is back to back.
+    perceive, scans, limits, clock, keep_going, on_start : as in `back_to_back`. Warm-up is back to back.
     """
     clock = clock or Clock()
     timings = _warm_up(perceive, scans, limits, clock, keep_going)
@@ -205,17 +191,9 @@ def paced(
 def throughput(calls: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[float, float]:
     """Scans per second of several processes together, while all of them were running.
 
-    Parameters
-    ----------
-    calls : sequence of (start_s, ms)
-        Of each process, on one clock.
-
-    Returns
-    -------
-    scans_per_s : float
-        NaN if there was no such time.
-    seconds : float
-        Length of that time.
+    calls : sequence of (start_s, ms); of each process, on one clock.
+    Returns scans_per_s: NaN if there was no such time.
+    Returns seconds: Length of that time.
     """
     ends = [np.asarray(start) + np.asarray(ms) / 1e3 for start, ms in calls]
     if not ends or not all(map(len, ends)):

@@ -12,8 +12,6 @@ BEGAN_S = time.perf_counter()
 import json
 import sys
 
-__all__ = ["main"]
-
 
 def main() -> None:
     """Print one line of JSON; the argument has ``spawned_s`` (the parent's clock), ``scan`` and Perceiver's options."""

@@ -30,17 +30,6 @@ from .context import EnergyMeter, conditions, peak_rss_mb, rss_mb
 from .loadgen import single_stream
 from .scenarios import Limits, Perceive, Timings, back_to_back, paced
 
-__all__ = [
-    "MEMORY_SAMPLES",
-    "Job",
-    "OnTick",
-    "Prediction",
-    "Scenario",
-    "WorkerError",
-    "measure",
-    "perceiver_arguments",
-]
-
 TICK_S = 0.25
 MEMORY_SAMPLES = 500  # at most, in a scenario: a longer list would itself be memory growth
 # Time for a process to end its scan and send its results after it was asked to stop.
@@ -293,22 +282,10 @@ def measure(jobs: Sequence[Job], on_tick: OnTick = lambda name, ms: None) -> lis
     Ctrl-C asks the processes for their results so far, which are returned with ``"interrupted"`` set; a second one ends
     them. Call this from the main thread.
 
-    Parameters
-    ----------
-    jobs : sequence of Job
-    on_tick : callable
-        Called with the name of a scenario and the milliseconds of its calls since the last time.
-
-    Returns
-    -------
-    list of dict
-        By job: ``engines``, ``construct_s``, ``first_call_ms``, ``scenarios``, ``rss_mb``, ``peak_rss_mb``,
+    on_tick : called with the name of a scenario and the milliseconds of its calls since the last time.
+    Returns: By job: ``engines``, ``construct_s``, ``first_call_ms``, ``scenarios``, ``rss_mb``, ``peak_rss_mb``,
         ``predictions`` and so on.
-
-    Raises
-    ------
-    EdgepercError
-        Raised in a process; `WorkerError` if a process died.
+    Raises EdgepercError.
     """
     spawn = multiprocessing.get_context("spawn")
     workers = []

@@ -20,8 +20,6 @@ from .system.clock import LATEST_S, Clock
 from .types.perception import Perception
 from .types.sensor import SensorProfile
 
-__all__ = ["Answer", "Health", "Stream", "stream"]
-
 Health = Literal["OK", "LATE", "STALE"]
 
 # Longest time that `Stream.close` waits for the reading thread.

@@ -42,8 +42,6 @@ from .types.views import CameraGeometry, RangeImageGeometry, TopViewGeometry
 from .warm_up import Rehearsed, n_processes, warm_up
 from .zoo import CAMERA, DEFAULT, resolve
 
-__all__ = ["ADAPTATIONS", "BoxesFrom", "Learned", "Perceiver"]
-
 Adaptation = Literal["both", "remission", "interpolation", "none"]
 OnMismatch = Literal["refuse", "warn", "raise", "ignore"]
 ADAPTATIONS: tuple[Adaptation, ...] = ("none", "remission", "interpolation", "both")

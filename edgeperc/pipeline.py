@@ -32,8 +32,6 @@ from .types.perception import Box, PointLabels, TopView
 from .types.sensor import SensorProfile
 from .types.views import RangeImageGeometry, TopViewGeometry
 
-__all__ = ["BoxesFrom", "Options", "Parts", "Pipeline", "RangeImageNetwork", "TopViewNetwork", "weigh"]
-
 BoxesFrom = Literal["both", "network", "clusters"]
 
 
@@ -144,13 +142,7 @@ class RangeImageNetwork:
 class Pipeline:
     """Networks, and what makes one answer of theirs. The next scan overwrites their buffers.
 
-    Parameters
-    ----------
-    top : TopViewNetwork or None
-    ranged : sequence of RangeImageNetwork
-        The same network once for each lane that may run it; none without a range image.
-    options : Options
-    lanes : Lanes
+    ranged : the same network once for each lane that may run it; none without a range image.
     """
 
     def __init__(

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from .types.perception import Box, Perception
     from .types.sensor import SensorProfile
 
-__all__ = ["SCAN_KEYS", "PerceivedScan", "Sink", "read_boxes", "scan_record"]
 
 SCAN_KEYS = (
     "n_points",
@@ -45,15 +44,7 @@ SCAN_KEYS = (
 def scan_record(perception: Perception, tracks: Tracks | None = None) -> dict[str, Any]:
     """`Perception.to_dict` with the road ahead and the tracks, as ``edgeperc run --json`` prints it.
 
-    Parameters
-    ----------
-    perception : Perception
-    tracks : Tracks, optional
-
-    Returns
-    -------
-    dict
-        With the keys of `SCAN_KEYS`; None for results of a kind of model that was not used.
+    Returns: With the keys of `SCAN_KEYS`; None for results of a kind of model that was not used.
     """
     record = perception.to_dict()
     record["road"] = _road_record(perception)
@@ -87,22 +78,9 @@ def _road_record(perception: Perception) -> dict[str, Any] | None:
 def read_boxes(path: Path | str) -> list[list[Box]]:
     """Read the boxes of a drive as ``edgeperc run --json`` prints them: one line for each scan.
 
-    Parameters
-    ----------
-    path : str or Path
-        A file of JSON lines.
-
-    Returns
-    -------
-    list of list of Box
-        By scan, in the sensor frame.
-
-    Raises
-    ------
-    TrackingError
-        A line is not such a record.
-    OSError
-        The file cannot be read.
+    path : a file of JSON lines.
+    Returns: By scan, in the sensor frame.
+    Raises TrackingError, OSError.
     """
     from .types.perception import Box
 

@@ -71,8 +71,6 @@ from .types.perception import Box, PointLabels, TopView
 from .types.points import read_only
 from .types.sensor import SensorProfile
 
-__all__ = ["Helpers", "Rehearsed", "car_and_person", "compile_parts", "n_processes", "warm_up"]
-
 logger = logging.getLogger(__name__)
 
 MAX_S = 120.0  # after which a helper ends in any case; one took 12 s on two cores at 2.4 GHz
@@ -86,10 +84,7 @@ START = "import os, sys; sys.path[:] = sys.argv[2:]; from edgeperc.warm_up impor
 def car_and_person() -> tuple[NDArray[np.float32], PointLabels]:
     """Nine points of a car and a person on a floor, and their labels: enough to compile every kernel of objects.
 
-    Returns
-    -------
-    points : (n, 4) float32
-    labels : PointLabels
+    Returns points: (n, 4) float32.
     """
     x, y = np.meshgrid(np.arange(-8.0, 8.0), np.arange(-8.0, 8.0))
     scan = np.zeros((x.size + 9, 4), np.float32)
@@ -262,10 +257,7 @@ MAX_HELPERS = 3
 class Helpers:
     """Processes that compile parts of the kernels, for use in a ``with`` statement; at its end none is left.
 
-    Parameters
-    ----------
-    parts : collection of str
-        Those of `PARTS` that the caller needs. Those in the cache are left out.
+    parts : collection of str; those of `PARTS` that the caller needs. Those in the cache are left out.
     """
 
     def __init__(self, parts: Collection[str]) -> None:
@@ -314,10 +306,7 @@ class Helpers:
 def compile_parts(parts: Sequence[str]) -> None:
     """Compile parts of the kernels in this process, one after the other, into the cache.
 
-    Parameters
-    ----------
-    parts : sequence of str
-        Of `PARTS`.
+    parts : of `PARTS`.
     """
     with fewer_collections():
         for part in parts:

@@ -12,17 +12,6 @@ from edgeperc.types.views import CameraGeometry, RangeImageGeometry, TopViewGeom
 
 from .recipe import EDGE_BLOCKS, Recipe
 
-__all__ = [
-    "CAMERA_INPUT",
-    "HEIGHT_INPUT",
-    "RANGE_IMAGE",
-    "RANGE_IMAGE_INPUT",
-    "ROAD_CLASSES",
-    "TOP_VIEW",
-    "TOP_VIEW_INPUT",
-    "card_of",
-]
-
 ROAD_CLASSES = TOP_VIEW_CLASSES[:2]
 """LoDNN's classes; the ground under a vehicle is background."""
 

@@ -18,8 +18,6 @@ from edgeperc.errors import EdgepercError, MissingExtraError, ModelError
 from .database.cli import add_database_commands
 from .recipe import MODELS, NETWORKS, PAPER, TASKS, Recipe
 
-__all__ = ["build_parser", "main"]
-
 KITTI = "KITTI object set: a folder of training/velodyne, label_2, calib and of frames.csv"
 LAYOUTS = "folder of KITTI's label_2, calib and frames.csv: half of the simulated scenes get their boxes"
 SEMANTICKITTI = "root folder of SemanticKITTI, to evaluate the drivable area"
@@ -36,11 +34,8 @@ PROOF = "scan (or image) files on which torch and onnxruntime must agree, in add
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
-    Returns
-    -------
-    int
-        0: success; 1: a model was refused or a scene was left out; 2: wrong usage or unusable files; 130 interrupted,
-        141 the program that reads the output closed it, 143 terminated.
+    Returns: 0: success; 1: a model was refused or a scene was left out; 2: wrong usage or unusable files; 130
+        interrupted, 141 the program that reads the output closed it, 143 terminated.
     """
     given = list(sys.argv[1:] if argv is None else argv)
     return run_program("edgeperc-export", lambda: _run(given))
@@ -305,10 +300,7 @@ def _title(networks: tuple[str, ...]) -> str:
 def _recipe(args: argparse.Namespace) -> Recipe:
     """The recipe of a ``train`` command.
 
-    Raises
-    ------
-    ValueError
-        An option has no effect on the network.
+    Raises ValueError.
     """
     if args.recipe == "paper" and args.network not in PAPER:
         raise ValueError(f"--recipe paper is for {', '.join(PAPER)}; got {args.network}")

@@ -20,8 +20,6 @@ from .recipe import MODELS
 from .release.to_onnx import export, write_card
 from .training.train import train
 
-__all__ = ["finish", "make"]
-
 N_SIMULATED = 2400
 SOURCES = {"real", "semantickitti", "simulated"}
 # What a card holds of the figures of a source; `edgeperc eval` prints the rest, which is four times as long.
@@ -48,39 +46,19 @@ def make(
 ) -> Path:
     """Simulate, train, export and evaluate a model. Finished parts are not made again.
 
-    Parameters
-    ----------
-    name : str
-        A key of `MODELS`. The models that it starts from or is distilled from are made first.
-    out : Path
-        Folder for scans, checkpoints and models.
-    kitti, layouts, semantickitti : Path or None
-        Folders of a KITTI object set, of its labels and calibrations alone, and of SemanticKITTI. Models whose name
-        ends in ``-sim`` need none of them; ``kitti`` then serves for evaluation only.
-    camvid : Path or None
-        Folder of CamVid, which the network of a camera is trained and evaluated on; it needs nothing else.
-    scan_sets : sequence of ScanFolder
-        More real scans to train on.
-    fold : int, optional
-        Validate on this fold of the training drives, and do not train on it.
-    steps : int, optional
-        Number of training steps; by default the shipped model's.
-    n_threads : int or None
-    n_workers : int
-    compiled : bool
-        As for `edgeperc_export.training.train.train`.
-    version : str
-        Version to write into the card.
-
-    Returns
-    -------
-    Path
-        ``out/NAME.onnx``, with its figures in its card.
-
-    Raises
-    ------
-    ValueError
-        The model is trained on real scans too, or on images, and a folder of them is missing.
+    name : a key of `MODELS`. The models that it starts from or is distilled from are made first.
+    out : folder for scans, checkpoints and models.
+    kitti, layouts, semantickitti : folders of a KITTI object set, of its labels and calibrations alone, and of
+        SemanticKITTI. Models whose name ends in ``-sim`` need none of them; ``kitti`` then serves for evaluation
+        only.
+    camvid : folder of CamVid, which the network of a camera is trained and evaluated on; it needs nothing else.
+    scan_sets : more real scans to train on.
+    fold : validate on this fold of the training drives, and do not train on it.
+    steps : number of training steps; by default the shipped model's.
+    compiled : as for `edgeperc_export.training.train.train`.
+    version : version to write into the card.
+    Returns: ``out/NAME.onnx``, with its figures in its card.
+    Raises ValueError.
     """
     stage = MODELS[name]
     recipe = stage.recipe if steps is None else replace(stage.recipe, steps=steps)
@@ -150,16 +128,10 @@ def finish(
 ) -> None:
     """Export a checkpoint, evaluate the file, and write the figures into its card and a JSON file beside it.
 
-    Parameters
-    ----------
-    name : str
-        A key of `MODELS`, and the name of the model.
-    checkpoint : Path
-    path : Path
-        The .onnx file to write. The JSON file has the same name, but ends in .json. If ``ssadnet-sim.onnx`` is in the
-        same folder, its road is the ground truth of KITTI's scans.
-    kitti, semantickitti, camvid, fold, version
-        As for `make`.
+    name : a key of `MODELS`, and the name of the model.
+    path : the .onnx file to write. The JSON file has the same name, but ends in .json. If ``ssadnet-sim.onnx`` is in
+        the same folder, its road is the ground truth of KITTI's scans.
+    kitti, semantickitti, camvid, fold, version : as for `make`.
     """
     stage = MODELS[name]
     if stage.recipe.task == "camera":

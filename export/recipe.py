@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-__all__ = ["EDGE_BLOCKS", "MODELS", "NETWORKS", "PAPER", "SCAN_NETWORKS", "TASKS", "Recipe", "Stage", "task_name"]
-
 TASKS: Mapping[str, tuple[str, ...]] = {
     "points": ("kulseg", "pointseg", "squeezesegv2"),
     "vehicles": ("ssadnet",),
@@ -29,10 +27,7 @@ EDGE_BLOCKS: Mapping[str, tuple[int, int]] = {"pointseg": (2, 4), "ssadnet": (4,
 def task_name(network: str) -> str:
     """The key of `TASKS` that a network belongs to.
 
-    Raises
-    ------
-    ValueError
-        The network is unknown.
+    Raises ValueError.
     """
     for task, networks in TASKS.items():
         if network in networks:

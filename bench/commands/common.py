@@ -23,8 +23,6 @@ from ..worker import Job
 if TYPE_CHECKING:
     from ..inputs import Input
 
-__all__ = ["job_of", "limits_of", "measure_offline", "new_document", "prepare_input"]
-
 
 @contextmanager
 def new_document(kind: str, arguments: argparse.Namespace) -> Iterator[tuple[dict[str, Any], LiveTable]]:
@@ -115,10 +113,7 @@ def measure_offline(
 ) -> None:
     """Measure the throughput of several processes into ``setting``.
 
-    Raises
-    ------
-    KeyboardInterrupt
-        Interrupted; the results so far are in ``setting``.
+    Raises KeyboardInterrupt.
     """
     from ..measure import offline
 

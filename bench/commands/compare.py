@@ -13,8 +13,6 @@ from ..document import ReportError, read_report, repeats_ms, scenario_names, set
 from ..options import Subparsers
 from ..samples import compare
 
-__all__ = ["add_parser", "run_command"]
-
 
 def add_parser(subparsers: Subparsers) -> None:
     """Declare the command."""

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from ..inputs import Input
     from ..measure import Reference
 
-__all__ = ["add_parser", "recommend", "run_command", "settings_to_try"]
-
 
 def add_parser(subparsers: Subparsers) -> None:
     """Declare the command."""
@@ -115,20 +113,11 @@ def settings_to_try(
 ) -> tuple[list[tuple[str, str]], list[str]]:
     """Select the settings of a model that this computer can run.
 
-    Parameters
-    ----------
-    model : str
-        As `edgeperc.Perceiver` takes it.
-    providers, precisions : sequence of str
-        What the user asked for.
-    present : sequence of str
-        The providers of this computer.
-
-    Returns
-    -------
-    settings : list of (provider, precision)
-    skipped : list of str
-        One sentence for each requested setting that this computer cannot run.
+    model : as `edgeperc.Perceiver` takes it.
+    providers, precisions : what the user asked for.
+    present : the providers of this computer.
+    Returns settings: list of (provider, precision).
+    Returns skipped: One sentence for each requested setting that this computer cannot run.
     """
     variants = resolve(model)
     settings, skipped = [], []

@@ -10,8 +10,6 @@ from pathlib import Path
 from ..options import Subparsers, at_least, engine_options, model_options, output_options, scan_options
 from .common import new_document, prepare_input
 
-__all__ = ["add_parser", "run_command"]
-
 
 def add_parser(subparsers: Subparsers) -> None:
     """Declare the command."""

@@ -26,8 +26,6 @@ from ..scenarios import Limits
 from ..worker import Job, Scenario
 from .common import job_of, limits_of, measure_offline, new_document, prepare_input
 
-__all__ = ["add_parser", "run_command"]
-
 DEFAULT_SCENARIOS = (SINGLE_STREAM, "paced:10", "paced:20", "offline", "cold-start")
 
 

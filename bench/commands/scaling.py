@@ -25,8 +25,6 @@ from ..samples import trend
 from ..worker import Job, Scenario
 from .common import job_of, limits_of, measure_offline, new_document
 
-__all__ = ["add_parser", "run_command"]
-
 POINT_COUNTS = (10_000, 20_000, 50_000, 100_000, 200_000, 500_000, 1_000_000, 2_000_000)
 CAR_COUNTS = (0, 4, 8, 16, 28)
 SIZES = (50, 100, 200, 400)

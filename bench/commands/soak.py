@@ -18,8 +18,6 @@ from ..scenarios import Limits
 from ..worker import MEMORY_SAMPLES, Scenario
 from .common import job_of, new_document
 
-__all__ = ["add_parser", "memory_growth", "run_command"]
-
 # Growth up to this counts as level [MB]: an allocator's pages vary by about as much.
 LEVEL_MB = 1.0
 # The share of the scans during which the allocator settles.
@@ -76,18 +74,11 @@ def run_command(arguments: argparse.Namespace) -> int:
 def memory_growth(rss_mb: Sequence[Sequence[float]], settling: int) -> dict[str, Any]:
     """Test whether memory grew.
 
-    Parameters
-    ----------
     rss_mb : sequence of (scans done, MB)
-    settling : int
-        Number of scans before the first sample.
-
-    Returns
-    -------
-    dict
-        ``verdict`` (grows, level, undecided), ``growth_mb`` over the run by a straight line and its ``growth_error_mb``
-        (half of a 95 % interval), ``last_minus_first_mb``, ``sentences``. Memory grows if the interval lies above 0 and
-        the growth above `LEVEL_MB`; it is level if the interval ends below `LEVEL_MB`.
+    settling : number of scans before the first sample.
+    Returns: ``verdict`` (grows, level, undecided), ``growth_mb`` over the run by a straight line and its
+        ``growth_error_mb`` (half of a 95 % interval), ``last_minus_first_mb``, ``sentences``. Memory grows if the
+        interval lies above 0 and the growth above `LEVEL_MB`; it is level if the interval ends below `LEVEL_MB`.
     """
     done, mb = np.asarray(rss_mb, np.float64).reshape(-1, 2).T
     line = trend(done, mb)

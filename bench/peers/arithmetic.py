@@ -19,17 +19,6 @@ import numpy as np
 
 from edgeperc import ModelError
 
-__all__ = [
-    "COPY_BYTES",
-    "PRODUCT_SIZE",
-    "Cost",
-    "cost",
-    "matrix_product",
-    "memory_copy",
-    "n_taps_inside",
-    "openvino_request",
-]
-
 PRODUCT_SIZE = 1536
 COPY_BYTES = 1 << 28
 
@@ -57,14 +46,8 @@ class Cost:
 def cost(model: Path | Any) -> Cost:
     """Count a network's multiplications and traffic.
 
-    Parameters
-    ----------
     model : Path or onnx.ModelProto
-
-    Raises
-    ------
-    ModelError
-        A shape is not fixed, or padding is left to the engine.
+    Raises ModelError.
     """
     import onnx
 

@@ -22,8 +22,6 @@ from edgeperc.types.views import CameraGeometry
 from ..worker import Prediction
 from .engines import Engine
 
-__all__ = ["N_IMAGES", "NumpyCamera", "camera_images", "small_unet"]
-
 N_IMAGES = 3
 
 
@@ -41,11 +39,7 @@ def camera_images(view: CameraGeometry, folder: Path) -> tuple[Path, ...]:
 class NumpyCamera:
     """`edgeperc.Perceiver` of images without edgeperc's stages, for images of the model's own size.
 
-    Parameters
-    ----------
-    card : ModelCard
-        Of the camera; its class output is the engine's only one.
-    engine : Engine
+    card : of the camera; its class output is the engine's only one.
     """
 
     def __init__(self, card: ModelCard, engine: Engine) -> None:

@@ -28,8 +28,6 @@ from ..samples import percentile
 from ..worker import Prediction
 from .camera import camera_images
 
-__all__ = ["INSTALL", "OPENVINO", "PEAKS", "Contender", "Measured", "default_models", "groups", "why_missing"]
-
 INSTALL = "not installed: pip install 'edgeperc[peers]'"
 TORCH = (("torch", "fp32"), ("torch.compile", "fp32"), ("torch", "bf16"), ("torch.compile", "bf16"))
 OPENVINO = (("openvino", "fp32"), ("openvino", "bf16"))
@@ -123,18 +121,11 @@ def groups(
 ) -> dict[str, list[Contender]]:
     """All contenders, by the title of their table.
 
-    Parameters
-    ----------
-    models : sequence of str
-        Names or paths; a name stands for its variant in fp32. Range-image models are paired with top-view models, the
-        first with the first.
-    provider, precision : str
-        For edgeperc itself.
-    folder : Path
-        For inputs and for the two networks in place of one.
-    scan : Path
-        The scan that is the input of networks alone.
-    sensor : str
+    models : names or paths; a name stands for its variant in fp32. Range-image models are paired with top-view
+        models, the first with the first.
+    provider, precision : for edgeperc itself.
+    folder : for inputs and for the two networks in place of one.
+    scan : the scan that is the input of networks alone.
     """
     points, _ = condition(np.load(scan), get_sensor(sensor), rendered=False)
     views: dict[str, list[Variant]] = {"range_image": [], "top_view": [], "camera": []}

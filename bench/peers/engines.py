@@ -18,8 +18,6 @@ from edgeperc import ModelError
 
 from .arithmetic import openvino_request
 
-__all__ = ["Engine", "open_engine", "torch_network"]
-
 
 @dataclass(frozen=True)
 class Engine:
@@ -40,19 +38,9 @@ class Engine:
 def open_engine(library: str, precision: str, path: Path, n_threads: int) -> Engine:
     """Open a model in an engine.
 
-    Parameters
-    ----------
-    library : {"mnn", "ncnn", "onnxruntime", "openvino", "torch", "torch.compile"}
-        onnxruntime is its CPU provider. MNN and ncnn run the graph as their own converters translate it.
-    precision : str
-        ``"fp32"`` or ``"bf16"``, in torch by autocast; onnxruntime, MNN and ncnn ignore it.
-    path : Path
-    n_threads : int
-
-    Raises
-    ------
-    ModelError
-        The engine cannot run the graph.
+    library : onnxruntime is its CPU provider. MNN and ncnn run the graph as their own converters translate it.
+    precision : ``"fp32"`` or ``"bf16"``, in torch by autocast; onnxruntime, MNN and ncnn ignore it.
+    Raises ModelError.
     """
     if library in ("mnn", "ncnn"):
         with tempfile.TemporaryDirectory() as folder:
@@ -176,10 +164,7 @@ def _signature(path: Path) -> tuple[str, tuple[int, ...], list[str]]:
 def torch_network(path: Path) -> tuple[Any, tuple[int, ...], list[str]]:
     """Translate a model's graph to a torch module; also the shape of its input and the names of its outputs.
 
-    Raises
-    ------
-    ModelError
-        The graph has an operator that is not translated here.
+    Raises ModelError.
     """
     import onnx
     import torch

@@ -26,8 +26,6 @@ from ..render import Section, text
 from .engines import open_engine
 from .rounds import measure, versions
 
-__all__ = ["main"]
-
 ENGINES = {"onnxruntime": "fp32", "openvino": "bf16"}
 """Engine -> precision of what is not in int8."""
 

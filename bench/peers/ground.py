@@ -39,8 +39,6 @@ from edgeperc.types.sensor import get_sensor
 from ..render import Section, number, share, text
 from .rounds import measure, versions
 
-__all__ = ["main"]
-
 SENSOR = get_sensor("hdl-64e")
 DISTANCE_M = 0.5
 # SemanticKITTI: road, parking, pavement, other ground, lane marking, terrain; unlabeled, outlier, vegetation.
@@ -108,10 +106,7 @@ def ground_finders(peers: Mapping[str, Any]) -> dict[str, Finder]:
 def clusterers(points: Scan, peers: Mapping[str, Any]) -> dict[str, Clusterer]:
     """By name: calls that cluster the points, (n,) int.
 
-    Raises
-    ------
-    AssertionError
-        DBSCAN's clusters differ from those of `find_clusters`.
+    Raises AssertionError.
     """
     calls: dict[str, Clusterer] = {
         "find_clusters": lambda: find_clusters(points),

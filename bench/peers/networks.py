@@ -10,18 +10,13 @@ from edgeperc import ModelError
 from edgeperc.types.views import TopViewGeometry
 from edgeperc.zoo import resolve
 
-__all__ = ["resized"]
-
 
 def resized(model: str, share: float, folder: Path) -> Path:
     """Make the same network for a view with ``share`` times the pixels, with random weights in fp32.
 
     A range image gets ``share`` times the columns, a top view ``share`` times the range.
 
-    Raises
-    ------
-    ModelError
-        The card has no training recipe, or the network does not fit such an image.
+    Raises ModelError.
     """
     from edgeperc_export.networks import build
     from edgeperc_export.recipe import Recipe

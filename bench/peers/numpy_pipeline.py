@@ -28,8 +28,6 @@ from ..worker import Prediction
 from .engines import Engine
 from .projection import NumpyRangeImage, NumpyTopView
 
-__all__ = ["NumpyPipeline", "iou"]
-
 STRIDE, MAX_BOXES = 4, 100
 WINDOW, N_VOTES, MAX_RANGE_GAP_M = 2, 5, 1.0
 
@@ -37,13 +35,8 @@ WINDOW, N_VOTES, MAX_RANGE_GAP_M = 2, 5, 1.0
 class NumpyPipeline:
     """`edgeperc.Perceiver` without edgeperc's stages.
 
-    Parameters
-    ----------
-    cards : sequence of ModelCard
-        Each of the front quarter as a range image, or of a top view with dense boxes.
-    engines : sequence of Engine
-        One for each card.
-    sensor : SensorProfile
+    cards : each of the front quarter as a range image, or of a top view with dense boxes.
+    engines : one for each card.
     """
 
     def __init__(self, cards: Sequence[ModelCard], engines: Sequence[Engine], sensor: SensorProfile) -> None:

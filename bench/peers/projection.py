@@ -43,8 +43,6 @@ from edgeperc.types.views import RangeImageGeometry, TopViewGeometry
 from ..render import Section, number, text
 from .rounds import measure, versions
 
-__all__ = ["NumpyRangeImage", "NumpyTopView", "contenders", "main"]
-
 SENSOR = "hdl-64e"
 TOP_VIEW = TopViewGeometry()
 RANGE_IMAGE = RangeImageGeometry(get_sensor(SENSOR).elevations_deg)
@@ -59,8 +57,6 @@ RANGE_IMAGE_INPUT = InputSpec(
 def fill_copy(points: NDArray[np.float32], copy: NDArray[np.float32]) -> None:
     """Copy the points, number by number.
 
-    Parameters
-    ----------
     points : (n, 4) float32, C-contiguous
     copy : (n, 4) float32, overwritten
     """
@@ -110,11 +106,7 @@ class _NumpyProjector:
 class NumpyTopView(_NumpyProjector):
     """`TopViewProjector` in numpy.
 
-    Parameters
-    ----------
-    view : TopViewGeometry
-    input : InputSpec
-        Channels distance, remission, height.
+    input : channels distance, remission, height.
     """
 
     def __init__(self, view: TopViewGeometry, input: InputSpec) -> None:
@@ -145,11 +137,7 @@ class NumpyTopView(_NumpyProjector):
 class NumpyRangeImage(_NumpyProjector):
     """`RangeImageProjector` in numpy, for the front quarter.
 
-    Parameters
-    ----------
-    view : RangeImageGeometry
-    input : InputSpec
-        Channels x, y, z, remission, range and, if wanted, height_above_ground.
+    input : channels x, y, z, remission, range and, if wanted, height_above_ground.
     """
 
     def __init__(self, view: RangeImageGeometry, input: InputSpec) -> None:
@@ -202,10 +190,7 @@ def winners(
 def contenders(points: NDArray[np.float32]) -> dict[str, Callable[[], object]]:
     """The calls to measure, by their names in the table, each with its own buffers.
 
-    Raises
-    ------
-    AssertionError
-        numpy and the kernels give different results.
+    Raises AssertionError.
     """
     copy = np.empty_like(points)
     calls: dict[str, Callable[[], object]] = {"copy loop": lambda: fill_copy(points, copy)}

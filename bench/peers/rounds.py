@@ -10,8 +10,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["elapsed_ms", "measure", "versions"]
-
 N_WARM_UP = 3
 
 

@@ -57,8 +57,6 @@ from edgeperc.types.geometry import inside
 from ..render import Section, number, text
 from .rounds import versions
 
-__all__ = ["Drive", "ghost_share", "main", "moving_boxes", "step_errors", "trajectory_error"]
-
 RATE_HZ = 10.0
 CELL_M = 0.2
 FARTHEST_CELL = 2**20  # from the origin; 200 km
@@ -176,8 +174,6 @@ def moving_boxes(labels: Sequence[Sequence[Box]], poses: Poses) -> list[list[Box
 def trajectory_error(true: Poses, found: Poses) -> float:
     """Root of the mean squared distance of positions [m], after the best rigid alignment.
 
-    Parameters
-    ----------
     true, found : (k, 4, 4) float64
     """
     a, b = (poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0) for poses in (true, found))
@@ -207,8 +203,6 @@ def ghost_share(
 ) -> float:
     """Share of the map's cells that hold a kept point of a moving object.
 
-    Parameters
-    ----------
     scans : sequence of (n, 4) float32
     kept, moving : sequence of (n,) bool
     poses : (k, 4, 4) float64

@@ -16,8 +16,6 @@ from ..samples import noise_floor, summary
 from .arithmetic import COPY_BYTES, PRODUCT_SIZE, cost
 from .contenders import INSTALL, OPENVINO, Contender, Measured, why_missing
 
-__all__ = ["floor_table", "latency_table"]
-
 
 def latency_table(title: str, measured: Sequence[Measured], n_threads: int) -> dict[str, Any]:
     """Table of the times of all contenders except the machine's peaks, with ratios to the first."""

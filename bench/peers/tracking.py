@@ -44,8 +44,6 @@ from edgeperc.types.sensor import get_sensor
 from ..render import Section, number, text
 from .rounds import elapsed_ms, versions
 
-__all__ = ["crossing", "every_second_beam", "main"]
-
 Scans = Sequence[Sequence[Box]]
 
 
@@ -90,12 +88,8 @@ def crossing(
 def every_second_beam(root: Path, out: Path) -> None:
     """Write the drives of an HDL-64E as if it had half the beams and its remission were squared, as a byte.
 
-    Parameters
-    ----------
-    root : Path
-        An object set with track ids; its scans hold one beam after the other, each a turn from ahead, as KITTI's.
-    out : Path
-        Becomes an object set; its ``sensor.json`` is the coarser sensor, without a fitted remission function.
+    root : an object set with track ids; its scans hold one beam after the other, each a turn from ahead, as KITTI's.
+    out : becomes an object set; its ``sensor.json`` is the coarser sensor, without a fitted remission function.
     """
     for folder in ("label_2", "track_id", "calib"):
         shutil.copytree(root / "training" / folder, out / "training" / folder)

@@ -33,8 +33,6 @@ from .numpy_pipeline import NumpyPipeline
 from .rounds import elapsed_ms
 from .tables import floor_table, latency_table
 
-__all__ = ["measure", "run"]
-
 PAUSE_S = 0.02  # threads of the previous contender spin for some milliseconds
 Calls = list[Callable[[], object]]
 
@@ -163,24 +161,11 @@ def measure(
 ) -> list[Measured]:
     """Let contenders take turns.
 
-    Parameters
-    ----------
-    contenders : sequence of Contender
-    files : sequence of Path
-        Scans, .npy (n, 4), in the sensor's raw unit of remission.
-    sensor : str
-    n_threads : int
-        The same for every library.
-    n_rounds : int
-    note : callable
-        Called with the name of each contender before it starts.
-    measured : list, optional
-        Filled while measuring, so that the results so far are left after an interruption.
-
-    Returns
-    -------
-    list of Measured
-        In the order of ``contenders``; ``missing`` says why a contender has no results.
+    files : scans, .npy (n, 4), in the sensor's raw unit of remission.
+    n_threads : the same for every library.
+    note : called with the name of each contender before it starts.
+    measured : filled while measuring, so that the results so far are left after an interruption.
+    Returns: In the order of ``contenders``; ``missing`` says why a contender has no results.
     """
     measured = [] if measured is None else measured
     spawn, rng = multiprocessing.get_context("spawn"), np.random.default_rng(0)

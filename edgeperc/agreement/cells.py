@@ -16,8 +16,6 @@ from ..types.points import read_only
 from .rules import RULES, cells_of, roles_of
 from .votes import VEHICLE
 
-__all__ = ["agree_on_cells", "mark_cells"]
-
 OBSTACLE_M = (0.3, 2.0)  # heights of returns that block a cell
 _NO_BOX = _NO_CLASS = 255
 
@@ -124,23 +122,16 @@ def fill_marks(
 ) -> None:
     """Write what the points show in each cell; see `mark_cells`.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
     height : (n,) float32
     in_view : (n,) bool
     labels : (n,) uint8
-    roles : (classes,) uint8
-        1 for vehicles, 2 for persons, 0 for classes that are no objects.
-    by_height : bool
-        Whether returns above the ground are obstacles, whatever their label.
-    grid : (3,) float64
-        x of the far edge, y of the left edge, edge of a cell [m].
-    is_vehicle : (256,) bool
-        Labels of cells that the points may contradict.
+    roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for classes that are no objects.
+    by_height : whether returns above the ground are obstacles, whatever their label.
+    grid : (3,) float64; x of the far edge, y of the left edge, edge of a cell [m].
+    is_vehicle : (256,) bool; labels of cells that the points may contradict.
     cells : (rows, columns) uint8
-    marks : (rows, columns) uint8, modified
-        Zeros before.
+    marks : (rows, columns) uint8, modified; zeros before.
     """
     n_rows, n_cols = cells.shape
     lowest, highest = OBSTACLE_M
@@ -175,17 +166,10 @@ def clear_cells(
 ) -> None:
     """Make background of drivable cells with objects or obstacles, and of vehicle cells that the points contradict.
 
-    Parameters
-    ----------
-    marks : (rows, columns) uint8
-        From `fill_marks`.
-    marked : (m,) int64
-        Flat numbers of the cells with marks.
-    drivable : int
-    is_vehicle : (256,) bool
-        Labels of cells that the points may contradict.
-    in_box : (rows, columns) bool
-        Cells of vehicles that stay.
+    marks : (rows, columns) uint8; from `fill_marks`.
+    marked : (m,) int64; flat numbers of the cells with marks.
+    is_vehicle : (256,) bool; labels of cells that the points may contradict.
+    in_box : (rows, columns) bool; cells of vehicles that stay.
     cells : (rows, columns) uint8, modified
     """
     n_rows, n_cols = cells.shape

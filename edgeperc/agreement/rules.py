@@ -41,16 +41,6 @@ from .votes import (
     find_persons_alone,
 )
 
-__all__ = [
-    "RULES",
-    "agree_on_boxes",
-    "agree_on_points",
-    "find_support",
-    "find_voters",
-    "stand_boxes",
-    "without_poles",
-]
-
 RULES = frozenset(
     {"column", "share", "height", "cells", "fill", "person", "support", "ground", "boxes", "stand", "road"}
 )
@@ -407,15 +397,10 @@ def clear_columns(
 ) -> None:
     """Make persons background whose column of points goes on above a limit.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32
-        [m] above the ground.
-    limits : (classes,) float64
-        Greatest height of a column [m] for each class; 0 for classes that are no persons.
-    labels : (n,) uint8, modified
-        Only points within 51.2 m along x and y are changed.
+    height : (n,) float32; [m] above the ground.
+    limits : (classes,) float64; greatest height of a column [m] for each class; 0 for classes that are no persons.
+    labels : (n,) uint8, modified; only points within 51.2 m along x and y are changed.
     """
     first_row, last_row, first_col, last_col = N_COLUMNS, -1, N_COLUMNS, -1  # of the cells around persons
     for i in range(points.shape[0]):
@@ -476,23 +461,16 @@ def fill_support(
 ) -> None:
     """Find the best box around each point, among the boxes with enough vehicle points (`MIN_BOX_SHARE`).
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
     height : (n,) float32
-    among : (n,) bool
-        Points that may be in a box: those in view, above the ground.
+    among : (n,) bool; points that may be in a box: those in view, above the ground.
     labels : (n,) uint8
-    roles : (classes,) uint8
-        1 for vehicles.
-    boxes : (m, 8) float64
-        x, y, half length, half width [m], cosine and sine of the yaw, greatest height of a point [m], score.
-    of_box : (m,) uint8
-        Class of each box.
-    scores : (n,) float32, overwritten
-        0 in no box.
-    names : (n,) uint8, overwritten
-        Class of the box with that score, the earlier one on ties; 0 in no box.
+    roles : (classes,) uint8; 1 for vehicles.
+    boxes : (m, 8) float64; x, y, half length, half width [m], cosine and sine of the yaw, greatest height of a point
+        [m], score.
+    of_box : (m,) uint8; class of each box.
+    scores : (n,) float32, overwritten; 0 in no box.
+    names : (n,) uint8, overwritten; class of the box with that score, the earlier one on ties; 0 in no box.
     """
     scores[:] = 0.0
     names[:] = 0
@@ -557,13 +535,10 @@ def clear_ground(
 
     Within `NEAR_ROAD_M`, points lower than `ROAD_TOP_M` become background in any cell.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
     height : (n,) float32
     on_ground : (n,) bool
-    roles : (classes,) uint8
-        1 for vehicles, 2 for persons, 0 for classes that are not changed.
+    roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for classes that are not changed.
     labels : (n,) uint8, modified
     """
     labeled = np.empty(points.shape[0], np.int32)
@@ -605,18 +580,13 @@ def count_inside(
 ) -> None:
     """Count the points above the ground in every box.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
     height : (n,) float32
     on_ground, in_view : (n,) bool
     labels : (n,) uint8
-    roles : (classes,) uint8
-        1 for vehicles.
-    boxes : (m, 8) float64
-        As in `fill_support`.
-    counts : (m, 3) int64, overwritten
-        All points, those in view, and vehicle points in view.
+    roles : (classes,) uint8; 1 for vehicles.
+    boxes : (m, 8) float64; as in `fill_support`.
+    counts : (m, 3) int64, overwritten; all points, those in view, and vehicle points in view.
     """
     counts[:] = 0
     low_x, high_x, low_y, high_y = bounds_of(boxes)

@@ -13,8 +13,6 @@ from ..objects.persons import MAX_RIDING_WIDTH_M, MIN_OF_WHOLE, measure
 from ..objects.persons import MAX_TOP_M as MAX_PERSON_TOP_M
 from ..system.kernel_cache import njit
 
-__all__ = ["apply_verdicts", "fill_tallies", "fill_verdicts", "fill_votes", "find_persons_alone"]
-
 VEHICLE, PERSON = 1, 2  # roles of classes
 NO_CLUSTER = -1
 
@@ -56,16 +54,12 @@ def fill_votes(
 ) -> None:
     """Write what each point may count for in its cluster.
 
-    Parameters
-    ----------
     in_view : (n,) bool
     labels : (n,) uint8
-    roles : (classes,) uint8
-        1 for vehicles, 2 for persons, 0 for others.
-    scores : (n,) float32
-        From `edgeperc.agreement.rules.fill_support`.
-    votes : (n,) uint8, overwritten
-        Bit 0: the point is in view. Bit 1: it may get the label of a vehicle. Bit 2: it has the label of a person.
+    roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for others.
+    scores : (n,) float32; from `edgeperc.agreement.rules.fill_support`.
+    votes : (n,) uint8, overwritten; bit 0: the point is in view. Bit 1: it may get the label of a vehicle. Bit 2: it
+        has the label of a person.
     """
     of_label = np.empty(len(roles), np.uint8)
     for c in range(len(roles)):
@@ -92,25 +86,18 @@ def fill_tallies(
 ) -> None:
     """Count the labels of every cluster, and measure it.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
     height : (n,) float32
     in_view : (n,) bool
     labels : (n,) uint8
     clusters : (n,) int32
-    cells : (rows, columns) uint8, C-contiguous
-        Labels of the top view; no cells without one.
-    is_vehicle : (256,) bool
-        Which labels of cells are vehicles.
-    grid : (3,) float64
-        x of the far edge of the top view, y of its left edge, edge of a cell [m].
-    counts : (k, classes + 1) int32, overwritten
-        Points in view of each class; last, of all classes.
-    bounds : (k, 5) float32, overwritten
-        Lowest x and y, highest x and y, highest height [m] of all points.
-    above : (k, 3) int32, overwritten
-        Points in view that are in the top view too; those of them in cells of vehicles; all points, in view or not.
+    cells : (rows, columns) uint8, C-contiguous; labels of the top view; no cells without one.
+    is_vehicle : (256,) bool; which labels of cells are vehicles.
+    grid : (3,) float64; x of the far edge of the top view, y of its left edge, edge of a cell [m].
+    counts : (k, classes + 1) int32, overwritten; points in view of each class; last, of all classes.
+    bounds : (k, 5) float32, overwritten; lowest x and y, highest x and y, highest height [m] of all points.
+    above : (k, 3) int32, overwritten; points in view that are in the top view too; those of them in cells of
+        vehicles; all points, in view or not.
     """
     n_rows, n_cols = cells.shape
     counts[:] = 0
@@ -152,19 +139,12 @@ def fill_verdicts(
 ) -> None:
     """Decide what becomes of each label in each cluster.
 
-    Parameters
-    ----------
     counts : (k, classes + 1) int32
-    bounds : (k, 5) float32
-        From `fill_tallies`.
-    refused : (k,) bool
-        Clusters that are no vehicles for another reason.
-    roles : (classes,) uint8
-        1 for vehicles, 2 for persons, 0 for others.
-    parts : (p, 2) int64
-        Class, and the class that it may be a part of.
-    by_share, by_height, is_filled : bool
-        Rules that apply.
+    bounds : (k, 5) float32; from `fill_tallies`.
+    refused : (k,) bool; clusters that are no vehicles for another reason.
+    roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for others.
+    parts : (p, 2) int64; class, and the class that it may be a part of.
+    by_share, by_height, is_filled : rules that apply.
     verdicts : (k, classes) uint8, overwritten
     """
     n_classes = len(roles)
@@ -226,17 +206,11 @@ def apply_verdicts(
 ) -> None:
     """Replace each label in view by what its cluster and the box around it say.
 
-    Parameters
-    ----------
     in_view : (n,) bool
-    clusters : (n,) int32
-        -1 for none; -2 for a cluster in which no label of a vehicle or person stays.
-    verdicts : (k, classes) uint8
-        New label by cluster and label.
-    roles : (classes,) uint8
-        1 for vehicles, 2 for persons, 0 for others.
-    scores, names : (n,) float32, (n,) uint8
-        From `edgeperc.agreement.rules.fill_support`.
+    clusters : (n,) int32; -1 for none; -2 for a cluster in which no label of a vehicle or person stays.
+    verdicts : (k, classes) uint8; new label by cluster and label.
+    roles : (classes,) uint8; 1 for vehicles, 2 for persons, 0 for others.
+    scores, names : (n,) float32, (n,) uint8; from `edgeperc.agreement.rules.fill_support`.
     labels : (n,) uint8, modified
     """
     for i in range(labels.shape[0]):
@@ -262,19 +236,11 @@ def find_persons_alone(
 ) -> list[NDArray[np.int32]]:
     """Find groups of points that are a person by themselves, though linked with something large.
 
-    Parameters
-    ----------
     points : (n, 4) float32, C-contiguous
-    height : (n,) float32
-        Height above the ground [m].
+    height : (n,) float32; height above the ground [m].
     roles : (classes,) uint8
-    before, labels : (n,) uint8
-        Labels before the clusters voted, and after.
-
-    Returns
-    -------
-    list of (k,) int32
-        Rows of each person. Their labels were lost.
+    before, labels : (n,) uint8; labels before the clusters voted, and after.
+    Returns list of (k,) int32: Rows of each person. Their labels were lost.
     """
     changed = np.flatnonzero(before != labels)
     lost = changed[(roles[before[changed]] == PERSON) & (labels[changed] == 0)].astype(np.int32)

@@ -14,8 +14,6 @@ from ..errors import CalibrationError, PointsError
 from ..system.kernel_cache import njit
 from ..types.points import read_only
 
-__all__ = ["Calibration", "fill_projected", "read_kitti_calibration"]
-
 MAX_EDGE, MAX_PIXELS = 2**15, 2**26  # of an image, as in `edgeperc.camera.image`
 MAX_DISTANCE_M = 100.0  # between the sensors; more is probably a translation in millimeters
 # KITTI's rotations have seven digits; a product of two of them is off by some 1e-6.
@@ -152,25 +150,11 @@ class Calibration:
 def read_kitti_calibration(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Read a calibration file of KITTI's object, tracking or odometry data.
 
-    Parameters
-    ----------
-    path : str or Path
-        A text file with P2, R0_rect (or R_rect) and Tr_velo_to_cam (or Tr_velo_cam); in odometry data P2 and Tr, which
-        includes the rectification.
-
-    Returns
-    -------
-    T_rectified_sensor : (4, 4) float64
-        From the Velodyne's frame to the rectified frame of camera 0.
-    P2 : (3, 4) float64
-        From there to the image of the left color camera.
-
-    Raises
-    ------
-    CalibrationError
-        An entry is missing or malformed.
-    OSError
-        The file cannot be read.
+    path : a text file with P2, R0_rect (or R_rect) and Tr_velo_to_cam (or Tr_velo_cam); in odometry data P2 and Tr,
+        which includes the rectification.
+    Returns T_rectified_sensor ((4, 4) float64): From the Velodyne's frame to the rectified frame of camera 0.
+    Returns P2 ((3, 4) float64): From there to the image of the left color camera.
+    Raises CalibrationError, OSError.
     """
     values = {}
     try:
@@ -219,15 +203,10 @@ def fill_projected(
 ) -> None:
     """Project points: column, row and depth of each.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
-    P : (3, 4) float64
-        ``K`` times the upper three rows of ``T_camera_sensor``.
-    u, v : (n,) float64, overwritten
-        [px]; NaN unless the point is finite and in front of the camera.
-    depth : (n,) float64, overwritten
-        [m]; NaN if the point is not finite.
+    P : (3, 4) float64; ``K`` times the upper three rows of ``T_camera_sensor``.
+    u, v : (n,) float64, overwritten; [px]; NaN unless the point is finite and in front of the camera.
+    depth : (n,) float64, overwritten; [m]; NaN if the point is not finite.
     """
     for i in range(points.shape[0]):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])

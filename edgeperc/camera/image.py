@@ -17,8 +17,6 @@ from ..types.card import CHANNELS, InputSpec
 from ..types.points import read_only
 from ..types.views import CameraGeometry
 
-__all__ = ["MAX_EDGE", "MAX_PIXELS", "ImageScaler", "as_image", "check_size", "label_pixels"]
-
 MAX_PIXELS = 2**26  # 8192 x 8192: three times a photograph of 24 megapixels, 200 MB
 MAX_EDGE = 2**15
 
@@ -103,11 +101,7 @@ class ImageScaler:
 
     The tables of the last size are kept, so use one instance per thread.
 
-    Parameters
-    ----------
-    view : CameraGeometry
-    input : InputSpec
-        Its channels, in any order.
+    input : its channels, in any order.
     """
 
     def __init__(self, view: CameraGeometry, input: InputSpec) -> None:
@@ -119,17 +113,9 @@ class ImageScaler:
     def fill(self, image: NDArray[np.uint8], out: NDArray[np.float32]) -> None:
         """Scale an image into the caller's buffer.
 
-        Parameters
-        ----------
-        image : (H, W, 3) uint8
-            From `as_image`.
-        out : (C, height, width) float32, C-contiguous, overwritten
-            ``(value - mean) / std`` per channel.
-
-        Raises
-        ------
-        ImageError
-            A shape, dtype or layout is another.
+        image : (H, W, 3) uint8; from `as_image`.
+        out : (C, height, width) float32, C-contiguous, overwritten; ``(value - mean) / std`` per channel.
+        Raises ImageError.
         """
         image = as_image(image)
         if out.shape != self.shape or out.dtype != np.float32 or not out.flags.carray:
@@ -144,12 +130,8 @@ class ImageScaler:
 def _taps(n_in: int, n_out: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """For each pixel of the output along one axis: the first pixel of the image that counts, and K weights from there.
 
-    Returns
-    -------
-    start : (n_out,) int32
-        ``start + K`` is at most ``n_in``.
-    weights : (n_out, K) float32
-        Their sum is 1, but for rounding.
+    Returns start ((n_out,) int32): ``start + K`` is at most ``n_in``.
+    Returns weights ((n_out, K) float32): Their sum is 1, but for rounding.
     """
     scale = n_in / n_out
     reach = max(scale, 1.0)
@@ -181,16 +163,10 @@ def fill_scaled(
 ) -> None:
     """Scale and normalize an image: for each row of the output, first along columns, then along rows.
 
-    Parameters
-    ----------
-    image : (H, 3 * W) uint8, C-contiguous
-        Red, green, blue of each pixel.
-    row_start, col_start : (h,), (w,) int32
-        First row and column of the image that count for each of the output.
-    row_weights, col_weights : (h, K), (w, L) float32
-        Weights from there.
-    channels : (C,) int32
-        0 red, 1 green, 2 blue.
+    image : (H, 3 * W) uint8, C-contiguous; red, green, blue of each pixel.
+    row_start, col_start : (h,), (w,) int32; first row and column of the image that count for each of the output.
+    row_weights, col_weights : (h, K), (w, L) float32; weights from there.
+    channels : (C,) int32; 0 red, 1 green, 2 blue.
     mean, std : (C,) float32
     out : (C, h, w) float32, overwritten
     """
@@ -227,25 +203,11 @@ def label_pixels(
     outermost centers they stay the same. Between four centers of one class, that class is taken: whatever the weights,
     no other can have a larger sum.
 
-    Parameters
-    ----------
     logits : (C, h, w) float32
-    height, width : int
-        Of the image.
-    model : str
-        Name for messages.
-
-    Returns
-    -------
-    (height, width) uint8
-        The lower class on ties.
-
-    Raises
-    ------
-    InferenceError
-        The logits hold values that are not finite.
-    CardMismatchError
-        The logits have another shape.
+    height, width : of the image.
+    model : name for messages.
+    Returns (height, width) uint8: The lower class on ties.
+    Raises InferenceError, CardMismatchError.
     """
     if logits.ndim != 3 or not 1 <= logits.shape[0] <= 255 or 0 in logits.shape:
         raise CardMismatchError(f"{model}: camera_logits have shape {logits.shape}; expected (C, h, w), C up to 255")
@@ -263,14 +225,11 @@ def label_pixels(
 def _between(n_in: int, n_out: int) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int32]]:
     """Interpolation along one axis.
 
-    Returns
-    -------
-    sides : (2, n_out) int32
-        The centers of the grid on the two sides of each pixel: one and the same where a pixel lies on it or outside.
-    weight : (n_out,) float32
-        Of the second center.
-    runs : (n_runs + 1,) int32
-        Where runs of pixels between the same two centers begin; the last is ``n_out``.
+    Returns sides ((2, n_out) int32): The centers of the grid on the two sides of each pixel: one and the same where a
+        pixel lies on it or outside.
+    Returns weight ((n_out,) float32): Of the second center.
+    Returns runs ((n_runs + 1,) int32): Where runs of pixels between the same two centers begin; the last is
+        ``n_out``.
     """
     at = np.clip((np.arange(n_out) + 0.5) * (n_in / n_out) - 0.5, 0.0, n_in - 1.0)
     first = np.floor(at).astype(np.int32)
@@ -293,17 +252,10 @@ def fill_image_labels(
 ) -> int:
     """Write every pixel's best class (`label_pixels`).
 
-    Parameters
-    ----------
     logits : (C, h, w) float32, C-contiguous
-    row_sides, row_weight, row_runs, col_sides, col_weight, col_runs
-        From `_between`.
+    row_sides, row_weight, row_runs, col_sides, col_weight, col_runs : from `_between`.
     labels : (H, W) uint8, overwritten
-
-    Returns
-    -------
-    n_bad : int
-        Number of logits that are not finite; if there are any, the labels are undefined.
+    Returns n_bad: Number of logits that are not finite; if there are any, the labels are undefined.
     """
     n_classes, height, width = logits.shape
     n_bad = 0

@@ -26,8 +26,6 @@ from ..types.sensor import SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
 from .calibration import Calibration
 
-__all__ = ["UNSEEN", "camera_road", "fill_nearest", "fill_painted", "paint"]
-
 UNSEEN = 255
 """Label of a point, or a cell, that the camera does not see."""
 
@@ -282,21 +280,14 @@ def fill_nearest(
 ) -> None:
     """Write the depth of the nearest point whose window covers each cell of an image.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
-    u, v, depth : (n,) float64
-        As `Calibration.project` returns them.
-    between : (beams - 1,) float64
-        Tangent of the elevation between each two beams, from the top.
-    half_up, half_down : (beams,) float64
-        Half-size of a window above and below its point [px], if the point is as far from the camera as from the sensor.
-    half_side : float
-        Half-size to the left and to the right [px].
-    cell_h, cell_w : int
-        Size of a cell [px].
-    buffer : (rows, columns) float32, overwritten
-        [m]; infinite where no window is.
+    u, v, depth : (n,) float64; as `Calibration.project` returns them.
+    between : (beams - 1,) float64; tangent of the elevation between each two beams, from the top.
+    half_up, half_down : (beams,) float64; half-size of a window above and below its point [px], if the point is as
+        far from the camera as from the sensor.
+    half_side : half-size to the left and to the right [px].
+    cell_h, cell_w : size of a cell [px].
+    buffer : (rows, columns) float32, overwritten; [m]; infinite where no window is.
     """
     buffer[:] = np.float32(math.inf)
     rows, columns = buffer.shape
@@ -344,15 +335,11 @@ def fill_painted(
 ) -> None:
     """Write the label of the pixel of each point that is not hidden, else `UNSEEN`.
 
-    Parameters
-    ----------
     labels : (H, W) uint8, C-contiguous
-    u, v, depth : (n,) float64
-        As `Calibration.project` returns them.
-    buffer, cell_h, cell_w
-        From `fill_nearest`.
-    slack_m, slack_share : float
-        A point is hidden if it is farther behind the nearest one than this [m], plus this share of its depth.
+    u, v, depth : (n,) float64; as `Calibration.project` returns them.
+    buffer, cell_h, cell_w : from `fill_nearest`.
+    slack_m, slack_share : a point is hidden if it is farther behind the nearest one than this [m], plus this share of
+        its depth.
     painted : (n,) uint8, overwritten
     """
     height, width = labels.shape

@@ -9,32 +9,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = [
-    "CAMERA",
-    "DEFAULT",
-    "DEFAULT_SENSOR",
-    "PRECISIONS",
-    "PROVIDERS",
-    "RULES",
-    "Commands",
-    "Renamed",
-    "add_adapt",
-    "add_agreement",
-    "add_boxes_from",
-    "add_command",
-    "add_ego_box",
-    "add_figures_file",
-    "add_model",
-    "add_mounting",
-    "add_network",
-    "add_provider",
-    "add_sensor",
-    "add_topic",
-    "finite_number",
-    "positive",
-    "positive_number",
-]
-
 Commands = Any  # what ArgumentParser.add_subparsers returns; argparse keeps its class private
 _WIDTH = 78
 
@@ -59,21 +33,11 @@ def add_command(
 ) -> argparse.ArgumentParser:
     """Add a subcommand.
 
-    Parameters
-    ----------
     commands : argparse's subparsers
-    name : str
-    command : callable
-        Takes the parsed arguments and returns the exit code.
-    help : str
-        The line in the list of commands.
-    description : str
-    examples : sequence of str
-        Command lines, printed below the options.
-
-    Returns
-    -------
-    argparse.ArgumentParser
+    command : takes the parsed arguments and returns the exit code.
+    help : the line in the list of commands.
+    examples : command lines, printed below the options.
+    Returns argparse.ArgumentParser.
     """
     parser: argparse.ArgumentParser = commands.add_parser(
         name,

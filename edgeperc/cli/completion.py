@@ -9,8 +9,6 @@ from typing import Any
 from ..system.extras import require
 from .arguments import PROVIDERS, Commands, add_command
 
-__all__ = ["add_parser", "completion_command"]
-
 
 def add_parser(commands: Commands) -> None:
     """Add ``completion``."""

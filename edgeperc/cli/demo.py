@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from ..simulation.scene import SimulatedScan
     from ..types.perception import Box, Perception
 
-__all__ = ["add_parser", "demo_command"]
 
 # A junction with cars, a van, pedestrians and a cyclist, most of which the models detect. Training scenes have other
 # seeds.

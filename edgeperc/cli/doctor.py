@@ -22,8 +22,6 @@ from ..errors import EdgepercError, MissingExtraError
 from .arguments import DEFAULT, Commands, add_command
 from .output import many, one_line, print_columns, print_line
 
-__all__ = ["Finding", "add_parser", "doctor_command", "examine"]
-
 # Extras for work on edgeperc itself, and the builds of onnxruntime, of which one at a time can be installed.
 _FOR_DEVELOPERS = ("docs", "test")
 _BUILDS = ("onnxruntime", "onnxruntime-gpu", "onnxruntime-directml", "onnxruntime-openvino")

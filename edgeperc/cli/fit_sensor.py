@@ -11,8 +11,6 @@ from .arguments import Commands, add_command, add_ego_box, add_sensor
 from .output import print_rows
 from .scans import find_scans, with_mounting
 
-__all__ = ["add_parser", "fit_sensor_command"]
-
 
 def add_parser(commands: Commands) -> None:
     """Add ``fit-sensor``."""

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from ..types.sensor import SensorProfile
     from ..zoo import Variant
 
-__all__ = ["add_parser", "info_command"]
 
 _WIDTH = 100  # characters of a line, with its name
 _MOST_SCANS = 300  # to look for the own vehicle in

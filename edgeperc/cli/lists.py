@@ -13,8 +13,6 @@ from ..errors import SettingsError
 from .arguments import DEFAULT_SENSOR, Commands, add_command
 from .output import print_columns, print_line
 
-__all__ = ["add_parser", "models_command", "providers_command", "sensors_command"]
-
 
 def add_parser(commands: Commands) -> None:
     """Add ``models``, ``sensors`` and ``providers``."""

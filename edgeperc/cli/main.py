@@ -20,8 +20,6 @@ from . import completion, demo, doctor, fit_sensor, info, lists, ros2, run
 from .evaluation import painting, scans, sensors, tracking
 from .program import Parser, run_program
 
-__all__ = ["build_parser", "in_options", "main"]
-
 # Former two-part commands and their present names.
 _RENAMED = {
     "eval sensors": "eval-sensors",
@@ -51,20 +49,9 @@ _OPTIONS = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments without the program's name; by default those of this process.
-
-    Returns
-    -------
-    code : int
-        The exit code.
-
-    Raises
-    ------
-    SystemExit
-        With code 2, for wrong usage; raised by argparse.
+    argv : arguments without the program's name; by default those of this process.
+    Returns code: The exit code.
+    Raises SystemExit.
     """
     given = sys.argv[1:] if argv is None else list(argv)
 

@@ -16,21 +16,6 @@ from typing import Any, TextIO
 from ..system.atomic import write_atomic
 from ..system.printable import printable
 
-__all__ = [
-    "FEW",
-    "many",
-    "one_line",
-    "print_columns",
-    "print_error",
-    "print_line",
-    "print_rows",
-    "progress",
-    "show_warning",
-    "table_lines",
-    "without_nan",
-    "write_figures",
-]
-
 FEW = " (n<10)"  # `edgeperc.evaluation.tables.FEWEST_OBJECTS`
 """Beside names of classes with few objects."""
 
@@ -129,17 +114,10 @@ def table_lines(
 ) -> list[str]:
     """Lay out a table of figures as lines of text.
 
-    Parameters
-    ----------
-    title : str
     columns : sequence of (heading, key)
-    rows : sequence of ((first name, second name), figures by key)
-        A first name that repeats in successive rows is printed once.
-
-    Returns
-    -------
-    list of str
-        Empty if there are no rows.
+    rows : sequence of ((first name, second name), figures by key); a first name that repeats in successive rows is
+        printed once.
+    Returns: Empty if there are no rows.
     """
     if not rows:
         return []

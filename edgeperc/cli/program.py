@@ -21,8 +21,6 @@ from ..errors import EdgepercError
 from ..system.printable import printable
 from .output import print_error, show_warning
 
-__all__ = ["Parser", "run_program"]
-
 _DELICATE = ("llvmlite.", "importlib._bootstrap", "edgeperc.sinks.kept_file", "logging")
 
 
@@ -41,25 +39,12 @@ class _TerminatedError(SystemExit):
 def run_program(program: str, command: Callable[[], int], message: Callable[[Exception], str] = str) -> int:
     """Run a program's command line. Warnings and errors are printed on stderr, each as one line.
 
-    Parameters
-    ----------
-    program : str
-        Its name, printed before each line.
-    command : callable
-        Parses the arguments, does the work and returns the exit code.
-    message : callable
-        The text to print for an error.
-
-    Returns
-    -------
-    code : int
-        What ``command`` returned; 2 after an `EdgepercError` or `OSError`; 130 after SIGINT (Ctrl-C); 143 after
-        SIGTERM; 141, without a message, if the program that reads stdout or stderr closed it.
-
-    Raises
-    ------
-    SystemExit
-        From argparse: wrong usage (2), ``--help`` and ``--version`` (0).
+    program : its name, printed before each line.
+    command : parses the arguments, does the work and returns the exit code.
+    message : the text to print for an error.
+    Returns code: What ``command`` returned; 2 after an `EdgepercError` or `OSError`; 130 after SIGINT (Ctrl-C); 143
+        after SIGTERM; 141, without a message, if the program that reads stdout or stderr closed it.
+    Raises SystemExit.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a file name may have characters that the terminal lacks

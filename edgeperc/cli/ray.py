@@ -31,7 +31,6 @@ from .report import Report
 if TYPE_CHECKING:
     from ..perceiver import Learned, Perceiver
 
-__all__ = ["add_engine", "check_engine", "perceive_on_ray", "through_temporary"]
 
 # Options that do not change what is written about a scan.
 _OTHERS = ("engine", "live", "out", "paths", "rate", "threads", "typed", "workers")

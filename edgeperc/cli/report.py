@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from ..tracking.tracks import Tracks
     from ..types.perception import Perception
 
-__all__ = ["Report"]
-
 
 class Report:
     """Prints the result of each scan, and counts scans and failures.

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from ..perceiver import Perceiver
     from ..ros2.graph import Graph
 
-__all__ = ["add_parser", "ros2_command"]
-
 
 def add_parser(commands: Commands) -> None:
     """Add ``ros2``."""

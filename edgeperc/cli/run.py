@@ -54,7 +54,6 @@ if TYPE_CHECKING:
     from ..types.perception import Perception
     from ..types.sensor import SensorProfile
 
-__all__ = ["add_parser", "make_perceiver", "run_command"]
 
 _KINDS = ("png", "html", "labels", "ply")
 

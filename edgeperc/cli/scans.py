@@ -19,16 +19,6 @@ if TYPE_CHECKING:
     from ..readers.identify import KnownSensor
     from ..types.sensor import SensorProfile
 
-__all__ = [
-    "Scans",
-    "find_images",
-    "find_scans",
-    "output_names",
-    "scan_folders",
-    "scan_namer",
-    "scan_sensor",
-    "with_mounting",
-]
 
 # Folders of scans in data sets: KITTI object and tracking, SemanticKITTI, a KITTI raw drive, a day of raw drives.
 _LAYOUTS = (
@@ -99,10 +89,7 @@ def find_scans(paths: Sequence[Path]) -> Scans:
 def find_images(paths: Sequence[Path]) -> list[Path]:
     """Find image files, in the order of ``paths``; those of a folder without scans are sorted. Empty if there are none.
 
-    Raises
-    ------
-    ImageError
-        Some of the paths are images, and others are not.
+    Raises ImageError.
     """
     from ..readers.captures import is_capture
     from ..readers.images import IMAGE_SUFFIXES
@@ -141,21 +128,9 @@ def scan_namer(path: Path) -> Callable[[int], Path]:
 def scan_sensor(path: Path, arguments: argparse.Namespace) -> tuple[str | SensorProfile, str]:
     """The sensor of a scan or capture, and how it is known: by ``--sensor``, by the capture, or as the default.
 
-    Parameters
-    ----------
-    path : Path
-    arguments : argparse.Namespace
-        With ``sensor`` and ``topic``.
-
-    Raises
-    ------
-    SensorError, PointsError, MissingExtraError
-        The sensor of a capture is unknown (`edgeperc.readers.captures.sensor_of`).
-
-    Warns
-    -----
-    UserWarning
-        ``--sensor`` contradicts the capture.
+    arguments : argparse.Namespace; with ``sensor`` and ``topic``.
+    Raises SensorError, PointsError, MissingExtraError.
+    Warns UserWarning: ``--sensor`` contradicts the capture.
     """
     from ..readers.captures import known_sensor
     from ..readers.identify import contradicts
@@ -183,10 +158,7 @@ def scan_sensor(path: Path, arguments: argparse.Namespace) -> tuple[str | Sensor
 def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) -> str | SensorProfile:
     """The sensor with what ``--extrinsic``, ``--mount-height``, ``--turn`` and ``--ego-box`` give.
 
-    Raises
-    ------
-    SensorError
-        A value is impossible, or the file of ``--extrinsic`` cannot be read.
+    Raises SensorError.
     """
     from ..types.mounting import Mounting
     from ..types.sensor import get_sensor
@@ -209,11 +181,7 @@ def with_mounting(sensor: str | SensorProfile, arguments: argparse.Namespace) ->
 def output_names(scans: Sequence[Path], *, keep_folder: bool = False) -> list[Path]:
     """Name the output files of each scan: its own name, after as few folder names as make all names different.
 
-    Parameters
-    ----------
-    scans : sequence of Path
-    keep_folder : bool
-        Include at least one folder, such as the sequence of a data set.
+    keep_folder : include at least one folder, such as the sequence of a data set.
     """
     whole = [Path(_absolute(scan)).parts[1:] for scan in scans]
     short = [(*(p for p in parts[:-1] if p not in _LAYOUT_FOLDERS), parts[-1]) for parts in whole]

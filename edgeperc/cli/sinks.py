@@ -13,7 +13,6 @@ from .output import print_line
 if TYPE_CHECKING:
     from ..records import Sink
 
-__all__ = ["SINKS", "add_sinks", "open_sinks", "wanted_sinks"]
 
 SINKS: tuple[str, ...] = (
     "mcap",

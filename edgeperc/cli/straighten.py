@@ -17,22 +17,13 @@ if TYPE_CHECKING:
     from ..tracking.tracks import Tracks
     from ..types.sensor import SensorProfile
 
-__all__ = ["Straightener"]
-
 
 class Straightener:
     """Straightens scans, by poses or by what the tracker found of the scans before.
 
-    Parameters
-    ----------
-    poses : Path, optional
-        A file for `edgeperc.Trajectory.from_tum`; by default the motion is that between the last two scans
-        that were tracked.
-
-    Raises
-    ------
-    TrackingError
-        The file cannot be read.
+    poses : a file for `edgeperc.Trajectory.from_tum`; by default the motion is that between the last two scans that
+        were tracked.
+    Raises TrackingError.
     """
 
     def __init__(self, poses: Path | None) -> None:
@@ -48,25 +39,11 @@ class Straightener:
     ) -> NDArray[np.float32]:
         """Points in the sensor's frame at the scan's stamp, or at its last point if it has none.
 
-        Parameters
-        ----------
-        stamp_s, points, times_s
-            A `edgeperc.TimedScan`.
-        sensor : SensorProfile, optional
-            What it drops of the scan stays where it is: the own vehicle moves with the sensor.
-
-        Raises
-        ------
-        PointsError
-            The scan has no times of points.
-        TrackingError
-            The poses do not cover the scan, or the tracker's are half a turn apart.
-
-        Warns
-        -----
-        UserWarning
-            Without poses: the tracker does not know the motion during the first two scans of a session, which stay as
-            they are.
+        stamp_s, points, times_s : a `edgeperc.TimedScan`.
+        sensor : what it drops of the scan stays where it is: the own vehicle moves with the sensor.
+        Raises PointsError, TrackingError.
+        Warns UserWarning: Without poses: the tracker does not know the motion during the first two scans of a
+            session, which stay as they are.
         """
         if times_s is None:
             raise PointsError(

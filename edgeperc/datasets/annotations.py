@@ -10,9 +10,6 @@ from typing import Any
 from ..errors import PointsError
 from ..types.perception import Box
 
-__all__ = ["read_datumaro", "read_labelcloud", "read_sustechpoints"]
-
-
 LARGEST_TILT = math.radians(20.0)
 """Boxes have a yaw alone. A box that is tilted further is an error."""
 
@@ -22,19 +19,8 @@ def read_labelcloud(path: Path) -> list[Box]:
 
     ``_classes.json`` in the same folder names the format; without it, angles are in radians.
 
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    list of Box
-        With the classes of the file, in the frame of the scan.
-
-    Raises
-    ------
-    PointsError
-        The file cannot be read, or is not such a file; or its format is another one.
+    Returns: With the classes of the file, in the frame of the scan.
+    Raises PointsError.
     """
     settings = path.with_name("_classes.json")
     known = _read(settings).get("format", "centroid_rel") if settings.exists() else "centroid_rel"
@@ -69,19 +55,9 @@ def read_sustechpoints(path: Path) -> list[Box]:
 def read_datumaro(path: Path) -> dict[str, list[Box]]:
     """Read ``annotations/default.json`` of "Datumaro 3D 1.0", which CVAT exports.
 
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    dict of str to list of Box
-        By the name of the scan, without folders. Boxes of tracks that are outside are left out.
-
-    Raises
-    ------
-    PointsError
-        The file cannot be read, or is not such a file; or two scans have one name.
+    Returns dict of str to list of Box: By the name of the scan, without folders. Boxes of tracks that are outside are
+        left out.
+    Raises PointsError.
     """
     document, found = _read(path), dict[str, list[Box]]()
     try:

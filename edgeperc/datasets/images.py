@@ -13,8 +13,6 @@ from ..errors import ImageError
 from ..readers.images import IMAGE_SUFFIXES, read_image
 from ..system.extras import require
 
-__all__ = ["LabeledImages", "image_hash"]
-
 FOLDERS = {"train": "train", "validation": "val", "test": "test"}
 UNLABELED = ("unlabelled", "unlabeled", "void")
 IGNORE = 255
@@ -62,10 +60,7 @@ class LabeledImages:
     def files(self, split: str) -> list[Path]:
         """The images of ``"train"``, ``"validation"``, ``"test"``, ``"held-back"`` (the last two) or ``"all"``, sorted.
 
-        Raises
-        ------
-        ImageError
-            There is none.
+        Raises ImageError.
         """
         parts = {"held-back": ("validation", "test"), "all": tuple(FOLDERS)}.get(split, (split,))
         folders = [self.root / FOLDERS[part] for part in parts]
@@ -83,16 +78,9 @@ class LabeledImages:
     def read(self, file: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Read an image and its labels.
 
-        Returns
-        -------
-        image : (H, W, 3) uint8
-        labels : (H, W) uint8
-            Index into ``classes``; 255 where unlabeled.
-
-        Raises
-        ------
-        ImageError
-            A file cannot be read, or the sizes differ.
+        Returns image: (H, W, 3) uint8.
+        Returns labels ((H, W) uint8): Index into ``classes``; 255 where unlabeled.
+        Raises ImageError.
         """
         image = read_image(file)
         path = file.parent.with_name(f"{file.parent.name}annot") / f"{file.stem}.png"

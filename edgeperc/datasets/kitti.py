@@ -27,24 +27,6 @@ from ..types.perception import Box
 from ..types.views import TopViewGeometry
 from .splits import TEST_DRIVES, in_split
 
-__all__ = [
-    "IMAGE_SIZE",
-    "IMAGE_SIZES",
-    "ROAD_CLASSES",
-    "SEQUENCE_DRIVES",
-    "Frame",
-    "KittiCalibration",
-    "KittiLabels",
-    "KittiObjects",
-    "RoadFrame",
-    "SemanticKitti",
-    "label_objects",
-    "layouts",
-    "read_labels",
-    "read_objects",
-    "scan_hash",
-]
-
 IMAGE_SIZE = (1242, 375)
 IMAGE_SIZES = {
     "2011_09_26": IMAGE_SIZE,
@@ -79,17 +61,9 @@ class KittiCalibration:
     def to_image(self, points: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Project points into the image.
 
-        Parameters
-        ----------
-        points : (n, 3+) array
-            x, y, z [m] in the sensor frame; further columns are ignored.
-
-        Returns
-        -------
-        pixels : (n, 2) float64
-            Column and row [px]. Not valid for points behind the camera.
-        depth : (n,) float64
-            Distance along the optical axis [m], negative behind the camera.
+        points : (n, 3+) array; x, y, z [m] in the sensor frame; further columns are ignored.
+        Returns pixels ((n, 2) float64): Column and row [px]. Not valid for points behind the camera.
+        Returns depth ((n,) float64): Distance along the optical axis [m], negative behind the camera.
         """
         cam = np.asarray(points[:, :3], np.float64) @ self.T_cam_velo[:3, :3].T + self.T_cam_velo[:3, 3]
         image = cam @ self.P2[:, :3].T + self.P2[:, 3]
@@ -100,15 +74,9 @@ class KittiCalibration:
     def sensor_boxes(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert boxes from KITTI's camera frame to the sensor frame.
 
-        Parameters
-        ----------
-        rows : (n, 7) float64
-            Height, width, length, x, y, z of the bottom face's center [m], rotation about the camera's y axis [rad].
-
-        Returns
-        -------
-        (n, 7) float64
-            x, y, z of the center, length, width, height [m], yaw [rad].
+        rows : (n, 7) float64; height, width, length, x, y, z of the bottom face's center [m], rotation about the
+            camera's y axis [rad].
+        Returns (n, 7) float64: x, y, z of the center, length, width, height [m], yaw [rad].
         """
         T_velo_cam = np.linalg.inv(self.T_cam_velo)
         height, width, length, x, y, z, turn = rows.T
@@ -131,17 +99,10 @@ class KittiCalibration:
     ) -> NDArray[np.float64]:
         """Project boxes into the image.
 
-        Parameters
-        ----------
-        rows : (n, 7) float64
-            x, y, z of the center, length, width, height [m], yaw [rad] in the sensor frame.
-        image_size : tuple of 2 int
-            Width and height [px].
-
-        Returns
-        -------
-        (n, 4) float64
-            Left, top, right, bottom [px], clipped to the image; without area if a box is not in it.
+        rows : (n, 7) float64; x, y, z of the center, length, width, height [m], yaw [rad] in the sensor frame.
+        image_size : tuple of 2 int; width and height [px].
+        Returns (n, 4) float64: Left, top, right, bottom [px], clipped to the image; without area if a box is not in
+            it.
         """
         signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
         local = signs[None] * rows[:, None, 3:6]
@@ -404,10 +365,7 @@ class RoadFrame:
 class SemanticKitti:
     """The scans with point labels below a SemanticKITTI root (``sequences/00/velodyne``, ``labels``), by drive.
 
-    Raises
-    ------
-    PointsError
-        There are no label files.
+    Raises PointsError.
     """
 
     def __init__(self, root: Path | str) -> None:

@@ -19,8 +19,6 @@ from ..types.mounting import Mounting
 from ..types.sensor import SensorProfile, get_sensor
 from .splits import in_split
 
-__all__ = ["SCHEMA", "ScanLayout", "box_label", "class_number", "known_layouts", "read_layout"]
-
 BOX_COLUMNS = ("class", "x", "y", "z", "l", "w", "h", "yaw")
 BOX_FILES = {
     "kitti": "label_2/{}.txt",
@@ -44,17 +42,9 @@ _KEYS = {
 def class_number(name: str, classes: Sequence[str] = POINT_CLASSES) -> int:
     """Label of a class of a description among the classes of points of a network.
 
-    Parameters
-    ----------
-    name : str
-        A value of `ScanLayout.boxes` or `ScanLayout.points`.
-    classes : sequence of str
-        Classes of the network, the background first.
-
-    Returns
-    -------
-    int
-        Its index. Vans and trucks count as cars and sitting persons as pedestrians, if ``classes`` lacks them;
+    name : a value of `ScanLayout.boxes` or `ScanLayout.points`.
+    classes : classes of the network, the background first.
+    Returns: Its index. Vans and trucks count as cars and sitting persons as pedestrians, if ``classes`` lacks them;
         ``drivable`` is background. `IGNORE` for a class that the network does not have.
     """
     if name in classes:
@@ -123,19 +113,9 @@ class ScanLayout:
     def from_json(cls, text: str, folder: Path | None = None) -> ScanLayout:
         """Read a description.
 
-        Parameters
-        ----------
-        text : str
-            JSON.
-        folder : Path or None
-            Folder of the profile that ``sensor`` names, if it is a file.
-
-        Raises
-        ------
-        PointsError
-            Not JSON, another schema, or an entry that is missing, unknown or of another type.
-        SensorError
-            The sensor is unknown, or the mounting impossible.
+        text : JSON.
+        folder : folder of the profile that ``sensor`` names, if it is a file.
+        Raises PointsError, SensorError.
         """
         try:
             given = json.loads(text)
@@ -209,10 +189,7 @@ def known_layouts() -> tuple[str, ...]:
 def read_layout(layout: str | Path) -> ScanLayout:
     """Read a description by the name of a public set, or from a file (a Path, or a str that ends in ``.json``).
 
-    Raises
-    ------
-    PointsError, SensorError
-        As `ScanLayout.from_json`; the file cannot be read, or no public set has this name.
+    Raises PointsError, SensorError.
     """
     if isinstance(layout, str) and not layout.endswith(".json"):
         if layout not in known_layouts():

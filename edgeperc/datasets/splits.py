@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from ..errors import OptionError
 
-__all__ = ["FOLDS", "TEST_DRIVES", "VALIDATION_DRIVES", "fold_of", "in_split"]
-
 # Three object drives with cars, vans, trucks, pedestrians and cyclists, and all of SemanticKITTI's sequence 00.
 TEST_DRIVES = frozenset(
     {"2011_09_26_drive_0011", "2011_09_26_drive_0015", "2011_09_26_drive_0032", "2011_10_03_drive_0027"}
@@ -80,10 +78,7 @@ def in_split(drive: str, split: str, fold: int | None = None) -> bool:
     and `VALIDATION_DRIVES` for validation. A drive that is not listed here (a user's own scans) is for both training
     and testing; `unseen` then detects training scans by the hashes in a model's card.
 
-    Raises
-    ------
-    OptionError
-        ``split`` or ``fold`` is unknown.
+    Raises OptionError.
     """
     if split not in ("train", "validation", "test", "all"):
         raise OptionError(f"split is {split!r}; expected train, validation, test or all")

@@ -19,8 +19,6 @@ from ..types.geometry import wrapped
 from ..types.perception import Box
 from .tracking_metrics import box_iou, fill_assignment
 
-__all__ = ["SETTINGS", "Ab3dmot", "Settings", "generalized_iou"]
-
 
 @dataclass(frozen=True, slots=True)
 class Settings:
@@ -61,12 +59,7 @@ _BACK = [0, 1, 2, 4, 5, 6, 3]
 
 
 class Ab3dmot:
-    """Track the boxes of one class from scan to scan, at a fixed rate.
-
-    Parameters
-    ----------
-    settings : Settings
-    """
+    """Track the boxes of one class from scan to scan, at a fixed rate."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -82,21 +75,11 @@ class Ab3dmot:
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         """Track the boxes of one scan.
 
-        Parameters
-        ----------
-        boxes : sequence of Box
-        scores : sequence of float
-            Any numbers, one for each box.
-
-        Returns
-        -------
-        ids : (n,) int64
-        rows : (n, 7) float64
-            Center, size and yaw.
-        scores : (n,) float64
-            Of the last detection of each track.
-        sources : (n,) int64
-            Index of the detection of this scan; -1 for none.
+        scores : any numbers, one for each box.
+        Returns ids: (n,) int64.
+        Returns rows ((n, 7) float64): Center, size and yaw.
+        Returns scores ((n,) float64): Of the last detection of each track.
+        Returns sources ((n,) int64): Index of the detection of this scan; -1 for none.
         """
         self._n_scans += 1
         given = np.array([(*box.center, *box.size, box.yaw) for box in boxes], np.float64).reshape(-1, 7)
@@ -167,16 +150,9 @@ class Ab3dmot:
 def generalized_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Generalized 3-D IoU: IoU less the share of the smallest upright prism around both that neither fills.
 
-    Parameters
-    ----------
-    a : (n, 7) float64
-        x, y, z, length, width, height [m], yaw [rad].
+    a : (n, 7) float64; x, y, z, length, width, height [m], yaw [rad].
     b : (m, 7) float64
-
-    Returns
-    -------
-    (n, m) float64
-        In -1..1. Boxes farther apart than the sum of their lengths and widths have -1.
+    Returns (n, m) float64: In -1..1. Boxes farther apart than the sum of their lengths and widths have -1.
     """
     iou = box_iou(a, b)
     volumes = np.add.outer(a[:, 3:6].prod(axis=1), b[:, 3:6].prod(axis=1))

@@ -21,8 +21,6 @@ from ..perceiver import Perceiver
 from .judge import training_scans_of
 from .metrics import Confusion
 
-__all__ = ["evaluate_images", "image_figures"]
-
 
 def evaluate_images(
     roots: Sequence[Path],
@@ -36,35 +34,13 @@ def evaluate_images(
 ) -> dict[str, Any]:
     """Compute the figures of a camera model on labeled images.
 
-    Parameters
-    ----------
-    roots : sequence of Path
-        Folders in CamVid's layout (`LabeledImages`).
-    model : str or Path
-    split : str or None
-        As in `LabeledImages.files`. None: the test images if there are any, else the validation images.
-    provider, precision
-        As in `edgeperc.Perceiver`.
-    n_resamples : int
-        Number of resamples of the images for the intervals.
-    on_image : callable
-        Called after each image with the number of images done and of all images.
-
-    Returns
-    -------
-    dict
-        ``"models"``, ``"providers"``, ``"split"``, ``"fold"`` (None) and ``"images"``: `image_figures`.
-
-    Raises
-    ------
-    ImageError
-        An image or its labels cannot be read.
-    CardMismatchError
-        The model has other classes than the images.
-    OptionError
-        The model is not of a camera.
-    SplitError
-        The model was trained on an image, and ``split`` is not ``"train"``.
+    roots : folders in CamVid's layout (`LabeledImages`).
+    split : as in `LabeledImages.files`. None: the test images if there are any, else the validation images.
+    provider, precision : as in `edgeperc.Perceiver`.
+    n_resamples : number of resamples of the images for the intervals.
+    on_image : called after each image with the number of images done and of all images.
+    Returns: ``"models"``, ``"providers"``, ``"split"``, ``"fold"`` (None) and ``"images"``: `image_figures`.
+    Raises ImageError, CardMismatchError, OptionError, SplitError.
     """
     perceive = Perceiver([model], provider=provider, precision=precision)
     (card,) = perceive.cards
@@ -102,18 +78,10 @@ def evaluate_images(
 def image_figures(classes: Sequence[str], counts: NDArray[np.int64], n_resamples: int = 1000) -> dict[str, Any]:
     """Figures of the summed confusion matrices of images, with 95 % intervals over resampled images.
 
-    Parameters
-    ----------
     classes : sequence of C str
-    counts : (n, C, C) int64
-        Of each image; rows are the truth.
-    n_resamples : int
-
-    Returns
-    -------
-    dict
-        ``"n_images"``; ``"all"``: ``mean_iou`` over the classes that occur, ``mean_accuracy`` (mean recall of the
-        classes), ``accuracy``, ``n_pixels``; ``"classes"``: ``iou``, ``precision``, ``recall``, ``n_pixels``,
+    counts : (n, C, C) int64; of each image; rows are the truth.
+    Returns: ``"n_images"``; ``"all"``: ``mean_iou`` over the classes that occur, ``mean_accuracy`` (mean recall of
+        the classes), ``accuracy``, ``n_pixels``; ``"classes"``: ``iou``, ``precision``, ``recall``, ``n_pixels``,
         ``n_images`` of each class. Shares have four decimals, None for those of no pixels, and beside each its
         ``..._interval``, None with fewer than two images.
     """

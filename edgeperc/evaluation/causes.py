@@ -17,8 +17,6 @@ from ..types.geometry import inside
 from ..types.perception import Box
 from .metrics import object_key
 
-__all__ = ["BUMPER", "CAUSES", "FLOOR", "count_causes"]
-
 BUMPER = "car at the own bumper"
 OTHER, VANS, FAR = "of other objects", "in vans and trucks", "beyond 30 m"
 NEAR, LARGE, FLOOR, POLE = "within 0.4 m of an object", "on large structures", "on the ground", "on poles"
@@ -53,28 +51,18 @@ def count_causes(
 ) -> Counts:
     """Count the wrong points of one scan by cause.
 
-    Parameters
-    ----------
-    points : (n, 3 or more) float32
-        x, y, z [m] in the frame of the models.
-    labels, right : (n,) uint8
-        Predicted and true class, indices into `POINT_CLASSES`. Values of ``right`` beyond them are unknown.
-    known, in_view : (n,) bool
-        Points that count, and points that have a prediction.
-    boxes : sequence of Box
-        The true boxes.
-    drive : str
-
-    Returns
-    -------
-    dict of tuple of str to Counter
-        ``("errors", "points")``: number of points by (error, cause). The cause ``"all"`` has all points of an error,
-        ``"of"`` the points that it is a share of: true points of the class if they are missed, predicted ones if they
-        are false. ``("errors", "scans")``: 1 by (error, cause, drive) with points. ``("errors", "objects")``: 1 by
-        (error, cause, `object_key`) with missed points.
-        The error `BUMPER` has all points in view that are labeled car at the bumper of the own vehicle, except those
-        of true objects. Where the truth is unknown, there may be a car beside the own one; the cause `FLOOR` counts the
-        points on the ground alone.
+    points : (n, 3 or more) float32; x, y, z [m] in the frame of the models.
+    labels, right : (n,) uint8; predicted and true class, indices into `POINT_CLASSES`. Values of ``right`` beyond
+        them are unknown.
+    known, in_view : (n,) bool; points that count, and points that have a prediction.
+    boxes : the true boxes.
+    Returns dict of tuple of str to Counter: ``("errors", "points")``: number of points by (error, cause). The cause
+        ``"all"`` has all points of an error, ``"of"`` the points that it is a share of: true points of the class if
+        they are missed, predicted ones if they are false. ``("errors", "scans")``: 1 by (error, cause, drive) with
+        points. ``("errors", "objects")``: 1 by (error, cause, `object_key`) with missed points. The error `BUMPER`
+        has all points in view that are labeled car at the bumper of the own vehicle, except those of true objects.
+        Where the truth is unknown, there may be a car beside the own one; the cause `FLOOR` counts the points on the
+        ground alone.
     """
     scan = _Scan(points, boxes)
     at_bumper = scan.at_bumper & in_view & (labels == 1) & ~((right > 0) & (right < len(POINT_CLASSES)))

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from ..types.perception import Box
 from .metrics import ObjectKey, object_key
 
-__all__ = ["CLASSES", "DISTANCES_M", "CenterTable", "center_scores", "count_centers"]
-
 DISTANCES_M = (0.5, 1.0, 2.0, 4.0)
 ERROR_DISTANCE_M = 2.0
 CLASSES = {"car": 50.0, "truck": 50.0, "pedestrian": 40.0, "cyclist": 40.0}
@@ -55,14 +53,9 @@ def count_centers(
 ) -> CenterTable:
     """Match the detections of one scan.
 
-    Parameters
-    ----------
-    boxes : sequence of Box
-        Detections where objects are labeled.
-    to_find, ignored : sequence of Box
-        From `metrics.boxes_to_find`. A detection without a match does not count if an ignored object of its class or of
-        an ``unknown`` class is as near as a match.
-    drive : str
+    boxes : detections where objects are labeled.
+    to_find, ignored : from `metrics.boxes_to_find`. A detection without a match does not count if an ignored object
+        of its class or of an ``unknown`` class is as near as a match.
     unknown : collection of str
     """
     table = CenterTable()

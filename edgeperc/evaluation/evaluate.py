@@ -18,7 +18,8 @@ from ..datasets.kitti import KittiObjects, SemanticKitti
 from ..datasets.layout import known_layouts
 from ..datasets.scan_folder import ScanFolder
 from ..errors import EdgepercError, OptionError, PointsError
-from ..perceiver import BoxesFrom, Learned, Perceiver
+from ..perceiver import Learned, Perceiver
+from ..pipeline import BoxesFrom
 from ..simulation.samples import FIRST_SEED
 from ..system.ray_cluster import MOST_FIRST, Lost, map_on_ray
 from ..types.mounting import Mounting

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from ..tracking.tracks import Tracks
 from .tracking_metrics import FrameTruth, box_iou
 
-__all__ = ["MOVING_MPS", "Headings", "Standing", "count_headings", "speeds"]
-
 MOVING_MPS = 1.5  # objects with a lower speed stand
 WINDOW = 5  # frames before and after, over which an object's speed is measured
 FRAME_S = 0.1
@@ -63,16 +61,8 @@ class Headings:
 def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[NDArray[np.float64]]:
     """Speed over ground of each true box, from its places up to `WINDOW` frames before and after.
 
-    Parameters
-    ----------
-    truth : sequence of FrameTruth
-    tracks : sequence of Tracks
-        One for each frame; their ``T_world_sensor`` is used.
-
-    Returns
-    -------
-    list of (n,) float64
-        By frame [m/s]; NaN for an object without other frames nearby.
+    tracks : one for each frame; their ``T_world_sensor`` is used.
+    Returns list of (n,) float64: By frame [m/s]; NaN for an object without other frames nearby.
     """
     places: list[dict[int, NDArray[np.float64]]] = []
     for frame, of in zip(truth, tracks, strict=True):
@@ -95,19 +85,9 @@ def count_headings(
 ) -> Headings:
     """Count right headings in one sequence.
 
-    Parameters
-    ----------
-    truth : sequence of FrameTruth
-    tracks : sequence of Tracks
-        One for each frame.
-    labels : collection of str
-        Labels of the tracks that count.
-    iou_threshold : float
-        Smallest 3-D IoU of a track and its label.
-
-    Returns
-    -------
-    Headings
+    tracks : one for each frame.
+    labels : collection of str; labels of the tracks that count.
+    iou_threshold : smallest 3-D IoU of a track and its label.
     """
     rows: list[tuple[int, int, bool, bool]] = []  # kind, track, resolved, right
     moved: set[int] = set()

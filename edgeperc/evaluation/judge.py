@@ -22,7 +22,8 @@ from ..inference.decode import decode_classes
 from ..inference.projection import make_projector, project
 from ..inference.session import Session
 from ..objects.boxes import classes_of_boxes
-from ..perceiver import BoxesFrom, Perceiver
+from ..perceiver import Perceiver
+from ..pipeline import BoxesFrom
 from ..simulation.samples import IGNORE
 from ..simulation.scene import POINT_CLASSES
 from ..types.card import ModelCard
@@ -40,44 +41,27 @@ from .mistakes import Mistakes
 from .tables import ALL_ROUND, BANDS, SITTING, VEHICLES, Record, banded, within
 from .truth import Truth, folder_truth, kitti_truth, semantickitti_truth, simulated_truth
 
-__all__ = ["Judge", "check_unseen", "training_scans_of"]
-
 FARTHEST_M = 46.0  # farther objects are evaluated by their points, but never listed as mistakes
 
 
 class Judge:
     """Perceives scans and compares the results with their truth.
 
-    Parameters
-    ----------
-    models : sequence of str or Path
-        Names of shipped models, or paths. Range-image models are evaluated by points, top-view models by boxes and
-        cells.
-    provider, precision, n_threads
-        As in `Perceiver`.
-    road_by : str, Path or None
-        A top-view model that supplies the true road of KITTI frames, because KITTI's labels have no road. SSADNet
-        (3.1.2) uses LoDNN in this way.
-    training_scans : bool
-        Also evaluate scans that a model was trained on.
-    boxes_from : {"network", "clusters", "both"}
-        As in `Perceiver`. The figures ``"boxes"`` are of the boxes that a top-view model detects, in its view; without
-        such a model, or with "clusters", of the boxes around clusters, wherever the truth is known.
-    rules : collection of str
-        Rules of the agreement of labels, boxes and cells; a part of `edgeperc.agreement.rules.RULES` for an ablation.
-    mounted : Mounting or None
-        Perceive each scan as a sensor mounted so would have recorded it, with the mounting to be estimated from this
-        scan alone. Points (not pixels) and boxes are evaluated. None: as recorded, on the training vehicle.
-    sensor : SensorProfile or None
-        The sensor of the scans for `record_scan`, with what is known of its mounting; their points are evaluated by the
-        classes of the model. None: the training vehicle's, and `POINT_CLASSES`.
-
-    Raises
-    ------
-    ModelError
-        ``road_by`` is one of the models, or has another top view.
-    OptionError
-        A rule is unknown.
+    models : names of shipped models, or paths. Range-image models are evaluated by points, top-view models by boxes
+        and cells.
+    provider, precision, n_threads : as in `Perceiver`.
+    road_by : a top-view model that supplies the true road of KITTI frames, because KITTI's labels have no road.
+        SSADNet (3.1.2) uses LoDNN in this way.
+    training_scans : also evaluate scans that a model was trained on.
+    boxes_from : as in `Perceiver`. The figures ``"boxes"`` are of the boxes that a top-view model detects, in its
+        view; without such a model, or with "clusters", of the boxes around clusters, wherever the truth is known.
+    rules : collection of str; rules of the agreement of labels, boxes and cells; a part of
+        `edgeperc.agreement.rules.RULES` for an ablation.
+    mounted : perceive each scan as a sensor mounted so would have recorded it, with the mounting to be estimated from
+        this scan alone. Points (not pixels) and boxes are evaluated. None: as recorded, on the training vehicle.
+    sensor : the sensor of the scans for `record_scan`, with what is known of its mounting; their points are evaluated
+        by the classes of the model. None: the training vehicle's, and `POINT_CLASSES`.
+    Raises ModelError, OptionError.
     """
 
     def __init__(
@@ -133,10 +117,7 @@ class Judge:
     def kitti(self, frame: Frame) -> Truth:
         """The truth of a KITTI frame.
 
-        Raises
-        ------
-        SplitError
-            A model was trained on this scan.
+        Raises SplitError.
         """
         check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
         if self.draw_road is None:
@@ -149,10 +130,7 @@ class Judge:
     def semantickitti(self, frame: RoadFrame) -> Truth:
         """The truth of a SemanticKITTI frame.
 
-        Raises
-        ------
-        SplitError
-            A model was trained on this scan.
+        Raises SplitError.
         """
         check_unseen(self.trained_on, frame.name, frame.drive, frame.points)
         return semantickitti_truth(frame, self.view)
@@ -164,17 +142,9 @@ class Judge:
     def record(self, truth: Truth) -> tuple[Record, Mistakes | None]:
         """Evaluate one scan.
 
-        Parameters
-        ----------
-        truth : Truth
-            From `kitti`, `semantickitti` or `simulated`.
-
-        Returns
-        -------
-        record : Record
-            Counts for `edgeperc.evaluation.tables.figures`.
-        mistakes : Mistakes or None
-            None if the objects of the scan are not labeled.
+        truth : from `kitti`, `semantickitti` or `simulated`.
+        Returns record: Counts for `edgeperc.evaluation.tables.figures`.
+        Returns mistakes: None if the objects of the scan are not labeled.
         """
         found = self._perceive(truth.points)
         return self._compare(truth, found, found.boxes)
@@ -182,10 +152,7 @@ class Judge:
     def record_scan(self, frame: ScanFrame) -> tuple[Record, Mistakes | None]:
         """Evaluate one scan of a `ScanFolder`, perceived as a user's: its mounting is found from scans of its drive.
 
-        Raises
-        ------
-        SplitError
-            A model was trained on this scan.
+        Raises SplitError.
         """
         truth, found, scan_boxes = self._perceive_frame(frame)
         return self._compare(truth, found, scan_boxes)

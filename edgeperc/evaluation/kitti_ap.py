@@ -19,23 +19,6 @@ from ..types.geometry import oriented_iou, shared_area
 from ..types.perception import Box
 from .metrics import EVERYWHERE, ObjectKey, interpolated_precision, object_key
 
-__all__ = [
-    "CLASSES",
-    "LEVELS",
-    "RANGES",
-    "ApTable",
-    "Candidate",
-    "Counts",
-    "FrontTruth",
-    "average_precisions",
-    "best_candidates",
-    "candidate_recall",
-    "count_all_round",
-    "count_in_image",
-    "count_matches",
-    "image_size_of",
-]
-
 N_POSITIONS = 40  # recall positions of the curve, without recall 0
 
 # Smallest IoU of a match, the benchmark's own and a looser one, and neighboring classes that a detector may find.
@@ -110,14 +93,9 @@ def image_size_of(drive: str) -> tuple[int, int]:
 def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> ApTable:
     """Count the matches of one scan as KITTI's benchmark does.
 
-    Parameters
-    ----------
-    truth : FrontTruth
-        DontCare rectangles have no 3-D boxes, so no detection is excused by them from above and in 3-D.
-    boxes : sequence of Box
-        Detections in the sensor frame. Those that the image does not show are left out, as in a submission. The
+    truth : dontCare rectangles have no 3-D boxes, so no detection is excused by them from above and in 3-D.
+    boxes : detections in the sensor frame. Those that the image does not show are left out, as in a submission. The
         rectangle of a detection is its projection, clipped to the image.
-    drive : str
     """
     kinds, numbers = _objects(truth.labels)
     placed = truth.calibration.sensor_boxes(numbers[:, 7:14])
@@ -162,14 +140,9 @@ def count_all_round(
 ) -> ApTable:
     """Count the matches of one scan without the limits in the image.
 
-    Parameters
-    ----------
-    boxes : sequence of Box
-        Detections where objects are labeled.
-    to_find, ignored : sequence of Box
-        From `metrics.boxes_to_find`. Ignored objects of a class, of its neighbors or of an ``unknown`` class may be
-        found; those of other classes may not.
-    drive : str
+    boxes : detections where objects are labeled.
+    to_find, ignored : from `metrics.boxes_to_find`. Ignored objects of a class, of its neighbors or of an ``unknown``
+        class may be found; those of other classes may not.
     unknown : collection of str
     """
     every = [*to_find, *ignored]
@@ -248,20 +221,13 @@ def count_matches(
     Objects choose in their order: in the first pass the detection with the best score, in the second, among those
     that reach the threshold, the one with the largest overlap, and one that is not small before one that is.
 
-    Parameters
-    ----------
-    overlaps : (n, m) float64
-        IoU of each detection with each object.
+    overlaps : (n, m) float64; ioU of each detection with each object.
     scores : sequence of float, n
-    least_iou : float
-        A match has a larger IoU.
+    least_iou : a match has a larger IoU.
     objects : sequence of ObjectKey, m
-    optional : sequence of bool, m
-        Objects that may be found but need not.
-    small : sequence of bool, n
-        Detections too small in the image: neither hits nor false positives.
-    excused : sequence of bool, n
-        Detections that are no false positives, but may be hits.
+    optional : sequence of bool, m; objects that may be found but need not.
+    small : sequence of bool, n; detections too small in the image: neither hits nor false positives.
+    excused : sequence of bool, n; detections that are no false positives, but may be hits.
     """
     candidates = [
         [(j, float(overlaps[j, k])) for j in np.flatnonzero(overlaps[:, k] > least_iou).tolist()]
@@ -314,15 +280,11 @@ def _second_pass(
 def average_precisions(counts: Sequence[Counts]) -> tuple[float, float, float]:
     """Average precision of any number of scans.
 
-    Returns
-    -------
-    ap_r40, ap_r11 : float
-        As the development kit computes it: precision at the thresholds of 41 recall positions, best from each on; the
-        mean without recall 0, and of every fourth. With fewer than 41 objects there are fewer thresholds than
-        positions, and the others count as 0.
-    ap : float
-        Mean of the best precision at recalls 1/40, 2/40 .. 1, read from the whole curve; for any number of objects.
-        All are NaN without objects.
+    Returns ap_r40, ap_r11: As the development kit computes it: precision at the thresholds of 41 recall positions,
+        best from each on; the mean without recall 0, and of every fourth. With fewer than 41 objects there are fewer
+        thresholds than positions, and the others count as 0.
+    Returns ap: Mean of the best precision at recalls 1/40, 2/40 .. 1, read from the whole curve; for any number of
+        objects. All are NaN without objects.
     """
     n_truth = sum(len(each.objects) for each in counts)
     if n_truth == 0:

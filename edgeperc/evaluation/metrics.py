@@ -14,20 +14,6 @@ from ..types.geometry import bounding_rectangles, oriented_iou, rectangles, shar
 from ..types.perception import Box
 from ..types.views import TopViewGeometry
 
-__all__ = [
-    "FEWEST_RETURNS",
-    "BoxEvaluator",
-    "BoxScores",
-    "Confusion",
-    "ObjectKey",
-    "ProbabilitySweep",
-    "average_precision",
-    "boxes_to_find",
-    "interpolated_precision",
-    "mean",
-    "object_key",
-]
-
 EVERYWHERE = (0.0, math.inf)
 FEWEST_RETURNS = 3  # an object with fewer returns cannot be distinguished from clutter
 HEADING_RAD = math.pi / 4.0  # largest error of a correct heading
@@ -60,15 +46,9 @@ class Confusion:
     def update(self, predicted: ArrayLike, truth: ArrayLike) -> None:
         """Count the labels of one scan or image.
 
-        Parameters
-        ----------
-        predicted, truth : array_like of int
-            Same shape; indices into ``classes``. ``truth`` may also hold ``ignore``.
-
-        Raises
-        ------
-        PointsError
-            The shapes differ, or a counted label is out of range.
+        predicted, truth : array_like of int; same shape; indices into ``classes``. ``truth`` may also hold
+            ``ignore``.
+        Raises PointsError.
         """
         guess, right = np.asarray(predicted), np.asarray(truth)
         if guess.shape != right.shape:
@@ -129,24 +109,11 @@ class Confusion:
 def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float:
     """Eleven-point average precision: mean of the best precision at recalls 0, 0.1 .. 1 (SSADNet equation A4).
 
-    Parameters
-    ----------
-    scores : (n,) array_like of float
-        One for each prediction. Equal scores keep their order.
-    hits : (n,) array_like of bool
-        Whether each prediction is correct.
-    n_truth : int
-        Number of objects to find.
-
-    Returns
-    -------
-    float
-        In 0..1; NaN if ``n_truth`` is 0.
-
-    Raises
-    ------
-    PointsError
-        ``scores`` and ``hits`` differ in length.
+    scores : (n,) array_like of float; one for each prediction. Equal scores keep their order.
+    hits : (n,) array_like of bool; whether each prediction is correct.
+    n_truth : number of objects to find.
+    Returns: In 0..1; NaN if ``n_truth`` is 0.
+    Raises PointsError.
     """
     values, right = np.asarray(scores, dtype=np.float64), np.asarray(hits, dtype=np.bool_)
     if values.ndim != 1 or values.shape != right.shape:
@@ -187,17 +154,9 @@ class ProbabilitySweep:
     def update(self, probability: ArrayLike, truth: ArrayLike) -> None:
         """Count one image.
 
-        Parameters
-        ----------
-        probability : array_like of float
-            Probability of the class, in 0..1.
-        truth : array_like of bool
-            Same shape. Do not pass cells with unknown truth.
-
-        Raises
-        ------
-        PointsError
-            The shapes differ, or a probability lies outside 0..1.
+        probability : array_like of float; probability of the class, in 0..1.
+        truth : array_like of bool; same shape. Do not pass cells with unknown truth.
+        Raises PointsError.
         """
         values, right = np.asarray(probability, dtype=np.float64), np.asarray(truth, dtype=np.bool_)
         if values.shape != right.shape or not ((values >= 0.0) & (values <= 1.0)).all():
@@ -294,19 +253,10 @@ class BoxEvaluator:
     its IoU with an ignored box reaches the threshold, or if at least half of it lies in an ignored region. Other
     unmatched predictions are false positives.
 
-    Parameters
-    ----------
-    iou_threshold : float
-        Smallest IoU of the footprints, seen from above, of a match.
-    oriented : bool
-        Compare the oriented footprints; False compares their axis-aligned bounds, as SSADNet does.
-    together : collection of str, optional
-        Classes that `overall` joins; all by default.
-
-    Raises
-    ------
-    PointsError
-        The threshold is not above 0, or above 1.
+    iou_threshold : smallest IoU of the footprints, seen from above, of a match.
+    oriented : compare the oriented footprints; False compares their axis-aligned bounds, as SSADNet does.
+    together : collection of str; classes that `overall` joins; all by default.
+    Raises PointsError.
     """
 
     def __init__(
@@ -331,22 +281,12 @@ class BoxEvaluator:
     ) -> list[tuple[Box | None, Box | None]]:
         """Count the boxes of one scan.
 
-        Parameters
-        ----------
-        predicted, truth : iterable of Box
-        ignored : iterable of Box
-            Objects that a detector may find but need not: out of view, with too few returns, or of a neighboring
-            class. A prediction of any class may match them.
-        ignored_regions : (r, 5) array_like
-            x, y, length, width [m], yaw [rad] of areas with unknown truth.
-        drive : str
-            The recording; distinct objects are counted by drive.
-
-        Returns
-        -------
-        list of (Box or None, Box or None)
-            Pairs of a prediction and its true box, matched regardless of class. A false positive is (box, None), a
-            missed true box (None, box). Ignored predictions are left out.
+        ignored : objects that a detector may find but need not: out of view, with too few returns, or of a
+            neighboring class. A prediction of any class may match them.
+        ignored_regions : (r, 5) array_like; x, y, length, width [m], yaw [rad] of areas with unknown truth.
+        drive : the recording; distinct objects are counted by drive.
+        Returns list of (Box or None, Box or None): Pairs of a prediction and its true box, matched regardless of
+            class. A false positive is (box, None), a missed true box (None, box). Ignored predictions are left out.
         """
         guesses = sorted(predicted, key=lambda box: -box.score)
         rights, spares = list(truth), list(ignored)
@@ -471,23 +411,12 @@ def boxes_to_find(
 ) -> tuple[list[Box], list[Box]]:
     """Split true boxes into those that a detector must find, and those that it may find but need not.
 
-    Parameters
-    ----------
-    truth : iterable of (Box, int)
-        True boxes, and the number of returns from each.
-    view : TopViewGeometry or None
-        Boxes count only if their center is in this view; None: anywhere.
-    classes : collection of str
-        Classes that count.
-    known : callable
-        Whether the scan is labeled at the place of a box.
-
-    Returns
-    -------
-    to_find : list of Box
-        Boxes that count, where the scan is labeled, with at least `FEWEST_RETURNS` returns.
-    ignored : list of Box
-        All others. Pass them to `BoxEvaluator.update` as ``ignored``.
+    truth : iterable of (Box, int); true boxes, and the number of returns from each.
+    view : boxes count only if their center is in this view; None: anywhere.
+    classes : collection of str; classes that count.
+    known : whether the scan is labeled at the place of a box.
+    Returns to_find: Boxes that count, where the scan is labeled, with at least `FEWEST_RETURNS` returns.
+    Returns ignored: All others. Pass them to `BoxEvaluator.update` as ``ignored``.
     """
     to_find: list[Box] = []
     ignored: list[Box] = []

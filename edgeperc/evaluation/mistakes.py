@@ -28,8 +28,6 @@ from ..view.canvas import (
 from ..view.colors import FAINT, FALSE, FOUND, INK, MISSED
 from ..view.content import drawable_boxes, drawable_points
 
-__all__ = ["Mistakes", "draw_mistakes"]
-
 
 @dataclass(frozen=True, eq=False)
 class Mistakes:

@@ -22,8 +22,6 @@ from ..simulation.scene import SimulatedScan, simulate
 from ..types.perception import ImageLabels
 from ..types.sensor import SensorProfile, get_sensor
 
-__all__ = ["EDGE_PX", "count_painting", "evaluate_painting"]
-
 EDGE_PX = 3
 """Points within this many rows and columns of a pixel of another class are not judged."""
 NEAR_M = 26.0  # where the rings of most sensors are close together
@@ -38,30 +36,15 @@ def evaluate_painting(
 ) -> dict[str, int | float]:
     """Evaluate painting on simulated streets that no model was trained on.
 
-    Parameters
-    ----------
-    sensor : str, Path or SensorProfile
-    n_scenes : int
-    at_m : tuple of 3 float
-        Place of the camera in the frame of the LiDAR: x ahead, y left, z up [m].
-    on_scene : callable
-        Called with the number of scenes that are done and their total.
-
-    Returns
-    -------
-    dict
-        Over all scenes: ``n_scenes``; ``n_points``, painted points at least `EDGE_PX` from edges; ``points_right``,
-        share of them with the class of their surface; ``points_right_untested``, if every point took the class of its
-        pixel, hidden or not; ``points_seen``, share of the points visible to the camera that are painted; ``n_cells``,
-        observed cells of the top view outside vehicles; ``cells_right`` and ``near_cells_right`` (up to 26 m), share of
-        them that are rightly road or not; ``road_iou``; ``road_seen``, share of the road that is observed.
-
-    Raises
-    ------
-    OptionError
-        ``n_scenes`` is not above 0.
-    SensorError, CalibrationError
-        The sensor is unknown; the camera is too far away.
+    at_m : tuple of 3 float; place of the camera in the frame of the LiDAR: x ahead, y left, z up [m].
+    on_scene : called with the number of scenes that are done and their total.
+    Returns: Over all scenes: ``n_scenes``; ``n_points``, painted points at least `EDGE_PX` from edges;
+        ``points_right``, share of them with the class of their surface; ``points_right_untested``, if every point
+        took the class of its pixel, hidden or not; ``points_seen``, share of the points visible to the camera that
+        are painted; ``n_cells``, observed cells of the top view outside vehicles; ``cells_right`` and
+        ``near_cells_right`` (up to 26 m), share of them that are rightly road or not; ``road_iou``; ``road_seen``,
+        share of the road that is observed.
+    Raises OptionError, SensorError, CalibrationError.
     """
     if n_scenes < 1:
         raise OptionError(f"n_scenes is {n_scenes}; expected at least 1")
@@ -95,18 +78,8 @@ def count_painting(
 ) -> Counter[str]:
     """Count the points and cells of one street that get their true class.
 
-    Parameters
-    ----------
-    scan : SimulatedScan
-    image : CameraImage
-        Of the same scene, from the same place.
-    calibration : Calibration
-    sensor : str, Path or SensorProfile
-
-    Returns
-    -------
-    Counter
-        Numbers of points and cells, by the names that `evaluate_painting` divides.
+    image : of the same scene, from the same place.
+    Returns: Numbers of points and cells, by the names that `evaluate_painting` divides.
     """
     labels = ImageLabels(image.labels, CAMERA_CLASSES)
     painted, true = paint(labels, scan.points, calibration, sensor=sensor), true_classes(scan)

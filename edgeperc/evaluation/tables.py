@@ -22,8 +22,6 @@ from .center_ap import CLASSES, CenterTable, center_scores
 from .kitti_ap import ApTable, average_precisions
 from .metrics import BoxEvaluator, BoxScores, Confusion, ObjectKey, ProbabilitySweep, mean
 
-__all__ = ["ALL_ROUND", "BANDS", "FEWEST_OBJECTS", "SITTING", "VEHICLES", "Record", "banded", "figures", "within"]
-
 VEHICLES = ("car", "van", "truck")
 
 # Groups of classes whose boxes are evaluated wherever the truth is known: their classes, and the smallest IoU of a
@@ -74,20 +72,10 @@ def banded(
 ) -> dict[tuple[str, ...], Confusion]:
     """Count a confusion matrix for each band of distance.
 
-    Parameters
-    ----------
-    table : tuple of str
-        Start of the keys of the result.
-    classes : tuple of str
-    labels, right : uint8, one shape
-        Predicted and true class; a true class of 255 is unknown and not counted.
-    range_m : float, same shape
-        Horizontal distance [m].
-
-    Returns
-    -------
-    dict of tuple of str to Confusion
-        By ``(*table, band)``.
+    table : start of the keys of the result.
+    labels, right : uint8, one shape; predicted and true class; a true class of 255 is unknown and not counted.
+    range_m : float, same shape; horizontal distance [m].
+    Returns dict of tuple of str to Confusion: By ``(*table, band)``.
     """
     known = right != 255
     labels, right, range_m = labels[known], right[known], range_m[known]

@@ -16,20 +16,6 @@ from ..errors import TrackingError
 from ..system.kernel_cache import njit
 from ..types.geometry import oriented_iou, shared_area
 
-__all__ = [
-    "Clear",
-    "FrameTracks",
-    "FrameTruth",
-    "Hota",
-    "TrackingScores",
-    "box_iou",
-    "count_breaks",
-    "evaluate_tracks",
-    "fill_assignment",
-    "fill_pairs",
-    "recall_thresholds",
-]
-
 N_RECALLS = 40
 HOTA_ALPHAS = np.linspace(0.05, 0.95, 19)
 
@@ -156,15 +142,9 @@ class TrackingScores:
 def box_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     """3-D intersection over union of each box of ``a`` with each box of ``b``.
 
-    Parameters
-    ----------
     a : (n, 7) array_like
     b : (m, 7) array_like
-
-    Returns
-    -------
-    (n, m) float64
-        In 0..1; 0 if a box is not finite or has no volume.
+    Returns (n, m) float64: In 0..1; 0 if a box is not finite or has no volume.
     """
     first = np.asarray(a, dtype=np.float64).reshape(-1, 7)
     second = np.asarray(b, dtype=np.float64).reshape(-1, 7)
@@ -182,17 +162,10 @@ def box_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
 def recall_thresholds(scores: ArrayLike, n_truth: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Scores at which the recall is nearest to 1/40, 2/40 .. 1 (AB3DMOT's protocol, after KITTI's).
 
-    Parameters
-    ----------
-    scores : (n,) array_like
-        Score of the matched track, for each match.
-    n_truth : int
-        Number of possible matches.
-
-    Returns
-    -------
-    thresholds, recalls : (k,) float64
-        At most 40, with falling thresholds. The lowest score is used for the first recall that is not reached.
+    scores : (n,) array_like; score of the matched track, for each match.
+    n_truth : number of possible matches.
+    Returns thresholds, recalls ((k,) float64): At most 40, with falling thresholds. The lowest score is used for the
+        first recall that is not reached.
     """
     falling = np.sort(np.asarray(scores, dtype=np.float64))[::-1]
     at: list[int] = []
@@ -226,25 +199,13 @@ def evaluate_tracks(
     the first recalls: on ten sequences of KITTI this costs 0 to 6 points of sAMOTA for cars, and more for pedestrians.
     From Python 3.12 on, the same program counts otherwise, because ``sum`` rounds otherwise.
 
-    Parameters
-    ----------
-    sequences : sequence of (sequence of FrameTruth, sequence of FrameTracks)
-        Frames in order, with equal numbers of frames of truth and of tracks.
-    iou_threshold : float
-        Smallest 3-D IoU of a match.
-    as_ab3dmot : bool
-        Round as AB3DMOT's program (commit 6a7fff5, Python 3.11 or older): scores are written and read with six digits,
-        and means of means. Also as there, a box that was matched at one threshold is not excused at the next ones, and
-        a track that finds an object only in its last frame is a fragment.
-
-    Returns
-    -------
-    TrackingScores
-
-    Raises
-    ------
-    TrackingError
-        A sequence has more or fewer frames of tracks than of truth.
+    sequences : sequence of (sequence of FrameTruth, sequence of FrameTracks); frames in order, with equal numbers of
+        frames of truth and of tracks.
+    iou_threshold : smallest 3-D IoU of a match.
+    as_ab3dmot : round as AB3DMOT's program (commit 6a7fff5, Python 3.11 or older): scores are written and read with
+        six digits, and means of means. Also as there, a box that was matched at one threshold is not excused at the
+        next ones, and a track that finds an object only in its last frame is a fragment.
+    Raises TrackingError.
     """
     packed = [_Packed(truth, tracks, iou_threshold, as_ab3dmot) for truth, tracks in sequences]
     everything, scores = _clear(packed, -math.inf)
@@ -405,10 +366,7 @@ def fill_assignment(gain: NDArray[np.float64], column: NDArray[np.int64]) -> Non
 
     Shortest augmenting paths (Jonker and Volgenant 1987) over the columns and one dummy column for each row.
 
-    Parameters
-    ----------
-    gain : (n, m) float64
-        Pairs with a gain of 0 or less are never made.
+    gain : (n, m) float64; pairs with a gain of 0 or less are never made.
     column : (n,) int64, overwritten
     """
     n, m = gain.shape
@@ -460,14 +418,10 @@ def fill_assignment(gain: NDArray[np.float64], column: NDArray[np.int64]) -> Non
 def fill_pairs(shapes: NDArray[np.int64], gain: NDArray[np.float64], pair: NDArray[np.int64]) -> None:
     """Match true boxes and tracks in each frame for the largest sum of gains.
 
-    Parameters
-    ----------
-    shapes : (frames, 2) int64
-        Number of true boxes and of tracks in each frame.
-    gain : (pairs,) float64
-        Gain of each pair of a frame, ordered by true box. Pairs with a gain of 0 or less are never made.
-    pair : (truths,) int64, overwritten
-        Index of the pair of each true box; -1 for none.
+    shapes : (frames, 2) int64; number of true boxes and of tracks in each frame.
+    gain : (pairs,) float64; gain of each pair of a frame, ordered by true box. Pairs with a gain of 0 or less are
+        never made.
+    pair : (truths,) int64, overwritten; index of the pair of each true box; -1 for none.
     """
     first, begun = 0, 0
     for n, m in shapes:
@@ -485,22 +439,13 @@ def count_breaks(
 ) -> tuple[int, int]:
     """Count ID switches and fragments as in KITTI's and AB3DMOT's evaluation.
 
-    Parameters
-    ----------
-    truth : (n,) int64
-        Object of each true box, in the order of frames.
-    ids : (n,) int64
-        Track matched to each true box; -1 for none.
+    truth : (n,) int64; object of each true box, in the order of frames.
+    ids : (n,) int64; track matched to each true box; -1 for none.
     ignored : (n,) bool
-    late : bool
-        Whether an object that is first found in its last frame has a fragment, as in these programs.
-
-    Returns
-    -------
-    switches, fragments : int
-        Switch: different tracks follow the object in this and the previous frame. Fragment: the object is tracked by
-        another track than before, or again after a gap, and is also tracked in the next frame. Ignored boxes reset
-        both.
+    late : whether an object that is first found in its last frame has a fragment, as in these programs.
+    Returns switches, fragments: Switch: different tracks follow the object in this and the previous frame. Fragment:
+        the object is tracked by another track than before, or again after a gap, and is also tracked in the next
+        frame. Ignored boxes reset both.
     """
     switches = 0
     fragments = 0

@@ -24,8 +24,6 @@ from .judge import Judge, check_unseen, training_scans_of
 from .metrics import FEWEST_RETURNS, Confusion, ObjectKey, object_key
 from .tables import FEWEST_OBJECTS, figures
 
-__all__ = ["Scan", "compare"]
-
 N_FITTED = 8  # scenes for a remission function, from seeds before the evaluated ones
 FARTHEST_M = 50.0
 
@@ -74,40 +72,22 @@ def compare(
 ) -> dict[str, Any]:
     """Compute the IoU of points by class, for each dataset and each of `edgeperc.perceiver.ADAPTATIONS`.
 
-    Parameters
-    ----------
-    datasets : sequence of str
-        ``SENSOR=SOURCE``. The sensor is a built-in name or the file of a profile. The source is ``simulation:N``, a
-        folder of labeled scans (`scan_folder.ScanFolder.parse`), or one with range images ``NAME.npy`` (H, W, 6).
-        Labeled scans need no ``SENSOR=``, because their description names it; those of test drives count. Their points
-        are labeled by boxes, as KITTI's are. Scans go through a `Perceiver` as a user's do, with ``full_turn=True``: it
-        finds the mounting, and nothing from the labels helps it. The remission function of a simulated sensor is fitted
-        to eight other scenes. That of a real sensor comes from its profile.
-    model : str or Path
-        A range-image model.
-    provider, precision : str
-        As in `Perceiver`.
-    on_scan : callable
-        Called after each scan with the number of scans done and the number of all scans, over all adaptations.
-
-    Returns
-    -------
-    dict
-        By dataset: ``"n_scans"``, ``"function"``, and by adaptation ``"iou"`` (class -> IoU, None for a class that does
-        not occur), ``"mean_iou"`` over the classes except the background, ``"n_points"`` (class -> count). In
-        ``"n_objects"`` distinct objects by class, or None if only points are labeled, and in ``"few"`` the classes with
-        fewer than `tables.FEWEST_OBJECTS`: their figures say little. In ``"boxes"`` the figures ``"kitti"`` and
+    datasets : ``SENSOR=SOURCE``. The sensor is a built-in name or the file of a profile. The source is
+        ``simulation:N``, a folder of labeled scans (`scan_folder.ScanFolder.parse`), or one with range images
+        ``NAME.npy`` (H, W, 6). Labeled scans need no ``SENSOR=``, because their description names it; those of test
+        drives count. Their points are labeled by boxes, as KITTI's are. Scans go through a `Perceiver` as a user's
+        do, with ``full_turn=True``: it finds the mounting, and nothing from the labels helps it. The remission
+        function of a simulated sensor is fitted to eight other scenes. That of a real sensor comes from its profile.
+    model : a range-image model.
+    provider, precision : as in `Perceiver`.
+    on_scan : called after each scan with the number of scans done and the number of all scans, over all adaptations.
+    Returns: By dataset: ``"n_scans"``, ``"function"``, and by adaptation ``"iou"`` (class -> IoU, None for a class
+        that does not occur), ``"mean_iou"`` over the classes except the background, ``"n_points"`` (class -> count).
+        In ``"n_objects"`` distinct objects by class, or None if only points are labeled, and in ``"few"`` the classes
+        with fewer than `tables.FEWEST_OBJECTS`: their figures say little. In ``"boxes"`` the figures ``"kitti"`` and
         ``"centers"`` of `tables.figures` for labeled scans with boxes: those of the default pair, all round, with
         ``model`` for the points.
-
-    Raises
-    ------
-    PointsError
-        A dataset cannot be read.
-    ModelError
-        The model is not a range-image model.
-    SplitError
-        The model was trained on a scan.
+    Raises PointsError, ModelError, SplitError.
     """
     result: dict[str, Any] = {}
     sets = [(name, *_dataset(name)) for name in datasets]

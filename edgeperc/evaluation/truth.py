@@ -22,16 +22,6 @@ from ..types.views import TopViewGeometry
 from .kitti_ap import FrontTruth, image_size_of
 from .tables import VEHICLES
 
-__all__ = [
-    "Truth",
-    "cells_inside",
-    "folder_truth",
-    "kitti_truth",
-    "road_cells",
-    "semantickitti_truth",
-    "simulated_truth",
-]
-
 GROUND_Z_M = -1.5  # height at which a cell is looked up in the camera image
 
 # Tables of the top view. Do not average them: each has its own ground truth.
@@ -83,13 +73,9 @@ class Truth:
 def kitti_truth(frame: Frame, view: TopViewGeometry | None, road: tuple[str, NDArray[np.bool_]] | None = None) -> Truth:
     """Ground truth of a KITTI frame: boxes, points and cells in the camera's field of view, outside DontCare.
 
-    Parameters
-    ----------
-    frame : Frame
-    view : TopViewGeometry or None
-        Grid of the cells; None: no cells.
-    road : tuple of str and (rows, columns) bool, optional
-        Name and drivable cells of a second table, which combines this road with the labeled vehicles (SSADNet 3.1.2).
+    view : grid of the cells; None: no cells.
+    road : tuple of str and (rows, columns) bool; name and drivable cells of a second table, which combines this road
+        with the labeled vehicles (SSADNet 3.1.2).
     """
     cells: Cells = {}
     if view is not None:
@@ -125,15 +111,9 @@ def folder_truth(
 ) -> Truth:
     """Ground truth of a scan of a `ScanFolder`, moved into the frame of the models.
 
-    Parameters
-    ----------
-    frame : ScanFrame
-    mounting : Mounting
-        The mounting that the runtime used for this scan: its results are compared in the frame that it had.
-    view : TopViewGeometry or None
-        Grid of the cells; None: no cells.
-    classes : sequence of str
-        Classes of points, the background first.
+    mounting : the mounting that the runtime used for this scan: its results are compared in the frame that it had.
+    view : grid of the cells; None: no cells.
+    classes : classes of points, the background first.
     """
     model = ModelFrame(mounting)
     boxes = model.move_boxes(frame.boxes or ())
@@ -164,18 +144,10 @@ def folder_truth(
 def road_cells(frame: ScanFrame, mounting: Mounting, view: TopViewGeometry) -> NDArray[np.uint8] | None:
     """True surface of each cell by the labels of points, or else by the polygons of a scan.
 
-    Parameters
-    ----------
-    frame : ScanFrame
-    mounting : Mounting
-        A known one.
-    view : TopViewGeometry
-        Grid in the frame of the models.
-
-    Returns
-    -------
-    (rows, columns) uint8 or None
-        Index into `ROAD_CLASSES`; `IGNORE` for cells that the scan did not observe. None: the scan has no such labels.
+    mounting : a known one.
+    view : grid in the frame of the models.
+    Returns (rows, columns) uint8 or None: Index into `ROAD_CLASSES`; `IGNORE` for cells that the scan did not
+        observe. None: the scan has no such labels.
     """
     model = ModelFrame(mounting)
     points, labels = model.move(frame.points), frame.road_labels()

@@ -24,17 +24,6 @@ from ..types.points import read_only
 from ..types.sensor import SensorProfile
 from ..types.views import TopViewGeometry
 
-__all__ = [
-    "BRIDGE_M",
-    "CLEARANCE_M",
-    "OVERHEAD_M",
-    "Observation",
-    "Observer",
-    "fill_lowest_returns",
-    "follow_rays",
-    "mark_cells",
-]
-
 CLEARANCE_M = 0.5
 """A ray observes the ground that it passes at most this far above [m].
 
@@ -101,12 +90,8 @@ class Observer:
 
     Tables and scratch are made once and reused between calls, so use one instance per thread.
 
-    Parameters
-    ----------
-    view : TopViewGeometry
-    sensor : SensorProfile
-        Its columns and beams. Sectors are at least 0.4 degrees wide, and at least two columns, so that a missing return
-        leaves no gap.
+    sensor : its columns and beams. Sectors are at least 0.4 degrees wide, and at least two columns, so that a missing
+        return leaves no gap.
     """
 
     def __init__(self, view: TopViewGeometry, sensor: SensorProfile) -> None:
@@ -220,16 +205,12 @@ def fill_lowest_returns(
 ) -> None:
     """Write the lowest return of each bin of the polar grid.
 
-    Parameters
-    ----------
     points : (n, 4) float32, C-contiguous
-    bounds : (2, 2) float64
-        Lowest and highest x, and y, of the points that are used [m].
-    grid : (3,) float64
-        Pseudo-azimuth of the first sector's edge, sectors per unit of pseudo-azimuth, width of a ring [m]. The
-        pseudo-azimuth is y / (|x| + |y|), unfolded to -2..2. It increases with the azimuth, and needs no trigonometry.
-    lowest : (sectors, rings) float32, overwritten
-        z [m]; infinite without a return.
+    bounds : (2, 2) float64; lowest and highest x, and y, of the points that are used [m].
+    grid : (3,) float64; pseudo-azimuth of the first sector's edge, sectors per unit of pseudo-azimuth, width of a
+        ring [m]. The pseudo-azimuth is y / (|x| + |y|), unfolded to -2..2. It increases with the azimuth, and needs
+        no trigonometry.
+    lowest : (sectors, rings) float32, overwritten; z [m]; infinite without a return.
     """
     lowest[:] = np.float32(math.inf)
     n_sectors, n_rings = lowest.shape
@@ -264,23 +245,18 @@ def follow_rays(
 ) -> None:
     """Follow the ground outwards in every sector.
 
-    Parameters
-    ----------
-    lowest : (sectors, rings) float32
-        From `fill_lowest_returns`.
-    rays : (4,) float64
-        Width of a ring [m]; z of the beams [m], from which all rays start; dz / dx of the lowest beam; largest
-        difference of the gradients of two connected returns.
-    steps : (n,) float64
-        Largest difference of the gradients of two neighboring beams, by the bin of the lower one's gradient.
-    tilt : (sectors,) float64
-        What a gradient is more in the frame of the sensor.
-    level : (sectors, rings) float32, overwritten
-        z of the ground [m]: on the line between two returns on the ground; that of the last one beyond it.
-    state : (sectors, rings) uint8, overwritten
-        `SEEN`: bins with a return below `OVERHEAD_M`, and bins between two connected returns that the ray to the
-        farther one passes at most `CLEARANCE_M` above the ground. `BETWEEN`: other bins of a gap that is bridged.
-        `PASSED`: bins of a longer gap that a ray passes as closely as observed ones.
+    lowest : (sectors, rings) float32; from `fill_lowest_returns`.
+    rays : (4,) float64; width of a ring [m]; z of the beams [m], from which all rays start; dz / dx of the lowest
+        beam; largest difference of the gradients of two connected returns.
+    steps : (n,) float64; largest difference of the gradients of two neighboring beams, by the bin of the lower one's
+        gradient.
+    tilt : (sectors,) float64; what a gradient is more in the frame of the sensor.
+    level : (sectors, rings) float32, overwritten; z of the ground [m]: on the line between two returns on the ground;
+        that of the last one beyond it.
+    state : (sectors, rings) uint8, overwritten; `SEEN`: bins with a return below `OVERHEAD_M`, and bins between two
+        connected returns that the ray to the farther one passes at most `CLEARANCE_M` above the ground. `BETWEEN`:
+        other bins of a gap that is bridged. `PASSED`: bins of a longer gap that a ray passes as closely as observed
+        ones.
     """
     n_sectors, n_rings = lowest.shape
     ring_m, z_beams, first_gradient, max_apart = rays[0], rays[1], rays[2], rays[3]
@@ -338,18 +314,13 @@ def mark_cells(
 ) -> None:
     """Mark the observed cells of a top view, and those between two beams.
 
-    Parameters
-    ----------
     points : (n, 4) float32, C-contiguous
-    index : (rows, columns) int32, C-contiguous
-        Highest point of each cell, -1 without one.
-    bin_of_cell : (rows * columns,) int32
-        Flat bin of each cell's center.
+    index : (rows, columns) int32, C-contiguous; highest point of each cell, -1 without one.
+    bin_of_cell : (rows * columns,) int32; flat bin of each cell's center.
     level : (sectors, rings) float32, C-contiguous
     state : (sectors, rings) uint8, C-contiguous
-    observed, between : (rows, columns) bool, C-contiguous, overwritten
-        `PASSED` bins are between two beams where both neighboring sectors are `SEEN` or `BETWEEN`: returns of a single
-        sector are missing.
+    observed, between : (rows, columns) bool, C-contiguous, overwritten; `PASSED` bins are between two beams where
+        both neighboring sectors are `SEEN` or `BETWEEN`: returns of a single sector are missing.
     """
     highest, z_ground, state_of_bin = index.reshape(-1), level.reshape(-1), state.reshape(-1)
     is_observed, is_between = observed.reshape(-1), between.reshape(-1)

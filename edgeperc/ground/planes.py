@@ -18,8 +18,6 @@ from ..errors import PointsError
 from ..system.kernel_cache import njit
 from ..types.points import read_only
 
-__all__ = ["Ground", "GroundFit", "find_ground", "fit_ground"]
-
 # 256 x 256 cells of half a meter, in 16 x 16 regions of 16 x 16 cells. Farther out, few rays meet the ground.
 CELL_M = 0.5
 N_CELLS = 256
@@ -199,13 +197,10 @@ def fit_ground(points: NDArray[np.float32], *, mount_height_m: float = 1.73, reg
 def fill_lowest(points: NDArray[np.float32], cell: NDArray[np.int32], lowest: NDArray[np.int32]) -> None:
     """Write every point's cell and every cell's lowest point.
 
-    Parameters
-    ----------
     points : (n, 4) float32, C-contiguous
-    cell : (n,) int32, overwritten
-        Flat cell, x by y; -1 for points that are not finite or out of the grid.
-    lowest : (N_CELLS, N_CELLS) int32, overwritten
-        Row of ``points``, the earlier of two equally low; -1 where there is none.
+    cell : (n,) int32, overwritten; flat cell, x by y; -1 for points that are not finite or out of the grid.
+    lowest : (N_CELLS, N_CELLS) int32, overwritten; row of ``points``, the earlier of two equally low; -1 where there
+        is none.
     """
     flat = lowest.reshape(-1)
     values = points.reshape(-1)
@@ -271,14 +266,11 @@ def fill_planes(
 ) -> None:
     """Fit every region's plane, from the middle outwards.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
     lowest : (N_CELLS, N_CELLS) int32
-    first : (3,) float64
-        a, b, c around the vehicle.
-    planes : (N_REGIONS, N_REGIONS, 3) float64, overwritten
-        Slopes along x and y, and height in the region's middle [m]; the expected plane if too few cells agree.
+    first : (3,) float64; a, b, c around the vehicle.
+    planes : (N_REGIONS, N_REGIONS, 3) float64, overwritten; slopes along x and y, and height in the region's middle
+        [m]; the expected plane if too few cells agree.
     """
     solved = np.empty((N_REGIONS, N_REGIONS))  # 1 and the cells that agree
     solved[:] = 0.0
@@ -461,16 +453,13 @@ def fill_levels(
 ) -> None:
     """Write the height of the ground in the middle of every cell that holds one of some points.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
     lowest : (N_CELLS, N_CELLS) int32
     planes : (N_REGIONS, N_REGIONS, 3) float64
-    rows : (m,) int32
-        The points.
+    rows : (m,) int32; the points.
     cell : (n,) int32
-    level : (N_CELLS, N_CELLS) float32, overwritten
-        z [m]; NaN without a point, and anything in rows of cells that no point of ``rows`` is in or between.
+    level : (N_CELLS, N_CELLS) float32, overwritten; z [m]; NaN without a point, and anything in rows of cells that no
+        point of ``rows`` is in or between.
     """
     # Of the points ahead, the cells behind are not needed: half of the time.
     first, last = N_CELLS - 1, 0
@@ -542,16 +531,13 @@ def fill_heights(
 ) -> None:
     """Write the heights of some points above the ground, and whether they are on the ground.
 
-    Parameters
-    ----------
     points : (n, 4) float32, C-contiguous
-    rows : (m,) int32
-        The points.
+    rows : (m,) int32; the points.
     cell : (n,) int32
     level : (N_CELLS, N_CELLS) float32
     planes : (N_REGIONS, N_REGIONS, 3) float64
-    height : (m,) float32, overwritten
-        [m]; outside the grid, above the plane of the nearest region. NaN for points that are not finite.
+    height : (m,) float32, overwritten; [m]; outside the grid, above the plane of the nearest region. NaN for points
+        that are not finite.
     mask : (m,) bool, overwritten
     """
     levels, slopes = level.reshape(-1), planes.reshape(-1)

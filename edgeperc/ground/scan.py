@@ -12,8 +12,6 @@ from ..types.perception import PointLabels
 from ..types.points import read_only
 from .planes import Ground
 
-__all__ = ["Scan"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
@@ -34,10 +32,7 @@ class Scan:
     def of(cls, points: NDArray[np.float32], ground: Ground, labels: PointLabels | None = None) -> Scan:
         """A scan of given arrays, which are checked and not copied.
 
-        Raises
-        ------
-        PointsError
-            Arrays disagree in shape, or a label is not in the classes.
+        Raises PointsError.
         """
         if points.ndim != 2 or points.shape[1] < 3:
             raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")

@@ -15,8 +15,6 @@ from ..types.geometry import suppress_overlaps
 from ..types.perception import Box
 from ..types.views import TopViewGeometry
 
-__all__ = ["decode_dense", "decode_scored_slots", "decode_slots"]
-
 STRIDE = 4  # cells of the top view behind one cell of a box_dense output, along each axis
 MIN_EXTENT_M = 0.5  # smaller slots are empty
 MAX_SUMMED = 2**18  # values under a box: 23 x 23 m of a map of 5 classes in cells of 0.1 m
@@ -39,40 +37,19 @@ def decode_slots(
 ) -> list[Box]:
     """Decode axis-aligned boxes; each gets the class of the segmentation at its center (SSADNet 2.2.1 B).
 
-    Parameters
-    ----------
-    slots : (1, K, 4) or (K, 4) float32
-        Center column, center row, extent across columns, extent along rows; shares of the image's width and height,
-        from its far left corner.
-    labels, scores : (H, W) uint8, (H, W) float32
-        From `decode_classes`.
-    geometry : TopViewGeometry
-    classes : sequence of str
-        Names of ``labels``.
-    box_classes : sequence of str
-        Classes that boxes may have.
-    box_size_priors : mapping
-        Class to (length, width, height) [m]; only the height is used, because the top view has none.
-    mount_height_m : float
-        Height of the sensor above the road [m]; boxes stand on the road.
-    max_boxes : int
-        Only this many boxes with the best scores are returned.
-    model : str
-        Name for messages.
-
-    Returns
-    -------
-    list of Box
-        Best score first, the earlier slot on ties. The score is the probability of the class at the center pixel. A
-        slot is empty if an extent is below 0.5 m, if its center is out of view, or if the class there is not a box
-        class. The yaw is 0 if the longer side points ahead, else pi/2.
-
-    Raises
-    ------
-    InferenceError
-        The slots hold values that are not finite.
-    CardMismatchError
-        Shapes disagree, or a box class has no size prior.
+    slots : (1, K, 4) or (K, 4) float32; center column, center row, extent across columns, extent along rows; shares
+        of the image's width and height, from its far left corner.
+    labels, scores : (H, W) uint8, (H, W) float32; from `decode_classes`.
+    classes : names of ``labels``.
+    box_classes : classes that boxes may have.
+    box_size_priors : class to (length, width, height) [m]; only the height is used, because the top view has none.
+    mount_height_m : height of the sensor above the road [m]; boxes stand on the road.
+    max_boxes : only this many boxes with the best scores are returned.
+    model : name for messages.
+    Returns: Best score first, the earlier slot on ties. The score is the probability of the class at the center
+        pixel. A slot is empty if an extent is below 0.5 m, if its center is out of view, or if the class there is not
+        a box class. The yaw is 0 if the longer side points ahead, else pi/2.
+    Raises InferenceError, CardMismatchError.
     """
     values = _slot_rows(slots, 4, box_classes, box_size_priors, model)
     height, width = geometry.height, geometry.width
@@ -107,29 +84,16 @@ def decode_scored_slots(
 ) -> list[Box]:
     """Decode axis-aligned boxes with scores of their own.
 
-    Parameters
-    ----------
-    slots : (1, K, 5) or (K, 5) float32
-        Center column, center row, extents as for `decode_slots`, and the logit that there is an object.
-    class_output, class_kind, classes, box_classes
-        As for `decode_dense`; the class of a box is the one with the largest sum of probabilities in its footprint.
-    geometry, box_size_priors, mount_height_m
-        As for `decode_slots`.
-    score_threshold, iou_threshold, max_boxes, model
-        As for `decode_dense`: of the best slots, those that overlap a better one are dropped.
-
-    Returns
-    -------
-    list of Box
-        Best score first, the earlier slot on ties. The yaw is 0 if the longer side points ahead, else pi/2. Extents are
-        clipped to 0.2 to 40 m.
-
-    Raises
-    ------
-    InferenceError
-        An output holds values that are not finite.
-    CardMismatchError
-        Shapes disagree, or a box class has no size prior.
+    slots : (1, K, 5) or (K, 5) float32; center column, center row, extents as for `decode_slots`, and the logit that
+        there is an object.
+    class_output, class_kind, classes, box_classes : as for `decode_dense`; the class of a box is the one with the
+        largest sum of probabilities in its footprint.
+    geometry, box_size_priors, mount_height_m : as for `decode_slots`.
+    score_threshold, iou_threshold, max_boxes, model : as for `decode_dense`: of the best slots, those that overlap a
+        better one are dropped.
+    Returns: Best score first, the earlier slot on ties. The yaw is 0 if the longer side points ahead, else pi/2.
+        Extents are clipped to 0.2 to 40 m.
+    Raises InferenceError, CardMismatchError.
     """
     rows = _slot_rows(slots, 5, box_classes, box_size_priors, model)
     values = _cell_values(class_output, class_kind, geometry, classes, model)
@@ -395,12 +359,8 @@ def _logit(probability: float) -> float:
 def fill_scores(values: NDArray[np.float32], scores: NDArray[np.float32]) -> None:
     """Replace every pixel's best logit by its softmax probability.
 
-    Parameters
-    ----------
-    values : (C, H, W) float32, C-contiguous
-        Finite logits.
-    scores : (H, W) float32, modified
-        The largest logit of each pixel.
+    values : (C, H, W) float32, C-contiguous; finite logits.
+    scores : (H, W) float32, modified; the largest logit of each pixel.
     """
     n_classes, height, width = values.shape
     total = np.empty(width, np.float32)
@@ -438,13 +398,9 @@ def count_not_finite(values: NDArray[np.float32]) -> int:
 def mark_peaks(heat: NDArray[np.float32], threshold: float, peak: NDArray[np.bool_]) -> None:
     """Mark the cells that no neighbor exceeds.
 
-    Parameters
-    ----------
     heat : (H, W) float32
-    threshold : float
-        Cells below it are not peaks.
-    peak : (H, W) bool, overwritten
-        Of equal neighbors, the first one in row order is the peak.
+    threshold : cells below it are not peaks.
+    peak : (H, W) bool, overwritten; of equal neighbors, the first one in row order is the peak.
     """
     height, width = heat.shape
     for row in range(height):
@@ -472,20 +428,12 @@ def fill_footprint_sums(
 ) -> None:
     """Sum each class's probability over the pixels whose centers lie in a rectangle.
 
-    Parameters
-    ----------
-    values : (C, H, W) float32
-        Logits or probabilities.
-    are_logits : bool
-    rectangles : (n, 5) float64
-        x, y, length, width [m], yaw [rad].
-    x_far, y_left : float
-        The view's far left corner [m].
-    cell : float
-        Edge of a pixel [m].
-    sums : (n, C) float64, overwritten
-        A rectangle that holds no pixel center gets the nearest pixel in view. If its bounds hold more than 2^18
-        values, only every other row and column is summed, or fewer still.
+    values : (C, H, W) float32; logits or probabilities.
+    rectangles : (n, 5) float64; x, y, length, width [m], yaw [rad].
+    x_far, y_left : the view's far left corner [m].
+    cell : edge of a pixel [m].
+    sums : (n, C) float64, overwritten; a rectangle that holds no pixel center gets the nearest pixel in view. If its
+        bounds hold more than 2^18 values, only every other row and column is summed, or fewer still.
     """
     n_classes, height, width = values.shape
     pixel = np.empty(n_classes)

@@ -18,8 +18,6 @@ from ..types.perception import PointLabels
 from ..types.points import read_only
 from ..types.views import RangeImageGeometry, TopViewGeometry
 
-__all__ = ["MARGIN_M", "Crop", "fill_rows", "fill_spread", "sectors_of_turn", "spread"]
-
 MARGIN_M = 5.0
 """Points up to this far beside a range image are kept [m]: a car at its edge is clustered as a whole.
 
@@ -35,17 +33,12 @@ class Crop:
 
     The selected points are kept in buffers that are used again, so use one instance per thread.
 
-    Parameters
-    ----------
-    views : sequence of RangeImageGeometry or TopViewGeometry
-        Of a range image, the sector and `MARGIN_M` beside it are kept. Of a top view, what `observed.Observer`
-        uses: up to 1.4 times as far as the view, between the directions of its sides; and 2.2 m beside it, where boxes
-        reach. Everything is kept without a view, for a sector of more than 180 degrees, and for a top view alone that
-        is not ahead of the sensor.
-    margin_m : float
-        In place of `MARGIN_M`.
-    turn_rad : float
-        By this angle the views are turned to the left.
+    views : of a range image, the sector and `MARGIN_M` beside it are kept. Of a top view, what `observed.Observer`
+        uses: up to 1.4 times as far as the view, between the directions of its sides; and 2.2 m beside it, where
+        boxes reach. Everything is kept without a view, for a sector of more than 180 degrees, and for a top view
+        alone that is not ahead of the sensor.
+    margin_m : in place of `MARGIN_M`.
+    turn_rad : by this angle the views are turned to the left.
     """
 
     def __init__(
@@ -71,17 +64,11 @@ class Crop:
     def select(self, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32] | None]:
         """The points that matter, in their order.
 
-        Parameters
-        ----------
-        points : (n, 4) float32
-            x, y, z [m] in the frame of the models, remission. Rows that are not finite are left out.
-
-        Returns
-        -------
-        kept : (m, 4) float32
-            Overwritten by the next call, unless it is ``points``.
-        rows : (m,) int32 or None
-            Their rows in ``points``. None if all points matter; ``kept`` is then ``points``.
+        points : (n, 4) float32; x, y, z [m] in the frame of the models, remission. Rows that are not finite are left
+            out.
+        Returns kept ((m, 4) float32): Overwritten by the next call, unless it is ``points``.
+        Returns rows ((m,) int32 or None): Their rows in ``points``. None if all points matter; ``kept`` is then
+            ``points``.
         """
         if self._lines is None:
             return points, None
@@ -95,17 +82,10 @@ class Crop:
 def sectors_of_turn(view: RangeImageGeometry, *, whole: bool) -> list[tuple[float, Crop]]:
     """The sectors of a full turn.
 
-    Parameters
-    ----------
-    view : RangeImageGeometry
-        Of the first sector.
-    whole : bool
-        Each sector gets all points, not only its own.
-
-    Returns
-    -------
-    list of (float, Crop)
-        The angle by which each lies to the left of the first one [rad], and what selects its points.
+    view : of the first sector.
+    whole : each sector gets all points, not only its own.
+    Returns list of (float, Crop): The angle by which each lies to the left of the first one [rad], and what selects
+        its points.
     """
     width_deg = view.azimuth_left_deg - view.azimuth_right_deg
     turns_rad = [math.radians(k * width_deg) for k in range(math.ceil(360.0 / width_deg))]
@@ -116,13 +96,9 @@ def sectors_of_turn(view: RangeImageGeometry, *, whole: bool) -> list[tuple[floa
 def spread(parts: Sequence[tuple[PointLabels, NDArray[np.int32] | None]], n: int) -> PointLabels:
     """Labels of a whole scan from those of parts of it.
 
-    Parameters
-    ----------
-    parts : sequence of tuple
-        Labels of a part, and the rows of its points from `Crop.select`; None for all points. Of a point in view of
-        several parts, the label is that of the first one. Points in no part are out of view.
-    n : int
-        Number of points of the scan.
+    parts : labels of a part, and the rows of its points from `Crop.select`; None for all points. Of a point in view
+        of several parts, the label is that of the first one. Points in no part are out of view.
+    n : number of points of the scan.
     """
     first, first_rows = parts[0]
     if len(parts) == 1 and first_rows is None:
@@ -167,20 +143,11 @@ def fill_rows(
 ) -> int:
     """Copy the points between two lines.
 
-    Parameters
-    ----------
     points : (n, 4) float32, C-contiguous
-    lines : (2, 3) float64
-        a, b and c; points with a x + b y >= c for both lines are kept.
-    rows : (more than n,) int32, overwritten
-        Rows of these points.
-    kept : (more than n, 4) float32, overwritten
-        These points.
-
-    Returns
-    -------
-    int
-        Number of these points.
+    lines : (2, 3) float64; a, b and c; points with a x + b y >= c for both lines are kept.
+    rows : (more than n,) int32, overwritten; rows of these points.
+    kept : (more than n, 4) float32, overwritten; these points.
+    Returns: Number of these points.
     """
     a, b, c = lines[0]
     d, e, f = lines[1]
@@ -203,14 +170,11 @@ def fill_spread(
 ) -> None:
     """Write the labels of points in view to their rows in a whole scan.
 
-    Parameters
-    ----------
     rows : (m,) int32
     labels : (m,) uint8
     in_view : (m,) bool
     all_labels : (n,) uint8, modified
-    all_in_view : (n,) bool, modified
-        True at these rows.
+    all_in_view : (n,) bool, modified; true at these rows.
     """
     for k in range(rows.shape[0]):
         if in_view[k]:

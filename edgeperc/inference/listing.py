@@ -13,8 +13,6 @@ from ..types.sensor import SENSORS
 from ..zoo import DEFAULT, listed
 from .providers import PROVIDERS, available_providers
 
-__all__ = ["ModelInfo", "ProviderInfo", "SensorInfo", "models", "providers", "purpose", "sensors"]
-
 INSTALLED_BY: Mapping[str, str] = MappingProxyType(
     {
         "tensorrt-rtx": "pip install onnxruntime-ep-nv-tensorrt-rtx, beside edgeperc[cpu]",

@@ -23,19 +23,6 @@ from ..types.mounting import MODEL_HEIGHT_M
 from ..types.points import read_only
 from ..types.views import RangeImageGeometry, TopViewGeometry
 
-__all__ = [
-    "HEIGHT_RANGE_M",
-    "Projection",
-    "RangeImageProjector",
-    "TopViewProjector",
-    "column_edges",
-    "input_heights",
-    "make_projector",
-    "project",
-    "row_edges",
-    "tabulate",
-]
-
 # Number of each channel in the kernels. "height" is z; "distance" is the range in the x-y plane.
 CHANNEL_CODES = {"x": 0, "y": 1, "z": 2, "height": 2, "remission": 3, "distance": 4, "range": 5}
 CHANNEL_CODES["height_above_ground"] = 6
@@ -100,18 +87,12 @@ def mark_top_view(
 ) -> None:
     """Mark the highest point of each cell in ``index``, and the cell of each point in ``pixel``.
 
-    Parameters
-    ----------
-    points : (n, 4) float32, C-contiguous
-        x, y, z [m] in the sensor frame, remission.
-    x_range, y_range, z_range : (2,) float32
-        Bounds of the view [m], lower first.
+    points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission.
+    x_range, y_range, z_range : (2,) float32; bounds of the view [m], lower first.
     cells_per_m : float32
     height, width : int32
-    index : (height * width,) int32, overwritten
-        Row of points; -1 without a return.
-    pixel : (n,) int32, overwritten
-        Flat pixel of each point; -1 out of view.
+    index : (height * width,) int32, overwritten; row of points; -1 without a return.
+    pixel : (n,) int32, overwritten; flat pixel of each point; -1 out of view.
     """
     pixel[:] = np.int32(-1)
     index[:] = np.int32(-1)
@@ -179,24 +160,16 @@ def mark_range_image(
 ) -> None:
     """Mark the nearest point of each pixel in ``index``, and the pixel of each point in ``pixel``.
 
-    Parameters
-    ----------
-    points : (n, 4) float32, C-contiguous
-        x, y, z [m] in the sensor frame, remission.
-    wedge : (4,) float32
-        Coefficients of x, y, x, y in two sums that are not negative for any point in view: a cheap test that
-        saves the divisions for three quarters of a full turn.
+    points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission.
+    wedge : (4,) float32; coefficients of x, y, x, y in two sums that are not negative for any point in view: a cheap
+        test that saves the divisions for three quarters of a full turn.
     row_scale, col_scale : (3,) float32
     row_base, col_base : (cells + 2,) int32
-    row_split, col_split : (cells + 2,) float32
-        From `tabulate`.
+    row_split, col_split : (cells + 2,) float32; from `tabulate`.
     width : int32
-    winner : (height * width,) int64, overwritten
-        Scratch: ``rank << 32 | row of points``, or ``EMPTY``.
-    index : (height * width,) int32, overwritten
-        Row of points; -1 without a return.
-    pixel : (n,) int32, overwritten
-        Flat pixel of each point; -1 out of view.
+    winner : (height * width,) int64, overwritten; scratch: ``rank << 32 | row of points``, or ``EMPTY``.
+    index : (height * width,) int32, overwritten; row of points; -1 without a return.
+    pixel : (n,) int32, overwritten; flat pixel of each point; -1 out of view.
     """
     pixel[:] = np.int32(-1)
     winner[:] = EMPTY
@@ -282,15 +255,11 @@ def fill_image(
 ) -> None:
     """Write the values of the points of ``index`` into ``image``.
 
-    Parameters
-    ----------
     points : (n, 4) float32, C-contiguous
-    heights : (n,) or (0,) float32, C-contiguous
-        Height of each point above the ground [m]; empty if no channel needs it.
-    index : (pixels,) int32
-        Row of points; -1 without a return.
-    channels : (C,) int32
-        Values of ``CHANNEL_CODES``.
+    heights : (n,) or (0,) float32, C-contiguous; height of each point above the ground [m]; empty if no channel needs
+        it.
+    index : (pixels,) int32; row of points; -1 without a return.
+    channels : (C,) int32; values of ``CHANNEL_CODES``.
     mean, std : (C,) float32
     image : (C, pixels) float32, overwritten
     """
@@ -342,17 +311,9 @@ class TopViewProjector:
     ``x_min <= x < x_max``, ``y_min <= y < y_max`` and ``z_min <= z <= z_max``. The highest point wins a cell, the
     earlier one on ties.
 
-    Parameters
-    ----------
-    view : TopViewGeometry
-    input : InputSpec
-        Channels, any of ``"distance"``, sqrt(x^2 + y^2) [m] (SSADNet equation 1), ``"remission"`` and ``"height"``,
-        z [m], in any order.
-
-    Raises
-    ------
-    CardError
-        A channel is not one of these.
+    input : channels, any of ``"distance"``, sqrt(x^2 + y^2) [m] (SSADNet equation 1), ``"remission"`` and
+        ``"height"``, z [m], in any order.
+    Raises CardError.
     """
 
     def __init__(self, view: TopViewGeometry, input: InputSpec) -> None:
@@ -373,22 +334,14 @@ class TopViewProjector:
     ) -> None:
         """Project into the caller's buffers.
 
-        Parameters
-        ----------
-        points : (n, 4) float32, C-contiguous
-            x, y, z [m] in the sensor frame, remission in 0..1 (`condition.condition`). May be empty or read-only.
+        points : (n, 4) float32, C-contiguous; x, y, z [m] in the sensor frame, remission in 0..1
+            (`condition.condition`). May be empty or read-only.
         image : (C, H, W) float32, C-contiguous, overwritten
         index : (H, W) int32, C-contiguous, overwritten
-        pixel : (n,) int32, C-contiguous, overwritten
-            As in `Projection`.
-        height_m : (n,) float32, optional
-            Height of each point above the ground [m] (`edgeperc.ground.planes.Ground.height_m`), for the channel
-            ``"height_above_ground"``; without this channel it is ignored.
-
-        Raises
-        ------
-        PointsError
-            An array has another shape, dtype or layout, or ``height_m`` is needed and missing.
+        pixel : (n,) int32, C-contiguous, overwritten; as in `Projection`.
+        height_m : (n,) float32; height of each point above the ground [m] (`edgeperc.ground.planes.Ground.height_m`),
+            for the channel ``"height_above_ground"``; without this channel it is ignored.
+        Raises PointsError.
         """
         points = _checked(self.shape, points, image, index, pixel)
         _, height, width = self.shape
@@ -496,10 +449,7 @@ def make_projector(
 ) -> TopViewProjector | RangeImageProjector:
     """Make the projector for a model's view and input.
 
-    Raises
-    ------
-    CardError
-        The input has a channel that the view does not, or beams or columns lie too close to be separated.
+    Raises CardError.
     """
     if isinstance(view, TopViewGeometry):
         return TopViewProjector(view, input)
@@ -542,24 +492,13 @@ def tabulate(
     float32, j is exactly ``base[k] + (value <= split[k])``: the edges are sorted into table cells by the same rounded
     arithmetic, and no two edges share a cell.
 
-    Parameters
-    ----------
-    edges : (m + 1,) float32
-        Strictly decreasing.
-    what : str
-        Noun for the error message, e.g. ``"rows"``.
-
-    Returns
-    -------
-    scale : (3,) float32
-        First edge, last edge (lower than any value if it is straight behind the sensor), cells_per_unit.
-    base : (cells + 2,) int32
-    split : (cells + 2,) float32
-
-    Raises
-    ------
-    CardError
-        Edges are so close that 65,536 table cells do not separate them.
+    edges : (m + 1,) float32; strictly decreasing.
+    what : noun for the error message, e.g. ``"rows"``.
+    Returns scale ((3,) float32): First edge, last edge (lower than any value if it is straight behind the sensor),
+        cells_per_unit.
+    Returns base: (cells + 2,) int32.
+    Returns split: (cells + 2,) float32.
+    Raises CardError.
     """
     first, last = edges[0], edges[-1]
     inner = edges[1:-1]
@@ -664,19 +603,7 @@ def input_heights(
 def project(projector: TopViewProjector | RangeImageProjector, points: NDArray[np.float32]) -> Projection:
     """Project a scan and, if the projector needs it, find the ground first, as a `Perceiver` does.
 
-    Parameters
-    ----------
-    projector : TopViewProjector or RangeImageProjector
-    points : (n, 4) float32, C-contiguous
-        x, y, z [m] in the frame of the models, remission in 0..1.
-
-    Returns
-    -------
-    Projection
-
-    Raises
-    ------
-    PointsError
-        ``points`` has another shape, dtype or layout.
+    points : (n, 4) float32, C-contiguous; x, y, z [m] in the frame of the models, remission in 0..1.
+    Raises PointsError.
     """
     return projector.project(points, input_heights(projector, points))

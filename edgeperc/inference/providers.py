@@ -9,8 +9,6 @@ from typing import Any
 from ..errors import ProviderError
 from ..system.extras import require, without_telemetry
 
-__all__ = ["PROVIDERS", "available_providers", "devices", "runtime_version"]
-
 PROVIDERS: Mapping[str, str] = {
     "tensorrt-rtx": "NvTensorRTRTXExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
@@ -73,12 +71,7 @@ def plugin_devices(ort: Any, short: str) -> list[Any]:
 def available_providers() -> tuple[str, ...]:
     """The providers that ``Perceiver(provider=...)`` accepts on this computer, as keys of `PROVIDERS`.
 
-    Raises
-    ------
-    MissingExtraError
-        onnxruntime is not installed.
-    ProviderError
-        The plugin of a provider is installed but does not load.
+    Raises MissingExtraError, ProviderError.
     """
     ort = load_onnxruntime()
     stock = ort.get_available_providers()
@@ -88,10 +81,7 @@ def available_providers() -> tuple[str, ...]:
 def runtime_version() -> str:
     """The version of the installed onnxruntime.
 
-    Raises
-    ------
-    MissingExtraError
-        onnxruntime cannot be imported; the cause says why.
+    Raises MissingExtraError.
     """
     return str(load_onnxruntime().__version__)
 
@@ -101,10 +91,7 @@ def devices() -> tuple[str, ...]:
 
     Empty if onnxruntime is older than 1.23, which does not list them.
 
-    Raises
-    ------
-    MissingExtraError, ProviderError
-        As `available_providers`.
+    Raises MissingExtraError, ProviderError.
     """
     present, ort = available_providers(), load_onnxruntime()  # in this order, which loads the plugins
     found = ort.get_ep_devices() if hasattr(ort, "get_ep_devices") else ()

@@ -45,8 +45,6 @@ from ..zoo import Variant, choose, digest, resolve
 from .decode import fill_pixels
 from .providers import AUTO, PLUGINS, PROVIDERS, SHARING, available_providers, load_onnxruntime, plugin_devices, version
 
-__all__ = ["PRECISIONS", "Session", "golden_input"]
-
 logger = logging.getLogger(__name__)
 
 PRECISIONS = ("fp32", "bf16", "int8")
@@ -409,16 +407,8 @@ class Session:
     def run(self) -> Mapping[str, NDArray[np.float32]]:
         """Run the network on `input`.
 
-        Returns
-        -------
-        mapping of str to ndarray
-            `outputs`, which the next run overwrites.
-
-        Raises
-        ------
-        InferenceError
-            onnxruntime failed, or this process was forked from the one that made the session, and the session has
-            threads or was running then.
+        Returns mapping of str to ndarray: `outputs`, which the next run overwrites.
+        Raises InferenceError.
         """
         here = os.getpid()
         if here != self._made_in and (self._has_threads or self._running_in not in (0, here)):

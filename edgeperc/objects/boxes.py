@@ -17,8 +17,6 @@ from ..types.points import read_only
 from .cluster import MIN_PERSON_SHARE, PERSONS, find_clusters, group_points, labels_of_groups
 from .persons import UNSEEN, fill_person_groups, fill_persons
 
-__all__ = ["MIN_SCORE", "OBJECT_SIZE_M", "classes_of_boxes", "join_boxes", "objects_from_points"]
-
 # Mean length, width and height [m] of KITTI's labeled objects.
 OBJECT_SIZE_M: Mapping[str, tuple[float, float, float]] = MappingProxyType(
     {
@@ -269,10 +267,7 @@ def _fitted(
 def classes_of_boxes(classes: Sequence[str]) -> tuple[str, ...]:
     """Classes that the boxes around labeled points can have: `objects_from_points` names vans and trucks by their size.
 
-    Parameters
-    ----------
-    classes : sequence of str
-        Of the labels; the first one is the background.
+    classes : of the labels; the first one is the background.
     """
     by_size = ("van", "truck") if "car" in classes and not {"van", "truck"} & {*classes} else ()
     return (*classes[1:], *by_size)
@@ -355,14 +350,7 @@ def join_boxes(first: Sequence[Box], second: Sequence[Box]) -> tuple[Box, ...]:
     A person with the better score is kept, because people stand close to cars. Two boxes are one object if they overlap
     by more than 0.1 (IoU), or if more than half of one footprint lies in the other.
 
-    Parameters
-    ----------
-    first, second : sequence of Box
-
-    Returns
-    -------
-    tuple of Box
-        Best score first.
+    Returns: Best score first.
     """
     others: list[Box] = []
     same = _same_object(second, first) if first and second else np.zeros((len(second), 0), np.bool_)
@@ -433,25 +421,14 @@ def fill_rectangle(
 ) -> float:
     """Write the rectangle around points seen from above, and what they stand on.
 
-    Parameters
-    ----------
-    points : (n, 3 or more) float32
-        x, y, z [m].
-    height : (n,) float32
-        Height of every point above the ground [m].
-    members : (m,) int32
-        Rows of the points in the rectangle, at least one.
-    l_shaped : bool
-        True: the heading for which most points lie near a side. False: the heading of the smallest rectangle.
-    rectangle : (5,) float64, overwritten
-        x, y of the middle, extent along and across the heading [m], heading [rad] in 0..pi/2.
-    levels : (m,) float64, overwritten
-        z of the ground below each point [m].
-
-    Returns
-    -------
-    float
-        z of the highest point [m].
+    points : (n, 3 or more) float32; x, y, z [m].
+    height : (n,) float32; height of every point above the ground [m].
+    members : (m,) int32; rows of the points in the rectangle, at least one.
+    l_shaped : true: the heading for which most points lie near a side. False: the heading of the smallest rectangle.
+    rectangle : (5,) float64, overwritten; x, y of the middle, extent along and across the heading [m], heading [rad]
+        in 0..pi/2.
+    levels : (m,) float64, overwritten; z of the ground below each point [m].
+    Returns: z of the highest point [m].
     """
     # All headings at once for each point: processors compare and divide eight at a time, which takes a third of the
     # time of one heading after the other.

@@ -21,8 +21,6 @@ from ..types.points import read_only
 from .linkage import COLUMN_EDGE, MAX_COLUMNS, TESTS_PER_POINT, Strips, chain_points, fill_clusters, levels_of
 from .persons import MIN_OF_WHOLE, RIDES, WALKS
 
-__all__ = ["cluster_labels", "find_clusters"]
-
 # Networks label many of a cyclist's points as pedestrian.
 PART_OF = MappingProxyType({"pedestrian": "cyclist"})
 MIN_PERSON_SHARE = 0.1  # persons stand near walls and cars: a larger share loses people
@@ -145,19 +143,8 @@ def sort_points(
 ) -> Strips:
     """The part of `find_clusters` that needs no labels, for a scan whose labels are not known yet.
 
-    Parameters
-    ----------
-    points, among, min_distance_m, distance_per_m, max_range_m
-        As in `find_clusters`.
-
-    Returns
-    -------
-    Strips
-
-    Raises
-    ------
-    PointsError
-        As in `find_clusters`.
+    points, among, min_distance_m, distance_per_m, max_range_m : as in `find_clusters`.
+    Raises PointsError.
     """
     if points.ndim != 2 or points.shape[1] < 3:
         raise PointsError(f"got points of shape {points.shape}; expected (n, 4): x, y, z, remission")
@@ -191,29 +178,14 @@ def cluster_labels(
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """The class that more than ``min_share`` of a cluster's points have (KUL-Seg 5.2).
 
-    Parameters
-    ----------
-    clusters : (n,) int32
-        Cluster of every point, -1 for none.
-    labels : (n,) uint8
-        Class of every point; 0 is the background.
-    min_share : float
-        In 0..1.
-    part_of : mapping of int to int
-        Class to the class that it may be a part of. If at least a quarter of the points of these two classes have the
-        second class, all of them count as the second class.
-
-    Returns
-    -------
-    classes : (k,) uint8
-        Class of every cluster, the lower one on ties; 0 if no class has the share.
-    shares : (k,) float64
-        Share of the cluster's points that have its most frequent class of objects.
-
-    Raises
-    ------
-    PointsError
-        Arrays disagree in shape.
+    clusters : (n,) int32; cluster of every point, -1 for none.
+    labels : (n,) uint8; class of every point; 0 is the background.
+    min_share : in 0..1.
+    part_of : mapping of int to int; class to the class that it may be a part of. If at least a quarter of the points
+        of these two classes have the second class, all of them count as the second class.
+    Returns classes ((k,) uint8): Class of every cluster, the lower one on ties; 0 if no class has the share.
+    Returns shares ((k,) float64): Share of the cluster's points that have its most frequent class of objects.
+    Raises PointsError.
     """
     if clusters.ndim != 1 or labels.shape != clusters.shape:
         raise PointsError(
@@ -248,14 +220,10 @@ def group_points(clusters: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArra
 def fill_groups(clusters: NDArray[np.int32], starts: NDArray[np.int64], order: NDArray[np.int32]) -> None:
     """Sort points by their clusters.
 
-    Parameters
-    ----------
-    clusters : (n,) int32
-        Negative for none.
-    starts : (k + 1,) int64, overwritten
-        Where each of the k clusters starts in ``order``; last, their number of points.
-    order : (n,) int32, overwritten
-        Rows of the points, in input order within a cluster.
+    clusters : (n,) int32; negative for none.
+    starts : (k + 1,) int64, overwritten; where each of the k clusters starts in ``order``; last, their number of
+        points.
+    order : (n,) int32, overwritten; rows of the points, in input order within a cluster.
     """
     starts[:] = 0
     for i in range(len(clusters)):
@@ -284,14 +252,9 @@ def fill_cluster_labels(
 ) -> None:
     """Write the class of every cluster; see `cluster_labels`.
 
-    Parameters
-    ----------
     labels : (n,) uint8
-    order, starts
-        From `fill_groups`.
-    parts : (p, 2) int64
-        Class, and the class that it may be a part of; below 256.
-    min_share : float
+    order, starts : from `fill_groups`.
+    parts : (p, 2) int64; class, and the class that it may be a part of; below 256.
     classes : (k,) uint8, overwritten
     shares : (k,) float64, overwritten
     """

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from ..system.kernel_cache import njit
 
-__all__ = ["COLUMN_EDGE", "MAX_COLUMNS", "TESTS_PER_POINT", "Strips", "chain_points", "fill_clusters", "levels_of"]
-
 # A column's edge is slightly more than half the reach of its points. Points of one column are linked if their heights
 # differ by at most 0.7 of the reach: 2 * 0.50005^2 + 0.7^2 < 1.
 COLUMN_EDGE = 0.50005
@@ -87,22 +85,15 @@ def chain_points(
 ) -> tuple[int, NDArray[np.int32]]:
     """Write the points of every strip; see `Strips`.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
     among : (n,) bool
     edges, limits : (levels + 1,) float64
-    max_range : float
-        Points with a larger x, y or z do not take part [m].
+    max_range : points with a larger x, y or z do not take part [m].
     rows, chain : (n,) int32, overwritten
     grids : (levels, 3) float64, overwritten
     shapes : (levels, 3) int64, overwritten
-
-    Returns
-    -------
-    m : int
-        Number of points that take part.
-    heads : (strips,) int32
+    Returns m: Number of points that take part.
+    Returns heads: (strips,) int32.
     """
     m = 0
     low_x, low_y, high_x, high_y = math.inf, math.inf, -math.inf, -math.inf
@@ -155,22 +146,15 @@ def fill_clusters(
 
     Only strips within reach of a growing cluster are opened: sorted, and divided into runs.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
-    rows, heads, chain, edges, limits, grids, shapes
-        Of `Strips`; ``heads`` is overwritten.
+    rows, heads, chain, edges, limits, grids, shapes : of `Strips`; ``heads`` is overwritten.
     seeds : (n,) bool
-    votes : (n,) uint8
-        Bit 0: the point counts. Bit k + 1: it may count for share k.
+    votes : (n,) uint8; bit 0: the point counts. Bit k + 1: it may count for share k.
     min_shares : (k,) float64, at most 7
-    distance_per_m, max_range : float
-    min_points : int
-    clusters : (n,) int32, overwritten
-        -1 without a cluster; -2 for points of clusters without a sufficient share, as far as they were looked at.
-    work : (3,) int64, overwritten
-        Number of pairs of runs looked at; of tests of their points and bounds; of pairs of runs whose tests were not
-        completed.
+    clusters : (n,) int32, overwritten; -1 without a cluster; -2 for points of clusters without a sufficient share, as
+        far as they were looked at.
+    work : (3,) int64, overwritten; number of pairs of runs looked at; of tests of their points and bounds; of pairs
+        of runs whose tests were not completed.
     """
     clusters[:] = FREE
     work[:] = 0

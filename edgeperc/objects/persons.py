@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from ..system.kernel_cache import njit
 
-__all__ = ["MIN_OF_WHOLE", "RIDES", "UNSEEN", "WALKS", "complete_persons", "fill_person_groups", "fill_persons"]
-
 WALKS, RIDES = 1, 2  # roles of labels
 UNSEEN = 3  # role of points out of view: they belong to a person, but say nothing about the class
 MIN_OF_WHOLE = 0.25  # a person rides if at least this share of the persons' points says so: many say "pedestrian"
@@ -59,17 +57,12 @@ def measure(
 ) -> None:
     """Measure the points of a group that are higher than a limit, along their principal axis.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
     height : (n,) float32
-    members : (k,) int32
-        Rows of the group.
-    above : float
-        [m] above the ground.
-    found : (7,) float64, overwritten
-        Cosine and sine of the axis, lowest and highest coordinate along and across it [m], greatest height of all
-        members [m]. Zeros before the height without a point above the limit.
+    members : (k,) int32; rows of the group.
+    above : [m] above the ground.
+    found : (7,) float64, overwritten; cosine and sine of the axis, lowest and highest coordinate along and across it
+        [m], greatest height of all members [m]. Zeros before the height without a point above the limit.
     """
     n, x, y, top = 0, 0.0, 0.0, -math.inf
     for i in members:
@@ -113,24 +106,14 @@ def fill_person_groups(
 ) -> tuple[int, int]:
     """List the clusters that may be one or a few persons, and the persons' points of the others.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32
-        [m] above the ground.
+    height : (n,) float32; [m] above the ground.
     labels : (n,) uint8
-    roles : (256,) uint8
-        0 for labels that are no persons', `UNSEEN` for points out of view.
-    order, starts : (m,) int32, (k + 1,) int64
-        Points by cluster, from `edgeperc.objects.cluster.fill_groups`.
-    groups, group_starts : (m,) int32, (k + 1,) int64, overwritten
-        Points by group.
-    loose : (m,) int32, overwritten
-        Persons' points of clusters that are larger than a person or hold too few persons' points.
-
-    Returns
-    -------
-    n_groups, n_loose : int
+    roles : (256,) uint8; 0 for labels that are no persons', `UNSEEN` for points out of view.
+    order, starts : (m,) int32, (k + 1,) int64; points by cluster, from `edgeperc.objects.cluster.fill_groups`.
+    groups, group_starts : (m,) int32, (k + 1,) int64, overwritten; points by group.
+    loose : (m,) int32, overwritten; persons' points of clusters that are larger than a person or hold too few
+        persons' points.
     """
     found = np.empty(7)
     n_groups, n_loose, n = 0, 0, 0
@@ -174,24 +157,18 @@ def complete_persons(
 ) -> None:
     """Give the points of a cluster that has a person's size and shape one label.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32
-        [m] above the ground.
+    height : (n,) float32; [m] above the ground.
     in_view : (n,) bool
-    clusters : (n,) int32
-        Negative for none.
-    counts, bounds : (k, classes + 1) int32, (k, 5) float32
-        Of each cluster, from `edgeperc.agreement.votes.fill_tallies`.
-    walks, rides : int
-        The labels of persons on foot and of those who ride.
-    labels : (n,) uint8, modified
-        A cluster up to 2.3 m long and 0.7 m wide (0.8 m if the person rides), whose upper quarter is at most 0.8 m
-        wide, and of which a fifth in view is labeled as persons, is one person, who rides if longer than a stride, or
-        if a quarter of the persons' points says so.
-        The persons' points of one who is longer than a stride, or all points of one who is 1.3 to 2.0 m high and of
-        whom at least 0.3 is labeled, get the label.
+    clusters : (n,) int32; negative for none.
+    counts, bounds : (k, classes + 1) int32, (k, 5) float32; of each cluster, from
+        `edgeperc.agreement.votes.fill_tallies`.
+    walks, rides : the labels of persons on foot and of those who ride.
+    labels : (n,) uint8, modified; a cluster up to 2.3 m long and 0.7 m wide (0.8 m if the person rides), whose upper
+        quarter is at most 0.8 m wide, and of which a fifth in view is labeled as persons, is one person, who rides if
+        longer than a stride, or if a quarter of the persons' points says so. The persons' points of one who is longer
+        than a stride, or all points of one who is 1.3 to 2.0 m high and of whom at least 0.3 is labeled, get the
+        label.
     """
     slots = np.full(bounds.shape[0], -1, np.int64)  # of clusters whose size may be a person's
     n_slots = 0
@@ -322,33 +299,21 @@ def fill_persons(
     A group whose upper quarter is wider than 0.8 m is cut where the fewest points are, and its parts again. A person
     rides if a quarter of the persons' points says so.
 
-    Parameters
-    ----------
     points : (n, 3 or more) float32, C-contiguous
-    height : (n,) float32
-        [m] above the ground.
+    height : (n,) float32; [m] above the ground.
     labels : (n,) uint8
-    roles : (256,) uint8
-        0 for labels that are no persons', `UNSEEN` for points out of view, `WALKS` or `RIDES` for others.
+    roles : (256,) uint8; 0 for labels that are no persons', `UNSEEN` for points out of view, `WALKS` or `RIDES` for
+        others.
     order : (m,) int32, modified
-    starts : (k + 1,) int64
-        Points by group. Those of a group are put in the order of its persons.
-    n_whole : int
-        Groups from this number on are labeled points of larger clusters. The share of the labels is counted among the
-        points of the cluster within 0.2 m of the person.
-    clusters, cluster_order, cluster_starts
-        Cluster of every point, and points by cluster.
-    min_points : int
-        Smaller parts are dropped.
-    persons : (p, 11) float64, overwritten
-        For each person: 1 if he or she rides, else 0; x, y of the middle, extent along and across the principal axis
-        [m], its angle [rad]; lowest and highest z [m], from the ground on; number of points in view; share of
-        labeled ones among them; `head_width` of the group [m].
-
-    Returns
-    -------
-    int
-        Number of persons. Those beyond p are left out, and groups with points that are not finite.
+    starts : (k + 1,) int64; points by group. Those of a group are put in the order of its persons.
+    n_whole : groups from this number on are labeled points of larger clusters. The share of the labels is counted
+        among the points of the cluster within 0.2 m of the person.
+    clusters, cluster_order, cluster_starts : cluster of every point, and points by cluster.
+    min_points : smaller parts are dropped.
+    persons : (p, 11) float64, overwritten; for each person: 1 if he or she rides, else 0; x, y of the middle, extent
+        along and across the principal axis [m], its angle [rad]; lowest and highest z [m], from the ground on; number
+        of points in view; share of labeled ones among them; `head_width` of the group [m].
+    Returns: Number of persons. Those beyond p are left out, and groups with points that are not finite.
     """
     found, upper = np.empty(7), np.empty(7)
     left = np.empty((MAX_CUTS + 1, 3), np.int64)  # parts: first and last place in `order`, number of cuts before

@@ -19,36 +19,21 @@ from ..types.points import as_points, read_only
 from ..types.sensor import SensorProfile
 from .returns import returns
 
-__all__ = ["condition", "render", "scale"]
-
 KIND_CODES = {"linear": 0, "polynomial": 1, "logarithm": 2, "power": 3}
 
 
 def condition(points: ArrayLike, sensor: SensorProfile, *, rendered: bool = True) -> tuple[NDArray[np.float32], int]:
     """Prepare a scan for every stage: projection, fitness check, refinement, ground and clusters.
 
-    Parameters
-    ----------
-    points : array_like
-        A scan, as for `edgeperc.types.points.as_points`; remission in the sensor's raw unit. Not modified.
-    sensor : SensorProfile
-        Rows that are not returns of the world are dropped (`returns.returns`), and remission is scaled to 0..1
+    points : array_like; a scan, as for `edgeperc.types.points.as_points`; remission in the sensor's raw unit. Not
+        modified.
+    sensor : rows that are not returns of the world are dropped (`returns.returns`), and remission is scaled to 0..1
         (`scale`).
-    rendered : bool
-        Convert the remission with ``sensor.remission`` (`render`), if the profile has a function.
-
-    Returns
-    -------
-    scan : (n, 4) float32, C-contiguous, read-only
-        x, y, z [m], remission in 0..1, in input order. Dropped rows are NaN in all four columns. A view of ``points``
-        if nothing had to be changed.
-    n_dropped : int
-        Number of dropped rows, those whose scaled remission is not finite included.
-
-    Raises
-    ------
-    PointsError
-        ``points`` is not a scan.
+    rendered : convert the remission with ``sensor.remission`` (`render`), if the profile has a function.
+    Returns scan ((n, 4) float32, C-contiguous, read-only): x, y, z [m], remission in 0..1, in input order. Dropped
+        rows are NaN in all four columns. A view of ``points`` if nothing had to be changed.
+    Returns n_dropped: Number of dropped rows, those whose scaled remission is not finite included.
+    Raises PointsError.
     """
     scan, dropped = returns(as_points(points), sensor)
     scan, n_overflowed = scale(scan, sensor, rendered=rendered)
@@ -60,20 +45,10 @@ def scale(
 ) -> tuple[NDArray[np.float32], int]:
     """Scale the remission of a scan, whose rows are finite or NaN, to 0..1.
 
-    Parameters
-    ----------
-    points : (n, 4) float32
-        From `edgeperc.preprocess.returns.returns`. Not modified.
-    sensor : SensorProfile
-    rendered : bool
-        As in `condition`.
-
-    Returns
-    -------
-    scan : (n, 4) float32, C-contiguous, read-only
-        A view of ``points`` if nothing had to be changed.
-    n_overflowed : int
-        Number of rows that became NaN because their scaled remission is not finite.
+    points : (n, 4) float32; from `edgeperc.preprocess.returns.returns`. Not modified.
+    rendered : as in `condition`.
+    Returns scan ((n, 4) float32, C-contiguous, read-only): A view of ``points`` if nothing had to be changed.
+    Returns n_overflowed: Number of rows that became NaN because their scaled remission is not finite.
     """
     if rendered and sensor.remission is not None:
         return read_only(render(points, sensor)), 0
@@ -93,24 +68,11 @@ def scale(
 def render(points: NDArray[np.float32], sensor: SensorProfile) -> NDArray[np.float32]:
     """Convert the remission to that of the sensor that the models were trained on, 0..1 (KUL-Seg 5).
 
-    Parameters
-    ----------
-    points : (n, 4) float32
-        x, y, z [m], remission in the sensor's raw unit. Not modified. Non-finite values stay non-finite.
-    sensor : SensorProfile
-        A profile with a remission function.
-
-    Returns
-    -------
-    (n, 4) float32
-        x, y, z [m], remission in 0..1.
-
-    Raises
-    ------
-    PointsError
-        ``points`` has another shape or dtype.
-    SensorError
-        The profile has no remission function.
+    points : (n, 4) float32; x, y, z [m], remission in the sensor's raw unit. Not modified. Non-finite values stay
+        non-finite.
+    sensor : a profile with a remission function.
+    Returns (n, 4) float32: x, y, z [m], remission in 0..1.
+    Raises PointsError, SensorError.
     """
     if points.ndim != 2 or points.shape[1] != 4 or points.dtype != np.float32:
         raise PointsError(f"got points of shape {points.shape} and {points.dtype}; expected (n, 4) float32")
@@ -142,17 +104,12 @@ def fill_rendered(
 ) -> None:
     """Write the points with rendered remission into ``rendered``.
 
-    Parameters
-    ----------
     points : (n, 4) float32, C-contiguous
-    kind : int
-        A value of ``KIND_CODES``.
+    kind : a value of ``KIND_CODES``.
     coefficients : (3,) float64
-    offset, scale : float
-        The argument x of `RemissionFunction` is ``(raw + offset) * scale``; logarithm and power clip it to 0 from
-        below.
-    rendered : (n, 4) float32, overwritten
-        A remission that is not finite becomes NaN.
+    offset, scale : the argument x of `RemissionFunction` is ``(raw + offset) * scale``; logarithm and power clip it
+        to 0 from below.
+    rendered : (n, 4) float32, overwritten; a remission that is not finite becomes NaN.
     """
     # Most sensors report whole numbers up to 255. A table of their 256 results takes 0.3 instead of 2 ms.
     whole = np.empty(256)

@@ -18,8 +18,6 @@ from ..types.mounting import MODEL_HEIGHT_M, Mounting
 from ..types.sensor import EgoBox, SensorProfile
 from .returns import returns
 
-__all__ = ["EgoSuggestion", "suggest_ego_box"]
-
 # In KITTI's drives with 10 to 43 such places, 7 to 9 directions fulfil all of these, all on corners of the own roof, as
 # in one scan each of 30 drives. In 77 scans of a traffic jam the vehicle is in 3 places: too few to tell the cars
 # beside it, which stand as still as it does, from itself.
@@ -57,19 +55,11 @@ class EgoSuggestion:
 def suggest_ego_box(scans: Iterable[NDArray[np.float32]], sensor: SensorProfile, mounting: Mounting) -> EgoSuggestion:
     """Find returns within 3 m of the sensor that never move with respect to it, while the street does.
 
-    Parameters
-    ----------
-    scans : iterable of (n, 4) float32
-        Of one sensor on one vehicle, from at least ten places a few meters apart, better from several streets.
-    sensor : SensorProfile
-        Its ``ego_box`` is not used.
-    mounting : Mounting
-        A known one, for the height of the road.
-
-    Raises
-    ------
-    SensorError
-        The vehicle is in fewer than ten different places: what stands beside it could not be told from itself.
+    scans : iterable of (n, 4) float32; of one sensor on one vehicle, from at least ten places a few meters apart,
+        better from several streets.
+    sensor : its ``ego_box`` is not used.
+    mounting : a known one, for the height of the road.
+    Raises SensorError.
     """
     frame, plain = ModelFrame(mounting), replace(sensor, ego_box=None)
     x, y = mounting.origin_m

@@ -12,8 +12,6 @@ from ..types.perception import DroppedPoints
 from ..types.sensor import SensorProfile
 from .fitness import FitnessProfile, Measures, Range, measure
 
-__all__ = ["Finding", "check_dropped", "check_fitness", "check_profiles"]
-
 
 class Finding(str):
     """A sentence about how a scan differs from the training scans.
@@ -40,28 +38,16 @@ def check_fitness(points: NDArray[np.float32], profile: FitnessProfile, sensor: 
     scans of the right sensor, including scans cropped to the model's view. It does not find scans turned by 180 degrees
     or mirrored left to right, and misses one of nine scans turned by 90 degrees (measured on KITTI).
 
-    Parameters
-    ----------
-    points : (n, 4) float32
-        x, y, z [m], remission scaled to 0..1 by ``sensor``. Points that are not finite are skipped.
-    profile : FitnessProfile
-    sensor : SensorProfile
-        The sensor that the caller says recorded the scan. If its remission function is constant, because the scan has
-        no remission, remission is not checked.
-
-    Returns
-    -------
-    tuple of Finding
-        One sentence for each difference; empty if there is none. Gross are: another unit; a vertical axis that is not
-        z, or points down; ground more than 1.3 m from where it lay in training; no points below the horizon; points
-        far above the sensor's field of view; points in less than a quarter of the model's view; half of the points as
-        near as in a room; less than 1/20 of the fewest or more than 20 times the most points in training; fewer than
-        eight rows of points; remission that is constant, missing or off the sensor's range.
-
-    Raises
-    ------
-    PointsError
-        ``points`` has another shape.
+    points : (n, 4) float32; x, y, z [m], remission scaled to 0..1 by ``sensor``. Points that are not finite are
+        skipped.
+    sensor : the sensor that the caller says recorded the scan. If its remission function is constant, because the
+        scan has no remission, remission is not checked.
+    Returns: One sentence for each difference; empty if there is none. Gross are: another unit; a vertical axis that
+        is not z, or points down; ground more than 1.3 m from where it lay in training; no points below the horizon;
+        points far above the sensor's field of view; points in less than a quarter of the model's view; half of the
+        points as near as in a room; less than 1/20 of the fewest or more than 20 times the most points in training;
+        fewer than eight rows of points; remission that is constant, missing or off the sensor's range.
+    Raises PointsError.
     """
     return check_profiles(points, [profile], sensor)
 
@@ -71,21 +57,9 @@ def check_profiles(
 ) -> tuple[Finding, ...]:
     """Describe how a scan differs from the training scans of several models, each difference once.
 
-    Parameters
-    ----------
-    points, sensor
-        As in `check_fitness`.
-    profiles : iterable of FitnessProfile
-        The scan is measured once for all profiles of the same view.
-
-    Returns
-    -------
-    tuple of Finding
-
-    Raises
-    ------
-    PointsError
-        ``points`` has another shape.
+    points, sensor : as in `check_fitness`.
+    profiles : the scan is measured once for all profiles of the same view.
+    Raises PointsError.
     """
     measured: dict[Range, Measures | None] = {}
     found: dict[Finding, None] = {}
@@ -123,13 +97,8 @@ _USUAL_M = 9.0  # median distance in a street
 def check_dropped(points: NDArray[np.float32], dropped: DroppedPoints, sensor: SensorProfile) -> tuple[Finding, ...]:
     """Describe a scan of which nearly all is nearer than the sensor measures: a street in another unit, or no returns.
 
-    Parameters
-    ----------
-    points : (n, 4) float32
-        The scan before anything was dropped.
-    dropped : DroppedPoints
-        What `edgeperc.preprocess.returns.returns` dropped of it.
-    sensor : SensorProfile
+    points : (n, 4) float32; the scan before anything was dropped.
+    dropped : what `edgeperc.preprocess.returns.returns` dropped of it.
     """
     n_left = len(points) - dropped.total
     if dropped.too_near <= _NEARLY_ALL * n_left:

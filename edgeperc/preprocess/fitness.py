@@ -15,8 +15,6 @@ from ..errors import CardError, PointsError
 from ..system.kernel_cache import njit
 from ..types.points import read_only
 
-__all__ = ["FitnessProfile", "fill_scan_sums"]
-
 # About 6,000 points are enough. Steps are prime, so that they do not align with the rows of an organized scan.
 _STEPS = np.array([1, 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 53, 61, 71, 83, 97, 127, 167, 223, 307, 401])
 _SAMPLE, _BEAM_SAMPLE = 6000, 130_000
@@ -43,31 +41,21 @@ def fill_scan_sums(
 ) -> None:
     """Histograms of every ``step``-th point, for `check_fitness`. Points that are not finite are skipped.
 
-    Parameters
-    ----------
-    points : (n, 4) float32
-        x, y, z [m], remission.
-    step, beam_step : int
-        Every ``step``-th point is used; for the elevations in eight directions, every ``beam_step``-th.
-    view_right, view_left : float
-        Edges of the model's view as pseudo-azimuth, y / (|x| + |y|) unfolded to -2..2.
-    remissions : (258,) int64, overwritten
-        Points of remission <= 0, 256 even bins in 0..1, points above 1.
-    elevations : (360,) int64, overwritten
-        Bins of half a degree from -90, of the points farther than 3 m: nearer, it depends on where in its housing a
-        laser sits, and on how far the origin is from the sensor.
-    ranges : (200,) int64, overwritten
-        Horizontal distance, 20 bins a decade from 1 mm.
-    heights : (3, 100) int64, overwritten
-        x, y and z of the points 3 to 25 m away, bins of 0.2 m from -10 m.
-    rows : (8, 1024) float64, overwritten
-        Elevation [deg] of the points in the eight directions ahead, left, behind, right and halfway between.
+    points : (n, 4) float32; x, y, z [m], remission.
+    step, beam_step : every ``step``-th point is used; for the elevations in eight directions, every ``beam_step``-th.
+    view_right, view_left : edges of the model's view as pseudo-azimuth, y / (|x| + |y|) unfolded to -2..2.
+    remissions : (258,) int64, overwritten; points of remission <= 0, 256 even bins in 0..1, points above 1.
+    elevations : (360,) int64, overwritten; bins of half a degree from -90, of the points farther than 3 m: nearer, it
+        depends on where in its housing a laser sits, and on how far the origin is from the sensor.
+    ranges : (200,) int64, overwritten; horizontal distance, 20 bins a decade from 1 mm.
+    heights : (3, 100) int64, overwritten; x, y and z of the points 3 to 25 m away, bins of 0.2 m from -10 m.
+    rows : (8, 1024) float64, overwritten; elevation [deg] of the points in the eight directions ahead, left, behind,
+        right and halfway between.
     n_rows : (8,) int64, overwritten
-    sums : (9,) float64, overwritten
-        0: finite points; 1: finite points in the view; 2: sectors of 1/64 turn with points; 3: share of the sectors in
-        the view that have points; 4: logarithm of the ratio of obstacles at the sides to those ahead and behind;
-        5, 6: lowest and highest remission; 7: points 3 to 25 m away; 8: points of the fullest sector over the mean of
-        the sectors that have points, of the points farther than 3 m.
+    sums : (9,) float64, overwritten; 0: finite points; 1: finite points in the view; 2: sectors of 1/64 turn with
+        points; 3: share of the sectors in the view that have points; 4: logarithm of the ratio of obstacles at the
+        sides to those ahead and behind; 5, 6: lowest and highest remission; 7: points 3 to 25 m away; 8: points of
+        the fullest sector over the mean of the sectors that have points, of the points farther than 3 m.
     """
     n = points.shape[0]
     remissions[:] = 0
@@ -341,17 +329,9 @@ class FitnessProfile:
     ) -> FitnessProfile:
         """Measure training scans.
 
-        Parameters
-        ----------
-        scans : iterable of (n, 4) float32
-            x, y, z [m], remission scaled to 0..1.
-        azimuth_deg : tuple of 2 float
-            Left and right edge of the model's view [deg], between 180 and -180.
-
-        Raises
-        ------
-        PointsError
-            No scan has a finite point, or an array is not a scan.
+        scans : iterable of (n, 4) float32; x, y, z [m], remission scaled to 0..1.
+        azimuth_deg : tuple of 2 float; left and right edge of the model's view [deg], between 180 and -180.
+        Raises PointsError.
         """
         measures = [measured for scan in scans if (measured := measure(scan, azimuth_deg)) is not None]
         if not measures:
@@ -370,10 +350,7 @@ class FitnessProfile:
     def from_dict(cls, document: Mapping[str, Any]) -> FitnessProfile:
         """Read what `to_dict` wrote.
 
-        Raises
-        ------
-        CardError
-            An entry is missing, unknown, not a pair of numbers or out of its bounds.
+        Raises CardError.
         """
         names = {field.name for field in fields(cls)}
         if not isinstance(document, Mapping) or set(document) != names:

@@ -18,8 +18,6 @@ from ..types.frame import fill_moved
 from ..types.points import as_points, read_only
 from .returns import blank_too_near
 
-__all__ = ["Motion", "Trajectory", "deskew", "fill_deskewed", "merge"]
-
 MAX_RATE = 1e4  # of m/s and rad/s
 MAX_TURN = 3.1  # rad; the axis of half a turn has no sign
 MAX_BYTES = 1 << 28  # of a file of poses; a line has about 100
@@ -352,13 +350,9 @@ def fill_deskewed(
 ) -> None:
     """Move points by the motion of the sensor (Rodrigues' formula for the turn and for its integral).
 
-    Parameters
-    ----------
     points : (n, 4) float32, C-contiguous
-    after_s : (n,) float64
-        Time of each point after the pose of the result [s].
-    velocity, rate : (3,) float64
-        Of the sensor, in its own frame [m/s, rad/s].
+    after_s : (n,) float64; time of each point after the pose of the result [s].
+    velocity, rate : (3,) float64; of the sensor, in its own frame [m/s, rad/s].
     moved : (n, 4) float32, overwritten
     """
     wx, wy, wz = rate[0], rate[1], rate[2]

@@ -16,8 +16,6 @@ from ..types.perception import DroppedPoints
 from ..types.points import read_only
 from ..types.sensor import SensorProfile
 
-__all__ = ["about_too_near", "blank_too_near", "fill_returns", "has_returns_only", "returns"]
-
 # A coordinate of float32 is off by at most 6e-8 of its size: a point at exactly the nearest range counts as near.
 ROUNDING = 1e-6
 
@@ -27,22 +25,15 @@ def returns(
 ) -> tuple[NDArray[np.float32], DroppedPoints]:
     """Blank the rows of a scan that are not returns of the world.
 
-    Parameters
-    ----------
-    points : (n, 4) float32
-        x, y, z [m] in the frame of the scan, before its mounting moves it; remission. Not modified.
-    sensor : SensorProfile
-        Rows at most ``min_range_m`` from the sensor are too near; with ``min_range_m=0``, those of the sensor's own
-        place. Rows inside ``ego_box`` are of the own vehicle.
-    origin_m : tuple of 2 float, optional
-        x, y of the sensor in the frame of the scan [m]; by default as the profile's mounting says.
-
-    Returns
-    -------
-    scan : (n, 4) float32, C-contiguous, read-only
-        In input order. Blanked rows are NaN in all four columns. A view of ``points`` if there are none.
-    dropped : DroppedPoints
-        A row of several kinds counts once, as the first of them.
+    points : (n, 4) float32; x, y, z [m] in the frame of the scan, before its mounting moves it; remission. Not
+        modified.
+    sensor : rows at most ``min_range_m`` from the sensor are too near; with ``min_range_m=0``, those of the sensor's
+        own place. Rows inside ``ego_box`` are of the own vehicle.
+    origin_m : tuple of 2 float; x, y of the sensor in the frame of the scan [m]; by default as the profile's mounting
+        says.
+    Returns scan ((n, 4) float32, C-contiguous, read-only): In input order. Blanked rows are NaN in all four columns.
+        A view of ``points`` if there are none.
+    Returns dropped: A row of several kinds counts once, as the first of them.
     """
     x, y = sensor.mounting.origin_m if origin_m is None else origin_m
     box = None if sensor.ego_box is None else np.array(sensor.ego_box)

@@ -14,21 +14,6 @@ from ..errors import PointsError, SensorError
 from ..types.sensor import REMISSION_KINDS, RemissionFunction, SensorProfile
 from .returns import returns
 
-__all__ = [
-    "N_SHARES",
-    "N_STRATA",
-    "REFERENCES",
-    "fit_functions",
-    "fit_sensor",
-    "incidences",
-    "increasing",
-    "match_quantiles",
-    "quantiles",
-    "quantiles_by_stratum",
-    "remission_strata",
-    "stratify",
-]
-
 # --- remission -------------------------------------------------------------------------------------------------------
 
 # Strata in which remissions of similar streets are compared: by range [m], then by the cosine of the incidence. The
@@ -115,27 +100,13 @@ def fit_functions(
 ) -> tuple[RemissionFunction, ...]:
     """Fit a line, a parabola, a logarithm and a power to pairs of remissions, the best first.
 
-    Parameters
-    ----------
-    raw : (n,) array_like
-        Remission of the sensor to adapt, from 0 (the lower end of its ``remission_range``).
-    wanted : (n,) array_like
-        Remission of the other sensor at the same places, 0..1.
-    full_scale : float
-        Width of the raw range, e.g. 255.
-    to, source : str
-        Entries of `RemissionFunction`.
-
-    Returns
-    -------
-    tuple of RemissionFunction
-        Lowest ``rmse`` in ten-fold cross-validation first. A parabola is never worse than a line on the pairs it is
-        fitted to, but it is the worst on held-back pairs, as in the paper (KUL-Seg, Table 5).
-
-    Raises
-    ------
-    SensorError
-        There are fewer than four finite pairs, or all raw values are equal.
+    raw : (n,) array_like; remission of the sensor to adapt, from 0 (the lower end of its ``remission_range``).
+    wanted : (n,) array_like; remission of the other sensor at the same places, 0..1.
+    full_scale : width of the raw range, e.g. 255.
+    to, source : entries of `RemissionFunction`.
+    Returns: Lowest ``rmse`` in ten-fold cross-validation first. A parabola is never worse than a line on the pairs it
+        is fitted to, but it is the worst on held-back pairs, as in the paper (KUL-Seg, Table 5).
+    Raises SensorError.
     """
     x, y = np.asarray(raw, np.float64).ravel(), np.asarray(wanted, np.float64).ravel()
     if len(x) != len(y):
@@ -162,17 +133,10 @@ def fit_functions(
 def incidences(points: NDArray[np.float32], cell_m: float = 0.8) -> NDArray[np.float64]:
     """Compute the cosine of the incidence, between each ray and the normal of the surface around its point.
 
-    Parameters
-    ----------
-    points : (n, 3 or more) float32
-        x, y, z [m] in the sensor frame.
-    cell_m : float
-        Edge of the cubic cells in which surfaces are fitted [m].
-
-    Returns
-    -------
-    (n,) float64
-        0..1. NaN if the point's cell has fewer than six returns, or if these are not on a surface (leaves).
+    points : (n, 3 or more) float32; x, y, z [m] in the sensor frame.
+    cell_m : edge of the cubic cells in which surfaces are fitted [m].
+    Returns (n,) float64: 0..1. NaN if the point's cell has fewer than six returns, or if these are not on a surface
+        (leaves).
     """
     # Column by column: over rows of three values, numpy takes several times as long.
     x, y, z = np.ascontiguousarray(points[:, :3].T, np.float64)
@@ -207,25 +171,14 @@ def stratify(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Find the stratum of each point, by range and incidence.
 
-    Parameters
-    ----------
-    scan : (n, 4) float32
-        x, y, z [m] in the sensor frame, remission. Points that are not finite or out of `RANGE_EDGES_M` are left out.
-    n_points : int or None
-        Use about so many points: all returns in some of the cells in which `incidences` fits surfaces. None: use all.
-    cell_m : float
-        Edge of the cells [m].
-
-    Returns
-    -------
-    strata : (k,) int64
-        0 to `N_STRATA` - 1.
-    remissions : (k,) float64
-
-    Raises
-    ------
-    PointsError
-        The array is not a scan.
+    scan : (n, 4) float32; x, y, z [m] in the sensor frame, remission. Points that are not finite or out of
+        `RANGE_EDGES_M` are left out.
+    n_points : use about so many points: all returns in some of the cells in which `incidences` fits surfaces. None:
+        use all.
+    cell_m : edge of the cells [m].
+    Returns strata ((k,) int64): 0 to `N_STRATA` - 1.
+    Returns remissions: (k,) float64.
+    Raises PointsError.
     """
     if scan.ndim != 2 or scan.shape[1] != 4:
         raise PointsError(f"got an array of shape {scan.shape}; expected (n, 4): x, y, z, remission")
@@ -254,20 +207,9 @@ def remission_strata(scans: Iterable[NDArray[np.float32]]) -> list[tuple[float, 
 
     A stratum of fewer than 200 points has a share of 0 and no quantiles.
 
-    Parameters
-    ----------
-    scans : iterable of (n, 4) float32
-        x, y, z [m] in the sensor frame, remission.
-
-    Returns
-    -------
-    list of (share, quantiles)
-        One entry per stratum.
-
-    Raises
-    ------
-    PointsError
-        An array is not a scan.
+    scans : iterable of (n, 4) float32; x, y, z [m] in the sensor frame, remission.
+    Returns list of (share, quantiles): One entry per stratum.
+    Raises PointsError.
     """
     return quantiles_by_stratum([stratify(scan) for scan in scans])
 
@@ -302,15 +244,9 @@ def match_quantiles(
     no influence. Matching within each stratum was worse: the least-squares curve through all strata is too flat, and
     car IoU on PandaSet was 0.44 instead of 0.56.
 
-    Parameters
-    ----------
-    strata, reference : sequence of (share, quantiles)
-        From `remission_strata`: one of the sensor's scans, one of another sensor in similar streets.
-
-    Returns
-    -------
-    raw, wanted : (k,) float64
-        Increasing; empty if no stratum is known for both.
+    strata, reference : sequence of (share, quantiles); from `remission_strata`: one of the sensor's scans, one of
+        another sensor in similar streets.
+    Returns raw, wanted ((k,) float64): Increasing; empty if no stratum is known for both.
     """
     both = [
         (min(share, other_share), own, other)
@@ -337,30 +273,13 @@ def fit_sensor(
 ) -> tuple[SensorProfile, tuple[RemissionFunction, ...]]:
     """Fit the remission function of a sensor to scans of any street.
 
-    Parameters
-    ----------
-    scans : sequence of (n, 4) float32
-        With raw remissions.
-    sensor : SensorProfile
-        The sensor that took them. What it drops (`edgeperc.preprocess.returns.returns`) is not used.
-    to : str
-        A key of `REFERENCES`.
-    source : str
-        Description of the scans; by default their number.
-
-    Returns
-    -------
-    profile : SensorProfile
-        ``sensor`` with the best function; a parabola that decreases before full scale is not used.
-    functions : tuple of RemissionFunction
-        All kinds, best first.
-
-    Raises
-    ------
-    SensorError
-        No reference of that name, or the scans hold too few points.
-    PointsError
-        An array is not a scan.
+    scans : sequence of (n, 4) float32; with raw remissions.
+    sensor : the sensor that took them. What it drops (`edgeperc.preprocess.returns.returns`) is not used.
+    to : a key of `REFERENCES`.
+    source : description of the scans; by default their number.
+    Returns profile: ``sensor`` with the best function; a parabola that decreases before full scale is not used.
+    Returns functions: All kinds, best first.
+    Raises SensorError, PointsError.
     """
     if to not in REFERENCES:
         raise SensorError(f"no reference remissions of {to!r}; known are {', '.join(REFERENCES)}")

@@ -24,8 +24,6 @@ from .tables import MAX_BYTES, MAX_SCAN_BYTES
 from .times import TimedScan
 from .worker import ALIVE, END, ERROR, FOUND, HEADER, MISSING, READY, SCAN, TIMES, WARNING
 
-__all__ = ["SCAN_LIMIT_S", "decode_apart", "describe_apart"]
-
 # Longest time to decode one scan [s]; the slowest library takes well under one.
 SCAN_LIMIT_S = 60.0
 
@@ -43,10 +41,7 @@ def decode_apart(
 
     The process runs ahead by one scan and waits then, so the memory stays flat. It ends with the iterator.
 
-    Raises
-    ------
-    PointsError
-        As `decoders.decode`, or the process ended, or it exceeded the limits of memory or time.
+    Raises PointsError.
     """
     request = {"path": str(path), "kind": kind, "topic": topic, "remission_field": remission_field, "times": times}
     return _serve(request, path, [])
@@ -55,10 +50,7 @@ def decode_apart(
 def describe_apart(path: Path, kind: str, topic: str | None) -> dict[str, Any]:
     """Like `decoders.describe`, in a process of its own.
 
-    Raises
-    ------
-    PointsError
-        As `decode_apart`.
+    Raises PointsError.
     """
     found: list[Any] = []
     for _ in _serve({"path": str(path), "kind": kind, "topic": topic}, path, found):

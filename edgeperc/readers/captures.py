@@ -18,17 +18,6 @@ from .identify import KnownSensor, of_cloud, of_metadata, of_packets
 from .packets import PCAP_MAGIC
 from .times import TimedScan
 
-__all__ = [
-    "CAPTURE_SUFFIXES",
-    "SCAN_SUFFIXES",
-    "is_capture",
-    "known_sensor",
-    "read_scans",
-    "read_timed_scans",
-    "scan_files",
-    "sensor_of",
-]
-
 SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 CAPTURE_SUFFIXES = (".bag", ".db3", ".mcap", ".osf", ".pcap", ".pcapng")
 

@@ -22,8 +22,6 @@ from .packets import pcap_packets, refuse_hesai, velodyne_packets
 from .tables import MAX_BYTES
 from .times import TimedScan, point_times
 
-__all__ = ["cloud_points", "decode", "describe", "describe_cloud", "is_ouster_cloud"]
-
 _Item = TypeVar("_Item")
 
 _CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -48,24 +46,11 @@ def decode(
 ) -> Iterator[TimedScan]:
     """The scans of a capture, decoded in this process.
 
-    Parameters
-    ----------
-    path : Path
-    kind : {".pcap", ".osf", ".bag", ".mcap", "ros2"}
-    topic, remission_field : str, optional
-        As in `edgeperc.read_scans`.
-    warn : callable
-        Called with a sentence about what was left out.
-    alive : callable
-        Called now and then while a large file is checked before its first scan.
-    times : bool
-        False leaves out the times of points.
-
-    Raises
-    ------
-    PointsError
-        Every error becomes one that names the file.
-    MissingExtraError
+    topic, remission_field : as in `edgeperc.read_scans`.
+    warn : called with a sentence about what was left out.
+    alive : called now and then while a large file is checked before its first scan.
+    times : false leaves out the times of points.
+    Raises PointsError, MissingExtraError.
     """
     scans = (
         _packet_scans(path, kind, topic, remission_field, warn, alive)
@@ -79,26 +64,12 @@ def decode(
 def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]) -> dict[str, Any]:
     """What a capture says about its sensor, as JSON types; `identify` draws the conclusion.
 
-    Parameters
-    ----------
-    path : Path
-    kind : {".osf", ".bag", ".mcap", "ros2"}
-    topic : str, optional
-        As in `edgeperc.read_scans`.
-    alive : callable
-        As in `decode`.
-
-    Returns
-    -------
-    dict
-        ``metadata`` of an Ouster, as text; or ``topic``, ``frame``, ``fields`` and ``elevations_deg`` of a point cloud:
-        the median elevation of each ring or, without rings, of each row of an organized cloud [deg], None where a ring
-        has no return; empty without both.
-
-    Raises
-    ------
-    PointsError, MissingExtraError
-        As `decode`.
+    topic : as in `edgeperc.read_scans`.
+    alive : as in `decode`.
+    Returns: ``metadata`` of an Ouster, as text; or ``topic``, ``frame``, ``fields`` and ``elevations_deg`` of a point
+        cloud: the median elevation of each ring or, without rings, of each row of an organized cloud [deg], None
+        where a ring has no return; empty without both.
+    Raises PointsError, MissingExtraError.
     """
 
     def found() -> Iterator[dict[str, Any]]:
@@ -116,10 +87,7 @@ def describe(path: Path, kind: str, topic: str | None, alive: Callable[[], None]
 def describe_cloud(topic: str, message: Any) -> dict[str, Any]:
     """What a ROS ``sensor_msgs/PointCloud2`` message says about its sensor; see `describe`.
 
-    Raises
-    ------
-    PointsError
-        As `cloud_points`.
+    Raises PointsError.
     """
     return {
         "topic": topic,
@@ -151,23 +119,12 @@ def _with_typed_errors(path: Path, items: Iterator[_Item]) -> Iterator[_Item]:
 def cloud_points(message: Any, *, remission_field: str | None = None) -> NDArray[np.float32]:
     """Convert a ROS ``sensor_msgs/PointCloud2`` message, from any library, to points.
 
-    Parameters
-    ----------
-    message : object
-        With the message's attributes: height, width, fields, is_bigendian, point_step, row_step, data. Organized or
-        not; fields in any order, of any type, padded or not.
-    remission_field : str, optional
-        As in `edgeperc.read_points`; by default ``reflectivity`` if the fields are those of Ouster's driver.
-
-    Returns
-    -------
-    (n, 4) float32, C-contiguous
-        Row by row. Points that are not finite stay in place.
-
-    Raises
-    ------
-    PointsError
-        The message holds fewer bytes than it declares, or has no x, y and z.
+    message : object; with the message's attributes: height, width, fields, is_bigendian, point_step, row_step, data.
+        Organized or not; fields in any order, of any type, padded or not.
+    remission_field : as in `edgeperc.read_points`; by default ``reflectivity`` if the fields are those of Ouster's
+        driver.
+    Returns (n, 4) float32, C-contiguous: Row by row. Points that are not finite stay in place.
+    Raises PointsError.
     """
     cloud = _as_table(message)
     if remission_field is None and is_ouster_cloud(cloud.dtype.names or ()):
@@ -353,14 +310,10 @@ def _clouds(path: Path, kind: str, topic: str | None, alive: Callable[[], None])
 def _plain_bag(folder: Path, alive: Callable[[], None]) -> tuple[Path, bool, list[Path]]:
     """A ROS 2 bag without compression, for readers that would unpack without limits.
 
-    Returns
-    -------
-    folder : Path
-        The bag's own; or a temporary one, whose files are unpacked, or links to those with compressed messages.
-    packed : bool
-        Whether its messages are compressed all the same.
-    files : list of Path
-        Its MCAP files, if nothing in it is compressed; empty if it has files of another format.
+    Returns folder: The bag's own; or a temporary one, whose files are unpacked, or links to those with compressed
+        messages.
+    Returns packed: Whether its messages are compressed all the same.
+    Returns files: Its MCAP files, if nothing in it is compressed; empty if it has files of another format.
     """
     yaml = require("ruamel.yaml", "ros", "Reading a bag", package="ruamel.yaml")
     information = yaml.YAML(typ="safe").load(folder / "metadata.yaml")["rosbag2_bagfile_information"]

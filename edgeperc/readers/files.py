@@ -22,8 +22,6 @@ from .ply import parse_ply
 from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES, Columns
 from .times import TimedScan, point_times
 
-__all__ = ["read_points", "read_timed_file"]
-
 _TEXT_BYTES = np.zeros(256, dtype=np.bool_)
 _TEXT_BYTES[[9, 10, 13, *range(32, 127)]] = True
 

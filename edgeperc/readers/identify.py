@@ -17,8 +17,6 @@ from .decoders import is_ouster_cloud
 from .ouster import check_metadata, metadata_beside, read_metadata
 from .packets import refuse_hesai, velodyne_packets
 
-__all__ = ["KnownSensor", "contradicts", "of_cloud", "of_metadata", "of_packets"]
-
 _CHOICES = f"Pass its name, sensor= or --sensor: {', '.join(SENSORS)}; or a profile of your own, a .json file."
 
 # The last byte of a Velodyne's packet, behind the return mode: the model's beam angles. VLS-128 has two by firmware.
@@ -65,18 +63,8 @@ def contradicts(given: SensorProfile, recorded_by: SensorProfile) -> bool:
 def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     """The sensor of a pcap file.
 
-    Parameters
-    ----------
-    path : Path
-    topic : str, optional
-        The serial number, if there is metadata of several Ouster sensors.
-
-    Raises
-    ------
-    PointsError
-        The file is not a capture of a sensor that can be decoded.
-    SensorError
-        The packets name no sensor, or several, or one of which there is no profile.
+    topic : the serial number, if there is metadata of several Ouster sensors.
+    Raises PointsError, SensorError.
     """
     names = {_velodyne_name(packet) for packet in velodyne_packets(path)}
     if names:
@@ -111,19 +99,9 @@ def _velodyne_name(packet: memoryview) -> str | None:
 def of_metadata(content: Any, source: str) -> KnownSensor:
     """The sensor that an Ouster's metadata describes, with its own beam angles and columns.
 
-    Parameters
-    ----------
-    content : object
-        The metadata as `json.loads` returns it.
-    source : str
-        What to call it in messages.
-
-    Raises
-    ------
-    PointsError
-        The metadata is impossible.
-    SensorError
-        It names no sensor, or one of which there is no profile.
+    content : object; the metadata as `json.loads` returns it.
+    source : what to call it in messages.
+    Raises PointsError, SensorError.
     """
     try:
         check_metadata(content)
@@ -158,15 +136,8 @@ def of_metadata(content: Any, source: str) -> KnownSensor:
 def of_cloud(found: Mapping[str, Any]) -> KnownSensor:
     """The sensor of a point cloud of ROS: its maker by fields, frame and topic, its model by the angles of its rings.
 
-    Parameters
-    ----------
-    found : mapping
-        ``topic``, ``frame``, ``fields`` and ``elevations_deg``, from `decoders.describe`.
-
-    Raises
-    ------
-    SensorError
-        The cloud names no sensor, or one of which there is no profile.
+    found : ``topic``, ``frame``, ``fields`` and ``elevations_deg``, from `decoders.describe`.
+    Raises SensorError.
     """
     topic, frame, fields = str(found["topic"]), str(found["frame"]), [str(name) for name in found["fields"]]
     rings = [np.nan if angle is None else float(angle) for angle in found["elevations_deg"]]

@@ -14,8 +14,6 @@ from ..camera.image import check_size
 from ..errors import ImageError
 from ..system.extras import require
 
-__all__ = ["IMAGE_SUFFIXES", "read_image"]
-
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".ppm", ".webp")
 # Only these decoders: others of Pillow start programs (EPS), print what is damaged (TIFF) or are of no camera.
 FORMATS = ("BMP", "JPEG", "PNG", "PPM", "WEBP")

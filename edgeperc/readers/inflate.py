@@ -13,8 +13,6 @@ from ..errors import PointsError
 from ..system.extras import require
 from .tables import MAX_BYTES
 
-__all__ = ["inflate", "inflate_file", "most_bytes"]
-
 # Scans pack less than 20 to 1. Clouds without a return pack better, but are smaller than 64 MiB.
 _MOST_RATIO, _ALWAYS_BYTES = 100, 1 << 26
 
@@ -27,18 +25,9 @@ def most_bytes(n_packed: int) -> int:
 def inflate(packed: bytes, method: str, limit: int | None = None) -> bytes:
     """Decompress bytes, but no more than a limit.
 
-    Parameters
-    ----------
-    packed : bytes
-    method : {"", "deflate", "bz2", "lz4", "zstd"}
-        ``""``: not compressed. ``"lz4"`` is LZ4's frame format.
-    limit : int, optional
-        Most bytes of the result; by default 2 GiB, and never more than `most_bytes`.
-
-    Raises
-    ------
-    PointsError
-        The data holds more than ``limit`` bytes, is damaged or cut short, or the method is unknown.
+    method : ``""``: not compressed. ``"lz4"`` is LZ4's frame format.
+    limit : most bytes of the result; by default 2 GiB, and never more than `most_bytes`.
+    Raises PointsError.
     """
     limit = min(MAX_BYTES if limit is None else limit, most_bytes(len(packed)) if method else MAX_BYTES)
     if method == "":
@@ -60,10 +49,7 @@ def inflate(packed: bytes, method: str, limit: int | None = None) -> bytes:
 def inflate_file(packed: Path, target: Path, limit: int, alive: Callable[[], None]) -> int:
     """Decompress a zstd file into another one, but no more bytes than a limit; their number.
 
-    Raises
-    ------
-    PointsError
-        As `inflate`.
+    Raises PointsError.
     """
     zstd = require("zstandard", "ros", "Reading zstd data")
     n = 0

@@ -13,8 +13,6 @@ from ..errors import PointsError
 from .inflate import inflate
 from .tables import MAX_BYTES
 
-__all__ = ["Channel", "McapFile", "Message"]
-
 _MAGIC = b"\x89MCAP0\r\n"
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 1, 2, 3, 4, 5, 6, 15
 

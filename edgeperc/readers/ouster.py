@@ -18,8 +18,6 @@ from ..errors import PointsError
 from ..system.extras import require
 from .packets import check_datagrams, copy_without
 
-__all__ = ["check_metadata", "check_osf", "metadata_beside", "open_capture", "read_metadata"]
-
 # Sensors have up to 128 beams, 4,096 columns in a turn and 32 columns in a packet.
 _MOST_BEAMS, _MOST_COLUMNS = 1024, 65536
 _MOST_JSON_BYTES = 1 << 24
@@ -28,10 +26,7 @@ _MOST_JSON_BYTES = 1 << 24
 def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], None]) -> Any:
     """The turns of an Ouster packet capture as ouster-sdk reads them, without packets that could end the process.
 
-    Returns
-    -------
-    ouster.sdk.pcap.PcapFrameSetSource or None
-        None if no packet has the size that the metadata says.
+    Returns ouster.sdk.pcap.PcapFrameSetSource or None: None if no packet has the size that the metadata says.
     """
     pcap = require("ouster.sdk.pcap", "ouster", "Reading a capture that is not Velodyne's", package="ouster-sdk")
     core = require("ouster.sdk.core", "ouster", "Reading an Ouster capture", package="ouster-sdk")
@@ -62,10 +57,7 @@ def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], No
 def metadata_beside(path: Path) -> list[Path]:
     """The .json files whose names have the longest beginning in common with the capture's, as ouster-sdk chooses.
 
-    Raises
-    ------
-    PointsError
-        There is none.
+    Raises PointsError.
     """
     files = sorted(file for file in path.absolute().parent.iterdir() if file.suffix.lower() == ".json")
     alike = {
@@ -101,10 +93,8 @@ def read_metadata(path: Path) -> str:
 def check_metadata(content: Any) -> None:
     """Raise `PointsError` unless the numbers that ouster-sdk divides and allocates by are possible and agree.
 
-    Parameters
-    ----------
-    content : object
-        The sensor's metadata as `json.loads` returns it, of any firmware. Fields that are absent are not checked.
+    content : object; the sensor's metadata as `json.loads` returns it, of any firmware. Fields that are absent are
+        not checked.
     """
     if not isinstance(content, dict):
         raise PointsError(f"expected an object, got {type(content).__name__}")

@@ -14,16 +14,6 @@ import numpy as np
 
 from ..errors import PointsError
 
-__all__ = [
-    "PCAP_MAGIC",
-    "Checked",
-    "check_datagrams",
-    "copy_without",
-    "pcap_packets",
-    "refuse_hesai",
-    "velodyne_packets",
-]
-
 # First bytes of a pcap file, and the byte order that they stand for.
 PCAP_MAGIC = {
     b"\xd4\xc3\xb2\xa1": "<",
@@ -48,11 +38,7 @@ _PENDING = 256
 def pcap_packets(path: Path, whole: bool = True) -> Iterator[tuple[int, memoryview]]:
     """The place in the file of each captured packet's record, and the packet with its network headers.
 
-    Parameters
-    ----------
-    path : Path
-    whole : bool
-        Raise `PointsError` if the file ends inside a packet; otherwise stop in front of that packet.
+    whole : raise `PointsError` if the file ends inside a packet; otherwise stop in front of that packet.
     """
     size = path.stat().st_size
     if size < 24:
@@ -105,14 +91,9 @@ def check_datagrams(path: Path, sizes: Collection[int], alive: Callable[[], None
 
     Packets of other protocols, and whole datagrams on other ports, are neither good nor bad.
 
-    Parameters
-    ----------
-    path : Path
-        A pcap file; one that is cut short is checked up to the cut.
-    sizes : collection of int
-        Bytes of payload that the sensor's packets have.
-    alive : callable
-        Called now and then, for large files.
+    path : a pcap file; one that is cut short is checked up to the cut.
+    sizes : collection of int; bytes of payload that the sensor's packets have.
+    alive : called now and then, for large files.
     """
     size = path.stat().st_size
     bad, n_good, n_bad, end = array("q"), 0, 0, 24

@@ -13,8 +13,6 @@ from ..system.kernel_cache import njit
 from ..types.points import plain_name
 from .tables import MAX_HEADER_BYTES, MAX_SCAN_BYTES, Columns, column, cut_short, parse_table, whole_number
 
-__all__ = ["begins_like_pcd", "fill_unpacked_lzf", "parse_pcd"]
-
 _PCD_TYPES = {f"{kind}{size}": f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)} | {
     "F4": "<f4",
     "F8": "<f8",
@@ -83,23 +81,10 @@ def _parse_pcd_header(head: bytes) -> _PcdHeader:
 def parse_pcd(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> Columns:
     """Parse a PCD file: ascii, binary or binary_compressed.
 
-    Parameters
-    ----------
-    data : (n_bytes,) uint8
-        The whole file.
-    head : bytes
-        Its beginning, with the whole header.
-    remission_field : str or None
-        As in `edgeperc.read_points`.
-
-    Returns
-    -------
-    Columns
-
-    Raises
-    ------
-    PointsError
-        The file is truncated or malformed.
+    data : (n_bytes,) uint8; the whole file.
+    head : its beginning, with the whole header.
+    remission_field : as in `edgeperc.read_points`.
+    Raises PointsError.
     """
     header = _parse_pcd_header(head)
     n = header.n_points
@@ -152,15 +137,9 @@ def _unpack_pcd(body: NDArray[np.uint8], n_bytes: int) -> NDArray[np.uint8]:
 def fill_unpacked_lzf(packed: NDArray[np.uint8], unpacked: NDArray[np.uint8]) -> int:
     """Decompress LZF data into ``unpacked``.
 
-    Parameters
-    ----------
     packed : (m,) uint8
     unpacked : (size,) uint8, overwritten
-
-    Returns
-    -------
-    int
-        Bytes written; -1 if a reference leaves the data or the output.
+    Returns: Bytes written; -1 if a reference leaves the data or the output.
     """
     n_in = packed.shape[0]
     n_out = unpacked.shape[0]

@@ -12,8 +12,6 @@ from ..errors import PointsError
 from ..types.points import plain_name
 from .tables import Columns, column, cut_short, parse_table, whole_number
 
-__all__ = ["parse_ply"]
-
 _PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
@@ -70,23 +68,10 @@ def _parse_ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
 def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> Columns:
     """Parse the vertices of a PLY file: ascii, or binary in either byte order.
 
-    Parameters
-    ----------
-    data : (n_bytes,) uint8
-        The whole file.
-    head : bytes
-        Its beginning, with the whole header.
-    remission_field : str or None
-        As in `edgeperc.read_points`.
-
-    Returns
-    -------
-    Columns
-
-    Raises
-    ------
-    PointsError
-        The file is truncated or malformed.
+    data : (n_bytes,) uint8; the whole file.
+    head : its beginning, with the whole header.
+    remission_field : as in `edgeperc.read_points`.
+    Raises PointsError.
     """
     encoding, elements, start = _parse_ply_header(head)
     before: list[_PlyElement] = []

@@ -13,17 +13,6 @@ from ..errors import PointsError
 from ..types.points import remission_name
 from .times import time_name
 
-__all__ = [
-    "MAX_BYTES",
-    "MAX_HEADER_BYTES",
-    "MAX_SCAN_BYTES",
-    "Columns",
-    "column",
-    "cut_short",
-    "parse_table",
-    "whole_number",
-]
-
 MAX_HEADER_BYTES = 65536
 
 # Limit for the memory that decoding a capture takes, and for what one of its chunks unpacks to: 2 GiB.

@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["TimedScan", "point_times", "time_name"]
-
 # Best first: of Ouster's and Velodyne's drivers, of Hesai's, RoboSense's and Livox', of others.
 _NAMES = ("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset", "time_offset_ns")
 
@@ -52,19 +50,12 @@ def point_times(
     Drivers store seconds, milli-, micro- or nanoseconds, and no field says which. A scan takes 2 ms to 2 s, so the
     difference between its first and its last time shows the unit. Times of less than 2 s count from ``stamp_s``.
 
-    Parameters
-    ----------
-    fields : mapping of str to (n,) array
-        Columns by `edgeperc.types.points.plain_name`.
-    points : (n, 4) float32
-        Times of points without a return, which are not finite or lie in the origin, do not show the unit.
-    stamp_s : float or None
-        None counts from 0.
-
-    Returns
-    -------
-    (n,) float64 or None
-        [s]; None without such a field, or if no unit gives a duration of 2 ms to 2 s, as where all times are 0.
+    fields : mapping of str to (n,) array; columns by `edgeperc.types.points.plain_name`.
+    points : (n, 4) float32; times of points without a return, which are not finite or lie in the origin, do not show
+        the unit.
+    stamp_s : none counts from 0.
+    Returns (n,) float64 or None: [s]; None without such a field, or if no unit gives a duration of 2 ms to 2 s, as
+        where all times are 0.
     """
     name = time_name(fields)
     if name is None:

@@ -19,8 +19,6 @@ from ..errors import MissingExtraError, PointsError
 from .decoders import decode, describe
 from .tables import MAX_BYTES, MAX_SCAN_BYTES
 
-__all__ = ["ALIVE", "END", "ERROR", "FOUND", "HEADER", "MISSING", "READY", "SCAN", "TIMES", "WARNING", "main"]
-
 HEADER = struct.Struct("<cdq")
 ALIVE, END, ERROR, FOUND, MISSING, READY, SCAN, TIMES, WARNING = b"A", b"Z", b"E", b"F", b"M", b"R", b"S", b"T", b"W"
 

@@ -22,17 +22,6 @@ from ..types.geometry import draw_footprints
 from ..types.perception import Box, TopView
 from .outline import outline_of
 
-__all__ = [
-    "FreeAhead",
-    "FreeEnd",
-    "RoadAhead",
-    "compile_kernels",
-    "fill_corridor",
-    "fill_first_cells",
-    "free_ahead",
-    "road_ahead",
-]
-
 FreeEnd = Literal["obstacle", "edge of the road", "unknown", "end of view"]
 """What ends a free distance."""
 FREE_ENDS: tuple[FreeEnd, ...] = ("obstacle", "edge of the road", "unknown", "end of view")
@@ -341,12 +330,9 @@ def fill_first_cells(
 ) -> None:
     """Count the cells of each column, from the last row up, before the first of each kind.
 
-    Parameters
-    ----------
     objects, known, road : (rows, columns) bool, C-contiguous
-    firsts : (3, columns) int64, overwritten
-        Cells before the first that is an object; that is known and neither road nor an object; that is neither known
-        nor an object. The number of rows if there is none.
+    firsts : (3, columns) int64, overwritten; cells before the first that is an object; that is known and neither road
+        nor an object; that is neither known nor an object. The number of rows if there is none.
     """
     height, width = objects.shape
     for kind in range(3):

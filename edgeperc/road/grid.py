@@ -25,8 +25,6 @@ from ..types.points import as_points, read_only
 from ..types.sensor import SensorProfile, get_sensor
 from ..types.views import TopViewGeometry
 
-__all__ = ["OccupancyGrid", "fill_standing", "occupancy_grid"]
-
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100  # values of nav_msgs/OccupancyGrid
 
 
@@ -301,19 +299,13 @@ def fill_standing(
 ) -> None:
     """Find what stands in each cell of a grid. Points higher than ``overhead`` above the ground are ignored.
 
-    Parameters
-    ----------
     points : (n, 4) float32, C-contiguous
-    height_m : (n,) float32
-        Height of each point above the ground [m].
-    corner : (3,) float64
-        x and y of the upper left corner of the grid, edge of a cell [m].
-    lowest, overhead : float
-        Heights between which something stands on the ground [m].
-    highest : (rows, columns) int32, overwritten
-        The point with the largest height, the first of equals; -1 without one.
-    tallest : (rows, columns) float32, overwritten
-        Largest height above ``lowest`` [m]; NaN without one.
+    height_m : (n,) float32; height of each point above the ground [m].
+    corner : (3,) float64; x and y of the upper left corner of the grid, edge of a cell [m].
+    lowest, overhead : heights between which something stands on the ground [m].
+    highest : (rows, columns) int32, overwritten; the point with the largest height, the first of equals; -1 without
+        one.
+    tallest : (rows, columns) float32, overwritten; largest height above ``lowest`` [m]; NaN without one.
     """
     n_rows, n_cols = highest.shape
     for r in range(n_rows):

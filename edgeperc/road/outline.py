@@ -16,18 +16,6 @@ from numpy.typing import NDArray
 
 from ..system.kernel_cache import njit
 
-__all__ = [
-    "Outline",
-    "fill_grown",
-    "fill_rings",
-    "mark_connected",
-    "mark_needed",
-    "merge_corners",
-    "nearest_part",
-    "outline_of",
-    "resolve_contacts",
-]
-
 REACHES = (1.0, 1.25, 1.5, 2.0, 4.0, 8.0)
 """Factors of the tolerance that are tried in turn if the outline has too many corners."""
 FARTHEST = 8
@@ -215,11 +203,8 @@ def _sums(cells: NDArray[np.bool_]) -> NDArray[np.int32]:
 def fill_grown(cells: NDArray[np.bool_], radius: float, grown: NDArray[np.bool_]) -> None:
     """Mark the cells whose middle is within a distance of the middle of a marked cell.
 
-    Parameters
-    ----------
     cells : (rows, columns) bool
-    radius : float
-        In cells, 0 or more and finite.
+    radius : in cells, 0 or more and finite.
     grown : (rows, columns) bool, overwritten
     """
     height, width = cells.shape
@@ -248,12 +233,10 @@ def fill_grown(cells: NDArray[np.bool_], radius: float, grown: NDArray[np.bool_]
 def resolve_contacts(cells: NDArray[np.bool_], addable: NDArray[np.bool_]) -> None:
     """Add or remove cells until no two marked cells share only a corner.
 
-    Parameters
-    ----------
     cells : (rows, columns) bool, modified
-    addable : (rows, columns) bool, modified
-        Cells that may be added: of the two between such a pair, the one with the larger row if possible. If neither may
-        be, the one of the pair with the smaller row is removed, and not added again.
+    addable : (rows, columns) bool, modified; cells that may be added: of the two between such a pair, the one with
+        the larger row if possible. If neither may be, the one of the pair with the smaller row is removed, and not
+        added again.
     """
     height, width = cells.shape
     changed = True
@@ -279,11 +262,8 @@ def resolve_contacts(cells: NDArray[np.bool_], addable: NDArray[np.bool_]) -> No
 def mark_connected(cells: NDArray[np.bool_], row: int, col: int, part: NDArray[np.bool_]) -> None:
     """Mark the cells that are connected to a start cell over shared sides.
 
-    Parameters
-    ----------
     cells : (rows, columns) bool
-    row, col : int
-        A marked cell of ``cells``, where the search begins.
+    row, col : a marked cell of ``cells``, where the search begins.
     part : (rows, columns) bool, overwritten
     """
     height, width = cells.shape
@@ -308,19 +288,11 @@ def mark_connected(cells: NDArray[np.bool_], row: int, col: int, part: NDArray[n
 def fill_rings(cells: NDArray[np.bool_], corners: NDArray[np.int64], ends: NDArray[np.int64]) -> int:
     """Trace the edges of marked cells, with the cells on the left.
 
-    Parameters
-    ----------
-    cells : (rows, columns) bool
-        None marked along the border.
-    corners : (n, 2) int64, overwritten
-        Row and column of the corners where the trace turns, ring after ring; a cell's upper left corner has its row and
-        column. ``n`` is at least the number of sides between a marked and an unmarked cell.
-    ends : (m,) int64, overwritten
-        Where each ring ends in ``corners``; ``m`` at least a quarter of ``n``.
-
-    Returns
-    -------
-    n_rings : int
+    cells : (rows, columns) bool; none marked along the border.
+    corners : (n, 2) int64, overwritten; row and column of the corners where the trace turns, ring after ring; a
+        cell's upper left corner has its row and column. ``n`` is at least the number of sides between a marked and an
+        unmarked cell.
+    ends : (m,) int64, overwritten; where each ring ends in ``corners``; ``m`` at least a quarter of ``n``.
     """
     height, width = cells.shape
     walked = np.empty((height, width), np.bool_)  # lower sides
@@ -361,16 +333,8 @@ def fill_rings(cells: NDArray[np.bool_], corners: NDArray[np.int64], ends: NDArr
 def may_change(ar: int, ac: int, br: int, bc: int, cr: int, cc: int, fixed: NDArray[np.int32]) -> bool:
     """Whether all cells that a triangle touches may change sides.
 
-    Parameters
-    ----------
-    ar, ac, br, bc, cr, cc : int
-        Row and column of its corners.
-    fixed : (rows, columns + 1) int32
-        Number of cells of each row before each column that may not.
-
-    Returns
-    -------
-    may : bool
+    ar, ac, br, bc, cr, cc : row and column of its corners.
+    fixed : (rows, columns + 1) int32; number of cells of each row before each column that may not.
     """
     # In the strip of a row, its columns are bounded by its corners there and by the crossings of its edges with the
     # strip's two lines.
@@ -539,20 +503,13 @@ def mark_needed(
 ) -> None:
     """Remove corners of rings that neither touch nor cross; smallest triangles first.
 
-    Parameters
-    ----------
-    corners : (n, 2) int64
-        Row and column, ring after ring, with the region on the left.
-    ends : (m,) int64
-        Where each ring ends in ``corners``.
-    not_addable, not_removable : (rows, columns + 1) int32
-        Number of cells of each row before each column that may not be added to the region, or removed from it.
-    outer : int
-        Number of the outer ring.
-    enough : int
-        Nothing more is removed once the outer ring has so few corners.
-    kept : (n,) bool, modified
-        The corners that are not removed; at least three of each ring.
+    corners : (n, 2) int64; row and column, ring after ring, with the region on the left.
+    ends : (m,) int64; where each ring ends in ``corners``.
+    not_addable, not_removable : (rows, columns + 1) int32; number of cells of each row before each column that may
+        not be added to the region, or removed from it.
+    outer : number of the outer ring.
+    enough : nothing more is removed once the outer ring has so few corners.
+    kept : (n,) bool, modified; the corners that are not removed; at least three of each ring.
     """
     n = corners.shape[0]
     before, after, ring_of = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)

@@ -9,8 +9,6 @@ from typing import Any, Protocol
 
 from ..errors import OptionError
 
-__all__ = ["RELIABLE", "SENSOR_DATA", "Graph", "Output", "Qos", "full_name"]
-
 
 @dataclass(frozen=True)
 class Qos:
@@ -71,21 +69,9 @@ class Graph(Protocol):
 def full_name(name: str, namespace: str = "/") -> str:
     """Resolve the name of a topic or a node.
 
-    Parameters
-    ----------
-    name : str
-        Absolute (``"/points"``), or relative to the namespace.
-    namespace : str
-
-    Returns
-    -------
-    str
-        With a leading slash.
-
-    Raises
-    ------
-    OptionError
-        ROS does not allow the name.
+    name : absolute (``"/points"``), or relative to the namespace.
+    Returns: With a leading slash.
+    Raises OptionError.
     """
     full = name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"
     full = full if full.startswith("/") else f"/{full}"

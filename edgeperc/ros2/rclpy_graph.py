@@ -10,27 +10,15 @@ from typing import Any
 from ..errors import OptionError
 from .graph import SENSOR_DATA, Qos
 
-__all__ = ["RclpyGraph"]
-
 
 class RclpyGraph:
     """A node by rclpy; see `Graph`.
 
-    Parameters
-    ----------
-    name : str
-        Name of the node.
-    namespace : str
-    domain : int, optional
-        ROS_DOMAIN_ID; by default that of the environment.
-    ros_args : sequence of str
-        What follows ``--ros-args``: remappings (``-r points:=/os/points``), parameters (``-p sensor:=os1-64``) and
-        files of parameters.
-
-    Raises
-    ------
-    OptionError
-        rclpy cannot be imported, or does not take the arguments.
+    name : name of the node.
+    domain : ROS_DOMAIN_ID; by default that of the environment.
+    ros_args : what follows ``--ros-args``: remappings (``-r points:=/os/points``), parameters (``-p sensor:=os1-64``)
+        and files of parameters.
+    Raises OptionError.
     """
 
     def __init__(

@@ -31,8 +31,6 @@ from ..system.lanes import returns
 from .graph import SENSOR_DATA, Qos, full_name
 from .messages import RosMessages
 
-__all__ = ["ROUTER", "ZenohGraph", "attachment", "qos_key", "type_key"]
-
 ROUTER = "tcp/localhost:7447"
 """Where rmw_zenoh's router listens."""
 CONFIG_VARIABLE = "ZENOH_SESSION_CONFIG_URI"
@@ -63,25 +61,12 @@ def attachment(number: int, stamp_ns: int, publisher_id: bytes) -> bytes:
 class ZenohGraph:
     """A node over Zenoh; see `Graph`.
 
-    Parameters
-    ----------
-    name : str
-        Name of the node.
-    namespace : str
-    domain : int, optional
-        ROS_DOMAIN_ID; by default that of the environment, or 0.
-    connect : str, optional
-        Zenoh endpoint of a router or a peer. By default the session is configured by the file that the variable
+    name : name of the node.
+    domain : ROS_DOMAIN_ID; by default that of the environment, or 0.
+    connect : zenoh endpoint of a router or a peer. By default the session is configured by the file that the variable
         ZENOH_SESSION_CONFIG_URI names or, without it, connects to `ROUTER`.
-    messages : RosMessages, optional
-        For the hashes of types.
-
-    Raises
-    ------
-    MissingExtraError
-        eclipse-zenoh or rosbags is not installed.
-    OptionError
-        A name, the domain or the configuration is not valid.
+    messages : for the hashes of types.
+    Raises MissingExtraError, OptionError.
     """
 
     def __init__(

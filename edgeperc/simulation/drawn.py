@@ -14,25 +14,15 @@ from .scene import Scene
 from .shapes import Row
 from .street import IN_BAYS, ROW_RANGE_M, ROW_WIDTH_M, SIZES, Street, any_vehicle, random_terrain, strip_row
 
-__all__ = ["ENVIRONMENTS", "random_scene"]
-
 ENVIRONMENTS = ("urban", "residential", "junction", "rural", "highway")
 
 
 def random_scene(seed: int, environment: str | None = None) -> Scene:
     """Make a random street.
 
-    Parameters
-    ----------
-    seed : int
-        The same seed gives the same scene.
-    environment : str, optional
-        One of `ENVIRONMENTS`; random by default.
-
-    Raises
-    ------
-    PointsError
-        ``environment`` is not one of `ENVIRONMENTS`.
+    seed : the same seed gives the same scene.
+    environment : one of `ENVIRONMENTS`; random by default.
+    Raises PointsError.
     """
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 104729))
     place = str(rng.choice(ENVIRONMENTS, p=[0.32, 0.28, 0.2, 0.12, 0.08])) if environment is None else environment

@@ -10,8 +10,6 @@ from .raycast import CYLINDER, MATTE, POROUS, RETRO
 from .shapes import Row, Vector, blob, block, rod
 from .vehicles import motorcycle
 
-__all__ = ["bicycle", "cyclist", "pedestrian", "person_sitting", "pram"]
-
 
 def _cloth(rng: np.random.Generator) -> float:
     # Measured: mean remission of people is 0.29..0.47, and 0 for one in twelve. Most cloth is bright in near infrared.

@@ -9,59 +9,6 @@ from numpy.typing import NDArray
 
 from ..system.kernel_cache import njit
 
-__all__ = [
-    "ASPHALT",
-    "BANK_RISE",
-    "BANK_RISE_LEFT",
-    "BANK_SLOPE",
-    "BANK_SLOPE_LEFT",
-    "BAY",
-    "BOX",
-    "CROWN",
-    "CYLINDER",
-    "DITCH",
-    "DROPPED",
-    "ELLIPSOID",
-    "FACADE",
-    "GLASS",
-    "GRASS",
-    "KERB",
-    "LANE",
-    "LEAVES",
-    "LIP",
-    "MARKING",
-    "MATTE",
-    "PAINT",
-    "PAVEMENT",
-    "PAVING",
-    "POROUS",
-    "RETRO",
-    "ROUGH",
-    "ROUNDING",
-    "ROW",
-    "SLOPE_X",
-    "SLOPE_Y",
-    "STRIP",
-    "TERRAIN",
-    "TILE",
-    "WAVE_X",
-    "WAVE_X_0",
-    "WAVE_X_K",
-    "WAVE_Y",
-    "WAVE_Y_0",
-    "WAVE_Y_K",
-    "WEAR",
-    "fill_bounds",
-    "fill_cast",
-    "fill_column_counts",
-    "fill_column_rows",
-    "fill_drivable",
-    "fill_ground_kinds",
-    "fill_placed",
-    "fill_points",
-    "ground_at",
-]
-
 # A primitive is a row of float64: kind, material, remission, density, center (3), rows of the matrix that maps an
 # offset from the center into the unit shape (9), taper of the front, rear and sides (3), object. Below 0, the last is a
 # static shape: -1 of no class, -2 - k of class k of `camera`.
@@ -204,12 +151,8 @@ def fill_placed(
 ) -> None:
     """Transform primitives into the sensor frame.
 
-    Parameters
-    ----------
-    primitives : (n, 20) float64
-        In the frame of their object, or of the world.
-    poses : (m, 4) float64
-        x, y, z [m], yaw [rad] of the objects.
+    primitives : (n, 20) float64; in the frame of their object, or of the world.
+    poses : (m, 4) float64; x, y, z [m], yaw [rad] of the objects.
     T_world_sensor : (4, 4) float64
     placed : (n, 20) float64, overwritten
     """
@@ -236,13 +179,9 @@ def fill_placed(
 def fill_bounds(primitives: NDArray[np.float64], bounds: NDArray[np.float64]) -> None:
     """Compute bounds of the rays from the origin that can hit each primitive.
 
-    Parameters
-    ----------
-    primitives : (n, 20) float64
-        In the sensor frame.
-    bounds : (n, 5) float64, overwritten
-        First azimuth, width in azimuth [rad], lowest and highest tangent of the elevation, horizontal distance [m].
-        Primitives that are not finite get an infinite distance.
+    primitives : (n, 20) float64; in the sensor frame.
+    bounds : (n, 5) float64, overwritten; first azimuth, width in azimuth [rad], lowest and highest tangent of the
+        elevation, horizontal distance [m]. Primitives that are not finite get an infinite distance.
     """
     corners = np.empty((8, 3))
     for k in range(primitives.shape[0]):
@@ -460,23 +399,14 @@ def fill_cast(
 ) -> None:
     """Find the first hit of each ray.
 
-    Parameters
-    ----------
-    primitives : (n, 20) float64
-        In the sensor frame, nearest first.
-    bounds, starts, rows
-        From `fill_bounds`, `fill_column_counts`, `fill_column_rows`.
-    elevations : (beams,) float64
-        Elevation of each beam, top to bottom [rad].
-    azimuths : (columns,) float64
-        Azimuth of each column [rad].
-    reach : float
-        Length of the rays [m].
-    key : uint64
-        Seed for leaves and fences.
-    ranges, hits, exits, cosines : (beams, columns), overwritten
-        Range [m]; row of ``primitives``, -1 for the ground, -2 for no hit; range at which the ray leaves the
-        primitive [m]; cosine of the angle of incidence.
+    primitives : (n, 20) float64; in the sensor frame, nearest first.
+    bounds, starts, rows : from `fill_bounds`, `fill_column_counts`, `fill_column_rows`.
+    elevations : (beams,) float64; elevation of each beam, top to bottom [rad].
+    azimuths : (columns,) float64; azimuth of each column [rad].
+    reach : length of the rays [m].
+    key : uint64; seed for leaves and fences.
+    ranges, hits, exits, cosines : (beams, columns), overwritten; range [m]; row of ``primitives``, -1 for the ground,
+        -2 for no hit; range at which the ray leaves the primitive [m]; cosine of the angle of incidence.
     """
     n_beams, n_columns = elevations.shape[0], azimuths.shape[0]
     tangents = np.tan(elevations)
@@ -662,26 +592,15 @@ def fill_points(
 ) -> int:
     """Convert hits to returns, beam by beam.
 
-    Parameters
-    ----------
-    range_offsets, remission_offsets : (beams,) float64
-        Calibration errors of the beams.
-    ranges, hits, exits, cosines : (beams, columns)
-        From `fill_cast`; a range that is not finite gives no return.
-    min_range, reach : float
-        Shortest and longest range of a return [m].
-    key : uint64
-        Seed for noise and drop-out.
-    noise, ego_shadow : bool
-        Whether to add noise and drop-out, and whether the ego vehicle hides the directions measured on KITTI's car.
+    range_offsets, remission_offsets : (beams,) float64; calibration errors of the beams.
+    ranges, hits, exits, cosines : (beams, columns); from `fill_cast`; a range that is not finite gives no return.
+    min_range, reach : shortest and longest range of a return [m].
+    key : uint64; seed for noise and drop-out.
+    noise, ego_shadow : whether to add noise and drop-out, and whether the ego vehicle hides the directions measured
+        on KITTI's car.
     points : (beams * columns, 4) float32, first rows overwritten
-    objects : (beams * columns,) int32, first rows overwritten
-        Object of each point, -1 for none.
-
-    Returns
-    -------
-    n : int
-        Number of returns.
+    objects : (beams * columns,) int32, first rows overwritten; object of each point, -1 for none.
+    Returns n: Number of returns.
     """
     n_beams, n_columns = hits.shape
     T = T_world_sensor

@@ -26,9 +26,6 @@ from .raycast import (
 from .shapes import Row, blob, block, post, rod
 from .street import Street
 
-__all__ = ["add_beside_people", "add_cafe", "add_islands_poles", "add_parked_bicycles", "add_roadside"]
-
-
 # --- poles and furniture ----------------------------------------------------------------------------------------------
 
 # Frame of all of these: x along the street, away from the driver who reads a sign, y to the left.

@@ -17,8 +17,6 @@ from .drawn import random_scene
 from .layouts import scene_from_boxes
 from .scene import POINT_CLASS_OF, Scene, SimulatedScan, sensor_pose, simulate
 
-__all__ = ["FIRST_SEED", "IGNORE", "labels_by_boxes", "simulated_scan"]
-
 IGNORE = 255
 
 # Measured: height of the bottom of KITTI's boxes above the ground around them (median of 720 boxes).
@@ -34,16 +32,10 @@ def simulated_scan(
 ) -> SimulatedScan:
     """Simulate one scan of a new scene. The vehicle is slightly pitched and rolled, beside the middle of its lane.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the scene, the pose and the noise.
-    sensor : str or SensorProfile
-    boxes : sequence of Box, optional
-        A real layout to build the scene around (`layouts.scene_from_boxes`); by default the scene is random.
-    mounting : Mounting, optional
-        How the sensor is mounted: height, and tilt relative to the vehicle. Default: at the height of the sensor's own
-        mounting, upright. Points and boxes are in the frame of the tilted sensor.
+    seed : seed of the scene, the pose and the noise.
+    boxes : a real layout to build the scene around (`layouts.scene_from_boxes`); by default the scene is random.
+    mounting : how the sensor is mounted: height, and tilt relative to the vehicle. Default: at the height of the
+        sensor's own mounting, upright. Points and boxes are in the frame of the tilted sensor.
     """
     rng = np.random.default_rng((seed, 1))
     if boxes is None:

@@ -25,19 +25,6 @@ from .raycast import (
     ground_at,
 )
 
-__all__ = [
-    "POINT_CLASSES",
-    "POINT_CLASS_OF",
-    "TOP_VIEW_CLASSES",
-    "Scene",
-    "SceneObject",
-    "SimulatedScan",
-    "place_shapes",
-    "sensor_pose",
-    "simulate",
-    "simulate_sequence",
-]
-
 POINT_CLASSES = ("background", "car", "pedestrian", "cyclist")
 TOP_VIEW_CLASSES = ("background", "drivable", "car", "van", "truck")
 # Point class of an object: PointSeg's car includes all vehicles. KITTI also labels sitting people. Trams and "misc"
@@ -159,15 +146,8 @@ class SimulatedScan:
     def top_view_labels(self, geometry: TopViewGeometry | None = None) -> NDArray[np.uint8]:
         """True class of each cell of a top view, including hidden cells.
 
-        Parameters
-        ----------
-        geometry : TopViewGeometry, optional
-
-        Returns
-        -------
-        (rows, columns) uint8
-            Index into `TOP_VIEW_CLASSES` at the center of the cell: the footprint of the nearest vehicle, else the road
-            surface. Below trams and ``"misc"`` objects is background.
+        Returns (rows, columns) uint8: Index into `TOP_VIEW_CLASSES` at the center of the cell: the footprint of the
+            nearest vehicle, else the road surface. Below trams and ``"misc"`` objects is background.
         """
         view = TopViewGeometry() if geometry is None else geometry
         x, y = view.cell_centers()
@@ -191,10 +171,8 @@ def sensor_pose(
 ) -> NDArray[np.float64]:
     """Make ``T_world_sensor`` for a sensor at its mounting height above the ground at x, y [m], world frame.
 
-    Returns
-    -------
-    (4, 4) float64
-        Rotated by roll about x, then by pitch about y (nose down is positive), then by yaw about z [rad].
+    Returns (4, 4) float64: Rotated by roll about x, then by pitch about y (nose down is positive), then by yaw about
+        z [rad].
     """
     T_world_sensor = np.eye(4)
     cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
@@ -304,20 +282,11 @@ def place_shapes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.int32]]:
     """Sort the shapes of a scene by the directions in which rays from a sensor may hit them.
 
-    Parameters
-    ----------
-    scene : Scene
     T_world_sensor : (4, 4) float64
-    n_columns : int
-        Number of sectors of a turn, counter-clockwise from +x.
-    reach_m : float
-
-    Returns
-    -------
-    primitives : (n, 20) float64
-        In the sensor frame, nearest first; the last column is the row of ``scene.primitives``.
-    bounds, starts, rows
-        As `fill_cast` needs them.
+    n_columns : number of sectors of a turn, counter-clockwise from +x.
+    Returns primitives ((n, 20) float64): In the sensor frame, nearest first; the last column is the row of
+        ``scene.primitives``.
+    Returns bounds, starts, rows: As `fill_cast` needs them.
     """
     primitives = np.empty_like(scene.primitives)
     poses = np.array([(*o.center[:2], o.center[2] - o.size[2] / 2.0, o.yaw) for o in scene.objects]).reshape(-1, 4)
@@ -344,12 +313,8 @@ def simulate_sequence(
 ) -> Iterator[tuple[float, NDArray[np.float64], SimulatedScan]]:
     """Simulate scans of a sensor that moves along the scene's first road, from the origin.
 
-    Yields
-    ------
-    stamp_s : float
-    T_world_sensor : (4, 4) float64
-    scan : SimulatedScan
-        ``scan.box_ids`` identify objects across scans.
+    Yields T_world_sensor: (4, 4) float64.
+    Yields scan: ``scan.box_ids`` identify objects across scans.
     """
     curvature = float(scene.strips[0, 4])
     heading = math.atan2(scene.strips[0, 3], scene.strips[0, 2])

@@ -6,8 +6,6 @@ import math
 
 from .raycast import BOX, CYLINDER, ELLIPSOID, MATTE
 
-__all__ = ["Row", "Vector", "blob", "block", "post", "rod"]
-
 Row = tuple[float, ...]
 Vector = tuple[float, float, float]
 

@@ -49,19 +49,6 @@ from .scene import Scene, SceneObject
 from .shapes import Row, Vector
 from .vehicles import bus, car, misc, truck, van
 
-__all__ = [
-    "CAMERA_CLASSES",
-    "IN_BAYS",
-    "ROW_RANGE_M",
-    "ROW_WIDTH_M",
-    "SHAPES",
-    "SIZES",
-    "Street",
-    "any_vehicle",
-    "random_terrain",
-    "strip_row",
-]
-
 SHAPES: dict[str, Callable[[Vector, np.random.Generator], list[Row]]] = {
     "car": car,
     "van": van,

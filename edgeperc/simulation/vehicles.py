@@ -9,8 +9,6 @@ import numpy as np
 from .raycast import GLASS, MATTE, PAINT, POROUS, RETRO
 from .shapes import Row, Vector, block, rod
 
-__all__ = ["bus", "car", "misc", "motorcycle", "truck", "van"]
-
 
 def _wheels(length: float, width: float, xs: Sequence[float], radius: float) -> list[Row]:
     side = width / 2.0 - 0.14

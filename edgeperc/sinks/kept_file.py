@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["KeptFile"]
-
 
 class KeptFile:
     """A file that keeps its first error. The SDK only logs errors of a file, and a panic follows some."""

@@ -7,8 +7,6 @@ from pathlib import Path
 
 from ..errors import OptionError
 
-__all__ = ["ScanFiles", "stem_of"]
-
 _SUFFIXES = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".ply")
 
 
@@ -31,10 +29,7 @@ class ScanFiles:
     def checked(self, target: Path, scan: str) -> Path:
         """Return ``target`` for the scan of this name.
 
-        Raises
-        ------
-        OptionError
-            It is the scan itself, or the file of another scan of this run.
+        Raises OptionError.
         """
         if os.path.realpath(target) == os.path.realpath(scan):
             raise OptionError(f"{target} is the scan itself and would be overwritten; choose another folder")

@@ -9,8 +9,6 @@ import threading
 import time
 from dataclasses import dataclass, field
 
-__all__ = ["MAX_VIEWERS", "Relay"]
-
 MAX_VIEWERS = 8
 _CHUNK = 2**18
 _BUFFER = 2**20  # of the kernel, for each socket
@@ -45,12 +43,8 @@ class Relay:
     has no handshake within 10 s, takes nothing for 30 s, or sends more than 4 MB. More viewers than `MAX_VIEWERS` are
     refused.
 
-    Parameters
-    ----------
-    listener : socket
-        Bound and listening; the relay closes it.
-    port : int
-        The server's port on 127.0.0.1.
+    listener : socket; bound and listening; the relay closes it.
+    port : the server's port on 127.0.0.1.
     """
 
     def __init__(self, listener: socket.socket, port: int) -> None:

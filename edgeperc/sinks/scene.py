@@ -22,18 +22,6 @@ from ..types.points import as_points
 from ..view.colors import color_of, rgb
 from ..view.content import check_points, in_model_frame, paint_points
 
-__all__ = [
-    "BASE",
-    "LIDAR",
-    "ODOM",
-    "Trails",
-    "base_pose",
-    "byte_colors",
-    "checked_target",
-    "colored_points",
-    "nanoseconds",
-]
-
 BASE, LIDAR, ODOM = "base_link", "lidar", "odom"
 
 _TRAIL = 100  # scans
@@ -57,21 +45,11 @@ def colored_points(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], tuple[str, ...], NDArray[np.uint8]]:
     """The points of a scan with their classes and colors.
 
-    Returns
-    -------
-    points : (n, 4) float32
-        x, y, z [m] in the sensor's frame, remission. All points of the scan, in its order, those that are not finite
-        too.
-    labels : (n,) uint8
-        Index into ``classes``; 0 if no model labels points.
-    classes : tuple of str
-    colors : (n, 3) uint8
-        Of the class; of the cell of the top view for a background point on the road.
-
-    Raises
-    ------
-    PointsError
-        The points are not those that were perceived.
+    Returns points ((n, 4) float32): x, y, z [m] in the sensor's frame, remission. All points of the scan, in its
+        order, those that are not finite too.
+    Returns labels ((n,) uint8): Index into ``classes``; 0 if no model labels points.
+    Returns colors ((n, 3) uint8): Of the class; of the cell of the top view for a background point on the road.
+    Raises PointsError.
     """
     points, perception = as_points(scan.points), scan.perception
     check_points(points, perception)
@@ -108,10 +86,7 @@ class Trails:
 def nanoseconds(scan: PerceivedScan) -> int:
     """The time of a scan [ns], which viewers hold as an unsigned number.
 
-    Raises
-    ------
-    PointsError
-        It is not finite, negative, or 2^32 s (the year 2106) or more.
+    Raises PointsError.
     """
     if not 0.0 <= scan.stamp_s < 2.0**32:
         raise PointsError(f"the scan's time is {scan.stamp_s} s; a viewer needs one from 0 to 2^32 s")

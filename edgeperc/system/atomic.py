@@ -9,8 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-__all__ = ["open_atomic", "write_atomic"]
-
 
 @contextmanager
 def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) -> Iterator[IO[Any]]:
@@ -18,24 +16,11 @@ def open_atomic(path: str | Path, mode: str = "wb", permissions: int = 0o666) ->
 
     A link is followed. A target that is no regular file, such as ``/dev/stdout`` or a named pipe, is written directly.
 
-    Parameters
-    ----------
-    path : str or Path
-        The target.
-    mode : {"wb", "w"}
-        ``"w"`` writes text as UTF-8.
-    permissions : int
-        Of a new file, reduced by the process's umask.
-
-    Yields
-    ------
-    file
-        The temporary file, open for writing.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written; the target is unchanged.
+    path : the target.
+    mode : ``"w"`` writes text as UTF-8.
+    permissions : of a new file, reduced by the process's umask.
+    Yields file: The temporary file, open for writing.
+    Raises OSError.
     """
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():

@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
-__all__ = ["GAP_S", "LATEST_S", "LATE_S", "Clock", "Step", "elapsed_s", "step_between"]
-
 SHORTEST_STEP_S = 1e-6  # a stamp that is less than this later than the last one is of a doubled scan
 LATE_S = 0.25  # a stamp that is earlier by more than this is not of a late scan
 GAP_S = 60.0  # a stamp that is later by more than this does not continue the session

@@ -22,8 +22,6 @@ from typing import Any, TextIO
 from .kernel_cache import are_kept, missing, watchers
 from .kernel_stamp import called_by
 
-__all__ = ["Compilation", "kernels_of"]
-
 logger = logging.getLogger(__name__)
 
 PACKAGE = "edgeperc"
@@ -74,12 +72,8 @@ PRIOR = 10  # kernels that the estimate counts for, beside those that are done
 class Compilation:
     """Say that kernels are compiled, for use in a ``with`` statement around what compiles them.
 
-    Parameters
-    ----------
-    kernels : callable
-        Returns the kernels that are needed; called when one is missing.
-    n_processes : int
-        That compile at the same time.
+    kernels : returns the kernels that are needed; called when one is missing.
+    n_processes : that compile at the same time.
     """
 
     def __init__(self, kernels: Callable[[], Iterable[Any]], n_processes: int = 1) -> None:

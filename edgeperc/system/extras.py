@@ -9,31 +9,16 @@ from typing import Any
 
 from ..errors import MissingExtraError
 
-__all__ = ["require", "without_telemetry"]
-
 
 def require(module: str, extra: str, purpose: str, *, package: str | None = None) -> Any:
     """Import a module of an optional package.
 
-    Parameters
-    ----------
-    module : str
-        Dotted name, e.g. ``"matplotlib"``.
-    extra : str
-        The extra of edgeperc that installs the package.
-    purpose : str
-        What needs the package; the beginning of the error message.
-    package : str, optional
-        Name on PyPI if it is not the module's top-level name.
-
-    Returns
-    -------
-    module
-
-    Raises
-    ------
-    MissingExtraError
-        The module cannot be imported; the message gives the command that installs it.
+    module : dotted name, e.g. ``"matplotlib"``.
+    extra : the extra of edgeperc that installs the package.
+    purpose : what needs the package; the beginning of the error message.
+    package : name on PyPI if it is not the module's top-level name.
+    Returns module.
+    Raises MissingExtraError.
     """
     try:
         return import_module(module)

@@ -39,8 +39,6 @@ from .atomic import write_atomic
 from .kernel_stamp import settings, stamp_of
 from .machine import cache_folder, unsafe_because
 
-__all__ = ["KernelCache", "are_kept", "fewer_collections", "missing", "njit", "tell_watchers", "watchers"]
-
 logger = logging.getLogger(__name__)
 
 _numba: Any = numba.core  # internals, which have no types
@@ -65,16 +63,9 @@ def tell_watchers() -> None:
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """`numba.njit`, whose cache is a `KernelCache`.
 
-    Parameters
-    ----------
-    **options
-        As `numba.njit`. With ``cache=True`` the compiled function is kept on disk, unless it is defined inside another
-        function and uses its variables.
-
-    Returns
-    -------
-    callable
-        The decorator.
+    **options : as `numba.njit`. With ``cache=True`` the compiled function is kept on disk, unless it is defined
+        inside another function and uses its variables.
+    Returns: The decorator.
     """
 
     kept = options.pop("cache", False)
@@ -154,10 +145,7 @@ class KernelCache:
     a SHA-256 of the rest and a stamp of what the machine code depends on (`system.kernel_stamp`). With another stamp
     it is compiled again and replaced.
 
-    Parameters
-    ----------
-    kernel : Dispatcher
-        What `numba.njit` returns.
+    kernel : what `numba.njit` returns.
     """
 
     def __init__(self, kernel: Any) -> None:
@@ -213,16 +201,9 @@ class KernelCache:
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load a compiled form.
 
-        Parameters
-        ----------
         sig : tuple of types, Signature or str
-        target_context : BaseContext
-            numba's description of the processor.
-
-        Returns
-        -------
-        CompileResult or None
-            None if there is none that can be used.
+        target_context : numba's description of the processor.
+        Returns: None if there is none that can be used.
         """
         result = self._load(sig, target_context)
         if result is None:
@@ -255,10 +236,7 @@ class KernelCache:
     def save_overload(self, sig: Any, result: Any) -> None:
         """Save a compiled form in the first folder that takes it; where that fails, a warning in the log says why.
 
-        Parameters
-        ----------
         sig : tuple of types, Signature or str
-        result : CompileResult
         """
         self._save(sig, result)
         tell_watchers()

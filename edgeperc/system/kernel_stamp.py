@@ -20,8 +20,6 @@ import numba
 import numba.core.config
 import numpy as np
 
-__all__ = ["called_by", "settings", "stamp_of"]
-
 VERSIONS = f"{numba.__version__} {llvmlite.__version__} {np.__version__} {sys.version}"
 # Of numba, which the environment sets, for example NUMBA_BOUNDSCHECK.
 SETTINGS = ("BOUNDSCHECK", "DEBUGINFO_DEFAULT", "LOOP_VECTORIZE", "OPT", "SLP_VECTORIZE", "USING_SVML")
@@ -42,24 +40,11 @@ _described: dict[Any, _Described] = {}
 def stamp_of(kernel: Any, passes: Any = None, *, anew: bool = False) -> bytes:
     """Digest of all that the machine code of a kernel depends on, except types, processor and `settings`.
 
-    Parameters
-    ----------
-    kernel : Dispatcher or function
-        What `numba.njit` returns.
-    passes : function, optional
-        What chooses numba's passes.
-    anew : bool
-        Look at the values as they are now, not as they were when this was first asked of a kernel.
-
-    Returns
-    -------
-    bytes
-        32 bytes, the same in every process.
-
-    Raises
-    ------
-    TypeError
-        The kernel, or one that it calls, reads a value that has no digest.
+    kernel : Dispatcher or function; what `numba.njit` returns.
+    passes : function; what chooses numba's passes.
+    anew : look at the values as they are now, not as they were when this was first asked of a kernel.
+    Returns: 32 bytes, the same in every process.
+    Raises TypeError.
     """
     kernels = [kernel]  # and those that are called, in the order in which they are met
     texts = [VERSIONS, "" if passes is None else repr(_fields(passes.__code__))]

@@ -9,8 +9,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Generic, TypeVar
 
-__all__ = ["STAGES", "Lanes", "Once", "Stopwatch", "returns"]
-
 STAGES = ("check", "project", "infer", "decode", "refine", "cluster", "agree")
 
 _Value = TypeVar("_Value")
@@ -39,14 +37,8 @@ class Stopwatch:
 class Once(Generic[_Value]):
     """A value that is computed when it is first asked for; another thread that asks waits for it, or gets its error.
 
-    Parameters
-    ----------
-    function : callable
-    *arguments, **options
-        Its arguments. Of one that is a `Once`, the function gets the value.
-    stage : str
-        Its time counts for this stage of the stopwatch.
-    watch : Stopwatch
+    *arguments, **options : its arguments. Of one that is a `Once`, the function gets the value.
+    stage : its time counts for this stage of the stopwatch.
     """
 
     __slots__ = ("_arguments", "_error", "_function", "_is_known", "_lock", "_options", "_stage", "_value", "_watch")

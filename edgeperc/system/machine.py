@@ -21,20 +21,6 @@ from typing import Any
 from ..errors import SettingsError
 from .atomic import write_atomic
 
-__all__ = [
-    "MAX_THREADS",
-    "cache_folder",
-    "compiled_folder",
-    "cpu_features",
-    "cpu_model",
-    "fingerprint",
-    "read_setting",
-    "settings_path",
-    "unsafe_because",
-    "usable_cores",
-    "write_settings",
-]
-
 logger = logging.getLogger(__name__)
 
 SCHEMA = 2
@@ -45,10 +31,7 @@ MAX_THREADS = 4096
 def cache_folder() -> Path:
     """``$EDGEPERC_CACHE_DIR``, or ``edgeperc`` in the system's cache folder; not created by this call.
 
-    Raises
-    ------
-    SettingsError
-        The user has no home folder, and no variable names another one.
+    Raises SettingsError.
     """
     given = os.environ.get("EDGEPERC_CACHE_DIR")
     if given:
@@ -67,15 +50,8 @@ def cache_folder() -> Path:
 def unsafe_because(status: os.stat_result) -> str | None:
     """Why compiled code in a file or folder may come from another user; None if only this user or root can write it.
 
-    Parameters
-    ----------
-    status : os.stat_result
-        Of the file or folder.
-
-    Returns
-    -------
-    str or None
-        The reason. Always None on Windows, where the user's folders have access lists.
+    status : os.stat_result; of the file or folder.
+    Returns: The reason. Always None on Windows, where the user's folders have access lists.
     """
     if not hasattr(os, "geteuid"):
         return None
@@ -89,19 +65,10 @@ def unsafe_because(status: os.stat_result) -> str | None:
 def compiled_folder(engine: str, sha256: str, precision: str) -> Path | None:
     """Create the folder for the compiled form of a model, separate for each engine, file and precision.
 
-    Parameters
-    ----------
-    engine : str
-        Name and versions; another version does not find the folder.
-    sha256 : str
-        Of the model file.
-    precision : str
-
-    Returns
-    -------
-    Path or None
-        None if there is no folder that this user can write and other users cannot. The engine then compiles at every
-        start, and a warning in the log says so.
+    engine : name and versions; another version does not find the folder.
+    sha256 : of the model file.
+    Returns: None if there is no folder that this user can write and other users cannot. The engine then compiles at
+        every start, and a warning in the log says so.
     """
     name = hashlib.sha256(f"{engine} {fingerprint()} {precision}".encode()).hexdigest()[:16]
     try:
@@ -177,22 +144,11 @@ def settings_path() -> Path:
 def write_settings(path: Path, machine: str, entries: Mapping[str, Mapping[str, Any]]) -> None:
     """Add settings to a file. They replace older ones of the same computer and model; others stay.
 
-    Parameters
-    ----------
-    path : Path
-        JSON: ``{"schema": 2, "machines": {fingerprint: {digest: entry}}}``; created if it does not exist.
-    machine : str
-        `fingerprint` of the computer that they were measured on.
-    entries : mapping
-        A network's digest (`edgeperc.zoo.digest`) to ``provider``, ``precision`` and ``n_threads``, as
+    path : JSON: ``{"schema": 2, "machines": {fingerprint: {digest: entry}}}``; created if it does not exist.
+    machine : `fingerprint` of the computer that they were measured on.
+    entries : a network's digest (`edgeperc.zoo.digest`) to ``provider``, ``precision`` and ``n_threads``, as
         `edgeperc.Perceiver` takes them, and any further keys.
-
-    Raises
-    ------
-    SettingsError
-        The file exists and is not a settings file.
-    OSError
-        The file cannot be written; it is unchanged.
+    Raises SettingsError, OSError.
     """
     document = _read(path) or {"schema": SCHEMA, "machines": {}}
     document["machines"].setdefault(machine, {}).update({sha: dict(entry) for sha, entry in entries.items()})
@@ -207,15 +163,8 @@ def write_settings(path: Path, machine: str, entries: Mapping[str, Mapping[str, 
 def read_setting(path: Path, machine: str, digest: str) -> dict[str, Any] | None:
     """Read the setting for a computer (`fingerprint`) and a network (`edgeperc.zoo.digest`).
 
-    Returns
-    -------
-    dict or None
-        ``provider``, ``precision``, ``n_threads`` and further keys; None if nothing was measured.
-
-    Raises
-    ------
-    SettingsError
-        The file is not a settings file, or the entry is malformed.
+    Returns: ``provider``, ``precision``, ``n_threads`` and further keys; None if nothing was measured.
+    Raises SettingsError.
     """
     document = _read(path)
     entry = None if document is None else document["machines"].get(machine, {}).get(digest)

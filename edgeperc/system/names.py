@@ -6,8 +6,6 @@ import re
 import reprlib
 from pathlib import PureWindowsPath
 
-__all__ = ["MAX_NAME", "check_file", "check_name", "check_text"]
-
 MAX_NAME = 200
 _NAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9._+-]*[A-Za-z0-9_+-])?")
 _DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)  # Windows opens them, whatever the suffix

@@ -13,8 +13,6 @@ from typing import Any
 
 from .extras import require
 
-__all__ = ["MOST_FIRST", "Lost", "map_on_ray"]
-
 MOST_FIRST = 20
 """Scans that the driver perceives at most, until its perceiver has learned what workers start from. Usually five are
 enough; a scan that shows no ground does not count."""
@@ -54,27 +52,13 @@ def map_on_ray(
     Items wait until a worker is free, and workers wait until the results are taken, so memory use does not grow with
     the number of items. Ray's dashboard and usage statistics are off.
 
-    Parameters
-    ----------
-    make : callable
-        Called with ``arguments`` once in each worker process; returns a function from an item to its result.
-    arguments : tuple
-    items : sequence
-        Anything that can be pickled, as the results.
-    workers : int or None
-        Number of worker processes. None: the cluster's number of CPUs divided by ``n_threads``.
-    n_threads : int
-        CPUs that Ray reserves for each worker.
-
-    Yields
-    ------
-    result : object or Lost
-        In the order of the items. `Lost` if the function raised an exception, or if its process died twice.
-
-    Raises
-    ------
-    MissingExtraError
-        Ray is not installed.
+    make : called with ``arguments`` once in each worker process; returns a function from an item to its result.
+    items : anything that can be pickled, as the results.
+    workers : number of worker processes. None: the cluster's number of CPUs divided by ``n_threads``.
+    n_threads : CPUs that Ray reserves for each worker.
+    Yields result (object or Lost): In the order of the items. `Lost` if the function raised an exception, or if its
+        process died twice.
+    Raises MissingExtraError.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # else Ray warns about a future default

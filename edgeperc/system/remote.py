@@ -13,8 +13,6 @@ from urllib.parse import unquote, urlsplit
 from ..errors import EdgepercError, OptionError, PointsError
 from .extras import require
 
-__all__ = ["MOST_BYTES", "Remote", "location"]
-
 MOST_BYTES = 4 * 2**30
 """Largest file that is fetched: a scan or a capture."""
 
@@ -113,10 +111,7 @@ class Remote:
     def fetch(self, folder: Path) -> Path:
         """Copy the file into a local folder.
 
-        Raises
-        ------
-        PointsError
-            There is no such file, or it is larger than `MOST_BYTES`.
+        Raises PointsError.
         """
         stamp = self.stamp()
         if stamp is None:

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from ..system.kernel_cache import njit
 
-__all__ = ["fit_motion", "nearest_detection", "support"]
-
 MAX_ROUNDS = 12
 MAX_PROPOSALS = 256
 

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from ..system.kernel_cache import njit
 
-__all__ = ["fill_combined", "fill_interaction", "fill_mode_probabilities"]
-
 
 @njit(cache=True, nogil=True)
 def fill_interaction(
@@ -22,21 +20,14 @@ def fill_interaction(
 ) -> None:
     """Mix the estimates of the motion models by a Markov chain (KUL-Seg's "interaction").
 
-    Parameters
-    ----------
-    states : (n, k, s) float64
-        State for each of k motion models.
+    states : (n, k, s) float64; state for each of k motion models.
     covariances : (n, k, s, s) float64
-    probabilities : (n, k) float64
-        Probability of each motion model after the last update.
-    stay : (n,) float64
-        Probability that a track keeps its motion model; the others share the rest.
-    mixed : (n, k, s) float64, overwritten
-        Initial state of each filter: x0_j = sum_i w_ij x_i with w_ij = p_ij mu_i / prior_j.
-    mixed_covariances : (n, k, s, s) float64, overwritten
-        sum_i w_ij (P_i + (x_i - x0_j)(x_i - x0_j)')
-    prior : (n, k) float64, overwritten
-        prior_j = sum_i p_ij mu_i
+    probabilities : (n, k) float64; probability of each motion model after the last update.
+    stay : (n,) float64; probability that a track keeps its motion model; the others share the rest.
+    mixed : (n, k, s) float64, overwritten; initial state of each filter: x0_j = sum_i w_ij x_i with w_ij = p_ij mu_i
+        / prior_j.
+    mixed_covariances : (n, k, s, s) float64, overwritten; sum_i w_ij (P_i + (x_i - x0_j)(x_i - x0_j)')
+    prior : (n, k) float64, overwritten; prior_j = sum_i p_ij mu_i
     """
     n, k, s = states.shape
     for t in range(n):
@@ -72,18 +63,12 @@ def fill_mode_probabilities(
     Bayes' rule for motion model j and detection d: P(j, d) = beta_d prior_j L_jd / sum_i prior_i L_id. The sum over d
     is the probability of model j. P(j, d) divided by that sum is the association that the filter of model j uses.
 
-    Parameters
-    ----------
-    prior : (n, k) float64
-        From `fill_interaction`.
-    likelihoods : (n, k, m) float64
-        Likelihood of each detection under each motion model; 0 outside the gate.
-    beta : (n, m + 1) float64
-        Column 0: probability that the track was not detected. Others: that the detection belongs to it.
-    shares : (n, k, m + 1) float64, overwritten
-        Association for each motion model; sums to 1 over the last axis.
-    probabilities : (n, k) float64, overwritten
-        Probability of each motion model after the update.
+    prior : (n, k) float64; from `fill_interaction`.
+    likelihoods : (n, k, m) float64; likelihood of each detection under each motion model; 0 outside the gate.
+    beta : (n, m + 1) float64; column 0: probability that the track was not detected. Others: that the detection
+        belongs to it.
+    shares : (n, k, m + 1) float64, overwritten; association for each motion model; sums to 1 over the last axis.
+    probabilities : (n, k) float64, overwritten; probability of each motion model after the update.
     """
     n, k, m = likelihoods.shape
     for t in range(n):
@@ -128,15 +113,11 @@ def fill_combined(
 ) -> None:
     """Combine the estimates of the motion models into one for each track (KUL-Seg's "combination").
 
-    Parameters
-    ----------
     states : (n, k, s) float64
     covariances : (n, k, s, s) float64
     probabilities : (n, k) float64
-    state : (n, s) float64, overwritten
-        x = sum_j mu_j x_j
-    covariance : (n, s, s) float64, overwritten
-        sum_j mu_j (P_j + (x_j - x)(x_j - x)')
+    state : (n, s) float64, overwritten; x = sum_j mu_j x_j
+    covariance : (n, s, s) float64, overwritten; sum_j mu_j (P_j + (x_j - x)(x_j - x)')
     """
     n, k, s = states.shape
     state[:] = 0.0

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from ..system.kernel_cache import njit
 
-__all__ = ["MAX_EVENTS", "fill_association", "fill_by_propagation", "fill_likelihoods"]
-
 MAX_EVENTS = 4096
 MAX_ROUNDS = 200
 TOLERANCE = 1e-6
@@ -132,20 +130,12 @@ def fill_association(weights: NDArray[np.float64], max_events: int, beta: NDArra
     A joint event assigns at most one detection to each track and at most one track to each detection. Its probability
     is proportional to the product of the weights of its pairs.
 
-    Parameters
-    ----------
-    weights : (n, m) float64
-        Likelihood ratio of "the detection belongs to the track" to "the track was missed and the detection is
-        clutter"; 0 outside the gate.
-    max_events : int
-        Clusters with a higher bound on the number of joint events are solved by belief propagation.
-    beta : (n, m + 1) float64, overwritten
-        Column 0: probability that the track was not detected. Others: that the detection belongs to it. Rows sum to 1.
-
-    Returns
-    -------
-    n_approximated : int
-        Tracks solved by belief propagation.
+    weights : (n, m) float64; likelihood ratio of "the detection belongs to the track" to "the track was missed and
+        the detection is clutter"; 0 outside the gate.
+    max_events : clusters with a higher bound on the number of joint events are solved by belief propagation.
+    beta : (n, m + 1) float64, overwritten; column 0: probability that the track was not detected. Others: that the
+        detection belongs to it. Rows sum to 1.
+    Returns n_approximated: Tracks solved by belief propagation.
     """
     n, m = weights.shape
     beta[:] = 0.0
@@ -193,13 +183,9 @@ def fill_by_events(
 ) -> None:
     """Solve one cluster exactly: enumerate its joint events, depth first.
 
-    Parameters
-    ----------
     weights : (n, m) float64
-    rows, columns : (r,), (c,) int64
-        Tracks and detections of the cluster.
-    beta : (n, m + 1) float64
-        The rows of the cluster are overwritten.
+    rows, columns : (r,), (c,) int64; tracks and detections of the cluster.
+    beta : (n, m + 1) float64; the rows of the cluster are overwritten.
     """
     n = len(rows)
     choice = np.full(n, -2, np.int64)  # -2: not begun; -1: missed; else an index into columns
@@ -246,10 +232,7 @@ def fill_by_propagation(
     over the other tracks i'. Rounds end when no nu changes by more than 1e-6, or after 200. beta_ij is proportional to
     w_ij nu_ji.
 
-    Parameters
-    ----------
-    weights, rows, columns, beta
-        As in `fill_by_events`.
+    weights, rows, columns, beta : as in `fill_by_events`.
     """
     # Only gated pairs, which are few in a large cluster.
     n_pairs = 0

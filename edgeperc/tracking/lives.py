@@ -9,22 +9,6 @@ from numpy.typing import NDArray
 
 from ..system.kernel_cache import njit
 
-__all__ = [
-    "CLASS",
-    "EXPECTED",
-    "LEAST_EXISTENCE",
-    "MOST_EXISTENCE",
-    "MOST_HIDDEN",
-    "TRACK",
-    "fill_hidden",
-    "fill_newborn",
-    "mark_out_of_view",
-    "mark_rivals",
-    "update_fronts",
-    "update_lives",
-    "update_shapes",
-]
-
 # Complete state of a track. The tracker replaces it as a whole, so a scan that raises an error changes nothing.
 TRACK = np.dtype(
     [
@@ -112,28 +96,16 @@ def fill_newborn(
 ) -> None:
     """Begin a track at each detection, with speed 0.
 
-    Parameters
-    ----------
-    first_id : int
-        Id of the first new track.
-    kinds : (n,) int64
-        Class of each detection.
-    classes : (n,) record
-        Parameters of each detection's class.
-    detections : (n, 3) float64
-        x, y [m], heading [rad].
-    shapes : (n, 4) float64
-        Height of the center, length, width, height [m].
-    logits : (n,) float64
-        Log odds of the scores.
-    told : (n,) float64
-        Log odds that the heading points to the front.
-    sources : (n,) int64
-        Index of each detection in the scan.
-    ranges : (n,) float64
-        Distances from the sensor [m].
-    tracks : (n,) record, overwritten
-        All fields 0 beforehand.
+    first_id : id of the first new track.
+    kinds : (n,) int64; class of each detection.
+    classes : (n,) record; parameters of each detection's class.
+    detections : (n, 3) float64; x, y [m], heading [rad].
+    shapes : (n, 4) float64; height of the center, length, width, height [m].
+    logits : (n,) float64; log odds of the scores.
+    told : (n,) float64; log odds that the heading points to the front.
+    sources : (n,) int64; index of each detection in the scan.
+    ranges : (n,) float64; distances from the sensor [m].
+    tracks : (n,) record, overwritten; all fields 0 beforehand.
     """
     for i in range(len(tracks)):
         track, of = tracks[i], classes[i]
@@ -171,15 +143,10 @@ def mark_out_of_view(
 ) -> None:
     """Exclude undetected tracks from the report if a corner of the footprint is outside the field of view.
 
-    Parameters
-    ----------
     tracks : (n,) record
-    pose : (4, 4) float64
-        T_world_sensor.
-    left, right : float
-        Azimuths of the edges of the view [rad].
-    reported : (n,) bool
-        Set to False for these tracks.
+    pose : (4, 4) float64; T_world_sensor.
+    left, right : azimuths of the edges of the view [rad].
+    reported : (n,) bool; set to False for these tracks.
     """
     for i in range(len(tracks)):
         if not reported[i] or tracks[i]["misses"] == 0:
@@ -206,18 +173,12 @@ def fill_hidden(
 ) -> None:
     """Compute the share of each track that other tracks hide from the sensor.
 
-    Parameters
-    ----------
-    state : (n, 5) float64
-        x, y [m], v [m/s], heading [rad], turn rate [rad/s].
-    shape : (n, 4) float64
-        Height of the center, length, width, height [m].
-    seen : (n,) bool
-        Tracks detected in this scan. They can hide others, and are not hidden.
-    sensor : (2,) float64
-        x, y [m].
-    hidden : (n,) float64, overwritten
-        Share of nine rays over the width of the footprint that meet a nearer track, in 0..1.
+    state : (n, 5) float64; x, y [m], v [m/s], heading [rad], turn rate [rad/s].
+    shape : (n, 4) float64; height of the center, length, width, height [m].
+    seen : (n,) bool; tracks detected in this scan. They can hide others, and are not hidden.
+    sensor : (2,) float64; x, y [m].
+    hidden : (n,) float64, overwritten; share of nine rays over the width of the footprint that meet a nearer track,
+        in 0..1.
     """
     n = len(hidden)
     azimuth, half, distance = np.empty(n), np.empty(n), np.empty(n)
@@ -249,16 +210,10 @@ def mark_rivals(
 
     Two objects cannot occupy one place. A cyclist, for example, is often detected as a pedestrian too.
 
-    Parameters
-    ----------
-    state : (n, 5) float64
-        x, y [m], v [m/s], heading [rad], turn rate [rad/s].
-    shape : (n, 4) float64
-        Height of the center, length, width, height [m].
-    order : (n,) int64
-        Rows of the tracks, strongest first (`edgeperc.tracking.tracks.strength_of`).
-    reported : (n,) bool
-        Set to False for these tracks.
+    state : (n, 5) float64; x, y [m], v [m/s], heading [rad], turn rate [rad/s].
+    shape : (n, 4) float64; height of the center, length, width, height [m].
+    order : (n,) int64; rows of the tracks, strongest first (`edgeperc.tracking.tracks.strength_of`).
+    reported : (n,) bool; set to False for these tracks.
     """
     # Strongest first, so the flags of all stronger tracks are final.
     for b in range(len(order)):
@@ -290,18 +245,11 @@ def update_shapes(
 ) -> None:
     """Smooth the height of the center and the size by Kalman filters; in place.
 
-    Parameters
-    ----------
-    beta : (n, m + 1) float64
-        As in `edgeperc.tracking.jpda.fill_association`.
-    shapes : (m, 4) float64
-        Height of the center, length, width, height [m].
-    sigmas : (n, 4) float64
-        Standard deviations of ``shapes`` [m].
-    walk : (4,) float64
-        Standard deviations of their random walks between the scans [m].
-    shape, variance : (n, 4) float64
-        Estimates of ``shapes`` and their variances [m, m2].
+    beta : (n, m + 1) float64; as in `edgeperc.tracking.jpda.fill_association`.
+    shapes : (m, 4) float64; height of the center, length, width, height [m].
+    sigmas : (n, 4) float64; standard deviations of ``shapes`` [m].
+    walk : (4,) float64; standard deviations of their random walks between the scans [m].
+    shape, variance : (n, 4) float64; estimates of ``shapes`` and their variances [m, m2].
     """
     for i in range(len(shape)):
         seen = np.zeros(4)
@@ -330,23 +278,15 @@ def update_fronts(
 ) -> None:
     """Collect evidence that the heading of each track points to its front and not to its rear; in place.
 
-    Parameters
-    ----------
-    state : (n, 5) float64
-        x, y, v, heading, turn rate after the update.
-    speed_sigma : (n,) float64
-        Standard deviation of v [m/s].
-    moving_mps : (n,) float64
-        A track moves if its speed is higher than this, and than three standard deviations.
-    beta : (n, m + 1) float64
-        As in `edgeperc.tracking.jpda.fill_association`.
-    detections : (m, 3) float64
-        x, y [m], heading [rad].
-    told : (m,) float64
-        Log odds that the heading of the detection points to the front; 0 if that is unknown.
-    fronts : (n, 3) float64
-        Log odds from motion, in -4..4: objects move forward. Log odds from the detections, in -8..8. Balance of the
-        detections' headings, in -10..10, for detections that do not say whether they know the front.
+    state : (n, 5) float64; x, y, v, heading, turn rate after the update.
+    speed_sigma : (n,) float64; standard deviation of v [m/s].
+    moving_mps : (n,) float64; a track moves if its speed is higher than this, and than three standard deviations.
+    beta : (n, m + 1) float64; as in `edgeperc.tracking.jpda.fill_association`.
+    detections : (m, 3) float64; x, y [m], heading [rad].
+    told : (m,) float64; log odds that the heading of the detection points to the front; 0 if that is unknown.
+    fronts : (n, 3) float64; log odds from motion, in -4..4: objects move forward. Log odds from the detections, in
+        -8..8. Balance of the detections' headings, in -10..10, for detections that do not say whether they know the
+        front.
     """
     for i in range(len(fronts)):
         speed = abs(state[i, 2])
@@ -375,21 +315,13 @@ def update_lives(
 ) -> None:
     """Update hits, misses and detection of each track, its label by majority, and its existence; in place.
 
-    Parameters
-    ----------
     tracks : (n,) record
-    classes : (n,) record
-        Parameters of each track's class.
-    beta : (n, m + 1) float64
-        As in `edgeperc.tracking.jpda.fill_association`.
-    hidden : (n,) float64
-        From `fill_hidden`.
-    logits : (m,) float64
-        Log odds of the detections' scores.
-    kinds : (m,) int64
-        Classes of the detections.
-    dt : float
-        Time since the last scan [s].
+    classes : (n,) record; parameters of each track's class.
+    beta : (n, m + 1) float64; as in `edgeperc.tracking.jpda.fill_association`.
+    hidden : (n,) float64; from `fill_hidden`.
+    logits : (m,) float64; log odds of the detections' scores.
+    kinds : (m,) int64; classes of the detections.
+    dt : time since the last scan [s].
     """
     for i in range(len(tracks)):
         track, of = tracks[i], classes[i]

@@ -15,8 +15,6 @@ from ..types.points import as_points, read_only
 from . import Track
 from .tracks import PARAMETERS
 
-__all__ = ["MOVABLE", "mark_in_boxes", "movable_points", "moving_points", "moving_tracks"]
-
 MOVABLE = frozenset(
     {
         *("car", "van", "truck", "bus", "tram", "trailer", "vehicle", "motorcycle", "bicycle"),
@@ -31,25 +29,13 @@ def moving_tracks(
 ) -> tuple[Track, ...]:
     """The tracks that move over ground, in their order.
 
-    Parameters
-    ----------
-    tracks : iterable of Track
-        `Tracks` of one scan.
-    min_speed_mps : float, optional
-        Lowest speed over ground [m/s]. Default: `ClassParameters.moving_mps` of the class, 0.7 m/s for pedestrians and
-        1 m/s for others.
-    n_sigmas : float
-        The speed must also exceed its standard deviation by this factor.
-
-    Returns
-    -------
-    tuple of Track
-        A new track has no certain speed, so it does not count as moving in its first scans. Tracks that coast count.
-
-    Raises
-    ------
-    OptionError
-        ``min_speed_mps`` or ``n_sigmas`` is negative or not finite.
+    tracks : `Tracks` of one scan.
+    min_speed_mps : lowest speed over ground [m/s]. Default: `ClassParameters.moving_mps` of the class, 0.7 m/s for
+        pedestrians and 1 m/s for others.
+    n_sigmas : the speed must also exceed its standard deviation by this factor.
+    Returns: A new track has no certain speed, so it does not count as moving in its first scans. Tracks that coast
+        count.
+    Raises OptionError.
     """
     for name, value in (("min_speed_mps", min_speed_mps), ("n_sigmas", n_sigmas)):
         if value is not None and not 0.0 <= value < math.inf:
@@ -160,10 +146,8 @@ def _inside_any(boxes: list[Box], points: NDArray[np.float32], margin_m: float) 
 def mark_in_boxes(boxes: NDArray[np.float64], points: NDArray[np.float32], inside: NDArray[np.bool_]) -> None:
     """Mark the points inside at least one box.
 
-    Parameters
-    ----------
-    boxes : (m, 8) float64, C-contiguous, read-only
-        x, y, z of the center, half length, half width, half height [m], cosine and sine of the yaw.
+    boxes : (m, 8) float64, C-contiguous, read-only; x, y, z of the center, half length, half width, half height [m],
+        cosine and sine of the yaw.
     points : (n, 3 or more) float32, C-contiguous, read-only
     inside : (n,) bool, overwritten
     """

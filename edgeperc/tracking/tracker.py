@@ -35,8 +35,6 @@ from .lives import (
 from .tracks import PARAMETERS, ClassParameters, Tracks, strength_of
 from .ukf import fill_predictions, fill_updates
 
-__all__ = ["Tracker"]
-
 SMALLEST_SHARE = 1e-13  # scores are clipped to this distance from 0 and 1
 # Standard deviations of random walks of center height, length, width and height after one second.
 SHAPE_WALK_M = np.array([0.5, 0.1, 0.05, 0.05])

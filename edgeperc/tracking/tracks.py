@@ -15,8 +15,6 @@ from ..types.perception import Box
 from .lives import MOVED
 from .ukf import MODES
 
-__all__ = ["PARAMETERS", "ClassParameters", "Track", "Tracks", "strength_of"]
-
 
 @dataclass(frozen=True, slots=True)
 class ClassParameters:

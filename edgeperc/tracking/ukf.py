@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from ..system.kernel_cache import njit
 
-__all__ = ["CONSTANT_VELOCITY", "CTRV", "MODES", "RANDOM_MOTION", "fill_predictions", "fill_updates"]
-
 CONSTANT_VELOCITY, CTRV, RANDOM_MOTION = 0, 1, 2
 MODES = ("constant_velocity", "constant_turn", "random_motion")
 
@@ -111,15 +109,9 @@ def fill_process_noise(
 ) -> None:
     """Compute the process noise of one motion model: white accelerations, random walks of position and heading.
 
-    Parameters
-    ----------
-    mode : int
-    heading : float
-        Heading before the prediction [rad].
-    noise : (5,) float64
-        As in `fill_predictions`.
-    dt : float
-        Time step [s].
+    heading : heading before the prediction [rad].
+    noise : (5,) float64; as in `fill_predictions`.
+    dt : time step [s].
     process : (5, 5) float64, overwritten
     """
     process[:] = 0.0

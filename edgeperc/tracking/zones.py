@@ -17,8 +17,6 @@ from ..types.perception import Box
 from ..types.points import read_only
 from . import Track, Tracks
 
-__all__ = ["Crossing", "Line", "Zone", "mark_inside"]
-
 FARTHEST_M = 1e8
 FORGET_S = 10.0
 """The last place of a track is kept for so long after its last report: a track that is hidden returns with its id."""
@@ -237,8 +235,6 @@ def _places(name: str, given: Any) -> NDArray[np.float64]:
 def mark_inside(polygon: NDArray[np.float64], points: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
     """Mark the points from which a ray along y crosses the polygon an odd number of times.
 
-    Parameters
-    ----------
     polygon : (k, 2) float64, C-contiguous, read-only
     points : (n, 2) float64, C-contiguous, read-only
     inside : (n,) bool, overwritten

@@ -18,8 +18,6 @@ from ..system.names import check_name, check_text
 from .onnx_file import read_metadata
 from .views import CameraGeometry, RangeImageGeometry, TopViewGeometry, check, check_each
 
-__all__ = ["CARD_KEY", "Golden", "InputSpec", "ModelCard", "OutputSpec"]
-
 CARD_KEY = "edgeperc.card"
 Precision = Literal["fp32", "int8"]
 SCHEMA = 3
@@ -159,10 +157,7 @@ class Golden:
     def check_output(self, name: str, size: int) -> None:
         """Check the record of an output against the number of its values.
 
-        Raises
-        ------
-        CardError
-            A position is outside the output, or there are too few different positions.
+        Raises CardError.
         """
         positions = self.outputs[name]["positions"]
         field, fewest = f"golden.outputs[{reprlib.repr(name)}]", min(MIN_GOLDEN_VALUES, size)

@@ -18,8 +18,6 @@ from .mounting import MODEL_HEIGHT_M, MODEL_MOUNTING, Mounting
 from .perception import Box
 from .points import read_only
 
-__all__ = ["ModelFrame", "fill_moved", "fill_turned", "quaternion", "turned"]
-
 
 class ModelFrame:
     """Moves scans into the frame of the models, and boxes back.
@@ -101,13 +99,10 @@ def fill_moved(
 ) -> None:
     """Write ``R p + t`` of every point into ``moved`` (n, 4) float32, with its remission.
 
-    Parameters
-    ----------
     points : (n, 4) float32, C-contiguous
     R : (3, 3) float64
     t : (3,) float64
-    moved : (n, 4) float32, overwritten
-        A coordinate beyond the range of float32 becomes infinite.
+    moved : (n, 4) float32, overwritten; a coordinate beyond the range of float32 becomes infinite.
     """
     for i in range(points.shape[0]):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
@@ -120,13 +115,9 @@ def fill_moved(
 def fill_turned(points: NDArray[np.float32], cos: np.float32, sin: np.float32, turned: NDArray[np.float32]) -> None:
     """Write the points, turned about the z axis in float32.
 
-    Parameters
-    ----------
     points : (n, 4) float32, C-contiguous
-    cos, sin : float32
-        Of the angle by which the sensor is turned to the left.
-    turned : (n, 4) float32, overwritten
-        A coordinate beyond the range of float32 becomes infinite.
+    cos, sin : float32; of the angle by which the sensor is turned to the left.
+    turned : (n, 4) float32, overwritten; a coordinate beyond the range of float32 becomes infinite.
     """
     for i in range(points.shape[0]):
         x, y = points[i, 0], points[i, 1]

@@ -19,17 +19,6 @@ from .perception import Box
 from .points import read_only
 from .views import TopViewGeometry
 
-__all__ = [
-    "bounding_rectangles",
-    "draw_footprints",
-    "inside",
-    "oriented_iou",
-    "rectangles",
-    "shared_area",
-    "suppress_overlaps",
-    "wrapped",
-]
-
 Angle = TypeVar("Angle", float, NDArray[np.float64])
 
 
@@ -46,13 +35,8 @@ def draw_footprints(
     A cell belongs to a box if its center lies in the footprint; the nearer of two boxes wins. Boxes of other classes
     are not drawn.
 
-    Parameters
-    ----------
     labels : (rows, columns) uint8, modified
-    boxes : iterable of Box
-    view : TopViewGeometry
-    classes : sequence of str
-        Names of the labels; a footprint gets the number of its box's class.
+    classes : names of the labels; a footprint gets the number of its box's class.
     """
     number = {name: k for k, name in enumerate(classes)}
     known = [box for box in boxes if box.label in number]
@@ -80,22 +64,10 @@ def rectangles(boxes: Iterable[Box]) -> NDArray[np.float64]:
 def oriented_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     """Intersection over union of every rectangle of ``a`` with every rectangle of ``b`` (SSADNet equation A1).
 
-    Parameters
-    ----------
-    a : (n, 5) array_like
-        x, y, length, width [m], yaw [rad].
-    b : (m, 5) array_like
-        As ``a``.
-
-    Returns
-    -------
-    (n, m) float64
-        In 0..1. A rectangle that is not finite or has no area overlaps nothing, not even itself.
-
-    Raises
-    ------
-    PointsError
-        ``a`` or ``b`` is not an (n, 5) array.
+    a : (n, 5) array_like; x, y, length, width [m], yaw [rad].
+    b : (m, 5) array_like; as ``a``.
+    Returns (n, m) float64: In 0..1. A rectangle that is not finite or has no area overlaps nothing, not even itself.
+    Raises PointsError.
     """
     first, second = _as_rectangles(a), _as_rectangles(b)
     iou = np.empty((len(first), len(second)))
@@ -106,16 +78,10 @@ def oriented_iou(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
 def shared_area(iou: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Area [m2] that rectangles share, from their overlap: ``iou = shared / (area of a + area of b - shared)``.
 
-    Parameters
-    ----------
-    iou : (n, m) float64
-        `oriented_iou` of ``a`` and ``b``.
+    iou : (n, m) float64; `oriented_iou` of ``a`` and ``b``.
     a : (n, 5) float64
     b : (m, 5) float64
-
-    Returns
-    -------
-    (n, m) float64
+    Returns (n, m) float64.
     """
     areas = np.add.outer(a[:, 2] * a[:, 3], b[:, 2] * b[:, 3])
     return np.asarray(iou / (1.0 + iou) * areas, np.float64)
@@ -126,27 +92,15 @@ def suppress_overlaps(
 ) -> NDArray[np.int64]:
     """Greedy non-maximum suppression of oriented rectangles.
 
-    Parameters
-    ----------
-    rectangles : (n, 5) array_like
-        x, y, length, width [m], yaw [rad].
+    rectangles : (n, 5) array_like; x, y, length, width [m], yaw [rad].
     scores : (n,) array_like
-    iou_threshold : float or (n,) array_like
-        A rectangle is dropped if it overlaps a kept one with a better score by more than this; with one threshold a
-        rectangle, by more than the lower one of the two.
-    max_inside : float
-        It is also dropped if the area shared with a better one is more than this share of the smaller one's area.
-
-    Returns
-    -------
-    (k,) int64
-        Rows kept, best score first, the earlier row on ties. Rows that are not finite overlap nothing, so they are
-        kept.
-
-    Raises
-    ------
-    PointsError
-        ``rectangles`` is not an (n, 5) array, or ``scores`` or ``iou_threshold`` has another length.
+    iou_threshold : float or (n,) array_like; a rectangle is dropped if it overlaps a kept one with a better score by
+        more than this; with one threshold a rectangle, by more than the lower one of the two.
+    max_inside : it is also dropped if the area shared with a better one is more than this share of the smaller one's
+        area.
+    Returns (k,) int64: Rows kept, best score first, the earlier row on ties. Rows that are not finite overlap
+        nothing, so they are kept.
+    Raises PointsError.
     """
     rows = _as_rectangles(rectangles)
     values = np.asarray(scores, dtype=np.float64)
@@ -165,20 +119,9 @@ def suppress_overlaps(
 def bounding_rectangles(rectangles: ArrayLike) -> NDArray[np.float64]:
     """Axis-aligned bounds of rectangles, as rectangles of yaw 0.
 
-    Parameters
-    ----------
-    rectangles : (n, 5) array_like
-        x, y, length, width [m], yaw [rad].
-
-    Returns
-    -------
-    (n, 5) float64
-        Same centers; extent along x, extent along y; yaw 0.
-
-    Raises
-    ------
-    PointsError
-        ``rectangles`` is not an (n, 5) array.
+    rectangles : (n, 5) array_like; x, y, length, width [m], yaw [rad].
+    Returns (n, 5) float64: Same centers; extent along x, extent along y; yaw 0.
+    Raises PointsError.
     """
     rows = _as_rectangles(rectangles)
     cos, sin = np.abs(np.cos(rows[:, 4])), np.abs(np.sin(rows[:, 4]))
@@ -204,13 +147,9 @@ def fill_footprints(
 ) -> None:
     """Write the class of each box into the cells whose centers lie in its footprint, one box after the other.
 
-    Parameters
-    ----------
-    boxes : (m, 6) float64
-        x, y, half length, half width [m], cosine and sine of the yaw.
+    boxes : (m, 6) float64; x, y, half length, half width [m], cosine and sine of the yaw.
     of_box : (m,) uint8
-    grid : (3,) float64
-        x of the far edge, y of the left edge, edge of a cell [m].
+    grid : (3,) float64; x of the far edge, y of the left edge, edge of a cell [m].
     labels : (rows, columns) uint8, modified
     """
     x_far, y_left, cell_m = grid[0], grid[1], grid[2]
@@ -237,11 +176,8 @@ def fill_footprints(
 def fill_oriented_iou(a: NDArray[np.float64], b: NDArray[np.float64], iou: NDArray[np.float64]) -> None:
     """Compute the overlap (IoU) of every pair.
 
-    Parameters
-    ----------
     a : (n, 5) float64, C-contiguous
-    b : (m, 5) float64, C-contiguous
-        x, y, length, width [m], yaw [rad].
+    b : (m, 5) float64, C-contiguous; x, y, length, width [m], yaw [rad].
     iou : (n, m) float64, overwritten
     """
     for i in range(a.shape[0]):
@@ -255,14 +191,9 @@ def mark_nms(
 ) -> None:
     """Mark the rectangles that overlap no better kept rectangle too much.
 
-    Parameters
-    ----------
-    rectangles : (n, 5) float64, C-contiguous
-        Best first.
-    limits : (n,) float64, C-contiguous
-        Two may overlap by the lower one of their limits (IoU).
-    max_inside : float
-        Of the smaller area of two.
+    rectangles : (n, 5) float64, C-contiguous; best first.
+    limits : (n,) float64, C-contiguous; two may overlap by the lower one of their limits (IoU).
+    max_inside : of the smaller area of two.
     keep : (n,) bool, overwritten
     """
     for i in range(rectangles.shape[0]):
@@ -339,18 +270,9 @@ def pair_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 def inside(box: Box, points: NDArray[Any], margin_m: float = 0.0) -> NDArray[np.bool_]:
     """Find the points inside a box.
 
-    Parameters
-    ----------
-    box : Box
-    points : (n, 3 or more) array
-        x, y, z [m] in the frame of the box.
-    margin_m : float
-        The box is grown by this on every side [m].
-
-    Returns
-    -------
-    (n,) bool
-        False for points that are not finite.
+    points : (n, 3 or more) array; x, y, z [m] in the frame of the box.
+    margin_m : the box is grown by this on every side [m].
+    Returns (n,) bool: False for points that are not finite.
     """
     offset = points[:, :3] - np.asarray(box.center, np.float32)
     cos, sin = np.cos(box.yaw), np.sin(box.yaw)

@@ -15,8 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import SensorError
 
-__all__ = ["MODEL_HEIGHT_M", "MODEL_MOUNTING", "UNKNOWN_MOUNTING", "Mounting"]
-
 
 @dataclass(frozen=True)
 class Mounting:

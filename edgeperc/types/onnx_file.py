@@ -16,8 +16,6 @@ from typing import BinaryIO, NamedTuple
 
 from ..errors import CardError, ModelFileError
 
-__all__ = ["OPERATORS", "check_graph", "open_model", "read_metadata", "read_model"]
-
 MAX_BYTES = 2 * 10**9  # protobuf itself stops at 2 GiB
 MAX_ENTRY_BYTES = 16 * 10**6
 MAX_TOP_FIELDS = 10_000  # of the file itself, which has about twenty; a file of empty fields would take minutes to read
@@ -56,10 +54,7 @@ SMALL = frozenset(_SMALL.split())
 def open_model(path: str | os.PathLike[str]) -> BinaryIO:
     """Open a model's file, which has to be a regular file of at most 2 GB.
 
-    Raises
-    ------
-    ModelFileError
-        The file cannot be read, is a folder, a pipe or a device, or is too large.
+    Raises ModelFileError.
     """
     try:
         # A pipe would be waited for if it were not opened without blocking.
@@ -79,10 +74,7 @@ def open_model(path: str | os.PathLike[str]) -> BinaryIO:
 def read_model(path: str | os.PathLike[str]) -> bytes:
     """The bytes of a model's file.
 
-    Raises
-    ------
-    ModelFileError
-        As `open_model`.
+    Raises ModelFileError.
     """
     with open_model(path) as file:
         try:
@@ -94,23 +86,9 @@ def read_model(path: str | os.PathLike[str]) -> bytes:
 def read_metadata(path: str | os.PathLike[str], key: str) -> str | None:
     """Read the text of a metadata entry.
 
-    Parameters
-    ----------
-    path : str or Path
-        An .onnx file.
-    key : str
-
-    Returns
-    -------
-    str or None
-        The last value if the key occurs several times, as in onnxruntime. None if the key is absent.
-
-    Raises
-    ------
-    ModelFileError
-        The file cannot be read, is truncated or is not an .onnx file.
-    CardError
-        The entry is not UTF-8 text, or is longer than 16 MB.
+    path : an .onnx file.
+    Returns: The last value if the key occurs several times, as in onnxruntime. None if the key is absent.
+    Raises ModelFileError, CardError.
     """
     wanted, value = key.encode(), None
     with open_model(path) as file:
@@ -216,20 +194,10 @@ class _Reader:
 def check_graph(blob: bytes, path: str | os.PathLike[str], *, trusted: bool = False) -> None:
     """Refuse a graph that could read other files, run without end or take all memory while it is opened.
 
-    Parameters
-    ----------
-    blob : bytes
-        The content of an .onnx file.
-    path : str or Path
-        Named in messages.
-    trusted : bool
-        Only refuse what is damaged or reads other files.
-
-    Raises
-    ------
-    ModelFileError
-        The file is damaged or not an .onnx file; keeps tensors in other files; or, if it is not trusted, has an
-        operator that is not in `OPERATORS`, a subgraph, a function, or a size beyond the limits of this module.
+    blob : the content of an .onnx file.
+    path : named in messages.
+    trusted : only refuse what is damaged or reads other files.
+    Raises ModelFileError.
     """
     if blob[4:8] == b"ORTM":  # onnxruntime would read it in its own format, which is not checked here
         raise ModelFileError(f"{os.fspath(path)} is in onnxruntime's own format; expected an .onnx file")

@@ -14,8 +14,6 @@ from .mounting import MODEL_MOUNTING, Mounting
 from .sensor import RemissionFunction
 from .views import TopViewGeometry
 
-__all__ = ["Box", "DroppedPoints", "ImageLabels", "Perception", "PointLabels", "TopView"]
-
 _PART = 2**20
 ROADS = ("drivable", "road")  # names of classes of an image on which a vehicle may drive, in lower case
 

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..errors import PointsError
 
-__all__ = ["as_points", "assemble", "plain_name", "read_only", "remission_name", "table_columns"]
-
 # Best first; of an Ouster's fields, "intensity" is the raw signal and "reflectivity" the calibrated byte.
 _REMISSION_NAMES = ("remission", "intensity", "i", "reflectivity", "reflectance")
 
@@ -19,24 +17,14 @@ _REMISSION_NAMES = ("remission", "intensity", "i", "reflectivity", "reflectance"
 def as_points(array: ArrayLike, *, remission_field: str | None = None) -> NDArray[np.float32]:
     """Convert an array to points.
 
-    Parameters
-    ----------
-    array : (n, 4) or (n, 3) array of numbers, or a structured array
-        Any float or integer dtype, byte order and memory layout. The columns are x, y, z [m], remission; without
-        the fourth, remission is 0. A structured array (any shape, e.g. that of a PointCloud2 message) needs the
-        fields x, y and z; other fields and padding are skipped.
-    remission_field : str, optional
-        As in `read_points`; structured arrays only.
-
-    Returns
-    -------
-    (n, 4) float32, C-contiguous
-        The given array itself if it already has this form. Values beyond the range of float32 become infinite.
-
-    Raises
-    ------
-    PointsError
-        The shape, the dtype or the fields are not those of points.
+    array : (n, 4) or (n, 3) array of numbers, or a structured array; any float or integer dtype, byte order and
+        memory layout. The columns are x, y, z [m], remission; without the fourth, remission is 0. A structured array
+        (any shape, e.g. that of a PointCloud2 message) needs the fields x, y and z; other fields and padding are
+        skipped.
+    remission_field : as in `read_points`; structured arrays only.
+    Returns (n, 4) float32, C-contiguous: The given array itself if it already has this form. Values beyond the range
+        of float32 become infinite.
+    Raises PointsError.
     """
     if isinstance(array, np.ma.MaskedArray):
         raise PointsError("got a masked array; fill it first, e.g. with array.filled(np.nan)")
@@ -92,10 +80,7 @@ def plain_name(name: str) -> str:
 def remission_name(names: Iterable[str], wanted: str | None) -> str | None:
     """Name of the remission field: the wanted one, or the first known name that is present; None if there is none.
 
-    Raises
-    ------
-    PointsError
-        The wanted field is not among ``names``.
+    Raises PointsError.
     """
     present = list(names)
     if wanted is None:
@@ -110,26 +95,12 @@ def assemble(
 ) -> NDArray[np.float32]:
     """Build points from named columns.
 
-    Parameters
-    ----------
-    n : int
-        Number of points.
-    fields : mapping of str to (n,) array
-        Columns by `plain_name`.
-    names : sequence of str
-        All fields of the source, for the error message.
-    remission_field : str or None
-        As in `as_points`.
-
-    Returns
-    -------
-    (n, 4) float32
-        x, y, z [m], remission; 0 without a remission field.
-
-    Raises
-    ------
-    PointsError
-        A coordinate or the wanted remission field is missing.
+    n : number of points.
+    fields : mapping of str to (n,) array; columns by `plain_name`.
+    names : all fields of the source, for the error message.
+    remission_field : as in `as_points`.
+    Returns (n, 4) float32: x, y, z [m], remission; 0 without a remission field.
+    Raises PointsError.
     """
     missing = [axis for axis in "xyz" if axis not in fields]
     if missing:

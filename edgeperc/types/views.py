@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CardError
 
-__all__ = ["CameraGeometry", "RangeImageGeometry", "TopViewGeometry"]
-
 MAX_ROWS, MAX_COLUMNS, MAX_PIXELS = 4096, 65_536, 16 * 10**6
 MIN_SECTOR_DEG = 1.0
 
@@ -86,16 +84,10 @@ class TopViewGeometry:
     def cells(self, x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
         """Find the cells that contain some positions.
 
-        Parameters
-        ----------
-        x, y : array_like
-            Positions in the sensor frame [m]; their shapes must broadcast.
-
-        Returns
-        -------
-        rows, cols : ndarray of int64
-        in_view : ndarray of bool
-            False if a position is out of view or not finite; its row and column are then not valid.
+        x, y : array_like; positions in the sensor frame [m]; their shapes must broadcast.
+        Returns rows, cols: ndarray of int64.
+        Returns in_view (ndarray of bool): False if a position is out of view or not finite; its row and column are
+            then not valid.
         """
         row = np.floor((self.x_range_m[1] - np.asarray(x)) / self.cell_m)
         col = np.floor((self.y_range_m[1] - np.asarray(y)) / self.cell_m)

@@ -44,10 +44,7 @@ _FARTHEST = 150.0
 def new_figure(width: int, height: int) -> Any:
     """Make an empty figure of a size in pixels, without pyplot.
 
-    Raises
-    ------
-    MissingExtraError
-        matplotlib is not installed.
+    Raises MissingExtraError.
     """
     agg = require("matplotlib.backends.backend_agg", "view", "Drawing a picture")
     from matplotlib.figure import Figure
@@ -185,19 +182,10 @@ def place_labels(
 ) -> int:
     """Write each label at the free place nearest to its object, with a line to the object if they are apart.
 
-    Parameters
-    ----------
-    axes : Axes
-        Labels stay inside.
-    labels : sequence of Label
-        The most important first. No label covers another label or any named object.
-    avoid : sequence of tuple of 4 float
-        Further rectangles that no label may cover [px].
-
-    Returns
-    -------
-    n_omitted : int
-        Labels for which there was no place.
+    axes : labels stay inside.
+    labels : the most important first. No label covers another label or any named object.
+    avoid : sequence of tuple of 4 float; further rectangles that no label may cover [px].
+    Returns n_omitted: Labels for which there was no place.
     """
     figure, panel, gap = axes.figure, axes.get_window_extent(), 4.0
     taken = np.array([*(label.area for label in labels), *avoid], dtype=np.float64).reshape(-1, 4)
@@ -228,25 +216,13 @@ def free_place(
 ) -> tuple[NDArray[np.float64], float] | None:
     """Find the free place for a label that is nearest to its object.
 
-    Parameters
-    ----------
-    area : sequence of 4 float
-        The named object [px]: smallest x and y, largest x and y.
-    half : (2,) float64
-        Half the label's width and height [px].
-    taken : (k, 4) float64
-        Rectangles that the label must not cover [px], as ``area``.
-    panel : sequence of 4 float
-        Rectangle that the label must not leave [px], as ``area``.
-
-    Returns
-    -------
-    middle : (2,) float64
-        Center of the label [px].
-    apart : float
-        Distance between label and area [px].
-
-    None if there is no free place within 150 pixels.
+    area : sequence of 4 float; the named object [px]: smallest x and y, largest x and y.
+    half : (2,) float64; half the label's width and height [px].
+    taken : (k, 4) float64; rectangles that the label must not cover [px], as ``area``.
+    panel : sequence of 4 float; rectangle that the label must not leave [px], as ``area``.
+    Returns middle ((2,) float64): Center of the label [px].
+    Returns apart: Distance between label and area [px].
+    Returns None if there is no free place within 150 pixels.
     """
     named = np.array(area, dtype=np.float64).reshape(2, 2)
     low = np.maximum(np.array(panel[:2]) + half, named[0] - half - _FARTHEST)

@@ -96,17 +96,10 @@ def drawable_boxes(boxes: Iterable[Box]) -> list[Box]:
 def paint_points(points: NDArray[np.float32], perception: Perception) -> tuple[list[str], NDArray[np.uint8]]:
     """Choose the class to show for every point.
 
-    Parameters
-    ----------
     points : (n, 4) float32
-    perception : Perception
-
-    Returns
-    -------
-    names : list of str
-        The classes of both views.
-    painted : (n,) uint8
-        Index into ``names``: the class of the point or, for background, that of its cell in the top view.
+    Returns names: The classes of both views.
+    Returns painted ((n,) uint8): Index into ``names``: the class of the point or, for background, that of its cell in
+        the top view.
     """
     names = list(perception.points.classes if perception.points is not None else ("background",))
     painted = np.zeros(len(points), dtype=np.uint8)
@@ -136,18 +129,9 @@ def paint_points(points: NDArray[np.float32], perception: Perception) -> tuple[l
 def fit_ground(points: NDArray[np.float32], names: list[str], painted: NDArray[np.uint8]) -> tuple[float, float, float]:
     """Fit the ground plane that a picture is drawn on: z = a + b x + c y [m].
 
-    Parameters
-    ----------
-    points : (n, 4) float32
-        Only those of `drawable_points`.
-    names : list of str
-    painted : (n,) uint8
-        As in `paint_points`.
-
-    Returns
-    -------
-    a, b, c : float
-        A plane through the drivable points; a level plane if there are fewer than 50 of them.
+    points : (n, 4) float32; only those of `drawable_points`.
+    painted : (n,) uint8; as in `paint_points`.
+    Returns a, b, c: A plane through the drivable points; a level plane if there are fewer than 50 of them.
     """
     if "drivable" in names:
         road = points[painted == names.index("drivable"), :3].astype(np.float64)

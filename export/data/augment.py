@@ -27,21 +27,6 @@ from edgeperc.types.views import RangeImageGeometry
 from .processes import mapped
 from .scans import LabeledScan, mirrored, turned, turned_box
 
-__all__ = [
-    "NEGATIVES",
-    "ObjectBank",
-    "augmented",
-    "background_pieces",
-    "facing",
-    "halved",
-    "pasted",
-    "resized",
-    "swapped",
-    "tilted",
-    "weathered",
-    "with_ground_ahead",
-]
-
 RARE = ("pedestrian", "cyclist")
 PASTE_AZIMUTHS = (-0.65, 0.65)
 FEWEST_PASTED = 5
@@ -116,17 +101,9 @@ def background_pieces(scan: LabeledScan, fewest: int = 8) -> Iterator[tuple[Box,
     A pole is a cluster at most 0.9 m wide, between 0.4 and 1.8 m above the ground, that goes on above 2 m. A wall is a
     cluster longer than 4 m; each gives the piece around its nearest point and the one around its middle.
 
-    Parameters
-    ----------
-    scan : LabeledScan
-    fewest : int
-        Fewest points of a piece.
-
-    Yields
-    ------
-    box : Box
-        Around the piece, standing on the ground, with the label ``"pole"`` or ``"wall"``.
-    points : (n, 4) float32
+    fewest : fewest points of a piece.
+    Yields box: Around the piece, standing on the ground, with the label ``"pole"`` or ``"wall"``.
+    Yields points: (n, 4) float32.
     """
     points = scan.points
     if not len(points):
@@ -369,31 +346,17 @@ def augmented(
     A scan that is labeled on all sides (simulation) faces forwards or backwards along the street. Other scans are
     turned by a few degrees only.
 
-    Parameters
-    ----------
-    scan : LabeledScan
     rng : np.random.Generator
-    bank : ObjectBank, optional
-    n_pasted : float
-        Mean number of objects to paste.
-    odds : mapping of str to float, optional
-        How often each kind is pasted; by default equally often.
-    turn_to_rare : float
-        Share of the scans labeled on all sides that are turned to a pedestrian or cyclist instead.
-    turn_anywhere : float
-        Share of the remaining ones that are turned by any angle.
-    weather : float
-        Share of scans in bad weather.
-    n_negatives : float
-        Mean number of pieces of background to paste.
-    negatives : mapping of str to float
-        How often each kind is pasted.
-    half_beams : float
-        Share of scans of which every second beam is left.
-    tilt_deg : float
-        Standard deviation of the errors of roll and pitch [deg]; the errors are at most twice as large.
-    no_remission : float
-        Share of scans whose remission is the constant that stands for a missing one.
+    n_pasted : mean number of objects to paste.
+    odds : mapping of str to float; how often each kind is pasted; by default equally often.
+    turn_to_rare : share of the scans labeled on all sides that are turned to a pedestrian or cyclist instead.
+    turn_anywhere : share of the remaining ones that are turned by any angle.
+    weather : share of scans in bad weather.
+    n_negatives : mean number of pieces of background to paste.
+    negatives : mapping of str to float; how often each kind is pasted.
+    half_beams : share of scans of which every second beam is left.
+    tilt_deg : standard deviation of the errors of roll and pitch [deg]; the errors are at most twice as large.
+    no_remission : share of scans whose remission is the constant that stands for a missing one.
     """
     full = scan.azimuths[1] - scan.azimuths[0] >= 2.0 * np.pi
     angle = rng.normal(0.0, np.radians(5.0))

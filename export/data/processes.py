@@ -9,8 +9,6 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
-__all__ = ["CONTEXT", "mapped"]
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 

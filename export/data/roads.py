@@ -16,28 +16,6 @@ from edgeperc.types.views import TopViewGeometry
 
 from .scans import SURFACE
 
-__all__ = [
-    "CELL_M",
-    "CLASSES",
-    "DRAWN",
-    "HEIGHT",
-    "VEHICLES",
-    "VIEW",
-    "WIDTH",
-    "X_RANGE_M",
-    "Y_RANGE_M",
-    "Z_RANGE_M",
-    "DatabaseError",
-    "box_sums",
-    "drawn_roads",
-    "ground_plane",
-    "mask_of",
-    "read_coco",
-    "sure_surface",
-    "with_road",
-    "write_coco",
-]
-
 DRAWN = Path(__file__).with_name("kitti_roads.coco.json")
 """Hand-drawn roads of some training scans of KITTI, as ``edgeperc-export database-label`` saves them: polygons in the
 top view, without the scans."""
@@ -53,17 +31,10 @@ BRIGHTER = 0.15
 def ground_plane(points: NDArray[np.float32], seed: int = 0) -> NDArray[np.float64] | None:
     """The ground plane near the vehicle (RANSAC, then least squares).
 
-    Parameters
-    ----------
-    points : (n, 4) float32
-        x, y, z [m] in the frame of a sensor 1.73 m above the road, remission.
-    seed : int
-        Of the random samples.
-
-    Returns
-    -------
-    (3,) float64 or None
-        a, b, c of z = a x + b y + c; None if there are fewer than 500 low points or no plausible plane.
+    points : (n, 4) float32; x, y, z [m] in the frame of a sensor 1.73 m above the road, remission.
+    seed : of the random samples.
+    Returns (3,) float64 or None: a, b, c of z = a x + b y + c; None if there are fewer than 500 low points or no
+        plausible plane.
     """
     # Not `edgeperc.ground.planes.find_ground`, which fits the lowest returns of cells: that plane is 0.3 to 12 cm lower
     # on 22 KITTI scans (median 4 cm). With it, the share of correct cells changes: of "no road" from 0.938 to
@@ -100,15 +71,8 @@ def sure_surface(points: NDArray[np.float32]) -> NDArray[np.uint8]:
 
     Low points in the lane ahead are road. Points above the ground, and areas brighter than the lane, are no road.
 
-    Parameters
-    ----------
-    points : (n, 4) float32
-        x, y, z [m] in the sensor frame, remission in 0..1.
-
-    Returns
-    -------
-    (500, 500) uint8
-        1 road, 0 no road, `IGNORE` elsewhere.
+    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission in 0..1.
+    Returns (500, 500) uint8: 1 road, 0 no road, `IGNORE` elsewhere.
     """
     surface = np.full((SURFACE.height, SURFACE.width), IGNORE, np.uint8)
     plane = ground_plane(points)
@@ -146,12 +110,7 @@ def drawn_roads(path: Path = DRAWN) -> dict[str, NDArray[np.uint8]]:
 
     The file keeps the hash as ``scan`` of each image, because names of scans differ between copies of KITTI.
 
-    Raises
-    ------
-    DatabaseError
-        The file is not a COCO file with roads.
-    MissingExtraError
-        The package that reads COCO files is not installed.
+    Raises DatabaseError, MissingExtraError.
     """
     try:
         drawn = read_coco([path])
@@ -164,17 +123,9 @@ def drawn_roads(path: Path = DRAWN) -> dict[str, NDArray[np.uint8]]:
 def with_road(surface: NDArray[np.uint8], road: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Ground truth with a drawn road.
 
-    Parameters
-    ----------
-    surface : (500, 500) uint8
-        Ground truth over `SURFACE`.
-    road : (400, 200) uint8
-        The drawn road over `VIEW`, from `mask_of`.
-
-    Returns
-    -------
-    (500, 500) uint8
-        ``road`` in its view, ``surface`` elsewhere.
+    surface : (500, 500) uint8; ground truth over `SURFACE`.
+    road : (400, 200) uint8; the drawn road over `VIEW`, from `mask_of`.
+    Returns (500, 500) uint8: ``road`` in its view, ``surface`` elsewhere.
     """
     x, y = SURFACE.cell_centers()
     row, col, drawn = VIEW.cells(x, y)
@@ -200,11 +151,7 @@ def read_coco(paths: Iterable[Path]) -> dict[str, list[Any]]:
     Annotations of a category "road" or "drivable" are road. Scenes have the names of their image files. A scene with
     annotations but none of road has an empty list.
 
-    Raises
-    ------
-    DatabaseError
-        A file is not a COCO file, has no road category, or has images of another size; or two files draw the same
-        scene.
+    Raises DatabaseError.
     """
     roads: dict[str, list[Any]] = {}
     for path in paths:
@@ -244,10 +191,7 @@ def mask_of(segmentations: Sequence[Any], source: str = "a polygon") -> NDArray[
 
     ``source`` starts the error message.
 
-    Raises
-    ------
-    DatabaseError
-        A segmentation is neither polygons nor run lengths of this image size.
+    Raises DatabaseError.
     """
     from faster_coco_eval.core import mask as coco
 
@@ -278,12 +222,9 @@ def mask_of(segmentations: Sequence[Any], source: str = "a polygon") -> NDArray[
 def write_coco(roads: Mapping[str, Sequence[Sequence[Sequence[float]]]], scans: Mapping[str, str] | None = None) -> str:
     """The text of a COCO file.
 
-    Parameters
-    ----------
-    roads : mapping of str to sequence
-        Scene -> polygons -> corners (x, y) in pixels.
-    scans : mapping of str to str, optional
-        Scene -> `edgeperc.datasets.kitti.scan_hash`, because names differ between copies of KITTI.
+    roads : mapping of str to sequence; scene -> polygons -> corners (x, y) in pixels.
+    scans : mapping of str to str; scene -> `edgeperc.datasets.kitti.scan_hash`, because names differ between copies
+        of KITTI.
     """
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []

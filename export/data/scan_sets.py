@@ -38,8 +38,6 @@ from edgeperc.types.views import RangeImageGeometry
 from .roads import box_sums
 from .scans import SURFACE, LabeledScan
 
-__all__ = ["labeled_scan", "read_scan_set", "seen_by_network"]
-
 NEAR_M = 0.5
 
 
@@ -51,28 +49,11 @@ def read_scan_set(
     As in a `Perceiver`, what the description does not say of the mounting is estimated from the first scans of each
     drive, and the remission is matched to that of the training sensor.
 
-    Parameters
-    ----------
-    folder : ScanFolder
-    split, fold
-        As in `ScanFolder.names`.
-    classes : sequence of str
-        Classes of points, the background first; objects of other classes are unknown (`IGNORE`).
-
-    Returns
-    -------
-    scans : list of LabeledScan
-    weights : list of float
-        How often to draw each scan: all scans of a drive together as the square root of their number.
-    hashes : dict of str to str
-        ``SET/NAME`` of each scan -> its `edgeperc.datasets.kitti.scan_hash`.
-
-    Raises
-    ------
-    PointsError
-        A file cannot be read.
-    MountingError
-        No scan of a drive shows how the sensor is mounted, and the description does not say it.
+    split, fold : as in `ScanFolder.names`.
+    classes : classes of points, the background first; objects of other classes are unknown (`IGNORE`).
+    Returns weights: How often to draw each scan: all scans of a drive together as the square root of their number.
+    Returns hashes (dict of str to str): ``SET/NAME`` of each scan -> its `edgeperc.datasets.kitti.scan_hash`.
+    Raises PointsError, MountingError.
     """
     layout, names = folder.layout, folder.names(split, fold=fold)
     n_scans = Counter(folder.drives[name] for name in names)
@@ -108,15 +89,9 @@ def labeled_scan(
 ) -> LabeledScan:
     """A scan with its truth in the frame of the models.
 
-    Parameters
-    ----------
-    frame : ScanFrame
-    points : (n, 4) float32
-        Its points, with the remission as `edgeperc.preprocess.condition.condition` returns it.
-    mounting : Mounting
-        A known one.
-    classes : sequence of str
-        As in `read_scan_set`.
+    points : (n, 4) float32; its points, with the remission as `edgeperc.preprocess.condition.condition` returns it.
+    mounting : a known one.
+    classes : as in `read_scan_set`.
     """
     model = ModelFrame(mounting)
     boxes = model.move_boxes(frame.boxes or ())
@@ -164,19 +139,10 @@ def seen_by_network(
 ) -> tuple[LabeledScan, Projection]:
     """A training scan projected as the runtime projects a scan of its sensor.
 
-    Parameters
-    ----------
-    projector : TopViewProjector or RangeImageProjector
-    scan : LabeledScan
-
-    Returns
-    -------
-    scan : LabeledScan
-        If the range image of a coarser sensor was filled: with the interpolated points. Each is labeled as the nearest
-        of the next measured points in its row and its column, and `IGNORE` if that is more than 0.5 m away and one of
-        them is no background. Else the given one.
-    projected : Projection
-        Its ``index`` refers to the points of the returned scan; ``pixel`` to the given ones.
+    Returns scan: If the range image of a coarser sensor was filled: with the interpolated points. Each is labeled as
+        the nearest of the next measured points in its row and its column, and `IGNORE` if that is more than 0.5 m
+        away and one of them is no background. Else the given one.
+    Returns projected: Its ``index`` refers to the points of the returned scan; ``pixel`` to the given ones.
     """
     points = np.ascontiguousarray(scan.points, np.float32)
     projected = project(projector, points)

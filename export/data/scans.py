@@ -18,8 +18,6 @@ from edgeperc.types.perception import Box
 from edgeperc.types.sensor import SensorProfile
 from edgeperc.types.views import TopViewGeometry
 
-__all__ = ["SURFACE", "LabeledScan", "mirrored", "turned", "turned_box"]
-
 # Wider and coarser than the network's view, so that a turned scan has ground truth everywhere in the view.
 SURFACE = TopViewGeometry(x_range_m=(-50.0, 50.0), y_range_m=(-50.0, 50.0), cell_m=0.2)
 CAMERA_AZIMUTHS = (-0.70, 0.69)  # KITTI's left color camera sees 41.2 degrees to the right and 40.2 to the left

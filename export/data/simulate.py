@@ -21,8 +21,6 @@ from edgeperc.types.perception import Box
 from .processes import mapped
 from .scans import LabeledScan
 
-__all__ = ["fitness_of", "parity_images", "parity_scans", "simulate"]
-
 
 def simulate(
     out: Path,
@@ -35,18 +33,10 @@ def simulate(
 ) -> None:
     """Write ``n`` labeled scans into ``out``. Existing files are kept, so a stopped run resumes.
 
-    Parameters
-    ----------
-    out : Path
-    n : int
-    first : int
-        Number and seed of the first scan.
-    layouts_root : Path, optional
-        Folder of KITTI's labels; every other scene gets the boxes of one of its scans.
-    sensor : str
-        Name of the sensor to simulate.
-    n_workers : int
-        Number of processes that simulate; 0: this one. The scans are the same.
+    first : number and seed of the first scan.
+    layouts_root : folder of KITTI's labels; every other scene gets the boxes of one of its scans.
+    sensor : name of the sensor to simulate.
+    n_workers : number of processes that simulate; 0: this one. The scans are the same.
     """
     out.mkdir(parents=True, exist_ok=True)
     real = list(layouts(layouts_root)) if layouts_root else []

@@ -8,8 +8,6 @@ from numpy.typing import ArrayLike, NDArray
 from edgeperc.types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
 from edgeperc.types.views import TopViewGeometry
 
-__all__ = ["REGRESSED_FROM", "SLOT_CELLS", "dense_targets", "paper_slot_targets", "slot_targets"]
-
 STRIDE = 4
 """Top-view cells along the edge of one output cell of head "dense"."""
 SLOT_CELLS = 32
@@ -29,24 +27,12 @@ def slot_targets(
 ) -> NDArray[np.float32]:
     """Targets of head "slots": each slot has a square of the view, and the upright box of the object centered there.
 
-    Parameters
-    ----------
-    boxes, labeled, unsure
-        As for `dense_targets`.
-    view : TopViewGeometry
-        Height and width at least `SLOT_CELLS`.
-
-    Returns
-    -------
-    (rows * columns, 5) float32
-        By rows from the far left square: center column, center row, width and height as in `paper_slot_targets`, and
-        the presence: 1 with an object, 0 without one, -1 if it is not learned. A slot without an object has zeros. Of
-        several objects in one square, the slot gets the nearest.
-
-    Raises
-    ------
-    ValueError
-        A length, width or height is not positive.
+    boxes, labeled, unsure : as for `dense_targets`.
+    view : height and width at least `SLOT_CELLS`.
+    Returns (rows * columns, 5) float32: By rows from the far left square: center column, center row, width and height
+        as in `paper_slot_targets`, and the presence: 1 with an object, 0 without one, -1 if it is not learned. A slot
+        without an object has zeros. Of several objects in one square, the slot gets the nearest.
+    Raises ValueError.
     """
     n_rows, n_cols = view.height // SLOT_CELLS, view.width // SLOT_CELLS
     target = np.zeros((n_rows, n_cols, 5), np.float32)
@@ -74,24 +60,11 @@ def slot_targets(
 def paper_slot_targets(boxes: ArrayLike, view: TopViewGeometry, n_slots: int) -> NDArray[np.float32]:
     """Targets of head "slots-paper": upright boxes around rotated footprints, nearest first (SSADNet 3.1.1).
 
-    Parameters
-    ----------
-    boxes : (m, 7) array_like
-        x, y, z of the center, length, width, height [m], yaw [rad], in the sensor frame.
-    view : TopViewGeometry
-    n_slots : int
-        Number of boxes to keep, nearest first.
-
-    Returns
-    -------
-    (n_slots, 4) float32
-        Center column, center row, width and height as shares of the image's width and height; zeros in empty slots.
-        Boxes whose center is outside the view are left out.
-
-    Raises
-    ------
-    ValueError
-        A length, width or height is not positive.
+    boxes : (m, 7) array_like; x, y, z of the center, length, width, height [m], yaw [rad], in the sensor frame.
+    n_slots : number of boxes to keep, nearest first.
+    Returns (n_slots, 4) float32: Center column, center row, width and height as shares of the image's width and
+        height; zeros in empty slots. Boxes whose center is outside the view are left out.
+    Raises ValueError.
     """
     boxes, rows, cols = _boxes_in_view(boxes, view)
     found = _upright(boxes, rows, cols, view)

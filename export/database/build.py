@@ -42,8 +42,6 @@ from .workers import run_jobs
 if TYPE_CHECKING:
     from ..recipe import Recipe
 
-__all__ = ["Report", "build", "folds"]
-
 
 @dataclass(frozen=True)
 class Report:
@@ -75,15 +73,8 @@ def folds(drives: Iterable[str]) -> dict[str, int]:
     All scenes of a drive are in one fold, because they look alike. Drives are assigned in order of their number of
     scenes, largest first, each to the fold with the fewest scenes.
 
-    Parameters
-    ----------
-    drives : iterable of str
-        The drive of every scene.
-
-    Returns
-    -------
-    dict of str to int
-        Drive -> fold.
+    drives : the drive of every scene.
+    Returns dict of str to int: Drive -> fold.
     """
     sizes = [0] * N_FOLDS
     chosen = {}
@@ -104,27 +95,13 @@ def build(
 ) -> Report:
     """Build a database, or resume a stopped build.
 
-    Parameters
-    ----------
-    plan : Plan
-    polygons : sequence of Path
-        COCO files of hand-drawn roads. They take precedence over the road model.
-    test_drives : sequence of str
-        Drives to keep for testing, in addition to `edgeperc.datasets.splits.TEST_DRIVES`.
-    recipe : edgeperc_export.recipe.Recipe, optional
-        Recipe of the road models if ``plan.road_by`` is ``"train"`` (default: the paper's LoDNN).
-    engine : {"local", "ray"}
-        Processes on this computer, or ``ray.data`` on the cluster named by ``RAY_ADDRESS``, else on a local one.
-    workers : int, optional
-        Scenes made in parallel (default: the number of cores; 1 starts no process).
-
-    Raises
-    ------
-    DatabaseError
-        ``plan.out`` holds other files, another build is running there, a worker was killed, or too few roads are drawn
-        to train on.
-    PointsError, SensorError, ModelError, ProviderError
-        ``plan.kitti`` is not a KITTI object set, or the sensor, model or provider is unknown or unusable.
+    polygons : COCO files of hand-drawn roads. They take precedence over the road model.
+    test_drives : drives to keep for testing, in addition to `edgeperc.datasets.splits.TEST_DRIVES`.
+    recipe : edgeperc_export.recipe.Recipe; recipe of the road models if ``plan.road_by`` is ``"train"`` (default: the
+        paper's LoDNN).
+    engine : processes on this computer, or ``ray.data`` on the cluster named by ``RAY_ADDRESS``, else on a local one.
+    workers : scenes made in parallel (default: the number of cores; 1 starts no process).
+    Raises DatabaseError, PointsError, SensorError, ModelError, ProviderError.
     """
     objects = KittiObjects(plan.kitti)
     drawn = read_coco(polygons)

@@ -11,8 +11,6 @@ from typing import Any
 
 from edgeperc.cli.output import print_error, print_line
 
-__all__ = ["add_database_commands"]
-
 DATABASE = "folder of a database made by edgeperc-export database-build"
 
 

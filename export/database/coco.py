@@ -18,8 +18,6 @@ from edgeperc.simulation.samples import IGNORE
 from ..data.roads import CLASSES, HEIGHT, VIEW, WIDTH
 from .files import TopViewDatabase, road_and_vehicles
 
-__all__ = ["draft", "varied", "write_database_coco"]
-
 TURN_DEG = 8.0
 SMALLEST_M2 = 2.0
 SMOOTH_CELLS, SIMPLIFIED_CELLS = 5.0, 1.5
@@ -28,14 +26,8 @@ SMOOTH_CELLS, SIMPLIFIED_CELLS = 5.0, 1.5
 def draft(labels: NDArray[np.uint8]) -> list[list[list[float]]]:
     """Polygons around the road of a map, for a person to correct. Holes are filled, and details below 1 m smoothed.
 
-    Parameters
-    ----------
-    labels : (400, 200) uint8
-        Index into `CLASSES`.
-
-    Returns
-    -------
-    list of polygons of corners [x, y], in pixels from the upper left corner
+    labels : (400, 200) uint8; index into `CLASSES`.
+    Returns list of polygons of corners [x, y], in pixels from the upper left corner.
     """
     from shapely import box, union_all
 
@@ -66,23 +58,11 @@ def varied(
     interpolation, so that the mask keeps its values. Variation 0 is the scene itself. The same name and number always
     give the same variation.
 
-    Parameters
-    ----------
     image : (400, 200, 3) uint8
-    mask : (400, 200) uint8
-        1 road, 0 no road.
-    name : str
-        Name of the scene.
-    k : int
-
-    Returns
-    -------
-    image : (400, 200, 3) uint8
-        0 outside the scene.
-    mask : (400, 200) uint8
-        `IGNORE` outside the scene.
-    turn_deg : float
-    mirrored : bool
+    mask : (400, 200) uint8; 1 road, 0 no road.
+    name : name of the scene.
+    Returns image ((400, 200, 3) uint8): 0 outside the scene.
+    Returns mask ((400, 200) uint8): `IGNORE` outside the scene.
     """
     if k == 0:
         return image, mask, 0.0, False

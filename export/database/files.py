@@ -37,20 +37,6 @@ from edgeperc.types.perception import Box
 
 from ..data.roads import CELL_M, CLASSES, HEIGHT, VEHICLES, VIEW, WIDTH, X_RANGE_M, Y_RANGE_M, Z_RANGE_M, DatabaseError
 
-__all__ = [
-    "FARTHEST_M",
-    "FORMAT",
-    "N_FOLDS",
-    "TopViewDatabase",
-    "TopViewScene",
-    "picture",
-    "png",
-    "read_labels",
-    "road_and_vehicles",
-    "vehicles",
-    "write_labels",
-]
-
 FORMAT = 1
 N_FOLDS = 5
 FARTHEST_M = float(np.hypot(X_RANGE_M[1], Y_RANGE_M[1]))
@@ -62,17 +48,10 @@ def picture(points: NDArray[np.float32]) -> NDArray[np.uint8]:
     Coordinates are rounded to pixels of 0.1 m and clamped to the image. A pixel shows its highest point, and the first
     of equally high ones. Each channel is scaled from its range to 0..255.
 
-    Parameters
-    ----------
-    points : (n, 4) float32
-        x, y, z [m] in the sensor frame, remission, clamped to 0..1 (`condition.condition` scales a sensor's). Rows
-        that are not finite are left out.
-
-    Returns
-    -------
-    (400, 200, 3) uint8
-        Distance in the plane 0..47.07 m, height -2.5..2.5 m, remission 0..1. Row 0 is farthest, column 0 leftmost.
-        The first channel is 0 in exactly the pixels without a return.
+    points : (n, 4) float32; x, y, z [m] in the sensor frame, remission, clamped to 0..1 (`condition.condition` scales
+        a sensor's). Rows that are not finite are left out.
+    Returns (400, 200, 3) uint8: Distance in the plane 0..47.07 m, height -2.5..2.5 m, remission 0..1. Row 0 is
+        farthest, column 0 leftmost. The first channel is 0 in exactly the pixels without a return.
     """
     p = points[(points[:, 0] >= X_RANGE_M[0]) & (points[:, 0] <= X_RANGE_M[1])]
     p = p[(p[:, 1] >= Y_RANGE_M[0]) & (p[:, 1] <= Y_RANGE_M[1]) & (p[:, 2] >= Z_RANGE_M[0]) & (p[:, 2] <= Z_RANGE_M[1])]
@@ -94,10 +73,7 @@ def vehicles(boxes: Iterable[Box]) -> tuple[Box, ...]:
 
     Numbers are rounded to 0.1 mm as in the label files, so that a map drawn from a label file is the same.
 
-    Raises
-    ------
-    DatabaseError
-        A vehicle's numbers are not finite or not plausible, or its footprint has no area.
+    Raises DatabaseError.
     """
     kept = []
     for box in boxes:
@@ -151,10 +127,7 @@ def write_labels(boxes: Iterable[Box]) -> str:
 def read_labels(path: Path) -> tuple[Box, ...]:
     """Vehicles of a label file; their z and height are 0.
 
-    Raises
-    ------
-    DatabaseError
-        A line is not of the format of `write_labels`.
+    Raises DatabaseError.
     """
     boxes = []
     for line in path.read_text().splitlines():

@@ -29,8 +29,6 @@ from ..training.samples import RealScans
 from ..training.train import train
 from .files import N_FOLDS
 
-__all__ = ["DrawnScene", "train_folds"]
-
 
 @dataclass(frozen=True)
 class DrawnScene:
@@ -53,22 +51,11 @@ class DrawnScene:
 def train_folds(objects: KittiObjects, drawn: Mapping[str, DrawnScene], recipe: Recipe, out: Path, work: Path) -> None:
     """Write ``out/fold-0.onnx`` to ``fold-4.onnx``. A model of the same scenes and recipe is not made again.
 
-    Parameters
-    ----------
-    objects : KittiObjects
-    drawn : mapping of str to DrawnScene
-        Name of the scene -> the scene.
-    recipe : Recipe
-        Recipe of a top-view network with a class "drivable".
-    out : Path
-        Folder for the models.
-    work : Path
-        Folder for checkpoints, from which a stopped training run resumes.
-
-    Raises
-    ------
-    DatabaseError
-        All drawn scenes are in one fold.
+    drawn : mapping of str to DrawnScene; name of the scene -> the scene.
+    recipe : recipe of a top-view network with a class "drivable".
+    out : folder for the models.
+    work : folder for checkpoints, from which a stopped training run resumes.
+    Raises DatabaseError.
     """
     made: dict[str, Path] = {}
     for fold in range(N_FOLDS):

@@ -34,8 +34,6 @@ from ..data.roads import HEIGHT, WIDTH, DatabaseError, read_coco, write_coco
 from .coco import draft
 from .files import TopViewDatabase
 
-__all__ = ["LabelServer"]
-
 PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".webp": "image/webp"}
 LARGEST_BODY = 1_000_000  # bytes; about 60,000 corners
 LARGEST_HEAD = 32_768  # bytes of all header lines; a browser sends the cookies of every server on this computer

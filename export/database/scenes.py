@@ -28,20 +28,6 @@ from ..data.roads import CLASSES, HEIGHT, VEHICLES, VIEW, WIDTH, mask_of
 from .coco import varied
 from .files import FORMAT, picture, png, road_and_vehicles, vehicles, write_labels
 
-__all__ = [
-    "FOLDERS",
-    "INDEX",
-    "ROAD_FOLDERS",
-    "ROAD_INDEX",
-    "TRAIN",
-    "TRAINED",
-    "Job",
-    "Plan",
-    "RoadModel",
-    "SceneBuilder",
-    "inputs_of",
-]
-
 INDEX = (
     "scene", "drive", "grade", "split", "fold", "points", "cells_returned", *VEHICLES,
     *(f"{name}_cells" for name in CLASSES[1:]), "road", "scan_sha256", "image_sha256", "label_sha256", "map_sha256",
@@ -110,18 +96,9 @@ class Job:
 class RoadModel:
     """Road maps by a network (section 3.7).
 
-    Parameters
-    ----------
-    plan : Plan
-    model : str
-        As `Plan.road_model` gives it.
-    on_mismatch : {"warn", "ignore"}
-        What to do if the scans differ from those the model was trained on.
-
-    Raises
-    ------
-    CardMismatchError
-        The model's input is not a top view of these cells, or it has no class "drivable".
+    model : as `Plan.road_model` gives it.
+    on_mismatch : what to do if the scans differ from those the model was trained on.
+    Raises CardMismatchError.
     """
 
     def __init__(self, plan: Plan, model: str, on_mismatch: Literal["warn", "ignore"]) -> None:
@@ -169,11 +146,7 @@ class RoadModel:
 class SceneBuilder:
     """Makes scenes, one at a time (sections 3.1 to 3.4, 3.7 and 3.8).
 
-    Parameters
-    ----------
-    plan : Plan
-    on_mismatch : {"warn", "ignore"}
-        Passed to `RoadModel`.
+    on_mismatch : passed to `RoadModel`.
     """
 
     def __init__(self, plan: Plan, on_mismatch: Literal["warn", "ignore"] = "ignore") -> None:
@@ -206,10 +179,7 @@ class SceneBuilder:
     def __call__(self, job: Job) -> str:
         """Make a scene; returns the reason if it is left out, else "".
 
-        Raises
-        ------
-        OSError
-            Its files cannot be written.
+        Raises OSError.
         """
         try:
             frame = self.objects.frame(job.name)

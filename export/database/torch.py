@@ -11,8 +11,6 @@ from torch.utils.data import Dataset
 
 from .files import TopViewDatabase
 
-__all__ = ["TopViewDataset"]
-
 
 class TopViewDataset(Dataset[tuple[Tensor, Tensor]]):
     """Images and maps of a database; parameters and errors are those of `TopViewDatabase`.

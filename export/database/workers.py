@@ -15,8 +15,6 @@ from edgeperc.system.ray_cluster import Lost, map_on_ray
 from ..data.roads import DatabaseError
 from .scenes import Job, Plan, SceneBuilder
 
-__all__ = ["run_jobs"]
-
 # Jobs queued for each worker: enough to keep it busy, few enough that memory use stays constant.
 AHEAD = 4
 

@@ -35,10 +35,7 @@ UNETS: dict[str, dict[str, Any]] = {
 def build(recipe: Recipe) -> nn.Module:
     """The network of a recipe, with initial weights drawn from the recipe's seed.
 
-    Raises
-    ------
-    ValueError
-        The network or its head is unknown, or the network has no version for small computers.
+    Raises ValueError.
     """
     task_name(recipe.network)  # raises ValueError for an unknown network
     card = card_of(recipe, version="0")

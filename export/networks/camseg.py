@@ -17,8 +17,6 @@ from torch import Tensor, nn
 
 from .pointseg import conv_bn_relu, initialize
 
-__all__ = ["CamSeg"]
-
 # Half of the channels, too, is a multiple of 16: for dilated convolutions of 72 channels, torch 2.13 on a CPU computes
 # wrong gradients of the weights in bf16 (relative error 0.47, or not finite); with 48, 64, 80 or 96 they are right.
 FINE, MIDDLE, COARSE = 64, 128, 128

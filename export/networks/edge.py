@@ -21,8 +21,6 @@ from ..recipe import EDGE_BLOCKS
 from .pointseg import conv_bn_relu, initialize
 from .ssadnet import HEAT_PRIOR
 
-__all__ = ["PointSegEdge", "SSADNetEdge", "spread"]
-
 CONTEXT_DILATIONS = ((1, 2), (2, 4))
 """Dilations (rows, columns) of the residual blocks; range images are wide."""
 
@@ -44,14 +42,9 @@ class Residual(nn.Module):
 class Trunk(nn.Module):
     """Encoder, context and decoder, on blocks of pixels: a convolution with the stride of a block makes its features.
 
-    Parameters
-    ----------
-    n_channels : int
-        Channels of the input.
-    block : (int, int)
-        Rows and columns of a block.
-    fine, coarse : int
-        Channels at the resolution of the blocks, and at half of it.
+    n_channels : channels of the input.
+    block : (int, int); rows and columns of a block.
+    fine, coarse : channels at the resolution of the blocks, and at half of it.
     """
 
     def __init__(self, n_channels: int, block: tuple[int, int], fine: int, coarse: int) -> None:

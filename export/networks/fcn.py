@@ -22,8 +22,6 @@ from torch import Tensor, nn
 from .pointseg import initialize
 from .segnet import VGG_16
 
-__all__ = ["FCN", "bilinear"]
-
 FULLY_CONNECTED = 4096
 SKIPS = {16: (3,), 8: (3, 2)}
 """Stride of the last upsampling -> the poolings, counted from 0, whose scores are added, deepest first."""

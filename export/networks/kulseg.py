@@ -8,8 +8,6 @@ from __future__ import annotations
 from .pointseg import Fire, initialize
 from .squeezesegv2 import SqueezeSegV2
 
-__all__ = ["KULSeg"]
-
 
 class KULSeg(SqueezeSegV2):
     """Labels every pixel of a range image; parameters, input and output are those of `SqueezeSegV2`."""

@@ -25,8 +25,6 @@ from torch import Tensor, nn
 from .pointseg import conv_bn_relu, initialize
 from .ssadnet import CONTEXT_DILATIONS, ELU_GAIN, ContextModule, conv_bn_elu, conv_elu, max_pool_with_mask, max_unpool
 
-__all__ = ["EDGE_DILATIONS", "LoDNN", "LoDNNEdge"]
-
 EDGE_DILATIONS = CONTEXT_DILATIONS[:-1]
 """Dilations (width, height) at a quarter of the resolution. Their receptive field, 65 x 127 cells of 0.4 m, covers
 26 x 51 m, as much as the 129 x 255 cells of 0.2 m of `CONTEXT_DILATIONS` at half the resolution."""

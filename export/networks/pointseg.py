@@ -20,17 +20,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-__all__ = [
-    "ENLARGEMENT_RATES",
-    "Fire",
-    "FireDeconv",
-    "PointSeg",
-    "SqueezeReweight",
-    "conv_bn_relu",
-    "initialize",
-    "pool",
-]
-
 ENLARGEMENT_RATES = (6, 9, 12)
 
 

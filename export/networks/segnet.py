@@ -20,8 +20,6 @@ from torch import Tensor, nn
 
 from .pointseg import conv_bn_relu, initialize
 
-__all__ = ["VGG_16", "SegNet", "unpool"]
-
 VGG_16 = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 """Channels of VGG-16's 13 convolutions, by resolution (Simonyan and Zisserman, 2015, configuration D)."""
 N_DROPPED = 3
@@ -30,13 +28,10 @@ N_DROPPED = 3
 def unpool(x: Tensor, positions: Tensor, size: tuple[int, int]) -> Tensor:
     """Put pooled values back where they were the maximum; all other values are 0.
 
-    Parameters
-    ----------
     x : (B, C, H, W) float
-    positions : (B, C, H, W) int64
-        Row x width + column of each value, as `torch.nn.functional.max_pool2d` returns them.
-    size : (int, int)
-        Rows and columns of the result.
+    positions : (B, C, H, W) int64; row x width + column of each value, as `torch.nn.functional.max_pool2d` returns
+        them.
+    size : (int, int); rows and columns of the result.
     """
     batch, channels = x.shape[:2]
     flat = x.new_zeros((batch, channels, size[0] * size[1]))

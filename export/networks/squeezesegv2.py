@@ -22,8 +22,6 @@ from torch import Tensor, nn
 
 from .pointseg import Fire, FireDeconv, conv_bn_relu, initialize, pool
 
-__all__ = ["ContextAggregation", "SqueezeSegV2"]
-
 REACH = 7
 """Rows and columns of the max-pooling window of context aggregation."""
 

@@ -35,22 +35,6 @@ from edgeperc.types.card import N_DENSE_CHANNELS, N_FRONT_CHANNELS
 
 from ..data.targets import SLOT_CELLS
 
-__all__ = [
-    "CONTEXT_DILATIONS",
-    "ELU_GAIN",
-    "HEAT_PRIOR",
-    "BoxRegressor",
-    "ContextModule",
-    "DenseHead",
-    "FeatureBlock",
-    "SSADNet",
-    "conv_bn_elu",
-    "conv_elu",
-    "max_pool_with_mask",
-    "max_unpool",
-    "receptive_fields",
-]
-
 CONTEXT_DILATIONS = ((1, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 64))
 """Table 1, as printed: (width, height). torch's ``dilation`` is (height, width)."""
 

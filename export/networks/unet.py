@@ -24,8 +24,6 @@ from torch import Tensor, nn
 
 from .pointseg import initialize
 
-__all__ = ["UNet"]
-
 WIDEST = 16
 """Channels of the deepest levels, as a multiple of the first level's."""
 

@@ -32,8 +32,6 @@ from edgeperc.zoo import BF16_FEATURES, Variant, resolve
 
 from .to_onnx import write_card
 
-__all__ = ["agree", "summary"]
-
 T = TypeVar("T")
 
 
@@ -62,37 +60,17 @@ def agree(
     fp32 and int8 run on stock onnxruntime's CPU provider. bf16 runs the fp32 file in OpenVINO's own Python API. It is
     measured if OpenVINO is installed and the processor has bf16 instructions.
 
-    Parameters
-    ----------
-    models : sequence of str or Path
-        Files of one network, or its name for all its variants. One of them is in fp32.
-    kitti, semantickitti : Path or None
-        Roots of a KITTI object set and of SemanticKITTI. Their labels are the ground truth: of points or vehicles
-        (KITTI) and of road (SemanticKITTI). All scans of SemanticKITTI are used, although they are of a test drive,
-        because no other real scans have road labels.
-    camvid : Path or None
-        Folder of CamVid, for a network of a camera; then the other sets are not used.
-    split : str
-        Drives of the KITTI object set (`edgeperc.datasets.splits.in_split`), or images of CamVid
+    models : files of one network, or its name for all its variants. One of them is in fp32.
+    kitti, semantickitti : roots of a KITTI object set and of SemanticKITTI. Their labels are the ground truth: of
+        points or vehicles (KITTI) and of road (SemanticKITTI). All scans of SemanticKITTI are used, although they are
+        of a test drive, because no other real scans have road labels.
+    camvid : folder of CamVid, for a network of a camera; then the other sets are not used.
+    split : drives of the KITTI object set (`edgeperc.datasets.splits.in_split`), or images of CamVid
         (`edgeperc.datasets.images.LabeledImages.files`).
-    n_scans : int or None
-        At most this many scans, or images, of each set, evenly spread; None takes all.
-    on_scan : callable
-        Called with the precision after each scan.
-
-    Returns
-    -------
-    precisions : dict
-        Precision -> its record (`edgeperc.ModelCard`, ``precisions``).
-
-    Raises
-    ------
-    ModelError
-        The files are not of one network, or none is in fp32.
-    PointsError
-        There are no labeled scans or images.
-    SplitError
-        The network was trained on one of the scans.
+    n_scans : at most this many scans, or images, of each set, evenly spread; None takes all.
+    on_scan : called with the precision after each scan.
+    Returns precisions: Precision -> its record (`edgeperc.ModelCard`, ``precisions``).
+    Raises ModelError, PointsError, SplitError.
     """
     variants = {variant.precision: variant for model in models for variant in resolve(model)}
     names = {f"{variant.name} {variant.card.version}" for variant in variants.values()}

@@ -11,8 +11,6 @@ import onnx
 from numpy.typing import NDArray
 from onnx import numpy_helper
 
-__all__ = ["equalize", "repeat_pixels"]
-
 # f(s x) = s f(x) for each channel and s > 0.
 HOMOGENEOUS = ("Add", "MaxPool", "Relu", "Resize")
 NEAREST = {b"mode": b"nearest", b"coordinate_transformation_mode": b"asymmetric", b"nearest_mode": b"floor"}
@@ -26,12 +24,9 @@ def equalize(model: onnx.ModelProto, sizes: Mapping[str, NDArray[np.float64]]) -
     (cross-layer equalization; Nagel et al., "Data-Free Quantization Through Weight Equalization and Bias Correction",
     2019, section 4.1, here with sizes of activations).
 
-    Parameters
-    ----------
-    model : onnx.ModelProto
-        With folded constants. Its weights are changed.
-    sizes : mapping of str to (C,) float64
-        Size of the values in each channel of a tensor, by the tensor's name; 0 if all are 0.
+    model : onnx.ModelProto; with folded constants. Its weights are changed.
+    sizes : mapping of str to (C,) float64; size of the values in each channel of a tensor, by the tensor's name; 0 if
+        all are 0.
     """
     weights = {each.name: each for each in model.graph.initializer}
     for tensors in _tied(model.graph):
@@ -87,10 +82,7 @@ def repeat_pixels(model: onnx.ModelProto) -> None:
     Where channels are last, as onnxruntime keeps int8, a row of pixels that are doubled is the row with its channels
     doubled, and rows that are doubled are a row of twice the width: 0.04 in place of 0.23 ms for each shipped network.
 
-    Parameters
-    ----------
-    model : onnx.ModelProto
-        Rounded. Its graph is changed.
+    model : onnx.ModelProto; rounded. Its graph is changed.
     """
     graph = model.graph
     shapes = {

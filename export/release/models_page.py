@@ -17,8 +17,6 @@ from edgeperc.zoo import DEFAULT, MAX_LOSS, Variant, digest, resolve
 
 from ..recipe import Recipe
 
-__all__ = ["models_page"]
-
 NO_AGREEMENT = "--no-agreement"
 
 TASKS = {

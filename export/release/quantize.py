@@ -56,8 +56,6 @@ from ..data.simulate import parity_images, parity_scans
 from .int8_graph import equalize, repeat_pixels
 from .to_onnx import pixel_labels, views, with_golden, write_card
 
-__all__ = ["RefusedError", "calibration_images", "calibration_scans", "quantize"]
-
 # Operators that onnxruntime's CPU provider computes in int8. It has no int8 kernel for ConvTranspose, Elu or Equal.
 ROUNDED_OPS = (
     *("Add", "Concat", "Conv", "DepthToSpace", "MaxPool", "Mul", "Relu", "Reshape", "Resize", "Sigmoid", "Transpose"),
@@ -92,28 +90,12 @@ def calibration_scans(
 ) -> tuple[list[NDArray[np.float32]], list[str]]:
     """Scans to calibrate on, and the hashes of the real ones.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Scans, or folders of ``.bin`` files.
-    kitti : Path or None
-        Root of a KITTI object set; 64 scans of its training drives are taken, evenly spread.
-    n_simulated : int
-        Number of simulated scans.
-
-    Returns
-    -------
-    scans : list of (n, 4) float32
-        The real scans first.
-    hashes : list of str
-        `edgeperc.datasets.kitti.scan_hash` of each real scan.
-
-    Raises
-    ------
-    SplitError
-        A scan is of a test or validation drive, according to its folders or the ``frames.csv`` above it.
-    PointsError
-        No scan was found.
+    paths : scans, or folders of ``.bin`` files.
+    kitti : root of a KITTI object set; 64 scans of its training drives are taken, evenly spread.
+    n_simulated : number of simulated scans.
+    Returns scans (list of (n, 4) float32): The real scans first.
+    Returns hashes: `edgeperc.datasets.kitti.scan_hash` of each real scan.
+    Raises SplitError, PointsError.
     """
     files = [file for path in paths for file in (sorted(path.rglob("*.bin")) if path.is_dir() else [path])]
     for file in files:
@@ -557,49 +539,22 @@ def quantize(
 
     ``precision="auto"`` takes the variant only after `edgeperc_export.release.agree` has measured it.
 
-    Parameters
-    ----------
-    path, out : Path
-        The model in fp32, and the .onnx to write.
-    scans : sequence of (n, 4) float32
-        To calibrate on, from `calibration_scans`; of a camera's model images (H, W, 3) uint8, from
-        `calibration_images`.
-    hashes : sequence of str
-        Hashes of the real scans. The card lists them, so that the model is never evaluated on these scans.
-    kitti : Path or None
-        Root of a KITTI object set. Both models are compared on its validation drives; the card's figures are of its
-        test drives.
-    semantickitti : Path or None
-        Root of SemanticKITTI; both models are evaluated on its roads.
-    camvid : Path or None
-        Folder of CamVid; both models are evaluated on its validation images.
-    exclude : sequence of str
-        Nodes to keep in fp32.
-    seven_bits : bool or None
-        Use 7-bit weights. x86 without VNNI needs them, because its sums of 8-bit products saturate; None: if this
-        computer needs them.
-    n_evaluated : int
-        Number of simulated scans, other than those of the calibration, on which both models are evaluated.
-    n_threads : int or None
-        For timing; None leaves it to onnxruntime.
-    max_noise : float
-        Largest noise of the outputs, as a share of their variance; above it, convolutions stay in fp32.
-    race : callable
-        Two paths and ``n_threads`` -> times of paired runs of both models [ms].
-
-    Returns
-    -------
-    ModelCard
-
-    Raises
-    ------
-    RefusedError
-        The int8 model is not faster (95 % interval of the ratio of times), or an IoU or F1 is lower by more than one
-        point with a 95 % interval of the loss above 0. ``out`` is unchanged.
-    ModelError
-        The model is not in fp32.
-    PointsError, OptionError
-        No scans, or an excluded node that the graph does not have.
+    path, out : the model in fp32, and the .onnx to write.
+    scans : sequence of (n, 4) float32; to calibrate on, from `calibration_scans`; of a camera's model images (H, W,
+        3) uint8, from `calibration_images`.
+    hashes : hashes of the real scans. The card lists them, so that the model is never evaluated on these scans.
+    kitti : root of a KITTI object set. Both models are compared on its validation drives; the card's figures are of
+        its test drives.
+    semantickitti : root of SemanticKITTI; both models are evaluated on its roads.
+    camvid : folder of CamVid; both models are evaluated on its validation images.
+    exclude : nodes to keep in fp32.
+    seven_bits : use 7-bit weights. x86 without VNNI needs them, because its sums of 8-bit products saturate; None: if
+        this computer needs them.
+    n_evaluated : number of simulated scans, other than those of the calibration, on which both models are evaluated.
+    n_threads : for timing; None leaves it to onnxruntime.
+    max_noise : largest noise of the outputs, as a share of their variance; above it, convolutions stay in fp32.
+    race : two paths and ``n_threads`` -> times of paired runs of both models [ms].
+    Raises RefusedError, ModelError, PointsError, OptionError.
     """
     if not scans:
         raise PointsError("no scan to calibrate on; expected at least one")

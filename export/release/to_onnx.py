@@ -39,18 +39,6 @@ from ..networks.ssadnet import SSADNet
 from ..recipe import Recipe
 from ..training.checkpoint import build_network, read_checkpoint
 
-__all__ = [
-    "ParityError",
-    "export",
-    "load",
-    "pixel_labels",
-    "to_graph",
-    "verify",
-    "views",
-    "with_golden",
-    "write_card",
-]
-
 OPSET = 18
 # In standard deviations of the output. Measured: 1e-4 for fp32 convolutions summed in another order, and 0.1 or more
 # for a wrong operator.
@@ -161,12 +149,7 @@ def write_card(model: onnx.ModelProto, card: ModelCard, path: Path) -> None:
     The graph may be of any network with a range image or a top view as input and outputs of the kinds of
     `edgeperc.types.card.OutputSpec`. It is changed in place: a card in it is replaced.
 
-    Raises
-    ------
-    CardError, CardMismatchError, ModelFileError
-        The card does not fit the graph, or onnxruntime cannot load it. ``path`` is unchanged.
-    ParityError
-        The card in the file differs from the one given. ``path`` is unchanged.
+    Raises CardError, CardMismatchError, ModelFileError, ParityError.
     """
     kept = [p for p in model.metadata_props if p.key != CARD_KEY]
     del model.metadata_props[:]
@@ -223,25 +206,14 @@ def pixel_labels(raw: NDArray[np.float32], kind: str) -> NDArray[np.uint8]:
 def verify(network: nn.Module, path: Path, scans: Sequence[NDArray[Any]]) -> dict[str, float]:
     """Compare an exported model with its torch network: raw outputs, and labels and boxes after post-processing.
 
-    Parameters
-    ----------
     network : nn.Module
-    path : Path
-        The .onnx.
-    scans : sequence of (n, 4) float32
-        x, y, z [m] in the sensor frame, remission in 0..1. Of a camera's model: images (H, W, 3) uint8.
-
-    Returns
-    -------
-    dict
-        ``n_scans``; ``max_deviation``: the 99.9 % quantile of the differences of raw outputs, in standard deviations of
-        the output; ``label_agreement``: the smallest share of pixels with the same label; ``box_deviation``: the
-        largest difference of a center's coordinate or a size [m].
-
-    Raises
-    ------
-    ParityError
-        A difference exceeds its limit, or the boxes differ in number or class.
+    path : the .onnx.
+    scans : sequence of (n, 4) float32; x, y, z [m] in the sensor frame, remission in 0..1. Of a camera's model:
+        images (H, W, 3) uint8.
+    Returns: ``n_scans``; ``max_deviation``: the 99.9 % quantile of the differences of raw outputs, in standard
+        deviations of the output; ``label_agreement``: the smallest share of pixels with the same label;
+        ``box_deviation``: the largest difference of a center's coordinate or a size [m].
+    Raises ParityError.
     """
     session = Session(path, "cpu")
     card = session.card
@@ -310,31 +282,13 @@ def export(
 ) -> ModelCard:
     """Export a checkpoint, verify the file, and write it with its card.
 
-    Parameters
-    ----------
-    checkpoint : Path
-    path : Path
-        The .onnx file to write.
-    scans : sequence of (n, 4) float32
-        Scans to verify on, as for `verify`.
-    fitness : FitnessProfile or None
-        Profile of the training scans, for the check of inputs at runtime; None for a camera's network.
-    name : str, optional
-        Name of the model; by default the network's.
-    version : str
-    metrics : mapping, optional
-        Figures to write into the card.
-    licence : str
-        License of weights trained on simulation alone; KITTI's applies to all others.
-
-    Returns
-    -------
-    ModelCard
-
-    Raises
-    ------
-    ParityError
-        The graph does not reproduce the network's outputs; ``path`` is unchanged.
+    path : the .onnx file to write.
+    scans : sequence of (n, 4) float32; scans to verify on, as for `verify`.
+    fitness : profile of the training scans, for the check of inputs at runtime; None for a camera's network.
+    name : name of the model; by default the network's.
+    metrics : figures to write into the card.
+    licence : license of weights trained on simulation alone; KITTI's applies to all others.
+    Raises ParityError.
     """
     network, recipe, notes = load(checkpoint)
     card = card_of(

@@ -19,34 +19,18 @@ from edgeperc.zoo import DEFAULT, model_path
 
 from . import triton_model
 
-__all__ = ["write_repository"]
-
 PIPELINE = "edgeperc"
 
 
 def write_repository(out: Path, models: Sequence[str | Path] = DEFAULT, *, sensor: str = "hdl-64e") -> list[Path]:
     """Write a model repository.
 
-    Parameters
-    ----------
-    out : Path
-        Folder for it. Models of the same names in it are replaced.
-    models : sequence of str or Path
-        Names or paths of models, one for each view; a name stands for its fp32 file, ``pointseg:int8`` for that one.
-    sensor : str
-        Name of the sensor of the scans, a built-in profile.
-
-    Returns
-    -------
-    list of Path
-        The folders of the models.
-
-    Raises
-    ------
-    ModelError
-        A model is of a camera, or its name is taken.
-    SensorError
-        The sensor is unknown.
+    out : folder for it. Models of the same names in it are replaced.
+    models : names or paths of models, one for each view; a name stands for its fp32 file, ``pointseg:int8`` for that
+        one.
+    sensor : name of the sensor of the scans, a built-in profile.
+    Returns: The folders of the models.
+    Raises ModelError, SensorError.
     """
     name = get_sensor(sensor).name
     files = [(ModelCard.read(path), path) for path in map(model_path, models)]

@@ -21,8 +21,6 @@ from edgeperc.errors import EdgepercError, InferenceError
 from edgeperc.inference.session import Session
 from edgeperc.records import scan_record
 
-__all__ = ["TritonPythonModel"]
-
 
 class TritonPythonModel:
     """Triton's interface of a Python model; it calls the methods in turn."""

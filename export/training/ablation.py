@@ -16,8 +16,6 @@ from typing import Any
 from ..recipe import MODELS, PAPER, Recipe
 from .train import train
 
-__all__ = ["PAPERS", "VARIANTS", "ablate", "plot"]
-
 VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "pointseg": {
         "as shipped": {},
@@ -82,31 +80,15 @@ def ablate(
 ) -> list[dict[str, Any]]:
     """Run variants and add their figures to ``out/ablation.json``; variants with figures there are not run again.
 
-    Parameters
-    ----------
-    network : str
-        ``"pointseg"``, ``"ssadnet"`` or ``"lodnn"``.
-    out : Path
-        Folder for the runs and ``ablation.json``.
-    kitti, simulated : Path
-        As for `edgeperc_export.training.train.train`.
-    start_from : Path or None
-        Checkpoint of the network's ``-sim`` model; None for ``"lodnn"``, which has none.
-    fold, steps : int
-        Fold to evaluate on; training steps of each run, for the shipped model's batch size.
-    variants : sequence of str
-        Names in `VARIANTS`, or `PAPERS`; by default all of them.
-    n_threads : int or None
-
-    Returns
-    -------
-    list of dict
-        ``network``, ``variant``, ``fold``, ``steps``, number of ``scans`` drawn, and ``figures`` at the end of the run.
-
-    Raises
-    ------
-    ValueError
-        The variant is unknown.
+    network : ``"pointseg"``, ``"ssadnet"`` or ``"lodnn"``.
+    out : folder for the runs and ``ablation.json``.
+    kitti, simulated : as for `edgeperc_export.training.train.train`.
+    start_from : checkpoint of the network's ``-sim`` model; None for ``"lodnn"``, which has none.
+    fold, steps : fold to evaluate on; training steps of each run, for the shipped model's batch size.
+    variants : names in `VARIANTS`, or `PAPERS`; by default all of them.
+    Returns: ``network``, ``variant``, ``fold``, ``steps``, number of ``scans`` drawn, and ``figures`` at the end of
+        the run.
+    Raises ValueError.
     """
     out.mkdir(parents=True, exist_ok=True)
     path = out / "ablation.json"
@@ -150,10 +132,7 @@ def ablate(
 def plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Draw the search for LoDNN's learning rate, number of scans and batch size, like the paper's Figure 16.
 
-    Raises
-    ------
-    ValueError
-        ``rows``, from `ablate`, has no run of LoDNN.
+    Raises ValueError.
     """
     from matplotlib.figure import Figure
 

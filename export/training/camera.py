@@ -18,8 +18,6 @@ from ..cards import card_of
 from ..recipe import Recipe
 from .losses import cross_entropy, lovasz_softmax
 
-__all__ = ["CLASS_SHARES", "Camera", "ImageOutputs", "class_weights", "upsampled"]
-
 ImageOutputs: TypeAlias = "Tensor | tuple[Tensor, ...]"
 """Logits (B, C, h, w), or in training a tuple of these and of early logits, at any resolutions."""
 

@@ -31,8 +31,6 @@ from .checkpoint import build_network, read_checkpoint
 from .images import camvid_samples, confusions, read_camvid
 from .train import train
 
-__all__ = ["ELEVEN", "FIGURES", "PAPER_ROWS", "ablate_camvid", "figures_of", "plot_camvid", "show_camvid", "table"]
-
 ELEVEN: Mapping[str, tuple[str, float]] = {
     "U-Net ReLU": ("unet", 0.0),
     "Small U-Net ReLU": ("unet-small", 0.0),
@@ -79,16 +77,9 @@ RESULTS, PREDICTIONS = "camvid.json", "camvid.npz"
 def figures_of(counts: NDArray[np.int64]) -> dict[str, float]:
     """Accuracy, mean IoU, F1 and Dice by the paper's equations 1 to 6.
 
-    Parameters
-    ----------
-    counts : (C, C) int64
-        Pixels; rows are the truth, columns the prediction.
-
-    Returns
-    -------
-    dict
-        ``miou``: mean of equation 1 over the classes. ``accuracy``: equation 2 over pixels, the share of right ones.
-        ``f1``: mean over the classes of equation 5, of the precision and recall of equations 3 and 4. ``dice``:
+    counts : (C, C) int64; pixels; rows are the truth, columns the prediction.
+    Returns: ``miou``: mean of equation 1 over the classes. ``accuracy``: equation 2 over pixels, the share of right
+        ones. ``f1``: mean over the classes of equation 5, of the precision and recall of equations 3 and 4. ``dice``:
         equation 6 with all classes' masks together. As each labeled pixel is in one mask of the truth and in one of
         the prediction, it equals the accuracy; averaged over the classes, it would equal the F1. Classes without true
         and predicted pixels are left out.
@@ -122,35 +113,17 @@ def ablate_camvid(
 ) -> list[dict[str, Any]]:
     """Train and evaluate the networks of `ELEVEN`; those with results in ``out/camvid.json`` are not trained again.
 
-    Parameters
-    ----------
-    camvid : Path
-        Folder of CamVid.
-    out : Path
-        Folder for ``camvid.json``, for ``camvid.npz`` (the labels of three validation images) and for the runs. A run
-        that was stopped is resumed; the checkpoint of a finished one is deleted.
-    networks : sequence of str
-        Names in `ELEVEN`; by default all.
-    width, height : int
-        Size that images are scaled to for training and inference. Labels are compared at their own size.
-    epochs, batch : int
-        The budget of each network: this many times all training images, in steps of ``batch`` images.
-    learning_rate : float, optional
-        By default the recipe's.
-    n_threads : int or None
-    compiled : bool
-        As for `edgeperc_export.training.train.train`.
-
-    Returns
-    -------
-    list of dict
-        For each network its name, ``budget``, `FIGURES`, ``miou_interval``, ``iou`` of each class, ``parameters``,
-        ``seconds`` and ``curve``.
-
-    Raises
-    ------
-    ValueError
-        A network is unknown, or ``out`` holds results of another budget.
+    camvid : folder of CamVid.
+    out : folder for ``camvid.json``, for ``camvid.npz`` (the labels of three validation images) and for the runs. A
+        run that was stopped is resumed; the checkpoint of a finished one is deleted.
+    networks : names in `ELEVEN`; by default all.
+    width, height : size that images are scaled to for training and inference. Labels are compared at their own size.
+    epochs, batch : the budget of each network: this many times all training images, in steps of ``batch`` images.
+    learning_rate : by default the recipe's.
+    compiled : as for `edgeperc_export.training.train.train`.
+    Returns: For each network its name, ``budget``, `FIGURES`, ``miou_interval``, ``iou`` of each class,
+        ``parameters``, ``seconds`` and ``curve``.
+    Raises ValueError.
     """
     if unknown := [name for name in networks if name not in ELEVEN]:
         raise ValueError(f"no network {unknown[0]!r}; expected one of: {'; '.join(ELEVEN)}")
@@ -251,10 +224,7 @@ def _color(name: str) -> str:
 def plot_camvid(rows: Sequence[Mapping[str, Any]], folder: Path) -> list[Path]:
     """Draw the figures of the networks beside the paper's, like its figures 7 to 11, and the curves, like 12 to 19.
 
-    Returns
-    -------
-    list of Path
-        ``figures.png`` and ``curves.png`` in the folder.
+    Returns: ``figures.png`` and ``curves.png`` in the folder.
     """
     from matplotlib.figure import Figure
 
@@ -304,14 +274,10 @@ def plot_camvid(rows: Sequence[Mapping[str, Any]], folder: Path) -> list[Path]:
 def show_camvid(predictions: Path, path: Path, camvid: Path | None = None) -> None:
     """Draw three validation images under all networks, like the paper's table 5.
 
-    Parameters
-    ----------
-    predictions : Path
-        The ``camvid.npz`` of `ablate_camvid`.
-    path : Path
-        Picture to write.
-    camvid : Path, optional
-        Folder of CamVid: the images and their true labels come first. Without it, the picture shows nothing of CamVid.
+    predictions : the ``camvid.npz`` of `ablate_camvid`.
+    path : picture to write.
+    camvid : folder of CamVid: the images and their true labels come first. Without it, the picture shows nothing of
+        CamVid.
     """
     from matplotlib.figure import Figure
 

@@ -16,8 +16,6 @@ from edgeperc.errors import ModelError
 from ..networks import build
 from ..recipe import Recipe
 
-__all__ = ["CheckpointError", "build_network", "read_checkpoint"]
-
 MAX_WIDTH = 4096
 _TEXTS = {"before": list, "curve": list, "frames": dict}  # entries that are JSON
 
@@ -29,24 +27,11 @@ class CheckpointError(ModelError):
 def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str, Any]:
     """Read a checkpoint. Only tensors and plain values are unpickled.
 
-    Parameters
-    ----------
-    path : Path
-    device : str or torch.device
-        Where its tensors go.
-
-    Returns
-    -------
-    dict
-        ``recipe`` (a Recipe), ``before`` and ``curve`` (lists), ``frames`` (dict), ``n_simulated`` and ``step`` (int),
-        ``averaged`` and ``best`` (weights by name; None if there was no best step), ``network`` and ``optimizer``.
-
-    Raises
-    ------
-    CheckpointError
-        The file is damaged or something else.
-    OSError
-        It cannot be read.
+    device : str or torch.device; where its tensors go.
+    Returns: ``recipe`` (a Recipe), ``before`` and ``curve`` (lists), ``frames`` (dict), ``n_simulated`` and ``step``
+        (int), ``averaged`` and ``best`` (weights by name; None if there was no best step), ``network`` and
+        ``optimizer``.
+    Raises CheckpointError, OSError.
     """
     try:
         state = torch.load(path, weights_only=True, map_location=device)
@@ -66,10 +51,7 @@ def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str,
 def build_network(state: Mapping[str, Any], path: Path) -> nn.Module:
     """The averaged network of a checkpoint, of its best step.
 
-    Raises
-    ------
-    CheckpointError
-        Its weights do not fit the network of its recipe.
+    Raises CheckpointError.
     """
     try:
         network = build(state["recipe"])

@@ -6,23 +6,13 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["curve_table"]
-
 
 def curve_table(run: Path, n_lines: int = 12) -> Iterator[str]:
     """Lines of a table: samples seen, loss, and each validation figure in percent, and what the last quarter brought.
 
-    Parameters
-    ----------
-    run : Path
-        Folder with the ``log.jsonl`` of `edgeperc_export.training.train.train`.
-    n_lines : int
-        At most this many rows; each is the mean of neighboring lines of the log.
-
-    Raises
-    ------
-    ValueError
-        The folder has no log, or it has no line.
+    run : folder with the ``log.jsonl`` of `edgeperc_export.training.train.train`.
+    n_lines : at most this many rows; each is the mean of neighboring lines of the log.
+    Raises ValueError.
     """
     path = run / "log.jsonl"
     rows = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []

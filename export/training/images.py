@@ -27,8 +27,6 @@ from edgeperc.types.card import InputSpec
 from .camera import Camera, upsampled
 from .losses import cross_entropy
 
-__all__ = ["ImageSamples", "ImageWatch", "LabeledImages", "augmented_images", "confusions", "normalized", "read_camvid"]
-
 # Bounds of the random scale, of the change of the aspect, and of the factors of brightness, contrast and saturation.
 SCALES = (0.7, 2.0)
 ASPECT = 1.1
@@ -74,18 +72,8 @@ class ImageSet(NamedTuple):
 def read_camvid(root: Path, split: str) -> ImageSet:
     """Read CamVid's images and labels, once.
 
-    Parameters
-    ----------
-    root : Path
-        As for `edgeperc.datasets.images.LabeledImages`.
-    split : {"train", "validation"}
-
-    Raises
-    ------
-    ImageError
-        There is no image, one or its labels cannot be read, their sizes differ, or the classes are not CamVid's eleven.
-    MissingExtraError
-        Pillow is not installed.
+    root : as for `edgeperc.datasets.images.LabeledImages`.
+    Raises ImageError, MissingExtraError.
     """
     data = LabeledImages(root)
     if data.classes != CAMERA_CLASSES:
@@ -116,18 +104,11 @@ def _scaling(spec: InputSpec, device: torch.device) -> tuple[Tensor, Tensor]:
 def augmented_images(images: Tensor, labels: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     """Scale, crop, mirror and recolor each image of a batch at random, on its device.
 
-    Parameters
-    ----------
     images : (B, 3, H, W) uint8
     labels : (B, H, W) uint8
     rng : numpy.random.Generator
-
-    Returns
-    -------
-    images : (B, 3, H, W) float32
-        In 0..255. What lies outside an image scaled down is gray.
-    labels : (B, H, W) uint8
-        `IGNORE` outside an image scaled down.
+    Returns images ((B, 3, H, W) float32): In 0..255. What lies outside an image scaled down is gray.
+    Returns labels ((B, H, W) uint8): `IGNORE` outside an image scaled down.
     """
     n = len(images)
     smallest, largest = np.log(SCALES)
@@ -205,24 +186,12 @@ def confusions(
 ) -> tuple[NDArray[np.int64], float, Tensor]:
     """Compare a network's labels with the truth.
 
-    Parameters
-    ----------
-    network : nn.Module
-        In inference mode.
-    images : ImageSet
-        At the size of the network's input, on its device.
-    truth : (n, H, W) uint8
-        At the size at which labels are compared; logits are interpolated to it.
-    spec : InputSpec
-
-    Returns
-    -------
-    counts : (n, C, C) int64
-        Of each image; rows are the truth, columns the prediction.
-    loss : float
-        Mean cross-entropy of the images, without weights.
-    labels : (n, H, W) uint8
-        Predicted, on the device.
+    network : nn.Module; in inference mode.
+    images : at the size of the network's input, on its device.
+    truth : (n, H, W) uint8; at the size at which labels are compared; logits are interpolated to it.
+    Returns counts ((n, C, C) int64): Of each image; rows are the truth, columns the prediction.
+    Returns loss: Mean cross-entropy of the images, without weights.
+    Returns labels ((n, H, W) uint8): Predicted, on the device.
     """
     counts, losses, predicted = [], [], []
     for first in range(0, len(images.hashes), VALIDATION_BATCH):
@@ -245,13 +214,8 @@ def confusions(
 class ImageWatch:
     """Validates a network on images that are not in its training set.
 
-    Parameters
-    ----------
-    task : Camera
-    images : ImageSet
-        At the size of the task's view.
-    truth : (n, H, W) uint8
-        Labels at the images' own size.
+    images : at the size of the task's view.
+    truth : (n, H, W) uint8; labels at the images' own size.
     """
 
     def __init__(self, task: Camera, images: ImageSet, truth: Tensor) -> None:
@@ -270,13 +234,8 @@ class ImageWatch:
 def camvid_samples(task: Camera, root: Path, device: torch.device) -> tuple[ImageSamples, ImageWatch]:
     """The training samples and the validation of a camera's task.
 
-    Parameters
-    ----------
-    task : Camera
-    root : Path
-        As for `read_camvid`.
-    device : torch.device
-        Where all images go.
+    root : as for `read_camvid`.
+    device : torch.device; where all images go.
     """
     size = (task.view.width, task.view.height)
     train, validation = (read_camvid(root, split).to(device) for split in ("train", "validation"))

@@ -10,21 +10,6 @@ from edgeperc.simulation.samples import IGNORE
 
 from ..data.targets import REGRESSED_FROM
 
-__all__ = [
-    "FRONT_WEIGHT",
-    "GEOMETRY_WEIGHTS",
-    "box_distillation_loss",
-    "cross_entropy",
-    "dense_loss",
-    "distillation_loss",
-    "lovasz_softmax",
-    "paper_slots_loss",
-    "pointseg_loss",
-    "road_loss",
-    "slots_loss",
-    "ssadnet_loss",
-]
-
 # Offsets, log sizes and the doubled angle have errors of similar size in an untrained head. z and height count half,
 # because no metric uses them.
 GEOMETRY_WEIGHTS = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.5, 0.5)
@@ -39,15 +24,10 @@ def cross_entropy(
 ) -> Tensor:
     """Cross-entropy averaged over the labeled pixels (SSADNet equation 4, where all pixels are labeled).
 
-    Parameters
-    ----------
     logits : (B, C, H, W) float
-    labels : (B, H, W) integer
-        `IGNORE` in unlabeled pixels. Without a labeled pixel the loss is 0.
-    class_weights : (C,) float, optional
-        Weights of the average, by true class.
-    focal_gamma : float
-        Scale each pixel by (1 - probability of its true class) ** focal_gamma.
+    labels : (B, H, W) integer; `IGNORE` in unlabeled pixels. Without a labeled pixel the loss is 0.
+    class_weights : (C,) float; weights of the average, by true class.
+    focal_gamma : scale each pixel by (1 - probability of its true class) ** focal_gamma.
     """
     log_p = F.log_softmax(logits.float(), dim=1)
     labels = labels.long()
@@ -237,28 +217,15 @@ def ssadnet_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """lw_seg x segmentation + lw_det x detection (SSADNet equation 3).
 
-    Parameters
-    ----------
-    logits, boxes : Tensor
-        Outputs of the network.
-    labels : (B, H, W) integer
-        As for `cross_entropy`.
-    box_targets : Tensor
-        (B, n_slots, 5) from `slot_targets`, (B, n_slots, 4) from `paper_slot_targets`, or (B, 11, H/4, W/4) from
-        `dense_targets`.
-    lw_seg, lw_det : float
-        Weights of the two losses (Table 2).
-    class_weights : (C,) float, optional
-        Not in the paper.
-    lovasz_weight : float
-        Weight of `lovasz_softmax` in the segmentation's loss. Not in the paper.
-
-    Returns
-    -------
-    total : Tensor
-    parts : dict
-        Detached losses: "seg", and "det" (the paper's slots), "presence" and "geometry" (slots) or "heat" and
-        "geometry" (dense).
+    logits, boxes : outputs of the network.
+    labels : (B, H, W) integer; as for `cross_entropy`.
+    box_targets : (B, n_slots, 5) from `slot_targets`, (B, n_slots, 4) from `paper_slot_targets`, or (B, 11, H/4, W/4)
+        from `dense_targets`.
+    lw_seg, lw_det : weights of the two losses (Table 2).
+    class_weights : (C,) float; not in the paper.
+    lovasz_weight : weight of `lovasz_softmax` in the segmentation's loss. Not in the paper.
+    Returns parts: Detached losses: "seg", and "det" (the paper's slots), "presence" and "geometry" (slots) or "heat"
+        and "geometry" (dense).
     """
     seg = cross_entropy(logits, labels, class_weights)
     if lovasz_weight > 0.0:

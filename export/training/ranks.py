@@ -20,8 +20,6 @@ from torch import Tensor, nn
 
 from edgeperc.errors import EdgepercError
 
-__all__ = ["RankError", "Ranks"]
-
 Value = TypeVar("Value")
 
 
@@ -54,10 +52,7 @@ class Ranks:
     def together(self) -> Iterator[None]:
         """Connect the ranks: by NCCL on GPUs, by gloo on CPUs.
 
-        Raises
-        ------
-        RankError
-            Another rank stopped.
+        Raises RankError.
         """
         if self.world == 1:
             yield

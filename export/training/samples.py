@@ -31,8 +31,6 @@ from .ranks import Ranks
 from .task import Targets, task_of
 from .teacher import OnnxTeacher
 
-__all__ = ["RealScans", "Recent", "Samples", "loaded", "real_scans"]
-
 # Scans whose objects are cut out for pasting; each holds about five.
 BANK_SCANS = 400
 # How often an object of a class of one's own is pasted; those of `Task.paste_odds` have a sum of 1.
@@ -131,12 +129,8 @@ class Samples:
     def redraw(self, network: nn.Module, step: int) -> None:
         """Let a network label some of the scans, and draw those with many false objects more often (`odds`).
 
-        Parameters
-        ----------
-        network : nn.Module
-            In inference mode.
-        step : int
-            Together with the recipe's seed it decides which scans are labeled.
+        network : nn.Module; in inference mode.
+        step : together with the recipe's seed it decides which scans are labeled.
         """
         rng = np.random.default_rng((self.recipe.seed, step, 1))
         device = next(network.parameters()).device
@@ -239,10 +233,7 @@ def loaded(
 class Recent:
     """The newest samples.
 
-    Parameters
-    ----------
-    size : int
-        At most this many samples are kept, rounded up to whole batches.
+    size : at most this many samples are kept, rounded up to whole batches.
     """
 
     def __init__(self, size: int) -> None:
@@ -297,22 +288,10 @@ def real_scans(
 ) -> tuple[list[LabeledScan], list[float], dict[str, str]]:
     """Read labeled scans of KITTI.
 
-    Parameters
-    ----------
-    kitti : KittiObjects
-    names : sequence of str
-    drawn : bool
-        Replace the ground truth by the hand-drawn road where a scan has one.
-    classes : sequence of str
-        Classes of points, the background first; empty: edgeperc's.
-
-    Returns
-    -------
-    scans : list of LabeledScan
-    weights : list of float
-        How often to draw each scan, relative to the others.
-    hashes : dict of str to str
-        Name of each scan -> its `edgeperc.datasets.kitti.scan_hash`.
+    drawn : replace the ground truth by the hand-drawn road where a scan has one.
+    classes : classes of points, the background first; empty: edgeperc's.
+    Returns weights: How often to draw each scan, relative to the others.
+    Returns hashes (dict of str to str): Name of each scan -> its `edgeperc.datasets.kitti.scan_hash`.
     """
     scans: list[LabeledScan] = []
     weights: list[float] = []

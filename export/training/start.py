@@ -24,37 +24,19 @@ from ..cards import card_of
 from ..recipe import Recipe
 from .checkpoint import read_checkpoint
 
-__all__ = ["folded_weights", "start"]
-
 
 def start(
     network: nn.Module, recipe: Recipe, path: Path, images: Sequence[Tensor]
 ) -> tuple[list[dict[str, Any]], dict[str, str]]:
     """Copy the weights that a checkpoint or an exported model shares with the network.
 
-    Parameters
-    ----------
-    network : nn.Module
-        The network of ``recipe``; changed.
-    recipe : Recipe
-    path : Path
-        A checkpoint.pt, or a model.onnx in fp32 made by ``edgeperc-export export``.
-    images : sequence of (B, C, H, W) float32
-        Inputs to compute the statistics of batch norm from; used for an .onnx only.
-
-    Returns
-    -------
-    before : list of dict
-        The recipes of the earlier training runs, in order.
-    frames : dict of str to str
-        Name of each real scan that they were trained on -> its hash.
-
-    Raises
-    ------
-    ValueError
-        No weight fits, or an input channel is scaled otherwise.
-    CheckpointError, ModelError
-        The file is damaged or something else.
+    network : nn.Module; the network of ``recipe``; changed.
+    path : a checkpoint.pt, or a model.onnx in fp32 made by ``edgeperc-export export``.
+    images : sequence of (B, C, H, W) float32; inputs to compute the statistics of batch norm from; used for an .onnx
+        only.
+    Returns before: The recipes of the earlier training runs, in order.
+    Returns frames (dict of str to str): Name of each real scan that they were trained on -> its hash.
+    Raises ValueError, CheckpointError, ModelError.
     """
     own_card = card_of(recipe, version="0")
     if path.suffix == ".onnx":

@@ -31,8 +31,6 @@ from ..data.targets import dense_targets, paper_slot_targets, slot_targets
 from ..recipe import Recipe
 from .losses import box_distillation_loss, distillation_loss, pointseg_loss, road_loss, ssadnet_loss
 
-__all__ = ["Outputs", "Points", "Road", "Tally", "Targets", "Task", "Vehicles", "task_of"]
-
 Outputs: TypeAlias = "Tensor | tuple[Tensor, Tensor]"
 """What a network returns: logits (B, C, H, W), or logits and boxes, or PointSeg's logits and early logits."""
 Targets: TypeAlias = "tuple[NDArray[Any], ...]"

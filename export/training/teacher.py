@@ -27,8 +27,6 @@ from ..data.scan_sets import seen_by_network
 from ..data.scans import SURFACE, LabeledScan, mirrored, turned
 from .task import Task
 
-__all__ = ["OnnxTeacher", "pseudo_labeled", "teach", "unlabeled_scans"]
-
 SURE = 0.9
 """Smallest probability of a pseudo-label."""
 
@@ -52,16 +50,10 @@ def pseudo_labeled(
 ) -> list[LabeledScan]:
     """The scans, labeled by a network on all sides.
 
-    Parameters
-    ----------
-    network : nn.Module
-        A network that labels points.
-    task : Task
-        The network's task.
-    scans : iterable of LabeledScan
-        Their own labels are kept.
-    sure : float
-        An unlabeled point gets the network's label if its probability is at least this.
+    network : nn.Module; a network that labels points.
+    task : the network's task.
+    scans : their own labels are kept.
+    sure : an unlabeled point gets the network's label if its probability is at least this.
     """
     projector = make_projector(task.view, task.input)
     network.eval()
@@ -83,17 +75,9 @@ def pseudo_labeled(
 class OnnxTeacher:
     """An exported network as the teacher: it answers for each sample, in the process that makes the sample.
 
-    Parameters
-    ----------
-    path : Path
-        The .onnx file. Its own channels are projected from the same scan as the input of the network to train.
-    task : Task
-        That of the network to train.
-
-    Raises
-    ------
-    ValueError
-        The teacher has another view, or other classes.
+    path : the .onnx file. Its own channels are projected from the same scan as the input of the network to train.
+    task : that of the network to train.
+    Raises ValueError.
     """
 
     def __init__(self, path: Path, task: Task) -> None:

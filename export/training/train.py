@@ -41,8 +41,6 @@ from .task import Task, task_of
 from .teacher import OnnxTeacher, pseudo_labeled, teach, unlabeled_scans
 from .watch import Watch
 
-__all__ = ["train"]
-
 WARM_UP_STEPS = 100
 
 # Of a drive with more frames than this, every sixth is enough to validate on, because neighboring frames look alike.
@@ -75,57 +73,31 @@ def train(
     Under ``torchrun`` the processes share each batch (`training.ranks`): the samples are the same, and the
     weights equal those of one process up to rounding. The first process writes the files; all read the checkpoint.
 
-    Parameters
-    ----------
-    recipe : Recipe
-    out : Path
-        Folder for ``checkpoint.pt`` and ``log.jsonl``. A checkpoint of the same recipe in it is resumed.
-    kitti : Path or None
-        Folder of a KITTI object set. Frames of test drives are not used; validation drives are for the curve only. With
-        a ``simulated_share`` of 1, all training drives are for validation only.
-    simulated : Path or None
-        Folder of scans written by ``edgeperc-export simulate``.
-    camvid : Path or None
-        Folder of CamVid, for a camera's networks: they are trained on its training images, and the curve is of its
-        validation images.
-    scan_sets : sequence of ScanFolder
-        More real scans, of any sensor; their drives for training are trained on, those for validation are watched.
-    given : RealScans, optional
-        Real scans in place of those of ``kitti``.
-    fold : int, optional
-        Fold of the training drives to validate on instead of training on it. Every ``checkpoint_every`` steps the
+    out : folder for ``checkpoint.pt`` and ``log.jsonl``. A checkpoint of the same recipe in it is resumed.
+    kitti : folder of a KITTI object set. Frames of test drives are not used; validation drives are for the curve
+        only. With a ``simulated_share`` of 1, all training drives are for validation only.
+    simulated : folder of scans written by ``edgeperc-export simulate``.
+    camvid : folder of CamVid, for a camera's networks: they are trained on its training images, and the curve is of
+        its validation images.
+    scan_sets : more real scans, of any sensor; their drives for training are trained on, those for validation are
+        watched.
+    given : real scans in place of those of ``kitti``.
+    fold : fold of the training drives to validate on instead of training on it. Every ``checkpoint_every`` steps the
         averaged network is evaluated on it, and the best weights are kept (early stopping).
-    start_from : Path or None
-        A checkpoint or an exported model (.onnx) whose weights a new run starts from. Weights that the networks do not
-        share are ignored.
-    teacher : Path or None
-        A checkpoint or an exported model (.onnx) of the network to distil from. If the recipe does not distil: a
-        checkpoint of a network that labels the unlabeled points of real scans.
-    n_threads : int or None
-        Number of CPU threads; None leaves it to torch.
-    n_workers : int
-        Number of processes that make the samples; 0: this one makes them between the steps. Each has one thread.
-    compiled : bool
-        Use `torch.compile`, which takes a minute and a C++ compiler; PointSeg then trains a third faster.
-    checkpoint_every : int
-        Steps between checkpoints, and between points of the curve; an epoch if the recipe has a ``stop_after``.
-    save_every_s : float
-        Seconds between checkpoints, at least; the last one is always written. Large networks take seconds to write.
-
-    Returns
-    -------
-    Path
-        The checkpoint.
-
-    Raises
-    ------
-    ValueError
-        There are no scans or images, the checkpoint is of another recipe, or the teacher is missing, unsuitable or
-        unused.
-    FloatingPointError
-        The loss is not finite.
-    RankError
-        Another process of ``torchrun`` stopped, or the processes cannot share a batch.
+    start_from : a checkpoint or an exported model (.onnx) whose weights a new run starts from. Weights that the
+        networks do not share are ignored.
+    teacher : a checkpoint or an exported model (.onnx) of the network to distil from. If the recipe does not distil:
+        a checkpoint of a network that labels the unlabeled points of real scans.
+    n_threads : number of CPU threads; None leaves it to torch.
+    n_workers : number of processes that make the samples; 0: this one makes them between the steps. Each has one
+        thread.
+    compiled : use `torch.compile`, which takes a minute and a C++ compiler; PointSeg then trains a third faster.
+    checkpoint_every : steps between checkpoints, and between points of the curve; an epoch if the recipe has a
+        ``stop_after``.
+    save_every_s : seconds between checkpoints, at least; the last one is always written. Large networks take seconds
+        to write.
+    Returns: The checkpoint.
+    Raises ValueError, FloatingPointError, RankError.
     """
     ranks = Ranks()
     ranks.check(recipe.batch, recipe.accumulate, compiled)

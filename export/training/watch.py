@@ -12,18 +12,12 @@ from ..data.scan_sets import seen_by_network
 from ..data.scans import LabeledScan
 from .samples import Samples
 
-__all__ = ["Watch"]
-
 
 class Watch:
     """Validates a network on scans that are not in its training set.
 
-    Parameters
-    ----------
-    samples : Samples
-        Makes the inputs and targets.
-    scans : sequence of LabeledScan
-        Scans to validate on.
+    samples : makes the inputs and targets.
+    scans : scans to validate on.
     """
 
     def __init__(self, samples: Samples, scans: Sequence[LabeledScan]) -> None:

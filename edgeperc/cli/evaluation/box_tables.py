@@ -7,8 +7,6 @@ from typing import Any
 
 from ..output import FEW, table_lines
 
-__all__ = ["box_table_lines", "interval_columns"]
-
 CAPPED = " (R40 capped)"
 """Beside rows with fewer objects than recall positions: KITTI's tool then leaves positions empty."""
 

@@ -7,8 +7,6 @@ import argparse
 from ..arguments import Commands, add_command, add_figures_file
 from ..output import many, print_line, progress, table_lines, write_figures
 
-__all__ = ["add_parser", "eval_painting_command"]
-
 # Places of the camera in the LiDAR's frame: as on KITTI's car, and behind a windscreen below a LiDAR on the roof.
 _PLACES = {"0.3 m": (0.27, 0.0, -0.08), "0.9 m": (0.5, 0.5, -0.6)}
 _COLUMNS = (

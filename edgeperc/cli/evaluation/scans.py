@@ -25,8 +25,6 @@ from ..output import FEW, many, print_line, progress, table_lines, write_figures
 from ..ray import add_engine
 from .box_tables import box_table_lines, interval_columns
 
-__all__ = ["add_parser", "eval_command"]
-
 
 def add_parser(commands: Commands) -> None:
     """Add ``eval``."""

@@ -8,8 +8,6 @@ from ..arguments import Commands, add_command, add_figures_file, add_provider
 from ..output import FEW, many, print_line, progress, table_lines, write_figures
 from .box_tables import box_table_lines
 
-__all__ = ["add_parser", "eval_sensors_command"]
-
 
 def add_parser(commands: Commands) -> None:
     """Add ``eval-sensors``."""

@@ -26,8 +26,6 @@ from ..run import make_perceiver
 if TYPE_CHECKING:
     from ...types.perception import Box
 
-__all__ = ["add_parser", "eval_tracking_command"]
-
 
 def add_parser(commands: Commands) -> None:
     """Add ``eval-tracking``."""
