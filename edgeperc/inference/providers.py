@@ -33,6 +33,7 @@ SHARING = ("cpu", "openvino")
 
 
 def load_onnxruntime() -> Any:
+    """The module onnxruntime, which sends and prints nothing. Raises MissingExtraError."""
     without_telemetry()
     ort = require("onnxruntime", "cpu", "Running a model")
     ort.set_default_logger_severity(4)  # its exceptions contain the messages, and ours repeat them
@@ -40,6 +41,7 @@ def load_onnxruntime() -> Any:
 
 
 def version(package: str) -> str:
+    """Version of an installed package."""
     return importlib.metadata.version(package.replace("_", "-"))
 
 

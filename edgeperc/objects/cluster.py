@@ -201,6 +201,7 @@ def labels_of_groups(
     min_share: float,
     part_of: Mapping[int, int],
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """`cluster_labels` of points that are sorted by `group_points`."""
     classes = np.empty(len(starts) - 1, np.uint8)
     shares = np.empty(len(starts) - 1)
     parts = np.array([*part_of.items()], np.int64).reshape(-1, 2)

@@ -24,11 +24,13 @@ def check(field: str, value: float, low: float, high: float) -> None:
 
 
 def check_each(field: str, values: Iterable[float], low: float, high: float) -> None:
+    """`check` for each number of a list."""
     for index, value in enumerate(values):
         check(f"{field}[{index}]", value, low, high)
 
 
 def check_size(rows: int, columns: int) -> None:
+    """Refuse a view of more rows, columns or pixels than are possible."""
     if not (1 <= rows <= MAX_ROWS and 1 <= columns <= MAX_COLUMNS and rows * columns <= MAX_PIXELS):
         raise CardError(
             f"the view has {reprlib.repr(rows)} rows and {reprlib.repr(columns)} columns; expected 1 to {MAX_ROWS} "

@@ -26,7 +26,8 @@ from dataclasses import replace
 from pathlib import Path
 import torch
 from edgeperc.types.views import TopViewGeometry
-from edgeperc_export import cards, ranks
+from edgeperc_export import cards
+from edgeperc_export.training import ranks
 from edgeperc_export.recipe import Recipe
 from edgeperc_export.training.train import train
 

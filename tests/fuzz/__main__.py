@@ -16,7 +16,8 @@ from pathlib import Path
 # One thread in each library: the jobs share the processors.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the tests' helpers
+TESTS = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(TESTS), str(TESTS / "readers")]  # the tests' helpers
 
 from edgeperc.system.atomic import write_atomic
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import twins.projection
 from edgeperc.errors import CardError, PointsError
 from edgeperc.ground.planes import find_ground
-from edgeperc.inference import network_input, projection
+from edgeperc.inference import projection
 from edgeperc.inference.projection import column_edges, make_projector, row_edges, tabulate
 from edgeperc.types.card import CHANNELS, InputSpec
 from edgeperc.types.sensor import get_sensor
@@ -339,16 +339,16 @@ def test_a_scan_is_projected_with_its_ground(n):
     points[::9, 2] += 1.2
     points[3::50] = math.nan
     projector = make_projector(VIEWS["front"], spec_of(VIEWS["front"]))
-    seen = network_input.project(projector, points)
+    seen = projection.project(projector, points)
     height_m = find_ground(points, mount_height_m=1.73).height_m
     assert_same(
         seen, twins.projection.project(points, VIEWS["front"], edges_of("front"), spec_of(VIEWS["front"]), height_m)
     )
     assert n < 4000 or abs(np.nanmedian(height_m)) < 0.05
     plain = make_projector(VIEWS["top view"], spec_of(VIEWS["top view"]))
-    assert network_input.input_heights(plain, points) is None
+    assert projection.input_heights(plain, points) is None
     assert_same(
-        network_input.project(plain, points), [getattr(plain.project(points), k) for k in ("image", "index", "pixel")]
+        projection.project(plain, points), [getattr(plain.project(points), k) for k in ("image", "index", "pixel")]
     )
 
 

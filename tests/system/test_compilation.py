@@ -186,7 +186,8 @@ def test_kernels_that_are_needed_exist_and_are_missing_from_an_empty_cache(
 COUNT = """
 import json, sys
 from numba.core import event
-from edgeperc import Perceiver, compilation, perceiver, warm_up
+from edgeperc import Perceiver, perceiver, warm_up
+from edgeperc.system import compilation
 
 warm_up.usable_cores = lambda: 1
 names, needed = set(), []
