@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import twins.painting
+import twins.returns
 from edgeperc import (
     Calibration,
     CalibrationError,
@@ -38,6 +39,7 @@ from edgeperc.simulation.camera import CAMERA_CLASSES, VOID, CameraImage, forwar
 from edgeperc.simulation.drawn import random_scene
 from edgeperc.simulation.scene import SimulatedScan, simulate
 from edgeperc.types.mounting import MODEL_MOUNTING
+from edgeperc.types.sensor import get_sensor
 from edgeperc.types.views import TopViewGeometry
 from edgeperc.view import draw_painted
 from edgeperc.view.colors import color_of, rgb
@@ -204,11 +206,15 @@ def test_any_points_are_painted_or_unseen(seed: int, n: int, columns: int) -> No
     u, v, depth = NEAR.project(points)
     with np.errstate(invalid="ignore"):
         inside = (depth > 0) & (u >= -0.5) & (u < NEAR.width - 0.5) & (v >= -0.5) & (v < NEAR.height - 0.5)
+    scan = np.zeros((n, 4), np.float32)
+    scan[:, :3] = points[:, :3]
+    kept, _ = twins.returns.returns(scan, get_sensor("vlp-16").min_range_m)  # what is nearer is not a return
+    inside &= np.isfinite(kept).all(axis=1)
     assert (painted[~inside] == UNSEEN).all()
     took = painted != UNSEEN
     row, col = np.floor(v[took] + 0.5).astype(int), np.floor(u[took] + 0.5).astype(int)
     np.testing.assert_array_equal(painted[took], labels[row, col])
-    assert took.any() or not inside.any()  # the nearest point in the image is seen
+    assert took.any() == inside.any()  # the nearest point in the image is seen
     road = camera_road(labels == ROAD, points, NEAR, sensor="vlp-16")
     assert not (road.labels.astype(bool) & ~road.observed).any()
 
