@@ -262,6 +262,14 @@ def test_only_tools_import_the_wings(name: str) -> None:
         assert not {unit_of(other) for other in own_imports(name)} & WINGS
 
 
+@pytest.mark.parametrize("name", sorted(modules()))
+def test_private_names_stay_in_their_module(name: str) -> None:
+    for node in ast.walk(ast.parse(modules()[name].read_text("utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.level or str(node.module).startswith("edgeperc")):
+            private = [alias.name for alias in node.names if alias.name.startswith("_") and alias.name[1] != "_"]
+            assert not private, f"{name} imports {private} of {node.module}"
+
+
 def test_the_listing_explains_the_system() -> None:
     """At most eight modules lie directly in the package; all others are in packages that name the data flow."""
     flat = [name for name in RUNTIME if name.count(".") == 1 and modules()[name].parent.name == "edgeperc"]

@@ -146,7 +146,7 @@ class ScanLayout:
             if missing := [column for column in BOX_COLUMNS if columns.count(column) != 1]:
                 raise PointsError(f"box_columns is {columns}; expected {', '.join(missing)} once each")
         if "point_names" in given:
-            own["point_names"] = _point_names(given["point_names"], "point_names")
+            own["point_names"] = point_names_of(given["point_names"], "point_names")
         if "labeled_deg" in given:
             low, high = own["labeled_deg"] = _pair(given, "labeled_deg")
             if not -360.0 <= low < high <= 360.0 or high - low > 360.0:
@@ -208,12 +208,13 @@ def read_layout(layout: str | Path) -> ScanLayout:
         raise PointsError(f"{path}: {exc}") from exc
 
 
-def _point_class_names(layout: ScanLayout) -> tuple[str, ...]:
+def point_class_names(layout: ScanLayout) -> tuple[str, ...]:
     """Classes of points by number, ``ignore`` first."""
     return (IGNORED, *sorted(set(layout.points.values()) - {IGNORED}))
 
 
-def _class_of(name: str, classes: Mapping[str, str], path: Path, kind: str) -> str:
+def class_of_name(name: str, classes: Mapping[str, str], path: Path, kind: str) -> str:
+    """The class that a description gives to a name in a label file."""
     key = name.lower()
     if key not in classes and ANY not in classes:
         raise PointsError(
@@ -276,7 +277,8 @@ def _splits(given: object) -> Mapping[str, tuple[str, ...]]:
     return MappingProxyType(splits)
 
 
-def _point_names(given: object, source: str) -> Mapping[int, str]:
+def point_names_of(given: object, source: str) -> Mapping[int, str]:
+    """Names of points by number, checked."""
     valid = isinstance(given, dict) and all(
         isinstance(name, str) and re.fullmatch(r"[0-9]{1,5}", str(number)) and int(number) <= 0xFFFF
         for number, name in given.items()

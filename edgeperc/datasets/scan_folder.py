@@ -45,11 +45,11 @@ from .layout import (
     IGNORED,
     SUFFIXES,
     ScanLayout,
-    _class_of,
-    _point_class_names,
-    _point_names,
     class_number,
+    class_of_name,
     known_layouts,
+    point_class_names,
+    point_names_of,
     read_layout,
 )
 
@@ -97,7 +97,7 @@ class ScanFrame:
     @cached_property
     def class_names(self) -> tuple[str, ...]:
         """Classes of `point_classes`."""
-        return _point_class_names(self.layout)
+        return point_class_names(self.layout)
 
     @cached_property
     def returns(self) -> tuple[int, ...]:
@@ -242,7 +242,7 @@ class ScanFolder:
             rows = read_labels(path)
             found, unlabeled = label_objects(rows, calibration)
             boxes = self._renamed(found, path)
-            kinds = [k if k == "dontcare" else _class_of(k, self.layout.boxes, path, "boxes") for k in rows.kinds]
+            kinds = [k if k == "dontcare" else class_of_name(k, self.layout.boxes, path, "boxes") for k in rows.kinds]
             image_labels = KittiLabels(tuple(kinds), rows.numbers)
         elif path is not None:
             boxes = self._renamed(self._read_boxes(path, name), path)
@@ -342,7 +342,7 @@ class ScanFolder:
 
     def _renamed(self, boxes: Sequence[Box], path: Path) -> tuple[Box, ...]:
         """Boxes with the classes of the description; boxes of background are left out."""
-        renamed = (replace(box, label=_class_of(box.label, self.layout.boxes, path, "boxes")) for box in boxes)
+        renamed = (replace(box, label=class_of_name(box.label, self.layout.boxes, path, "boxes")) for box in boxes)
         return tuple(box for box in renamed if box.label != BACKGROUND)
 
     def _read_classes(self, path: Path, n_points: int) -> NDArray[np.uint8]:
@@ -378,12 +378,12 @@ class ScanFolder:
                 raise PointsError(
                     f"{source} cannot be read ({exc}); expected names by number, or point_names in the description"
                 ) from exc
-            names = _point_names(document, str(source))
-        classes = _point_class_names(self.layout)
+            names = point_names_of(document, str(source))
+        classes = point_class_names(self.layout)
         numbers = np.full(max(names, default=0) + 1, IGNORE, np.uint8)
         numbers[0] = classes.index(IGNORED)  # 0 is unlabeled, unless it has a name
         for number, name in names.items():
-            numbers[number] = classes.index(_class_of(name, self.layout.points, source, "points"))
+            numbers[number] = classes.index(class_of_name(name, self.layout.points, source, "points"))
         return numbers
 
 
@@ -420,6 +420,3 @@ def _read_polygons(path: Path) -> tuple[NDArray[np.float64], ...]:
                 f"{path}: a polygon of shape {ring.shape}; expected three corners [x, y] or [x, y, z] or more, finite"
             )
     return tuple(polygons)
-
-
-# --- entries of a description -----------------------------------------------------------------------------------------

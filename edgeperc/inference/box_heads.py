@@ -117,7 +117,7 @@ def _cell_values(
     class_output: NDArray[np.float32], class_kind: str, geometry: TopViewGeometry, classes: Sequence[str], model: str
 ) -> NDArray[np.float32]:
     """The values of all classes in all cells of a view, (classes, height, width) float32."""
-    values = _class_values(class_output, class_kind, model)
+    values = class_values(class_output, class_kind, model)
     expected = (len(classes), geometry.height, geometry.width)
     if values.shape != expected:
         raise CardMismatchError(
@@ -325,7 +325,8 @@ def _facing(
     return np.where(logits >= 0.0, yaws, opposite), 1.0 / (1.0 + np.exp(-np.abs(logits)))
 
 
-def _class_values(output: NDArray[np.float32], kind: str, model: str) -> NDArray[np.float32]:
+def class_values(output: NDArray[np.float32], kind: str, model: str) -> NDArray[np.float32]:
+    """The class output of a network as (classes, H, W), checked."""
     if kind not in ("class_logits", "class_probabilities"):
         raise CardMismatchError(f"{model}: got kind {kind!r}; expected class_logits or class_probabilities")
     values = output[0] if output.ndim == 4 and output.shape[0] == 1 else output
@@ -337,10 +338,11 @@ def _class_values(output: NDArray[np.float32], kind: str, model: str) -> NDArray
 def _check_finite(values: NDArray[np.float32], kind: str, model: str) -> None:
     n_bad = count_not_finite(values.reshape(-1))
     if n_bad:
-        _raise_not_finite(n_bad, values.size, kind, model)
+        raise_not_finite(n_bad, values.size, kind, model)
 
 
-def _raise_not_finite(n_bad: int, n: int, kind: str, model: str) -> None:
+def raise_not_finite(n_bad: int, n: int, kind: str, model: str) -> None:
+    """Raise `InferenceError` for an output with values that are not finite."""
     raise InferenceError(
         f"{model}: {n_bad} of {n} values of {kind} are not finite; expected numbers. "
         "Check the scan's units, or run the model with provider='cpu' and precision='fp32'"

@@ -17,12 +17,12 @@ from ..types.points import read_only
 from ..types.views import TopViewGeometry
 from .box_heads import (
     MAX_PROBABILITY,
-    _class_values,
-    _raise_not_finite,
+    class_values,
     decode_dense,
     decode_scored_slots,
     decode_slots,
     fill_scores,
+    raise_not_finite,
 )
 
 
@@ -34,11 +34,11 @@ def decode_labels(output: NDArray[np.float32], kind: str, *, model: str = "the m
     Returns (H, W) uint8: The lower class on ties.
     Raises InferenceError, CardMismatchError.
     """
-    values = _class_values(output, kind, model)
+    values = class_values(output, kind, model)
     labels = np.empty(values.shape[1:], np.uint8)
     n_bad, lowest, highest = fill_labels(values, labels)
     if n_bad:
-        _raise_not_finite(n_bad, values.size, kind, model)
+        raise_not_finite(n_bad, values.size, kind, model)
     if kind == "class_probabilities" and labels.size and not (lowest >= 0.0 and highest <= MAX_PROBABILITY):
         raise InferenceError(
             f"{model}: probabilities of classes are {lowest:g} to {highest:g}; expected 0 to 1. "
@@ -58,7 +58,7 @@ def decode_classes(
     Raises InferenceError, CardMismatchError.
     """
     labels = decode_labels(output, kind, model=model)
-    values = _class_values(output, kind, model)
+    values = class_values(output, kind, model)
     scores = values.max(axis=0)
     if kind == "class_logits":
         fill_scores(values, scores)
