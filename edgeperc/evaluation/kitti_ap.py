@@ -93,7 +93,7 @@ def image_size_of(drive: str) -> tuple[int, int]:
 def count_in_image(truth: FrontTruth, boxes: Sequence[Box], drive: str) -> ApTable:
     """Count the matches of one scan as KITTI's benchmark does.
 
-    truth : dontCare rectangles have no 3-D boxes, so no detection is excused by them from above and in 3-D.
+    truth : DontCare rectangles have no 3-D boxes, so no detection is excused by them from above and in 3-D.
     boxes : detections in the sensor frame. Those that the image does not show are left out, as in a submission. The
         rectangle of a detection is its projection, clipped to the image.
     """
@@ -221,7 +221,7 @@ def count_matches(
     Objects choose in their order: in the first pass the detection with the best score, in the second, among those
     that reach the threshold, the one with the largest overlap, and one that is not small before one that is.
 
-    overlaps : (n, m) float64; ioU of each detection with each object.
+    overlaps : (n, m) float64; IoU of each detection with each object.
     scores : sequence of float, n
     least_iou : a match has a larger IoU.
     objects : sequence of ObjectKey, m

@@ -138,6 +138,3 @@ def rendered_at(x: float, kind: int, coefficients: NDArray[np.float64]) -> float
     else:
         value = a + b * math.log1p(max(x, 0.0)) if kind == 2 else a + (b + c * x) * x
     return min(max(value, 0.0), 1.0)
-
-
-# --- interpolation ---------------------------------------------------------------------------------------------------

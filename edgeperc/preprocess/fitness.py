@@ -370,6 +370,7 @@ class FitnessProfile:
         return cls(**values)
 
 
+MEASURED = tuple(field.name for field in fields(FitnessProfile) if field.name not in ("n_scans", "azimuth_deg"))
 # Of the entries in a card. A median distance of 0 is impossible, and would be divided by.
 _BOUNDS = {
     "azimuth_deg": (-180.0, 180.0),
@@ -402,6 +403,3 @@ def _range(name: str, value: Any) -> Range:
             f"{most:g}, the {'left edge' if name == 'azimuth_deg' else 'lower'} first"
         )
     return first, second
-
-
-MEASURED = tuple(field.name for field in fields(FitnessProfile) if field.name not in ("n_scans", "azimuth_deg"))

@@ -14,8 +14,6 @@ from ..errors import PointsError, SensorError
 from ..types.sensor import REMISSION_KINDS, RemissionFunction, SensorProfile
 from .returns import returns
 
-# --- remission -------------------------------------------------------------------------------------------------------
-
 # Strata in which remissions of similar streets are compared: by range [m], then by the cosine of the incidence. The
 # last one is for points that are not on a surface (leaves, single beams). Quantiles are at the middles of equal shares.
 RANGE_EDGES_M = (3.0, 10.0, 25.0, 60.0)

@@ -53,7 +53,7 @@ def point_times(
     fields : mapping of str to (n,) array; columns by `edgeperc.types.points.plain_name`.
     points : (n, 4) float32; times of points without a return, which are not finite or lie in the origin, do not show
         the unit.
-    stamp_s : none counts from 0.
+    stamp_s : None counts from 0.
     Returns (n,) float64 or None: [s]; None without such a field, or if no unit gives a duration of 2 ms to 2 s, as
         where all times are 0.
     """

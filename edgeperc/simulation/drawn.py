@@ -20,9 +20,17 @@ ENVIRONMENTS = ("urban", "residential", "junction", "rural", "highway")
 def random_scene(seed: int, environment: str | None = None) -> Scene:
     """Make a random street.
 
-    seed : the same seed gives the same scene.
-    environment : one of `ENVIRONMENTS`; random by default.
-    Raises PointsError.
+    Parameters
+    ----------
+    seed : int
+        The same seed gives the same scene.
+    environment : str, optional
+        One of `ENVIRONMENTS`; random by default.
+
+    Raises
+    ------
+    PointsError
+        ``environment`` is not one of `ENVIRONMENTS`.
     """
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 104729))
     place = str(rng.choice(ENVIRONMENTS, p=[0.32, 0.28, 0.2, 0.12, 0.08])) if environment is None else environment

@@ -22,12 +22,21 @@ _ROW_GAP_M = 9.0  # between the centers of two parked cars
 def scene_from_boxes(boxes: Sequence[Box], seed: int, *, mount_height_m: float = 1.73) -> Scene:
     """Make a street around a real layout of boxes.
 
-    boxes : in a sensor frame with its origin ``mount_height_m`` above the road. Boxes with labels other than KITTI's
-        are left out.
-    seed : seed of everything else: road edges, roadside, and objects outside the labeled view.
-    mount_height_m : height of the sensor above the road [m].
-    Returns: Its first objects are the ``boxes``, in order. They stand on the ground of the scene, so z differs
-        slightly from the boxes.
+    Parameters
+    ----------
+    boxes : sequence of Box
+        In a sensor frame with its origin ``mount_height_m`` above the road. Boxes with labels other than KITTI's are
+        left out.
+    seed : int
+        Seed of everything else: road edges, roadside, and objects outside the labeled view.
+    mount_height_m : float
+        Height of the sensor above the road [m].
+
+    Returns
+    -------
+    Scene
+        Its first objects are the ``boxes``, in order. They stand on the ground of the scene, so z
+        differs slightly from the boxes.
     """
     rng = np.random.default_rng((int(seed) & 0x7FFFFFFFFFFFFFFF, 15485863))
     vehicles = [box for box in boxes if box.label in _VEHICLES]

@@ -146,8 +146,15 @@ class SimulatedScan:
     def top_view_labels(self, geometry: TopViewGeometry | None = None) -> NDArray[np.uint8]:
         """True class of each cell of a top view, including hidden cells.
 
-        Returns (rows, columns) uint8: Index into `TOP_VIEW_CLASSES` at the center of the cell: the footprint of the
-            nearest vehicle, else the road surface. Below trams and ``"misc"`` objects is background.
+        Parameters
+        ----------
+        geometry : TopViewGeometry, optional
+
+        Returns
+        -------
+        (rows, columns) uint8
+            Index into `TOP_VIEW_CLASSES` at the center of the cell: the footprint of the nearest vehicle, else the road
+            surface. Below trams and ``"misc"`` objects is background.
         """
         view = TopViewGeometry() if geometry is None else geometry
         x, y = view.cell_centers()

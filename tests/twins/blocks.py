@@ -1,4 +1,4 @@
-"""Slow twin of `edgeperc.inference.blocks`."""
+"""Slow twin of `edgeperc.inference.decode.fill_pixels`."""
 
 from __future__ import annotations
 
