@@ -19,7 +19,8 @@ from typing import Any, Literal
 
 from .. import __version__
 from ..errors import EdgepercError, MissingExtraError
-from .arguments import DEFAULT, Commands, add_command
+from ..types.choices import DEFAULT_MODELS
+from .arguments import Commands, add_command
 from .output import many, one_line, print_columns, print_line
 
 # Extras for work on edgeperc itself, and the builds of onnxruntime, of which one at a time can be installed.
@@ -245,7 +246,7 @@ def _caches() -> Iterator[Finding]:
             again = "every start compiles again; set EDGEPERC_CACHE_DIR to a folder that only you can write"
             yield Finding(name, "note", f"{part}: {held}, {reason}", again)
     try:
-        measured = [read_setting(settings_path(), fingerprint(), digest(resolve(model))) for model in DEFAULT]
+        measured = [read_setting(settings_path(), fingerprint(), digest(resolve(model))) for model in DEFAULT_MODELS]
     except SettingsError as exc:
         yield Finding("settings", "note", one_line(exc))
         return
@@ -294,7 +295,7 @@ def _models() -> Iterator[Finding]:
         else:
             checked = "as in MODELS.md" if listed else "not compared"
             yield Finding(f"model {path.name}", "ok", f"{card.name} {card.version}, SHA-256 {sha256[:16]}... {checked}")
-    for name in DEFAULT:
+    for name in DEFAULT_MODELS:
         if name not in found:
             yield Finding(f"model {name}", "broken", "missing", _REINSTALL)
     yield from _runs(found)
@@ -304,7 +305,7 @@ def _runs(found: set[str]) -> Iterator[Finding]:
     """Whether the default models open and answer their golden inputs, with the provider that is chosen here."""
     from ..inference.session import Session
 
-    for name in DEFAULT:
+    for name in DEFAULT_MODELS:
         if name in found:
             try:
                 yield Finding(f"runs {name}", "ok", Session(name).description)

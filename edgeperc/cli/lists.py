@@ -10,7 +10,8 @@ from dataclasses import fields
 from typing import Any
 
 from ..errors import SettingsError
-from .arguments import DEFAULT_SENSOR, Commands, add_command
+from ..types.choices import DEFAULT_SENSOR
+from .arguments import Commands, add_command
 from .output import print_columns, print_line
 
 

@@ -15,10 +15,8 @@ from ..errors import EdgepercError, ImageError, ModelError, PointsError
 from ..records import PerceivedScan, Sink
 from ..system.extras import require
 from ..system.remote import Remote, location
+from ..types.choices import CAMERA, DEFAULT_MODELS, DEFAULT_SENSOR
 from .arguments import (
-    CAMERA,
-    DEFAULT,
-    DEFAULT_SENSOR,
     Commands,
     add_adapt,
     add_command,
@@ -201,7 +199,7 @@ def make_perceiver(
     from ..perceiver import Perceiver
 
     return Perceiver(
-        arguments.model or DEFAULT,
+        arguments.model or DEFAULT_MODELS,
         sensor=sensor,
         provider=arguments.provider,
         precision=arguments.precision,
@@ -330,7 +328,7 @@ def _images(arguments: argparse.Namespace, kinds: Sequence[str]) -> dict[Path, P
         arguments.usage_error(f"--{of_scans[0]} is of scans; add --scan, or leave it out")
     require("PIL.Image", "camera", "Reading an image", package="pillow")
     if arguments.model is None:
-        arguments.model = [*DEFAULT, CAMERA] if scans else [CAMERA]
+        arguments.model = [*DEFAULT_MODELS, CAMERA] if scans else [CAMERA]
     return {image: scans[k] if scans else None for k, image in enumerate(images)}
 
 

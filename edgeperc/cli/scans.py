@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import EdgepercError, ImageError
 from ..system.remote import Remote
-from .arguments import DEFAULT_SENSOR
+from ..types.choices import DEFAULT_SENSOR
 
 if TYPE_CHECKING:
     from ..readers.identify import KnownSensor

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import reprlib
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,20 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CardError
+from ..system.fields import Fields
 
 MAX_ROWS, MAX_COLUMNS, MAX_PIXELS = 4096, 65_536, 16 * 10**6
 MIN_SECTOR_DEG = 1.0
 
 
-def check(field: str, value: float, low: float, high: float) -> None:
-    """Refuse a number of the card that is out of its bounds, or not finite."""
-    if not low <= value <= high:
-        raise CardError(f"{field} is {reprlib.repr(value)}; expected a number from {low:g} to {high:g}")
-
-
-def check_each(field: str, values: Iterable[float], low: float, high: float) -> None:
-    for index, value in enumerate(values):
-        check(f"{field}[{index}]", value, low, high)
+_FIELDS = Fields("the card", CardError)
 
 
 def check_size(rows: int, columns: int) -> None:
@@ -55,11 +47,10 @@ class TopViewGeometry:
 
     def __post_init__(self) -> None:
         for name in ("x_range_m", "y_range_m", "z_range_m"):
-            low, high = getattr(self, name)
-            check_each(f"view.{name}", (low, high), -1e4, 1e4)
+            low, high = _FIELDS.pair(f"view.{name}", getattr(self, name), -1e4, 1e4)
             if not high - low >= 1e-3:
                 raise CardError(f"view.{name} is {(low, high)}; expected two finite numbers, the lower first")
-        check("view.cell_m", self.cell_m, 1e-3, 100.0)
+        _FIELDS.number("view.cell_m", self.cell_m, 1e-3, 100.0)
         check_size(self.height, self.width)
 
     @property

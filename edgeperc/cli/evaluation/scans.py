@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ...system.extras import require
+from ...types.choices import CAMERA, DEFAULT_MODELS, RULES
 from ..arguments import (
-    CAMERA,
-    DEFAULT,
-    RULES,
     Commands,
     add_agreement,
     add_boxes_from,
@@ -127,7 +125,7 @@ def eval_command(arguments: argparse.Namespace) -> int:
     with progress() as show:
         figures, mistakes = evaluate(
             arguments.datasets,
-            arguments.model or DEFAULT,
+            arguments.model or DEFAULT_MODELS,
             split=arguments.split,
             fold=arguments.fold,
             road_by=arguments.road_by,
