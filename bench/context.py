@@ -16,7 +16,7 @@ from typing import Any
 
 from edgeperc import __version__
 from edgeperc.system.extras import require
-from edgeperc.system.machine import cpu_model
+from edgeperc.system.machine import board, cpu_model, cpu_quota, has_hypervisor, read_text
 
 PACKAGES = (
     *("numpy", "numba", "onnxruntime", "onnxruntime-gpu", "onnxruntime-ep-openvino", "onnxruntime-ep-nv-tensorrt-rtx"),
@@ -37,15 +37,8 @@ def _psutil() -> Any:
     return require("psutil", "bench", "Measuring")
 
 
-def _read(path: Path) -> str | None:
-    try:
-        return path.read_text(errors="replace").strip()
-    except OSError:
-        return None
-
-
 def _number(path: Path) -> int | None:
-    text = _read(path)
+    text = read_text(path)
     return int(text) if text is not None and text.lstrip("-").isdigit() else None
 
 
@@ -53,14 +46,13 @@ def machine() -> dict[str, Any]:
     """The hardware and how it is set up."""
     psutil = _psutil()
     affinity = psutil.Process().cpu_affinity() if hasattr(psutil.Process, "cpu_affinity") else None
-    governors = {text for path in CPU.glob("cpu[0-9]*/cpufreq/scaling_governor") if (text := _read(path))}
+    governors = {text for path in CPU.glob("cpu[0-9]*/cpufreq/scaling_governor") if (text := read_text(path))}
     no_turbo, boost = _number(CPU / "intel_pstate/no_turbo"), _number(CPU / "cpufreq/boost")
-    quota = _read(Path("/sys/fs/cgroup/cpu.max"))
-    board = _read(Path("/sys/firmware/devicetree/base/model"))
+    quota, model = cpu_quota(), board()
     frequency = psutil.cpu_freq()
     return {
         "cpu": cpu_model(),
-        "board": board.rstrip("\0") if board else None,
+        "board": model.rstrip("\0") if model else None,
         "architecture": platform.machine(),
         "cores": psutil.cpu_count(logical=False),
         "logical_cores": psutil.cpu_count(),
@@ -71,15 +63,9 @@ def machine() -> dict[str, Any]:
         "cpu_quota": None if quota is None or quota.startswith("max") else quota,
         "memory_mb": round(psutil.virtual_memory().total / 1e6),
         "swap_mb": round(psutil.swap_memory().total / 1e6),
-        "hypervisor": _has_hypervisor(),
+        "hypervisor": has_hypervisor(),
         "energy_rails": sorted(EnergyMeter().rails) or None,
     }
-
-
-def _has_hypervisor() -> bool | None:
-    text = _read(Path("/proc/cpuinfo"))
-    # Only x86 shows it.
-    return None if text is None or "flags" not in text else " hypervisor" in text
 
 
 def software() -> dict[str, Any]:
@@ -108,7 +94,7 @@ def conditions() -> dict[str, Any]:
     sensors = psutil.sensors_temperatures() if hasattr(psutil, "sensors_temperatures") else {}
     found = [each for group in sensors.values() for each in group if each.current]
     throttles = [_number(path) for path in CPU.glob("cpu[0-9]*/thermal_throttle/*_throttle_count")]
-    quota = dict(line.split() for line in (_read(Path("/sys/fs/cgroup/cpu.stat")) or "").splitlines())
+    quota = dict(line.split() for line in (read_text(Path("/sys/fs/cgroup/cpu.stat")) or "").splitlines())
     times = psutil.cpu_times()
     battery = psutil.sensors_battery() if hasattr(psutil, "sensors_battery") else None
     # Time of guests is part of user and nice.
@@ -208,7 +194,7 @@ def rss_mb() -> float:
 def peak_rss_mb() -> float | None:
     """Largest resident memory of this process so far [MB]."""
     # After fork and exec, getrusage starts from the parent's value.
-    for line in (_read(Path("/proc/self/status")) or "").splitlines():
+    for line in (read_text(Path("/proc/self/status")) or "").splitlines():
         if line.startswith("VmHWM:"):
             return int(line.split()[1]) * 1.024e-3
     memory = _psutil().Process().memory_info()
@@ -244,16 +230,16 @@ class EnergyMeter:
         for domain in sorted(root.glob("class/powercap/intel-rapl:*")):
             if _number(domain / "energy_uj") is not None:  # often readable by root only
                 span = _number(domain / "max_energy_range_uj") or 2**32
-                self._counters[f"{_read(domain / 'name')} ({domain.name})"] = domain / "energy_uj", span + 1
+                self._counters[f"{read_text(domain / 'name')} ({domain.name})"] = domain / "energy_uj", span + 1
         self._powers: dict[str, tuple[Path, Path]] = {}
         for label in sorted(root.glob("class/hwmon/hwmon*/in*_label")):
             number = label.name[2:].removesuffix("_label")
             volts, amperes = (label.with_name(f"{kind}{number}_input") for kind in ("in", "curr"))
-            if (_read(label.parent / "name") or "").startswith("ina") and None not in (
+            if (read_text(label.parent / "name") or "").startswith("ina") and None not in (
                 _number(volts),
                 _number(amperes),
             ):
-                self._powers[f"{_read(label)} ({label.parent.name})"] = volts, amperes
+                self._powers[f"{read_text(label)} ({label.parent.name})"] = volts, amperes
         self.rails = (*self._counters, *self._powers)
         self.joules = dict.fromkeys(self.rails, 0.0)
         self._last_s = time.perf_counter()

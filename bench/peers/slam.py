@@ -388,7 +388,7 @@ def main() -> None:
     arguments = parser.parse_args()
     require("kiss_icp", "slam", "The comparison with KISS-ICP", package="kiss-icp")
     if arguments.picture and arguments.root is not None:
-        parser.error("--picture is of a drawn street; leave ROOT out")
+        parser.error("--picture shows a drawn street; leave ROOT out")
     perceive = Perceiver(sensor="hdl-64e", full_turn=True)
     drives = (
         drawn_streets(arguments.scans or 60, arguments.drive)

@@ -64,7 +64,7 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
 def check_engine(arguments: argparse.Namespace, sinks: Sequence[str]) -> None:
     """Check for options that do not go with ``--engine ray`` or with URLs."""
     if arguments.workers is not None and arguments.engine != "ray":
-        arguments.usage_error("--workers is of --engine ray; add it")
+        arguments.usage_error("--workers needs --engine ray")
     in_order = [name for name in ("live", "track", "gif", "scan") if getattr(arguments, name)]
     in_order = [f"--{name.replace('_', '-')}" for name in (*in_order, *sinks)]
     if arguments.engine == "ray" and in_order:
@@ -72,13 +72,15 @@ def check_engine(arguments: argparse.Namespace, sinks: Sequence[str]) -> None:
             f"{in_order[0]} needs the scans in their order, and --engine ray perceives them side by side; leave out one"
         )
     if arguments.engine == "ray" and arguments.deskew:
-        arguments.usage_error("--deskew works with --engine local, not with ray; leave out one")
+        arguments.usage_error("--deskew needs --engine local")
     local = [name for name in in_order if name in ("--live", "--gif", "--labels-for")]
     urls = [path for path in (*arguments.paths, arguments.out) if isinstance(path, Remote)]
     if urls and local:
         arguments.usage_error(f"{local[0]} takes no URL such as {urls[0]}; copy the files to this computer")
     if arguments.engine == "ray" and any(url.url.startswith("memory:") for url in urls):
-        arguments.usage_error("memory:// is of one process, and --engine ray has several; pass another URL or a path")
+        arguments.usage_error(
+            "memory:// belongs to one process, and --engine ray has several; pass another URL or a path"
+        )
 
 
 def perceive_on_ray(

@@ -174,12 +174,12 @@ def _open_graph(arguments: argparse.Namespace) -> Graph:
         from ..ros2.rclpy_graph import RclpyGraph
 
         if arguments.connect is not None:
-            arguments.usage_error("--connect is of Zenoh; leave it out, or leave out --rclpy")
+            arguments.usage_error("--connect needs Zenoh; leave it out, or leave out --rclpy")
         return RclpyGraph(arguments.name, ros_args=arguments.ros_args, **names)
     from ..ros2.zenoh_graph import ZenohGraph
 
     if arguments.ros_args:
-        arguments.usage_error("--ros-args is read by rclpy; add --rclpy, or pass the options of this command")
+        arguments.usage_error("--ros-args needs --rclpy; add it, or pass the options of this command")
     return ZenohGraph(arguments.name, connect=arguments.connect, **names)
 
 

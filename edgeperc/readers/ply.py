@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import PointsError
 from ..types.points import plain_name
-from .tables import Columns, column, cut_short, parse_table, whole_number
+from .tables import Columns, column, cut_short, header_lines, parse_table, whole_number
 
 _PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -33,17 +33,10 @@ class _PlyElement:
 def _parse_ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
     encoding = ""
     elements: list[_PlyElement] = []
-    at = 0
-    while True:
-        end = head.find(b"\n", at)
-        if end < 0:
-            raise PointsError("the PLY header has no end_header line; the file is cut short or not a PLY file")
-        tokens = head[at:end].decode("latin-1").split()
-        at = end + 1
+    lines, n_bytes = header_lines(head, "end_header", "PLY")
+    for tokens in lines:
         try:
             match tokens:
-                case ["end_header"]:
-                    break
                 case ["format", kind, *_]:
                     encoding = kind
                 case ["element", name, count]:
@@ -56,13 +49,13 @@ def _parse_ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
                     elements[-1].properties.append((name, _PLY_TYPES[kind], _PLY_TYPES[length_type]))
                 case ["property", kind, name]:
                     elements[-1].properties.append((name, _PLY_TYPES[kind], ""))
-                case ["ply"] | [] | ["comment" | "obj_info", *_]:
+                case ["ply" | "end_header"] | [] | ["comment" | "obj_info", *_]:
                     pass
                 case _:
                     raise ValueError("an unknown line")
         except (ValueError, KeyError, IndexError) as exc:
             raise PointsError(f"the PLY header line {' '.join(tokens)[:80]!r} cannot be read ({exc})") from exc
-    return encoding, elements, at
+    return encoding, elements, n_bytes
 
 
 def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None) -> Columns:

@@ -49,6 +49,22 @@ def column(data: NDArray[np.uint8], kind: str, n: int, offset: int, stride: int)
     return column
 
 
+def header_lines(head: bytes, last: str, kind: str) -> tuple[list[list[str]], int]:
+    """Words of each line of a header that ends with the line ``last``, and its length in bytes.
+
+    Raises PointsError.
+    """
+    lines: list[list[str]] = []
+    start = 0
+    while not lines or lines[-1][:1] != [last]:
+        end = head.find(b"\n", start)
+        if end < 0:
+            raise PointsError(f"the {kind} header has no {last} line; the file is cut short or not a {kind} file")
+        lines.append(head[start:end].decode("latin-1").split())
+        start = end + 1
+    return lines, start
+
+
 def whole_number(text: str) -> int:
     """Parse an integer of a header; ValueError if it does not fit 64 bits."""
     value = int(text)

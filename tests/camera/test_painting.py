@@ -415,7 +415,7 @@ def test_run_draws_an_image_and_its_scan(tmp_path: Path, capsys: pytest.CaptureF
     for wrong in ([*both, *options], [both[0], "--calib", str(calib), "--png", "--out", str(out)], both[2:]):
         with pytest.raises(SystemExit):
             cli.main(["run", *wrong])
-    assert "--calib is for the picture of images and their scans" in capsys.readouterr().err
+    assert "--calib needs images with --scan and --png" in capsys.readouterr().err
     calib.write_text("P2: 1 2 3\n")
     assert cli.main(["run", *both, *options, "--png", "--out", str(out)]) == 2
     assert "holds no KITTI calibration" in capsys.readouterr().err

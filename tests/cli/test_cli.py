@@ -550,7 +550,7 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: t
         (("--live", "--ply", "--out", tmp_path / "out"), "--live writes no files; leave out --ply"),
         ((scan, "--live"), f"--live replays one path, got 2: {scan}, {scan}"),
         (("--deskew",), "--deskew needs --poses FILE or --track"),
-        (("--poses", scan), "--poses is of --deskew"),
+        (("--poses", scan), "--poses needs --deskew"),
         (("--deskew", "--track", "--live"), "and no --live"),
     ]:
         assert usage_code("run", scan, *arguments) == 2

@@ -163,8 +163,8 @@ def test_the_table_of_images(tmp_path: Path, model: Path, capsys: pytest.Capture
     assert document["images"]["classes"]["Road"]["iou"] == 0.5
     for arguments, said in (
         ((root, "simulation:1"), "different figures"),
-        ((root, "--fold", "0"), "--fold is for scans"),
-        ((root, "--worst", tmp_path / "w.png"), "--worst is for scans"),
+        ((root, "--fold", "0"), "--fold needs scans"),
+        ((root, "--worst", tmp_path / "w.png"), "--worst needs scans"),
         ((root, "--model", model, "--model", model), "got 2 models"),
     ):
         with pytest.raises(SystemExit, match="2"):

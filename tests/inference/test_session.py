@@ -187,7 +187,7 @@ def test_every_provider_is_available_or_refused() -> None:
 
 @pytest.mark.parametrize("name", ["gpu", "CPUExecutionProvider", ""])
 def test_unknown_providers_are_refused(name: str) -> None:
-    with pytest.raises(ProviderError, match="is unknown.*; expected auto or one of"):
+    with pytest.raises(ProviderError, match=r"is unknown.*; expected auto or one of"):
         Session(model_path("pointseg"), name)
 
 

@@ -417,7 +417,7 @@ def test_parameters_take_the_place_of_options(bus: Bus, capsys: pytest.CaptureFi
     ("arguments", "said"),
     [
         (["--ros-args", "-r", "a:=b"], "add --rclpy"),
-        (["--rclpy", "--connect", "tcp/localhost:1"], "--connect is of Zenoh"),
+        (["--rclpy", "--connect", "tcp/localhost:1"], "--connect needs Zenoh"),
     ],
 )
 def test_options_that_exclude_one_another(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -117,16 +117,16 @@ def test_documents_of_another_schema(text: str, message: str) -> None:
 
 @pytest.mark.parametrize("value", [None, True, "1", b"1", [1], math.nan, math.inf, 10**400, 2.5])
 def test_numbers_out_of_their_bounds(value: object) -> None:
-    with pytest.raises(ValueError, match="v is .*; expected a number from 0 to 2$"):
+    with pytest.raises(ValueError, match=r"v is .*; expected a number from 0 to 2$"):
         READ.number("v", value, 0, 2)
-    with pytest.raises(ValueError, match="v is .*; expected a whole number from 0 to 2$"):
+    with pytest.raises(ValueError, match=r"v is .*; expected a whole number from 0 to 2$"):
         READ.whole("v", value, 0, 2)
     assert READ.number("v", 2, 0, 2) == 2.0
 
 
 @pytest.mark.parametrize("values", [None, 3, "12", {"a": 1}, [1], [1, 2, 3]])
 def test_lists_of_another_length(values: object) -> None:
-    with pytest.raises(ValueError, match="v is .*; expected a list of 2 numbers"):
+    with pytest.raises(ValueError, match=r"v is .*; expected a list of 2 numbers"):
         READ.pair("v", values)
     with pytest.raises(ValueError, match="expected a list of numbers"):
         READ.numbers("v", [])

@@ -156,11 +156,11 @@ def _eval_images(arguments: argparse.Namespace, roots: Sequence[Path]) -> int:
     if len(roots) < len(arguments.datasets):
         arguments.usage_error("labeled images and labeled scans have different figures; evaluate them one by one")
     if arguments.engine == "ray":
-        arguments.usage_error("--engine ray is for scans; leave it out")
+        arguments.usage_error("--engine ray needs scans, and these are images; leave it out")
     used = {"--fold": arguments.fold, "--mounted": arguments.mounted, "--road-by": arguments.road_by}
     for option, value in (used | {"--worst": arguments.worst}).items():
         if value is not None:
-            arguments.usage_error(f"{option} is for scans")
+            arguments.usage_error(f"{option} needs scans, and these are images; leave it out")
     models = arguments.model or [CAMERA]
     if len(models) > 1:
         arguments.usage_error(f"got {len(models)} models; images are evaluated with one --model")
