@@ -1,4 +1,4 @@
-"""Measure one setting (repeats, accuracy, offline throughput, cold starts) and record it in a document at once."""
+"""Measure one setting (repeats, accuracy, offline throughput, cold starts) and record it in a document immediately."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def reference(job: Job, files: Sequence[Path]) -> Reference:
 
 
 def accuracy_of(right: Reference, found: Sequence[Prediction], truth: Sequence[SimulatedScan]) -> dict[str, Any]:
-    """The accuracy of a setting, which is reported beside its speed."""
+    """The accuracy of a setting, which is reported with its speed."""
     accuracy: dict[str, Any] = {
         "reference": right.engines,
         "agreement": agreement(right.predictions, found),

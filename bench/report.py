@@ -86,7 +86,7 @@ def _setting(setting: Mapping[str, Any]) -> list[Section]:
         parts.append(
             Section(
                 "Offline",
-                ["several processes at once, each back to back; counted while all of them run"],
+                ["several concurrent processes, each back to back; counted while all of them run"],
                 [head, *rows],
             )
         )

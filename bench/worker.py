@@ -277,7 +277,7 @@ def _interrupts() -> Iterator[_Interrupts]:
 
 
 def measure(jobs: Sequence[Job], on_tick: OnTick = lambda name, ms: None) -> list[dict[str, Any]]:
-    """Run several jobs at once, each in a fresh process; all start when all are ready.
+    """Run several jobs concurrently, each in a fresh process; all start when all are ready.
 
     Ctrl-C asks the processes for their results so far, which are returned with ``"interrupted"`` set; a second one ends
     them. Call this from the main thread.

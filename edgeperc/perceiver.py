@@ -141,8 +141,8 @@ class Perceiver:
         card shows a loss of at most 0.3 points (`edgeperc.zoo.choose`). Any other value is required.
     n_threads : int or None
         Threads of a network, one network after the other. None leaves it to the provider; on onnxruntime's CPU provider
-        the networks of the range image and of the top view then run at once, each on half of the cores. The results do
-        not depend on it.
+        the networks of the range image and of the top view then run concurrently, each on half of the cores. The
+        results do not depend on it.
     on_mismatch : {"refuse", "warn", "raise", "ignore"}
         What to do when one of the first five scans is unlike the training scans. ``"refuse"``: raise FitnessError,
         before anything is perceived, if a difference is gross (`findings.check_fitness` lists them), and warn
@@ -164,7 +164,7 @@ class Perceiver:
         part.
     full_turn : bool
         Run a range-image model once for each sector, four times for the shipped models. Every point then has a class,
-        and there are boxes beside and behind the vehicle.
+        and there are boxes next to and behind the vehicle.
     agree : bool or collection of str
         Correct the parts of the result by one another (`agreement.rules`): the clusters of points above the ground
         vote on their class, boxes support or complete labels, and no cell below an object is drivable. Boxes below

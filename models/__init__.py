@@ -135,7 +135,7 @@ def resolve(model: str | os.PathLike[str]) -> tuple[Variant, ...]:
     if not chosen:
         stored = " and ".join(map(str, of_name))
         raise ModelFileError(
-            f"no model is called {model!r}; {name} comes as {stored}. bf16 is no file: ask for precision 'bf16'"
+            f"no model is called {model!r}; {name} comes as {stored}. bf16 is not a file: ask for precision 'bf16'"
         )
     return chosen
 

@@ -1,7 +1,7 @@
 """Count the work of a network and measure the peak of this machine: together a lower bound for every latency.
 
 A network's multiplications are those of its convolutions and matrix products, counted from the ONNX graph; taps that
-only meet padding are counted separately, because an engine can skip them. The machine's peak is measured beside the
+only meet padding are counted separately, because an engine can skip them. The machine's peak is measured next to the
 networks, with the installed libraries: large matrix products, and a copy of more memory than any cache holds. The bound
 holds for direct convolution; Winograd's method needs fewer multiplications but more of all other operations.
 """

@@ -121,7 +121,7 @@ def _open_ncnn(path: Path, folder: Path, n_threads: int) -> Engine:
     import ncnn
 
     _, shape, names = _signature(path)
-    copied, spec = folder / path.name, importlib.util.find_spec("pnnx")  # pnnx writes beside the model
+    copied, spec = folder / path.name, importlib.util.find_spec("pnnx")  # pnnx writes next to the model
     copied.write_bytes(path.read_bytes())
     assert spec is not None
     assert spec.origin is not None

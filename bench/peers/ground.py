@@ -12,7 +12,7 @@ Every round handles the same scan once with each of these, in a new random order
 What is not installed is listed with the line that installs it, and left out. ``OMP_NUM_THREADS=1`` restricts Open3D to
 one core, as edgeperc always is.
 
-For every ground finder the command prints recall and precision, from the labels beside a SemanticKITTI scan
+For every ground finder the command prints recall and precision, from the labels next to a SemanticKITTI scan
 (``sequences/00/velodyne/000000.bin``), or from the simulator if no scan is given. Vegetation and unlabeled points do
 not count. ``--accuracy`` takes more scans and prints the means.
 """
@@ -135,7 +135,7 @@ def by_first_point(clusters: NDArray[np.signedinteger[Any]]) -> NDArray[np.int64
 
 
 def read_truth(scan: Path, n: int) -> Truth | None:
-    """The ground truth of a SemanticKITTI scan, from the labels beside it; None if there are none."""
+    """The ground truth of a SemanticKITTI scan, from the labels next to it; None if there are none."""
     path = scan.parent.parent / "labels" / f"{scan.stem}.label"
     if not path.is_file():
         return None
@@ -200,7 +200,7 @@ def main() -> None:
     for path in arguments.accuracy:
         more = read_points(path)
         if (known := read_truth(path, len(more))) is None:
-            raise SystemExit(f"{path} has no labels beside it: expected ../labels/{path.stem}.label")
+            raise SystemExit(f"{path} has no labels next to it: expected ../labels/{path.stem}.label")
         scans.append((more, known))
 
     finders = ground_finders(peers)

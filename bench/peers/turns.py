@@ -41,7 +41,7 @@ Calls = list[Callable[[], object]]
 
 
 def make_perceiver(contender: Contender, scans: Sequence[NDArray[Any]], sensor: str, n_threads: int) -> Calls:
-    """edgeperc itself; as by default, without a number of threads, both networks run at once, with one thread each."""
+    """edgeperc; as by default, without a number of threads, both networks run concurrently, each on one thread."""
     perceive = Perceiver(
         list(contender.paths),
         sensor=sensor,

@@ -130,7 +130,7 @@ def _camera_rows(
     from ..simulation.camera import CAMERA_CLASSES, VOID, true_classes
     from ..types.perception import ImageLabels
 
-    rows = [("image", f"{calibration.width} x {calibration.height} pixels, drawn from the scene; it is no photograph")]
+    rows = [("image", f"{calibration.width} x {calibration.height} pixels, drawn from the scene, not a photograph")]
     known, found, source = drawn.labels != VOID, perception.image, "the network's classes"
     if found is None:
         rows.append(("camera", "no model of a camera's images ran"))

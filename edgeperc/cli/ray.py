@@ -94,7 +94,7 @@ def perceive_on_ray(
 ) -> None:
     """Perceive scan files on a Ray cluster, and report them in their order.
 
-    Beside the files of a scan, ``.run/NAME.json`` records what they were made of: the scan, the options, the models,
+    Next to the files of a scan, ``.run/NAME.json`` records what they were made of: the scan, the options, the models,
     and what was learned from the first scans. A scan is not perceived again if its record says the same and its files
     have the recorded sizes. The first scans are always perceived again.
     """

@@ -14,7 +14,7 @@ from ..readers.images import IMAGE_SUFFIXES, read_image
 from ..system.extras import require
 
 FOLDERS = {"train": "train", "validation": "val", "test": "test"}
-UNLABELED = ("unlabelled", "unlabeled", "void")
+UNLABELED = ("unlabeled", "unlabeled", "void")
 IGNORE = 255
 LEVEL = 0.95
 

@@ -227,8 +227,8 @@ def scan_hash(points: NDArray[np.float32]) -> str:
 class KittiObjects:
     """The labeled scans below a KITTI root (``training/velodyne``, ``label_2``, ``calib``), by drive.
 
-    ``frames.csv`` and ``frames-*.csv`` beside ``training`` list the drive of each scan (columns ``name``, ``drive`` and
-    optionally ``grade``). Scans without an entry are left out, because a model may have been trained on their drive.
+    ``frames.csv`` and ``frames-*.csv`` next to ``training`` give the drive of each scan (columns ``name``,
+    ``drive`` and optionally ``grade``). Scans without an entry are left out, because a model may have been trained on their drive.
     Without any table, each scan counts as a drive of its own.
 
     Parameters

@@ -10,7 +10,7 @@
     FOLDER/drivable/NAME.json     the drivable area: a list of polygons [[x, y], ...] or [[x, y, z], ...]
     FOLDER/frames.csv             columns name and drive
 
-A scan is labeled if it has at least one of the three label files. ``layouts/`` beside this module has descriptions of
+A scan is labeled if it has at least one of the three label files. ``layouts/`` next to this module has descriptions of
 public sets. With ``"files": "semantickitti"`` in the description, the folder is SemanticKITTI's root instead:
 ``sequences/SEQ/velodyne/NAME.bin`` and ``sequences/SEQ/labels/NAME.label``.
 """
@@ -350,7 +350,7 @@ class ScanFolder:
         raw: NDArray[Any] = data
         if path.suffix == ".label":
             if data.size % 4:
-                raise PointsError(f"{path}: {data.size} bytes are no uint32 labels; expected 4 bytes for each point")
+                raise PointsError(f"{path}: {data.size} bytes are not uint32 labels; expected 4 bytes for each point")
             raw = data.view("<u4") & 0xFFFF  # the upper 16 bits are the instance
         if len(raw) != n_points:
             raise PointsError(

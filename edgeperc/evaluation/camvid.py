@@ -82,7 +82,7 @@ def image_figures(classes: Sequence[str], counts: NDArray[np.int64], n_resamples
     counts : (n, C, C) int64; of each image; rows are the truth.
     Returns: ``"n_images"``; ``"all"``: ``mean_iou`` over the classes that occur, ``mean_accuracy`` (mean recall of
         the classes), ``accuracy``, ``n_pixels``; ``"classes"``: ``iou``, ``precision``, ``recall``, ``n_pixels``,
-        ``n_images`` of each class. Shares have four decimals, None for those of no pixels, and beside each its
+        ``n_images`` of each class. Shares have four decimals, None for those of no pixels, and with each its
         ``..._interval``, None with fewer than two images.
     """
     n, n_classes, _ = counts.shape

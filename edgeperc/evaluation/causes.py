@@ -34,7 +34,7 @@ CAUSES: dict[str, tuple[str, ...]] = {
 FAR_M = 30.0
 NEAR_M = 0.4
 LARGE_LENGTH_M, LARGE_HEIGHT_M = 8.0, 4.0  # a longer or higher cluster is a wall, a hedge or a bank
-POLE_RADIUS_M, POLE_HEIGHT_M = 0.3, 2.0  # a column of points that goes on above this height is no person
+POLE_RADIUS_M, POLE_HEIGHT_M = 0.3, 2.0  # a column of points that goes on above this height is not a person
 BUMPER_X_M, BUMPER_Y_M, BUMPER_Z_M = 4.5, 3.0, -1.5  # upper bounds of x, |y| and z; the road is at z = -1.73
 
 Counts = dict[tuple[str, ...], "Counter[Any]"]
@@ -61,8 +61,8 @@ def count_causes(
         they are missed, predicted ones if they are false. ``("errors", "scans")``: 1 by (error, cause, drive) with
         points. ``("errors", "objects")``: 1 by (error, cause, `object_key`) with missed points. The error `BUMPER`
         has all points in view that are labeled car at the bumper of the own vehicle, except those of true objects.
-        Where the truth is unknown, there may be a car beside the own one; the cause `FLOOR` counts the points on the
-        ground alone.
+        Where the truth is unknown, there may be a car next to the ego vehicle; the cause `FLOOR` counts the points
+        on the ground alone.
     """
     scan = _Scan(points, boxes)
     at_bumper = scan.at_bumper & in_view & (labels == 1) & ~((right > 0) & (right < len(POINT_CLASSES)))
@@ -119,7 +119,7 @@ class _Scan:
         return found
 
     def near_objects(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Points in a true box, or beside one."""
+        """Points in a true box, or next to one."""
         return self.within(mask, self.boxes, NEAR_M)
 
     def on_large_structures(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -227,7 +227,7 @@ def count_matches(
     objects : sequence of ObjectKey, m
     optional : sequence of bool, m; objects that may be found but need not.
     small : sequence of bool, n; detections too small in the image: neither hits nor false positives.
-    excused : sequence of bool, n; detections that are no false positives, but may be hits.
+    excused : sequence of bool, n; detections that are not false positives, but may be hits.
     """
     candidates = [
         [(j, float(overlaps[j, k])) for j in np.flatnonzero(overlaps[:, k] > least_iou).tolist()]
@@ -330,7 +330,7 @@ def _rules(levels: Collection[str], of_ranges: str) -> Iterator[tuple[str, str, 
 
 
 def _objects(labels: KittiLabels) -> tuple[list[str], NDArray[np.float64]]:
-    """Classes and numbers of the rows that are no DontCare regions."""
+    """Classes and numbers of the rows that are not DontCare regions."""
     is_object = np.array([kind != "dontcare" for kind in labels.kinds], np.bool_)
     return [kind for kind in labels.kinds if kind != "dontcare"], labels.numbers[is_object]
 

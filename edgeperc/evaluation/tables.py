@@ -95,7 +95,7 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
     ----------
     records : iterable of Record
     n_resamples : int
-        Number of bootstrap resamples of the drives, for the 95 % intervals (``"iou_interval"`` beside ``"iou"``). An
+        Number of bootstrap resamples of the drives, for the 95 % intervals (``"iou_interval"`` for ``"iou"``). An
         interval is None if fewer than two drives have data for the figure.
 
     Returns
@@ -122,7 +122,7 @@ def figures(records: Iterable[Record], n_resamples: int = 1000) -> dict[str, Any
         - ``"errors"``: by error and cause (`causes.CAUSES`). ``"all"`` is a share of the true (missed) or predicted
           (false) points of the class, a cause a share of the error; ``"n_of"`` is the whole.
         - ``"bumper"``: points at the own bumper that are labeled car: all, and those on the ground. Where the truth is
-          unknown they may be of a real car beside the own one.
+          unknown they may be of a real car next to the ego vehicle.
         - ``"segmentation"``: by table and band. ``"road"``: by band.
     """
     by_drive: dict[str, list[Tallies]] = {}

@@ -44,7 +44,7 @@ def read_scans(
     ----------
     source : str or path
         A scan file (`edgeperc.read_points`); a folder of scan files and captures, read in the order of their names; a
-        Velodyne ``.pcap``; an Ouster ``.osf``, or ``.pcap`` with its metadata beside it in a ``.json`` file whose name
+        Velodyne ``.pcap``; an Ouster ``.osf``, or ``.pcap`` with its metadata next to it in a ``.json`` file whose name
         has the same beginning; a ROS 1 ``.bag``, a ROS 2 bag's folder or one ``.mcap`` file. Bags are read for
         messages of type ``sensor_msgs/PointCloud2``. The first bytes of a file decide its format, not its name.
     topic : str, optional
@@ -198,7 +198,7 @@ def _readable_kind(path: Path) -> str:
     if kind == ".pcapng":
         raise PointsError(f"{path}: a pcapng file; expected pcap. Run: editcap -F pcap {path.name} {path.stem}.pcap")
     if kind == ".db3":
-        raise PointsError(f"{path}: a .db3 is read with the folder it lies in; expected metadata.yaml beside it")
+        raise PointsError(f"{path}: a .db3 is read with the folder it lies in; expected metadata.yaml next to it")
     return kind
 
 

@@ -69,7 +69,7 @@ def metadata_beside(path: Path) -> list[Path]:
     if not longest:
         raise PointsError(
             "not a Velodyne capture (packets of 1206 bytes), and cannot be read as Ouster's: there is no "
-            "metadata beside it. Expected a .json file whose name has the same beginning"
+            "metadata next to it. Expected a .json file whose name has the same beginning"
         )
     return [file for file, n in alike.items() if n == longest]
 
@@ -82,7 +82,7 @@ def read_metadata(path: Path) -> str:
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as exc:
-        raise PointsError(f"the metadata {path.name} cannot be read: it is no JSON ({exc})") from exc
+        raise PointsError(f"the metadata {path.name} cannot be read: it is not JSON ({exc})") from exc
     try:
         check_metadata(content)
     except PointsError as exc:

@@ -31,7 +31,7 @@ _GPS_BYTES = 600  # what LiDARs send of their GPS is shorter, their points are l
 # Enough to find a LiDAR's packet among those of a GPS, and quick to read.
 _SNIFFED_PACKETS = 2000
 
-# Datagrams of which fragments are awaited; more than a few at once are damage.
+# Datagrams of which fragments are awaited; more than a few at the same time are damage.
 _PENDING = 256
 
 

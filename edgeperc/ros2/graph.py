@@ -77,7 +77,7 @@ def full_name(name: str, namespace: str = "/") -> str:
     full = full if full.startswith("/") else f"/{full}"
     if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", full) or "__" in full:
         raise OptionError(
-            f"{full!r} is no name of ROS 2; expected words of letters, digits and single underscores after slashes, "
+            f"{full!r} is not a name of ROS 2; expected words of letters, digits and single underscores after slashes, "
             "such as /lidar_top/points"
         )
     return full

@@ -144,19 +144,19 @@ class RosMessages:
         Raises
         ------
         PointsError
-            The bytes are no such message.
+            The bytes are not such a message.
         """
         try:
             return self.typestore.deserialize_cdr(data, name)
         except Exception as exc:  # of rosbags, struct, numpy: whatever the bytes lead to
             reason = " ".join(str(exc).split()) or type(exc).__name__
-            raise PointsError(f"got {len(data):,} bytes that are no {name} ({reason}); expected one in CDR") from exc
+            raise PointsError(f"got {len(data):,} bytes that are not a {name} ({reason}); expected one in CDR") from exc
 
     def points(self, scan: PerceivedScan, stamp_ns: int | None = None) -> Any:
         """Every point of the scan with its class: a sensor_msgs/PointCloud2.
 
         Fields are ``x``, ``y``, ``z``, ``intensity`` (the remission as it came; 0 without one), ``label`` (uint8, index
-        into the classes that `diagnostics` lists) and ``in_view`` (uint8, 0 where the label is no prediction).
+        into the classes that `diagnostics` lists) and ``in_view`` (uint8, 0 where the label is not a prediction).
 
         Parameters
         ----------

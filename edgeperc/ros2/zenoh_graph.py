@@ -54,7 +54,7 @@ def qos_key(qos: Qos) -> str:
 
 
 def attachment(number: int, stamp_ns: int, publisher_id: bytes) -> bytes:
-    """The 33 bytes beside each message: its number from 1, the time of publishing, and the id of its publisher."""
+    """The 33 bytes with each message: its number from 1, the time of publishing, and the id of its publisher."""
     return _ATTACHMENT.pack(number, stamp_ns, len(publisher_id), publisher_id)
 
 

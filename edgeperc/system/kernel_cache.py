@@ -5,7 +5,7 @@ raises an unrelated error or crashes the process. Here each file begins with a c
 compiled again and replaced. The checksum protects against damage only. Against other users, a folder or file is used
 only if it belongs to this user or to root and nobody else can write it.
 
-Folders, in this order: ``NUMBA_CACHE_DIR``, if it is set; otherwise ``__pycache__`` beside the source, and ``kernels``
+Folders, in this order: ``NUMBA_CACHE_DIR``, if it is set; otherwise ``__pycache__`` next to the source, and ``kernels``
 in `machine.cache_folder`. If none can be written, every start compiles again, and a warning in the log says so.
 """
 
@@ -312,7 +312,7 @@ class KernelCache:
 def _rebuilt(target_context: Any, defined: Iterable[str], library: tuple[str, str, Any], *rest: Any) -> Any:
     """A compiled form from what ``CompileResult._reduce`` gave, and the names that its module defines.
 
-    Beside the machine code there is a module for kernels that call this one. It is parsed when such a kernel is
+    In addition to the machine code there is a module for kernels that call this one. It is parsed when such a kernel is
     compiled; at a start that would take as long as everything else here.
     """
     name, kind, content = library

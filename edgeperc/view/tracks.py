@@ -219,7 +219,7 @@ def _draw_rings(pen: Any, font: Any) -> None:
         pen.arc(
             [middle[0] - reach, middle[1] - reach, middle[0] + reach, middle[1] + reach], -90, 90, FRAME, width=_FINE
         )
-        y = min(24.0, 0.8 * ring_m)  # beside the road, where there are few labels
+        y = min(24.0, 0.8 * ring_m)  # next to the road, where there are few labels
         (at,) = _pixels(np.array([[math.sqrt(ring_m**2 - y**2), y]]))
         pen.text(at, f" {ring_m} m", fill=FAINT, font=font)
     pen.polygon(_pixels(np.array([[2.2, 0.0], [-1.4, 0.9], [-1.4, -0.9]])), fill=INK)

@@ -379,7 +379,7 @@ def test_the_demo_with_a_camera(tmp_path: Path, capsys: pytest.CaptureFixture[st
     options = ("--out", str(tmp_path / "out"), "--model", "pointseg")
     assert cli.main(["demo", "--camera", *options]) == 0
     out = capsys.readouterr().out
-    assert "it is no photograph" in out
+    assert "not a photograph" in out
     assert "no model of a camera's images ran" in out
     assert "the scene's true classes, not those of a network" in out
     assert float(re.search(r"([\d.]+) % of them have the class of their surface", out)[1]) > 98.0  # type: ignore[index]

@@ -148,7 +148,7 @@ def test_classes_of_points_that_are_wrong(
 def test_label_files_of_half_a_number_and_names_that_are_none(tmp_path: Path) -> None:
     root = with_classes(tmp_path, [1, 2, 3, 4], np.uint32)
     (root / "semseg/a.label").write_bytes(b"12345")
-    with pytest.raises(PointsError, match="5 bytes are no uint32 labels"):
+    with pytest.raises(PointsError, match="5 bytes are not uint32 labels"):
         ScanFolder(root).frame("a")
     np.array([1, 2, 3, 4], np.uint32).tofile(root / "semseg/a.label")
     for text in ("[1]", "{", '{"-1": "Road"}', '{"1": 2}'):

@@ -26,7 +26,7 @@ HEIGHT, WIDTH = 24, 32
 
 def write_set(root: Path, ids: dict[str, NDArray[np.uint8]], names: tuple[str, ...] = tiny_camera.CLASSES) -> Path:
     """Images whose colors are the classes 0, 1 and 2 in stripes of 8 columns, with the given labels."""
-    document = {str(k): name for k, name in enumerate((*names, "Unlabelled"))}
+    document = {str(k): name for k, name in enumerate((*names, "Unlabeled"))}
     root.mkdir(exist_ok=True)
     (root / "classes.json").write_text(json.dumps(document))
     for name, labels in ids.items():

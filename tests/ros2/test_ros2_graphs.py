@@ -218,7 +218,7 @@ def test_the_command_of_the_page_answers_another_process(router: str, watch: Wat
         _compare(heard)
         until(lambda: any(_status(raw).level == 2 for raw in heard("diagnostics")))
         status = next(_status(raw) for raw in heard("diagnostics") if _status(raw).level == 2)
-        assert "are no sensor_msgs/msg/PointCloud2" in status.message
+        assert "are not a sensor_msgs/msg/PointCloud2" in status.message
         values = {v.key: v.value for v in status.values}
         assert (values["answers"], values["clouds failed"], values["clouds dropped"]) == ("3", "1", "0")
         node.send_signal(signal.SIGTERM)
