@@ -92,7 +92,7 @@ def conditions() -> dict[str, Any]:
     psutil = _psutil()
     frequency = psutil.cpu_freq()
     sensors = psutil.sensors_temperatures() if hasattr(psutil, "sensors_temperatures") else {}
-    found = [each for group in sensors.values() for each in group if each.current]
+    sensors_read = [each for group in sensors.values() for each in group if each.current]
     throttles = [_number(path) for path in CPU.glob("cpu[0-9]*/thermal_throttle/*_throttle_count")]
     quota = dict(line.split() for line in (read_text(Path("/sys/fs/cgroup/cpu.stat")) or "").splitlines())
     times = psutil.cpu_times()
@@ -104,8 +104,8 @@ def conditions() -> dict[str, Any]:
     return {
         "at_s": time.perf_counter(),
         "mhz": frequency.current if frequency else None,
-        "temperature_c": max((each.current for each in found), default=None),
-        "critical_c": min((each.critical for each in found if each.critical), default=None),
+        "temperature_c": max((each.current for each in sensors_read), default=None),
+        "critical_c": min((each.critical for each in sensors_read if each.critical), default=None),
         "throttle_count": sum(n or 0 for n in throttles) if throttles else None,
         "quota_throttled": int(quota["nr_throttled"]) if "nr_throttled" in quota else None,
         "load_average": psutil.getloadavg()[0],
@@ -122,11 +122,11 @@ def busiest(seconds: float = 0.5) -> list[dict[str, Any]]:
     for process in processes:
         _ask(process.cpu_percent, 0.0)
     time.sleep(seconds)
-    found = [
+    loads = [
         {"name": _ask(process.name, "?"), "cores": round(_ask(process.cpu_percent, 0.0) / 100.0, 2)}
         for process in processes
     ]
-    return sorted((each for each in found if each["cores"] >= 0.05), key=lambda each: -each["cores"])[:5]
+    return sorted((each for each in loads if each["cores"] >= 0.05), key=lambda each: -each["cores"])[:5]
 
 
 def _ask(question: Callable[[], Any], otherwise: Any) -> Any:
@@ -145,45 +145,45 @@ def disturbances(
     before, after : from `conditions`.
     own_cpu_s : CPU time of the measured process itself [s].
     """
-    found = []
+    sentences = []
     wall_s = max(after["at_s"] - before["at_s"], 1e-9)
     others = (after["busy_s"] - before["busy_s"] - own_cpu_s) / wall_s
     if others > BUSY_CORES:
-        found.append(f"other processes kept {others:.1f} of {hardware['logical_cores']} cores busy")
+        sentences.append(f"other processes kept {others:.1f} of {hardware['logical_cores']} cores busy")
     stolen = (after["stolen_s"] - before["stolen_s"]) / wall_s / hardware["logical_cores"]
     if stolen > STOLEN_SHARE:
-        found.append(f"the hypervisor withheld {stolen:.0%} of the CPU time (steal)")
+        sentences.append(f"the hypervisor withheld {stolen:.0%} of the CPU time (steal)")
     for key, sentence in (
         ("throttle_count", "the CPU was throttled for heat {} times"),
         ("quota_throttled", "the container's CPU quota paused it {} times"),
     ):
         if before[key] is not None and after[key] is not None and after[key] > before[key]:
-            found.append(sentence.format(after[key] - before[key]))
+            sentences.append(sentence.format(after[key] - before[key]))
     hot, critical = after["temperature_c"], after["critical_c"]
     if hot is not None and critical is not None and hot > critical - HOT_MARGIN_C:
-        found.append(f"the CPU is at {hot:.0f} C; {critical:.0f} C is critical")
+        sentences.append(f"the CPU is at {hot:.0f} C; {critical:.0f} C is critical")
     if before["mhz"] and after["mhz"] and after["mhz"] < 0.9 * before["mhz"]:
-        found.append(f"the clock fell from {before['mhz']:.0f} to {after['mhz']:.0f} MHz")
+        sentences.append(f"the clock fell from {before['mhz']:.0f} to {after['mhz']:.0f} MHz")
     if after["on_battery"]:
-        found.append("the machine runs on battery")
-    return found
+        sentences.append("the machine runs on battery")
+    return sentences
 
 
 def lasting_disturbances(hardware: Mapping[str, Any], busy: list[dict[str, Any]]) -> list[str]:
     """List what disturbs every sample of a report, one sentence each."""
-    found = []
+    sentences = []
     governor = hardware["governor"]
     if governor not in (None, "performance"):
-        found.append(f"the frequency governor is {governor}, not performance: the clock follows the load")
+        sentences.append(f"the frequency governor is {governor}, not performance: the clock follows the load")
     if hardware["turbo"]:
-        found.append("turbo is on: the clock depends on heat and on the other cores")
+        sentences.append("turbo is on: the clock depends on heat and on the other cores")
     if hardware["cpu_quota"]:
-        found.append(f"a container's CPU quota applies ({hardware['cpu_quota']})")
+        sentences.append(f"a container's CPU quota applies ({hardware['cpu_quota']})")
     if busy:
-        found.append("busy before the start: " + ", ".join(f"{p['name']} ({p['cores']:g} cores)" for p in busy))
+        sentences.append("busy before the start: " + ", ".join(f"{p['name']} ({p['cores']:g} cores)" for p in busy))
     if hardware["hypervisor"]:
-        found.append("a virtual machine: other machines on its host, the clock and the heat are not visible")
-    return found
+        sentences.append("a virtual machine: other machines on its host, the clock and the heat are not visible")
+    return sentences
 
 
 def rss_mb() -> float:

@@ -98,8 +98,8 @@ def sized(n_points: int, sensor: str) -> NDArray[np.float32]:
         scans.append(simulated_scan(FIRST_SEED + len(scans), sensor).points)
     points = np.concatenate(scans)
     # In the sensor's own order, which decides how caches are used.
-    kept = np.sort(np.random.default_rng(0).choice(len(points), n_points, replace=False))
-    return raw(points[kept], sensor)
+    rows = np.sort(np.random.default_rng(0).choice(len(points), n_points, replace=False))
+    return raw(points[rows], sensor)
 
 
 def crowd(n_cars: int, sensor: str) -> NDArray[np.float32]:

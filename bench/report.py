@@ -138,19 +138,18 @@ def _starts(setting: Mapping[str, Any]) -> Section:
 
 def accuracy_sentences(accuracy: Mapping[str, Any]) -> list[str]:
     """Sentences on how far the results of a setting agree with the reference and the ground truth."""
-    found = accuracy["agreement"]
+    agreement = accuracy["agreement"]
     parts = []
     for kind in ("points", "cells"):
-        if found[kind] is not None:
-            parts.append(
-                f"{share(found[kind]['equal'])} of the {kind}' labels equal, mean IoU {share(found[kind]['mean_iou'])}"
-            )
-    if found["boxes"] is not None:
+        if agreement[kind] is not None:
+            equal, iou = (share(agreement[kind][name]) for name in ("equal", "mean_iou"))
+            parts.append(f"{equal} of the {kind}' labels equal, mean IoU {iou}")
+    if agreement["boxes"] is not None:
         parts.append(
-            "{n_both} common boxes of {n_found} found and {n_reference} of the reference".format(**found["boxes"])
+            "{n_both} common boxes of {n_found} found and {n_reference} of the reference".format(**agreement["boxes"])
         )
     reference = "; ".join(accuracy["reference"])
-    sentences = [f"compared with {reference} on {found['n_scans']} scans: {'; '.join(parts)}"]
+    sentences = [f"compared with {reference} on {agreement['n_scans']} scans: {'; '.join(parts)}"]
     if accuracy["truth"] is None:
         return [*sentences, "these scans have no ground truth; edgeperc eval evaluates labeled scans"]
     for name, kept in (("ground truth", "truth"), ("ground truth, reference", "reference_truth")):

@@ -37,9 +37,9 @@ def supported(p: float, n: int) -> bool:
 def summary(values: ArrayLike) -> dict[str, float | int | None]:
     """``n``, ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max``; None if there are too few samples."""
     array = np.asarray(values, np.float64)
-    found: dict[str, float | int | None] = {"n": len(array)}
-    found |= {f"p{p:g}": percentile(array, p) if supported(p, len(array)) else None for p in PERCENTILES}
-    return found | {"max": float(array.max()) if len(array) else None}
+    figures: dict[str, float | int | None] = {"n": len(array)}
+    figures |= {f"p{p:g}": percentile(array, p) if supported(p, len(array)) else None for p in PERCENTILES}
+    return figures | {"max": float(array.max()) if len(array) else None}
 
 
 def noise_floor(repeats: Sequence[ArrayLike]) -> float | None:

@@ -143,9 +143,9 @@ def back_to_back(
     while keep_going(timings) and (timings.n < limits.min_scans or clock.now() - first < limits.min_seconds):
         scan = scans[timings.n % len(scans)]
         began = clock.now()
-        found = perceive(scan)
+        perception = perceive(scan)
         took_ms = 1e3 * (clock.now() - began)
-        timings.add(began - first, took_ms, took_ms, found.stage_ms)
+        timings.add(began - first, took_ms, took_ms, perception.stage_ms)
     return timings
 
 
@@ -180,10 +180,10 @@ def paced(
         scan, due = scans[k % len(scans)], first + k / rate_hz
         clock.sleep_until(due)
         began = clock.now()
-        found = perceive(scan)
+        perception = perceive(scan)
         done = clock.now()
         timings.missed += done > due + 1.0 / rate_hz
-        timings.add(began - first, 1e3 * (done - began), 1e3 * (done - due), found.stage_ms)
+        timings.add(began - first, 1e3 * (done - began), 1e3 * (done - due), perception.stage_ms)
         k += 1
     return timings
 

@@ -153,13 +153,13 @@ def _work(connection: Any, job: Job) -> dict[str, Any]:
             if stopped:
                 break
             watch = _Watch(connection, scenario)
-            own = [scans[path] for path in scenario.scans]
+            inputs = [scans[path] for path in scenario.scans]
             if job.loadgen is not None:
                 run: Callable[..., Timings] = partial(single_stream, folder=job.loadgen)
             else:
                 run = back_to_back if scenario.rate_hz is None else partial(paced, rate_hz=scenario.rate_hz)
             with closing(Application(perceive)) if scenario.application else nullcontext(perceive) as called:
-                timings = run(called, own, limits=scenario.limits, keep_going=watch, on_start=watch.start)
+                timings = run(called, inputs, limits=scenario.limits, keep_going=watch, on_start=watch.start)
             result["scenarios"][scenario.name] = watch.record(timings)
             stopped = watch.stopped
         result |= {"interrupted": stopped, "rss_mb": rss_mb(), "peak_rss_mb": peak_rss_mb()}
@@ -175,8 +175,8 @@ def _paths(job: Job) -> Iterator[Path]:
 
 
 def _predict(perceive: Perceive, scan: NDArray[np.float32]) -> Prediction:
-    found = perceive(scan)
-    return Prediction(found.points, found.top_view, found.boxes)
+    perception = perceive(scan)
+    return Prediction(perception.points, perception.top_view, perception.boxes)
 
 
 def _engines(perceive: Perceiver) -> list[dict[str, Any]]:

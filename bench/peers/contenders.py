@@ -179,12 +179,12 @@ def _pipelines(models: Sequence[Variant], provider: str, precision: str) -> list
     """All pipelines from scan to result. The first one is edgeperc's, the reference of the ratios."""
     paths, cards = _paths(models), tuple(each.card.to_json() for each in models)
     int8 = any(each.precision == "int8" for each in models)
-    own = dict.fromkeys(((provider, precision), ("cpu", "auto"), *([("openvino", "auto")] if int8 else OPENVINO)))
+    settings = dict.fromkeys(((provider, precision), ("cpu", "auto"), *([("openvino", "auto")] if int8 else OPENVINO)))
     if (provider, precision) == ("auto", "auto") and available_providers() == ("cpu",):
-        del own["cpu", "auto"]  # the same as auto
+        del settings["cpu", "auto"]  # the same as auto
     others = (("onnxruntime", ""), *OPENVINO, *(() if int8 else (*SMALL, *TORCH)))  # torch cannot run the int8 graphs
     return [
-        *(Contender(f"edgeperc, {_label(name, kind)}", "edgeperc", name, kind, paths) for name, kind in own),
+        *(Contender(f"edgeperc, {_label(name, kind)}", "edgeperc", name, kind, paths) for name, kind in settings),
         *(Contender(f"numpy + {_label(name, kind)}", "pipeline", name, kind, paths, cards) for name, kind in others),
     ]
 

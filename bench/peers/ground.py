@@ -165,7 +165,9 @@ def table(title: str, ms: Mapping[str, NDArray[np.float64]], reference: str) -> 
     rows = [["", "minimum, ms", "median, ms", "minimum x edgeperc", "median x edgeperc"]]
     for name, of_call in ms.items():
         figures = [(float(of(of_call)), float(of(ms[reference]))) for of in (np.min, np.median)]
-        rows.append([name, *(number(own) for own, _ in figures), *(number(own / theirs, 1) for own, theirs in figures)])
+        rows.append(
+            [name, *(number(ours) for ours, _ in figures), *(number(ours / theirs, 1) for ours, theirs in figures)]
+        )
     return Section(title, (), rows)
 
 

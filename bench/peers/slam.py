@@ -253,18 +253,18 @@ class Seen:
 def look(perceive: Callable[..., Any], drive: Drive) -> Seen:
     """Perceive and track a drive, without its poses."""
     tracker, perceptions, poses, ms = Tracker(), list[Perception](), [], []
-    kept: dict[str, list[NDArray[np.bool_]]] = {name: [] for name in (ALL, MOVING, MOVABLE)}
+    masks: dict[str, list[NDArray[np.bool_]]] = {name: [] for name in (ALL, MOVING, MOVABLE)}
     for k, points in enumerate(drive.scans):
         started = time.process_time()
         perceptions.append(perceive(points, k / RATE_HZ))
         tracks = tracker(perceptions[-1])
         moving = moving_points(tracks, points)
-        kept[MOVING].append(~moving)
-        kept[MOVABLE].append(~(moving | movable_points(perceptions[-1], points)))
+        masks[MOVING].append(~moving)
+        masks[MOVABLE].append(~(moving | movable_points(perceptions[-1], points)))
         ms.append(1e3 * (time.process_time() - started))
-        kept[ALL].append(np.ones(len(points), np.bool_))
+        masks[ALL].append(np.ones(len(points), np.bool_))
         poses.append(tracks.T_world_sensor)
-    return Seen(kept, perceptions, np.array(poses), float(np.median(ms)))
+    return Seen(masks, perceptions, np.array(poses), float(np.median(ms)))
 
 
 def compared(
@@ -280,10 +280,10 @@ def compared(
             tracker, stays = Tracker(), []
             for points, perception, pose in zip(drive.scans, seen.perceptions, first, strict=True):
                 stays.append(~moving_points(tracker(perception, pose), points))
-            kept = stays
+            staying = stays
         else:
-            kept = seen.kept[name]
-        scans = chosen(drive, kept)
+            staying = seen.kept[name]
+        scans = chosen(drive, staying)
         started = time.process_time()
         poses, gap = closure(odometry, scans)
         ms = 1e3 * (time.process_time() - started) / (2 * len(scans) - 1)
@@ -293,11 +293,11 @@ def compared(
                 on_objects(points, boxes)
                 for points, boxes in zip(drive.scans, moving_boxes(drive.labels, poses), strict=True)
             ]
-        counted = [np.logical_and.reduce(masks) for masks in zip(kept, drive.known, drive.usable, strict=True)]
+        counted = [np.logical_and.reduce(masks) for masks in zip(staying, drive.known, drive.usable, strict=True)]
         n_still = sum(int(np.count_nonzero(known & ~moves)) for known, moves in zip(drive.known, moving, strict=True))
         n_lost = sum(
             int(np.count_nonzero(known & ~moves & ~mask))
-            for known, moves, mask in zip(drive.known, moving, kept, strict=True)
+            for known, moves, mask in zip(drive.known, moving, staying, strict=True)
         )
         way_m = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
         known = any(mask.any() for mask in drive.known)
@@ -334,11 +334,11 @@ def per_cent(value: float) -> str:
 
 def on_objects(points: Points, boxes: Sequence[Box]) -> NDArray[np.bool_]:
     """The points (n, 4) inside boxes, above the ground, (n,) bool."""
-    found = np.zeros(len(points), np.bool_)
+    is_object = np.zeros(len(points), np.bool_)
     for box in boxes:
         bottom = box.center[2] - box.size[2] / 2.0
-        found |= inside(box, points, 0.1) & (points[:, 2] > bottom + GROUND_M)
-    return found
+        is_object |= inside(box, points, 0.1) & (points[:, 2] > bottom + GROUND_M)
+    return is_object
 
 
 def draw_maps(drive: Drive, seen: Seen, odometry: Odometry, path: Path) -> None:
@@ -346,10 +346,10 @@ def draw_maps(drive: Drive, seen: Seen, odometry: Odometry, path: Path) -> None:
     pyplot = require("matplotlib.pyplot", "view", "Drawing a picture")
     figure, axes = pyplot.subplots(3, 1, figsize=(9.0, 8.2), dpi=100, sharex=True, sharey=True)
     assert drive.moving is not None
-    for axis, (name, kept) in zip(axes, seen.kept.items(), strict=True):
-        poses = odometry(chosen(drive, kept))
+    for axis, (name, mask) in zip(axes, seen.kept.items(), strict=True):
+        poses = odometry(chosen(drive, mask))
         still, ghosts = [], []
-        for points, stays, moves, pose in zip(drive.scans, kept, drive.moving, poses, strict=True):
+        for points, stays, moves, pose in zip(drive.scans, mask, drive.moving, poses, strict=True):
             placed = points[:, :3] @ pose[:3, :3].T + pose[:3, 3]
             standing = stays & (points[:, 2] > -1.4)
             still.append(placed[standing & ~moves][::7])

@@ -91,8 +91,8 @@ def demo_command(arguments: argparse.Namespace) -> int:
     if perception.top_view is not None:
         area_m2 = perception.top_view.drivable_area_m2
         rows.append(("drivable", f"{area_m2:.0f} m2 of the {_extent(perception)} ahead"))
-    found = [_box_text(box) for box in perception.boxes] or ["none"]
-    rows += [("boxes" if k == 0 else "", text) for k, text in enumerate(found)]
+    texts = [_box_text(box) for box in perception.boxes] or ["none"]
+    rows += [("boxes" if k == 0 else "", text) for k, text in enumerate(texts)]
     if perception.points is not None:
         true = np.bincount(scan.labels[perception.points.in_view], minlength=len(perception.points.classes))
         for k, (name, count) in enumerate(perception.points.counts().items()):
@@ -131,16 +131,16 @@ def _camera_rows(
     from ..types.perception import ImageLabels
 
     rows = [("image", f"{calibration.width} x {calibration.height} pixels, drawn from the scene, not a photograph")]
-    known, found, source = drawn.labels != VOID, perception.image, "the network's classes"
-    if found is None:
+    known, labels, source = drawn.labels != VOID, perception.image, "the network's classes"
+    if labels is None:
         rows.append(("camera", "no model of a camera's images ran"))
     else:
         names = [name.casefold() for name in CAMERA_CLASSES]
-        to_camvid = np.array([names.index(n) if (n := name.casefold()) in names else VOID for name in found.classes])
-        share = float(np.mean(to_camvid[found.labels[known]] == drawn.labels[known]))
+        to_camvid = np.array([names.index(n) if (n := name.casefold()) in names else VOID for name in labels.classes])
+        share = float(np.mean(to_camvid[labels.labels[known]] == drawn.labels[known]))
         rows.append(("camera", f"{100.0 * share:.0f} % of the pixels get their true class"))
         rows.append(("", "The network was trained on photographs; a drawing says little about its accuracy."))
-    if found is None or share < _GOOD_PIXELS:
+    if labels is None or share < _GOOD_PIXELS:
         perception = replace(perception, image=ImageLabels(drawn.labels, CAMERA_CLASSES))
         source = "the scene's true classes, not those of a network"
     painted = paint(perception, scan.points, calibration)

@@ -165,21 +165,23 @@ def _suggest_ego_box(
     ((sensor, estimator),) = estimators.items()
     scans = (points for path in paths for _, points in read_scans(path, topic=arguments.topic))
     try:
-        found = suggest_ego_box(islice(scans, _MOST_SCANS), sensor, estimator.mounting())
+        suggestion = suggest_ego_box(islice(scans, _MOST_SCANS), sensor, estimator.mounting())
     except EdgepercError as exc:
         print_error(f"--suggest-ego-box: {exc}")
         return True
     if arguments.json:
-        print_line(json.dumps({"sensor": sensor.name, "suggested_ego_box": found.box, "n_places": found.n_places}))
-    elif found.box is None:
-        print_rows([("own vehicle", f"in {found.n_places} places, no return near the sensor stays where it is")])
+        print_line(
+            json.dumps({"sensor": sensor.name, "suggested_ego_box": suggestion.box, "n_places": suggestion.n_places})
+        )
+    elif suggestion.box is None:
+        print_rows([("own vehicle", f"in {suggestion.n_places} places, no return near the sensor stays where it is")])
     else:
-        option = " ".join(f"{value:g}" for axis in found.box for value in axis)
+        option = " ".join(f"{value:g}" for axis in suggestion.box for value in axis)
         print_rows(
             [
                 (
                     "own vehicle",
-                    f"returns in {found.n_directions} directions stay in {found.n_places} places: if the box",
+                    f"returns in {suggestion.n_directions} directions stay in {suggestion.n_places} places: if the box",
                 ),
                 ("", f"holds the own vehicle and nothing else, pass --ego-box {option}"),
             ]

@@ -93,14 +93,14 @@ def run_program(program: str, command: Callable[[], int], message: Callable[[Exc
 
 def _unread() -> bool:
     """Whether the reader of stdout or stderr closed it. Such a stream is discarded from here on."""
-    found = False
+    is_closed = False
     for stream in (sys.stdout, sys.stderr):
         if _is_closed_pipe(stream):
             # Python flushes the streams again at exit, and would print an error.
             with Path(os.devnull).open("wb") as nowhere:
                 os.dup2(nowhere.fileno(), stream.fileno())
-            found = True
-    return found
+            is_closed = True
+    return is_closed
 
 
 def _is_closed_pipe(stream: TextIO) -> bool:

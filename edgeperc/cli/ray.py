@@ -134,14 +134,14 @@ def perceive_on_ray(
         workers=arguments.workers,
         n_threads=n_threads,
     )
-    said: set[str] = set()
+    reported: set[str] = set()
     n_kept = 0
     for done, (scan, answer) in enumerate(zip(scans[n_first:], answers, strict=True), start=n_first + 1):
         if isinstance(answer, Lost):
             answer = _Answer(report.text(scan, EdgepercError(answer.reason)), one_line(answer.reason), (), ())
         for message in answer.warnings:
             warnings.warn(message, stacklevel=2)
-        report.show(scan, _said_once(answer, said) if learned.is_settled else answer.text, answer.error)
+        report.show(scan, _said_once(answer, reported) if learned.is_settled else answer.text, answer.error)
         n_kept += answer.kept
         show(done, len(scans))
     if n_kept:
@@ -159,10 +159,10 @@ class _Answer:
     kept: bool = False
 
 
-def _said_once(answer: _Answer, said: set[str]) -> str:
+def _said_once(answer: _Answer, reported: set[str]) -> str:
     """The text without sentences of other scans: a perceiver says of its remission once what is wrong with it."""
-    text, again = answer.text, said & {*answer.fitness}
-    said |= {*answer.fitness}
+    text, again = answer.text, reported & {*answer.fitness}
+    reported |= {*answer.fitness}
     if again and text.startswith("{"):
         record = json.loads(text)
         record["fitness"] = [sentence for sentence in record["fitness"] if sentence not in again]
@@ -186,8 +186,8 @@ class _ScanWorker:
         files = self._files(target)
         record = target.parent / ".run" / f"{target.name}.json"
         made_of = hashlib.sha256(f"{self._made_of} {name} {_stamp(path)}".encode()).hexdigest()
-        if files and (kept := _kept(record, made_of, files)) is not None:
-            return kept
+        if files and (recorded := _kept(record, made_of, files)) is not None:
+            return recorded
         self._perceive.start_from(self._learned)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -197,10 +197,10 @@ class _ScanWorker:
         ((_, outcome, _, _),) = outcomes
         if isinstance(outcome, EdgepercError):  # it names the absolute path
             outcome.args = (str(outcome).replace(str(path), str(name)),)
-        text, said = self._report.text(name, outcome), tuple(dict.fromkeys(str(each.message) for each in caught))
+        text, warned = self._report.text(name, outcome), tuple(dict.fromkeys(str(each.message) for each in caught))
         if isinstance(outcome, Exception):
-            return _Answer(text, str(outcome).removeprefix(f"{name}: "), (), said)
-        answer = _Answer(text, None, tuple(map(str, outcome.fitness)), said)
+            return _Answer(text, str(outcome).removeprefix(f"{name}: "), (), warned)
+        answer = _Answer(text, None, tuple(map(str, outcome.fitness)), warned)
         if files:
             sizes = {file.name: stamp[0] for file in files if (stamp := _stamp(file)) is not None}
             content = json.dumps({"made_of": made_of, "files": sizes, "answer": astuple(answer)}).encode()
@@ -221,10 +221,10 @@ def _kept(record: Path | Remote, made_of: str, files: Sequence[Path | Remote]) -
         stamps = {file.name: _stamp(file) for file in files}
         if any(stamp is None or stamp[0] != content["files"][name] for name, stamp in stamps.items()):
             return None
-        text, error, fitness, said, _ = content["answer"]
+        text, error, fitness, warned, _ = content["answer"]
     except (FileNotFoundError, KeyError, TypeError, ValueError):
         return None
-    return _Answer(text, error, tuple(fitness), tuple(said), kept=True)
+    return _Answer(text, error, tuple(fitness), tuple(warned), kept=True)
 
 
 def _stamp(file: Path | Remote) -> tuple[int, str] | None:
@@ -232,10 +232,10 @@ def _stamp(file: Path | Remote) -> tuple[int, str] | None:
     if isinstance(file, Remote):
         return file.stamp()
     try:
-        found = file.stat()
+        status = file.stat()
     except OSError:
         return None
-    return found.st_size, str(found.st_mtime_ns)
+    return status.st_size, str(status.st_mtime_ns)
 
 
 def _absolute(path: Path | Remote) -> Path | Remote:

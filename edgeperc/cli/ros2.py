@@ -145,16 +145,16 @@ def ros2_command(arguments: argparse.Namespace) -> int:
         graph.close()
         raise
     print_line(f"{graph.name}: waiting for clouds on {arguments.topic}, publishing {arguments.prefix}/*")
-    n_answers, said = 0, ""
+    n_answers, reported = 0, ""
     with node:
         try:
             for outcome in node:
                 if isinstance(outcome, Exception):
-                    if str(outcome) != said:  # the same of every cloud is printed once; the diagnostics repeat it
+                    if str(outcome) != reported:  # the same of every cloud is printed once; the diagnostics repeat it
                         print_error(f"{arguments.topic}: {outcome}")
-                    said = str(outcome)
+                    reported = str(outcome)
                     continue
-                said = ""
+                reported = ""
                 n_answers += 1
                 if n_answers == 1:
                     print_line(f"perceiving: {many(outcome.perception.n_points, 'point')} in the first cloud")

@@ -59,14 +59,14 @@ def read_datumaro(path: Path) -> dict[str, list[Box]]:
         left out.
     Raises PointsError.
     """
-    document, found = _read(path), dict[str, list[Box]]()
+    document, boxes = _read(path), dict[str, list[Box]]()
     try:
         names = [str(label["name"]) for label in document["categories"]["label"]["labels"]]
         for item in document["items"]:
             name = str(item["id"]).rpartition("/")[2]
-            if name in found:
+            if name in boxes:
                 raise PointsError(f"{path} has two scans called {name}; expected one")
-            found[name] = [
+            boxes[name] = [
                 _box(names[each["label_id"]], each["position"], each["scale"], each["rotation"])
                 for each in item["annotations"]
                 if each["type"] == "cuboid_3d" and not each.get("attributes", {}).get("outside", False)
@@ -75,7 +75,7 @@ def read_datumaro(path: Path) -> dict[str, list[Box]]:
         raise
     except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as exc:
         raise PointsError(f"{path} holds no annotations of Datumaro ({type(exc).__name__}: {exc})") from exc
-    return found
+    return boxes
 
 
 def _read(path: Path, kind: type = dict) -> Any:

@@ -228,8 +228,8 @@ class KittiObjects:
     """The labeled scans below a KITTI root (``training/velodyne``, ``label_2``, ``calib``), by drive.
 
     ``frames.csv`` and ``frames-*.csv`` next to ``training`` give the drive of each scan (columns ``name``,
-    ``drive`` and optionally ``grade``). Scans without an entry are left out, because a model may have been trained on their drive.
-    Without any table, each scan counts as a drive of its own.
+    ``drive`` and optionally ``grade``). Scans without an entry are left out, because a model may have been trained on
+    their drive. Without any table, each scan counts as a drive of its own.
 
     Parameters
     ----------
@@ -370,13 +370,13 @@ class SemanticKitti:
 
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root)
-        found = sorted(self.root.glob("sequences/*/labels/*.label"))
-        if not found:
+        files = sorted(self.root.glob("sequences/*/labels/*.label"))
+        if not files:
             raise PointsError(
                 f"{self.root} has no sequences/*/labels/*.label; expected the root of a SemanticKITTI set"
             )
         self.drives = {
-            f"{path.parts[-3]}/{path.stem}": SEQUENCE_DRIVES.get(path.parts[-3], path.parts[-3]) for path in found
+            f"{path.parts[-3]}/{path.stem}": SEQUENCE_DRIVES.get(path.parts[-3], path.parts[-3]) for path in files
         }
 
     def names(self, split: str, *, fold: int | None = None) -> list[str]:

@@ -280,8 +280,8 @@ class ScanFolder:
     def _scans(self) -> dict[str, Path]:
         scans: dict[str, Path] = {}
         nested = self.layout.files == "semantickitti"
-        found = self.root.glob("sequences/*/velodyne/*" if nested else "velodyne/*")
-        for path in sorted(found):
+        files = self.root.glob("sequences/*/velodyne/*" if nested else "velodyne/*")
+        for path in sorted(files):
             if path.name.startswith("."):
                 continue
             suffix = next((end for end in SUFFIXES if path.name.lower().endswith(end)), None)
@@ -358,12 +358,12 @@ class ScanFolder:
             )
         if self._point_numbers is None:
             self._point_numbers = self._numbers()
-        found = np.unique(raw)
-        known = found < len(self._point_numbers)
-        known[known] = self._point_numbers[found[known]] != IGNORE
+        numbers = np.unique(raw)
+        known = numbers < len(self._point_numbers)
+        known[known] = self._point_numbers[numbers[known]] != IGNORE
         if not known.all():
             raise PointsError(
-                f"{path}: no name for {', '.join(map(str, found[~known][:5]))}; add it to semseg_classes.json or, in "
+                f"{path}: no name for {', '.join(map(str, numbers[~known][:5]))}; add it to semseg_classes.json or, in "
                 "the description, to point_names"
             )
         return self._point_numbers[raw]

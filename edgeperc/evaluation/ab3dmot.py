@@ -89,23 +89,23 @@ class Ab3dmot:
         source = np.full(len(states), -1)
         for detection, track in self._pairs(given, states[:, _BACK]):
             source[track] = detection
-        found = source >= 0
-        self._missed = np.where(found, 0, self._missed + 1)
-        self._hits = self._hits + found
-        self._scores = np.where(found, np.append(scores, 0.0)[source], self._scores)
+        is_matched = source >= 0
+        self._missed = np.where(is_matched, 0, self._missed + 1)
+        self._hits = self._hits + is_matched
+        self._scores = np.where(is_matched, np.append(scores, 0.0)[source], self._scores)
 
         # Headings are known up to half a turn; the state turns to the detection's direction.
-        seen = given[source[found]][:, _ORDER]
-        mine = states[found]
+        seen = given[source[is_matched]][:, _ORDER]
+        mine = states[is_matched]
         off = np.abs(wrapped(seen[:, 3] - mine[:, 3])) > math.pi / 2.0
         mine[off, 3] += math.pi
         innovation = seen - mine[:, :N_SEEN]
         innovation[:, 3] = wrapped(innovation[:, 3])
-        spread = covariances[found]
+        spread = covariances[is_matched]
         gain = spread[:, :, :N_SEEN] @ np.linalg.inv(spread[:, :N_SEEN, :N_SEEN] + np.eye(N_SEEN))
-        states[found] = mine + (gain @ innovation[:, :, None])[:, :, 0]
+        states[is_matched] = mine + (gain @ innovation[:, :, None])[:, :, 0]
         states[:, 3] = wrapped(states[:, 3])
-        covariances[found] = spread - gain @ spread[:, :N_SEEN]
+        covariances[is_matched] = spread - gain @ spread[:, :N_SEEN]
 
         new = np.setdiff1d(np.arange(len(given)), source)
         born = np.zeros((len(new), N_STATE))

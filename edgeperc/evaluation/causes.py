@@ -113,10 +113,10 @@ class _Scan:
 
     def within(self, mask: NDArray[np.bool_], boxes: Sequence[Box], margin_m: float = 0.0) -> NDArray[np.bool_]:
         """Points in one of the boxes."""
-        rows, found = np.flatnonzero(mask), np.zeros(len(mask), np.bool_)
+        rows, is_near = np.flatnonzero(mask), np.zeros(len(mask), np.bool_)
         for box in boxes:
-            found[rows] |= inside(box, self.points[rows], margin_m)
-        return found
+            is_near[rows] |= inside(box, self.points[rows], margin_m)
+        return is_near
 
     def near_objects(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Points in a true box, or next to one."""
@@ -139,11 +139,11 @@ class _Scan:
 
     def on_poles(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Points with a point higher than people above or below them, at most 0.3 m aside."""
-        found = np.zeros(len(mask), np.bool_)
+        is_pole = np.zeros(len(mask), np.bool_)
         tall = self.points[self.ground.height_m > POLE_HEIGHT_M, :2]
         tall = tall[np.argsort(tall[:, 1])]
         for row in np.flatnonzero(mask):
             x, y = self.points[row, :2]
             first, end = np.searchsorted(tall[:, 1], (y - POLE_RADIUS_M, y + POLE_RADIUS_M))
-            found[row] = (np.hypot(*(tall[first:end] - (x, y)).T) <= POLE_RADIUS_M).any()
-        return found
+            is_pole[row] = (np.hypot(*(tall[first:end] - (x, y)).T) <= POLE_RADIUS_M).any()
+        return is_pole

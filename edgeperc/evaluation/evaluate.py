@@ -161,15 +161,15 @@ class _Evaluator:
         self._learned = learned
 
     def __call__(self, numbers: Sequence[int]) -> list[_Figures] | EdgepercError:
-        found = []
+        results = []
         try:
             for _, drive, evaluate in (self._scans[number] for number in numbers):
                 if drive is None:
                     self._perceive.start_from(self._learned)
-                found.append(evaluate())
+                results.append(evaluate())
         except EdgepercError as exc:
             return exc
-        return found
+        return results
 
 
 def _on_ray(job: _Job, perceive: Perceiver, scans: Sequence[_Scan], workers: int | None) -> Iterator[_Figures]:
@@ -183,9 +183,9 @@ def _on_ray(job: _Job, perceive: Perceiver, scans: Sequence[_Scan], workers: int
     # Consecutive scans of one drive stay together; the others are apart.
     rest = (k for k in range(len(scans)) if k not in first)
     groups = [[*each] for _, each in groupby(rest, lambda k: (scans[k][0], scans[k][1] or k))]
-    found = map_on_ray(_Evaluator, (job, perceive.learned), groups, workers=workers) if groups else iter(())
+    results = map_on_ray(_Evaluator, (job, perceive.learned), groups, workers=workers) if groups else iter(())
     done = 0
-    for numbers, answer in zip(groups, found, strict=True):
+    for numbers, answer in zip(groups, results, strict=True):
         if isinstance(answer, EdgepercError):
             raise answer
         if isinstance(answer, Lost):

@@ -68,7 +68,7 @@ def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[NDArra
     for frame, of in zip(truth, tracks, strict=True):
         world = frame.boxes[:, :3] @ of.T_world_sensor[:3, :3].T + of.T_world_sensor[:3, 3]
         places.append(dict(zip(frame.ids.tolist(), world[:, :2], strict=True)))
-    found = []
+    speeds_mps = []
     for k, here in enumerate(places):
         speed = np.full(len(truth[k].ids), np.nan)
         for i, one in enumerate(here):
@@ -76,8 +76,8 @@ def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[NDArra
             if near[-1] > near[0]:
                 way = places[near[-1]][one] - places[near[0]][one]
                 speed[i] = np.hypot(*way) / (FRAME_S * (near[-1] - near[0]))
-        found.append(speed)
-    return found
+        speeds_mps.append(speed)
+    return speeds_mps
 
 
 def count_headings(
@@ -105,10 +105,12 @@ def count_headings(
             rows.append((kind, int(of.ids[at]), bool(of.fronts[at] >= 0.5), right))
     counted = []
     for kind in range(3):
-        own = [row for row in rows if row[0] == kind]
-        resolved = [row for row in own if row[2]]
+        of_kind = [row for row in rows if row[0] == kind]
+        resolved = [row for row in of_kind if row[2]]
         n_right = sum(row[3] for row in resolved)
         counted.append(
-            Standing(len(own), len({row[1] for row in own}), len(resolved), n_right, sum(row[3] for row in own))
+            Standing(
+                len(of_kind), len({row[1] for row in of_kind}), len(resolved), n_right, sum(row[3] for row in of_kind)
+            )
         )
     return Headings(*counted)

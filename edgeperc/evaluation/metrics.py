@@ -101,9 +101,9 @@ class Confusion:
 
     def weighted_precision(self) -> float:
         """Mean of `precision`, weighted by the frequency of the classes (mAP as SSADNet table 3 defines it)."""
-        found = self.precision()
-        weights = self.counts.sum(axis=1) * ~np.isnan(found)
-        return float(_share(np.nansum(found * weights), weights.sum()))
+        precision = self.precision()
+        weights = self.counts.sum(axis=1) * ~np.isnan(precision)
+        return float(_share(np.nansum(precision * weights), weights.sum()))
 
 
 def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float:
@@ -120,8 +120,8 @@ def average_precision(scores: ArrayLike, hits: ArrayLike, n_truth: int) -> float
         raise PointsError(f"got scores {values.shape} and hits {right.shape}; expected two lists of one length")
     if n_truth == 0:
         return float("nan")
-    found = np.cumsum(right[np.argsort(-values, kind="stable")], dtype=np.int64)
-    return _eleven_points(found, np.arange(1, len(found) + 1), n_truth)
+    n_right = np.cumsum(right[np.argsort(-values, kind="stable")], dtype=np.int64)
+    return _eleven_points(n_right, np.arange(1, len(n_right) + 1), n_truth)
 
 
 def _eleven_points(found: NDArray[np.int64], predicted: NDArray[np.int64], n_truth: int) -> float:
@@ -174,9 +174,9 @@ class ProbabilitySweep:
 
     def max_f1(self) -> float:
         """Best F1 over the thresholds (KITTI road's MaxF); NaN if the class does not occur."""
-        found, predicted = self._above()
+        n_right, predicted = self._above()
         n_truth = self.counts[1].sum()
-        return float(np.max(2.0 * found / (predicted + n_truth))) if n_truth else float("nan")
+        return float(np.max(2.0 * n_right / (predicted + n_truth))) if n_truth else float("nan")
 
     def average_precision(self) -> float:
         """Eleven-point average precision over the thresholds; NaN if the class does not occur."""
@@ -185,8 +185,8 @@ class ProbabilitySweep:
 
     def _above(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """True positives and positives, (256,) each, from the highest threshold to the lowest."""
-        found = np.cumsum(self.counts[1, ::-1])
-        return found, np.cumsum(self.counts.sum(axis=0)[::-1])
+        n_right = np.cumsum(self.counts[1, ::-1])
+        return n_right, np.cumsum(self.counts.sum(axis=0)[::-1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -375,14 +375,14 @@ class BoxEvaluator:
     def _scores(self, matches: _Matches, within_m: tuple[float, float]) -> BoxScores:
         near, far = within_m
         ranges_m, truth_m = np.array(matches.ranges_m), np.array(matches.truth_m)
-        kept = (ranges_m >= near) & (ranges_m < far)
-        scores, overlaps = np.array(matches.scores)[kept], np.array(matches.overlaps)[kept]
+        in_range = (ranges_m >= near) & (ranges_m < far)
+        scores, overlaps = np.array(matches.scores)[in_range], np.array(matches.overlaps)[in_range]
         to_find = np.flatnonzero((truth_m >= near) & (truth_m < far))
         n_truth = len(to_find)
         hits = overlaps >= self.iou_threshold
         n_hits = int(np.count_nonzero(hits))
-        turns = np.array(matches.turns)[kept][hits]
-        fronts = np.array(matches.fronts, dtype=np.bool_)[kept][hits]
+        turns = np.array(matches.turns)[in_range][hits]
+        fronts = np.array(matches.fronts, dtype=np.bool_)[in_range][hits]
         objects = {matches.objects[k] for k in to_find}
         return BoxScores(
             ap=average_precision(scores, hits, n_truth),
@@ -397,7 +397,7 @@ class BoxEvaluator:
             n_predicted=len(hits),
             n_hits=n_hits,
             n_objects=len(objects),
-            n_found=len({matches.matched[k] for k in np.flatnonzero(kept)[hits]}),
+            n_found=len({matches.matched[k] for k in np.flatnonzero(in_range)[hits]}),
             n_drives=len({drive for drive, *_ in objects}),
         )
 

@@ -81,9 +81,9 @@ def banded(
     labels, right, range_m = labels[known], right[known], range_m[known]
     confusions: dict[tuple[str, ...], Confusion] = {}
     for band, within_m in BANDS.items():
-        kept = within(range_m, within_m)
+        in_range = within(range_m, within_m)
         confusion = Confusion(classes)
-        confusion.update(labels[kept], right[kept])
+        confusion.update(labels[in_range], right[in_range])
         confusions |= {(*table, band): confusion}
     return confusions
 
@@ -155,44 +155,46 @@ def _summed(parts: Sequence[Tallies]) -> Tallies:
 
 
 def _figures(tallies: Tallies) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    figures: dict[str, Any] = {}
     for key, tally in tallies.items():
         group, band = key[0], key[-1]
         if group == "labeled":
-            found[group] = _labeled_rows(tally)
+            figures[group] = _labeled_rows(tally)
         elif group in ("points", "pixels"):
-            found.setdefault(group, {})[band] = _point_rows(tally, tallies["objects", band])
+            figures.setdefault(group, {})[band] = _point_rows(tally, tallies["objects", band])
         elif group == "sure":
             objects = tallies["objects", band]
             others = Counter({key: n for key, n in objects.items() if key[1][1] != SITTING})
-            found.setdefault(group, {})[band] = _point_rows(tally, others)
+            figures.setdefault(group, {})[band] = _point_rows(tally, others)
         elif group == "mean_scan":
             for name, iou in zip(tally.classes, tally.iou().tolist(), strict=True):
-                found["points"][band][name]["iou_by_drive"] = iou
+                figures["points"][band][name]["iou_by_drive"] = iou
         elif group == "boxes":
             bands = {name: _of_all(tally, within_m, "vehicle") for name, within_m in BANDS.items()}
-            found.setdefault(group, {})[key[1]] = {name: _with_mean(scores) for name, scores in bands.items()}
+            figures.setdefault(group, {})[key[1]] = {name: _with_mean(scores) for name, scores in bands.items()}
             if key[1] == "oriented":
-                found.setdefault("heading", {})[group] = {name: _heading_rows(scores) for name, scores in bands.items()}
+                figures.setdefault("heading", {})[group] = {
+                    name: _heading_rows(scores) for name, scores in bands.items()
+                }
         elif group == "all_round":
             for name, within_m in BANDS.items():
                 scores = _of_all(tally, within_m, key[1])
-                found.setdefault(group, {}).setdefault(name, {}).update(_box_rows(scores))
-                headings = found.setdefault("heading", {}).setdefault(group, {})
+                figures.setdefault(group, {}).setdefault(name, {}).update(_box_rows(scores))
+                headings = figures.setdefault("heading", {}).setdefault(group, {})
                 headings.setdefault(name, {}).update(_heading_rows(scores))
         elif group == "kitti":
-            found[group] = _kitti_rows(tally)
+            figures[group] = _kitti_rows(tally)
         elif group == "centers":
-            found[group] = _center_rows(tally)
+            figures[group] = _center_rows(tally)
         elif key == ("errors", "points"):
             scans, objects = tallies["errors", "scans"], tallies["errors", "objects"]
-            found["errors"] = {error: _error_rows(error, tally, scans, objects) for error in CAUSES}
-            found["bumper"] = {cause: _error_row(BUMPER, cause, tally, scans) for cause in ("all", FLOOR)}
+            figures["errors"] = {error: _error_rows(error, tally, scans, objects) for error in CAUSES}
+            figures["bumper"] = {cause: _error_row(BUMPER, cause, tally, scans) for cause in ("all", FLOOR)}
         elif group == "segmentation":
-            found.setdefault(group, {}).setdefault(key[1], {})[band] = _map_row(tally)
+            figures.setdefault(group, {}).setdefault(key[1], {})[band] = _map_row(tally)
         elif group == "road":
-            found.setdefault(group, {})[band] = _road_row(tally, tallies["decision", band], tallies["drivable", band])
-    return found
+            figures.setdefault(group, {})[band] = _road_row(tally, tallies["decision", band], tallies["drivable", band])
+    return figures
 
 
 def _labeled_rows(labeled: Counter[ObjectKey]) -> dict[str, Any]:

@@ -513,10 +513,10 @@ def perceive_drive(
         A scan cannot be read.
     """
     trained_on = training_scans_of(perceive.cards)
-    found: list[list[Box]] = [[] for _ in range(1 + max(scans, default=-1))]
+    boxes: list[list[Box]] = [[] for _ in range(1 + max(scans, default=-1))]
     for frame, path in scans.items():
         points = read_points(path)
         check_unseen(trained_on, path.stem, drive, points)
-        found[frame] = list(perceive(points).boxes)
+        boxes[frame] = list(perceive(points).boxes)
         on_scan()
-    return found
+    return boxes

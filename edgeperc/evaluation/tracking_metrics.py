@@ -272,10 +272,10 @@ class _Packed:
 
     def matched(self, threshold: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Indices of the matched pairs, and which boxes of tracks are above the threshold."""
-        kept = (self.mean_score >= threshold)[self.track]
+        is_scored = (self.mean_score >= threshold)[self.track]
         most = 1.0 + float(self.shapes[:, 0].max(initial=0))  # one more pair outweighs any IoU
-        may = kept[self.column] & (self.iou >= self.iou_threshold)
-        return self.assigned(np.where(may, most + self.iou, 0.0)), kept
+        may = is_scored[self.column] & (self.iou >= self.iou_threshold)
+        return self.assigned(np.where(may, most + self.iou, 0.0)), is_scored
 
     def assigned(self, gain: NDArray[np.float64]) -> NDArray[np.int64]:
         """Indices of the pairs with the largest sum of gains in each frame; each box is in at most one pair."""
@@ -328,8 +328,8 @@ def _hota(packed: Sequence[_Packed], threshold: float) -> Hota:
     n_found, n_truth, n_tracked = np.zeros(len(HOTA_ALPHAS)), 0, 0
     associated = np.zeros(len(HOTA_ALPHAS))
     for of in packed:
-        pair, kept = of.matched(threshold)
-        real, counted = ~of.ignored, kept & ~of.excused
+        pair, is_matched = of.matched(threshold)
+        real, counted = ~of.ignored, is_matched & ~of.excused
         counted[of.column[pair]] = real[of.row[pair]]
         in_truth = np.bincount(of.truth[real], minlength=int(of.truth.max(initial=-1)) + 1).astype(np.float64)
         in_track = np.bincount(of.track[counted], minlength=of.n_tracks).astype(np.float64)
@@ -346,10 +346,10 @@ def _hota(packed: Sequence[_Packed], threshold: float) -> Hota:
 
         made = of.assigned(alignment[names] * shared)
         for k, alpha in enumerate(HOTA_ALPHAS):
-            found = made[of.iou[made] >= alpha - 1e-12]
+            hits = made[of.iou[made] >= alpha - 1e-12]
             counts = np.zeros(either.shape)
-            np.add.at(counts, (names[0][found], names[1][found]), 1.0)
-            n_found[k] += len(found)
+            np.add.at(counts, (names[0][hits], names[1][hits]), 1.0)
+            n_found[k] += len(hits)
             associated[k] += (counts * counts / np.maximum(either - counts, 1.0)).sum()
         n_truth += int(np.count_nonzero(real))
         n_tracked += int(np.count_nonzero(counted))
@@ -450,23 +450,23 @@ def count_breaks(
     switches = 0
     fragments = 0
     for one in range(truth.max() + 1 if len(truth) else 0):
-        own = np.flatnonzero(truth == one)
+        rows = np.flatnonzero(truth == one)
         hidden = True
-        for i in own:
+        for i in rows:
             hidden = hidden and ignored[i]
         if hidden:
             continue
-        last = ids[own[0]]
-        for f in range(1, len(own)):
-            now, before = ids[own[f]], ids[own[f - 1]]
-            if ignored[own[f]]:
+        last = ids[rows[0]]
+        for f in range(1, len(rows)):
+            now, before = ids[rows[f]], ids[rows[f - 1]]
+            if ignored[rows[f]]:
                 last = -1
                 continue
             if last != -1 and now != -1:
-                stays = f == len(own) - 1 or ids[own[f + 1]] != -1
+                stays = f == len(rows) - 1 or ids[rows[f + 1]] != -1
                 switches += last != now and before != -1
                 fragments += before != now and stays
-            elif late and f == len(own) - 1 and now != -1 and before != now:
+            elif late and f == len(rows) - 1 and now != -1 and before != now:
                 fragments += 1  # no track since its first box, or since an ignored one
             if now != -1:
                 last = now

@@ -171,8 +171,10 @@ def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
     try:
         if kind == ".pcap":
             return of_packets(path, topic)
-        found = describe_apart(path, kind, topic)
-        return of_metadata(json.loads(found["metadata"]), "the metadata") if "metadata" in found else of_cloud(found)
+        description = describe_apart(path, kind, topic)
+        if "metadata" in description:
+            return of_metadata(json.loads(description["metadata"]), "the metadata")
+        return of_cloud(description)
     except SensorError as exc:
         raise SensorError(f"{path}: {exc}") from exc
     except PointsError as exc:

@@ -127,8 +127,8 @@ def _of_array(array: NDArray[Any], remission_field: str | None) -> _Read:
     return as_points(array, remission_field=remission_field), table_columns(array)
 
 
-def _of_columns(found: Columns, remission_field: str | None) -> _Read:
-    return assemble(*found, remission_field), found.fields
+def _of_columns(columns: Columns, remission_field: str | None) -> _Read:
+    return assemble(*columns, remission_field), columns.fields
 
 
 def _parse_raw(data: NDArray[np.uint8], columns: int, by_name: bool) -> NDArray[np.float32]:

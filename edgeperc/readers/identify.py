@@ -133,14 +133,14 @@ def of_metadata(content: Any, source: str) -> KnownSensor:
     return KnownSensor(replace(profile, columns=columns), because)
 
 
-def of_cloud(found: Mapping[str, Any]) -> KnownSensor:
+def of_cloud(cloud: Mapping[str, Any]) -> KnownSensor:
     """The sensor of a point cloud of ROS: its maker by fields, frame and topic, its model by the angles of its rings.
 
-    found : ``topic``, ``frame``, ``fields`` and ``elevations_deg``, from `decoders.describe`.
+    cloud : ``topic``, ``frame``, ``fields`` and ``elevations_deg``, from `decoders.describe`.
     Raises SensorError.
     """
-    topic, frame, fields = str(found["topic"]), str(found["frame"]), [str(name) for name in found["fields"]]
-    rings = [np.nan if angle is None else float(angle) for angle in found["elevations_deg"]]
+    topic, frame, fields = str(cloud["topic"]), str(cloud["frame"]), [str(name) for name in cloud["fields"]]
+    rings = [np.nan if angle is None else float(angle) for angle in cloud["elevations_deg"]]
     if np.isnan(rings).all():
         rings = []
     words = f"{topic} {frame}".lower()

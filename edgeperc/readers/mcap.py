@@ -78,8 +78,8 @@ class McapFile:
         with self._path.open("rb") as file:
             for kind, content in _records(file, 8, self._end):
                 if kind == _CHUNK:
-                    found = list(self._of_records(_split(_unpacked(content))))
-                    yield from sorted(found, key=lambda message: message.stamp_ns)
+                    records = list(self._of_records(_split(_unpacked(content))))
+                    yield from sorted(records, key=lambda message: message.stamp_ns)
                 elif kind == _DATA_END:
                     return
                 else:

@@ -36,19 +36,19 @@ def open_capture(path: Path, warn: Callable[[str], None], alive: Callable[[], No
         text = read_metadata(file)
         layout = core.PacketFormat(core.SensorInfo(text))
         sizes |= {int(getattr(layout, f"{kind}_packet_size", 0)) for kind in ("lidar", "imu", "zone")}
-    found = check_datagrams(path, sizes - {0}, alive)
-    if not found.n_good:
+    datagrams = check_datagrams(path, sizes - {0}, alive)
+    if not datagrams.n_good:
         return None
-    if found.n_bad:
+    if datagrams.n_bad:
         warn(
-            f"{path}: dropped {found.n_bad} damaged packets of the capture: empty, incomplete, or of another length "
-            "than the metadata says"
+            f"{path}: dropped {datagrams.n_bad} damaged packets of the capture: empty, incomplete, or of another "
+            "length than the metadata says"
         )
-    if found.bad:
+    if datagrams.bad:
         if shutil.disk_usage(tempfile.gettempdir()).free < path.stat().st_size:
             raise PointsError("the temporary folder has no room for a copy without the damaged packets")
         source = Path(tempfile.mkdtemp()) / "whole.pcap"
-        copy_without(path, found.bad, source, alive)
+        copy_without(path, datagrams.bad, source, alive)
     else:
         source = path
     return pcap.PcapFrameSetSource(str(source), meta=[str(file) for file in metadata])

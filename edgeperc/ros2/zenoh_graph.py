@@ -152,8 +152,8 @@ class ZenohGraph:
     def close(self) -> None:
         """Undeclare everything and close the session; more calls have no effect."""
         with self._closing:
-            kept, self._kept = self._kept, []
-            if not returns(lambda: self._undeclare(kept), _CLOSING_S):
+            entities, self._kept = self._kept, []
+            if not returns(lambda: self._undeclare(entities), _CLOSING_S):
                 warnings.warn(
                     f"the Zenoh session did not close within {_CLOSING_S:.0f} s and was left behind",
                     RuntimeWarning,

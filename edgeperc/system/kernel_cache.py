@@ -168,8 +168,8 @@ class KernelCache:
     def cache_path(self) -> str | None:
         """The first folder that can be written, or holds this kernel already; None if there is none."""
         usable = [folder for folder in self._folders() if _unusable(folder) is None]
-        kept = (folder for folder in usable if _can_be_written(folder) or self._is_in(folder))
-        return next(map(str, kept), None)
+        writable = (folder for folder in usable if _can_be_written(folder) or self._is_in(folder))
+        return next(map(str, writable), None)
 
     def is_missing(self) -> bool:
         """Whether no folder holds a compiled form of this kernel, for any types, and one of them can be written."""

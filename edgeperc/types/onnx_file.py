@@ -121,13 +121,13 @@ def _damaged(path: str | os.PathLike[str], exc: ValueError) -> ModelFileError:
 
 def _entry(reader: _Reader, start: int, end: int, wanted: bytes) -> tuple[int, int] | None:
     """Start and end of the value of a metadata entry; None if the entry has another key."""
-    found, value = b"", (0, 0)
+    key, value = b"", (0, 0)
     for number, _, first, last in reader.fields(start, end):
         if number == 1:
-            found = reader.content(first, last) if last - first == len(wanted) else b""
+            key = reader.content(first, last) if last - first == len(wanted) else b""
         elif number == 2:
             value = first, last
-    return value if found == wanted else None
+    return value if key == wanted else None
 
 
 class _Reader:

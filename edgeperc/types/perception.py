@@ -186,10 +186,10 @@ class ImageLabels:
     def drivable(self) -> NDArray[np.bool_]:
         """Pixels of the road, (H, W) bool: of a class called road or drivable; all False if there is none."""
         roads = [k for k, name in enumerate(self.classes) if name.casefold() in ROADS]
-        found = np.zeros(self.labels.shape, np.bool_)
+        is_road = np.zeros(self.labels.shape, np.bool_)
         for k in roads:
-            found |= self.labels == k
-        return found
+            is_road |= self.labels == k
+        return is_road
 
     @property
     def drivable_share(self) -> float:

@@ -196,12 +196,12 @@ def place_labels(
         )
         extent = text.get_window_extent()
         half = np.array([extent.width / 2.0 + gap, extent.height / 2.0 + gap])
-        found = free_place(label.area, half, taken, (panel.x0, panel.y0, panel.x1, panel.y1))
-        if found is None:
+        place = free_place(label.area, half, taken, (panel.x0, panel.y0, panel.x1, panel.y1))
+        if place is None:
             text.remove()
             n_omitted += 1
             continue
-        middle, apart = found
+        middle, apart = place
         text.set(position=tuple(middle), ha="center", va="center")
         text.set_bbox({"facecolor": PANEL, "edgecolor": "none", "alpha": 0.8, "pad": 2.0})
         taken = np.vstack([taken, [*(middle - half), *(middle + half)]])

@@ -69,7 +69,7 @@ def draw_painted(
     OSError
         The file cannot be written.
     """
-    image, found = perceived_image(image, perception)
+    image, labels = perceived_image(image, perception)
     check_points(points, perception)
     painted = paint(perception, points, calibration, sensor=sensor)
     road = camera_road(perception, points, calibration, sensor=sensor)
@@ -80,13 +80,13 @@ def draw_painted(
     bottom = _TOP + max(2.0 * height + _GAP, 740.0)
     counts = np.bincount(painted, minlength=256)
     facts = {
-        name: [f"{100.0 * n / found.labels.size:.1f} %"] + [f"{counts[k]:,} points"] * bool(counts[k])
-        for k, (name, n) in enumerate(found.counts().items())
+        name: [f"{100.0 * n / labels.labels.size:.1f} %"] + [f"{counts[k]:,} points"] * bool(counts[k])
+        for k, (name, n) in enumerate(labels.counts().items())
         if n
     }
     figure = new_figure(_WIDTH, int(bottom) + 40 + height_of_legend(facts) + 68)
-    colors = rgb([color_of(name) for name in found.classes])
-    _draw_image(figure, (_MARGIN, _TOP, width, height), image, colors, found.labels)
+    colors = rgb([color_of(name) for name in labels.classes])
+    _draw_image(figure, (_MARGIN, _TOP, width, height), image, colors, labels.labels)
     place = (_MARGIN, _TOP + height + _GAP, width, height)
     _draw_points(figure, place, image, points, calibration, colors, painted)
     left = _MARGIN + width + 34.0 + _AXIS

@@ -253,9 +253,9 @@ def _write_names(pen: Any, tracks: Sequence[Track], font: Any) -> None:
         text = f"{track.id}" + (f" · {3.6 * speed:.0f} km/h" if speed > 0.5 else "")
         left, top, right, bottom = pen.textbbox((0, 0), text, font=font, anchor="mm")
         half = np.array([(right - left) / 2.0 + 6.0, (bottom - top) / 2.0 + 6.0])
-        found = free_place(area, half, np.array(taken), panel)
-        if found is not None:
-            middle, _ = found
+        place = free_place(area, half, np.array(taken), panel)
+        if place is not None:
+            middle, _ = place
             taken.append((*(middle - half).tolist(), *(middle + half).tolist()))
             pen.rectangle(taken[-1], fill=PANEL)
             pen.text(tuple(middle.tolist()), text, fill=color_of(track.label), font=font, anchor="mm")

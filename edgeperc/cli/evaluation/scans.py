@@ -322,8 +322,8 @@ def _cell_lines(of_block: Mapping[str, Any]) -> list[str]:
             if row["n_cells"]:
                 rows.append(((band, ""), row | {"iou": None, "iou_interval": None}))
                 for name, n_cells in row["n_cells_of"].items():
-                    own = {key: row[key][name] for key in ("iou", "iou_interval")}
-                    rows.append(((band, name), own | {"n_cells": n_cells}))
+                    of_class = {key: row[key][name] for key in ("iou", "iou_interval")}
+                    rows.append(((band, name), of_class | {"n_cells": n_cells}))
         lines += table_lines(f"top view, {kind}", _CELL_COLUMNS, rows)
     return lines
 
