@@ -213,16 +213,9 @@ class EnergyMeter:
     The energy is that of whole packages or boards, including idle power and all other processes. Call `tick` often,
     because counters wrap, and because rails show only power, which is integrated here.
 
-    Parameters
-    ----------
-    root : Path
-        ``/sys``.
-
-    Attributes
-    ----------
+    root : Path; ``/sys``.
     rails : tuple of str
-    joules : dict of str to float
-        Since construction, by rail.
+    joules : dict of str to float; since construction, by rail.
     """
 
     def __init__(self, root: Path = Path("/sys")) -> None:

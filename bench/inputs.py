@@ -22,14 +22,9 @@ from edgeperc.types.sensor import get_sensor
 class Input:
     """Scans as files for measuring processes.
 
-    Attributes
-    ----------
-    files : tuple of Path
-        .npy, (n, 4) float32 in the sensor's raw unit of remission.
-    truth : tuple of SimulatedScan
-        Empty if there is no ground truth.
-    record : dict
-        For the report; two reports with the same ``sha256`` are of the same scans.
+    files : .npy, (n, 4) float32 in the sensor's raw unit of remission.
+    truth : empty if there is no ground truth.
+    record : for the report; two reports with the same ``sha256`` are of the same scans.
     """
 
     files: tuple[Path, ...]

@@ -52,15 +52,10 @@ def noise_floor(repeats: Sequence[ArrayLike]) -> float | None:
 class Verdict:
     """Result of comparing a run B with a run A.
 
-    Attributes
-    ----------
     word : {"faster", "slower", "no difference", "unusable"}
-    ratio : float
-        Median of B over that of A.
-    interval : tuple of 2 float
-        95 % bootstrap interval of the ratio.
-    noise : float
-        The larger `noise_floor` of the two runs; NaN if a run was not repeated.
+    ratio : median of B over that of A.
+    interval : 95 % bootstrap interval of the ratio.
+    noise : the larger `noise_floor` of the two runs; NaN if a run was not repeated.
     """
 
     word: str
@@ -113,14 +108,8 @@ def _resampled(repeats: Sequence[ArrayLike], rng: np.random.Generator) -> NDArra
 class Trend:
     """A straight line through samples.
 
-    Attributes
-    ----------
-    slope : float
-    error : float
-        Half of the slope's 95 % interval.
-    intercept : float
-    r2 : float
-        Share of the variance that the line explains; NaN if the variance is 0.
+    error : half of the slope's 95 % interval.
+    r2 : share of the variance that the line explains; NaN if the variance is 0.
     """
 
     slope: float

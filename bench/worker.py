@@ -44,16 +44,9 @@ class WorkerError(EdgepercError):
 class Scenario:
     """How scans arrive: back to back, or at a rate.
 
-    Attributes
-    ----------
-    name : str
-    scans : tuple of Path
-        .npy files, (n, 4) float32 each, with remission in the sensor's raw unit.
-    limits : Limits
-    rate_hz : float or None
-        None for back to back.
-    application : bool
-        Also stream, track, write JSON and draw, as `Application` does.
+    scans : .npy files, (n, 4) float32 each, with remission in the sensor's raw unit.
+    rate_hz : none for back to back.
+    application : also stream, track, write JSON and draw, as `Application` does.
     """
 
     name: str
@@ -67,17 +60,10 @@ class Scenario:
 class Job:
     """The work of one process.
 
-    Attributes
-    ----------
-    models : tuple of str
-    provider, precision, n_threads, sensor, full_turn
-        As in `Perceiver`.
-    scenarios : tuple of Scenario
-        One after the other.
-    predict : tuple of Path
-        Scans whose predictions are returned; perceived after everything else.
-    loadgen : Path or None
-        Folder for MLPerf LoadGen's logs; if given, LoadGen drives the scenarios in place of `back_to_back`.
+    provider, precision, n_threads, sensor, full_turn : as in `Perceiver`.
+    scenarios : one after the other.
+    predict : scans whose predictions are returned; perceived after everything else.
+    loadgen : folder for MLPerf LoadGen's logs; if given, LoadGen drives the scenarios in place of `back_to_back`.
     """
 
     models: tuple[str, ...]

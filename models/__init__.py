@@ -16,9 +16,8 @@ from pathlib import Path
 
 from edgeperc.errors import ModelFileError, ProviderError
 from edgeperc.system.names import nearest
+from edgeperc.types import choices
 from edgeperc.types.card import ModelCard
-from edgeperc.types.choices import CAMERA
-from edgeperc.types.choices import DEFAULT_MODELS as DEFAULT
 from edgeperc.types.onnx_file import read_model
 
 __all__ = [
@@ -35,6 +34,12 @@ __all__ = [
     "resolve",
     "shipped_models",
 ]
+
+DEFAULT = choices.DEFAULT_MODELS
+"""The best pair: drivable area and vehicles ahead, and a class for every point."""
+
+CAMERA = choices.CAMERA
+"""The model of a camera's images."""
 
 MAX_LOSS = 0.3
 """Largest loss of mean IoU or AP, in percentage points, that ``precision="auto"`` accepts for speed."""

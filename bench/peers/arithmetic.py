@@ -27,14 +27,10 @@ COPY_BYTES = 1 << 28
 class Cost:
     """The work of a network; traffic is counted in values, not bytes.
 
-    Attributes
-    ----------
-    macs : int
-        Multiply-accumulates including padding, as usually reported.
-    padding_macs : int
-        Multiply-accumulates with padding only; part of ``macs``.
-    weights, activations : int
-        Values that convolutions and matrix products read, and read or write; other operators can be fused into them.
+    macs : multiply-accumulates including padding, as usually reported.
+    padding_macs : multiply-accumulates with padding only; part of ``macs``.
+    weights, activations : values that convolutions and matrix products read, and read or write; other operators can be
+        fused into them.
     """
 
     macs: int

@@ -49,24 +49,14 @@ PEAKS = (("numpy", "fp32"), ("torch", "fp32"), ("torch", "bf16"), ("torch", "int
 class Contender:
     """One row of a table.
 
-    Attributes
-    ----------
-    name : str
-    kind : str
-        A key of `turns.MAKERS`.
-    engine : str
-        A provider for the kinds ``"edgeperc"``, ``"default"`` and ``"session"``, else as `open_engine` or
+    kind : A key of `turns.MAKERS`.
+    engine : A provider for the kinds ``"edgeperc"``, ``"default"`` and ``"session"``, else as `open_engine` or
         `matrix_product` take it.
-    precision : str
-        As the provider or the engine takes it; empty if it has no choice.
-    paths : tuple of Path
-        Models.
-    cards : tuple of str
-        The models' cards, JSON.
-    image : Path or None
-        Input of a network alone, .npy.
-    inputs : tuple of Path
-        A camera's images, .npy, in place of the scans of the run.
+    precision : as the provider or the engine takes it; empty if it has no choice.
+    paths : models.
+    cards : the models' cards, JSON.
+    image : input of a network alone, .npy.
+    inputs : A camera's images, .npy, in place of the scans of the run.
     """
 
     name: str

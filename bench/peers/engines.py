@@ -23,12 +23,8 @@ from .arithmetic import openvino_request
 class Engine:
     """A network ready to run.
 
-    Attributes
-    ----------
-    input : (C, H, W) float32
-        Write here, then `run`.
-    run : callable
-        Returns the outputs by their names in the graph, without the batch axis.
+    input : (C, H, W) float32; write here, then `run`.
+    run : returns the outputs by their names in the graph, without the batch axis.
     """
 
     input: NDArray[np.float32]

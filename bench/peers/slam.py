@@ -75,22 +75,13 @@ Odometry = Callable[[Sequence[Points]], Poses]
 class Drive:
     """Consecutive scans.
 
-    Attributes
-    ----------
-    name : str
     scans : list of (n, 4) float32
-    poses : (k, 4, 4) float64 or None
-        True poses of the sensor.
-    moving : list of (n,) bool, or None
-        Points on objects that move; None: from ``labels``.
-    usable : list of (n,) bool
-        Points for KISS-ICP.
-    known : list of (n,) bool
-        Points of which it is known whether they move.
-    labels : list of list of Box
-        True boxes of each scan, of all objects; empty if ``moving`` is known.
-    trained : bool
-        Whether a model was trained on one of the scans.
+    poses : (k, 4, 4) float64 or None; true poses of the sensor.
+    moving : list of (n,) bool, or None; points on objects that move; None: from ``labels``.
+    usable : list of (n,) bool; points for KISS-ICP.
+    known : list of (n,) bool; points of which it is known whether they move.
+    labels : true boxes of each scan, of all objects; empty if ``moving`` is known.
+    trained : whether a model was trained on one of the scans.
     """
 
     name: str
@@ -234,14 +225,8 @@ def kiss_icp(scans: Sequence[Points]) -> Poses:
 class Seen:
     """What is left out of the scans of a drive, and the median processor time of a scan.
 
-    Attributes
-    ----------
-    kept : dict of str to list of (n,) bool
-        By variant, in their order; without the second pass.
-    perceptions : list of Perception
-    poses : (k, 4, 4) float64
-        Of the sensor, as the tracker estimates them.
-    ms : float
+    kept : dict of str to list of (n,) bool; by variant, in their order; without the second pass.
+    poses : (k, 4, 4) float64; of the sensor, as the tracker estimates them.
     """
 
     kept: dict[str, list[NDArray[np.bool_]]]

@@ -35,15 +35,10 @@ _REINSTALL = "pip install --force-reinstall edgeperc"
 class Finding:
     """One line of the report.
 
-    Attributes
-    ----------
-    name : str
-        What was examined, e.g. ``"cache folder"``.
-    state : {"ok", "note", "broken"}
-        ``"note"`` is something that edgeperc works without; ``"broken"`` something that it needs.
-    found : str
-    advice : str
-        A command or what to do; empty if nothing is to be done.
+    name : what was examined, e.g. ``"cache folder"``.
+    state : {"ok", "note", "broken"}; ``"note"`` is something that edgeperc works without; ``"broken"`` something that
+        it needs.
+    advice : A command or what to do; empty if nothing is to be done.
     """
 
     name: str

@@ -32,14 +32,9 @@ _LAYOUT_FOLDERS = ("velodyne", "velodyne_points", "data")
 class Scans(NamedTuple):
     """Scans found at the paths of a command line.
 
-    Attributes
-    ----------
-    paths : list of Path
-        Scan files and captures, each once.
-    empty : list of Path
-        Folders without scans.
-    of_data_set : bool
-        Whether a path is the root of a data set. Its sequences all number their scans from 0.
+    paths : scan files and captures, each once.
+    empty : folders without scans.
+    of_data_set : whether a path is the root of a data set. Its sequences all number their scans from 0.
     """
 
     paths: list[Path]

@@ -56,40 +56,26 @@ def class_number(name: str, classes: Sequence[str] = POINT_CLASSES) -> int:
 class ScanLayout:
     """What ``scans.json`` says of the scans of a folder.
 
-    Attributes
-    ----------
-    name : str
-        Name of the set, in tables and in cards.
-    files : str
-        ``"plain"``, or ``"semantickitti"``: the tree of that set; a scan is called ``SEQ/NAME``, and its drive is that
-        of its sequence (`datasets.SEQUENCE_DRIVES`).
-    sensor : SensorProfile
-        Its ``mounting`` is what is known of the mounting.
-    boxes, points : mapping of str to str
-        Class of a label file, in lower case -> class of edgeperc: ``car``, ``van``, ``truck``, ``pedestrian``,
-        ``person_sitting``, ``cyclist``, ``background``, a new name, or ``ignore`` (objects and points of which nothing
-        is known); for points also ``drivable``. The key ``*`` stands for all other classes.
-    box_format : str
-        ``"plain"``: ``label/NAME.txt``; ``"kitti"``: ``label_2/NAME.txt`` with ``calib/NAME.txt``; or what an
+    name : name of the set, in tables and in cards.
+    files : ``"plain"``, or ``"semantickitti"``: the tree of that set; a scan is called ``SEQ/NAME``, and its drive is
+        that of its sequence (`datasets.SEQUENCE_DRIVES`).
+    sensor : its ``mounting`` is what is known of the mounting.
+    boxes, points : class of a label file, in lower case -> class of edgeperc: ``car``, ``van``, ``truck``,
+        ``pedestrian``, ``person_sitting``, ``cyclist``, ``background``, a new name, or ``ignore`` (objects and points
+        of which nothing is known); for points also ``drivable``. The key ``*`` stands for all other classes.
+    box_format : ``"plain"``: ``label/NAME.txt``; ``"kitti"``: ``label_2/NAME.txt`` with ``calib/NAME.txt``; or what an
         annotation tool saves: ``"labelcloud"``: ``labels/NAME.json``, ``"sustechpoints"``: ``label/NAME.json``,
         ``"cvat"``: ``annotations/default.json`` of its format "Datumaro 3D".
-    box_columns : tuple of str
-        Columns of ``label/NAME.txt``. Columns that are not among `BOX_COLUMNS` are skipped; columns after the listed
-        ones are too.
-    point_names : mapping of int to str, or None
-        Names of the numbers in ``semseg``; None: ``semseg_classes.json`` has them.
-    labeled_deg : tuple of 2 float
-        Sector in which all objects have boxes, as azimuths counter-clockwise from x [deg].
-    labeled_m : float
-        Distance up to which all objects have boxes [m].
-    min_points : int
-        A box with fewer points need not be detected, and its object is not counted.
-    drives : str
-        ``"table"``: ``frames.csv`` names them, and without that file each scan is a drive of its own; ``"scan"``: each
-        scan is a drive of its own; ``"one"``: all scans are of one drive.
-    splits : mapping of str to tuple of str
-        ``"train"``, ``"validation"`` or ``"test"`` -> drives; ``*`` stands for all drives that are not listed. Drives
-        that no entry covers are for training and testing, as in `splits.in_split`.
+    box_columns : columns of ``label/NAME.txt``. Columns that are not among `BOX_COLUMNS` are skipped; columns after the
+        listed ones are too.
+    point_names : names of the numbers in ``semseg``; None: ``semseg_classes.json`` has them.
+    labeled_deg : sector in which all objects have boxes, as azimuths counter-clockwise from x [deg].
+    labeled_m : distance up to which all objects have boxes [m].
+    min_points : A box with fewer points need not be detected, and its object is not counted.
+    drives : ``"table"``: ``frames.csv`` names them, and without that file each scan is a drive of its own; ``"scan"``:
+        each scan is a drive of its own; ``"one"``: all scans are of one drive.
+    splits : ``"train"``, ``"validation"`` or ``"test"`` -> drives; ``*`` stands for all drives that are not listed.
+        Drives that no entry covers are for training and testing, as in `splits.in_split`.
     """
 
     name: str

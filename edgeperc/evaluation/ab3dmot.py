@@ -24,16 +24,10 @@ from .tracking_metrics import box_iou, fill_assignment
 class Settings:
     """Association and life of the tracks of one class.
 
-    Attributes
-    ----------
-    by_distance : bool
-        Associate by the distance of the centers, instead of generalized 3-D IoU.
-    greedy : bool
-        Assign the best pair first, instead of the best sum.
-    least : float
-        Lowest affinity of a pair: generalized IoU, or the negative distance [m].
-    min_hits, max_age : int
-        Detections before a track is reported; scans without a detection after which it is deleted.
+    by_distance : associate by the distance of the centers, instead of generalized 3-D IoU.
+    greedy : assign the best pair first, instead of the best sum.
+    least : lowest affinity of a pair: generalized IoU, or the negative distance [m].
+    min_hits, max_age : detections before a track is reported; scans without a detection after which it is deleted.
     """
 
     by_distance: bool

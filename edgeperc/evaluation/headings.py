@@ -24,16 +24,10 @@ FRAME_S = 0.1
 class Standing:
     """Counts of boxes of tracks that match a label, without ignored ones.
 
-    Attributes
-    ----------
-    n_boxes, n_tracks : int
-        Boxes, and tracks with at least one of them.
-    n_resolved : int
-        Boxes with a front (`edgeperc.Box.front`); for the others the heading is known up to half a turn.
-    n_right : int
-        Boxes with a front, whose heading is less than a quarter turn from the label's.
-    n_right_of_all : int
-        All boxes whose heading is less than a quarter turn from the label's.
+    n_boxes, n_tracks : boxes, and tracks with at least one of them.
+    n_resolved : boxes with a front (`edgeperc.Box.front`); for the others the heading is known up to half a turn.
+    n_right : boxes with a front, whose heading is less than a quarter turn from the label's.
+    n_right_of_all : all boxes whose heading is less than a quarter turn from the label's.
     """
 
     n_boxes: int = 0

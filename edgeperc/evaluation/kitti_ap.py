@@ -39,14 +39,10 @@ BIRDS_EYE, IN_3D = "bird's eye", "3-D"
 class Counts:
     """Matches of one scan, for one class and one rule.
 
-    Attributes
-    ----------
-    objects : tuple of ObjectKey
-        One for each object to find.
-    hits : tuple of float
-        Scores of the first pass: of the best detection of each object.
-    steps : tuple of (float, int, int)
-        Change of the number of true and of false positives as the threshold falls to a score, best score first.
+    objects : one for each object to find.
+    hits : scores of the first pass: of the best detection of each object.
+    steps : tuple of (float, int, int); change of the number of true and of false positives as the threshold falls to a
+        score, best score first.
     """
 
     objects: tuple[ObjectKey, ...]

@@ -26,16 +26,9 @@ class Confusion:
 
     A class without true and predicted labels has NaN scores.
 
-    Parameters
-    ----------
     classes : sequence of str
-    ignore : int
-        True label of cells or points that are not counted.
-
-    Attributes
-    ----------
-    counts : (C, C) int64
-        Rows are the truth, columns the prediction.
+    ignore : int; true label of cells or points that are not counted.
+    counts : (C, C) int64; rows are the truth, columns the prediction.
     """
 
     def __init__(self, classes: Sequence[str], *, ignore: int = 255) -> None:
@@ -142,10 +135,8 @@ def interpolated_precision(
 class ProbabilitySweep:
     """Precision and recall of one class over all thresholds of its probability (KITTI road, LoDNN).
 
-    Attributes
-    ----------
-    counts : (2, 256) int64
-        Histograms of the probability in steps of 1/255. Row 0: cells of other classes. Row 1: cells of the class.
+    counts : (2, 256) int64; histograms of the probability in steps of 1/255. Row 0: cells of other classes. Row 1:
+        cells of the class.
     """
 
     def __init__(self) -> None:
@@ -193,25 +184,16 @@ class ProbabilitySweep:
 class BoxScores:
     """Scores of the boxes of one class, or of all classes together.
 
-    Attributes
-    ----------
-    ap : float
-        `average_precision`; NaN if there was no box to find.
-    precision, recall : float
-        Over all predictions with any score; NaN without predictions, or without boxes to find.
-    mean_iou_50, mean_iou_70 : float
-        Mean IoU of the predictions with an IoU of at least 0.5, or 0.7 (SSADNet table 5); NaN without any.
-    heading, axis : float
-        Share of the hits whose yaw is within 45 degrees of the true one: over the full turn, where front for rear is
-        wrong, and modulo half a turn. NaN without hits; a yaw that is not finite is wrong.
-    front_known : float
-        Share of the hits with a known front (`Box.front`); the yaw of the others counts as it is.
-    n_truth, n_predicted, n_hits : int
-        Ignored boxes are not counted.
-    n_objects, n_found : int
-        Distinct objects (`object_key`) of the boxes to find, and of the hits.
-    n_drives : int
-        Drives of the boxes to find.
+    ap : `average_precision`; NaN if there was no box to find.
+    precision, recall : over all predictions with any score; NaN without predictions, or without boxes to find.
+    mean_iou_50, mean_iou_70 : mean IoU of the predictions with an IoU of at least 0.5, or 0.7 (SSADNet table 5); NaN
+        without any.
+    heading, axis : share of the hits whose yaw is within 45 degrees of the true one: over the full turn, where front
+        for rear is wrong, and modulo half a turn. NaN without hits; a yaw that is not finite is wrong.
+    front_known : share of the hits with a known front (`Box.front`); the yaw of the others counts as it is.
+    n_truth, n_predicted, n_hits : ignored boxes are not counted.
+    n_objects, n_found : distinct objects (`object_key`) of the boxes to find, and of the hits.
+    n_drives : drives of the boxes to find.
     """
 
     ap: float

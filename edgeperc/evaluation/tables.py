@@ -45,12 +45,8 @@ Tallies = Mapping[tuple[str, ...], Any]
 class Record:
     """Counts of one evaluated scan.
 
-    Attributes
-    ----------
-    name, drive : str
-    tallies : mapping of tuple of str to object
-        Counts, by the keys of their figures in the result, such as ``("points", "0-15 m")``. Counts of several scans
-        can be added.
+    tallies : counts, by the keys of their figures in the result, such as ``("points", "0-15 m")``. Counts of several
+        scans can be added.
     """
 
     name: str

@@ -24,13 +24,9 @@ HOTA_ALPHAS = np.linspace(0.05, 0.95, 19)
 class FrameTruth:
     """True objects of one frame.
 
-    Attributes
-    ----------
-    ids : (n,) int64
-        Id of the object in each box, the same in all frames.
+    ids : (n,) int64; id of the object in each box, the same in all frames.
     boxes : (n, 7) float64
-    ignored : (n,) bool
-        Objects that a tracker may find but need not: occluded, truncated, or of a neighboring class.
+    ignored : (n,) bool; objects that a tracker may find but need not: occluded, truncated, or of a neighboring class.
     """
 
     ids: NDArray[np.int64]
@@ -42,14 +38,11 @@ class FrameTruth:
 class FrameTracks:
     """Tracks of one frame.
 
-    Attributes
-    ----------
     ids : (m,) int64
     boxes : (m, 7) float64
-    scores : (m,) float64
-        The score of a track is the mean over its frames.
-    excused : (m,) bool
-        Boxes that do not count as false positives: too small in the image, or in a region without labels.
+    scores : (m,) float64; the score of a track is the mean over its frames.
+    excused : (m,) bool; boxes that do not count as false positives: too small in the image, or in a region without
+        labels.
     """
 
     ids: NDArray[np.int64]
@@ -62,20 +55,13 @@ class FrameTracks:
 class Clear:
     """CLEAR-MOT counts of the tracks above one score (false alarms, missed and ID SW in KUL-Seg's Table 7).
 
-    Attributes
-    ----------
-    threshold : float
-        Lowest mean score of a counted track.
-    n_truth : int
-        True boxes, without ignored ones.
-    n_found : int
-        Matched true boxes, with ignored ones.
-    n_false, n_missed : int
-        False alarms and missed detections.
-    n_switches, n_fragments : int
-        How often the track of an object changed between frames, and how often it resumed after a gap.
-    mota, motp : float
-        Accuracy 1 - (missed + false + switches) / truth, NaN without true boxes; mean IoU of the matches, NaN
+    threshold : lowest mean score of a counted track.
+    n_truth : true boxes, without ignored ones.
+    n_found : matched true boxes, with ignored ones.
+    n_false, n_missed : false alarms and missed detections.
+    n_switches, n_fragments : how often the track of an object changed between frames, and how often it resumed after a
+        gap.
+    mota, motp : accuracy 1 - (missed + false + switches) / truth, NaN without true boxes; mean IoU of the matches, NaN
         without matches.
     """
 
@@ -99,10 +85,8 @@ class Clear:
 class Hota:
     """Higher order tracking accuracy, mean over the IoU thresholds 0.05, 0.10 .. 0.95 (Luiten et al., IJCV 2020).
 
-    Attributes
-    ----------
-    hota, deta, assa : float
-        HOTA, detection accuracy and association accuracy, in 0..1; NaN if there are neither true boxes nor tracks.
+    hota, deta, assa : HOTA, detection accuracy and association accuracy, in 0..1; NaN if there are neither true boxes
+        nor tracks.
     """
 
     hota: float
@@ -114,19 +98,12 @@ class Hota:
 class TrackingScores:
     """All figures of one class.
 
-    Attributes
-    ----------
-    samota, amota, amotp : float
-        Means over forty recalls of scaled MOTA, MOTA and MOTP (AB3DMOT); a recall that is never reached counts as 0.
-        NaN without true boxes.
-    all_tracks : Clear
-        Counts of all reported tracks, with any score.
-    best : Clear
-        Counts at the score threshold with the highest MOTA.
-    hota : Hota
-        At the same threshold.
-    n_frames, n_objects : int
-        Number of frames, and of true objects that are not ignored in every frame.
+    samota, amota, amotp : means over forty recalls of scaled MOTA, MOTA and MOTP (AB3DMOT); a recall that is never
+        reached counts as 0. NaN without true boxes.
+    all_tracks : counts of all reported tracks, with any score.
+    best : counts at the score threshold with the highest MOTA.
+    hota : at the same threshold.
+    n_frames, n_objects : number of frames, and of true objects that are not ignored in every frame.
     """
 
     samota: float

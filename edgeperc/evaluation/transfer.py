@@ -45,15 +45,10 @@ VELODYNE_BYTE = (
 class Scan:
     """A labeled scan of another sensor.
 
-    Attributes
-    ----------
-    name : str
-    points : (n, 4) float32
-        x, y, z [m] in the sensor frame, raw remission.
-    labels : (n,) uint8
-        Index into `POINT_CLASSES`, `IGNORE` where unknown.
-    objects : frozenset of (str, ObjectKey) or None
-        Labeled objects within 50 m, by the class of their points; None if only points or pixels are labeled.
+    points : (n, 4) float32; x, y, z [m] in the sensor frame, raw remission.
+    labels : (n,) uint8; index into `POINT_CLASSES`, `IGNORE` where unknown.
+    objects : frozenset of (str, ObjectKey) or None; labeled objects within 50 m, by the class of their points; None if
+        only points or pixels are labeled.
     """
 
     name: str

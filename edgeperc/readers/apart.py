@@ -98,10 +98,8 @@ def _start(folder: str) -> subprocess.Popen[bytes]:
 class _Watch:
     """A thread that ends the process when a reply takes too long; not every system can wait for a pipe with a limit.
 
-    Attributes
-    ----------
-    since_s : float or None
-        Since when a reply is awaited, on the monotonic clock; None while the reader of the scans takes its time.
+    since_s : float or None; since when a reply is awaited, on the monotonic clock; None while the reader of the scans
+        takes its time.
     expired : bool
     """
 

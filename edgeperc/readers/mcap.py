@@ -36,14 +36,8 @@ class Message(NamedTuple):
 class McapFile:
     """One .mcap file, read from front to back; an index is not needed.
 
-    Parameters
-    ----------
     path : Path
-
-    Attributes
-    ----------
-    channels : dict of int to Channel
-        Those of the summary, or those met so far.
+    channels : dict of int to Channel; those of the summary, or those met so far.
     """
 
     def __init__(self, path: Path) -> None:

@@ -64,14 +64,9 @@ def pcap_packets(path: Path, whole: bool = True) -> Iterator[tuple[int, memoryvi
 class Checked(NamedTuple):
     """What `check_datagrams` finds.
 
-    Attributes
-    ----------
-    n_good : int
-        Datagrams of an expected size.
-    n_bad : int
-        Datagrams that are empty, incomplete, contradict themselves, or have another size on a port of good ones.
-    bad : array of int
-        Places in the file of the bad records, and of the unfinished one at its end.
+    n_good : datagrams of an expected size.
+    n_bad : datagrams that are empty, incomplete, contradict themselves, or have another size on a port of good ones.
+    bad : places in the file of the bad records, and of the unfinished one at its end.
     """
 
     n_good: int

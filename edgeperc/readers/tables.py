@@ -26,14 +26,9 @@ MAX_SCAN_BYTES = 1 << 28
 class Columns(NamedTuple):
     """The fields of a scan, for `edgeperc.types.points.assemble`.
 
-    Attributes
-    ----------
-    n : int
-        Number of points.
-    fields : mapping of str to (n,) array
-        Columns by `edgeperc.types.points.plain_name`.
-    names : sequence of str
-        All fields of the source.
+    n : number of points.
+    fields : mapping of str to (n,) array; columns by `edgeperc.types.points.plain_name`.
+    names : all fields of the source.
     """
 
     n: int

@@ -14,11 +14,7 @@ from ..errors import OptionError
 class Qos:
     """Quality of service: always volatile, and the last ``depth`` messages are kept.
 
-    Attributes
-    ----------
-    reliable : bool
-        False: best effort.
-    depth : int
+    reliable : false: best effort.
     """
 
     reliable: bool
@@ -45,10 +41,7 @@ class Output(Protocol):
 class Graph(Protocol):
     """A node in a ROS graph; one for each middleware.
 
-    Attributes
-    ----------
-    name : str
-        Fully qualified name of the node.
+    name : fully qualified name of the node.
     """
 
     name: str

@@ -45,13 +45,8 @@ class InputSpec:
 
     The raw values of a camera are 0..255 in ``"red"``, ``"green"`` and ``"blue"``, in the order that the network takes.
 
-    Attributes
-    ----------
-    name : str
-        Name of the input in the graph.
-    channels : tuple of str
-    mean, std : tuple of float
-        One value per channel, in the channel's unit.
+    name : name of the input in the graph.
+    mean, std : one value per channel, in the channel's unit.
     """
 
     name: str
@@ -80,19 +75,13 @@ class InputSpec:
 class OutputSpec:
     """One output of the graph; ``kind`` picks the function in ``decode.py`` that reads it.
 
-    Attributes
-    ----------
-    name : str
-        Name of the output in the graph.
-    kind : str
-        One of ``OUTPUT_KINDS``.
-    front : bool
-        Of kind ``"box_dense"``: it has two more channels, a vector towards the front of a box. Its component along a
-        heading is the logit that the front is there.
-    block : (int, int)
-        Of a class output: rows and columns of the pixels whose values are channels of one position. Value of class c in
-        pixel (row, column): channel ``(c * rows + row % rows) * columns + column % columns``, at position
-        ``(row // rows, column // columns)``.
+    name : name of the output in the graph.
+    kind : one of ``OUTPUT_KINDS``.
+    front : of kind ``"box_dense"``: it has two more channels, a vector towards the front of a box. Its component along
+        a heading is the logit that the front is there.
+    block : (int, int); of a class output: rows and columns of the pixels whose values are channels of one position.
+        Value of class c in pixel (row, column): channel ``(c * rows + row % rows) * columns + column % columns``, at
+        position ``(row // rows, column // columns)``.
     """
 
     name: str
@@ -125,13 +114,8 @@ class Golden:
     positions, so that any runtime can be compared with the exporter's: at 16 or more different positions, or at all
     positions of a smaller output.
 
-    Attributes
-    ----------
-    seed : int
-    input_sha256 : str
-        SHA-256 of the input as float32 bytes in C order.
-    outputs : mapping
-        Output name to ``{"sha256": str, "std": float, "positions": [int], "values": [float]}``.
+    input_sha256 : SHA-256 of the input as float32 bytes in C order.
+    outputs : output name to ``{"sha256": str, "std": float, "positions": [int], "values": [float]}``.
     """
 
     seed: int

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 DEFAULT_MODELS = ("ssadnet", "pointseg")
-"""The best pair: drivable area and vehicles ahead, and a class for every point."""
 CAMERA = "camseg"
-"""The model of a camera's images."""
 DEFAULT_SENSOR = "hdl-64e"
 PRECISIONS = ("fp32", "bf16", "int8")
 RULES = ("boxes", "cells", "column", "fill", "ground", "height", "person", "road", "share", "stand", "support")
-"""Rules of the agreement; `edgeperc.agreement.rules` describes them."""

@@ -32,12 +32,8 @@ def check_size(rows: int, columns: int) -> None:
 class TopViewGeometry:
     """The ground ahead as an image (SSADNet 2.1.2). Row 0 is farthest ahead, column 0 leftmost.
 
-    Attributes
-    ----------
-    x_range_m, y_range_m, z_range_m : tuple of 2 float
-        Bounds of the view [m] in the sensor frame, lower first.
-    cell_m : float
-        Edge of a cell [m].
+    x_range_m, y_range_m, z_range_m : bounds of the view [m] in the sensor frame, lower first.
+    cell_m : edge of a cell [m].
     """
 
     x_range_m: tuple[float, float] = (6.0, 46.0)
@@ -99,14 +95,11 @@ class TopViewGeometry:
 class RangeImageGeometry:
     """The scan as seen from the sensor (PointSeg 3.1). Row 0 is the top beam, column 0 leftmost.
 
-    Attributes
-    ----------
-    row_elevations_deg : tuple of float
-        Elevation of every row [deg], top to bottom, strictly decreasing, not necessarily evenly spaced.
-    width : int
-        Columns, evenly spread over the azimuths.
-    azimuth_left_deg, azimuth_right_deg : float
-        Azimuths of the image's left and right edges [deg], counter-clockwise from +x; 180 and -180 for a full turn.
+    row_elevations_deg : elevation of every row [deg], top to bottom, strictly decreasing, not necessarily evenly
+        spaced.
+    width : columns, evenly spread over the azimuths.
+    azimuth_left_deg, azimuth_right_deg : azimuths of the image's left and right edges [deg], counter-clockwise from +x;
+        180 and -180 for a full turn.
     """
 
     row_elevations_deg: tuple[float, ...]
@@ -145,13 +138,10 @@ class RangeImageGeometry:
 class CameraGeometry:
     """The image of a camera, scaled to the network's input. Row 0 is the top, column 0 leftmost.
 
-    Attributes
-    ----------
-    width, height : int
-        Columns and rows of the input.
-    fit : {"stretch"}
-        How an image of another size gets there: all of it is scaled to ``width`` and ``height``, bilinearly with
-        half-pixel centers (`edgeperc.camera.image.ImageScaler`), whatever its aspect; nothing is cropped or padded.
+    width, height : columns and rows of the input.
+    fit : {"stretch"}; how an image of another size gets there: all of it is scaled to ``width`` and ``height``,
+        bilinearly with half-pixel centers (`edgeperc.camera.image.ImageScaler`), whatever its aspect; nothing is
+        cropped or padded.
     """
 
     width: int

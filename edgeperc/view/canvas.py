@@ -158,11 +158,7 @@ def draw_legend(figure: Any, left: float, top: float, width: float, facts: Mappi
 class Label:
     """A text that names something in a picture.
 
-    Attributes
-    ----------
-    area : tuple of 4 float
-        The named object, in pixels of the figure: left, bottom, right, top.
-    text, color : str
+    area : the named object, in pixels of the figure: left, bottom, right, top.
     """
 
     area: tuple[float, float, float, float]
