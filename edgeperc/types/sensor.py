@@ -141,7 +141,7 @@ class SensorProfile:
             FIELDS.refuse(f"{who} columns", self.columns, "a whole number")
         object.__setattr__(self, "columns", int(columns))
         object.__setattr__(self, "elevations_deg", FIELDS.numbers(f"{who} elevations_deg", self.elevations_deg))
-        bounds = FIELDS.pair(f"{who} remission_range", self.remission_range)
+        bounds = FIELDS.pair(f"{who} remission_range", self.remission_range, -1e9, 1e9)
         object.__setattr__(self, "remission_range", bounds)
         for name in ("min_range_m", "max_range_m"):
             object.__setattr__(self, name, FIELDS.number(f"{who} {name}", getattr(self, name), 0.0))
@@ -149,10 +149,8 @@ class SensorProfile:
             raise SensorError(f"{who} elevations_deg needs one angle a beam, between -90 and 90, of 1 to 4096 beams")
         if any(upper <= lower for upper, lower in pairwise(self.elevations_deg)):
             raise SensorError(f"{who} elevations_deg must strictly decrease, from the top beam down")
-        if not max(map(abs, bounds)) <= 1e9 or not bounds[1] - bounds[0] >= 1e-9:
-            raise SensorError(
-                f"{who} remission_range is (lowest, highest) raw value, such as (0, 255), up to 1e9, got {bounds!r}"
-            )
+        if not bounds[1] - bounds[0] >= 1e-9:
+            FIELDS.refuse(f"{who} remission_range", bounds, "the lowest and the highest raw value, such as (0, 255)")
         if not isinstance(self.mounting, Mounting):
             raise SensorError(f"{who} mounting is a Mounting, got {self.mounting!r:.80}")
         if not self.min_range_m < self.max_range_m:

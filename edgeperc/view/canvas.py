@@ -16,23 +16,6 @@ from ..system.atomic import write_atomic
 from ..system.extras import require
 from .colors import FAINT, FRAME, GROUND, INK, PANEL, color_of
 
-__all__ = [
-    "Label",
-    "add_axes",
-    "area_of",
-    "as_png",
-    "draw_legend",
-    "free_place",
-    "height_of_legend",
-    "new_figure",
-    "place_labels",
-    "shorten",
-    "wrap",
-    "write_at",
-    "write_heading",
-    "write_text",
-]
-
 _DPI = 100.0
 _CLASSES_A_ROW, _LEGEND_ROW = 7, 104
 # More labels would cover the picture; the rest is only counted.

@@ -21,23 +21,6 @@ from .colors import CLASS_COLORS
 if TYPE_CHECKING:
     from ..tracking.tracks import Track
 
-__all__ = [
-    "EDGES",
-    "box_corners",
-    "box_text",
-    "check_points",
-    "class_facts",
-    "drawable_boxes",
-    "drawable_points",
-    "fit_ground",
-    "in_model_frame",
-    "paint_points",
-    "perceived_image",
-    "provider_lines",
-    "timing_line",
-    "track_text",
-]
-
 # Limits of what is drawn: no sensor reaches as far, and a drawing library may fail on huge coordinates.
 _REACH_M = 1000.0
 _LARGEST_BOX_M = 100.0

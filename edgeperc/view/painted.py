@@ -18,8 +18,6 @@ from .canvas import add_axes, as_png, draw_legend, height_of_legend, new_figure,
 from .colors import FAINT, INK, color_of, rgb
 from .content import check_points, drawable_boxes, drawable_points, perceived_image, provider_lines, timing_line
 
-__all__ = ["draw_painted"]
-
 # Sizes in pixels.
 _WIDTH, _MARGIN, _TOP, _GAP, _AXIS = 1600, 28, 128, 44, 62
 _WIDEST, _HIGHEST = 888, 560

@@ -42,8 +42,6 @@ from .content import (
     timing_line,
 )
 
-__all__ = ["draw", "draw_image"]
-
 # Sizes in pixels. A page that shows the picture 1000 pixels wide reduces text of 13 points to 8.
 _WIDTH, _MARGIN, _TOP, _BOTTOM = 1600, 28, 128, 868
 _AXIS = 62

@@ -26,8 +26,6 @@ from .content import drawable_boxes, drawable_points, fit_ground, paint_points
 if TYPE_CHECKING:
     from ..tracking.tracks import Track, Tracks
 
-__all__ = ["draw_tracks", "flatten_scan"]
-
 # Forward is to the right, left is up. Sizes in pixels, 10 per meter. Frames are drawn twice as large and reduced, which
 # smooths the edges.
 _PX_PER_M, _FINE = 10, 2

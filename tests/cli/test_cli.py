@@ -613,12 +613,12 @@ def test_a_reader_that_goes_away_is_no_accident(tmp_path: Path) -> None:
     for k in range(30):
         write_scan(tmp_path / f"{k:02}.bin")
     code = (
-        "import sys, types; sys.path.insert(0, sys.argv[1]); import test_cli\n"
+        "import sys, types, test_cli\n"
         "sys.modules['edgeperc.perceiver'] = types.SimpleNamespace(Perceiver=test_cli.FakePerceiver)\n"
-        "from edgeperc.cli import main; sys.exit(main(['run', sys.argv[2], '--json']))\n"
+        "from edgeperc.cli import main; sys.exit(main(['run', sys.argv[1], '--json']))\n"
     )
-    command = [sys.executable, "-c", code, str(Path(__file__).parent.parent), str(tmp_path)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    command, modules = [sys.executable, "-c", code, str(tmp_path)], {"PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | modules)
     assert process.stdout is not None
     assert process.stderr is not None
     process.stdout.close()
