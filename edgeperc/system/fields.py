@@ -48,6 +48,7 @@ class Fields:
         return {key: value for key, value in document.items() if key != "schema"}
 
     def refuse(self, name: str, value: object, expected: str) -> NoReturn:
+        """Raise the error of a wrong entry."""
         raise self.error(f"{name} is {reprlib.repr(value)}; expected {expected}")
 
     def number(self, name: str, value: Any, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> float:

@@ -542,7 +542,7 @@ def test_a_scan_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: type[FakePerceiver]) -> None:
     scan = write_scan(tmp_path / "a.bin")
     for arguments, words in [
-        (("--png",), "add --out"),
+        (("--png",), "--png needs --out DIR"),
         (("--out", tmp_path / "out"), "add --png"),
         (("--on-mismatch", "explode"), "invalid choice"),
         (("--rate", "0"), "above 0"),

@@ -171,7 +171,7 @@ def _of(watch: Watch, name: str, n: int) -> set[str]:
         ({}, {"ROS_DOMAIN_ID": "seven"}, "ROS_DOMAIN_ID is 'seven'"),
         ({"connect": "nonsense"}, {}, "connect='nonsense'"),
         ({}, {CONFIG_VARIABLE: "/nowhere.json5"}, "nowhere.json5"),
-        ({"name": "two words"}, {}, "no name of ROS 2"),
+        ({"name": "two words"}, {}, "not a name of ROS 2"),
     ],
 )
 def test_what_is_no_graph(
@@ -416,7 +416,7 @@ def test_parameters_take_the_place_of_options(bus: Bus, capsys: pytest.CaptureFi
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--ros-args", "-r", "a:=b"], "add --rclpy"),
+        (["--ros-args", "-r", "a:=b"], "--ros-args needs --rclpy"),
         (["--rclpy", "--connect", "tcp/localhost:1"], "--connect needs Zenoh"),
     ],
 )
