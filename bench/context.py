@@ -126,7 +126,7 @@ def busiest(seconds: float = 0.5) -> list[dict[str, Any]]:
         {"name": _ask(process.name, "?"), "cores": round(_ask(process.cpu_percent, 0.0) / 100.0, 2)}
         for process in processes
     ]
-    return sorted((each for each in loads if each["cores"] >= 0.05), key=lambda each: -each["cores"])[:5]
+    return sorted((load for load in loads if load["cores"] >= 0.05), key=lambda load: -load["cores"])[:5]
 
 
 def _ask(question: Callable[[], Any], otherwise: Any) -> Any:

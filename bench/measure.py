@@ -52,8 +52,10 @@ def repeat(
         (result,) = measure([job if k == 0 else replace(job, predict=())], on_tick)
         predictions += result.pop("predictions")
         setting["repeats"].append(result)
-        for name, each in result["scenarios"].items():
-            for disturbance in disturbances(document["machine"], each["before"], each["after"], each["cpu_s"]):
+        for name, scenario in result["scenarios"].items():
+            for disturbance in disturbances(
+                document["machine"], scenario["before"], scenario["after"], scenario["cpu_s"]
+            ):
                 document["disturbances"].append(f"{name}, repeat {k + 1}: {disturbance}")
         if result["interrupted"]:
             raise KeyboardInterrupt

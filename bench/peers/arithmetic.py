@@ -87,8 +87,8 @@ def cost(model: Path | Any) -> Cost:
 
 def n_taps_inside(n_here: int, n_there: int, kernel: int, stride: int, pad: int, dilation: int) -> int:
     """Number of pairs of a position and a tap, along one axis, that do not fall on padding."""
-    at = np.arange(n_here)[:, None] * stride - pad + np.arange(kernel) * dilation
-    return int(np.count_nonzero((at >= 0) & (at < n_there)))
+    places = np.arange(n_here)[:, None] * stride - pad + np.arange(kernel) * dilation
+    return int(np.count_nonzero((places >= 0) & (places < n_there)))
 
 
 def matrix_product(library: str, precision: str, n_threads: int) -> Callable[[], object]:

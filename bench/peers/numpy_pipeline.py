@@ -102,10 +102,10 @@ def vote(
     around = np.pad(labels, WINDOW)
     row, col = np.divmod(pixel[hidden], labels.shape[1])
     d_row, d_col = np.mgrid[: 2 * WINDOW + 1, : 2 * WINDOW + 1].reshape(2, -1)
-    at = row[:, None] + d_row, col[:, None] + d_col
-    gaps = np.abs(ranges[at] - distance[hidden, None])
+    cell = row[:, None] + d_row, col[:, None] + d_col
+    gaps = np.abs(ranges[cell] - distance[hidden, None])
     nearest = np.argsort(gaps, axis=1, kind="stable")[:, :N_VOTES]
-    votes = np.take_along_axis(around[at], nearest, axis=1).astype(np.int64)
+    votes = np.take_along_axis(around[cell], nearest, axis=1).astype(np.int64)
     votes[np.take_along_axis(gaps, nearest, axis=1) > MAX_RANGE_GAP_M] = n_classes
     same = (votes[:, :, None] == votes[:, None, :]).sum(axis=2) * (votes < n_classes)
     winner = np.take_along_axis(votes, same.argmax(axis=1)[:, None], axis=1)[:, 0]

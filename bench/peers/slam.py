@@ -101,7 +101,7 @@ def drawn_streets(n_scans: int, wanted: Sequence[str] = ()) -> Iterator[Drive]:
             continue
         scans, poses, moving, usable = [], [], [], []
         scene = random_scene(seed, place)
-        moves = np.array([*(abs(each.speed_mps) > 0.5 for each in scene.objects), False])  # -1 is the background
+        moves = np.array([*(abs(thing.speed_mps) > 0.5 for thing in scene.objects), False])  # -1 is the background
         for _, pose, scan in simulate_sequence(scene, "hdl-64e", n_scans, RATE_HZ, speed, seed):
             scans.append(scan.points)
             poses.append(pose)
@@ -118,7 +118,7 @@ def real_drives(
     data = KittiObjects(root)
     for drive in sorted({*data.drives.values()}):
         names = [name for name, of in data.drives.items() if of == drive][:most]
-        if len(names) < least or (wanted and not any(drive.endswith(each) for each in wanted)):
+        if len(names) < least or (wanted and not any(drive.endswith(ending) for ending in wanted)):
             continue
         scans, known, labels, trained = [], [], [], False
         for name in names:
@@ -156,7 +156,7 @@ def moving_boxes(labels: Sequence[Sequence[Box]], poses: Poses) -> list[list[Box
         [
             box
             for index, box in enumerate(boxes)
-            if any(abs(k - at) <= MOVING_AROUND for at in moves.get(numbers[k].get(index, -1), []))
+            if any(abs(k - frame) <= MOVING_AROUND for frame in moves.get(numbers[k].get(index, -1), []))
         ]
         for k, boxes in enumerate(labels)
     ]

@@ -132,10 +132,10 @@ def _processor() -> Iterator[Finding]:
 def _installed(prefix: str = "") -> dict[str, str]:
     """Version of each installed distribution whose name has this beginning."""
     versions: dict[str, str] = {}
-    for each in importlib.metadata.distributions():
-        name = each.metadata["Name"]  # None if its folder is damaged
+    for distribution in importlib.metadata.distributions():
+        name = distribution.metadata["Name"]  # None if its folder is damaged
         if name and name.lower().replace("_", "-").startswith(prefix):
-            versions.setdefault(name.lower().replace("_", "-"), each.version)
+            versions.setdefault(name.lower().replace("_", "-"), distribution.version)
     return versions
 
 
@@ -322,8 +322,8 @@ def _extras() -> Iterator[Finding]:
         return
     needed = [requirement(text) for text in metadata.get_all("Requires-Dist") or ()]
     versions = _installed()
-    for each, fault in _faults(needed, "", versions):
-        yield Finding(each, "broken", fault, f"pip install '{each}'")
+    for package, fault in _faults(needed, "", versions):
+        yield Finding(package, "broken", fault, f"pip install '{package}'")
     present = []
     for extra in sorted(metadata.get_all("Provides-Extra") or ()):
         faults = _faults(needed, extra, versions)
@@ -340,17 +340,19 @@ def _extras() -> Iterator[Finding]:
 def _faults(needed: list[Any], extra: str, versions: dict[str, str]) -> list[tuple[str, str]]:
     """Requirements of an extra, or of edgeperc itself, that are not met: each with what is wrong."""
     faults = []
-    for each in needed:
-        of_extra = each.marker is not None and "extra" in str(each.marker)
-        if of_extra != bool(extra) or (each.marker is not None and not each.marker.evaluate({"extra": extra})):
+    for requirement in needed:
+        of_extra = requirement.marker is not None and "extra" in str(requirement.marker)
+        if of_extra != bool(extra) or (
+            requirement.marker is not None and not requirement.marker.evaluate({"extra": extra})
+        ):
             continue
-        name = each.name.lower().replace("_", "-")
+        name = requirement.name.lower().replace("_", "-")
         if name == "edgeperc":  # an extra that consists of others
-            for other in sorted(each.extras):
+            for other in sorted(requirement.extras):
                 faults += _faults(needed, other, versions)
         elif name not in versions:
-            faults.append((str(each).partition(";")[0].strip(), f"{name} is missing"))
-        elif not each.specifier.contains(versions[name], prereleases=True):
-            wanted = f"{name} is {versions[name]}, expected {each.specifier}"
-            faults.append((str(each).partition(";")[0].strip(), wanted))
+            faults.append((str(requirement).partition(";")[0].strip(), f"{name} is missing"))
+        elif not requirement.specifier.contains(versions[name], prereleases=True):
+            wanted = f"{name} is {versions[name]}, expected {requirement.specifier}"
+            faults.append((str(requirement).partition(";")[0].strip(), wanted))
     return faults

@@ -244,7 +244,9 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
         rows.append(("boxes", f"{', '.join(card.box_classes)}, score from {card.score_threshold:g}"))
     rows += [(key, str(card.training[key])) for key in ("data", "licence") if key in card.training]
     rows += _accuracy_rows(card.metrics)
-    reduced = {name: of for variant in variants for name, of in variant.card.precisions.items() if name != "fp32"}
+    reduced = {
+        name: figures for variant in variants for name, figures in variant.card.precisions.items() if name != "fp32"
+    }
     for precision, agreement in reduced.items():
         loss, same = agreement.get("loss"), agreement.get("label_agreement")
         if isinstance(same, float):
@@ -256,7 +258,7 @@ def _model_rows(variants: Sequence[Variant]) -> list[tuple[str, str]]:
 def _accuracy_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The main figures on each evaluated kind of scans, over all distances, in per cent."""
     rows = []
-    for block, of in (("real", "KITTI"), ("semantickitti", "SemanticKITTI"), ("simulated", "simulation")):
+    for block, data in (("real", "KITTI"), ("semantickitti", "SemanticKITTI"), ("simulated", "simulation")):
         figures = metrics.get(block, {})
         points = figures.get("points", {}).get("all", {})
         parts = [f"IoU {name} {_percent(row.get('iou'))}" for name, row in points.items() if row.get("n_objects")]
@@ -269,7 +271,7 @@ def _accuracy_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
         road = figures.get("road", {}).get("all", {})
         parts += [f"road F1 {_percent(road['f1'])}"] if road.get("f1") is not None else []
         if parts:
-            rows.append((f"on {of}", f"{figures.get('n_frames', '?')} scans, %: {', '.join(parts)}"))
+            rows.append((f"on {data}", f"{figures.get('n_frames', '?')} scans, %: {', '.join(parts)}"))
     return rows
 
 

@@ -197,7 +197,10 @@ class _ScanWorker:
         ((_, outcome, _, _),) = outcomes
         if isinstance(outcome, EdgepercError):  # it names the absolute path
             outcome.args = (str(outcome).replace(str(path), str(name)),)
-        text, warned = self._report.text(name, outcome), tuple(dict.fromkeys(str(each.message) for each in caught))
+        text, warned = (
+            self._report.text(name, outcome),
+            tuple(dict.fromkeys(str(warning.message) for warning in caught)),
+        )
         if isinstance(outcome, Exception):
             return _Answer(text, str(outcome).removeprefix(f"{name}: "), (), warned)
         answer = _Answer(text, None, tuple(map(str, outcome.fitness)), warned)

@@ -226,10 +226,10 @@ def run_command(arguments: argparse.Namespace) -> int:
     names = output_names(scans, keep_folder=found.of_data_set) if kinds else []
     targets = [arguments.out / name for name in names] if kinds else [Path()] * len(scans)
     sources = {_real(source) for source in (*scans, *images.values()) if source is not None}
-    of = _pictures_of(arguments, images)
+    pictures = _pictures_of(arguments, images)
     whole = [getattr(arguments, name) for name in wanted_sinks(arguments)]
     for file in (
-        *(file for target in targets for file in _files_of(target, kinds, **of).values()),
+        *(file for target in targets for file in _files_of(target, kinds, **pictures).values()),
         *(value for value in whole if isinstance(value, Path)),
     ):
         if _real(file) in sources:

@@ -129,8 +129,8 @@ class Ab3dmot:
         made: list[tuple[int, int]] = []
         if self.settings.greedy:
             free = np.ones(affinity.shape, np.bool_)
-            for at in np.argsort(-affinity, axis=None, kind="stable").tolist():
-                i, j = divmod(at, len(tracks))
+            for index in np.argsort(-affinity, axis=None, kind="stable").tolist():
+                i, j = divmod(index, len(tracks))
                 if free[i, j]:
                     made.append((i, j))
                     free[i] = free[:, j] = False

@@ -108,8 +108,8 @@ class _Scan:
     @property
     def at_bumper(self) -> NDArray[np.bool_]:
         x, y, z = self.points[:, :3].T
-        at: NDArray[np.bool_] = (x < BUMPER_X_M) & (np.abs(y) < BUMPER_Y_M) & (z < BUMPER_Z_M)
-        return at
+        is_near: NDArray[np.bool_] = (x < BUMPER_X_M) & (np.abs(y) < BUMPER_Y_M) & (z < BUMPER_Z_M)
+        return is_near
 
     def within(self, mask: NDArray[np.bool_], boxes: Sequence[Box], margin_m: float = 0.0) -> NDArray[np.bool_]:
         """Points in one of the boxes."""

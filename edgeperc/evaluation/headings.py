@@ -59,8 +59,8 @@ def speeds(truth: Sequence[FrameTruth], tracks: Sequence[Tracks]) -> list[NDArra
     Returns list of (n,) float64: By frame [m/s]; NaN for an object without other frames nearby.
     """
     places: list[dict[int, NDArray[np.float64]]] = []
-    for frame, of in zip(truth, tracks, strict=True):
-        world = frame.boxes[:, :3] @ of.T_world_sensor[:3, :3].T + of.T_world_sensor[:3, 3]
+    for frame, result in zip(truth, tracks, strict=True):
+        world = frame.boxes[:, :3] @ result.T_world_sensor[:3, :3].T + result.T_world_sensor[:3, 3]
         places.append(dict(zip(frame.ids.tolist(), world[:, :2], strict=True)))
     speeds_mps = []
     for k, here in enumerate(places):
@@ -85,18 +85,18 @@ def count_headings(
     """
     rows: list[tuple[int, int, bool, bool]] = []  # kind, track, resolved, right
     moved: set[int] = set()
-    for frame, of, speed in zip(truth, tracks, speeds(truth, tracks), strict=True):
-        mine = np.flatnonzero([label in labels for label in of.labels])
-        iou = box_iou(frame.boxes, of.boxes[mine])
+    for frame, result, speed in zip(truth, tracks, speeds(truth, tracks), strict=True):
+        mine = np.flatnonzero([label in labels for label in result.labels])
+        iou = box_iou(frame.boxes, result.boxes[mine])
         moves = speed > MOVING_MPS
         moved |= {*frame.ids[moves].tolist()}
         for i in np.flatnonzero(~frame.ignored & ~np.isnan(speed)).tolist():
             if iou[i].max(initial=0.0) < iou_threshold:
                 continue
-            at = mine[int(iou[i].argmax())]
-            right = bool(np.cos(of.boxes[at, 6] - frame.boxes[i, 6]) > 0.0)
+            track = mine[int(iou[i].argmax())]
+            right = bool(np.cos(result.boxes[track, 6] - frame.boxes[i, 6]) > 0.0)
             kind = 0 if moves[i] else 1 if int(frame.ids[i]) in moved else 2
-            rows.append((kind, int(of.ids[at]), bool(of.fronts[at] >= 0.5), right))
+            rows.append((kind, int(result.ids[track]), bool(result.fronts[track] >= 0.5), right))
     counted = []
     for kind in range(3):
         of_kind = [row for row in rows if row[0] == kind]

@@ -230,7 +230,7 @@ class Judge:
         to_find, ignored = boxes_to_find(returns, None, every, known=known)
         for group, (names, least_iou) in ALL_ROUND.items():
             evaluator = tallies["all_round", group] = BoxEvaluator(least_iou, together=names)
-            guesses, rights = ([box for box in of if box.label in names] for of in (predicted, to_find))
+            guesses, rights = ([box for box in boxes if box.label in names] for boxes in (predicted, to_find))
             evaluator.update(guesses, rights, ignored=ignored, drive=truth.drive)
         returns_of = {id(box): n for box, n in returns}
         return replace(
@@ -401,7 +401,7 @@ def _renamed(labels: NDArray[np.uint8], names: Sequence[str], classes: Sequence[
 def training_scans_of(cards: Sequence[ModelCard]) -> dict[str, set[str]]:
     """Read from cards the `scan_hash` of every real training scan, by name and version of the model."""
     frames = {f"{card.name} {card.version}": card.training.get("frames", {}) for card in cards}
-    return {name: set(of.values()) if isinstance(of, Mapping) else set() for name, of in frames.items()}
+    return {name: set(hashes.values()) if isinstance(hashes, Mapping) else set() for name, hashes in frames.items()}
 
 
 def check_unseen(trained_on: Mapping[str, set[str]], name: str, drive: str, points: NDArray[np.float32]) -> None:

@@ -198,7 +198,9 @@ def best_candidates(
 
 def candidate_recall(found: Sequence[Candidate], least_iou: float = 0.3) -> dict[str, tuple[float, int]]:
     """Share of the objects of each class with a candidate of at least this IoU, and the number of objects."""
-    by_class = {label: [each.iou >= least_iou for each in found if each.label == label] for label in CLASSES}
+    by_class = {
+        label: [candidate.iou >= least_iou for candidate in found if candidate.label == label] for label in CLASSES
+    }
     return {label: (sum(hits) / len(hits) if hits else math.nan, len(hits)) for label, hits in by_class.items()}
 
 
@@ -282,11 +284,11 @@ def average_precisions(counts: Sequence[Counts]) -> tuple[float, float, float]:
     Returns ap: Mean of the best precision at recalls 1/40, 2/40 .. 1, read from the whole curve; for any number of
         objects. All are NaN without objects.
     """
-    n_truth = sum(len(each.objects) for each in counts)
+    n_truth = sum(len(count.objects) for count in counts)
     if n_truth == 0:
         return math.nan, math.nan, math.nan
-    hits = np.sort(np.array([score for each in counts for score in each.hits], np.float64))[::-1]
-    steps = np.array([step for each in counts for step in each.steps], np.float64).reshape(-1, 3)
+    hits = np.sort(np.array([score for count in counts for score in count.hits], np.float64))[::-1]
+    steps = np.array([step for count in counts for step in count.steps], np.float64).reshape(-1, 3)
     steps = steps[np.argsort(-steps[:, 0], kind="stable")]
     n_hits, n_false = np.cumsum(steps[:, 1:], axis=0).astype(np.int64).T
     curve = np.zeros(N_POSITIONS + 1)

@@ -235,7 +235,7 @@ def _with_mean(scores_of: Mapping[str, BoxScores]) -> dict[str, Any]:
 
 
 def _box_rows(scores_of: Mapping[str, BoxScores]) -> dict[str, Any]:
-    names = [each.name for each in fields(BoxScores) if each.name not in _HEADING]
+    names = [score.name for score in fields(BoxScores) if score.name not in _HEADING]
     return {
         label: {name: getattr(scores, name) for name in names} | _few(scores.n_objects)
         for label, scores in scores_of.items()
@@ -246,7 +246,7 @@ def _kitti_rows(table: ApTable) -> dict[str, Any]:
     """By class, overlap and level or range."""
     rows: dict[str, Any] = {}
     for (label, overlap, level), counts in table.counts.items():
-        objects = [key for each in counts for key in each.objects]
+        objects = [key for count in counts for key in count.objects]
         scores = dict(zip(("ap_r40", "ap_r11", "ap"), average_precisions(counts), strict=True))
         row = scores | {"n_truth": len(objects)} | _distinct(objects)
         rows.setdefault(label, {}).setdefault(overlap, {})[level] = row
@@ -281,13 +281,13 @@ def _error_rows(
         n, whole = points[error, cause], points[error, "of" if cause == "all" else "all"]
         row = {"share": n / whole if whole else math.nan, "n_of": whole} | _error_row(error, cause, points, scans)
         if error.startswith("missed"):
-            row |= _distinct(key for *of, key in objects if of == [error, cause])
+            row |= _distinct(key for *kind, key in objects if kind == [error, cause])
         rows[cause] = row
     return rows
 
 
 def _error_row(error: str, cause: str, points: Counter[Any], scans: Counter[Any]) -> dict[str, Any]:
-    n_scans = [n for (*of, _), n in scans.items() if of == [error, cause]]
+    n_scans = [n for (*kind, _), n in scans.items() if kind == [error, cause]]
     return {"n_points": points[error, cause], "n_scans": sum(n_scans), "n_drives": len(n_scans)}
 
 
@@ -343,29 +343,31 @@ def _add_intervals(
     """Add the interval of each figure to ``whole``; ``drives`` holds the figures of single drives."""
     count = next((name for name in _COUNTS if name in whole), None)
     for key, value in list(whole.items()):
-        of_drives, of_samples = [each.get(key, {}) for each in drives], [each.get(key, {}) for each in samples]
+        of_drives, of_samples = [record.get(key, {}) for record in drives], [record.get(key, {}) for record in samples]
         if key == "iou" and isinstance(value, dict):
-            counts = {name: [each["n_cells_of"][name] for each in drives] for name in value}
+            counts = {name: [record["n_cells_of"][name] for record in drives] for name in value}
             whole["iou_interval"] = {
-                name: _interval(counts[name], [each[name] for each in of_samples], times) for name in value
+                name: _interval(counts[name], [record[name] for record in of_samples], times) for name in value
             }
         elif isinstance(value, dict):
             _add_intervals(value, of_drives, of_samples, times)
         elif count and isinstance(value, float):
-            values = [each.get(key, math.nan) for each in samples]
-            whole[f"{key}_interval"] = _interval([each.get(count, 0) for each in drives], values, times)
+            values = [record.get(key, math.nan) for record in samples]
+            whole[f"{key}_interval"] = _interval([record.get(count, 0) for record in drives], values, times)
         for cause in value if key == "bumper" else ():
-            n_points = [each[cause]["n_points"] if each else 0 for each in of_samples]
+            n_points = [record[cause]["n_points"] if record else 0 for record in of_samples]
             bounds = _interval([1] * len(drives), n_points, times)
             value[cause]["n_points_interval"] = bounds and [round(bound) for bound in bounds]
     for mean_of in ("mean_iou", "mean_ap"):
         # Means over different classes are not comparable, so only drives and resamples with all classes count.
         meant = [name for name, (value, _) in _parts(whole, mean_of).items() if not math.isnan(value)]
         if meant:
-            parts = [[_parts(each, mean_of).get(name, (math.nan, 0)) for name in meant] for each in (*drives, *samples)]
-            fewest = [min(n for _, n in each) for each in parts[: len(drives)]]
-            complete = [not any(math.isnan(value) for value, _ in each) for each in parts[len(drives) :]]
-            values = [each[mean_of] if same else math.nan for each, same in zip(samples, complete, strict=True)]
+            parts = [
+                [_parts(record, mean_of).get(name, (math.nan, 0)) for name in meant] for record in (*drives, *samples)
+            ]
+            fewest = [min(n for _, n in record) for record in parts[: len(drives)]]
+            complete = [not any(math.isnan(value) for value, _ in record) for record in parts[len(drives) :]]
+            values = [record[mean_of] if same else math.nan for record, same in zip(samples, complete, strict=True)]
             whole[f"{mean_of}_interval"] = _interval(fewest, values, times)
 
 
@@ -374,8 +376,8 @@ def _parts(row: Mapping[str, Any], mean_of: str) -> dict[str, tuple[float, int]]
     if mean_of == "mean_iou" and "iou" in row and "n_cells_of" in row:
         return {name: (value, row["n_cells_of"][name]) for name, value in row["iou"].items() if name != "vehicle"}
     if mean_of == "mean_ap" and mean_of in row:
-        rows = {name: each for name, each in row.items() if isinstance(each, dict) and "ap" in each}
-        return {name: (each["ap"], each["n_truth"]) for name, each in rows.items() if name != "vehicle"}
+        rows = {name: figures for name, figures in row.items() if isinstance(figures, dict) and "ap" in figures}
+        return {name: (figures["ap"], figures["n_truth"]) for name, figures in rows.items() if name != "vehicle"}
     return {}
 
 

@@ -145,17 +145,17 @@ def recall_thresholds(scores: ArrayLike, n_truth: int) -> tuple[NDArray[np.float
         first recall that is not reached.
     """
     falling = np.sort(np.asarray(scores, dtype=np.float64))[::-1]
-    at: list[int] = []
+    ranks: list[int] = []
     recalls: list[float] = []
     recall = 0.0
     for rank in range(len(falling)):
         # The next rank is nearer. With equal distances rounding decides, so this is written as in KITTI's program.
         if rank < len(falling) - 1 and (rank + 2) / n_truth - recall < recall - (rank + 1) / n_truth:
             continue
-        at.append(rank)
+        ranks.append(rank)
         recalls.append(recall)
         recall += 1.0 / N_RECALLS
-    return falling[at[1:]], np.array(recalls[1:], np.float64)
+    return falling[ranks[1:]], np.array(recalls[1:], np.float64)
 
 
 def evaluate_tracks(
@@ -205,8 +205,8 @@ def evaluate_tracks(
         all_tracks=everything,
         best=best,
         hota=_hota(packed, best.threshold),
-        n_frames=sum(len(of.shapes) for of in packed),
-        n_objects=sum(len({*of.truth[~of.ignored].tolist()}) for of in packed),
+        n_frames=sum(len(sequence.shapes) for sequence in packed),
+        n_objects=sum(len({*sequence.truth[~sequence.ignored].tolist()}) for sequence in packed),
     )
 
 
@@ -267,9 +267,9 @@ def _counted(ids: Sequence[NDArray[np.int64]]) -> tuple[NDArray[np.int64], int]:
 
 
 def _at_threshold(packed: Sequence[_Packed], threshold: float) -> Clear:
-    for of in packed:
-        if of.as_ab3dmot:
-            of.mean_score = of.averaged(of.mean_score[of.track])
+    for sequence in packed:
+        if sequence.as_ab3dmot:
+            sequence.mean_score = sequence.averaged(sequence.mean_score[sequence.track])
     return _clear(packed, threshold)[0]
 
 
@@ -278,22 +278,22 @@ def _clear(packed: Sequence[_Packed], threshold: float) -> tuple[Clear, NDArray[
     n_truth = n_found = n_false = n_missed = n_switches = n_fragments = 0
     total_overlap = 0.0
     scores = [np.zeros(0)]
-    for of in packed:
-        pair, unmatched = of.matched(threshold)
-        unmatched[of.column[pair]] = False
-        ids = np.full(len(of.truth), -1)
-        ids[of.row[pair]] = of.track[of.column[pair]]
-        switches, fragments = count_breaks(of.truth, ids, of.ignored, of.as_ab3dmot)
-        if of.as_ab3dmot:
-            of.once_matched[of.column[pair]] = True
-        n_truth += int(np.count_nonzero(~of.ignored))
+    for sequence in packed:
+        pair, unmatched = sequence.matched(threshold)
+        unmatched[sequence.column[pair]] = False
+        ids = np.full(len(sequence.truth), -1)
+        ids[sequence.row[pair]] = sequence.track[sequence.column[pair]]
+        switches, fragments = count_breaks(sequence.truth, ids, sequence.ignored, sequence.as_ab3dmot)
+        if sequence.as_ab3dmot:
+            sequence.once_matched[sequence.column[pair]] = True
+        n_truth += int(np.count_nonzero(~sequence.ignored))
         n_found += len(pair)
-        n_missed += int(np.count_nonzero((ids < 0) & ~of.ignored))
-        n_false += int(np.count_nonzero(unmatched & ~(of.excused & ~of.once_matched)))
+        n_missed += int(np.count_nonzero((ids < 0) & ~sequence.ignored))
+        n_false += int(np.count_nonzero(unmatched & ~(sequence.excused & ~sequence.once_matched)))
         n_switches += switches
         n_fragments += fragments
-        total_overlap += float(of.iou[pair].sum())
-        scores.append(of.mean_score[of.track[of.column[pair]]])
+        total_overlap += float(sequence.iou[pair].sum())
+        scores.append(sequence.mean_score[sequence.track[sequence.column[pair]]])
     mota = 1.0 - (n_missed + n_false + n_switches) / n_truth if n_truth else math.nan
     motp = total_overlap / n_found if n_found else math.nan
     counts = n_truth, n_found, n_false, n_missed, n_switches, n_fragments
@@ -304,26 +304,28 @@ def _hota(packed: Sequence[_Packed], threshold: float) -> Hota:
     """HOTA, without ignored true boxes, the tracks matched to them, and excused boxes of tracks."""
     n_found, n_truth, n_tracked = np.zeros(len(HOTA_ALPHAS)), 0, 0
     associated = np.zeros(len(HOTA_ALPHAS))
-    for of in packed:
-        pair, is_matched = of.matched(threshold)
-        real, counted = ~of.ignored, is_matched & ~of.excused
-        counted[of.column[pair]] = real[of.row[pair]]
-        in_truth = np.bincount(of.truth[real], minlength=int(of.truth.max(initial=-1)) + 1).astype(np.float64)
-        in_track = np.bincount(of.track[counted], minlength=of.n_tracks).astype(np.float64)
+    for sequence in packed:
+        pair, is_matched = sequence.matched(threshold)
+        real, counted = ~sequence.ignored, is_matched & ~sequence.excused
+        counted[sequence.column[pair]] = real[sequence.row[pair]]
+        in_truth = np.bincount(sequence.truth[real], minlength=int(sequence.truth.max(initial=-1)) + 1).astype(
+            np.float64
+        )
+        in_track = np.bincount(sequence.track[counted], minlength=sequence.n_tracks).astype(np.float64)
         either = in_truth[:, None] + in_track[None, :]
 
         # HOTA's global alignment: the overlap of each object with each track over the whole sequence.
-        shared = of.iou * real[of.row] * counted[of.column]
-        of_truth = np.bincount(of.row, shared, len(of.truth))[of.row]
-        of_track = np.bincount(of.column, shared, len(of.track))[of.column]
-        names = of.truth[of.row], of.track[of.column]
+        shared = sequence.iou * real[sequence.row] * counted[sequence.column]
+        of_truth = np.bincount(sequence.row, shared, len(sequence.truth))[sequence.row]
+        of_track = np.bincount(sequence.column, shared, len(sequence.track))[sequence.column]
+        names = sequence.truth[sequence.row], sequence.track[sequence.column]
         together = np.zeros(either.shape)
         np.add.at(together, names, shared / np.maximum(of_truth + of_track - shared, 1e-12))
         alignment = together / np.maximum(either - together, 1e-12)
 
-        made = of.assigned(alignment[names] * shared)
+        made = sequence.assigned(alignment[names] * shared)
         for k, alpha in enumerate(HOTA_ALPHAS):
-            hits = made[of.iou[made] >= alpha - 1e-12]
+            hits = made[sequence.iou[made] >= alpha - 1e-12]
             counts = np.zeros(either.shape)
             np.add.at(counts, (names[0][hits], names[1][hits]), 1.0)
             n_found[k] += len(hits)

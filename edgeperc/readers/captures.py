@@ -158,14 +158,14 @@ def known_sensor(path: Path, topic: str | None = None) -> KnownSensor | None:
     """Like `sensor_of`, with how it is known."""
     kind = _readable_kind(path)
     if kind == "folder":
-        each = {file: known_sensor(file, topic) for file in scan_files(path)}
-        profiles = {None if known is None else known.profile for known in each.values()}
+        sensors = {file: known_sensor(file, topic) for file in scan_files(path)}
+        profiles = {None if known is None else known.profile for known in sensors.values()}
         if len(profiles) > 1:
             names = sorted({"scan files" if profile is None else profile.name for profile in profiles})
             raise SensorError(
                 f"{path}: the captures in this folder are of several sensors ({', '.join(names)}); read them one by one"
             )
-        return next(iter(each.values()), None)
+        return next(iter(sensors.values()), None)
     if kind == "scan":
         return None
     try:

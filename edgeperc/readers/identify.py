@@ -77,9 +77,9 @@ def of_packets(path: Path, topic: str | None = None) -> KnownSensor:
     refuse_hesai(path)
     files = metadata_beside(path)
     contents = [(file.name, json.loads(read_metadata(file))) for file in files]
-    chosen = [each for each in contents if topic is None or _serial(each[1]) == topic] or contents
+    chosen = [entry for entry in contents if topic is None or _serial(entry[1]) == topic] or contents
     known = [of_metadata(content, f"the metadata {name}") for name, content in chosen]
-    if len({each.profile for each in known}) > 1:
+    if len({entry.profile for entry in known}) > 1:
         raise SensorError(
             f"there is metadata of several sensors: {', '.join(name for name, _ in contents)}; say which by topic="
         )

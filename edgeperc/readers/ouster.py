@@ -144,14 +144,14 @@ def _checked_beams(name: str, values: Any, n: int | None) -> int:
 def check_osf(path: Path) -> None:
     """Raise `PointsError` unless every checksum is right."""
     data = np.memmap(path, np.uint8, "r").data
-    kind, at, size = b"", 0, len(data)
-    while at < size:
+    kind, offset, size = b"", 0, len(data)
+    while offset < size:
         # The length of the block, the block, CRC-32 of both.
-        end = at + 4 + struct.unpack_from("<I", data, at)[0] if at + 8 <= size else size
-        if end + 4 > size or zlib.crc32(data[at:end]) != struct.unpack_from("<I", data, end)[0]:
+        end = offset + 4 + struct.unpack_from("<I", data, offset)[0] if offset + 8 <= size else size
+        if end + 4 > size or zlib.crc32(data[offset:end]) != struct.unpack_from("<I", data, end)[0]:
             raise PointsError(
-                f"the .osf file is damaged or cut short: the block at byte {at:,} of {size:,} is not whole"
+                f"the .osf file is damaged or cut short: the block at byte {offset:,} of {size:,} is not whole"
             )
-        kind, at = bytes(data[at + 8 : at + 12]), end + 4
+        kind, offset = bytes(data[offset + 8 : offset + 12]), end + 4
     if kind != b"OSF#":
         raise PointsError("the .osf file is cut short: its last block is not the metadata")

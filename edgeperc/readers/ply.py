@@ -87,10 +87,10 @@ def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
     if encoding not in ("binary_little_endian", "binary_big_endian"):
         raise PointsError(f"PLY data is ascii, binary_little_endian or binary_big_endian, got {encoding!r}")
     order = "<" if encoding == "binary_little_endian" else ">"
-    at = 0
+    offset = 0
     for element in before:
-        at = _row_starts(body, at, element, order)[1]
-    starts, _ = _row_starts(body, at, vertex, order)
+        offset = _row_starts(body, offset, element, order)[1]
+    starts, _ = _row_starts(body, offset, vertex, order)
     n = vertex.count
     fields: dict[str, NDArray[Any]] = {}
     if starts is None:
@@ -98,7 +98,7 @@ def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
         record = sum(widths)
         for name, k in places.items():
             kind = order + vertex.properties[k][1]
-            fields[name] = column(body, kind, n, at + sum(widths[:k]), record)
+            fields[name] = column(body, kind, n, offset + sum(widths[:k]), record)
     else:
         for name, k in places.items():
             kind = order + vertex.properties[k][1]
@@ -108,14 +108,14 @@ def parse_ply(data: NDArray[np.uint8], head: bytes, remission_field: str | None)
 
 
 def _row_starts(
-    body: NDArray[np.uint8], at: int, element: _PlyElement, order: str
+    body: NDArray[np.uint8], offset: int, element: _PlyElement, order: str
 ) -> tuple[NDArray[np.int64] | None, int]:
     """Start of each property of each row, None if all rows have one length; and the end of the element."""
     if not element.has_lists:
         record = sum(int(np.dtype(kind).itemsize) for _, kind, _ in element.properties)
-        end = at + element.count * record
+        end = offset + element.count * record
         if end > body.size:
-            raise cut_short(element.count, record, body.size - at)
+            raise cut_short(element.count, record, body.size - offset)
         return None, end
     byte_order: Literal["little", "big"] = "little" if order == "<" else "big"
     steps = [
@@ -123,16 +123,16 @@ def _row_starts(
         for _, kind, length in element.properties
     ]
     least = sum(length_size or size for size, length_size in steps)
-    if at + element.count * least > body.size:
-        raise cut_short(element.count, least, body.size - at)
+    if offset + element.count * least > body.size:
+        raise cut_short(element.count, least, body.size - offset)
     starts = np.empty((element.count, len(steps)), dtype=np.int64)
     for row in range(element.count):
         for k, (size, length_size) in enumerate(steps):
-            starts[row, k] = at
+            starts[row, k] = offset
             if length_size:
-                at += length_size + size * int.from_bytes(body[at : at + length_size].tobytes(), byte_order)
+                offset += length_size + size * int.from_bytes(body[offset : offset + length_size].tobytes(), byte_order)
             else:
-                at += size
-            if at > body.size:
+                offset += size
+            if offset > body.size:
                 raise PointsError(f"cut short: row {row} of {element.count} of {element.name!r} ends past the file")
-    return starts, at
+    return starts, offset

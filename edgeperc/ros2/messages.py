@@ -407,7 +407,7 @@ class RosMessages:
             color=self._make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=alpha),
             lifetime=self._make("builtin_interfaces/msg/Duration", sec=lasting_ns // 10**9, nanosec=lasting_ns % 10**9),
             frame_locked=False,
-            points=[self._point(each) for each in (() if points is None else points)],
+            points=[self._point(point) for point in (() if points is None else points)],
             colors=[],
             texture_resource="",
             texture=image,
@@ -418,8 +418,8 @@ class RosMessages:
             mesh_use_embedded_materials=False,
         )
 
-    def _point(self, at: Any) -> Any:
-        return self._make("geometry_msgs/msg/Point", x=float(at[0]), y=float(at[1]), z=float(at[2]))
+    def _point(self, place: Any) -> Any:
+        return self._make("geometry_msgs/msg/Point", x=float(place[0]), y=float(place[1]), z=float(place[2]))
 
     def _vector(self, along: Any) -> Any:
         return self._make("geometry_msgs/msg/Vector3", x=float(along[0]), y=float(along[1]), z=float(along[2]))

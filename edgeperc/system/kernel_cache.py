@@ -56,8 +56,8 @@ watchers: list[Callable[[], None]] = []
 
 def tell_watchers() -> None:
     """Call the `watchers`."""
-    for each in tuple(watchers):
-        each()
+    for watcher in tuple(watchers):
+        watcher()
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -371,7 +371,7 @@ def _stamp_of(file: Path) -> bytes:
 def _can_be_written(folder: Path) -> bool:
     """Whether files can be put into a folder, which may not exist yet."""
     try:
-        return os.access(next(each for each in (folder, *folder.parents) if each.exists()), os.W_OK)
+        return os.access(next(parent for parent in (folder, *folder.parents) if parent.exists()), os.W_OK)
     except OSError:
         return False
 

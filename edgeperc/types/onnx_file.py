@@ -240,10 +240,10 @@ class _GraphCheck:
                 self._refuse_unless_trusted("defines functions of its own")
                 for part, _, first, last in self._messages(start, end, 7, 11):
                     (self._node if part == 7 else self._attribute)(first, last, 1)
-        for each in graphs:  # a parser joins them into one; initializers may stand behind the nodes
-            self._initializers(*each, 1)
-        for each in graphs:
-            self._walk_nodes(*each, 1)
+        for graph in graphs:  # a parser joins them into one; initializers may stand behind the nodes
+            self._initializers(*graph, 1)
+        for graph in graphs:
+            self._walk_nodes(*graph, 1)
         if not self._trusted:
             self._follow_constants()
 

@@ -173,7 +173,7 @@ def _draw_from_above(
         outline.set_linewidth(2.0)
         axes.add_patch(outline)
     ahead = np.arange(0.0, high, 10.0)
-    axes.set_yticks(ahead, labels=[f"{at:.0f} m" for at in ahead])
+    axes.set_yticks(ahead, labels=[f"{tick:.0f} m" for tick in ahead])
     axes.grid(color=INK, alpha=0.12, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.add_patch(Polygon([[0.0, 1.2], [0.9, -1.2], [-0.9, -1.2]], closed=True, facecolor=INK, zorder=4))

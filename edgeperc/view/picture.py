@@ -236,9 +236,9 @@ def _draw_top_view(
     step = 10.0 if high - low > 25.0 else 5.0
     ticks = np.arange(math.ceil(low / step) * step, high, step)[:30]
     beside = np.arange(math.ceil(right / step) * step, left, step)[:30]
-    axes.set_yticks(ticks, labels=[f"{at:.0f} m" for at in ticks])
+    axes.set_yticks(ticks, labels=[f"{tick:.0f} m" for tick in ticks])
     axes.set_xticks(
-        beside, labels=[f"{abs(at):.0f} m{' left' * (at > 0)}{' right' * (at < 0)}" for at in beside.tolist()]
+        beside, labels=[f"{abs(tick):.0f} m{' left' * (tick > 0)}{' right' * (tick < 0)}" for tick in beside.tolist()]
     )
     axes.grid(color=INK, alpha=0.12, linewidth=0.8)
     axes.set_axisbelow(True)

@@ -162,7 +162,7 @@ def draw_tracks(
         _write_names(pen, drawn, fonts[14])
         facts = f"{time_s:.1f} s · {len(tracks)} track{'s' * (len(tracks) != 1)}"
         _write_frame(
-            pen, title or "Tracks", facts, sorted({label for of in scans for label in of.labels}), fonts, tail_s
+            pen, title or "Tracks", facts, sorted({label for scan in scans for label in scan.labels}), fonts, tail_s
         )
         pictures.append(picture.reduce(_FINE).quantize(palette=palette, dither=Image.Dither.NONE))
     lasted = [round(1e3 * (after - before)) for before, after in pairwise([*times_s, times_s[-1] + 1.0])]
@@ -218,8 +218,8 @@ def _draw_rings(pen: Any, font: Any) -> None:
             [middle[0] - reach, middle[1] - reach, middle[0] + reach, middle[1] + reach], -90, 90, FRAME, width=_FINE
         )
         y = min(24.0, 0.8 * ring_m)  # next to the road, where there are few labels
-        (at,) = _pixels(np.array([[math.sqrt(ring_m**2 - y**2), y]]))
-        pen.text(at, f" {ring_m} m", fill=FAINT, font=font)
+        (place,) = _pixels(np.array([[math.sqrt(ring_m**2 - y**2), y]]))
+        pen.text(place, f" {ring_m} m", fill=FAINT, font=font)
     pen.polygon(_pixels(np.array([[2.2, 0.0], [-1.4, 0.9], [-1.4, -0.9]])), fill=INK)
 
 
