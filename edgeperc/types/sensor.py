@@ -73,12 +73,14 @@ class RemissionFunction:
     def __post_init__(self) -> None:
         if not isinstance(self.kind, str) or self.kind not in REMISSION_KINDS:
             FIELDS.refuse("remission.kind", self.kind, f"one of {', '.join(REMISSION_KINDS)}")
-        n, smallest = REMISSION_KINDS[self.kind], math.ulp(0.0)
+        n = REMISSION_KINDS[self.kind]
         coefficients = FIELDS.numbers("remission.coefficients", self.coefficients, n, -1e9, 1e9)
         if self.kind == "power" and coefficients[1] <= 0.0:
             FIELDS.refuse("remission.coefficients", coefficients, "an exponent above 0")
         object.__setattr__(self, "coefficients", coefficients)
-        object.__setattr__(self, "full_scale", FIELDS.number("remission.full_scale", self.full_scale, smallest, 1e9))
+        object.__setattr__(self, "full_scale", FIELDS.number("remission.full_scale", self.full_scale, 0.0, 1e9))
+        if self.full_scale == 0.0:
+            FIELDS.refuse("remission.full_scale", self.full_scale, "a number above 0")
         object.__setattr__(self, "rmse", FIELDS.number("remission.rmse", self.rmse, 0.0, 1e9))
         if not isinstance(self.to, str) or not self.to or not isinstance(self.source, str):
             FIELDS.refuse("remission.to and source", (self.to, self.source), "two texts")

@@ -21,7 +21,7 @@ _FIELDS = Fields("the card", CardError)
 
 
 def check_size(rows: int, columns: int) -> None:
-    """Refuse a view without pixels, or with more than a network is run on."""
+    """Refuse a view of more rows, columns or pixels than are possible."""
     if not (1 <= rows <= MAX_ROWS and 1 <= columns <= MAX_COLUMNS and rows * columns <= MAX_PIXELS):
         raise CardError(
             f"the view has {reprlib.repr(rows)} rows and {reprlib.repr(columns)} columns; expected 1 to {MAX_ROWS} "

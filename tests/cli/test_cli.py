@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from test_captures import vlp16_packets, write_pcap
 
 from cli_helpers import POINTSEG, SSADNET, run, write_scan
-from edgeperc import __version__, zoo
+from edgeperc import __version__, live, zoo
 from edgeperc.cli.arguments import PRECISIONS, PROVIDERS
 from edgeperc.cli.evaluation.scans import _figure_lines
 from edgeperc.cli.main import build_parser, in_options
@@ -613,12 +613,12 @@ def test_a_reader_that_goes_away_is_no_accident(tmp_path: Path) -> None:
     for k in range(30):
         write_scan(tmp_path / f"{k:02}.bin")
     code = (
-        "import sys, types, test_cli\n"
+        "import os, sys, types; sys.path[:0] = sys.argv[1].split(os.pathsep); import test_cli\n"
         "sys.modules['edgeperc.perceiver'] = types.SimpleNamespace(Perceiver=test_cli.FakePerceiver)\n"
-        "from edgeperc.cli import main; sys.exit(main(['run', sys.argv[1], '--json']))\n"
+        "from edgeperc.cli import main; sys.exit(main(['run', sys.argv[2], '--json']))\n"
     )
-    command, modules = [sys.executable, "-c", code, str(tmp_path)], {"PYTHONPATH": os.pathsep.join(sys.path)}
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | modules)
+    command = [sys.executable, "-c", code, os.pathsep.join(sys.path), str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None
     assert process.stderr is not None
     process.stdout.close()
@@ -759,7 +759,7 @@ def test_live_replays_the_one_folder_of_a_data_set(tmp_path: Path, capsys: pytes
 
 
 def test_live_names_the_scans_of_a_capture(capture: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
-    monkeypatch.setattr("edgeperc.live.read_scans", captures.read_scans)
+    monkeypatch.setattr(live, "read_scans", captures.read_scans)
     assert run("run", capture, "--live", "--json") == 1
     answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     named = [answer["scan"] for answer in answers if "error" not in answer]
